@@ -1,0 +1,1 @@
+"""OpenCL C templates: what the device runs. They know pixels, not stars."""

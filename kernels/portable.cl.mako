@@ -1,0 +1,75 @@
+## One small header for what differs between compilers: vectors of WIDTH realisations, and forms that
+## PoCL's compiler turns into single vector instructions. Both branches give the same bits.
+<%
+    lanes = [""] if width == 1 else [f".s{lane:x}" for lane in range(width)]
+    w = "" if width == 1 else str(width)
+    half = width // 2
+    def per_lane(template):
+        values = ", ".join(template.replace("@", lane) for lane in lanes)
+        return values if width == 1 else f"(float{w})({values})"
+%>\
+#pragma OPENCL FP_CONTRACT OFF
+
+typedef uint${w} uintv;
+typedef int${w} intv;
+typedef float${w} floatv;
+#define AS_UINT as_uint${w}
+#define AS_INT as_int${w}
+#define AS_FLOAT as_float${w}
+% if width == 1:
+#define LANE_INDEX ((uintv)0)
+% else:
+#define LANE_INDEX ((uintv)(${", ".join(f"{lane}u" for lane in range(width))}))
+% endif
+
+% if vector_forms:
+/* A built-in on a 16-vector is a function call that spills every register here; a loop over lanes is
+   fused into one instruction, and operators never call. */
+#define FMA(a, b, c) fused((a), (b), (c))
+static inline floatv fused(floatv a, floatv b, floatv c) { return ${per_lane("__builtin_fmaf(a@, b@, c@)")}; }
+static inline floatv root(floatv a) { return ${per_lane("__builtin_sqrtf(a@)")}; }
+#define TO_FLOAT(x) __builtin_convertvector((x), floatv)
+#define TO_INT(x) __builtin_convertvector((x), intv)
+
+/* 32 x 32 -> 64 bit products of the even and the odd lanes, put back together with a shuffle. */
+static inline void multiply(uint factor, uintv x, uintv *high, uintv *low)
+{
+    ulong${half} even = (as_ulong${half}(x) & (ulong${half})0xffffffffUL) * (ulong${half})factor;
+    ulong${half} odd = (as_ulong${half}(x) >> (ulong${half})32UL) * (ulong${half})factor;
+    *low = __builtin_shufflevector(as_uint${w}(even), as_uint${w}(odd), ${", ".join(f"{i}, {i + width}" for i in range(0, width, 2))});
+    *high = __builtin_shufflevector(as_uint${w}(even), as_uint${w}(odd), ${", ".join(f"{i + 1}, {i + 1 + width}" for i in range(0, width, 2))});
+}
+% else:
+#define FMA(a, b, c) fma((a), (b), (c))
+static inline floatv root(floatv a) { return sqrt(a); }
+#define TO_FLOAT(x) convert_float${w}(x)
+#define TO_INT(x) convert_int${w}_rtz(x)
+static inline void multiply(uint factor, uintv x, uintv *high, uintv *low)
+{
+    *high = mul_hi((uintv)factor, x);
+    *low = (uintv)factor * x;
+}
+% endif
+
+/* The ternary operator works lane by lane and never becomes a call. */
+#define least(a, b) ((a) < (b) ? (a) : (b))
+#define most(a, b) ((a) > (b) ? (a) : (b))
+
+static inline uintv look_up(__global const uint *table, uintv index)
+{
+% if width == 1:
+    return table[index];
+% else:
+    return (uintv)(${", ".join(f"table[index{lane}]" for lane in lanes)});
+% endif
+}
+
+/* Nearest integer, ties to even, for |x| < 2^22: no call, and the same bits as rint(). */
+static inline floatv nearest(floatv x) { return (x + 12582912.0f) - 12582912.0f; }
+% if width == 1:
+#define LOAD(pointer) (*(pointer))
+#define STORE(value, pointer) (*(pointer) = (value))
+% else:
+#define LOAD(pointer) vload${width}(0, (pointer))
+#define STORE(value, pointer) vstore${width}((value), 0, (pointer))
+% endif

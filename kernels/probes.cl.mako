@@ -1,0 +1,45 @@
+## Small kernels that push chosen words through the production code, for tests and the self-test.
+__kernel ${attributes}
+void probe_philox(const uint count, __global const uint *counters, __global const uint *keys, __global uint *out)
+{
+    /* Each work-item takes one counter and key in all lanes; lane 0 is written. */
+    const uint item = get_global_id(0);
+    __global const uint *c = counters + 4u * item;
+    Words full = philox((uintv)c[0], (uintv)c[1], (uintv)c[2], (uintv)c[3], keys[2u * item], keys[2u * item + 1u]);
+    const Address at = address((uintv)c[0], c[1], c[2], keys[2u * item], keys[2u * item + 1u]);
+    Words quick = words_at(&at, c[3] >> 24, c[3] & 0xffffffu);
+    __global uint *o = out + 8u * item;
+% for i, word in enumerate("abcd"):
+    o[${i}] = ${"full." + word + (".s0" if width > 1 else "")};
+    o[${i + 4}] = ${"quick." + word + (".s0" if width > 1 else "")};
+% endfor
+}
+
+__kernel ${attributes}
+void probe_normal(__global const uint *restrict words, __global float *restrict out)
+{
+    /* words[2][n] -> normals[2][n], n = WIDTH x global size */
+    const uint item = get_global_id(0), n = get_global_size(0) * ${width}u;
+    floatv z0, z1;
+    normal_pair(LOAD(words + item * ${width}u), LOAD(words + n + item * ${width}u), &z0, &z1);
+    STORE(z0, out + item * ${width}u);
+    STORE(z1, out + n + item * ${width}u);
+}
+
+__kernel ${attributes}
+void probe_alias(__global const uint *restrict words, __global const uint *restrict table, const uint bits, __global uint *restrict out)
+{
+    const uint item = get_global_id(0);
+    STORE(alias_draw(LOAD(words + item * ${width}u), table, bits), out + item * ${width}u);
+}
+
+__kernel void probe_layout(__global uint *restrict out)
+{
+    uint i = 0;
+% for name, fields in structs.items():
+% for field in fields:
+    out[i++] = (uint)(size_t)&((${name} *)0)->${field};
+% endfor
+    out[i++] = (uint)sizeof(${name});
+% endfor
+}

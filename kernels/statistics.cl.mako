@@ -1,0 +1,121 @@
+## Every statistic of METHODS section 6 of every scenario, from one pass over common draws.
+## t = observed - expected quiescent DN of one pixel; each work-item follows WIDTH realisations over all pixels.
+__kernel ${attributes}
+void statistics(const uint seed_low, const uint seed_high, const uint first_low, const uint first_high,
+                const uint pixel_count, const uint scenario_count, const uint frame_count,
+                __global const Pixel *restrict pixels, __global const Level *restrict levels,
+                __global const uint *restrict tables, __global const float *restrict weights,
+                __global const uint *restrict linear_end, const uint stride, __global float *restrict values)
+{
+    const uint item = get_global_id(0);
+    const uintv realisation = (uintv)(first_low + item * ${width}u) + LANE_INDEX;
+    floatv chi2[${scenarios}], element[${scenarios}], chi2_element[${scenarios}], linear[${linears}];
+% if pair:
+    floatv chi2_pair[${scenarios}];
+% endif
+    for (uint k = 0; k < scenario_count; k++) {
+        chi2[k] = 0.0f; element[k] = 0.0f; chi2_element[k] = 0.0f;
+% if pair:
+        chi2_pair[k] = 0.0f;
+% endif
+    }
+    for (uint l = 0; l < linear_end[scenario_count - 1]; l++) linear[l] = 0.0f;
+% if not frames:
+    const Address at = address(realisation, first_high, 0u, seed_low, seed_high);
+% endif
+
+    for (uint start = 0; start < pixel_count; start += ${chunk}u) {
+        floatv z[${chunk}], d[${chunk}];
+% if frames:
+        floatv t[${scenarios}][${chunk}];
+        for (uint k = 0; k < scenario_count; k++)
+            for (uint i = 0; i < ${chunk}u; i++) t[k][i] = 0.0f;
+% else:
+        floatv t[${chunk}];
+% endif
+% if pair:
+        floatv reference[${chunk}];
+% if frames:
+        for (uint i = 0; i < ${chunk}u; i++) reference[i] = 0.0f;
+        for (uint frame = 0; frame < frame_count; frame++) {
+            const Address at = address(realisation, first_high, frame, seed_low, seed_high);
+% endif
+            for (uint i = 0; i < ${chunk}u; i += 4)
+                draw_four(&at, ${streams["reference_noise"]}u, ${streams["reference_dark"]}u, (start + i) / 4u, pixels + start + i, tables, z + i, d + i);
+            for (uint i = 0; i < ${chunk}u; i++)
+% if frames:
+                reference[i] += digitise(z[i], d[i], pixels[start + i].dark_gain, levels + start + i);
+        }
+        for (uint i = 0; i < ${chunk}u; i++) reference[i] += levels[start + i].offset;
+% else:
+                reference[i] = digitise(z[i], d[i], pixels[start + i].dark_gain, levels + start + i) + levels[start + i].offset;
+% endif
+% endif
+% if frames:
+        for (uint frame = 0; frame < frame_count; frame++) {
+            const Address at = address(realisation, first_high, frame, seed_low, seed_high);
+% endif
+            for (uint i = 0; i < ${chunk}u; i += 4)
+                draw_four(&at, ${streams["noise"]}u, ${streams["dark"]}u, (start + i) / 4u, pixels + start + i, tables, z + i, d + i);
+% if frames:
+            for (uint k = 0; k < scenario_count; k++)
+                for (uint i = 0; i < ${chunk}u; i++)
+                    t[k][i] += digitise(z[i], d[i], pixels[start + i].dark_gain, levels + k * pixel_count + start + i);
+        }
+% endif
+        uint l = 0;
+        for (uint k = 0; k < scenario_count; k++) {
+            __global const Level *level = levels + k * pixel_count + start;
+            __global const Pixel *pixel = pixels + start;
+% if frames:
+            floatv *x = t[k];
+            for (uint i = 0; i < ${chunk}u; i++) x[i] += level[i].offset;
+% else:
+            floatv *x = t;
+            for (uint i = 0; i < ${chunk}u; i++) x[i] = digitise(z[i], d[i], pixel[i].dark_gain, level + i) + level[i].offset;
+% endif
+            floatv sum = chi2[k];
+            for (uint i = 0; i < ${chunk}u; i++)
+                sum = FMA(x[i] * x[i], (floatv)pixel[i].inverse_variance, sum);
+            chi2[k] = sum;
+% if elements:
+            floatv inside = element[k], outside = chi2_element[k];
+            for (uint i = 0; i < ${chunk}u; i++) {
+                inside = FMA(x[i], (floatv)pixel[i].used, inside);
+                if (pixel[i].element_end) {
+                    outside = FMA(inside * inside, (floatv)pixel[i].inverse_element_variance, outside);
+                    inside = 0.0f;
+                }
+            }
+            element[k] = inside;
+            chi2_element[k] = outside;
+% endif
+            for (; l < linear_end[k]; l++) {
+                __global const float *weight = weights + l * pixel_count + start;
+                floatv total = linear[l];
+                for (uint i = 0; i < ${chunk}u; i++) total = FMA(x[i], (floatv)weight[i], total);
+                linear[l] = total;
+            }
+% if pair:
+            floatv both = chi2_pair[k];
+            for (uint i = 0; i < ${chunk}u; i++) {
+                floatv difference = x[i] - reference[i];
+                both = FMA(difference * difference, (floatv)(0.5f * pixel[i].inverse_variance), both);
+            }
+            chi2_pair[k] = both;
+% endif
+        }
+    }
+
+    /* One row per channel: three fixed ones a scenario, then the linear ones. */
+    __global float *out = values + item * ${width}u;
+    for (uint k = 0; k < scenario_count; k++) {
+        STORE(chi2[k], out + (3u * k) * stride);
+        STORE(chi2_element[k], out + (3u * k + 1u) * stride);
+% if pair:
+        STORE(chi2_pair[k], out + (3u * k + 2u) * stride);
+% endif
+    }
+    for (uint l = 0; l < linear_end[scenario_count - 1]; l++)
+        STORE(linear[l], out + (3u * scenario_count + l) * stride);
+}

@@ -1,0 +1,129 @@
+"""Exact integer alias tables for Poisson counts (METHODS section 4)."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.layout import WORD_BITS
+
+#: Largest mean a table is made for; 17 index bits then still leave 15 for acceptance.
+LARGEST_MEAN = 1e8
+
+
+@dataclass(frozen=True)
+class AliasTable:
+    """A Poisson distribution as 2**bits columns of one packed word each.
+
+    Attributes
+    ----------
+    low : int
+        The count that column 0 stands for.
+    bits : int
+        Base-2 logarithm of the number of columns.
+    entries : ndarray of uint32, shape (2**bits,)
+        ``alias << (32 - bits) | threshold``.
+    """
+
+    low: int
+    bits: int
+    entries: NDArray[np.uint32]
+
+    def words_per_column(self) -> NDArray[np.int64]:
+        """How many of the 2**32 words give each column: the realised probabilities, exactly."""
+        shift = WORD_BITS - self.bits
+        threshold = self.entries.astype(np.int64) & ((1 << shift) - 1)
+        alias = self.entries.astype(np.int64) >> shift
+        words = threshold.copy()
+        np.add.at(words, alias, (1 << shift) - threshold)
+        return words
+
+
+def alias_table(mean: float) -> AliasTable:
+    """The alias table of a Poisson distribution; each probability is right to 2**-32.
+
+    Parameters
+    ----------
+    mean : float
+        Expected count, 0 to 1e8.
+
+    Raises
+    ------
+    ValueError
+        For a mean outside that range.
+
+    Notes
+    -----
+    Walker's method (1977, doi 10.1145/355744.355749) on whole numbers of words: the probabilities are first
+    rounded to multiples of 2**-32 that sum to one, so the table then holds them without any error.
+    """
+    from scipy.stats import poisson
+
+    if not 0.0 <= mean <= LARGEST_MEAN:
+        raise ValueError(f"Poisson mean = {mean!r}, expected 0 to {LARGEST_MEAN:g}")
+    # Counts outside have less than half a word each.
+    low, high = (int(poisson.ppf(2.0**-33, mean)), int(poisson.isf(2.0**-33, mean))) if mean > 0 else (0, 0)
+    low = max(low - 1, 0)
+    bits = max(int(high + 1 - low).bit_length(), 1)
+    counts = low + np.arange(1 << bits)
+    words = _whole_words(poisson.pmf(counts, mean))
+    return AliasTable(low, bits, _pack(words, bits))
+
+
+def _whole_words(probability: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Probabilities as whole numbers of words that sum to 2**32, by largest remainder."""
+    exact = probability / probability.sum() * 2.0**WORD_BITS
+    words = np.floor(exact).astype(np.int64)
+    missing = int(2**WORD_BITS - words.sum())
+    largest = np.argsort(words - exact, kind="stable")[:missing]
+    words[largest] += 1
+    return words
+
+
+def _pack(words: NDArray[np.int64], bits: int) -> NDArray[np.uint32]:
+    shift = WORD_BITS - bits
+    share = 1 << shift
+    left: list[int] = words.tolist()
+    # A full column keeps itself: alias = itself, threshold 0.
+    entries = [column << shift for column in range(1 << bits)]
+    small = [c for c, n in enumerate(left) if n < share]
+    large = [c for c, n in enumerate(left) if n > share]
+    while small:
+        poor, rich = small.pop(), large[-1]
+        entries[poor] = rich << shift | left[poor]
+        left[rich] -= share - left[poor]
+        if left[rich] <= share:
+            large.pop()
+            if left[rich] < share:
+                small.append(rich)
+    return np.array(entries, dtype=np.uint32)
+
+
+def table_set(means: Iterable[float]) -> tuple[list[AliasTable], NDArray[np.intp], NDArray[np.uint32]]:
+    """One table per distinct mean, laid end to end.
+
+    Returns
+    -------
+    tables : list of AliasTable
+        For each mean, its table; equal means share one.
+    starts : ndarray of int, shape (n_mean,)
+        Where each mean's table starts.
+    entries : ndarray of uint32
+        All tables, end to end.
+    """
+    distinct: dict[float, tuple[AliasTable, int]] = {}
+    size = 0
+    tables, starts = [], []
+    for mean in means:
+        if mean not in distinct:
+            table = alias_table(mean)
+            distinct[mean] = (table, size)
+            size += table.entries.size
+        table, start = distinct[mean]
+        tables.append(table)
+        starts.append(start)
+    parts = [table.entries for table, _ in distinct.values()]
+    return tables, np.array(starts, dtype=np.intp), np.concatenate(parts)

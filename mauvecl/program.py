@@ -1,0 +1,230 @@
+"""Find a device, render the kernels, build them, keep them in a private cache.
+
+This module and `engine` are the only ones that touch pyopencl.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import shutil
+import tempfile
+from dataclasses import asdict, dataclass
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mauvecl import __version__, layout
+
+if TYPE_CHECKING:
+    import pyopencl
+
+ROOMS = ("portable", "philox", "normal", "poisson", "detector")
+POCL = "Portable Computing Language"
+
+
+class DeviceError(RuntimeError):
+    """The device or its driver cannot do what is asked; the message is one sentence."""
+
+
+class BuildError(DeviceError):
+    """A kernel did not compile; the message holds the numbered source and the device's log."""
+
+
+@dataclass(frozen=True)
+class DeviceRecord:
+    """One OpenCL device, as `mauvecl devices` lists it."""
+
+    platform: str
+    name: str
+    driver: str
+    kind: str
+    compute_units: int
+    global_memory: int
+    default: bool
+
+    @property
+    def label(self) -> str:
+        return f"{self.platform}: {self.name}"
+
+
+@dataclass(frozen=True)
+class Variant:
+    """What the templates are rendered for; no value of a study is among it."""
+
+    width: int
+    vector_forms: bool
+    chunk: int
+    scenarios: int = 16
+    linears: int = 32
+    frames: bool = False
+    clip: bool = False
+    pair: bool = False
+    elements: bool = True
+    bins: int = layout.BINS
+    fine_bits: int = layout.FINE_BITS
+
+
+def load_opencl() -> Any:
+    """Import pyopencl with a cache folder of our own, after checking what would abort the process.
+
+    PoCL ends the whole process when its cache is unusable or the linker it calls is missing, so both
+    are looked at before it is loaded.
+
+    Raises
+    ------
+    DeviceError
+        If the linker ``ld`` is not on the path or pyopencl cannot be loaded.
+    """
+    if shutil.which("ld") is None:
+        raise DeviceError(
+            "no linker `ld` found on PATH, and PoCL needs it to link kernels: install binutils "
+            "(Debian, Ubuntu: `apt-get install binutils`; Fedora: `dnf install binutils`)"
+        )
+    os.environ["POCL_CACHE_DIR"] = str(cache_folder())
+    # pyopencl's own cache would be a second one beside PoCL's.
+    os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
+    try:
+        import pyopencl
+    except ImportError as error:
+        raise DeviceError(f"pyopencl cannot be loaded ({error}): install `pyopencl[pocl]`") from error
+    return pyopencl
+
+
+@cache
+def cache_folder() -> Path:
+    """A writable folder for compiled kernels, private to this version; a temporary one where none can be made."""
+    import platformdirs
+
+    wanted = os.environ.get("MAUVECL_CACHE_DIR") or platformdirs.user_cache_dir("mauvecl")
+    folder = Path(wanted) / f"kernels-{__version__}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.NamedTemporaryFile(dir=folder) as probe:
+            probe.write(b"\0" * 4096)
+            probe.flush()
+    except OSError:
+        return Path(tempfile.mkdtemp(prefix="mauvecl-kernels-"))
+    return folder
+
+
+def _devices() -> list[Any]:
+    cl = load_opencl()
+    try:
+        platforms = cl.get_platforms()
+    except cl.Error:
+        platforms = []
+    found = []
+    for platform in platforms:
+        try:
+            found += platform.get_devices()
+        except cl.Error:
+            continue
+    if not found:
+        raise DeviceError(
+            "no OpenCL device found: install PoCL with `pip install 'pyopencl[pocl]'` or a driver for your device"
+        )
+    # PoCL on the CPU first: it is the default.
+    return sorted(found, key=lambda d: (d.platform.name != POCL, "cpu" not in _kind(d)))
+
+
+def _kind(device: Any) -> str:
+    cl = load_opencl()
+    kinds = {"cpu": cl.device_type.CPU, "gpu": cl.device_type.GPU, "accelerator": cl.device_type.ACCELERATOR}
+    return next((name for name, bit in kinds.items() if device.type & bit), "other")
+
+
+def devices() -> list[DeviceRecord]:
+    """Every OpenCL device here, the default one first.
+
+    Raises
+    ------
+    DeviceError
+        If there is none, or no linker.
+    """
+    return [
+        DeviceRecord(
+            platform=device.platform.name.strip(),
+            name=device.name.strip(),
+            driver=device.driver_version.strip(),
+            kind=_kind(device),
+            compute_units=int(device.max_compute_units),
+            global_memory=int(device.global_mem_size),
+            default=index == 0,
+        )
+        for index, device in enumerate(_devices())
+    ]
+
+
+def choose_device(wanted: str | None) -> tuple[Any, DeviceRecord]:
+    """The pyopencl device whose number, platform or name matches `wanted`; the default one for None.
+
+    Raises
+    ------
+    DeviceError
+        If nothing matches; the message lists the devices present.
+    """
+    handles, records = _devices(), devices()
+    if wanted is None:
+        return handles[0], records[0]
+    for index, record in enumerate(records):
+        if wanted == str(index) or wanted.casefold() in record.label.casefold():
+            return handles[index], record
+    present = "; ".join(f"{index} = {record.label}" for index, record in enumerate(records))
+    raise DeviceError(f"device {wanted!r} is not here, expected one of: {present}")
+
+
+@cache
+def render(rooms: tuple[str, ...], variant: Variant) -> str:
+    """The OpenCL C source of these templates, after the shared ones.
+
+    Parameters
+    ----------
+    rooms : tuple of str
+        Template names without their ending, such as ``("statistics",)``.
+    variant : Variant
+        Widths and switches.
+    """
+    from mako.template import Template
+
+    folder = files("mauvecl.kernels")
+    local = "" if variant.width == 1 else "__attribute__((reqd_work_group_size(1, 1, 1)))"
+    values = asdict(variant) | {
+        "attributes": local,
+        "streams": layout.STREAMS,
+        "polynomials": {k: [f"{c}f" for c in v] for k, v in layout.POLYNOMIALS.items()},
+        "two_ln2": f"{layout.TWO_LN2}f",
+        "limit": layout.STEP_LIMIT,
+        "structs": {name: dtype.names for name, dtype in layout.STRUCTS.items()},
+    }
+    parts = [f"/* mauvecl {__version__} */", layout.c_structs()]
+    for room in (*ROOMS, *rooms):
+        text = folder.joinpath(f"{room}.cl.mako").read_text(encoding="utf-8")
+        parts.append(str(Template(text, strict_undefined=True).render(**values)))
+    return "\n".join(parts)
+
+
+def digest(source: str) -> str:
+    """Short sha256 of a rendered source, as run records carry it."""
+    return hashlib.sha256(source.encode()).hexdigest()[:16]
+
+
+def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
+    """Compile a rendered source with strict arithmetic.
+
+    Raises
+    ------
+    BuildError
+        With the numbered source and the device's log.
+    """
+    cl = load_opencl()
+    device = context.devices[0]
+    options = ["-cl-std=CL1.2"]
+    if device.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT:
+        options.append("-cl-fp32-correctly-rounded-divide-sqrt")
+    try:
+        return cl.Program(context, source).build(options, cache_dir=False)
+    except cl.Error as error:
+        numbered = "\n".join(f"{i:4d}  {line}" for i, line in enumerate(source.splitlines(), 1))
+        raise BuildError(f"a kernel did not compile on {device.name}\n{numbered}\n{error}") from error
