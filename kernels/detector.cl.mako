@@ -1,6 +1,6 @@
 ## One frame, or one stack of frames, of one pixel: METHODS section 2.
 /* Gaussian z and dark count d (relative to the table's centre) of four neighbouring pixels. */
-static inline void draw_four(const Address *at, uint noise_stream, uint dark_stream, uint group,
+INLINE void draw_four(const Address *at, uint noise_stream, uint dark_stream, uint group,
                       __global const Pixel *pixels, __global const uint *tables, floatv *z, floatv *d)
 {
     Words g = words_at(at, noise_stream, group);
@@ -14,7 +14,7 @@ static inline void draw_four(const Address *at, uint noise_stream, uint dark_str
 
 /* The raw count above the level's base, rounded to whole DN and clipped to the ADC's range: exact in
    float, because everything large is in the base. */
-static inline floatv digitise(floatv z, floatv d, const float dark_gain, __global const Level *level)
+INLINE floatv digitise(floatv z, floatv d, const float dark_gain, __global const Level *level)
 {
     floatv dn = nearest(FMA((floatv)level->sd, z, FMA((floatv)dark_gain, d, (floatv)level->fraction)));
 % if clip:

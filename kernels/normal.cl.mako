@@ -9,7 +9,7 @@
 %>\
 /* Two standard normals from two words. The radius comes from (word + 1/2) / 2^32, so that small words
    keep all their digits: |z| reaches 6.76 and no word gives an infinity. */
-static inline void normal_pair(uintv radius_word, uintv angle_word, floatv *z0, floatv *z1)
+INLINE void normal_pair(uintv radius_word, uintv angle_word, floatv *z0, floatv *z1)
 {
     floatv t = TO_FLOAT(radius_word) + 0.5f;
     uintv bits = AS_UINT(t) - (uintv)0x3f3504f3u;                  /* split at sqrt(1/2) */

@@ -7,34 +7,39 @@
 
 typedef struct { uintv a, b, c, d; } Words;
 
-static inline Words philox_rounds(uintv c0, uintv c1, uintv c2, uintv c3, uint k0, uint k1, int first)
+/* Unrolled here, because not every compiler follows a request to. */
+#define PHILOX_ROUND(r) \
+    multiply(PHILOX_M0, c0, &high0, &low0); \
+    multiply(PHILOX_M1, c2, &high1, &low1); \
+    c0 = high1 ^ c1 ^ (uintv)(k0 + r##u * PHILOX_W0); \
+    c1 = low1; \
+    c2 = high0 ^ c3 ^ (uintv)(k1 + r##u * PHILOX_W1); \
+    c3 = low0;
+
+INLINE Words rounds_3_to_9(uintv c0, uintv c1, uintv c2, uintv c3, uint k0, uint k1)
 {
     uintv high0, low0, high1, low1;
-    /* Unrolled by the compiler: the keys are uniform, so they stay scalars. */
-    #pragma unroll
-    for (int r = first; r < 10; r++) {
-        uint key0 = k0 + (uint)r * PHILOX_W0, key1 = k1 + (uint)r * PHILOX_W1;
-        multiply(PHILOX_M0, c0, &high0, &low0);
-        multiply(PHILOX_M1, c2, &high1, &low1);
-        c0 = high1 ^ c1 ^ (uintv)key0;
-        c1 = low1;
-        c2 = high0 ^ c3 ^ (uintv)key1;
-        c3 = low0;
-    }
+% for r in range(3, 10):
+    PHILOX_ROUND(${r})
+% endfor
     Words out = {c0, c1, c2, c3};
     return out;
 }
 
-static inline Words philox(uintv c0, uintv c1, uintv c2, uintv c3, uint k0, uint k1)
+INLINE Words philox(uintv c0, uintv c1, uintv c2, uintv c3, uint k0, uint k1)
 {
-    return philox_rounds(c0, c1, c2, c3, k0, k1, 0);
+    uintv high0, low0, high1, low1;
+% for r in range(3):
+    PHILOX_ROUND(${r})
+% endfor
+    return rounds_3_to_9(c0, c1, c2, c3, k0, k1);
 }
 
 /* Only the last counter word changes from pixel to pixel. What the first three rounds make of the
    others is computed once per realisation and frame: 16 of the 20 products are left in the loop. */
 typedef struct { uintv first, e, f; uint s1, s3; uint k0, k1; } Address;
 
-static inline Address address(uintv realisation, uint realisation_high, uint frame, uint k0, uint k1)
+INLINE Address address(uintv realisation, uint realisation_high, uint frame, uint k0, uint k1)
 {
     Address at;
     uintv high, low, high2, low2;
@@ -54,12 +59,12 @@ static inline Address address(uintv realisation, uint realisation_high, uint fra
     return at;
 }
 
-static inline Words words_at(const Address *at, uint stream, uint group)
+INLINE Words words_at(const Address *at, uint stream, uint group)
 {
     uintv high, low, high0, low0;
     uintv x2 = at->first ^ (uintv)(stream << 24 | group);
     multiply(PHILOX_M1, x2, &high, &low);
     uintv y0 = high ^ (uintv)at->s1;
     multiply(PHILOX_M0, y0, &high0, &low0);
-    return philox_rounds(at->e ^ low, at->f, high0 ^ (uintv)at->s3, low0, at->k0, at->k1, 3);
+    return rounds_3_to_9(at->e ^ low, at->f, high0 ^ (uintv)at->s3, low0, at->k0, at->k1);
 }

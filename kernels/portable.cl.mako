@@ -10,6 +10,8 @@
 %>\
 #pragma OPENCL FP_CONTRACT OFF
 
+#define INLINE static inline __attribute__((always_inline))
+
 typedef uint${w} uintv;
 typedef int${w} intv;
 typedef float${w} floatv;
@@ -26,13 +28,13 @@ typedef float${w} floatv;
 /* A built-in on a 16-vector is a function call that spills every register here; a loop over lanes is
    fused into one instruction, and operators never call. */
 #define FMA(a, b, c) fused((a), (b), (c))
-static inline floatv fused(floatv a, floatv b, floatv c) { return ${per_lane("__builtin_fmaf(a@, b@, c@)")}; }
-static inline floatv root(floatv a) { return ${per_lane("__builtin_sqrtf(a@)")}; }
+INLINE floatv fused(floatv a, floatv b, floatv c) { return ${per_lane("__builtin_fmaf(a@, b@, c@)")}; }
+INLINE floatv root(floatv a) { return ${per_lane("__builtin_sqrtf(a@)")}; }
 #define TO_FLOAT(x) __builtin_convertvector((x), floatv)
 #define TO_INT(x) __builtin_convertvector((x), intv)
 
 /* 32 x 32 -> 64 bit products of the even and the odd lanes, put back together with a shuffle. */
-static inline void multiply(uint factor, uintv x, uintv *high, uintv *low)
+INLINE void multiply(uint factor, uintv x, uintv *high, uintv *low)
 {
     ulong${half} even = (as_ulong${half}(x) & (ulong${half})0xffffffffUL) * (ulong${half})factor;
     ulong${half} odd = (as_ulong${half}(x) >> (ulong${half})32UL) * (ulong${half})factor;
@@ -41,10 +43,10 @@ static inline void multiply(uint factor, uintv x, uintv *high, uintv *low)
 }
 % else:
 #define FMA(a, b, c) fma((a), (b), (c))
-static inline floatv root(floatv a) { return sqrt(a); }
+INLINE floatv root(floatv a) { return sqrt(a); }
 #define TO_FLOAT(x) convert_float${w}(x)
 #define TO_INT(x) convert_int${w}_rtz(x)
-static inline void multiply(uint factor, uintv x, uintv *high, uintv *low)
+INLINE void multiply(uint factor, uintv x, uintv *high, uintv *low)
 {
     *high = mul_hi((uintv)factor, x);
     *low = (uintv)factor * x;
@@ -55,17 +57,24 @@ static inline void multiply(uint factor, uintv x, uintv *high, uintv *low)
 #define least(a, b) ((a) < (b) ? (a) : (b))
 #define most(a, b) ((a) > (b) ? (a) : (b))
 
-static inline uintv look_up(__global const uint *table, uintv index)
+INLINE uintv look_up(__global const uint *table, uintv index)
 {
 % if width == 1:
     return table[index];
+% elif vector_forms and width == 16:
+#ifdef __AVX512F__
+    typedef int word16 __attribute__((ext_vector_type(16)));
+    return AS_UINT(__builtin_ia32_gathersiv16si((intv)0, (const void *)(size_t)table, AS_INT(index), (unsigned short)0xffff, 4));
+#else
+    return (uintv)(${", ".join(f"table[index{lane}]" for lane in lanes)});
+#endif
 % else:
     return (uintv)(${", ".join(f"table[index{lane}]" for lane in lanes)});
 % endif
 }
 
 /* Nearest integer, ties to even, for |x| < 2^22: no call, and the same bits as rint(). */
-static inline floatv nearest(floatv x) { return (x + 12582912.0f) - 12582912.0f; }
+INLINE floatv nearest(floatv x) { return (x + 12582912.0f) - 12582912.0f; }
 % if width == 1:
 #define LOAD(pointer) (*(pointer))
 #define STORE(value, pointer) (*(pointer) = (value))

@@ -1,0 +1,13 @@
+"""The probe kernels in every form that a device may be given."""
+
+from __future__ import annotations
+
+import pytest
+from probes import Probes
+
+
+@pytest.fixture(scope="session", params=["vector forms", "vectors of built-ins", "scalar"])
+def probes(request: pytest.FixtureRequest) -> Probes:
+    """PoCL's fast forms, the plain OpenCL vectors that other compilers get, and what a GPU runs."""
+    width = 1 if request.param == "scalar" else 16
+    return Probes(width=width, vector_forms=request.param == "vector forms")

@@ -1,0 +1,54 @@
+"""Push chosen words through the production code on the device."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl import program
+from mauvecl.program import Variant
+
+
+class Probes:
+    """The probe kernels of one device, at one vector width."""
+
+    def __init__(self, device: str | None = None, width: int = 16, *, vector_forms: bool = True) -> None:
+        self.cl = program.load_opencl()
+        handle, _ = program.choose_device(device)
+        self.context = self.cl.Context([handle])
+        self.queue = self.cl.CommandQueue(self.context)
+        self.width = width
+        variant = Variant(width=width, vector_forms=vector_forms and width > 1, chunk=32)
+        self.program = program.build(self.context, program.render(("probes",), variant))
+
+    def run(self, name: str, items: int, out: NDArray[Any], *inputs: Any) -> NDArray[Any]:
+        """Launch a probe; arrays are uploaded, the last argument of the kernel is `out`."""
+        flags = self.cl.mem_flags
+        arguments = [
+            self.cl.Buffer(self.context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=np.ascontiguousarray(x))
+            if isinstance(x, np.ndarray)
+            else x
+            for x in inputs
+        ]
+        buffer = self.cl.Buffer(self.context, flags.READ_WRITE, out.nbytes)
+        local = (1,) if self.width > 1 and name != "probe_layout" else None
+        self.cl.Kernel(self.program, name)(self.queue, (items,), local, *arguments, buffer)
+        self.cl.enqueue_copy(self.queue, out, buffer)
+        return out
+
+    def philox(self, counters: NDArray[np.uint32], keys: NDArray[np.uint32]) -> NDArray[np.uint32]:
+        """Eight words per counter: the plain generator's four, then those of the loop-invariant form."""
+        out = np.empty((len(counters), 8), np.uint32)
+        return self.run("probe_philox", len(counters), out, np.uint32(len(counters)), counters, keys)
+
+    def normal(self, radius: NDArray[np.uint32], angle: NDArray[np.uint32]) -> NDArray[np.float32]:
+        """Two rows of normals from two words each; sizes are multiples of the width."""
+        words = np.stack([radius, angle])
+        return self.run("probe_normal", radius.size // self.width, np.empty(words.shape, np.float32), words)
+
+    def alias(self, words: NDArray[np.uint32], table: NDArray[np.uint32], bits: int) -> NDArray[np.uint32]:
+        """The column each word chooses."""
+        items = words.size // self.width
+        return self.run("probe_alias", items, np.empty(words.size, np.uint32), words, table, np.uint32(bits))

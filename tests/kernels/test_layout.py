@@ -1,0 +1,21 @@
+"""What Python lays out is what the device reads."""
+
+from __future__ import annotations
+
+import numpy as np
+from probes import Probes
+
+from mauvecl import layout
+
+
+def test_every_offset_on_the_device(probes: Probes) -> None:
+    expected = []
+    for dtype in layout.STRUCTS.values():
+        expected += [offset for _, offset in dtype.fields.values()] + [dtype.itemsize]
+    out = probes.run("probe_layout", 1, np.zeros(len(expected), np.uint32))
+    np.testing.assert_array_equal(out, expected)
+
+
+def test_streams_are_distinct_bytes() -> None:
+    assert len(set(layout.STREAMS.values())) == len(layout.STREAMS)
+    assert all(0 <= stream < 256 for stream in layout.STREAMS.values())

@@ -1,0 +1,98 @@
+"""Poisson draws by alias table: exact probabilities, Pearson tests, extreme words."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from probes import Probes
+from scipy import stats
+
+from mauvecl import reference
+from mauvecl.poisson import alias_table, table_set
+
+MEANS = [0.0, 0.5, 5.0, 64.0, 2225.0, 22250.0, 222500.0]
+
+
+@pytest.mark.parametrize("mean", [*MEANS, 1e-9, 0.01, 1.0, 999.5, 1e6, 1e7])
+def test_realised_probabilities(mean: float) -> None:
+    """The words of each outcome, counted exactly, are scipy's probabilities to one word in 2**32."""
+    table = alias_table(mean)
+    words = table.words_per_column()
+    assert words.sum() == 2**32
+    counts = table.low + np.arange(words.size)
+    np.testing.assert_allclose(words / 2**32, stats.poisson.pmf(counts, mean), rtol=0, atol=2.0**-32 * 1.01)
+    # Nothing that matters lies outside the table.
+    outside = stats.poisson.cdf(table.low - 1, mean) + stats.poisson.sf(counts[-1], mean)
+    assert outside < 2.0**-31
+
+
+@pytest.mark.parametrize("mean", MEANS)
+def test_extreme_words_and_column_edges(probes: Probes, mean: float) -> None:
+    table = alias_table(mean)
+    share = 2 ** (32 - table.bits)
+    starts = np.arange(2**table.bits, dtype=np.int64) * share
+    threshold = table.entries.astype(np.int64) & (share - 1)
+    words = np.concatenate([starts, starts + share - 1, starts + threshold, starts + np.maximum(threshold - 1, 0)])
+    words = np.append(words, np.zeros(-words.size % 16, np.int64)).astype(np.uint32)
+    ours = probes.alias(words, table.entries, table.bits)
+    np.testing.assert_array_equal(ours, reference.alias_draw(words, table.entries, table.bits))
+    # Both sides of every threshold: the column below it, its alias from there on.
+    column, alias = words >> np.uint32(32 - table.bits), table.entries >> np.uint32(32 - table.bits)
+    below = (words & np.uint32(share - 1)) < threshold[column]
+    np.testing.assert_array_equal(ours, np.where(below, column, alias[column]))
+
+
+@pytest.mark.parametrize("mean", MEANS)
+def test_pearson(probes_fast: Probes, mean: float) -> None:
+    """Pearson's test at 1e8 draws; fails by chance once in 1e6 runs of a new seed."""
+    table = alias_table(mean)
+    n, block = 100_000_000, 2_500_000
+    counts = np.zeros(2**table.bits, np.int64)
+    for i in range(n // (4 * block)):
+        words = np.concatenate(reference.words_at(np.arange(i * block, (i + 1) * block), 3, "dark", 7, 99))
+        counts += np.bincount(probes_fast.alias(words, table.entries, table.bits), minlength=counts.size)
+    assert counts.sum() == n
+    expected = n * stats.poisson.pmf(table.low + np.arange(counts.size), mean)
+    common = expected > 20
+    observed = np.append(counts[common], counts[~common].sum())
+    wanted = np.append(expected[common], n - expected[common].sum())
+    if mean == 0.0:
+        assert observed[0] == n
+        return
+    if wanted[-1] < 20:
+        observed, wanted = observed[:-1], wanted[:-1]
+    statistic = float(np.sum((observed - wanted) ** 2 / wanted))
+    assert stats.chi2.sf(statistic, observed.size - 1) > 1e-6
+    assert stats.chi2.cdf(statistic, observed.size - 1) > 1e-6
+
+
+@pytest.fixture(scope="session")
+def probes_fast() -> Probes:
+    return Probes()
+
+
+def test_moments_of_the_table() -> None:
+    """Mean, variance, skewness and kurtosis, from the exact word counts."""
+    for mean in (5.0, 2225.0, 22250.0):
+        table = alias_table(mean)
+        p = table.words_per_column() / 2**32
+        x = table.low + np.arange(p.size) - mean
+        moments = [np.sum(p * x**k) for k in (1, 2, 3, 4)]
+        # 2**-32 a column over some ten standard deviations.
+        sigma = np.sqrt(mean)
+        assert abs(moments[0]) < 1e-7 * sigma
+        np.testing.assert_allclose(moments[1:], [mean, mean, mean + 3 * mean**2], rtol=0, atol=1e-5 * sigma**4)
+        np.testing.assert_allclose(moments[1], mean, rtol=1e-6)
+
+
+def test_equal_means_share_a_table() -> None:
+    tables, starts, entries = table_set([5.0, 64.0, 5.0])
+    assert tables[0] is tables[2]
+    assert starts[0] == starts[2] != starts[1]
+    assert entries.size == tables[0].entries.size + tables[1].entries.size
+
+
+@pytest.mark.parametrize("mean", [-1.0, np.nan, np.inf, 1e9])
+def test_impossible_means_are_refused(mean: float) -> None:
+    with pytest.raises(ValueError, match="Poisson mean"):
+        alias_table(mean)
