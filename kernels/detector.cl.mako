@@ -1,15 +1,26 @@
 ## One frame, or one stack of frames, of one pixel: METHODS section 2.
-/* Gaussian z and dark count d (relative to the table's centre) of four neighbouring pixels. */
-INLINE void draw_four(const Address *at, uint noise_stream, uint dark_stream, uint group,
-                      __global const Pixel *pixels, __global const uint *tables, floatv *z, floatv *d)
+/* Gaussian z of `count` neighbouring pixels from `start` on, both multiples of four. */
+INLINE void draw_noise(const Address *at, uint stream, uint start, uint count, floatv *z)
 {
-    Words g = words_at(at, noise_stream, group);
-    normal_pair(g.a, g.b, z, z + 1);
-    normal_pair(g.c, g.d, z + 2, z + 3);
-    Words w = words_at(at, dark_stream, group);
+    for (uint i = 0; i < count; i += 4) {
+        Words w = words_at(at, stream, (start + i) / 4u);
+        normal_pair(w.a, w.b, z + i, z + i + 1);
+        normal_pair(w.c, w.d, z + i + 2, z + i + 3);
+    }
+}
+
+/* Dark counts of the same pixels, relative to their tables' centres. Two loops, because one would need
+   more registers than there are. */
+INLINE void draw_dark(const Address *at, uint stream, uint start, uint count,
+                      __global const Pixel *pixels, __global const uint *tables, floatv *d)
+{
+    for (uint i = 0; i < count; i += 4) {
+        Words w = words_at(at, stream, (start + i) / 4u);
+        __global const Pixel *pixel = pixels + start + i;
 % for i, word in enumerate("abcd"):
-    d[${i}] = TO_FLOAT(AS_INT(alias_draw(w.${word}, tables + pixels[${i}].table_start, pixels[${i}].table_bits)) + (intv)pixels[${i}].dark_low);
+        d[i + ${i}] = TO_FLOAT(AS_INT(alias_draw(w.${word}, tables + pixel[${i}].table_start, pixel[${i}].table_bits)) + (intv)pixel[${i}].dark_low);
 % endfor
+    }
 }
 
 /* The raw count above the level's base, rounded to whole DN and clipped to the ADC's range: exact in

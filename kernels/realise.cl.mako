@@ -17,14 +17,16 @@ void realise(const uint seed_low, const uint seed_high, const uint first_low, co
         floatv sum[4] = {0.0f, 0.0f, 0.0f, 0.0f};
         for (uint frame = 0; frame < frame_count; frame++) {
             const Address at = address(realisation, first_high, frame, seed_low, seed_high);
-            draw_four(&at, ${streams["noise"]}u, ${streams["dark"]}u, start / 4u, pixels + start, tables, z, d);
+            draw_noise(&at, ${streams["noise"]}u, start, 4u, z);
+            draw_dark(&at, ${streams["dark"]}u, start, 4u, pixels, tables, d);
             for (uint i = 0; i < 4u; i++)
                 sum[i] += digitise(z[i], d[i], pixels[start + i].dark_gain, levels + start + i);
         }
         for (uint i = 0; i < 4u; i++)
             STORE(sum[i], values + (size_t)(start + i) * stride + item * ${width}u);
 % else:
-        draw_four(&at, ${streams["noise"]}u, ${streams["dark"]}u, start / 4u, pixels + start, tables, z, d);
+        draw_noise(&at, ${streams["noise"]}u, start, 4u, z);
+        draw_dark(&at, ${streams["dark"]}u, start, 4u, pixels, tables, d);
         for (uint i = 0; i < 4u; i++)
             STORE(digitise(z[i], d[i], pixels[start + i].dark_gain, levels + start + i),
                   values + (size_t)(start + i) * stride + item * ${width}u);

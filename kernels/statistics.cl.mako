@@ -40,8 +40,8 @@ void statistics(const uint seed_low, const uint seed_high, const uint first_low,
         for (uint frame = 0; frame < frame_count; frame++) {
             const Address at = address(realisation, first_high, frame, seed_low, seed_high);
 % endif
-            for (uint i = 0; i < ${chunk}u; i += 4)
-                draw_four(&at, ${streams["reference_noise"]}u, ${streams["reference_dark"]}u, (start + i) / 4u, pixels + start + i, tables, z + i, d + i);
+            draw_noise(&at, ${streams["reference_noise"]}u, start, ${chunk}u, z);
+            draw_dark(&at, ${streams["reference_dark"]}u, start, ${chunk}u, pixels, tables, d);
             for (uint i = 0; i < ${chunk}u; i++)
 % if frames:
                 reference[i] += digitise(z[i], d[i], pixels[start + i].dark_gain, levels + start + i);
@@ -55,8 +55,8 @@ void statistics(const uint seed_low, const uint seed_high, const uint first_low,
         for (uint frame = 0; frame < frame_count; frame++) {
             const Address at = address(realisation, first_high, frame, seed_low, seed_high);
 % endif
-            for (uint i = 0; i < ${chunk}u; i += 4)
-                draw_four(&at, ${streams["noise"]}u, ${streams["dark"]}u, (start + i) / 4u, pixels + start + i, tables, z + i, d + i);
+            draw_noise(&at, ${streams["noise"]}u, start, ${chunk}u, z);
+            draw_dark(&at, ${streams["dark"]}u, start, ${chunk}u, pixels, tables, d);
 % if frames:
             for (uint k = 0; k < scenario_count; k++)
                 for (uint i = 0; i < ${chunk}u; i++)

@@ -77,8 +77,7 @@ class QuadraticForm:
         -----
         Davies's inversion of the characteristic function (1973, doi 10.1093/biomet/60.2.415): a trapezoidal sum whose
         aliasing error is the probability of lying more than 2 pi / spacing away. The spacing puts that 40 standard
-        deviations out, below 1e-15 with the heaviest chi-squared tail in use; the sum stops where the
-        characteristic function has fallen below 1e-17.
+        deviations out, below 1e-15 for ten terms or more; the sum stops where its terms have fallen below 1e-15.
         """
         if self._is_chi_squared():
             return (
@@ -102,7 +101,7 @@ class QuadraticForm:
             )
             total += float(np.sum(np.exp(log_size) * np.sin(phase) / (k + np.arange(256))))
             k += 256
-            if log_size[-1] < np.log(1e-17):
+            if log_size[-1] < np.log(1e-15 * k):
                 return float(np.clip(0.5 + total / np.pi, 0.0, 1.0))
 
     def isf(self, probability: float) -> float:

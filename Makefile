@@ -1,0 +1,32 @@
+# Two commands set up everything: `make demo` and `make test`. Both use a private .venv.
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: demo test lint docs bench clean
+
+.venv/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "mauvecl needs Python 3.11 or newer, found " + sys.version.split()[0])'
+	@command -v ld >/dev/null || { echo "mauvecl needs the linker ld: install binutils (Debian, Ubuntu: apt-get install binutils)"; exit 1; }
+	$(PYTHON) -m venv .venv
+
+# One stamp per extra: installed again only when pyproject.toml changes.
+.venv/%.stamp: pyproject.toml | .venv/bin/python
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check --editable '.[$*]'
+	@touch $@
+
+demo: .venv/plot.stamp
+	$(BIN)/mauvecl detect --output demo
+
+test: .venv/test.stamp
+	$(BIN)/python -m pytest -n 2
+
+lint: .venv/test.stamp .venv/lint.stamp
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+docs: .venv/docs.stamp
+	$(BIN)/sphinx-build -W -q -b html docs docs/_build
+
+clean:
+	rm -rf .venv demo build docs/_build *.egg-info

@@ -1,0 +1,147 @@
+"""Photometric bands and synthetic photometry, by synphot with embedded bands and Vega."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .catalogue import band_table, find, spectrum_table
+from .errors import InputError
+
+#: Band names and what else they answer to.
+ALIASES = {
+    "V": ("Johnson V", "V"),
+    "Kepler": ("Kp", "Kepler Kp"),
+    "TESS": ("T",),
+    "Gaia G": ("G", "Gaia DR2 G"),
+    "GALEX NUV": ("NUV",),
+}
+#: A spectrum must cover this share of a band's throughput.
+COVERAGE = 0.99
+
+
+@dataclass(frozen=True, eq=False)
+class Band:
+    """A photometric band.
+
+    Attributes
+    ----------
+    name : str
+    system : {"Vega", "AB"}
+        What magnitudes in it mean.
+    origin : str
+    wavelength_nm, throughput : ndarray, shape (n,)
+        Response per photon, relative.
+    """
+
+    name: str
+    system: Literal["Vega", "AB"]
+    origin: str
+    wavelength_nm: NDArray[np.float64]
+    throughput: NDArray[np.float64]
+
+    def element(self) -> Any:
+        """The band as a synphot SpectralElement."""
+        import astropy.units as u
+        from synphot import Empirical1D, SpectralElement
+
+        return SpectralElement(Empirical1D, points=self.wavelength_nm * u.nm, lookup_table=self.throughput)
+
+
+def band(name: str) -> Band:
+    """A band by name or alias, in any case.
+
+    Raises
+    ------
+    InputError
+        If there is none of that name.
+    """
+    wanted = name.strip().casefold()
+    for known, others in ALIASES.items():
+        if wanted in (known.casefold(), *(other.casefold() for other in others)):
+            return _load(known)
+    raise InputError(f"band {name!r} is unknown, expected one of {', '.join(ALIASES)}")
+
+
+@cache
+def _load(name: str) -> Band:
+    table = band_table(f"{name.lower().replace(' ', '_')}.ecsv")
+    return Band(
+        name=name,
+        system=table.meta["system"],
+        origin=table.meta["origin"],
+        wavelength_nm=np.asarray(table["wavelength"], float),
+        throughput=np.asarray(table["throughput"], float),
+    )
+
+
+def synphot_spectrum(wavelength_nm: NDArray[np.float64], flux_flam: NDArray[np.float64]) -> Any:
+    """Arrays as a synphot SourceSpectrum, piecewise linear in F_lambda."""
+    import astropy.units as u
+    from synphot import Empirical1D, SourceSpectrum
+    from synphot.units import FLAM, PHOTLAM, convert_flux
+
+    # synphot interpolates in photons; the difference is far below a spectrum's own sampling.
+    photons = convert_flux(wavelength_nm * u.nm, flux_flam * FLAM, PHOTLAM)
+    return SourceSpectrum(Empirical1D, points=wavelength_nm * u.nm, lookup_table=photons)
+
+
+@cache
+def _vega() -> Any:
+    table = spectrum_table(find("Vega")["file"])
+    return synphot_spectrum(np.asarray(table["wavelength"], float), np.asarray(table["flux"], float))
+
+
+def _observation(wavelength_nm: NDArray[np.float64], flux_flam: NDArray[np.float64], name: str) -> tuple[Band, Any]:
+    from synphot import Observation
+
+    chosen = band(name)
+    inside = (chosen.wavelength_nm >= wavelength_nm[0]) & (chosen.wavelength_nm <= wavelength_nm[-1])
+    share = np.trapezoid(chosen.throughput * inside, chosen.wavelength_nm) / np.trapezoid(
+        chosen.throughput, chosen.wavelength_nm
+    )
+    if share < COVERAGE:
+        raise InputError(
+            f"the spectrum covers {wavelength_nm[0]:.0f}-{wavelength_nm[-1]:.0f} nm, expected {COVERAGE:.0%} of "
+            f"the band {chosen.name} ({chosen.wavelength_nm[0]:.0f}-{chosen.wavelength_nm[-1]:.0f} nm): it has {share:.0%}"
+        )
+    # Both samplings enter the integral: a narrow band on a coarse spectrum, and the other way round.
+    grid = np.union1d(wavelength_nm, chosen.wavelength_nm)
+    spectrum, element = synphot_spectrum(wavelength_nm, flux_flam), chosen.element()
+    return chosen, Observation(spectrum, element, binset=grid * 10.0, force="taper")
+
+
+def magnitude(wavelength_nm: NDArray[np.float64], flux_flam: NDArray[np.float64], name: str = "V") -> float:
+    """Synthetic magnitude in a band.
+
+    Parameters
+    ----------
+    wavelength_nm : ndarray, shape (n,)
+    flux_flam : ndarray, shape (n,)
+        erg s-1 cm-2 A-1.
+    name : str
+        Band; its record says whether the zero point is Vega's or AB.
+
+    Raises
+    ------
+    InputError
+        For an unknown band, one that the spectrum does not cover, or no light in it.
+    """
+    import astropy.units as u
+    from synphot.units import VEGAMAG
+
+    chosen, observation = _observation(wavelength_nm, flux_flam, name)
+    if not float(observation.integrate().value) > 0.0:
+        raise InputError(f"the spectrum has no light in the band {chosen.name}, expected a positive flux")
+    unit = VEGAMAG if chosen.system == "Vega" else u.ABmag
+    value = observation.effstim(unit, vegaspec=_vega(), wavelengths=observation.binset)
+    return float(value.value)
+
+
+def photons(wavelength_nm: NDArray[np.float64], flux_flam: NDArray[np.float64], name: str) -> float:
+    """Photons s-1 cm-2 in a band, weighted with its throughput; errors as `magnitude`."""
+    return float(_observation(wavelength_nm, flux_flam, name)[1].integrate().value)

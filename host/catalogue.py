@@ -1,0 +1,88 @@
+"""The embedded library: which spectra there are, and their tables."""
+
+from __future__ import annotations
+
+import difflib
+from functools import cache
+from importlib.resources import files
+from typing import TYPE_CHECKING
+
+from .errors import InputError
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+_LIBRARY = files("mauvecl.host") / "library"
+
+
+def _read(*path: str) -> Table:
+    from astropy.table import Table
+
+    return Table.read(_LIBRARY.joinpath(*path).read_text(encoding="utf-8"), format="ascii.ecsv")
+
+
+@cache
+def _index() -> dict[str, dict[str, str]]:
+    rows: dict[str, dict[str, str]] = {}
+    for row in _read("index.ecsv"):
+        entry = {name: str(row[name]) for name in row.colnames}
+        rows[entry["name"].casefold()] = entry
+    return rows
+
+
+@cache
+def _names() -> dict[str, str]:
+    """Every name and alias, in lower case, to its entry's name."""
+    names = {}
+    for key, entry in _index().items():
+        names[key] = key
+        for other in (entry["alias"], entry["star"]):
+            names.setdefault(other.casefold(), key)
+    names.pop("", None)
+    return names
+
+
+def library_table() -> Table:
+    """The embedded spectra.
+
+    Returns
+    -------
+    astropy.table.Table
+        Columns name, alias, spectral_type, star, origin, citation, licence, treatment, uv_quality (all text).
+    """
+    table = _read("index.ecsv")
+    table.remove_columns(["file", "source_file"])
+    return table
+
+
+def find(name: str) -> dict[str, str]:
+    """The index entry of a library spectrum.
+
+    Parameters
+    ----------
+    name : str
+        Name, alias or star, in any case.
+
+    Raises
+    ------
+    InputError
+        If there is none; the message holds the nearest names.
+    """
+    key = _names().get(name.strip().casefold())
+    if key is None:
+        near = difflib.get_close_matches(name.strip().casefold(), _names(), n=4, cutoff=0.3)
+        known = [_index()[_names()[n]]["name"] for n in near] or [entry["name"] for entry in _index().values()]
+        raise InputError(
+            f"library spectrum {name!r} is unknown, expected a name such as {', '.join(dict.fromkeys(known))}"
+        )
+    return _index()[key]
+
+
+def spectrum_table(file: str) -> Table:
+    """A library spectrum: columns wavelength (nm) and flux (erg s-1 cm-2 A-1)."""
+    return _read("spectra", file)
+
+
+def band_table(file: str) -> Table:
+    """A photometric band: columns wavelength (nm) and throughput (per photon)."""
+    return _read("bands", file)

