@@ -17,9 +17,17 @@ INLINE void draw_dark(const Address *at, uint stream, uint start, uint count,
     for (uint i = 0; i < count; i += 4) {
         Words w = words_at(at, stream, (start + i) / 4u);
         __global const Pixel *pixel = pixels + start + i;
+% if expansion:
+        floatv g[4];
+        normal_pair(w.a, w.b, g, g + 1);
+        normal_pair(w.c, w.d, g + 2, g + 3);
+        for (uint j = 0; j < 4u; j++)
+            d[i + j] = expansion_draw(g[j], pixel[j].dark_offset, pixel[j].dark_slope, pixel[j].dark_cubic);
+% else:
 % for i, word in enumerate("abcd"):
         d[i + ${i}] = TO_FLOAT(AS_INT(alias_draw(w.${word}, tables + pixel[${i}].table_start, pixel[${i}].table_bits)) + (intv)pixel[${i}].dark_low);
 % endfor
+% endif
     }
 }
 

@@ -1,5 +1,5 @@
-## Poisson counts by an exact integer alias table: one word, one look-up, no rejection.
-/* Entry = alias << (32 - bits) | threshold. The word's top bits choose the column, the rest accept it
+## Poisson counts, relative to a whole number near their mean: never a rounded normal (METHODS section 4).
+/* By an exact integer alias table: one word, one look-up, no rejection. Entry = alias << (32 - bits) | threshold. The word's top bits choose the column, the rest accept it
    or take its alias. The outcome is a column number; the caller adds the table's lowest count. */
 INLINE uintv alias_draw(uintv word, __global const uint *table, uint bits)
 {
@@ -8,4 +8,13 @@ INLINE uintv alias_draw(uintv word, __global const uint *table, uint bits)
     uintv entry = look_up(table, column);
     uintv mask = (uintv)((1u << shift) - 1u);
     return (word & mask) < (entry & mask) ? column : entry >> (uintv)shift;
+}
+
+/* By the inverse's expansion in the mean (Cornish & Fisher), for means of a thousand and more, where no number
+   of draws that anyone makes can tell it from the exact distribution:
+   n = nearest(mean + sqrt(mean) z + (z^2 - 1) / 6 - z (z^2 + 2) / (72 sqrt(mean))). */
+INLINE floatv expansion_draw(floatv z, float offset, float slope, float cubic)
+{
+    floatv curve = FMA(z, (floatv)cubic, (floatv)0.16666667f);
+    return nearest(FMA(z, FMA(z, curve, (floatv)slope), (floatv)offset));
 }

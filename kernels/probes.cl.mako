@@ -33,6 +33,18 @@ void probe_alias(__global const uint *restrict words, __global const uint *restr
     STORE(alias_draw(LOAD(words + item * ${width}u), table, bits), out + item * ${width}u);
 }
 
+__kernel ${attributes}
+void probe_expansion(__global const uint *restrict words, const float offset, const float slope, const float cubic,
+                     __global float *restrict out)
+{
+    /* words[2][n] -> counts[2][n], n = WIDTH x global size */
+    const uint item = get_global_id(0), n = get_global_size(0) * ${width}u;
+    floatv z0, z1;
+    normal_pair(LOAD(words + item * ${width}u), LOAD(words + n + item * ${width}u), &z0, &z1);
+    STORE(expansion_draw(z0, offset, slope, cubic), out + item * ${width}u);
+    STORE(expansion_draw(z1, offset, slope, cubic), out + n + item * ${width}u);
+}
+
 __kernel void probe_layout(__global uint *restrict out)
 {
     uint i = 0;

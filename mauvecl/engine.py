@@ -279,6 +279,7 @@ class Engine:
             clip=scene.clip,
             pair=pair,
             elements=elements,
+            expansion=scene.expansion,
             bins=bins,
             fine_bits=fine_bits,
         )

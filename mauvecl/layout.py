@@ -13,12 +13,16 @@ WORD_BITS = 32
 #: one moves no other. Two streams of Gaussian noise and dark serve the observed exposure, two its reference.
 STREAMS = {"noise": 0, "dark": 1, "reference_noise": 2, "reference_dark": 3}
 
-#: What all scenarios share in one pixel. Poisson counts come out as column + dark_low, relative to the table's centre.
+#: What all scenarios share in one pixel. Poisson counts come out relative to a
+#: whole number near the mean: as column + dark_low of an alias table, or from the expansion's coefficients.
 PIXEL = np.dtype(
     [
         ("table_start", "u4"),
         ("table_bits", "u4"),
         ("dark_low", "i4"),
+        ("dark_offset", "f4"),
+        ("dark_slope", "f4"),
+        ("dark_cubic", "f4"),
         ("dark_gain", "f4"),
         ("used", "f4"),
         ("inverse_variance", "f4"),

@@ -1,4 +1,4 @@
-"""Exact integer alias tables for Poisson counts (METHODS section 4)."""
+"""Poisson counts: exact integer alias tables, and from which mean on an expansion is as good."""
 
 from __future__ import annotations
 
@@ -12,6 +12,10 @@ from mauvecl.layout import WORD_BITS
 
 #: Largest mean a table is made for; 17 index bits then still leave 15 for acceptance.
 LARGEST_MEAN = 1e8
+
+#: From this mean on counts come from the inverse's expansion (kernels/poisson.cl.mako): its distribution differs from
+#: the exact one by less than 1e13 draws would show.
+SMALLEST_EXPANDED = 1000.0
 
 
 @dataclass(frozen=True)

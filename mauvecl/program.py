@@ -62,6 +62,7 @@ class Variant:
     clip: bool = False
     pair: bool = False
     elements: bool = True
+    expansion: bool = False
     bins: int = layout.BINS
     fine_bits: int = layout.FINE_BITS
 

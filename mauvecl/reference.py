@@ -115,6 +115,12 @@ def alias_draw(word: NDArray[np.uint32], table: NDArray[np.uint32], bits: int) -
     return np.where((word & mask) < (entry & mask), column, entry >> shift)
 
 
+def expansion_draw(z: Floats, offset: np.float32, slope: np.float32, cubic: np.float32) -> Floats:
+    """Poisson counts of a large mean, relative to the whole number nearest to it."""
+    curve = fma(z, cubic, np.float32(0.16666667))
+    return nearest(fma(z, fma(z, curve, slope), offset))
+
+
 def nearest(x: Floats) -> Floats:
     """Nearest whole number, ties to even, for values below 2**22."""
     return (x + _NEAREST) - _NEAREST
@@ -128,9 +134,13 @@ def draws(
     g = words_at(realisation, frame, f"{prefix}noise", group, seed)
     w = words_at(realisation, frame, f"{prefix}dark", group, seed)
     z = [*normal_pair(g[0], g[1]), *normal_pair(g[2], g[3])]
+    four = scene.pixels[4 * group : 4 * group + 4]
+    if scene.expansion:
+        g = [*normal_pair(w[0], w[1]), *normal_pair(w[2], w[3])]
+        coefficients = zip(four["dark_offset"], four["dark_slope"], four["dark_cubic"], strict=True)
+        return z, [expansion_draw(g[i], *c) for i, c in enumerate(coefficients)]
     d = []
-    for i in range(4):
-        pixel = scene.pixels[4 * group + i]
+    for i, pixel in enumerate(four):
         table = scene.tables[int(pixel["table_start"]) :]
         column = alias_draw(w[i], table, int(pixel["table_bits"]))
         d.append((column.astype(np.int32) + pixel["dark_low"]).astype(np.float32))

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mauvecl import layout
 from mauvecl.host.errors import InputError
-from mauvecl.poisson import table_set
+from mauvecl.poisson import SMALLEST_EXPANDED, table_set
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -36,6 +36,8 @@ class Scene:
         Frames of the exposure.
     frames : bool
         Each frame drawn, rounded and clipped (True), or their sum drawn at once.
+    expansion : bool
+        Whether the dark counts come from the expansion, all means being large, or from alias tables.
     clip : bool
         Whether single draws meet the ADC's rails.
     pixels : ndarray of layout.PIXEL, shape (n_padded,)
@@ -51,6 +53,7 @@ class Scene:
     n_pixel: int
     n_frames: int
     frames: bool
+    expansion: bool
     clip: bool
     pixels: NDArray[np.void]
     levels: NDArray[np.void]
@@ -103,7 +106,8 @@ def prepare(scenarios: Sequence[Expectation], mode: Mode = "auto") -> Scene:
     gain = quiet.gain_dn_per_electron
     dark_gain = gain if quiet.dark_unit == "electrons" else np.ones(n_pixel)
     dark_mean = n_draw * quiet.dark_dn / dark_gain
-    tables, starts, entries = table_set(dark_mean.tolist())
+    expansion = bool(dark_mean.min() >= SMALLEST_EXPANDED)
+    tables, starts, entries = table_set([0.0] * n_pixel if expansion else dark_mean.tolist())
     centre = np.rint(dark_mean)
 
     used = ~quiet.saturated
@@ -114,6 +118,11 @@ def prepare(scenarios: Sequence[Expectation], mode: Mode = "auto") -> Scene:
     real["table_bits"] = [table.bits for table in tables]
     pixels["table_bits"][n_pixel:] = tables[0].bits
     real["dark_low"] = np.array([table.low for table in tables]) - centre
+    if expansion:
+        root = np.sqrt(dark_mean)
+        real["dark_offset"] = dark_mean - centre - 1 / 6
+        real["dark_slope"] = root - 1 / (36 * root)
+        real["dark_cubic"] = -1 / (72 * root)
     real["dark_gain"] = dark_gain
     real["used"] = used
     real["inverse_variance"] = used / variance
@@ -143,6 +152,7 @@ def prepare(scenarios: Sequence[Expectation], mode: Mode = "auto") -> Scene:
         n_pixel=n_pixel,
         n_frames=quiet.n_frames,
         frames=frames,
+        expansion=expansion,
         clip=n_draw == 1,
         pixels=pixels,
         levels=levels,

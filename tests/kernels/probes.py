@@ -52,3 +52,11 @@ class Probes:
         """The column each word chooses."""
         items = words.size // self.width
         return self.run("probe_alias", items, np.empty(words.size, np.uint32), words, table, np.uint32(bits))
+
+    def expansion(self, radius: NDArray[np.uint32], angle: NDArray[np.uint32], mean: float) -> NDArray[np.int64]:
+        """Two rows of counts relative to the whole number nearest to the mean."""
+        words, root = np.stack([radius, angle]), np.sqrt(mean)
+        offset, slope, cubic = mean - np.rint(mean) - 1 / 6, root - 1 / (36 * root), -1 / (72 * root)
+        coefficients = [np.float32(c) for c in (offset, slope, cubic)]
+        out = np.empty(words.shape, np.float32)
+        return self.run("probe_expansion", radius.size // self.width, out, words, *coefficients).astype(np.int64)

@@ -8,7 +8,7 @@ from probes import Probes
 from scipy import stats
 
 from mauvecl import reference
-from mauvecl.poisson import alias_table, table_set
+from mauvecl.poisson import SMALLEST_EXPANDED, alias_table, table_set
 
 MEANS = [0.0, 0.5, 5.0, 64.0, 2225.0, 22250.0, 222500.0]
 
@@ -42,28 +42,68 @@ def test_extreme_words_and_column_edges(probes: Probes, mean: float) -> None:
     np.testing.assert_array_equal(ours, np.where(below, column, alias[column]))
 
 
-@pytest.mark.parametrize("mean", MEANS)
-def test_pearson(probes_fast: Probes, mean: float) -> None:
-    """Pearson's test at 1e8 draws; fails by chance once in 1e6 runs of a new seed."""
-    table = alias_table(mean)
-    n, block = 100_000_000, 2_500_000
-    counts = np.zeros(2**table.bits, np.int64)
-    for i in range(n // (4 * block)):
-        words = np.concatenate(reference.words_at(np.arange(i * block, (i + 1) * block), 3, "dark", 7, 99))
-        counts += np.bincount(probes_fast.alias(words, table.entries, table.bits), minlength=counts.size)
-    assert counts.sum() == n
-    expected = n * stats.poisson.pmf(table.low + np.arange(counts.size), mean)
+def pearson(counts: np.ndarray, low: int, mean: float) -> float:
+    """Pearson's statistic as a probability of both tails; rare counts are put together."""
+    n = counts.sum()
+    expected = n * stats.poisson.pmf(low + np.arange(counts.size), mean)
     common = expected > 20
     observed = np.append(counts[common], counts[~common].sum())
     wanted = np.append(expected[common], n - expected[common].sum())
-    if mean == 0.0:
-        assert observed[0] == n
-        return
     if wanted[-1] < 20:
         observed, wanted = observed[:-1], wanted[:-1]
     statistic = float(np.sum((observed - wanted) ** 2 / wanted))
-    assert stats.chi2.sf(statistic, observed.size - 1) > 1e-6
-    assert stats.chi2.cdf(statistic, observed.size - 1) > 1e-6
+    upper = stats.chi2.sf(statistic, observed.size - 1)
+    return 2 * min(upper, 1 - upper)
+
+
+BLOCK = 2_500_000
+
+
+@pytest.mark.parametrize("mean", MEANS)
+def test_pearson_of_the_table(probes_fast: Probes, mean: float) -> None:
+    """Pearson's test at 1e8 draws; fails by chance once in 1e6 runs of a new seed."""
+    table = alias_table(mean)
+    counts = np.zeros(2**table.bits, np.int64)
+    for i in range(10):
+        words = np.concatenate(reference.words_at(np.arange(i * BLOCK, (i + 1) * BLOCK), 3, "dark", 7, 99))
+        counts += np.bincount(probes_fast.alias(words, table.entries, table.bits), minlength=counts.size)
+    assert counts.sum() == 100_000_000
+    if mean == 0.0:
+        assert counts[0] == counts.sum()
+    else:
+        assert pearson(counts, table.low, mean) > 1e-6
+
+
+@pytest.mark.parametrize("mean", [SMALLEST_EXPANDED, 2225.0, 22250.0, 222500.0])
+def test_pearson_of_the_expansion(probes_fast: Probes, mean: float) -> None:
+    """The same for counts from the expansion. A rounded normal of mean 2225 gives p < 1e-100 here."""
+    half = int(10 * np.sqrt(mean))
+    counts = np.zeros(2 * half, np.int64)
+    for i in range(10):
+        w = np.array(reference.words_at(np.arange(i * BLOCK, (i + 1) * BLOCK), 5, "dark", 9, 99))
+        drawn = probes_fast.expansion(w[[0, 2]].ravel(), w[[1, 3]].ravel(), mean)
+        counts += np.bincount(drawn.ravel() + half, minlength=counts.size)
+    assert counts.sum() == 100_000_000
+    assert pearson(counts, round(mean) - half, mean) > 1e-6
+
+
+@pytest.mark.parametrize("mean", [SMALLEST_EXPANDED, 2225.0, 22250.0])
+def test_a_rounded_normal_would_fail(mean: float) -> None:
+    """The test above can fail: the same number of draws from a rounded normal, or without the last term."""
+    half = int(10 * np.sqrt(mean))
+    n = np.arange(-half, half)
+    rounded = np.diff(stats.norm.cdf(np.append(n, half) - 0.5, 0.0, np.sqrt(mean)))
+    assert pearson(np.rint(1e8 * rounded).astype(np.int64), round(mean) - half, mean) < 1e-6
+
+
+def test_the_expansion_is_the_twins(probes: Probes) -> None:
+    mean = 2225.0
+    w = np.array(reference.words_at(np.arange(4096), 0, "dark", 1, 5))
+    z = reference.normal_pair(w[0], w[1])
+    root = np.sqrt(mean)
+    coefficients = [np.float32(c) for c in (-1 / 6, root - 1 / (36 * root), -1 / (72 * root))]
+    twin = [reference.expansion_draw(row, *coefficients) for row in z]
+    np.testing.assert_array_equal(probes.expansion(w[0], w[1], mean), twin)
 
 
 @pytest.fixture(scope="session")

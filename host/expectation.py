@@ -1,0 +1,346 @@
+"""What the detector expects: per-pixel means and noise of an exposure, before anything is drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal
+
+import astropy.units as u
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import InputError
+from .instrument import Instrument
+from .response import Order, electrons_per_second
+from .sky import Sky
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from .source import Source
+
+Float = NDArray[np.float64]
+
+#: Longest exposure, s.
+DAY_S = 86_400.0
+
+
+@dataclass(frozen=True, eq=False)
+class Expectation:
+    """Means and noise per pixel of an exposure of `n_frames` frames; arrays are for ONE frame and read-only.
+
+    Attributes
+    ----------
+    wavelength_nm : ndarray, shape (n_pixel,)
+        Pixel centres.
+    source_electrons, sky_electrons : ndarray, shape (n_pixel,)
+        Mean electrons per frame.
+    dark_dn : ndarray, shape (n_pixel,)
+        Mean dark per frame, DN, whatever unit it is drawn in.
+    dark_unit : {"DN", "electrons"}
+        Unit in which the dark is Poisson; its mean in electrons is dark_dn / gain.
+    bias_dn, read_noise_dn, gain_dn_per_electron : ndarray, shape (n_pixel,)
+        Mean and rms per frame, DN; DN per electron.
+    n_frames : int
+    frame_s : float
+        The exposure is n_frames * frame_s.
+    element : ndarray of int32, shape (n_pixel,)
+        Index of each pixel's resolution element, ascending from 0: half-open bins from the start of the output range.
+    element_wavelength_nm : ndarray, shape (n_element,)
+        Centres of these bins; the last may hold fewer pixels.
+    adc_max_dn : int
+    saturation_dn : float
+        Raw level at which the detector saturates, DN.
+    name, instrument : str
+    provenance : mapping of str
+        Where everything came from: digests, order, sky, history of the source, exposure asked for.
+    messages : tuple of str
+        What the user must be told, saturation first.
+    """
+
+    wavelength_nm: Float
+    source_electrons: Float
+    sky_electrons: Float
+    dark_dn: Float
+    dark_unit: Literal["DN", "electrons"]
+    bias_dn: Float
+    read_noise_dn: Float
+    gain_dn_per_electron: Float
+    n_frames: int
+    frame_s: float
+    element: NDArray[np.int32]
+    element_wavelength_nm: Float
+    adc_max_dn: int
+    saturation_dn: float
+    name: str
+    instrument: str
+    provenance: Mapping[str, str]
+    messages: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        for field in fields(self):
+            value = getattr(self, field.name)
+            if isinstance(value, np.ndarray):
+                kept = np.array(value, np.int32 if field.name == "element" else np.float64)
+                kept.setflags(write=False)
+                object.__setattr__(self, field.name, kept)
+        n_pixel = self.wavelength_nm.shape
+        for name in PER_PIXEL:
+            values = getattr(self, name)
+            if values.shape != n_pixel:
+                raise ValueError(f"{name} has the shape {values.shape}, expected {n_pixel}")
+            bad = ~(np.isfinite(values) & (values >= 0))
+            if bad.any():
+                pixel = int(np.argmax(bad))
+                raise ValueError(f"{name}[{pixel}] = {values[pixel]:g}, expected >= 0 and finite")
+        object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
+
+    @property
+    def exposure_s(self) -> float:
+        """Length of the exposure, s."""
+        return self.n_frames * self.frame_s
+
+    @cached_property
+    def net_source_dn(self) -> Float:
+        """Mean signal of the source alone in the exposure, DN, shape (n_pixel,)."""
+        return self.n_frames * self.gain_dn_per_electron * self.source_electrons
+
+    @cached_property
+    def signal_dn(self) -> Float:
+        """Mean net signal of the exposure, source and sky, DN, shape (n_pixel,)."""
+        return self.n_frames * self.gain_dn_per_electron * (self.source_electrons + self.sky_electrons)
+
+    @cached_property
+    def mean_raw_dn(self) -> Float:
+        """Mean raw level of one frame: light, dark and bias, DN, before the ADC; shape (n_pixel,)."""
+        return self.signal_dn / self.n_frames + self.dark_dn + self.bias_dn
+
+    @cached_property
+    def dark_variance_dn2(self) -> Float:
+        """Variance of one frame's dark, DN^2, shape (n_pixel,): Poisson in DN, or in electrons times the gain."""
+        scale = self.gain_dn_per_electron if self.dark_unit == "electrons" else 1.0
+        return np.asarray(self.dark_dn * scale)
+
+    @cached_property
+    def variance_dn2(self) -> Float:
+        """Variance of the exposure, DN^2, with the rounding of each frame (1/12); shape (n_pixel,)."""
+        return self._noise_dn2 + self.n_frames / 12
+
+    @cached_property
+    def _noise_dn2(self) -> Float:
+        photon = self.gain_dn_per_electron * self.signal_dn
+        return photon + self.n_frames * (self.read_noise_dn**2 + self.dark_variance_dn2)
+
+    def snr(self) -> Float:
+        """Signal to noise per pixel, shape (n_pixel,).
+
+        S / sqrt(sigma_S^2 + sigma_R^2 + sigma_D^2) of the paper, all in DN, with S the net signal, zodiacal light
+        included as there, and sigma_S the gain times the root of its electrons. Without the ADC's rounding.
+        """
+        return _ratio(self.signal_dn, self._noise_dn2)
+
+    def snr_per_element(self) -> Float:
+        """Signal to noise per resolution element, shape (n_element,): signals summed, noise in quadrature."""
+        return _ratio(self.per_element(self.signal_dn), self.per_element(self._noise_dn2))
+
+    def per_element(self, values: Float) -> Float:
+        """Sums of pixels over resolution elements: (n_pixel,) to (n_element,)."""
+        return np.bincount(self.element, values, minlength=self.element_wavelength_nm.size)
+
+    def noise_budget(self) -> QTable:
+        """Noise of the exposure by origin, DN rms per pixel.
+
+        Returns
+        -------
+        QTable
+            `wavelength`, `source_photon`, `zodiacal_photon`, `dark`, `read` and `total`, which is the four in quadrature:
+            signal_dn / total is `snr`. The ADC's rounding, 0.29 DN per frame, is left out.
+        """
+        from astropy.table import QTable
+
+        n, gain = self.n_frames, self.gain_dn_per_electron
+        variances = {
+            "source_photon": n * gain**2 * self.source_electrons,
+            "zodiacal_photon": n * gain**2 * self.sky_electrons,
+            "dark": n * self.dark_variance_dn2,
+            "read": n * self.read_noise_dn**2,
+            "total": self._noise_dn2,
+        }
+        table = QTable({"wavelength": self.wavelength_nm * u.nm})
+        for name, variance in variances.items():
+            table[name] = np.sqrt(variance) * u.DN
+        table.meta["exposure_s"] = self.exposure_s
+        table.meta["name"] = self.name
+        return table
+
+    @property
+    def ceiling_dn(self) -> float:
+        """Raw level at which a pixel is saturated: the detector's or the ADC's, whichever is lower, DN."""
+        return min(self.saturation_dn, float(self.adc_max_dn))
+
+    @cached_property
+    def saturated(self) -> NDArray[np.bool_]:
+        """Pixels whose mean raw level in one frame reaches `ceiling_dn`, shape (n_pixel,)."""
+        return np.asarray(self.mean_raw_dn >= self.ceiling_dn)
+
+    @property
+    def longest_safe_frame_s(self) -> float:
+        """Longest frame in which no pixel's mean, with dark and bias, reaches saturation, s; infinite in the dark."""
+        rise = (self.mean_raw_dn - self.bias_dn) / self.frame_s
+        with np.errstate(divide="ignore"):
+            return float(np.min(np.where(rise > 0, (self.ceiling_dn - self.bias_dn) / rise, np.inf)))
+
+
+#: The arrays of one value per pixel, all finite and >= 0.
+PER_PIXEL = (
+    "source_electrons",
+    "sky_electrons",
+    "dark_dn",
+    "bias_dn",
+    "read_noise_dn",
+    "gain_dn_per_electron",
+)
+
+
+def _ratio(signal: Float, variance: Float) -> Float:
+    # A noiseless detector without light has no signal to noise to speak of: 0.
+    return np.divide(signal, np.sqrt(variance), out=np.zeros_like(signal), where=variance > 0)
+
+
+def expect(
+    source: Source,
+    instrument: Instrument,
+    *,
+    exposure: u.Quantity | float,
+    sky: Sky | None = None,
+    order: Order = "paper",
+) -> Expectation:
+    """What an instrument expects of a source: deterministic, nothing is drawn.
+
+    Parameters
+    ----------
+    source : Source
+        Zero beyond its own wavelengths.
+    instrument : Instrument
+    exposure : Quantity or float
+        Time, or seconds; rounded up to whole frames, which `messages` then tells.
+    sky : Sky, optional
+        None by default.
+    order : {"paper", "physical"}
+        Whether efficiencies act after the line function or before; see `response_matrix`.
+
+    Raises
+    ------
+    InputError
+        If the exposure is not a time above 0 and up to one day, or the source does not cover the output range.
+    """
+    sky = Sky.none() if sky is None else sky
+    asked_s = _seconds(exposure)
+    # A hair less, so that 0.1 + 0.2 s is three frames of 0.1 s.
+    n_frames = max(1, int(np.ceil(asked_s / instrument.frame_s * (1 - 1e-12))))
+    low, high = instrument.output_min_nm, instrument.output_max_nm
+    if source.wavelength_nm[0] > low or source.wavelength_nm[-1] < high:
+        raise InputError(
+            f"the spectrum of {source.name} spans {source.wavelength_nm[0]:g}-{source.wavelength_nm[-1]:g} nm, "
+            f"expected at least the output range {low:g}-{high:g} nm of {instrument.name}"
+        )
+
+    def per_frame(light: Source) -> Float:
+        rate = electrons_per_second(instrument, light.wavelength_nm, light.flux_flam, order)
+        # Quadrature can leave -1e-30 where there is no light.
+        return np.maximum(rate, 0.0) * instrument.frame_s
+
+    zodiacal = sky.spectrum(instrument.field_of_view_arcsec2)
+    n_pixel = instrument.wavelength_nm.size
+    element, element_wavelength = _elements(instrument)
+    plain = Expectation(
+        wavelength_nm=instrument.wavelength_nm,
+        source_electrons=per_frame(source),
+        sky_electrons=np.zeros(n_pixel) if zodiacal is None else per_frame(zodiacal),
+        dark_dn=np.full(n_pixel, instrument.dark_dn_per_s * instrument.frame_s),
+        dark_unit=instrument.dark_unit,
+        bias_dn=np.full(n_pixel, instrument.bias_dn),
+        read_noise_dn=np.full(n_pixel, instrument.read_noise_dn),
+        gain_dn_per_electron=np.full(n_pixel, instrument.gain_dn_per_electron),
+        n_frames=n_frames,
+        frame_s=instrument.frame_s,
+        element=element,
+        element_wavelength_nm=element_wavelength,
+        adc_max_dn=instrument.adc_max_dn,
+        saturation_dn=instrument.saturation_dn,
+        name=source.name,
+        instrument=instrument.name,
+        provenance={
+            "source": source.name,
+            "source origin": source.origin,
+            "source notes": "; ".join(source.notes),
+            "source history": "; ".join(source.history),
+            "source digest": source.digest,
+            "sky": sky.description,
+            "sky digest": "" if zodiacal is None else zodiacal.digest,
+            "instrument": instrument.name,
+            "instrument digest": instrument.digest,
+            "detector temperature": f"{instrument.temperature_c:g} C",
+            "order": order,
+            "requested exposure": f"{asked_s:g} s",
+            "exposure": f"{n_frames} frames of {instrument.frame_s:g} s",
+        },
+    )
+    messages = [*_saturation(plain)]
+    if n_frames * instrument.frame_s > asked_s * (1 + 1e-9):
+        messages.append(
+            f"The exposure of {asked_s:g} s is rounded up to {plain.exposure_s:g} s, "
+            f"{n_frames} frame{'s' if n_frames > 1 else ''} of {instrument.frame_s:g} s."
+        )
+    if instrument.notice:
+        messages.append(instrument.notice)
+    return replace(plain, messages=tuple(messages))
+
+
+def _seconds(exposure: Any) -> float:
+    expected = "expected a time above 0 and up to one day (86400 s)"
+    value = exposure
+    if isinstance(exposure, u.Quantity):
+        try:
+            value = exposure.to_value(u.s)
+        except u.UnitConversionError:
+            raise InputError(f"exposure = {exposure}, {expected}") from None
+    if isinstance(value, bool | np.bool_ | str) or np.ndim(value) != 0:
+        raise InputError(f"exposure = {exposure!r}, {expected}")
+    try:
+        seconds = float(value)
+    except (TypeError, ValueError):
+        raise InputError(f"exposure = {exposure!r}, {expected}") from None
+    if not 0 < seconds <= DAY_S:
+        raise InputError(f"exposure = {seconds:g} s, {expected}")
+    return seconds
+
+
+def _elements(instrument: Instrument) -> tuple[NDArray[np.int32], Float]:
+    """Each pixel's resolution element, and the centres of those that hold a pixel."""
+    width = instrument.resolution_element_nm
+    bins = np.floor((instrument.wavelength_nm - instrument.output_min_nm) / width)
+    # An array that starts above the output range leaves the first bins empty.
+    held, element = np.unique(bins, return_inverse=True)
+    return element.astype(np.int32), instrument.output_min_nm + (held + 0.5) * width
+
+
+def _saturation(x: Expectation) -> tuple[str, ...]:
+    """The sentence on saturation, if any."""
+    if not x.saturated.any():
+        return ()
+    # Runs of saturated pixels, as first and last wavelength.
+    steps = np.flatnonzero(np.diff(np.concatenate([[0], x.saturated.astype(np.int8), [0]])))
+    runs = [f"{x.wavelength_nm[a]:.1f}-{x.wavelength_nm[b - 1]:.1f}" for a, b in steps.reshape(-1, 2)]
+    brightest = int(np.argmax(x.mean_raw_dn))
+    safe = x.longest_safe_frame_s
+    # Rounded down: a frame of the length told is safe.
+    told = np.floor(safe * 1000) / 1000
+    return (
+        f"SATURATED: {int(x.saturated.sum())} of {x.saturated.size} pixels at {', '.join(runs)} nm reach "
+        f"{x.ceiling_dn:.0f} DN in a {x.frame_s:g} s frame of {x.name}; the longest safe frame is {told:g} s "
+        f"(brightest pixel at {x.wavelength_nm[brightest]:.1f} nm, dark and bias included).",
+    )

@@ -1,0 +1,298 @@
+"""The instrument as one matrix: flux at the nodes of a spectrum to mean electrons per second and pixel.
+
+Flux is piecewise linear between its nodes. With P_p(l) the fraction of light of wavelength l that lands in pixel p (the
+line function integrated over the pixel, in closed form), a pixel's rate is the integral of flux * P_p, times the efficiency
+and area. The integral runs over panels in which every P_p is smooth: in a panel P_p is its polynomial through Gauss-Legendre
+nodes, and the flux enters through its integrals against the Lagrange polynomials of these nodes. So the matrix is a product,
+
+    response = landing @ gathering        (n_pixel, n_panel_node) @ (n_panel_node, n_wavelength)
+
+whose first factor belongs to the instrument and whose second costs the same for every node, however dense the spectrum:
+nothing is resampled, and no flux lost. Against adaptive quadrature it is right to 1e-13.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal, cast
+
+import numpy as np
+from numpy.polynomial.legendre import leggauss, legvander
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import csr_array
+from scipy.special import erf, ndtr
+
+from .errors import InputError
+from .instrument import Instrument
+
+Order = Literal["paper", "physical"]
+Float = NDArray[np.float64]
+
+#: 1 erg s^-1 cm^-2 A^-1 in W cm^-2 nm^-1.
+W_PER_NM_IN_FLAM = 1e-6
+#: Gaussian tails end here, in sigma: what lies beyond is below 1e-15.
+REACH_SIGMA = 8.0
+#: Gauss-Legendre nodes per panel, and the widest panel in sigma of the Gaussian.
+PANEL_NODES = 10
+PANEL_SIGMA = 0.5
+#: Gauss-Legendre nodes per cell of the flux: exact for a linear flux times a panel's Lagrange polynomials.
+CELL_NODES = 6
+#: Cells gathered at once, which bounds the memory.
+CHUNK = 20_000
+#: Spectra with more nodes than this go through without a matrix of their own.
+MATRIX_NODES = 20_000
+
+
+@dataclass(frozen=True)
+class Line:
+    """The line function and the pixels that it falls on, all in nm.
+
+    Attributes
+    ----------
+    centres : tuple of float
+        Pixel centres.
+    pixel, top_hat, sigma : float
+        Widths of a pixel and of the top hat, and the Gaussian's sigma.
+    """
+
+    centres: tuple[float, ...]
+    pixel: float
+    top_hat: float
+    sigma: float
+
+    @classmethod
+    def of(cls, instrument: Instrument) -> Line:
+        """The line function of an instrument."""
+        return cls(
+            tuple(instrument.wavelength_nm.tolist()),
+            instrument.dispersion_nm_per_pixel,
+            instrument.top_hat_width_nm,
+            instrument.gaussian_fwhm_nm / np.sqrt(8 * np.log(2)),
+        )
+
+    @property
+    def reach(self) -> float:
+        """Farthest distance from a pixel's centre that sends light into it."""
+        return (self.top_hat + self.pixel) / 2 + REACH_SIGMA * self.sigma
+
+    def density(self, offset_nm: ArrayLike) -> Float:
+        """The line function, nm^-1, unit integral: a difference of two error functions."""
+        x = np.asarray(offset_nm, np.float64)
+        if self.top_hat == 0:
+            return np.asarray(np.exp(-0.5 * (x / self.sigma) ** 2) / (self.sigma * np.sqrt(2 * np.pi)))
+        half = self.top_hat / 2
+        if self.sigma == 0:
+            return np.where(np.abs(x) <= half, 1 / self.top_hat, 0.0)
+        scale = self.sigma * np.sqrt(2)
+        return np.asarray((erf((x + half) / scale) - erf((x - half) / scale)) / (2 * self.top_hat))
+
+    def landing(self, offset_nm: Float) -> Float:
+        """Fraction of a line's light that a pixel takes, by the distance of its centre from the line."""
+        # Even in the offset; on the left side of the line no digits cancel.
+        x = -np.abs(offset_nm)
+        half = self.pixel / 2
+        return np.asarray(self._below(x + half) - self._below(x - half))
+
+    def _below(self, x: Float) -> Float:
+        """Fraction of a line's light that lands below x."""
+        if self.top_hat == 0:
+            return np.asarray(ndtr(x / self.sigma))
+        half = self.top_hat / 2
+        return (self._ramp(x + half) - self._ramp(x - half)) / self.top_hat
+
+    def _ramp(self, x: Float) -> Float:
+        """Integral of the Gaussian's distribution function from far below to x."""
+        if self.sigma == 0:
+            return np.maximum(x, 0.0)
+        z = x / self.sigma
+        return np.asarray(self.sigma * (z * ndtr(z) + np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)))
+
+    def panel_edges(self, knots: Float) -> Float:
+        """Edges of panels in which every pixel's `landing` is smooth, cut at `knots` too; shape (n_panel + 1,)."""
+        low, high = self.centres[0] - self.reach, self.centres[-1] + self.reach
+        parts = [np.array([low, high]), knots[(knots > low) & (knots < high)]]
+        if self.sigma > 0:
+            parts.append(np.linspace(low, high, int(np.ceil((high - low) / (PANEL_SIGMA * self.sigma))) + 1))
+        else:
+            # Without a Gaussian it is a trapezoid: straight between these corners.
+            ends = np.append(np.asarray(self.centres) - self.pixel / 2, self.centres[-1] + self.pixel / 2)
+            parts += [ends - self.top_hat / 2, ends + self.top_hat / 2]
+        edges = np.unique(np.concatenate(parts))
+        # Knots that rounding has split apart would make empty panels.
+        kept: Float = edges[np.append(True, np.diff(edges) > 1e-9)]
+        return kept
+
+
+def response_matrix(instrument: Instrument, wavelength_nm: ArrayLike, order: Order = "paper") -> csr_array:
+    """Mean electrons per second in each pixel for unit flux at each node.
+
+    Parameters
+    ----------
+    instrument : Instrument
+    wavelength_nm : array_like, shape (n_wavelength,)
+        Nodes of the flux, nm, strictly increasing; the flux is straight between them and zero outside.
+    order : {"paper", "physical"}
+        Efficiency of the wavelength where light lands, applied after the line function (the paper), or of the light's own
+        wavelength, before it (physics). Beyond the ends of an efficiency curve its end value holds: an assumption
+        that only the physical order meets, for light from outside the output range.
+
+    Returns
+    -------
+    csr_array, shape (n_pixel, n_wavelength)
+        Electrons s^-1 per (erg s^-1 cm^-2 A^-1): `response_matrix(...) @ flux_flam` is electrons per second.
+        Cached: the same instrument, nodes and order give the same object, which is not to be changed.
+
+    Raises
+    ------
+    InputError
+        If the nodes are not at least two finite, strictly increasing wavelengths, or the order is unknown.
+    """
+    return _response(instrument, _nodes(wavelength_nm).tobytes(), _known(order))
+
+
+def electrons_per_second(
+    instrument: Instrument, wavelength_nm: ArrayLike, flux_flam: ArrayLike, order: Order = "paper"
+) -> Float:
+    """Mean electrons per second in each pixel, shape (n_pixel,), for a spectrum of any number of nodes.
+
+    Parameters
+    ----------
+    instrument, wavelength_nm, order
+        As in `response_matrix`.
+    flux_flam : array_like, shape (n_wavelength,)
+        Flux at the nodes, erg s^-1 cm^-2 A^-1.
+
+    Raises
+    ------
+    InputError
+        As `response_matrix`, or if fluxes and nodes differ in number.
+    """
+    nodes = _nodes(wavelength_nm)
+    flux = np.asarray(flux_flam, np.float64)
+    if flux.shape != nodes.shape:
+        raise InputError(f"flux has {flux.size} values for {nodes.size} wavelengths, expected as many")
+    if nodes.size <= MATRIX_NODES:
+        return cast(Float, response_matrix(instrument, nodes, order) @ flux)
+    gathered = sum(part @ flux for part in _gathering(instrument, nodes, _known(order)))
+    return cast(Float, _landing(instrument, order) @ gathered)
+
+
+@lru_cache(maxsize=8)
+def _response(instrument: Instrument, nodes: bytes, order: Order) -> csr_array:
+    wavelength = np.frombuffer(nodes, np.float64)
+    parts = list(_gathering(instrument, wavelength, order))
+    gathering = parts[0]
+    for part in parts[1:]:
+        gathering = gathering + part
+    return _read_only(csr_array(_landing(instrument, order) @ gathering))
+
+
+def _landing(instrument: Instrument, order: Order) -> csr_array:
+    """First factor of the matrix, with every constant; shape (n_pixel, n_panel_node)."""
+    landing = _line_landing(Line.of(instrument), _knots(instrument, order))
+    if order == "physical":
+        return landing
+    per_pixel = W_PER_NM_IN_FLAM * instrument.electrons_per_joule_cm2(instrument.wavelength_nm)
+    scaled = landing.copy()
+    scaled.data *= np.repeat(per_pixel, np.diff(landing.indptr))
+    return scaled
+
+
+@lru_cache(maxsize=8)
+def _line_landing(line: Line, knots: tuple[float, ...]) -> csr_array:
+    """Fraction of the light at each panel node that lands in each pixel, shape (n_pixel, n_panel_node)."""
+    nodes = _panel_nodes(line.panel_edges(np.array(knots)))
+    centres = np.array(line.centres)
+    first = np.searchsorted(nodes, centres - line.reach)
+    count = np.searchsorted(nodes, centres + line.reach) - first
+    indptr = np.append(0, np.cumsum(count))
+    rows = np.repeat(np.arange(centres.size), count)
+    columns = np.arange(indptr[-1]) - np.repeat(indptr[:-1] - first, count)
+    values = line.landing(nodes[columns] - centres[rows])
+    return _read_only(csr_array((values, columns, indptr), shape=(centres.size, nodes.size)))
+
+
+def _gathering(instrument: Instrument, wavelength: Float, order: Order) -> Iterator[csr_array]:
+    """Second factor of the matrix, as a sum of parts; each of shape (n_panel_node, n_wavelength).
+
+    An entry is the integral (nm) over a panel of a Lagrange polynomial of the panel times the hat function of a node; in the
+    physical order the efficiency is under the integral.
+    """
+    panels = Line.of(instrument).panel_edges(np.array(_knots(instrument, order)))
+    low, high = max(panels[0], wavelength[0]), min(panels[-1], wavelength[-1])
+    shape = ((panels.size - 1) * PANEL_NODES, wavelength.size)
+    if not low < high:
+        yield csr_array(shape)
+        return
+    inside = [edges[(edges > low) & (edges < high)] for edges in (panels, wavelength)]
+    edges = np.unique(np.concatenate([[low], *inside, [high]]))
+    for start in range(0, edges.size - 1, CHUNK):
+        yield _gather(instrument, wavelength, order, panels, edges[start : start + CHUNK + 1], shape)
+
+
+def _gather(
+    instrument: Instrument, wavelength: Float, order: Order, panels: Float, edges: Float, shape: tuple[int, int]
+) -> csr_array:
+    """`_gathering` of the cells between `edges`, each within one panel and between two nodes."""
+    abscissa, weight = leggauss(CELL_NODES)
+    width = np.diff(edges)
+    middle = edges[:-1] + width / 2
+    panel = np.searchsorted(panels, middle) - 1
+    node = np.searchsorted(wavelength, middle) - 1
+    at = middle[:, None] + width[:, None] / 2 * abscissa  # (n_cell, CELL_NODES)
+    mass = width[:, None] / 2 * weight
+    if order == "physical":
+        mass = mass * W_PER_NM_IN_FLAM * instrument.electrons_per_joule_cm2(at)
+    span = (wavelength[node + 1] - wavelength[node])[:, None]
+    right = (at - wavelength[node][:, None]) / span
+    in_panel = (2 * at - (panels[panel] + panels[panel + 1])[:, None]) / np.diff(panels)[panel][:, None]
+    # Lagrange polynomials of Gauss-Legendre nodes, through the Legendre polynomials (no division, no cancellation).
+    lagrange = legvander(in_panel, PANEL_NODES - 1) @ _legendre_to_lagrange()
+    rows = np.broadcast_to(panel[:, None] * PANEL_NODES + np.arange(PANEL_NODES), (panel.size, PANEL_NODES))
+    values = [np.einsum("cq,cqk->ck", mass * share, lagrange) for share in (1 - right, right)]
+    columns = [np.broadcast_to((node + side)[:, None], rows.shape) for side in (0, 1)]
+    index = (np.tile(rows.ravel(), 2), np.concatenate([c.ravel() for c in columns]))
+    # Entries of one place add up.
+    return csr_array((np.concatenate([v.ravel() for v in values]), index), shape=shape)
+
+
+def _read_only(matrix: csr_array) -> csr_array:
+    # What a cache hands out twice must not change in between.
+    matrix.data.setflags(write=False)
+    return matrix
+
+
+@lru_cache(maxsize=1)
+def _legendre_to_lagrange() -> Float:
+    """Lagrange polynomials of the panel's nodes from Legendre polynomials, shape (degree, node)."""
+    x, weight = leggauss(PANEL_NODES)
+    degree = np.arange(PANEL_NODES)
+    return np.asarray((degree[:, None] + 0.5) * legvander(x, PANEL_NODES - 1).T * weight)
+
+
+def _panel_nodes(edges: Float) -> Float:
+    """Gauss-Legendre nodes of each panel, in order, shape (n_panel * PANEL_NODES,)."""
+    x, _ = leggauss(PANEL_NODES)
+    return np.asarray(edges[:-1, None] + np.diff(edges)[:, None] * (1 + x) / 2).ravel()
+
+
+def _knots(instrument: Instrument, order: Order) -> tuple[float, ...]:
+    """Wavelengths where the integrand has a kink of the instrument's own."""
+    if order == "paper":
+        return ()
+    return instrument.knots_nm
+
+
+def _nodes(wavelength_nm: ArrayLike) -> Float:
+    nodes = np.ascontiguousarray(wavelength_nm, np.float64)
+    if nodes.ndim != 1 or nodes.size < 2 or not np.isfinite(nodes).all() or not (np.diff(nodes) > 0).all():
+        raise InputError("the wavelengths of a spectrum, expected at least two, finite and strictly increasing, in nm")
+    return nodes
+
+
+def _known(order: str) -> Order:
+    if order not in ("paper", "physical"):
+        raise InputError(f"order = {order!r}, expected 'paper' or 'physical'")
+    return cast(Order, order)
