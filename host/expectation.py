@@ -286,7 +286,7 @@ def expect(
             "detector temperature": f"{instrument.temperature_c:g} C",
             "order": order,
             "requested exposure": f"{asked_s:g} s",
-            "exposure": f"{n_frames} frames of {instrument.frame_s:g} s",
+            "exposure": f"{n_frames} x {instrument.frame_s:g} s",
         },
     )
     messages = [*_saturation(plain)]

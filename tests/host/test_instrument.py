@@ -1,0 +1,201 @@
+"""The payload's numbers, and what a user's instrument file may and may not say."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mauvecl.host.curve import Curve
+from mauvecl.host.errors import InputError
+from mauvecl.host.instrument import LABELS, Instrument
+
+# Computed independently of this code: wavelength nm, total efficiency, effective area cm^2.
+PUBLISHED = [
+    (200, 0.101, 5.6),
+    (250, 0.207, 11.6),
+    (300, 0.263, 16.2),
+    (400, 0.228, 14.7),
+    (500, 0.167, 12.3),
+    (600, 0.125, 9.7),
+    (700, 0.093, 6.9),
+]
+
+
+@pytest.fixture(scope="module")
+def mauve() -> Instrument:
+    return Instrument.load("mauve")
+
+
+@pytest.mark.parametrize(("nm", "efficiency", "area_cm2"), PUBLISHED)
+def test_efficiency_and_effective_area(mauve: Instrument, nm: float, efficiency: float, area_cm2: float) -> None:
+    assert mauve.efficiency(nm) == pytest.approx(efficiency, rel=0.02)
+    assert mauve.effective_area_cm2(nm) == pytest.approx(area_cm2, rel=0.02)
+
+
+def test_efficiency_is_the_papers_product(mauve: Instrument) -> None:
+    # The knots at 300 nm, by hand.
+    by_hand = 0.80 * 0.977 * 0.96**4 * 0.910**2 * 0.888**2 * 0.92 * 0.999 * 0.66
+    assert mauve.efficiency(300.0) == pytest.approx(by_hand, rel=1e-12)
+    assert mauve.quantum_efficiency(300.0) == pytest.approx(0.122 * 1239.84198 / 300, rel=1e-8)
+    assert mauve.throughput(300.0) == pytest.approx(by_hand * 0.122 * 1239.84198 / 300, rel=1e-8)
+    assert mauve.with_(pointing_loss=0.05).efficiency(300.0) == pytest.approx(0.95 * by_hand, rel=1e-12)
+
+
+def test_detector(mauve: Instrument) -> None:
+    assert mauve.dark_dn_per_s == pytest.approx(445.5, abs=0.1)
+    assert mauve.with_(temperature_c=13).dark_dn_per_s == pytest.approx(258, abs=0.5)
+    assert mauve.gain_dn_per_electron == pytest.approx(0.5958, abs=5e-5)
+    assert mauve.saturation_dn == pytest.approx(59.6e3, rel=1e-3)
+    assert mauve.adc_max_dn == 65535
+    assert mauve.field_of_view_arcsec2 == pytest.approx(np.pi * 47.46**2)
+
+
+def test_pixels(mauve: Instrument) -> None:
+    centres = mauve.wavelength_nm
+    assert centres.size == 1643
+    assert centres[0] >= 200
+    assert centres[0] - 0.3043 < 200
+    assert centres[-1] <= 700 < centres[-1] + 0.3043
+    np.testing.assert_allclose(np.diff(centres), 0.3043, rtol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["mauve", "mauve-electrons"])
+def test_every_value_has_a_source(name: str) -> None:
+    instrument = Instrument.load(name)
+    assert instrument.name == name
+    assert set(instrument.sources) == set(Instrument.model_fields) - set(LABELS)
+    assert all(source[:3] in ("P: ", "D: ", "C: ", "A: ") for source in instrument.sources.values())
+    assert not any("no source" in source for source in instrument.sources.values())
+    assert "not a flight calibration" in instrument.notice
+
+
+def test_electrons_differ_in_the_dark_alone(mauve: Instrument) -> None:
+    electrons = Instrument.load("mauve-electrons")
+    assert (mauve.dark_unit, electrons.dark_unit) == ("DN", "electrons")
+    assert electrons != mauve
+    assert electrons.with_(dark_unit="DN") == mauve
+
+
+def test_a_changed_copy(mauve: Instrument) -> None:
+    cold = mauve.with_(temperature_c=13, grating_efficiency=0.5)
+    assert (mauve.temperature_c, cold.temperature_c) == (21, 13)
+    assert cold.grating_efficiency.at([200, 700]).tolist() == [0.5, 0.5]
+    assert cold.sources["temperature_c"].startswith("U: ")
+    assert cold.sources["grating_efficiency"].startswith("U: ")
+    assert cold.sources["light_loss"] == mauve.sources["light_loss"]
+    assert cold.digest != mauve.digest
+    assert mauve.with_(name="renamed").digest == mauve.digest
+    assert {mauve: 1}[mauve.with_(temperature_c=21.0)] == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"temprature_c": 13}, "unknown key 'temprature_c'.*'temperature_c'"),
+        ({"temperature_c": 100}, "temperature_c = 100, expected"),
+        ({"temperature_c": float("nan")}, "temperature_c = nan, expected a finite number"),
+        ({"temperature_c": "13"}, "temperature_c = '13', expected a valid number"),
+        ({"frame_s": 0}, "frame_s = 0, expected greater than 0"),
+        ({"light_loss": 1.0}, "light_loss = 1.0, expected less than 1"),
+        ({"pixels": 2048.5}, "pixels = 2048.5, expected a valid integer"),
+        ({"dark_unit": "e-"}, "dark_unit = 'e-', expected 'DN' or 'electrons'"),
+        ({"grating_efficiency": 1.5}, "grating_efficiency has a value of 1.5, expected a fraction"),
+        ({"quantum_efficiency_a_per_w": 0.5}, "electrons per photon, expected at most 1"),
+        ({"output_max_nm": 750}, "covers 200-700 nm, expected at least the output range 200-750 nm"),
+        ({"output_max_nm": 150}, "output_max_nm = 150, expected more than output_min_nm"),
+        ({"top_hat_width_nm": 0, "gaussian_fwhm_nm": 0}, "both 0, expected at least one above 0"),
+        ({"gaussian_fwhm_nm": 0.01}, r"gaussian_fwhm_nm = 0.01, expected 0 \(none\) or at least 0.1"),
+        ({"bias_dn": 60_000}, "bias_dn = 60000, expected below saturation"),
+    ],
+)
+def test_bad_values(mauve: Instrument, changes: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        mauve.with_(**changes)
+    assert "\n" not in str(caught.value)
+
+
+CURVE = """# %ECSV 1.0
+# ---
+# datatype:
+# - {name: wavelength, unit: Angstrom, datatype: float64}
+# - {name: efficiency, unit: '', datatype: float64}
+# meta: !!omap
+# - {tag: D}
+# - {source: measured}
+# schema: astropy-2.0
+wavelength efficiency
+1900 0.2
+7100 0.4
+"""
+
+
+def test_a_users_file(tmp_path: Path, mauve: Instrument) -> None:
+    (tmp_path / "grating.ecsv").write_text(CURVE)
+    file = tmp_path / "mine.toml"
+    file.write_text(
+        'extends = "mauve"\nname = "mine"\nlight_loss = 0.2\ngrating_efficiency = "grating.ecsv"\n'
+        'read_noise_dn = { value = 11, tag = "D", source = "lab" }\nwindow_efficiency = 0.9\n'
+    )
+    mine = Instrument.load(str(file))
+    assert (mine.name, mine.light_loss, mine.read_noise_dn, mine.frame_s) == ("mine", 0.2, 11, 5)
+    assert mine.grating_efficiency.at(450.0) == pytest.approx(0.3)
+    assert mine.window_efficiency.at(450.0) == 0.9
+    assert mine.sources["light_loss"] == "A: assumed, no source in mine.toml"
+    assert mine.sources["read_noise_dn"] == "D: lab"
+    assert mine.sources["grating_efficiency"] == "D: measured"
+    assert mine.sources["bias_dn"] == mauve.sources["bias_dn"]
+    # A file may extend a user's own, too.
+    colder = tmp_path / "colder.toml"
+    colder.write_text('extends = "mine.toml"\ntemperature_c = 13\n')
+    assert Instrument.load(colder).with_(temperature_c=21) == mine
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ('extends = "mauve"\nligth_loss = 0.2', "bad.toml: unknown key 'ligth_loss'.*nearest is 'light_loss'"),
+        ("light_loss = 0.2\nname = 'x'", "bad.toml: 'notice' is missing"),
+        ("light_loss 0.2", "bad.toml is not valid TOML: .*line 1"),
+        ('extends = "mauve"\nlight_loss = { tag = "P" }', "light_loss has no 'value'"),
+        ('extends = "mauve"\nlight_loss = { value = 0.2, sauce = "x" }', "light_loss has the unknown key 'sauce'"),
+        ('extends = "mauve"\nlight_loss = { value = 0.2, tag = "Z" }', "light_loss has the tag 'Z', expected one of P"),
+        ('extends = "mauve"\nfibre_efficiency = "none.ecsv"', "none.ecsv does not exist"),
+        ('extends = "mauve"\nfibre_efficiency = "short.ecsv"', "fibre_efficiency covers 250-710 nm, expected"),
+        ('extends = "mauve"\nfibre_efficiency = "falling.ecsv"', "not finite and strictly increasing"),
+        ('extends = "mauve"\nfibre_efficiency = "negative.ecsv"', "value at 190 nm is -0.2, expected"),
+        ('extends = "mauve"\nfibre_efficiency = "unitless.ecsv"', "'wavelength' has the unit 'none', expected nm"),
+        ('extends = "mauve"\nfibre_efficiency = "text.ecsv"', "text.ecsv cannot be read"),
+        ('extends = "mauve"\nfibre_efficiency = true', "fibre_efficiency = True, expected"),
+        ('extends = "bad.toml"', "bad.toml extends itself"),
+        ("extends = 3", "instrument 3, expected a name or the path"),
+        ('extends = "mauve"\nsources = {}', "unknown key 'sources'"),
+    ],
+)
+def test_bad_files(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "short.ecsv").write_text(CURVE.replace("1900", "2500"))
+    (tmp_path / "falling.ecsv").write_text(CURVE.replace("1900", "7900"))
+    (tmp_path / "negative.ecsv").write_text(CURVE.replace(" 0.2", " -0.2"))
+    (tmp_path / "unitless.ecsv").write_text(CURVE.replace("unit: Angstrom, ", ""))
+    (tmp_path / "text.ecsv").write_text("wavelength efficiency\n200 0.3\n")
+    file = tmp_path / "bad.toml"
+    file.write_text(text)
+    with pytest.raises(InputError, match=message):
+        Instrument.load(file)
+
+
+def test_unknown_names() -> None:
+    with pytest.raises(InputError, match="unknown instrument 'mauv', expected .*nearest: 'mauve'"):
+        Instrument.load("mauv")
+    with pytest.raises(InputError, match=r"no-such.toml does not exist"):
+        Instrument.load("no-such.toml")
+
+
+def test_curves_hold_their_ends() -> None:
+    curve = Curve((200.0, 300.0), (0.2, 0.4))
+    assert curve.at([100.0, 200.0, 250.0, 900.0]).tolist() == pytest.approx([0.2, 0.2, 0.3, 0.4])
+    assert curve.covers(200, 300)
+    assert not curve.covers(199, 300)
+    assert Curve.flat(0.5).covers(1, 1e6)

@@ -1,0 +1,157 @@
+"""Detection: calibrated nulls, probabilities against closed forms, inversions, and honest refusals."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scenes import instrument, star
+from scipy import stats
+
+from mauvecl.detection import Detection
+from mauvecl.engine import Engine
+from mauvecl.host.errors import InputError
+from mauvecl.statistics import STATISTICS
+from mauvecl.tally import Distribution
+
+N = 1_000_000
+#: The paper's G2V star, with flares around the edge of detection for one statistic or another.
+AMPLITUDES = (0.03, 0.081, 0.15, 0.24)
+
+
+@pytest.fixture(scope="module")
+def found(engine: Engine) -> Detection:
+    quiet, *flares = star(amplitudes=AMPLITUDES)
+    return engine.detect(quiet, flares, realisations=N, seed=20, statistics=tuple(STATISTICS))
+
+
+def ks_probability(d: Distribution, sf: object) -> float:
+    """Kolmogorov-Smirnov at the edges of the filled bins, a hundred or more to a standard deviation."""
+    filled = np.flatnonzero(d.counts)
+    edges = np.arange(filled[0], filled[-1] + 2, 4)
+    ours = np.array([d.above(int(i)) / d.n for i in edges])
+    theirs = np.array([sf(float(x)) for x in np.asarray(d.edge(edges))])
+    return float(stats.kstwo.sf(np.abs(ours - theirs).max(), d.n))
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+def test_the_null_is_its_closed_form(found: Detection, statistic: str) -> None:
+    """At 1e6 realisations of a star where Gaussian limits hold; fails by chance once in 1e6 seeds."""
+    d = found.distribution(statistic)
+    exact = stats.norm() if statistic == "matched" else stats.chi2(found.dof(statistic))
+    assert ks_probability(d, exact.sf) > 1e-6
+    assert d.beyond == 0
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+@pytest.mark.parametrize("flare", range(len(AMPLITUDES)))
+def test_a_flare_follows_its_closed_form(found: Detection, statistic: str, flare: int) -> None:
+    """The whole distribution under a flare, binned on its own grid: the same test."""
+    assert ks_probability(found.distribution(statistic, flare), found.closed_form(statistic, flare).sf) > 1e-6
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+@pytest.mark.parametrize("fap", [1e-2, 1e-3])
+def test_detection_probabilities_agree_with_the_closed_form(found: Detection, statistic: str, fap: float) -> None:
+    """Within 4 standard errors, binomial and of the threshold: 32 values, one chance failure in 500 seeds at most."""
+    for flare, p in enumerate(found.detection_probability(fap, statistic)):
+        theory = found.closed_form(statistic, flare)
+        null = found.closed_form(statistic, template=flare)
+        cut = null.isf(fap)
+        exact = theory.sf(cut)
+        # How the probability moves when the simulated threshold errs by its own standard error.
+        shifted = theory.sf(null.isf(fap + np.sqrt(fap * (1 - fap) / N)))
+        error = np.hypot(np.sqrt(exact * (1 - exact) / N), shifted - exact)
+        # A bin is 1/512 of a standard deviation, and the threshold its upper edge.
+        grain = exact - theory.sf(cut + null.std / 512)
+        assert abs(p.value - exact) < 4 * error + grain + 3 / N
+        assert p.low <= p.value <= p.high
+
+
+def test_the_paper_flares_have_an_order(found: Detection) -> None:
+    """More flare is never harder to see, and the right template is never beaten (Neyman & Pearson)."""
+    probability = {s: [p.value for p in found.detection_probability(1e-3, s)] for s in STATISTICS}
+    for values in probability.values():
+        assert all(a <= b + 1e-3 for a, b in pairwise(values))
+    for statistic in ("chi2", "chi2_element", "chi2_pair"):
+        assert all(m >= p - 1e-3 for m, p in zip(probability["matched"], probability[statistic], strict=True))
+    # Fewer numbers, less noise in their sum: elements see the smallest flare better than pixels do.
+    assert probability["chi2_element"][0] > 2 * probability["chi2"][0]
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+def test_thresholds_invert(found: Detection, statistic: str) -> None:
+    for fap in (0.5, 0.1, 1e-2, 1e-3, 1e-4):
+        cut = found.threshold(fap, statistic)
+        assert cut.low <= cut.value <= cut.high
+        back = found.false_alarm_probability(cut.value, statistic)
+        # A bin holds at most 1/512 of a standard deviation's worth.
+        assert fap * 0.96 - 2 / N < back.value <= fap
+        exact = found.closed_form(statistic).isf(fap)
+        assert cut.low - 1e-9 <= exact <= cut.high or abs(cut.value - exact) < 4 * (cut.high - cut.low) / 3.92
+
+
+def test_roc(found: Detection) -> None:
+    fap, probability = found.roc("matched", 1)
+    assert (fap[0], probability[0]) == (1.0, 1.0)
+    assert np.all(np.diff(fap) <= 0)
+    assert np.all(np.diff(probability) <= 0)
+    assert np.all(probability >= fap - 1e-3)
+    at = int(np.searchsorted(-fap, -1e-3))
+    assert probability[at] == pytest.approx(found.detection_probability(1e-3, "matched")[1].value, rel=0.01)
+
+
+def test_rare_tails_are_refused_not_extrapolated(found: Detection) -> None:
+    with pytest.raises(InputError, match="ask for 10000000 realisations"):
+        found.threshold(1e-5)
+    found.threshold(1e-4)
+    for fap in (0.0, 1.0, -1.0, np.nan):
+        with pytest.raises(InputError, match="fap = "):
+            found.threshold(fap)
+
+
+def test_table(found: Detection) -> None:
+    table = found.table(fap=1e-3)
+    assert len(table) == len(AMPLITUDES) * len(STATISTICS)
+    chi2 = table[table["statistic"] == "chi2"]
+    assert list(chi2["dof"]) == [found.quiet.wavelength_nm.size] * len(AMPLITUDES)
+    np.testing.assert_allclose(chi2["reduced"], chi2["mean"] / chi2["dof"])
+    np.testing.assert_allclose(chi2["mean"], chi2["expected"], rtol=5e-4)
+    assert table.meta["realisations"] == N
+    assert all(table[name].info.description for name in ("probability", "threshold", "expected"))
+
+
+def test_unsimulated_statistics_are_refused(engine: Engine) -> None:
+    quiet, flare = star(amplitudes=(0.24,), payload=instrument(part=True))
+    found = engine.detect(quiet, [flare], realisations=1000, seed=1, statistics=("matched",))
+    with pytest.raises(InputError, match="'chi2' was not simulated"):
+        found.threshold(0.5, "chi2")
+    with pytest.raises(InputError, match="flare = 1"):
+        found.distribution("matched", 1)
+
+
+def test_saturated_pixels_are_left_out(engine: Engine) -> None:
+    """Pixels saturated without a flare have no news; the rest still gives a calibrated null."""
+    payload = instrument(part=True)
+    quiet, flare = star(magnitude=-0.2, amplitudes=(0.05,), exposure=10.0, payload=payload)
+    assert 0 < quiet.saturated.sum() < 10
+    found = engine.detect(quiet, [flare], realisations=100_000, seed=3)
+    dof = int((~quiet.saturated).sum())
+    assert found.dof("chi2") == dof
+    assert found.scene.frames
+    mean = found.distribution("chi2").mean
+    assert abs(mean - dof) < 5 * np.sqrt(2 * dof / 100_000)
+    bright, _ = star(magnitude=-3.0, amplitudes=(0.05,), payload=payload)
+    with pytest.raises(InputError, match="every pixel of G2V is saturated"):
+        engine.detect(bright, [bright], realisations=10, seed=1)
+
+
+def test_wider_wings_than_the_grid_are_counted(engine: Engine) -> None:
+    """On the null's grid a strong flare lies beyond its end, and is still above every threshold."""
+    quiet, flare = star(magnitude=3.0, amplitudes=(0.24,), payload=instrument(part=True))
+    found = engine.detect(quiet, [flare], realisations=2000, seed=1)
+    assert [p.value for p in found.detection_probability(0.05, "chi2")] == [1.0]
+    own = found.distribution("chi2", 0)
+    assert own.mean == pytest.approx(found.closed_form("chi2", 0).mean, rel=0.02)
+    assert own.beyond == 0

@@ -1,0 +1,332 @@
+"""The engine against its NumPy twin, its own splits, and the closed-form moments."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from scenes import instrument, star
+from scipy import stats
+
+from mauvecl import layout, reference
+from mauvecl.detection import plan_channels
+from mauvecl.engine import DeviceError, Engine, devices
+from mauvecl.host.errors import InputError
+from mauvecl.scene import prepare
+from mauvecl.snr import OBSERVER_BINS, OBSERVER_FINE_BITS, observers, plan_snr
+from mauvecl.statistics import STATISTICS
+from mauvecl.tally import Grid
+
+#: What the noise model can be asked for: paper and physical dark, one frame and stacks, a rail, a cold detector whose
+#: dark counts come from alias tables.
+CASES = {
+    "stack": {},
+    "one frame": {"exposure": 5.0},
+    "electrons": {"name": "mauve-electrons"},
+    "cold": {"temperature_c": -30.0, "exposure": 5.0},
+    "cold electrons": {"name": "mauve-electrons", "temperature_c": -20.0, "exposure": 10.0},
+    "frames": {"exposure": 15.0, "mode": "frames"},
+    "at the rail": {"exposure": 10.0, "magnitude": -0.7},
+}
+
+
+def case(name: str) -> tuple[list, str]:
+    options = dict(CASES[name])
+    mode = options.pop("mode", "auto")
+    exposure, magnitude = options.pop("exposure", 50.0), options.pop("magnitude", 7.4)
+    payload = instrument(options.pop("name", "mauve"), part=True, **options)
+    return star(magnitude=magnitude, amplitudes=(0.081, 0.24), exposure=exposure, payload=payload), mode
+
+
+#: Around the boundary of the counter's first word.
+START = 2**32 - 24
+INDEX = np.arange(START, START + 40, dtype=np.uint64)
+SEED = 2**63 + 12345
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_raw_spectra_are_the_twins(engine: Engine, name: str) -> None:
+    (quiet, *_), mode = case(name)
+    raw = engine.realise(quiet, start=START, count=INDEX.size, seed=SEED, mode=mode)
+    np.testing.assert_array_equal(raw, reference.realise(prepare([quiet], mode), INDEX, SEED))
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_statistic_is_the_twins(engine: Engine, name: str) -> None:
+    (quiet, *flares), mode = case(name)
+    found = engine.detect(
+        quiet, flares, realisations=INDEX.size, start=START, seed=SEED, statistics=tuple(STATISTICS), mode=mode
+    )
+    plan = plan_channels(found, range(len(flares)), first=True)
+    values = reference.statistics(found.scene, INDEX, SEED, plan.weights, plan.linear_end)
+    histogram, sums = reference.tally(values, Grid.pack(plan.grids), layout.BINS, layout.FINE_BITS)
+    for i, (statistic, role, flare) in enumerate(plan.keys):
+        if role == "flare_on_null_grid":
+            continue
+        ours = found.distribution(statistic, None if role == "null" else flare, template=flare)
+        np.testing.assert_array_equal(ours.counts, histogram[i])
+        assert (ours.first, ours.second) == tuple(sums[i])
+
+
+@pytest.mark.parametrize("name", ["stack", "at the rail", "cold electrons"])
+def test_signal_to_noise_is_the_twins(engine: Engine, name: str) -> None:
+    (quiet, *_), mode = case(name)
+    scene = prepare([quiet], mode)
+    found = engine.snr(quiet, realisations=INDEX.size, start=START, seed=SEED, mode=mode)
+    pixels, elements = reference.signal_to_noise(scene, observers(quiet, scene), INDEX, SEED)
+    grids = plan_snr(quiet, scene)
+    values = np.concatenate([pixels, elements])
+    histogram, sums = reference.tally(values, Grid.pack(grids), OBSERVER_BINS, OBSERVER_FINE_BITS)
+    np.testing.assert_array_equal(found.tally.counts, histogram)
+    np.testing.assert_array_equal(found.tally.sums.astype(np.int64), sums)
+
+
+def test_modes_meet_the_rails(engine: Engine) -> None:
+    """A star that saturates is drawn frame by frame, clipped at the ADC's end, unasked."""
+    (bright, *_), _ = case("at the rail")
+    assert prepare([bright]).frames
+    raw = engine.realise(bright, count=200, seed=1)
+    assert raw.max() == 2 * 65535
+    with pytest.raises(InputError, match="stacked"):
+        prepare([bright], "stacked")
+    (faint, *_), _ = case("stack")
+    assert not prepare([faint]).frames
+
+
+@pytest.mark.parametrize("payload", ["mauve", "mauve-electrons"])
+def test_moments_of_raw_spectra(engine: Engine, payload: str) -> None:
+    """Mean and variance of each pixel follow the model: |z| < 6 in 1643 pixels fails once in 3e5 seeds."""
+    (quiet,) = star(payload=instrument(payload))
+    n = 20_000
+    raw = engine.realise(quiet, count=n, seed=4).astype(float)
+    mean, variance = quiet.n_frames * quiet.mean_raw_dn, quiet.variance_dn2
+    z = (raw.mean(axis=0) - mean) / np.sqrt(variance / n)
+    assert np.abs(z).max() < 6
+    assert abs(z.sum()) < 5 * np.sqrt(z.size)
+    ratio = raw.var(axis=0) / variance
+    assert np.abs(ratio - 1).max() < 6 * np.sqrt(2 / n)
+    assert abs(ratio.mean() - 1) < 5 * np.sqrt(2 / n / z.size)
+
+
+def test_frames_and_stacks_agree(engine: Engine) -> None:
+    """Two ways to draw the same exposure, far from the rails: means and variances, 5 standard errors."""
+    (quiet, *_), _ = case("frames")
+    n = 20_000
+    frames, stacked = (engine.realise(quiet, count=n, seed=s, mode=m) for s, m in ((1, "frames"), (2, "stacked")))
+    difference = frames.mean(axis=0) - stacked.mean(axis=0)
+    assert np.abs(difference / np.sqrt(2 * quiet.variance_dn2 / n)).max() < 5.5
+    total = frames.var(axis=0).sum() / stacked.var(axis=0).sum()
+    assert abs(total - 1) < 5 * np.sqrt(4 / n / quiet.wavelength_nm.size)
+
+
+def test_pixels_and_realisations_are_uncorrelated(engine: Engine) -> None:
+    """Neighbours in pixel, realisation and seed: |z| < 5 for sums of 3e7 products."""
+    (quiet,) = star()
+    raw = engine.realise(quiet, count=20_000, seed=9)
+    z = (raw - quiet.n_frames * quiet.mean_raw_dn) / np.sqrt(quiet.variance_dn2)
+    other = engine.realise(quiet, count=20_000, seed=10)
+    y = (other - quiet.n_frames * quiet.mean_raw_dn) / np.sqrt(quiet.variance_dn2)
+    for a, b in ((z[:, 1:], z[:, :-1]), (z[:, 2:], z[:, :-2]), (z[1:], z[:-1]), (z[16:], z[:-16]), (z, y)):
+        products = a * b
+        assert abs(products.sum()) < 5 * np.sqrt(products.size)
+
+
+def test_any_realisation_by_its_index_alone(engine: Engine) -> None:
+    (quiet, *_), _ = case("stack")
+    far = 734_221_008
+    run = engine.realise(quiet, start=far - 100, count=300, seed=5)
+    for offset in (0, 99, 100, 299):
+        alone = engine.realise(quiet, start=far - 100 + offset, count=1, seed=5)
+        np.testing.assert_array_equal(alone[0], run[offset])
+    huge = engine.realise(quiet, start=2**62 + 3, count=2, seed=5)
+    twin = reference.realise(prepare([quiet]), np.array([2**62 + 3, 2**62 + 4], np.uint64), 5)
+    np.testing.assert_array_equal(huge, twin)
+
+
+@pytest.mark.parametrize("tile", [16, 64, 4096])
+def test_tiles_change_no_bit(engine: Engine, tile: int) -> None:
+    (quiet, *flares), _ = case("stack")
+    whole = engine.detect(quiet, flares, realisations=3001, start=77, seed=6, statistics=tuple(STATISTICS))
+    parts = Engine(tile=tile).detect(quiet, flares, realisations=3001, start=77, seed=6, statistics=tuple(STATISTICS))
+    for key, distribution in whole._found.items():
+        np.testing.assert_array_equal(distribution.counts, parts._found[key].counts)
+        assert (distribution.mean, distribution.std) == (parts._found[key].mean, parts._found[key].std)
+
+
+THREADS = """
+import hashlib, sys
+sys.path.insert(0, {tests!r})
+from scenes import star
+from mauvecl.engine import Engine
+quiet, *flares = star(amplitudes=(0.081, 0.24))
+found = Engine().detect(quiet, flares, realisations=20_000, seed=3)
+table = found.table(fap=1e-2)
+print(hashlib.sha256(repr([tuple(row) for row in table]).encode()).hexdigest())
+"""
+
+
+def test_threads_change_no_bit() -> None:
+    """The same table from one thread and from two, to the last digit."""
+    code = THREADS.format(tests=os.path.dirname(__file__))
+    digests = {
+        subprocess.run(
+            [sys.executable, "-c", code],
+            env=os.environ | {"POCL_MAX_PTHREAD_COUNT": threads},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for threads in ("1", "2")
+    }
+    assert len(digests) == 1
+
+
+def test_many_flares_are_done_in_batches(engine: Engine) -> None:
+    """More scenarios than one launch holds give each flare what it gets alone."""
+    amplitudes = tuple(np.linspace(0.01, 0.3, 18))
+    payload = instrument(part=True)
+    quiet, *flares = star(amplitudes=amplitudes, payload=payload)
+    together = engine.detect(quiet, flares, realisations=2000, seed=8)
+    for k in (0, 14, 15, 17):
+        alone = engine.detect(quiet, [flares[k]], realisations=2000, seed=8)
+        for statistic in ("chi2", "chi2_element", "matched"):
+            for flare in (None, 0):
+                wanted = alone.distribution(statistic, flare)
+                ours = together.distribution(statistic, None if flare is None else k, template=k)
+                np.testing.assert_array_equal(ours.counts, wanted.counts)
+
+
+def test_snr_follows_the_closed_form(engine: Engine) -> None:
+    """Mean S/N against the closed form: the clipped root's bias is below 2 % of the spread for a star this bright."""
+    (quiet,) = star(magnitude=5.0)
+    found = engine.snr(quiet, realisations=20_000, seed=2)
+    for table in (found.pixel, found.element):
+        bright = table["expected"] > 5
+        z = (table["mean"] - table["expected"])[bright] / table["std"][bright]
+        assert np.abs(z).max() < 0.02 + 5 / np.sqrt(20_000)
+        for column, p in (("q16", 0.16), ("q50", 0.5), ("q97.5", 0.975)):
+            normal = table["mean"] + table["std"] * stats.norm.ppf(p)
+            assert np.abs((table[column] - normal)[bright] / table["std"][bright]).max() < 0.08
+
+
+def test_progress_is_reported_and_may_stop(engine: Engine) -> None:
+    (quiet, *flares), _ = case("stack")
+    seen: list[tuple[int, int]] = []
+    Engine(tile=1024, progress=lambda done, total: seen.append((done, total))).detect(
+        quiet, flares, realisations=5000, seed=1
+    )
+    assert seen[-1] == (5000, 5000)
+    assert len(seen) == 5
+
+    def stop(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    stopping = Engine(tile=1024, progress=stop)
+    with pytest.raises(KeyboardInterrupt):
+        stopping.realise(quiet, count=5000, seed=1)
+    # The engine works on.
+    stopping._progress = None
+    assert stopping.realise(quiet, count=3, seed=1).shape[0] == 3
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"count": 0, "seed": 1}, "realisations = 0"),
+        ({"count": 1, "seed": -1}, "seed = -1"),
+        ({"count": 1, "seed": 2**64}, "seed = 18446744073709551616"),
+        ({"count": 1, "seed": 1, "start": -1}, "start = -1"),
+        ({"count": 1, "seed": 1, "mode": "fast"}, "mode = 'fast'"),
+    ],
+)
+def test_impossible_requests_are_refused(engine: Engine, options: dict, sentence: str) -> None:
+    (quiet, *_), _ = case("stack")
+    with pytest.raises(InputError, match=sentence):
+        engine.realise(quiet, **options)
+
+
+def test_statistics_and_scenarios_are_checked(engine: Engine) -> None:
+    (quiet, *flares), _ = case("stack")
+    with pytest.raises(InputError, match="'chi3' is unknown"):
+        engine.detect(quiet, flares, realisations=10, seed=1, statistics=("chi3",))
+    with pytest.raises(InputError, match="no flare"):
+        engine.detect(quiet, [], realisations=10, seed=1)
+    (other, *_), _ = case("one frame")
+    with pytest.raises(InputError, match="n_frames of"):
+        engine.detect(quiet, [other], realisations=10, seed=1)
+
+
+def test_devices_and_absent_ones() -> None:
+    present = devices()
+    assert present[0].default
+    assert "Portable" in present[0].platform
+    with pytest.raises(DeviceError, match="not here, expected one of: 0 = "):
+        Engine(device="no such device")
+    assert Engine(device="portable").device == present[0]
+    assert Engine(device="0").device == present[0]
+
+
+def test_a_missing_linker_is_named(tmp_path) -> None:
+    """PoCL would abort Python; here one sentence says what to install."""
+    code = "from mauvecl.engine import Engine, DeviceError\ntry: Engine()\nexcept DeviceError as e: print(e)"
+    run = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "no linker `ld`" in run.stdout
+    assert "binutils" in run.stdout
+
+
+def test_no_device_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    from mauvecl import program
+
+    opencl = program.load_opencl()
+
+    def nothing() -> list:
+        raise opencl.LogicError("clGetPlatformIDs failed: PLATFORM_NOT_FOUND_KHR")
+
+    for empty in (nothing, list):
+        monkeypatch.setattr(opencl, "get_platforms", empty)
+        with pytest.raises(DeviceError, match="no OpenCL device found"):
+            Engine()
+
+
+def test_an_unwritable_cache_is_no_obstacle(tmp_path) -> None:
+    """A cache folder that cannot be made is replaced by a temporary one."""
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")
+    code = "from mauvecl.engine import Engine; print(Engine().device_name)"
+    environment = os.environ | {"MAUVECL_CACHE_DIR": str(blocked)}
+    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert "Portable" in run.stdout
+
+
+def test_an_engine_from_before_a_fork_is_refused(engine: Engine) -> None:
+    """PoCL would wait for ever for threads that did not survive."""
+    (quiet, *_), _ = case("stack")
+    queue = multiprocessing.get_context("fork").Queue()
+
+    def child() -> None:
+        try:
+            engine.realise(quiet, count=1, seed=1)
+        except DeviceError as error:
+            queue.put(str(error))
+
+    process = multiprocessing.get_context("fork").Process(target=child)
+    process.start()
+    assert "fork" in queue.get(timeout=20)
+    process.join(timeout=20)
+
+
+def test_a_failing_build_shows_the_numbered_source(engine: Engine) -> None:
+    from mauvecl.program import BuildError, build
+
+    with pytest.raises(BuildError, match=r"   2  nonsense here"):
+        build(engine._context, "// a comment\nnonsense here\n")
