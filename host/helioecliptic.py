@@ -110,11 +110,11 @@ def _time(time: Time | str) -> Time:
     elif isinstance(time, Time):
         moment = time
     else:
-        raise InputError(f"time = {time!r}, {expected}")
+        raise InputError(f"time = {_line(time)}, {expected}")
     if not moment.isscalar:
         raise InputError(f"time holds {moment.size} times, expected one")
     if np.ma.is_masked(moment.jd) or not np.isfinite(moment.jd):
-        raise InputError(f"time = {time!r} is not finite, {expected}")
+        raise InputError(f"time = {_line(time)} is not finite, {expected}")
     year = float(moment.decimalyear)
     if not YEARS[0] <= year < YEARS[1]:
         raise InputError(f"time = {moment.utc.isot}, expected between {YEARS[0]} and {YEARS[1]}")
@@ -136,12 +136,12 @@ def _position(target: SkyCoord | str) -> SkyCoord:
     elif isinstance(target, SkyCoord | BaseCoordinateFrame):
         position = SkyCoord(target)
     else:
-        raise InputError(f"target = {target!r}, {expected}")
+        raise InputError(f"target = {_line(target)}, {expected}")
     if not position.isscalar:
         raise InputError(f"target holds {position.size} positions, expected one")
     angles = position.spherical
     if not np.isfinite([angles.lon.deg, angles.lat.deg]).all():
-        raise InputError(f"target = {target!r} is not finite, {expected}")
+        raise InputError(f"target = {_line(target)} is not finite, {expected}")
     return position
 
 
@@ -151,3 +151,8 @@ def _in_degrees(target: str) -> bool:
     if found and not 0 <= float(found[1]) <= 360:
         raise InputError(f"target = {target!r} has a right ascension of {found[1]}, expected 0 to 360 degrees")
     return found is not None
+
+
+def _line(value: object) -> str:
+    """An object as one line of a message."""
+    return " ".join(repr(value).split())

@@ -69,7 +69,9 @@ def _read(path: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], dict[str,
         values, sources = _read(_find(content.pop("extends"), path.parent), (*seen, path.resolve()))
     for name, entry in content.items():
         if name == "sources":
-            raise InputError(f"{path.name}: unknown key 'sources', expected each value's source in the value's own table")
+            raise InputError(
+                f"{path.name}: unknown key 'sources', expected each value's source in the value's own table"
+            )
         value, source = _entry(name, entry, path)
         values[name] = value
         if name not in LABELS:

@@ -259,7 +259,8 @@ def _gather(
 
 
 def _read_only(matrix: csr_array) -> csr_array:
-    # What a cache hands out twice must not change in between.
+    # What a cache hands out twice must not change in between, nor be tidied by scipy in place.
+    matrix.sum_duplicates()
     matrix.data.setflags(write=False)
     return matrix
 

@@ -299,8 +299,8 @@ def plan_channels(result: Detection, batch: Sequence[int], *, first: bool) -> Ch
         # The quiescent draws meet every template, each flare only its own.
         ends[:] = len(batch) + np.arange(n_scenario)
         for i, flare in enumerate(batch):
-            row = matched_weights(result.quiet, result.flares[flare], result.scene.used)
-            weights[[i, len(batch) + i], : result.scene.n_pixel] = row
+            shape = matched_weights(result.quiet, result.flares[flare], result.scene.used)
+            weights[[i, len(batch) + i], : result.scene.n_pixel] = shape
     grids: list[Grid] = []
     keys: list[Key] = []
 

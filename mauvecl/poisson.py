@@ -43,7 +43,7 @@ class AliasTable:
         alias = self.entries.astype(np.int64) >> shift
         words = threshold.copy()
         np.add.at(words, alias, (1 << shift) - threshold)
-        return words
+        return np.asarray(words)
 
 
 def alias_table(mean: float) -> AliasTable:
@@ -80,7 +80,7 @@ def alias_table(mean: float) -> AliasTable:
 def _whole_words(probability: NDArray[np.float64]) -> NDArray[np.int64]:
     """Probabilities as whole numbers of words that sum to 2**32, by largest remainder."""
     exact = probability / probability.sum() * 2.0**WORD_BITS
-    words = np.floor(exact).astype(np.int64)
+    words: NDArray[np.int64] = np.floor(exact).astype(np.int64)
     missing = int(2**WORD_BITS - words.sum())
     largest = np.argsort(words - exact, kind="stable")[:missing]
     words[largest] += 1

@@ -225,7 +225,8 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
     if device.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT:
         options.append("-cl-fp32-correctly-rounded-divide-sqrt")
     try:
-        return cl.Program(context, source).build(options, cache_dir=False)
+        program: pyopencl.Program = cl.Program(context, source).build(options, cache_dir=False)
     except cl.Error as error:
         numbered = "\n".join(f"{i:4d}  {line}" for i, line in enumerate(source.splitlines(), 1))
         raise BuildError(f"a kernel did not compile on {device.name}\n{numbered}\n{error}") from error
+    return program

@@ -136,9 +136,9 @@ def draws(
     z = [*normal_pair(g[0], g[1]), *normal_pair(g[2], g[3])]
     four = scene.pixels[4 * group : 4 * group + 4]
     if scene.expansion:
-        g = [*normal_pair(w[0], w[1]), *normal_pair(w[2], w[3])]
+        y = [*normal_pair(w[0], w[1]), *normal_pair(w[2], w[3])]
         coefficients = zip(four["dark_offset"], four["dark_slope"], four["dark_cubic"], strict=True)
-        return z, [expansion_draw(g[i], *c) for i, c in enumerate(coefficients)]
+        return z, [expansion_draw(y[i], *c) for i, c in enumerate(coefficients)]
     d = []
     for i, pixel in enumerate(four):
         table = scene.tables[int(pixel["table_start"]) :]

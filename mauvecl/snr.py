@@ -37,35 +37,24 @@ def observers(x: Expectation, scene: Scene) -> NDArray[np.void]:
     real = table[: scene.n_pixel]
     real["net_offset"] = scene.n_draws * scene.base_dn[0] - x.n_frames * (x.bias_dn + x.dark_dn)
     real["gain"] = x.gain_dn_per_electron
-    real["variance"] = x.n_frames * (x.read_noise_dn**2 + dark_variance_dn2(x))
+    real["variance"] = x.n_frames * (x.read_noise_dn**2 + x.dark_variance_dn2)
     real["used"] = 1.0
     return table
 
 
-def dark_variance_dn2(x: Expectation) -> NDArray[np.float64]:
-    """Variance of one frame's dark in DN^2, shape (n_pixel,): Poisson in DN, or in electrons times the gain."""
-    scale: NDArray[np.float64] = x.gain_dn_per_electron if x.dark_unit == "electrons" else np.ones_like(x.dark_dn)
-    return x.dark_dn * scale
-
-
 def plan_snr(x: Expectation, scene: Scene) -> list[Grid]:
     """One grid per pixel and per resolution element, around the closed form with its linearised spread."""
-    background = x.n_frames * (x.read_noise_dn**2 + dark_variance_dn2(x))
+    background = x.n_frames * (x.read_noise_dn**2 + x.dark_variance_dn2)
     photon = x.gain_dn_per_electron * x.signal_dn
-    n_element = x.element_wavelength_nm.size
-
-    def per_element(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.bincount(x.element, values, minlength=n_element)
-
     grids = []
     for offset, signal, shot, dark, total in (
         (0, x.signal_dn, photon, background, x.variance_dn2),
         (
             len(scene.pixels),
-            per_element(x.signal_dn),
-            per_element(photon),
-            per_element(background),
-            per_element(x.variance_dn2),
+            x.per_element(x.signal_dn),
+            x.per_element(photon),
+            x.per_element(background),
+            x.per_element(x.variance_dn2),
         ),
     ):
         noise = np.sqrt(shot + dark)

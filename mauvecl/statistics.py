@@ -171,7 +171,7 @@ def closed_form(
         return Normal(float(weights @ delta), float(np.sqrt(weights**2 @ observed.variance_dn2)))
     model, true = quiet.variance_dn2 * used, observed.variance_dn2 * used
     if statistic == "chi2_element":
-        delta, model, true = (np.bincount(quiet.element, values) for values in (delta, model, true))
+        delta, model, true = (quiet.per_element(values) for values in (delta, model, true))
     if statistic == "chi2_pair":
         model, true = 2.0 * model, true + model
     counts = model > 0

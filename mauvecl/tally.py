@@ -143,7 +143,7 @@ class Distribution:
         filled = np.flatnonzero(self.counts)
         span = np.arange(filled[0], filled[-1] + 2)
         edges = np.asarray(self.edge(span))
-        return np.interp(probability, cumulative[span], edges)
+        return np.asarray(np.interp(probability, cumulative[span], edges))
 
     def histogram(self, bins: int = 200) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Edges and counts over the filled range, in at most `bins` equal bins, for pictures.

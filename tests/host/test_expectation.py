@@ -1,0 +1,235 @@
+"""The whole deterministic chain, and the closed forms of its noise."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import FrozenInstanceError, replace
+from typing import Any
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from mauvecl.host.errors import InputError
+from mauvecl.host.expectation import Expectation, expect
+from mauvecl.host.instrument import Instrument
+from mauvecl.host.sky import Sky
+from mauvecl.host.source import Source
+
+
+@pytest.fixture(scope="module")
+def mauve() -> Instrument:
+    return Instrument.load("mauve")
+
+
+@pytest.fixture(scope="module")
+def sunlike() -> Source:
+    return Source.from_library("G2V").at_magnitude(7.4)
+
+
+@pytest.fixture(scope="module")
+def quiet(sunlike: Source, mauve: Instrument) -> Expectation:
+    return expect(sunlike, mauve, exposure=50 * u.s, sky=Sky.of_brightness(22.1))
+
+
+# DN/s/pixel, computed independently; Pickles spectra as the library's, so that 10 % is for the grids alone.
+@pytest.mark.parametrize(
+    ("name", "magnitude", "rates"),
+    [
+        ("G2V", 7.4, {250: 0.4, 300: 5.1, 400: 16.8, 500: 23.7, 600: 20.1, 699.7: 13.8}),
+        ("B2IV", 3.03, {200.2: 2989, 250: 5373, 300: 6064, 400: 3657, 500: 1741, 600: 851, 699.7: 406}),
+    ],
+)
+def test_published_rates(mauve: Instrument, name: str, magnitude: float, rates: dict[float, float]) -> None:
+    x = expect(Source.from_library(name).at_magnitude(magnitude), mauve, exposure=5)
+    for nm, rate in rates.items():
+        assert np.interp(nm, x.wavelength_nm, x.net_source_dn / x.exposure_s) == pytest.approx(rate, rel=0.1)
+
+
+def test_zodiacal_light_is_a_fifth_of_a_count(quiet: Expectation) -> None:
+    rate = quiet.sky_electrons * quiet.gain_dn_per_electron / quiet.frame_s
+    assert rate.max() == pytest.approx(0.2, abs=0.05)
+
+
+def test_signal_is_linear_in_the_light(sunlike: Source, mauve: Instrument) -> None:
+    bright = expect(sunlike.at_magnitude(4.9), mauve, exposure=50)
+    faint = expect(sunlike, mauve, exposure=50)
+    np.testing.assert_allclose(bright.source_electrons, 10 * faint.source_electrons, rtol=1e-9)
+    assert not faint.sky_electrons.any()
+
+
+def test_closed_form_signal_to_noise(quiet: Expectation) -> None:
+    # The paper's equation for one pixel, by hand: 10 frames, noise added in quadrature.
+    p = 900
+    electrons = 10 * (quiet.source_electrons[p] + quiet.sky_electrons[p])
+    signal = 0.5957818 * electrons
+    noise = np.sqrt((0.5957818 * np.sqrt(electrons)) ** 2 + 10 * 12.0**2 + 10 * 445.5337 * 5)
+    assert quiet.signal_dn[p] == pytest.approx(signal, rel=1e-6)
+    assert quiet.snr()[p] == pytest.approx(signal / noise, rel=1e-6)
+    assert quiet.variance_dn2[p] == pytest.approx(noise**2 + 10 / 12, rel=1e-6)
+    assert quiet.mean_raw_dn[p] == pytest.approx(signal / 10 + 445.5337 * 5 + 600, rel=1e-6)
+
+
+def test_per_element(quiet: Expectation) -> None:
+    snr, noise = quiet.snr_per_element(), quiet.noise_budget()["total"].value
+    assert snr.size == quiet.element_wavelength_nm.size == quiet.element[-1] + 1 == 48
+    for k, low in enumerate(200 + 10.5 * np.arange(48)):
+        inside = (quiet.wavelength_nm >= low) & (quiet.wavelength_nm < low + 10.5)
+        assert (quiet.element[inside] == k).all()
+        assert quiet.element_wavelength_nm[k] == pytest.approx(low + 5.25)
+        assert snr[k] == pytest.approx(quiet.signal_dn[inside].sum() / np.sqrt((noise[inside] ** 2).sum()))
+    assert set(np.diff(quiet.element).tolist()) == {0, 1}
+
+
+def test_noise_budget(quiet: Expectation) -> None:
+    budget = quiet.noise_budget()
+    assert budget.colnames == ["wavelength", "source_photon", "zodiacal_photon", "dark", "read", "total"]
+    assert budget["wavelength"].unit == u.nm
+    assert budget["read"].unit == u.DN
+    parts = sum(budget[name] ** 2 for name in budget.colnames[1:5])
+    np.testing.assert_allclose((budget["total"] ** 2).value, parts.value, rtol=1e-12)
+    np.testing.assert_allclose(quiet.signal_dn / budget["total"].value, quiet.snr(), rtol=1e-12)
+    assert budget["read"][0].value == pytest.approx(12 * np.sqrt(10))
+    assert budget["dark"][0].value == pytest.approx(np.sqrt(445.5337 * 50), rel=1e-6)
+    photon = 0.5957818 * np.sqrt(10 * quiet.source_electrons[800])
+    assert budget["source_photon"][800].value == pytest.approx(photon, rel=1e-6)
+
+
+def test_dark_in_electrons_is_quieter(sunlike: Source, quiet: Expectation) -> None:
+    electrons = expect(sunlike, Instrument.load("mauve-electrons"), exposure=50)
+    np.testing.assert_array_equal(electrons.dark_dn, quiet.dark_dn)
+    ratio = quiet.noise_budget()["dark"] / electrons.noise_budget()["dark"]
+    # 1 / sqrt(gain); the conversion efficiencies that are quoted give 1.16 to 1.30.
+    np.testing.assert_allclose(ratio, 1.2956, rtol=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("exposure", "frames", "told"),
+    [
+        (50, 10, False),
+        (47.0, 10, True),
+        (0.001, 1, True),
+        (5, 1, False),
+        (5.001, 2, True),
+        (2 * u.min, 24, False),
+        (1 * u.day, 17280, False),
+        (np.float32(10), 2, False),
+    ],
+)
+def test_exposures_are_whole_frames(sunlike: Source, mauve: Instrument, exposure: Any, frames: int, told: bool) -> None:
+    x = expect(sunlike, mauve, exposure=exposure)
+    assert x.n_frames == frames
+    assert x.exposure_s == 5 * frames
+    assert any("rounded up" in message for message in x.messages) is told
+
+
+def test_a_sum_of_floats_is_not_rounded_up(sunlike: Source, mauve: Instrument) -> None:
+    x = expect(sunlike, mauve.with_(frame_s=0.1), exposure=0.1 + 0.2)
+    assert x.n_frames == 3
+    assert not any("rounded up" in message for message in x.messages)
+
+
+@pytest.mark.parametrize(
+    "exposure", [0, -5, np.nan, np.inf, 86_401, 2 * u.day, 3 * u.m, "50", True, None, [50, 60], [5, 6] * u.s]
+)
+def test_impossible_exposures(sunlike: Source, mauve: Instrument, exposure: Any) -> None:
+    with pytest.raises(InputError, match=r"exposure = .*, expected a time above 0 and up to one day"):
+        expect(sunlike, mauve, exposure=exposure)
+
+
+@pytest.mark.parametrize(
+    # The ADC's end is the published 12.5 kDN/s; the detector's typical 2.0 V comes before it.
+    ("saturation_v", "rate_dn_per_s"),
+    [(2.2, 12_541), (2.0, 11_350)],
+)
+def test_the_rate_that_saturates_a_frame(
+    sunlike: Source, mauve: Instrument, saturation_v: float, rate_dn_per_s: float
+) -> None:
+    x = expect(sunlike, mauve.with_(saturation_v=saturation_v), exposure=5)
+    electrons = np.full(1643, rate_dn_per_s * 5 / mauve.gain_dn_per_electron)
+    assert not replace(x, source_electrons=electrons * 0.999).saturated.any()
+    assert replace(x, source_electrons=electrons * 1.001).saturated.all()
+
+
+def test_saturation_is_told_first(mauve: Instrument) -> None:
+    star = Source.from_library("B2IV").at_magnitude(1.5)
+    x = expect(star, mauve, exposure=7)
+    assert x.messages[0].startswith("SATURATED: ")
+    assert "rounded up to 10 s" in x.messages[1]
+    assert "not a flight calibration" in x.messages[-1]
+    hit = x.wavelength_nm[x.saturated]
+    assert f"{hit[0]:.1f}-" in x.messages[0]
+    assert f"-{hit[-1]:.1f} nm" in x.messages[0]
+    assert f"{x.saturated.sum()} of 1643 pixels" in x.messages[0]
+    # A frame of the length told is safe, and one a little longer is not.
+    safe = float(x.messages[0].split("longest safe frame is ")[1].split(" s")[0])
+    assert safe == pytest.approx(x.longest_safe_frame_s, abs=1e-3)
+    assert not expect(star, mauve.with_(frame_s=safe), exposure=1).saturated.any()
+    assert expect(star, mauve.with_(frame_s=safe + 0.002), exposure=1).saturated.any()
+
+
+def test_a_faint_star_saturates_nothing(quiet: Expectation) -> None:
+    assert not quiet.saturated.any()
+    assert not any("SATURATED" in message for message in quiet.messages)
+    assert quiet.longest_safe_frame_s > 60
+
+
+def test_where_it_all_came_from(quiet: Expectation, sunlike: Source, mauve: Instrument) -> None:
+    assert quiet.name == sunlike.name
+    assert quiet.instrument == "mauve"
+    assert quiet.provenance["source digest"] == sunlike.digest
+    assert quiet.provenance["instrument digest"] == mauve.digest
+    assert quiet.provenance["order"] == "paper"
+    assert "22.10" in quiet.provenance["sky"]
+    assert quiet.provenance["requested exposure"] == "50 s"
+    assert all(isinstance(value, str) for value in quiet.provenance.values())
+
+
+def test_frozen(quiet: Expectation) -> None:
+    with pytest.raises(FrozenInstanceError):
+        quiet.n_frames = 3  # type: ignore[misc]
+    with pytest.raises(ValueError, match="read-only"):
+        quiet.dark_dn[0] = 0.0
+    with pytest.raises(TypeError):
+        quiet.provenance["order"] = "x"  # type: ignore[index]
+
+
+def test_bad_means_are_named(quiet: Expectation) -> None:
+    bad = quiet.source_electrons.copy()
+    bad[17] = -0.2
+    with pytest.raises(ValueError, match=r"source_electrons\[17\] = -0\.2, expected >= 0"):
+        replace(quiet, source_electrons=bad)
+
+
+def test_a_spectrum_that_stops_short(sunlike: Source, mauve: Instrument) -> None:
+    wide = mauve.with_(
+        output_max_nm=2000.0,
+        pixels=8000,
+        **{name: 0.5 for name in ("grating_efficiency", "fibre_efficiency", "telescope_mirror_reflectivity")},
+        spectrometer_mirror_reflectivity=0.9,
+        quantum_efficiency_a_per_w=0.1,
+    )
+    short = replace(
+        sunlike,
+        wavelength_nm=sunlike.wavelength_nm[sunlike.wavelength_nm < 800],
+        flux_flam=sunlike.flux_flam[sunlike.wavelength_nm < 800],
+    )
+    with pytest.raises(InputError, match="expected at least the output range 200-2000 nm of mauve"):
+        expect(short, wide, exposure=5)
+
+
+def test_order_changes_little_but_in_the_ultraviolet(sunlike: Source, mauve: Instrument, quiet: Expectation) -> None:
+    physical = expect(sunlike, mauve, exposure=50, order="physical")
+    ratio = physical.net_source_dn / quiet.net_source_dn
+    assert np.abs(ratio[quiet.wavelength_nm > 250] - 1).max() < 0.04
+    # At 200 nm most light has come from longer wavelengths, where the efficiency is higher.
+    assert ratio[0] > 1.3
+    assert physical.provenance["order"] == "physical"
+
+
+def test_import_is_light() -> None:
+    heavy = "{'synphot', 'matplotlib', 'pyopencl', 'specutils', 'astropy.table', 'astropy.coordinates'}"
+    code = f"import sys, mauvecl.host.expectation, mauvecl.host.source; print(sorted({heavy} & set(sys.modules)))"
+    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"

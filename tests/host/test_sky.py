@@ -1,0 +1,189 @@
+"""Zodiacal light: the table's cells, the helio-ecliptic position against an independent one, and what is refused."""
+
+from __future__ import annotations
+
+import socket
+from datetime import datetime
+from typing import Any
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.coordinates import SkyCoord, solar_system_ephemeris
+from astropy.time import Time
+from astropy.utils import iers
+
+from mauvecl.host.errors import InputError
+from mauvecl.host.helioecliptic import HelioEcliptic, helioecliptic
+from mauvecl.host.sky import Lookup, Sky, zodiacal_brightness, zodiacal_table
+
+# The paper's table, longitude 180 to 0 downwards, latitude 0 to 90 across.
+PAPER = """
+22.1 22.4 22.7 23.0 23.2 23.4 23.3
+22.3 22.5 22.8 23.0 23.2 23.4 23.3
+22.4 22.6 22.9 23.1 23.3 23.4 23.3
+22.4 22.6 22.9 23.2 23.3 23.4 23.3
+22.4 22.6 22.9 23.2 23.3 23.3 23.3
+22.2 22.5 22.9 23.1 23.3 23.3 23.3
+22.0 22.3 22.7 23.0 23.2 23.3 23.3
+21.7 22.2 22.6 22.9 23.1 23.2 23.3
+21.3 21.9 22.4 22.7 23.0 23.2 23.3
+SA SA 22.1 22.5 22.9 23.1 23.3
+SA SA SA 22.3 22.7 23.1 23.3
+SA SA SA SA 22.6 23.0 23.3
+SA SA SA SA 22.6 23.0 23.3
+"""
+CELLS = {
+    (180 - 15 * row, 15 * column): cell
+    for row, line in enumerate(PAPER.split("\n")[1:-1])
+    for column, cell in enumerate(line.split())
+}
+
+
+def almanac(ra_deg: float, dec_deg: float, utc: str) -> tuple[float, float, float]:
+    """Helio-ecliptic longitude, latitude and the Sun's separation, degrees, to 0.03 deg for 1950-2050.
+
+    The Astronomical Almanac's low-precision Sun (page C5), a rotation by the obliquity of J2000, and general precession.
+    """
+    n = (datetime.fromisoformat(utc) - datetime(2000, 1, 1, 12)).total_seconds() / 86400
+    anomaly = np.radians(357.528 + 0.9856003 * n)
+    sun = 280.460 + 0.9856474 * n + 1.915 * np.sin(anomaly) + 0.020 * np.sin(2 * anomaly)
+    tilt = np.radians(23.4393)
+    ra, dec = np.radians([ra_deg, dec_deg])
+    x, y, z = np.cos(dec) * np.cos(ra), np.cos(dec) * np.sin(ra), np.sin(dec)
+    turned = y * np.cos(tilt) + z * np.sin(tilt)
+    latitude = np.degrees(np.arcsin(z * np.cos(tilt) - y * np.sin(tilt)))
+    longitude = np.degrees(np.arctan2(turned, x)) + 3.82394e-5 * n
+    folded = abs((longitude - sun + 180) % 360 - 180)
+    separation = np.degrees(np.arccos(np.cos(np.radians(latitude)) * np.cos(np.radians(folded))))
+    return folded, abs(latitude), separation
+
+
+@pytest.mark.parametrize("lookup", ["bilinear", "nearest"])
+@pytest.mark.parametrize("place", CELLS)
+def test_the_tables_own_cells(place: tuple[int, int], lookup: Lookup) -> None:
+    where = HelioEcliptic(float(place[0]), float(place[1]), 31.4)
+    if CELLS[place] == "SA":
+        with pytest.raises(InputError, match=r"the Sun is 31\.4 deg from the target"):
+            zodiacal_brightness(where, lookup)
+    else:
+        assert zodiacal_brightness(where, lookup) == pytest.approx(float(CELLS[place]), abs=1e-12)
+
+
+def test_the_tables_shape() -> None:
+    assert zodiacal_table().brightness.shape == (13, 7)
+    assert len(CELLS) == 91
+    assert np.isnan(zodiacal_table().brightness).sum() == 13
+
+
+def test_between_cells() -> None:
+    def at(longitude: float, latitude: float, lookup: Lookup = "bilinear") -> float:
+        return zodiacal_brightness(HelioEcliptic(longitude, latitude, 90.0), lookup)
+
+    assert at(82.5, 7.5) == pytest.approx((22.0 + 22.3 + 21.7 + 22.2) / 4)
+    assert at(80.0, 0.0) == pytest.approx(21.7 + (22.0 - 21.7) / 3)
+    assert at(80.0, 5.0, "nearest") == 21.7
+    assert at(83.0, 8.0, "nearest") == 22.3
+    # Beside avoided cells the others share their weight: (60, 0) and (60, 15) here, a third and two thirds.
+    assert at(55.0, 10.0) == pytest.approx((21.3 + 2 * 21.9) / 3)
+    # The nearest cell decides on avoidance, at half a step.
+    assert at(52.5, 0.0) == pytest.approx(21.3)
+    for lookup in ("bilinear", "nearest"):
+        with pytest.raises(InputError, match="solar avoidance"):
+            at(52.4, 0.0, lookup)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("ra", "dec"), [(290.0, -11.2), (0.0, 0.0), (53.2327, -9.4583), (243.9053, -8.3694), (180.0, 85.0), (84.4, 21.1)]
+)
+@pytest.mark.parametrize("utc", ["2026-03-01T12:00:00", "2026-06-21T00:00:00", "2027-11-05T05:06:07", "1999-12-31"])
+def test_position_against_the_almanac(ra: float, dec: float, utc: str) -> None:
+    found = helioecliptic(SkyCoord(ra * u.deg, dec * u.deg), Time(utc, scale="utc"))
+    folded, latitude, separation = almanac(ra, dec, utc)
+    assert found.longitude_deg == pytest.approx(folded, abs=0.05 / np.cos(np.radians(latitude)))
+    assert found.latitude_deg == pytest.approx(latitude, abs=0.05)
+    assert found.separation_deg == pytest.approx(separation, abs=0.05)
+    assert 0 <= found.longitude_deg <= 180
+    assert 0 <= found.latitude_deg <= 90
+
+
+def test_ways_to_say_where_and_when() -> None:
+    target = SkyCoord("19h22m00s -11d12m00s")
+    same = Sky.at(target, Time("2026-07-01T00:00:00", scale="utc"))
+    assert Sky.at("19h22m00s -11d12m00s", "2026-07-01") == same
+    assert Sky.at("19:22:00 -11:12:00", "2026-07-01 00:00:00Z") == same
+    assert Sky.at("290.5 -11.2", "2026-07-01T00:00:00.0") == same
+    assert Sky.at("290.5, -11.2", "2026-07-01T00:00") == same
+    turned = Sky.at(target.galactic, Time("2026-07-01", scale="utc")).surface_brightness
+    assert turned == pytest.approx(same.surface_brightness, abs=1e-6)
+    assert Sky.at(target, "2026-07-01", "nearest").surface_brightness == 22.5
+    assert "deg from the Sun" in same.description
+
+
+def test_solar_avoidance_says_how_far_the_sun_is() -> None:
+    _, _, separation = almanac(100.0, 10.0, "2026-06-21")
+    with pytest.raises(InputError, match="deg from the target") as caught:
+        Sky.at("100.0 10.0", "2026-06-21")
+    told = float(str(caught.value).removeprefix("the Sun is ").split(" deg")[0])
+    assert told == pytest.approx(separation, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    ("target", "time", "message"),
+    [
+        ("18 Sco", "2026-01-01", "target = '18 Sco', expected right ascension and declination"),
+        ("290 -95", "2026-01-01", "target = '290 -95', expected"),
+        ("700 10", "2026-01-01", "has a right ascension of 700, expected 0 to 360"),
+        ("", "2026-01-01", "target = '', expected"),
+        ("nan nan", "2026-01-01", "target = 'nan nan', expected"),
+        (12.0, "2026-01-01", "target = 12.0, expected"),
+        (SkyCoord([1, 2] * u.deg, [3, 4] * u.deg), "2026-01-01", "target holds 2 positions, expected one"),
+        (SkyCoord(np.nan * u.deg, 4 * u.deg), "2026-01-01", "is not finite"),
+        ("290 -11", "yesterday", "time = 'yesterday', expected a UTC time"),
+        ("290 -11", "2026-13-01", "time = '2026-13-01', expected a UTC time"),
+        ("290 -11", "1850-01-01", "time = 1850-01-01T00:00:00.000, expected between 1990 and 2100"),
+        ("290 -11", Time(["2026-01-01", "2026-01-02"]), "time holds 2 times, expected one"),
+        ("290 -11", 2026, "time = 2026, expected a UTC time"),
+    ],
+)
+def test_bad_targets_and_times(target: Any, time: Any, message: str) -> None:
+    with pytest.raises(InputError, match=message) as caught:
+        Sky.at(target, time)
+    assert "\n" not in str(caught.value)
+
+
+def test_bad_lookup() -> None:
+    with pytest.raises(InputError, match="lookup = 'cubic', expected 'bilinear' or 'nearest'"):
+        Sky.at("290 -11", "2026-07-01", "cubic")  # type: ignore[arg-type]
+
+
+@pytest.mark.filterwarnings("error")
+def test_no_network_and_nothing_global(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_: object, **__: object) -> None:
+        raise AssertionError("the network was asked")
+
+    monkeypatch.setattr(socket, "socket", refuse)
+    monkeypatch.setattr(socket, "create_connection", refuse)
+    before = (iers.conf.auto_download, solar_system_ephemeris.get())
+    # Decades past the bundled tables of Earth rotation.
+    assert Sky.at("290 -11", "2085-07-01").surface_brightness == pytest.approx(22.4, abs=0.1)
+    assert (iers.conf.auto_download, solar_system_ephemeris.get()) == before
+
+
+def test_fixed_brightness() -> None:
+    assert Sky.of_brightness(22.1).surface_brightness == 22.1
+    assert Sky.of_brightness(22.1 * u.mag / u.arcsec**2) == Sky.of_brightness(22.1)
+    for bad in (float("nan"), 100.0, "bright", True, 22.1 * u.mag, 3 * u.m, None):
+        with pytest.raises(InputError, match="sky brightness"):
+            Sky.of_brightness(bad)  # type: ignore[arg-type]
+
+
+def test_total_magnitude_and_spectrum() -> None:
+    area = np.pi * 47.46**2
+    sky = Sky.of_brightness(22.1)
+    assert sky.total_magnitude(area) == pytest.approx(12.48, abs=0.005)
+    spectrum = sky.spectrum(area)
+    assert spectrum is not None
+    assert spectrum.magnitude("V") == pytest.approx(22.1 - 2.5 * np.log10(area), abs=1e-3)
+    assert Sky.none().spectrum(area) is None
+    assert Sky.none().total_magnitude(area) is None
