@@ -35,7 +35,7 @@ class Curve:
         value = np.asarray(self.value, dtype=np.float64)
         if wavelength.ndim != 1 or wavelength.size == 0 or wavelength.shape != value.shape:
             raise InputError(
-                f"a curve has {wavelength.size} wavelengths and {value.size} values, expected as many of each, and at least one"
+                f"a curve has {wavelength.size} wavelengths and {value.size} values, expected as many, one or more"
             )
         if not (np.isfinite(wavelength).all() and (np.diff(wavelength) > 0).all()):
             raise InputError("a curve's wavelengths are not finite and strictly increasing, expected nm in order")

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Literal
 
 import astropy.units as u
@@ -96,7 +95,7 @@ class Expectation:
             if bad.any():
                 pixel = int(np.argmax(bad))
                 raise ValueError(f"{name}[{pixel}] = {values[pixel]:g}, expected >= 0 and finite")
-        object.__setattr__(self, "provenance", MappingProxyType(dict(self.provenance)))
+        object.__setattr__(self, "provenance", dict(self.provenance))
 
     @property
     def exposure_s(self) -> float:
@@ -148,7 +147,7 @@ class Expectation:
 
     def per_element(self, values: Float) -> Float:
         """Sums of pixels over resolution elements: (n_pixel,) to (n_element,)."""
-        return np.bincount(self.element, values, minlength=self.element_wavelength_nm.size)
+        return np.asarray(np.bincount(self.element, values, minlength=self.element_wavelength_nm.size), np.float64)
 
     def noise_budget(self) -> QTable:
         """Noise of the exposure by origin, DN rms per pixel.
@@ -156,8 +155,8 @@ class Expectation:
         Returns
         -------
         QTable
-            `wavelength`, `source_photon`, `zodiacal_photon`, `dark`, `read` and `total`, which is the four in quadrature:
-            signal_dn / total is `snr`. The ADC's rounding, 0.29 DN per frame, is left out.
+            `wavelength`, `source_photon`, `zodiacal_photon`, `dark`, `read` and `total`, which is the four in
+            quadrature: signal_dn / total is `snr`. The ADC's rounding, 0.29 DN per frame, is left out.
         """
         from astropy.table import QTable
 

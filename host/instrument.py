@@ -216,7 +216,7 @@ class Instrument(BaseModel):
     @cached_property
     def wavelength_nm(self) -> Float:
         """Centres of the pixels that are read, nm, shape (n_pixel,)."""
-        centres: Float = self.pixel_zero_nm + self.dispersion_nm_per_pixel * np.arange(self.pixels)
+        centres = np.asarray(self.pixel_zero_nm + self.dispersion_nm_per_pixel * np.arange(self.pixels), np.float64)
         chosen = centres[(centres >= self.output_min_nm) & (centres <= self.output_max_nm)]
         chosen.setflags(write=False)
         return chosen
@@ -228,9 +228,14 @@ class Instrument(BaseModel):
         return tuple(sorted({knot for curve in curves if len(curve.value) > 1 for knot in curve.wavelength_nm}))
 
     @property
+    def _dn_v(self) -> float:
+        """Volts of one DN."""
+        return float(self.adc_range_v / 2**self.adc_bits)
+
+    @property
     def gain_dn_per_electron(self) -> float:
         """Gain, DN per electron: charge conversion over the volts of one DN (METHODS: CE / (2.2 V / 65536))."""
-        return self.conversion_uv_per_electron * 1e-6 / (self.adc_range_v / 2**self.adc_bits)
+        return self.conversion_uv_per_electron * 1e-6 / self._dn_v
 
     @property
     def adc_max_dn(self) -> int:
@@ -240,7 +245,7 @@ class Instrument(BaseModel):
     @property
     def saturation_dn(self) -> float:
         """Raw level at which the detector saturates, DN."""
-        return self.saturation_v / (self.adc_range_v / 2**self.adc_bits)
+        return self.saturation_v / self._dn_v
 
     @property
     def dark_dn_per_s(self) -> float:

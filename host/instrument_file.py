@@ -44,7 +44,8 @@ def _find(name: str | Path, folder: Path) -> Path:
         raise InputError(f"instrument file {path} does not exist, expected a TOML file")
     near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.0)[0]
     raise InputError(
-        f"unknown instrument {str(name)!r}, expected {' or '.join(names)} (nearest: {near!r}) or the path of a TOML file"
+        f"unknown instrument {str(name)!r}, expected {' or '.join(names)} (nearest: {near!r}) "
+        "or the path of a TOML file"
     )
 
 

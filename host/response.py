@@ -1,9 +1,10 @@
 """The instrument as one matrix: flux at the nodes of a spectrum to mean electrons per second and pixel.
 
-Flux is piecewise linear between its nodes. With P_p(l) the fraction of light of wavelength l that lands in pixel p (the
-line function integrated over the pixel, in closed form), a pixel's rate is the integral of flux * P_p, times the efficiency
-and area. The integral runs over panels in which every P_p is smooth: in a panel P_p is its polynomial through Gauss-Legendre
-nodes, and the flux enters through its integrals against the Lagrange polynomials of these nodes. So the matrix is a product,
+Flux is piecewise linear between its nodes. With P_p(l) the fraction of light of wavelength l that lands in pixel p
+(the line function integrated over the pixel, in closed form), a pixel's rate is the integral of flux * P_p, times the
+efficiency and area. The integral runs over panels in which every P_p is smooth: in a panel P_p is its polynomial
+through Gauss-Legendre nodes, and the flux enters through its integrals against the Lagrange polynomials of these
+nodes. So the matrix is a product,
 
     response = landing @ gathering        (n_pixel, n_panel_node) @ (n_panel_node, n_wavelength)
 
@@ -134,9 +135,10 @@ def response_matrix(instrument: Instrument, wavelength_nm: ArrayLike, order: Ord
     wavelength_nm : array_like, shape (n_wavelength,)
         Nodes of the flux, nm, strictly increasing; the flux is straight between them and zero outside.
     order : {"paper", "physical"}
-        Efficiency of the wavelength where light lands, applied after the line function (the paper), or of the light's own
-        wavelength, before it (physics). Beyond the ends of an efficiency curve its end value holds: an assumption
-        that only the physical order meets, for light from outside the output range.
+        Efficiency of the wavelength where light lands, applied after the line function (the paper), or of the light's
+        own wavelength, before it (physics). They differ by up to 4 % (G2V) or 6 % (K2.5V), by 6-11 % at 200 nm, and
+        by 0.1 % in total. Beyond the ends of an efficiency curve its end value holds: an assumption that only the
+        physical order meets, for light from outside the output range.
 
     Returns
     -------
@@ -175,8 +177,11 @@ def electrons_per_second(
         raise InputError(f"flux has {flux.size} values for {nodes.size} wavelengths, expected as many")
     if nodes.size <= MATRIX_NODES:
         return cast(Float, response_matrix(instrument, nodes, order) @ flux)
-    gathered = sum(part @ flux for part in _gathering(instrument, nodes, _known(order)))
-    return cast(Float, _landing(instrument, order) @ gathered)
+    landing = _landing(instrument, _known(order))
+    gathered = np.zeros(landing.shape[1])
+    for part in _gathering(instrument, nodes, order):
+        gathered += part @ flux
+    return np.asarray(landing @ gathered)
 
 
 @lru_cache(maxsize=8)
@@ -217,8 +222,8 @@ def _line_landing(line: Line, knots: tuple[float, ...]) -> csr_array:
 def _gathering(instrument: Instrument, wavelength: Float, order: Order) -> Iterator[csr_array]:
     """Second factor of the matrix, as a sum of parts; each of shape (n_panel_node, n_wavelength).
 
-    An entry is the integral (nm) over a panel of a Lagrange polynomial of the panel times the hat function of a node; in the
-    physical order the efficiency is under the integral.
+    An entry is the integral (nm) over a panel of a Lagrange polynomial of the panel times the hat function of a node;
+    in the physical order the efficiency is under the integral.
     """
     panels = Line.of(instrument).panel_edges(np.array(_knots(instrument, order)))
     low, high = max(panels[0], wavelength[0]), min(panels[-1], wavelength[-1])

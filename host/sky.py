@@ -93,8 +93,9 @@ class Sky:
         brightness = zodiacal_brightness(place, lookup)
         return cls(
             brightness,
-            f"zodiacal light V = {brightness:.2f} mag/arcsec2 at helio-ecliptic longitude {place.longitude_deg:.1f} deg, "
-            f"latitude {place.latitude_deg:.1f} deg, {place.separation_deg:.1f} deg from the Sun ({lookup})",
+            f"zodiacal light V = {brightness:.2f} mag/arcsec2 at helio-ecliptic longitude "
+            f"{place.longitude_deg:.1f} deg, latitude {place.latitude_deg:.1f} deg, "
+            f"{place.separation_deg:.1f} deg from the Sun ({lookup})",
         )
 
     def total_magnitude(self, field_of_view_arcsec2: float) -> float | None:

@@ -1,3 +1,40 @@
-"""Would the Mauve satellite see this stellar flare, and how sure can one be?"""
+"""Would the Mauve satellite see this stellar flare, and how sure can one be?
+
+The public names are loaded when first used: importing mauvecl loads neither OpenCL nor synphot.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mauvecl.engine import Engine
+    from mauvecl.host.errors import InputError
+    from mauvecl.host.expectation import Expectation, expect
+    from mauvecl.host.instrument import Instrument
+    from mauvecl.host.sky import Sky
+    from mauvecl.host.source import Source
 
 __version__ = "0.1.0"
+__all__ = ["Engine", "Expectation", "InputError", "Instrument", "Sky", "Source", "expect"]
+
+_HOMES = {
+    "Engine": "engine",
+    "Expectation": "host.expectation",
+    "InputError": "host.errors",
+    "Instrument": "host.instrument",
+    "Sky": "host.sky",
+    "Source": "host.source",
+    "expect": "host.expectation",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'mauvecl' has no attribute {name!r}")
+    return getattr(import_module(f"mauvecl.{_HOMES[name]}"), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOMES])

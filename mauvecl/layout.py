@@ -10,8 +10,9 @@ import numpy as np
 WORD_BITS = 32
 
 #: Each random process draws from its own stream, the top byte of the counter's last word, so that adding
-#: one moves no other. Two streams of Gaussian noise and dark serve the observed exposure, two its reference.
-STREAMS = {"noise": 0, "dark": 1, "reference_noise": 2, "reference_dark": 3}
+#: one moves no other. Gaussian noise and dark of the observed
+#: exposure and of its reference; `split` takes a drawn spectrum apart.
+STREAMS = {"noise": 0, "dark": 1, "reference_noise": 2, "reference_dark": 3, "split": 4}
 
 #: What all scenarios share in one pixel. Poisson counts come out relative to a
 #: whole number near the mean: as column + dark_low of an alias table, or from the expansion's coefficients.

@@ -187,7 +187,7 @@ def test_bad_files(tmp_path: Path, text: str, message: str) -> None:
 
 
 def test_unknown_names() -> None:
-    with pytest.raises(InputError, match="unknown instrument 'mauv', expected .*nearest: 'mauve'"):
+    with pytest.raises(InputError, match=r"unknown instrument 'mauv', expected .*nearest: 'mauve'"):
         Instrument.load("mauv")
     with pytest.raises(InputError, match=r"no-such.toml does not exist"):
         Instrument.load("no-such.toml")

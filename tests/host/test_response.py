@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
@@ -44,9 +46,9 @@ def landing(offset: Float, instrument: Instrument) -> Float:
     )
     if fwhm == 0:  # the overlap of two intervals
         low, high = np.maximum(offset - half, -top_hat / 2), np.minimum(offset + half, top_hat / 2)
-        return np.maximum(high - low, 0) / top_hat
+        return np.asarray(np.maximum(high - low, 0) / top_hat)
     x, w = np.polynomial.legendre.leggauss(24)
-    return line_function(offset[..., None] + half * x, top_hat, fwhm) @ w * half
+    return np.asarray(line_function(offset[..., None] + half * x, top_hat, fwhm) @ w * half)
 
 
 def brute(instrument: Instrument, wavelength: Float, flux: Float, pixel: int, order: Order) -> float:
@@ -67,10 +69,8 @@ def brute(instrument: Instrument, wavelength: Float, flux: Float, pixel: int, or
         return float(np.interp(x, wavelength, flux) * 1e-6 * share * amperes / CHARGE_C)
 
     peak = max(integrand(x) for x in np.linspace(low, high, 101))
-    pieces = [
-        quad(integrand, a, b, epsabs=1e-12 * peak, epsrel=1e-11) for a, b in zip(edges[:-1], edges[1:], strict=True)
-    ]
-    return sum(piece[0] for piece in pieces)
+    pieces = [quad(integrand, a, b, epsabs=1e-12 * peak, epsrel=1e-11) for a, b in pairwise(edges)]
+    return float(sum(piece[0] for piece in pieces))
 
 
 @pytest.mark.parametrize(("top_hat", "fwhm"), KERNELS)
@@ -79,7 +79,7 @@ def test_line_function(mauve: Instrument, top_hat: float, fwhm: float) -> None:
     x = np.array([-30.0, -7.0, -5.0, -0.3, 0.0, 1.0, 5.2, 11.0])
     np.testing.assert_allclose(line.density(x), line_function(x, top_hat, fwhm), rtol=1e-9, atol=1e-15)
     edges = [-60.0, -top_hat / 2, 0.0, top_hat / 2, 60.0]
-    total = sum(quad(line.density, a, b, epsrel=1e-10)[0] for a, b in zip(edges[:-1], edges[1:], strict=True))
+    total = sum(quad(lambda x: float(line.density(x)), a, b, epsrel=1e-10)[0] for a, b in pairwise(edges))
     assert total == pytest.approx(1, abs=1e-9)
 
 
@@ -91,9 +91,9 @@ def test_line_function_is_the_convolution(mauve: Instrument) -> None:
         )
         assert Line.of(mauve).density(x) == pytest.approx(smoothed, rel=1e-10)
     # The whole profile's width, quoted in the paper as that of the Gaussian alone.
-    x = np.linspace(0, 15, 15_001)
-    density = Line.of(mauve).density(x)
-    assert 2 * np.interp(-density[0] / 2, -density, x) == pytest.approx(13.3, abs=0.05)
+    offset = np.linspace(0, 15, 15_001)
+    density = Line.of(mauve).density(offset)
+    assert 2 * np.interp(-density[0] / 2, -density, offset) == pytest.approx(13.3, abs=0.05)
 
 
 @pytest.mark.parametrize("order", ["paper", "physical"])

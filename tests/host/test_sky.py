@@ -43,7 +43,7 @@ CELLS = {
 def almanac(ra_deg: float, dec_deg: float, utc: str) -> tuple[float, float, float]:
     """Helio-ecliptic longitude, latitude and the Sun's separation, degrees, to 0.03 deg for 1950-2050.
 
-    The Astronomical Almanac's low-precision Sun (page C5), a rotation by the obliquity of J2000, and general precession.
+    The Astronomical Almanac's low-precision Sun (page C5), a rotation by the obliquity of J2000, general precession.
     """
     n = (datetime.fromisoformat(utc) - datetime(2000, 1, 1, 12)).total_seconds() / 86400
     anomaly = np.radians(357.528 + 0.9856003 * n)
@@ -90,7 +90,7 @@ def test_between_cells() -> None:
     assert at(52.5, 0.0) == pytest.approx(21.3)
     for lookup in ("bilinear", "nearest"):
         with pytest.raises(InputError, match="solar avoidance"):
-            at(52.4, 0.0, lookup)  # type: ignore[arg-type]
+            at(52.4, 0.0, lookup)
 
 
 @pytest.mark.parametrize(
@@ -175,7 +175,7 @@ def test_fixed_brightness() -> None:
     assert Sky.of_brightness(22.1 * u.mag / u.arcsec**2) == Sky.of_brightness(22.1)
     for bad in (float("nan"), 100.0, "bright", True, 22.1 * u.mag, 3 * u.m, None):
         with pytest.raises(InputError, match="sky brightness"):
-            Sky.of_brightness(bad)  # type: ignore[arg-type]
+            Sky.of_brightness(bad)
 
 
 def test_total_magnitude_and_spectrum() -> None:

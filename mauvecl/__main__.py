@@ -1,0 +1,5 @@
+"""`python -m mauvecl`."""
+
+from mauvecl.cli import main
+
+main()

@@ -1,0 +1,108 @@
+"""What the terminal shows: tables, messages, progress."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any, Self
+
+if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
+#: Work shorter than this shows no progress.
+PATIENCE_S = 2.0
+
+
+class Meter:
+    """Progress with rate and time left, on standard error, for work longer than two seconds.
+
+    On a terminal it is a bar; elsewhere a plain line every ten seconds.
+    """
+
+    def __init__(self, *, quiet: bool = False) -> None:
+        self._quiet = quiet
+        self._started = self._shown = time.monotonic()
+        self._last = 0
+        self._bar: Progress | None = None
+        self._task: TaskID | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._stop()
+
+    def __call__(self, done: int, total: int) -> None:
+        """Take note of work done, in realisations."""
+        now = time.monotonic()
+        if done < self._last:
+            # The next star's work begins.
+            self._stop()
+            self._started = self._shown = now
+        self._last = done
+        if self._quiet or now - self._started < PATIENCE_S:
+            return
+        if sys.stderr.isatty():
+            self._draw(done, total)
+        elif now - self._shown >= 10.0:
+            self._shown = now
+            rate = done / (now - self._started)
+            print(
+                f"{done} of {total} realisations, {rate:.3g} a second, {(total - done) / rate:.0f} s left",
+                file=sys.stderr,
+            )
+
+    def _draw(self, done: int, total: int) -> None:
+        from rich.console import Console
+        from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+        if self._bar is None:
+            self._bar = Progress(
+                TextColumn("drawing"),
+                BarColumn(),
+                TaskProgressColumn(),
+                TextColumn("{task.fields[rate]} realisations/s"),
+                TimeRemainingColumn(),
+                TextColumn("left"),
+                console=Console(stderr=True),
+                transient=True,
+            )
+            self._bar.start()
+            self._task = self._bar.add_task("", total=total, rate="")
+        rate = done / (time.monotonic() - self._started)
+        assert self._task is not None
+        self._bar.update(self._task, completed=done, rate=f"{rate:,.0f}")
+
+    def _stop(self) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+
+def show(lines: Sequence[str]) -> None:
+    """Plain lines on standard output."""
+    from rich.console import Console
+
+    console = Console(highlight=False, soft_wrap=True)
+    for line in lines:
+        console.print(line, markup=False)
+
+
+def show_table(title: str, columns: Sequence[str], cells: Sequence[Sequence[Any]]) -> None:
+    """A table; numbers are to be formatted already."""
+    from rich import box
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        # Piped: as wide as it needs to be.
+        console = Console(highlight=False, width=200)
+    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
+    for i, name in enumerate(columns):
+        numeric = all(isinstance(row[i], str) and row[i][:1] in "0123456789-+.<>=" for row in cells) and bool(cells)
+        table.add_column(name, justify="right" if numeric else "left", no_wrap=True)
+    for row in cells:
+        table.add_row(*(str(cell) for cell in row))
+    console.print(table)

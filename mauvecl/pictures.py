@@ -1,0 +1,197 @@
+"""Pictures of answers, with matplotlib (the extra ``plot``). Nothing is computed here."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.answer import StarDetection
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.snr import SnrResult
+
+#: Okabe and Ito's colours, which colour-blind readers can tell apart (jfly.uni-koeln.de/color).
+COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7", "#000000")
+NULL = "#777777"
+
+STYLE = {
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlesize": 9,
+    "axes.titlelocation": "left",
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "figure.constrained_layout.use": True,
+    "savefig.dpi": 160,
+    "lines.linewidth": 1.2,
+}
+
+NAMES = {
+    "chi2": "chi2 over pixels",
+    "chi2_element": "chi2 over 10.5 nm elements",
+    "chi2_pair": "chi2 against a noisy exposure",
+    "matched": "matched filter (standard deviations)",
+}
+
+
+def available() -> bool:
+    """Whether matplotlib is installed."""
+    from importlib.util import find_spec
+
+    return find_spec("matplotlib") is not None
+
+
+def _pyplot() -> Any:
+    import matplotlib as mpl
+
+    mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    return plt
+
+
+def _save(figure: Any, path: Path) -> Path:
+    figure.savefig(path)
+    _pyplot().close(figure)
+    return path
+
+
+def detection(stars: Sequence[StarDetection], amplitudes: Sequence[float], fap: float, path: Path) -> Path:
+    """Null and flare distributions: a row per star, a column per statistic."""
+    plt = _pyplot()
+    statistics = stars[0].found.statistics
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(
+            len(stars), len(statistics), figsize=(3.6 * len(statistics), 2.6 * len(stars) + 0.4), squeeze=False
+        )
+        for row, star in zip(axes, stars, strict=True):
+            for axis, statistic in zip(row, statistics, strict=True):
+                _distributions(axis, star, statistic, amplitudes, fap)
+            row[0].set_ylabel(f"{star.label}\nprobability per unit of log value")
+        handles, names = axes[0][0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower center", ncols=len(names))
+        exposure = stars[0].found.quiet.exposure_s
+        figure.suptitle(
+            f"Detection statistics without a flare and with one, {exposure:g} s, "
+            f"{stars[0].found.realisations:,} realisations each; nominal throughput",
+            fontsize=10,
+        )
+        return _save(figure, path)
+
+
+def _distributions(axis: Any, star: StarDetection, statistic: str, amplitudes: Sequence[float], fap: float) -> None:
+    found = star.found
+    linear = statistic == "matched"
+    shapes = [(None, NULL, "no flare")]
+    shapes += [(k, COLOURS[k % len(COLOURS)], f"flare {100 * a:g} %") for k, a in enumerate(amplitudes)]
+    for flare, colour, name in shapes:
+        edges, counts = found.histogram(statistic, flare, bins=120)
+        # Means lie decades apart: a logarithmic axis shows them all, and densities per its unit keep equal areas.
+        scale = edges if linear else np.log10(np.maximum(edges, 1e-9))
+        if linear:
+            scale = np.arcsinh(edges / 2)
+        density = counts / counts.sum() / np.diff(scale)
+        middle = (edges[1:] + edges[:-1]) / 2
+        axis.fill_between(middle, density, step="mid", color=colour, alpha=0.3, linewidth=0)
+        axis.step(middle, density, where="mid", color=colour, label=name)
+    cut = found.threshold(fap, statistic).value
+    axis.axvline(cut, color="black", linewidth=0.9, linestyle="--", label=f"threshold, fap {fap:g} per test")
+    if linear:
+        axis.set_xscale("function", functions=(lambda x: np.arcsinh(x / 2), lambda y: 2 * np.sinh(y)))
+        low, high = axis.get_xlim()
+        ticks = [t for t in (-4, 0, 4, 10, 30, 100, 300, 1000, 3000, 10000) if low <= t <= high]
+        axis.set_xticks(ticks, [str(t) for t in ticks])
+    else:
+        axis.set_xscale("log")
+    axis.set_ylim(bottom=0)
+    axis.set_xlabel(NAMES[statistic])
+
+
+def spectra(
+    groups: Sequence[tuple[str, Expectation, Sequence[Expectation]]], amplitudes: Sequence[float], path: Path
+) -> Path:
+    """Quiescent and flare spectra per second, with one standard deviation of a pixel's noise."""
+    plt = _pyplot()
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(len(groups), 1, figsize=(7.2, 2.9 * len(groups) + 0.3), squeeze=False, sharex=True)
+        for axis, (title, quiet, flares) in zip(axes[:, 0], groups, strict=True):
+            for k in reversed(range(len(flares))):
+                x = flares[k]
+                axis.plot(
+                    x.wavelength_nm,
+                    x.signal_dn / x.exposure_s,
+                    color=COLOURS[k % len(COLOURS)],
+                    label=f"flare {100 * amplitudes[k]:g} %",
+                )
+            mean, noise = quiet.signal_dn / quiet.exposure_s, np.sqrt(quiet.variance_dn2) / quiet.exposure_s
+            axis.fill_between(
+                quiet.wavelength_nm, mean - noise, mean + noise, color=NULL, alpha=0.35, linewidth=0,
+                label="1 sigma noise of a pixel",
+            )  # fmt: skip
+            axis.plot(quiet.wavelength_nm, mean, color="black", linestyle="--", label="no flare")
+            axis.set_title(f"{title}, {quiet.exposure_s:g} s")
+            axis.set_ylabel("net signal (DN s$^{-1}$ pixel$^{-1}$)")
+            axis.set_xlim(200, 700)
+        axes[0][0].legend(ncols=2)
+        axes[-1][0].set_xlabel("wavelength (nm)")
+        figure.suptitle(
+            "Mean spectra as Mauve would see them; nominal throughput, not a flight calibration", fontsize=10
+        )
+        return _save(figure, path)
+
+
+def observation(title: str, table: QTable, path: Path) -> Path:
+    """One raw spectrum and what it is made of, as the paper's figure of components."""
+    plt = _pyplot()
+    panels = (
+        ("raw", "raw spectrum"),
+        ("source", "star"),
+        ("sky", "zodiacal light"),
+        ("photon_noise", "photon noise"),
+        ("dark", "dark"),
+        ("bias", "bias"),
+        ("read_noise", "read noise"),
+    )
+    wavelength = table["wavelength"].to_value("nm")
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(len(panels), 1, figsize=(7.2, 9.5), sharex=True)
+        for i, (axis, (name, text)) in enumerate(zip(axes, panels, strict=True)):
+            axis.plot(wavelength, table[name].value, color=COLOURS[i % len(COLOURS)], linewidth=0.7)
+            axis.set_title(f"({'abcdefg'[i]}) {text}")
+            axis.set_ylabel("DN")
+        axes[-1].set_xlabel("wavelength (nm)")
+        axes[-1].set_xlim(200, 700)
+        figure.suptitle(f"{title}: one observation of {table.meta['exposure_s']:g} s; nominal throughput", fontsize=10)
+        return _save(figure, path)
+
+
+def signal_to_noise(stars: Sequence[tuple[str, SnrResult]], path: Path) -> Path:
+    """S/N per pixel and per resolution element: closed form, and the spread of the realisations."""
+    plt = _pyplot()
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(len(stars), 2, figsize=(7.6, 2.6 * len(stars) + 0.4), squeeze=False, sharex=True)
+        for row, (title, result) in zip(axes, stars, strict=True):
+            for axis, table, what in (
+                (row[0], result.pixel, "per pixel"),
+                (row[1], result.element, "per 10.5 nm element"),
+            ):
+                wavelength = table["wavelength"].to_value("nm")
+                for low, high, alpha, text in (("q2.5", "q97.5", 0.25, "95 %"), ("q16", "q84", 0.45, "68 %")):
+                    axis.fill_between(
+                        wavelength, table[low], table[high], color=COLOURS[0], alpha=alpha, linewidth=0,
+                        label=f"{text} of realisations",
+                    )  # fmt: skip
+                axis.plot(wavelength, table["expected"], color="black", linewidth=0.9, label="closed form")
+                axis.set_ylabel(f"S/N {what}")
+                axis.set_title(f"{title}, {result.expectation.exposure_s:g} s")
+                axis.set_xlim(200, 700)
+        axes[0][0].legend()
+        for axis in axes[-1]:
+            axis.set_xlabel("wavelength (nm)")
+        return _save(figure, path)

@@ -1,0 +1,121 @@
+"""Write answers down: tables, the study itself, and a record of the run. Nothing is computed here."""
+
+from __future__ import annotations
+
+import datetime
+import json
+import platform
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import mauvecl
+from mauvecl.host.errors import InputError
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+    from mauvecl.engine import Engine
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.study import Study
+
+
+def make_folder(path: Path) -> Path:
+    """A folder to write to.
+
+    Raises
+    ------
+    InputError
+        If it cannot be made or written to.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe = path / ".mauvecl-probe"
+        probe.write_text("")
+        probe.unlink()
+    except OSError as error:
+        raise InputError(
+            f"output folder {str(path)!r} cannot be written ({error.strerror}), expected a writable one"
+        ) from error
+    return path
+
+
+def write_table(table: Table, path: Path) -> Path:
+    """A table as ECSV, or as FITS by the file's ending."""
+    if path.suffix == ".fits":
+        plain = table.copy()
+        # FITS headers hold no long text: the study goes beside it.
+        plain.meta = {k: v for k, v in plain.meta.items() if k != "study"}
+        plain.write(path, overwrite=True)
+    else:
+        table.write(path, format="ascii.ecsv", overwrite=True)
+    return path
+
+
+def write_study(study: Study, folder: Path) -> Path:
+    """The study, to be run again as it was."""
+    path = folder / "study.toml"
+    path.write_text(study.toml(), encoding="utf-8")
+    return path
+
+
+def write_record(
+    verb: str,
+    study: Study,
+    expectations: Sequence[Expectation],
+    folder: Path,
+    *,
+    engine: Engine | None,
+    seconds: float,
+    messages: Sequence[str],
+) -> Path:
+    """The run record: what made this answer.
+
+    Parameters
+    ----------
+    verb : str
+    study : Study
+    expectations : sequence of Expectation
+        Their provenance holds the digests of the inputs.
+    folder : Path
+    engine : Engine, optional
+    seconds : float
+        Wall time.
+    messages : sequence of str
+        What the reader was told.
+    """
+    record: dict[str, Any] = {
+        "mauvecl": mauvecl.__version__,
+        "verb": verb,
+        "date_utc": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "wall_time_s": round(seconds, 3),
+        "seed": study.run.seed,
+        "study": study.model_dump(mode="json", exclude_none=True),
+        "inputs": [{"name": x.name} | dict(x.provenance) for x in expectations],
+        "messages": list(messages),
+        "python": platform.python_version(),
+        "packages": _versions("numpy", "scipy", "astropy", "synphot", "pyopencl"),
+    }
+    if engine is not None:
+        record["device"] = asdict(engine.device)
+        record["kernels"] = engine.kernel_digest
+    path = folder / "run.json"
+    path.write_text(json.dumps(record, indent=2, default=str) + "\n", encoding="utf-8")
+    return path
+
+
+def _versions(*names: str) -> dict[str, str]:
+    from importlib.metadata import version
+
+    return {name: version(name) for name in names}
+
+
+def rows(table: Table) -> list[dict[str, Any]]:
+    """A table as plain rows, for JSON; units are in the table's file."""
+    return [{name: _plain(row[name]) for name in table.colnames} for row in table]
+
+
+def _plain(value: Any) -> Any:
+    value = getattr(value, "value", value)
+    return value.item() if hasattr(value, "item") else value
