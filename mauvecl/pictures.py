@@ -88,7 +88,7 @@ def detection(stars: Sequence[StarDetection], amplitudes: Sequence[float], fap: 
 def _distributions(axis: Any, star: StarDetection, statistic: str, amplitudes: Sequence[float], fap: float) -> None:
     found = star.found
     linear = statistic == "matched"
-    shapes = [(None, NULL, "no flare")]
+    shapes: list[tuple[int | None, str, str]] = [(None, NULL, "no flare")]
     shapes += [(k, COLOURS[k % len(COLOURS)], f"flare {100 * a:g} %") for k, a in enumerate(amplitudes)]
     for flare, colour, name in shapes:
         edges, counts = found.histogram(statistic, flare, bins=120)

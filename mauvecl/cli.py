@@ -1,0 +1,529 @@
+"""The command line: one verb each, from a study file or flags."""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mauvecl import __version__
+
+if TYPE_CHECKING:
+    from mauvecl.console import Meter
+    from mauvecl.engine import Engine
+    from mauvecl.study import Study
+
+app = typer.Typer(
+    name="mauvecl",
+    no_args_is_help=True,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+    context_settings={"help_option_names": ["-h", "--help"]},
+    help="Would the Mauve satellite see this stellar flare, and how sure can one be?\n\n"
+    "Start with `mauvecl detect`, which answers the question of the MauveSim paper. The throughput is nominal, not a "
+    "flight calibration. Exit codes: 0 done, 2 bad input, 130 interrupted.",
+)
+
+StudyFile = Annotated[Path | None, typer.Argument(help="Study file (TOML); flags override it.", show_default=False)]
+StarFlag = Annotated[
+    list[str] | None,
+    typer.Option("--star", "-s", help="Library name or spectrum file; may be repeated.", show_default=False),
+]
+MagnitudeFlag = Annotated[
+    list[float] | None,
+    typer.Option("--magnitude", "-m", help="Magnitude, one for all stars or one each.", show_default=False),
+]
+BandFlag = Annotated[str | None, typer.Option(help="Band of the magnitude [V].", show_default=False)]
+ExposureFlag = Annotated[
+    float | None, typer.Option("--exposure", "-t", help="Seconds, rounded up to 5 s frames [50].", show_default=False)
+]
+InstrumentFlag = Annotated[
+    str | None, typer.Option(help="mauve, mauve-electrons, or your own TOML file [mauve].", show_default=False)
+]
+TemperatureFlag = Annotated[float | None, typer.Option(help="Detector temperature, deg C [21].", show_default=False)]
+SkyFlag = Annotated[
+    str | None, typer.Option(help="Sky brightness, V mag/arcsec^2, or none [22.1].", show_default=False)
+]
+TargetFlag = Annotated[str | None, typer.Option(help="Coordinates, with --time: zodiacal light.", show_default=False)]
+TimeFlag = Annotated[str | None, typer.Option("--time", help="UTC of the observation.", show_default=False)]
+AmplitudeFlag = Annotated[
+    list[float] | None,
+    typer.Option("--amplitude", "-a", help="Flare amplitude, 0.24 is 24 %; may be repeated.", show_default=False),
+]
+FlareTemperatureFlag = Annotated[float | None, typer.Option(help="Flare temperature, K [10000].", show_default=False)]
+FlareBandFlag = Annotated[str | None, typer.Option(help="Band of the amplitude [Kepler].", show_default=False)]
+RealisationsFlag = Annotated[
+    int | None, typer.Option("--realisations", "-n", help="Noise realisations [1000000].", show_default=False)
+]
+SeedFlag = Annotated[int | None, typer.Option(help="Seed [1].", show_default=False)]
+StatisticFlag = Annotated[
+    list[str] | None,
+    typer.Option("--statistic", help="chi2, chi2_element, chi2_pair, matched; may be repeated.", show_default=False),
+]
+FapFlag = Annotated[float | None, typer.Option(help="False-alarm probability per test [0.001].", show_default=False)]
+DeviceFlag = Annotated[
+    str | None, typer.Option(help="OpenCL device: number or part of its name [PoCL].", show_default=False)
+]
+OutputFlag = Annotated[
+    Path | None,
+    typer.Option("--output", "-o", help="Folder for tables and pictures [mauvecl-VERB].", show_default=False),
+]
+JsonFlag = Annotated[bool, typer.Option("--json", help="Print JSON and nothing else.")]
+QuietFlag = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress and no file names.")]
+PicturesFlag = Annotated[bool, typer.Option("--pictures/--no-pictures", help="Draw pictures (needs mauvecl[plot]).")]
+
+
+def _study(
+    file: Path | None,
+    *,
+    star: list[str] | None,
+    magnitude: list[float] | None,
+    band: str | None,
+    exposure: float | None,
+    instrument: str | None,
+    temperature: float | None,
+    sky: str | None,
+    target: str | None,
+    when: str | None,
+    **changes: dict[str, Any],
+) -> Study:
+    """A study file, or the default, with the flags on top."""
+    from mauvecl.host.errors import InputError
+    from mauvecl.study import Study
+
+    study = Study.read(file) if file is not None else Study()
+    skylight: dict[str, Any] = {"target": target, "time": when}
+    if sky is not None:
+        if sky.strip().lower() == "none":
+            skylight["none"] = True
+        else:
+            try:
+                skylight["surface_brightness"] = float(sky)
+            except ValueError as error:
+                raise InputError(f"--sky {sky!r}, expected V mag/arcsec^2 or none") from error
+    sections = {
+        "observation": {"exposure_s": exposure, "instrument": instrument, "temperature_c": temperature},
+        "sky": skylight,
+        **changes,
+    }
+    return study.with_changes(sections, _stars(study, star, magnitude, band))
+
+
+def _stars(
+    study: Study, names: list[str] | None, magnitudes: list[float] | None, band: str | None
+) -> list[dict[str, Any]] | None:
+    from mauvecl.host.errors import InputError
+
+    if not (names or magnitudes or band):
+        return None
+    if names:
+        # A name that is a file's is a file; anything else is looked up in the library.
+        stars: list[dict[str, Any]] = [
+            {"file": name} if Path(name).suffix or Path(name).exists() else {"library": name} for name in names
+        ]
+        for entry in stars:
+            if "file" in entry and not Path(entry["file"]).exists() and Path(entry["file"]).suffix[1:].isupper():
+                # "K2.5V" looks like a file's name and is not one.
+                entry["library"] = entry.pop("file")
+    else:
+        stars = [entry.model_dump(exclude_none=True) for entry in study.star]
+    if magnitudes:
+        if len(magnitudes) not in (1, len(stars)):
+            raise InputError(f"{len(magnitudes)} magnitudes for {len(stars)} stars, expected one for all or one each")
+        for entry, value in zip(stars, magnitudes * (len(stars) if len(magnitudes) == 1 else 1), strict=True):
+            entry["magnitude"] = value
+    if band:
+        for entry in stars:
+            entry["band"] = band
+    return stars
+
+
+def _engine(device: str | None, meter: Meter) -> Engine:
+    from mauvecl.engine import Engine
+
+    return Engine(device, progress=meter)
+
+
+def _say(lines: list[str], *, as_json: bool) -> None:
+    from mauvecl.console import show
+
+    if not as_json:
+        show(lines)
+
+
+def _pictures_wanted(pictures: bool, *, quiet: bool, as_json: bool) -> bool:
+    from mauvecl.pictures import available
+
+    if pictures and not available():
+        if not quiet:
+            _say(["No pictures: matplotlib is missing, `pip install 'mauvecl[plot]'` brings it."], as_json=as_json)
+        return False
+    return pictures
+
+
+def _finish(files: list[Path], started: float, *, quiet: bool, as_json: bool) -> None:
+    if not quiet:
+        names = ", ".join(path.name for path in files)
+        seconds = time.perf_counter() - started
+        _say([f"Wrote {names} to {files[0].parent}/ in {seconds:.1f} s."], as_json=as_json)
+
+
+@app.command()
+def library(as_json: JsonFlag = False) -> None:
+    """List the embedded spectra.
+
+    Example: mauvecl library
+    """
+    from mauvecl.host.catalogue import library_table
+    from mauvecl.report import rows
+
+    table = library_table()
+    if as_json:
+        print(json.dumps(rows(table), indent=2))
+        return
+    from mauvecl.console import show_table
+
+    columns = ("name", "also", "type", "star", "UV at 190-210, 240-260, 290-310 nm", "licence")
+    cells = []
+    for row in table:
+        ratios = ", ".join(part.split()[0] for part in row["uv_quality"].split(": ")[1].split(", "))
+        cells.append(tuple(row[n] for n in ("name", "alias", "spectral_type", "star")) + (ratios, row["licence"]))
+    show_table(
+        "Embedded spectra (UV: mean flux over that at 540-560 nm); origin and citation of each: --json", columns, cells
+    )
+
+
+@app.command()
+def devices(as_json: JsonFlag = False) -> None:
+    """List the OpenCL devices that the kernels can run on.
+
+    Example: mauvecl devices
+    """
+    from dataclasses import asdict
+
+    from mauvecl.program import devices as present
+
+    found = present()
+    if as_json:
+        print(json.dumps([asdict(record) for record in found], indent=2))
+        return
+    from mauvecl.console import show_table
+
+    cells = [
+        (
+            str(i),
+            record.platform,
+            record.name,
+            record.driver,
+            record.kind,
+            str(record.compute_units),
+            f"{record.global_memory / 2**30:.1f}",
+            "default" if record.default else "",
+        )
+        for i, record in enumerate(found)
+    ]
+    columns = ("number", "platform", "device", "driver", "kind", "units", "memory (GiB)", "")
+    show_table("OpenCL devices; choose with --device NUMBER or part of a name", columns, cells)
+
+
+@app.command()
+def simulate(
+    study_file: StudyFile = None,
+    star: StarFlag = None,
+    magnitude: MagnitudeFlag = None,
+    band: BandFlag = None,
+    exposure: ExposureFlag = None,
+    instrument: InstrumentFlag = None,
+    temperature: TemperatureFlag = None,
+    sky: SkyFlag = None,
+    target: TargetFlag = None,
+    when: TimeFlag = None,
+    amplitude: AmplitudeFlag = None,
+    flare_temperature: FlareTemperatureFlag = None,
+    flare_band: FlareBandFlag = None,
+    seed: SeedFlag = None,
+    realisation: Annotated[int, typer.Option(min=0, help="Which realisation to show.")] = 0,
+    output: OutputFlag = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+    pictures: PicturesFlag = True,
+) -> None:
+    """One observation and what it is made of: star, sky, photon noise, dark, bias, read noise.
+
+    Example: mauvecl simulate --star G2V --magnitude 7.4 --exposure 50 --amplitude 0.24
+    """
+    from mauvecl import answer, report
+
+    started = time.perf_counter()
+    study = _study(
+        study_file, star=star, magnitude=magnitude, band=band, exposure=exposure, instrument=instrument,
+        temperature=temperature, sky=sky, target=target, when=when,
+        flare={"amplitudes": amplitude, "temperature_k": flare_temperature, "band": flare_band}, run={"seed": seed},
+    )  # fmt: skip
+    folder = report.make_folder(output or Path("mauvecl-simulate"))
+    found = answer.simulate(study, realisation=realisation, flaring=bool(amplitude))
+    _say(found.messages, as_json=as_json)
+    files, summary = [], []
+    draw = _pictures_wanted(pictures, quiet=quiet, as_json=as_json)
+    for number, (title, x, table) in enumerate(found.observations, 1):
+        stem = f"observation-{number}"
+        files += [report.write_table(table, folder / f"{stem}{ending}") for ending in (".ecsv", ".fits")]
+        if draw:
+            from mauvecl.pictures import observation
+
+            files.append(observation(title, table, folder / f"{stem}.png"))
+        peak = int(x.signal_dn.argmax())
+        summary.append(
+            {
+                "observation": title,
+                "frames": x.n_frames,
+                "peak_nm": float(x.wavelength_nm[peak]),
+                "peak_dn": float(x.signal_dn[peak]),
+                "snr_pixel": float(x.snr().max()),
+                "snr_element": float(x.snr_per_element().max()),
+                "saturated_pixels": int(x.saturated.sum()),
+            }
+        )
+    files.append(report.write_study(study, folder))
+    files.append(
+        report.write_record(
+            "simulate",
+            study,
+            [x for _, x, _ in found.observations],
+            folder,
+            engine=None,
+            seconds=time.perf_counter() - started,
+            messages=found.messages,
+        )
+    )
+    if as_json:
+        print(json.dumps({"messages": found.messages, "observations": summary}, indent=2))
+        return
+    from mauvecl.console import show_table
+
+    show_table(
+        "One observation each (closed-form S/N)",
+        ("observation", "frames", "peak (nm)", "peak signal (DN)", "best S/N pixel", "best S/N element", "saturated"),
+        [
+            (s["observation"], str(s["frames"]), f"{s['peak_nm']:.1f}", f"{s['peak_dn']:.0f}", f"{s['snr_pixel']:.2f}",
+             f"{s['snr_element']:.1f}", str(s["saturated_pixels"]))
+            for s in summary
+        ],
+    )  # fmt: skip
+    _finish(files, started, quiet=quiet, as_json=as_json)
+
+
+@app.command()
+def snr(
+    study_file: StudyFile = None,
+    star: StarFlag = None,
+    magnitude: MagnitudeFlag = None,
+    band: BandFlag = None,
+    exposure: ExposureFlag = None,
+    instrument: InstrumentFlag = None,
+    temperature: TemperatureFlag = None,
+    sky: SkyFlag = None,
+    target: TargetFlag = None,
+    when: TimeFlag = None,
+    realisations: Annotated[
+        int | None, typer.Option("--realisations", "-n", help="Noise realisations [100000].", show_default=False)
+    ] = None,
+    seed: SeedFlag = None,
+    device: DeviceFlag = None,
+    output: OutputFlag = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+    pictures: PicturesFlag = True,
+) -> None:
+    """Distributions of the signal-to-noise ratio per pixel and per resolution element.
+
+    Example: mauvecl snr --star B2IV --magnitude 3.03 --exposure 5
+    """
+    from mauvecl import answer, report
+    from mauvecl.console import Meter, show_table
+
+    started = time.perf_counter()
+    if realisations is None and study_file is None:
+        realisations = 100_000
+    study = _study(
+        study_file, star=star, magnitude=magnitude, band=band, exposure=exposure, instrument=instrument,
+        temperature=temperature, sky=sky, target=target, when=when,
+        run={"seed": seed, "realisations": realisations},
+    )  # fmt: skip
+    folder = report.make_folder(output or Path("mauvecl-snr"))
+    with Meter(quiet=quiet or as_json) as meter:
+        engine = _engine(device, meter)
+        found = answer.snr(study, engine)
+    _say(found.messages, as_json=as_json)
+    files, cells, data = [], [], []
+    for number, (title, result) in enumerate(found.stars, 1):
+        for what, table in (("pixel", result.pixel), ("element", result.element)):
+            table.meta["study"] = study.toml()
+            files.append(report.write_table(table, folder / f"snr-{number}-{what}.ecsv"))
+            data.append({"star": title, "per": what, "rows": report.rows(table)})
+        budget = result.expectation.noise_budget()
+        files.append(report.write_table(budget, folder / f"noise-budget-{number}.ecsv"))
+        for row in result.element[::4]:
+            cells.append(
+                (title, f"{row['wavelength'].value:.1f}", f"{row['expected']:.2f}", f"{row['mean']:.2f}",
+                 f"{row['std']:.2f}", f"{row['q2.5']:.2f}", f"{row['q50']:.2f}", f"{row['q97.5']:.2f}")
+            )  # fmt: skip
+    if _pictures_wanted(pictures, quiet=quiet, as_json=as_json):
+        from mauvecl.pictures import signal_to_noise
+
+        files.append(signal_to_noise(found.stars, folder / "snr.png"))
+    files.append(report.write_study(study, folder))
+    files.append(
+        report.write_record(
+            "snr",
+            study,
+            [r.expectation for _, r in found.stars],
+            folder,
+            engine=engine,
+            seconds=time.perf_counter() - started,
+            messages=found.messages,
+        )
+    )
+    if as_json:
+        print(json.dumps({"messages": found.messages, "stars": data}, indent=2))
+        return
+    show_table(
+        "S/N per 10.5 nm element, every fourth; all in the files",
+        ("star", "nm", "closed form", "mean", "std", "2.5 %", "50 %", "97.5 %"),
+        cells,
+    )
+    _finish(files, started, quiet=quiet, as_json=as_json)
+
+
+@app.command()
+def detect(
+    study_file: StudyFile = None,
+    star: StarFlag = None,
+    magnitude: MagnitudeFlag = None,
+    band: BandFlag = None,
+    exposure: ExposureFlag = None,
+    instrument: InstrumentFlag = None,
+    temperature: TemperatureFlag = None,
+    sky: SkyFlag = None,
+    target: TargetFlag = None,
+    when: TimeFlag = None,
+    amplitude: AmplitudeFlag = None,
+    flare_temperature: FlareTemperatureFlag = None,
+    flare_band: FlareBandFlag = None,
+    realisations: RealisationsFlag = None,
+    seed: SeedFlag = None,
+    statistic: StatisticFlag = None,
+    fap: FapFlag = None,
+    device: DeviceFlag = None,
+    output: OutputFlag = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+    pictures: PicturesFlag = True,
+) -> None:
+    """Would these flares be seen? Thresholds, detection probabilities, distributions.
+
+    Without arguments: the paper's K3V star of V = 3.7 and G2V star of V = 7.4 with flares of 0.76, 2, 8.1 and 24 %,
+    50 s, one million realisations.
+
+    Example: mauvecl detect --star K5V --magnitude 6 --amplitude 0.05 --amplitude 0.1 --exposure 30
+    """
+    from mauvecl import answer, report
+    from mauvecl.console import Meter, show_table
+
+    started = time.perf_counter()
+    study = _study(
+        study_file, star=star, magnitude=magnitude, band=band, exposure=exposure, instrument=instrument,
+        temperature=temperature, sky=sky, target=target, when=when,
+        flare={"amplitudes": amplitude, "temperature_k": flare_temperature, "band": flare_band},
+        run={"realisations": realisations, "seed": seed, "statistics": statistic, "fap": fap},
+    )  # fmt: skip
+    folder = report.make_folder(output or Path("mauvecl-detect"))
+    with Meter(quiet=quiet or as_json) as meter:
+        engine = _engine(device, meter)
+        found = answer.detect(study, engine)
+    _say(found.messages, as_json=as_json)
+    files = [report.write_table(found.table, folder / "detection.ecsv")]
+    if _pictures_wanted(pictures, quiet=quiet, as_json=as_json):
+        from mauvecl.pictures import detection, spectra
+
+        amplitudes = study.flare.amplitudes
+        files.append(detection(found.stars, amplitudes, study.run.fap, folder / "detection.png"))
+        groups = [(s.label, s.found.quiet, s.found.flares) for s in found.stars]
+        files.append(spectra(groups, amplitudes, folder / "spectra.png"))
+    files.append(report.write_study(study, folder))
+    files.append(
+        report.write_record(
+            "detect",
+            study,
+            [x for s in found.stars for x in (s.found.quiet, *s.found.flares)],
+            folder,
+            engine=engine,
+            seconds=time.perf_counter() - started,
+            messages=[*found.messages, *found.paper],
+        )
+    )
+    if as_json:
+        out = {"messages": found.messages, "paper": found.paper, "rows": report.rows(found.table)}
+        print(json.dumps(out, indent=2))
+        return
+    run = study.run
+    frames = found.stars[0].found.quiet
+    show_table(
+        f"Detection at a false-alarm probability of {run.fap:g} per test, {frames.exposure_s:g} s "
+        f"({frames.n_frames} frames), {run.realisations:,} realisations; [95 % interval]",
+        ("star", "flare", "statistic", "expected", "simulated", "reduced", "threshold", "detected", "", "closed form"),
+        [
+            (row["star"], f"{100 * row['amplitude']:g} %", row["statistic"], f"{row['expected']:.2f}",
+             f"{row['mean']:.2f}", f"{row['reduced']:.3f}", f"{row['threshold']:.2f}", f"{row['probability']:.4f}",
+             f"[{row['low']:.4f}, {row['high']:.4f}]", f"{row['closed_form_probability']:.4f}")
+            for row in found.table
+        ],
+    )  # fmt: skip
+    _say(found.paper, as_json=as_json)
+    _finish(files, started, quiet=quiet, as_json=as_json)
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        print(f"mauvecl {__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+def main() -> None:
+    """Run the command line; bad input is one sentence and exit code 2, never a traceback."""
+    import click
+
+    from mauvecl.host.errors import InputError
+
+    try:
+        sys.exit(app(standalone_mode=False))
+    except click.ClickException as error:
+        error.show()
+        sys.exit(error.exit_code)
+    except InputError as error:
+        print(f"mauvecl: {error}", file=sys.stderr)
+        sys.exit(2)
+    except (KeyboardInterrupt, click.Abort):
+        print("mauvecl: interrupted; files already written are complete", file=sys.stderr)
+        sys.exit(130)
+    except RuntimeError as error:
+        # Imported late: program is not needed by verbs that draw nothing.
+        from mauvecl.program import DeviceError
+
+        if not isinstance(error, DeviceError):
+            raise
+        print(f"mauvecl: {error}", file=sys.stderr)
+        sys.exit(2)
