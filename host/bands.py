@@ -107,7 +107,8 @@ def _observation(wavelength_nm: NDArray[np.float64], flux_flam: NDArray[np.float
     if share < COVERAGE:
         raise InputError(
             f"the spectrum covers {wavelength_nm[0]:.0f}-{wavelength_nm[-1]:.0f} nm, expected {COVERAGE:.0%} of "
-            f"the band {chosen.name} ({chosen.wavelength_nm[0]:.0f}-{chosen.wavelength_nm[-1]:.0f} nm): it has {share:.0%}"
+            f"the band {chosen.name} ({chosen.wavelength_nm[0]:.0f}-{chosen.wavelength_nm[-1]:.0f} nm), "
+            f"not {share:.0%}"
         )
     # Both samplings enter the integral: a narrow band on a coarse spectrum, and the other way round.
     grid = np.union1d(wavelength_nm, chosen.wavelength_nm)

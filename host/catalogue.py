@@ -18,7 +18,9 @@ _LIBRARY = files("mauvecl.host") / "library"
 def _read(*path: str) -> Table:
     from astropy.table import Table
 
-    return Table.read(_LIBRARY.joinpath(*path).read_text(encoding="utf-8"), format="ascii.ecsv")
+    table = Table.read(_LIBRARY.joinpath(*path).read_text(encoding="utf-8"), format="ascii.ecsv")
+    # Empty text comes back masked.
+    return table.filled("") if table.has_masked_values else table
 
 
 @cache

@@ -56,8 +56,8 @@ def with_flare(
         Where the amplitude is measured.
     geometry : {"added", "replaces"}
         ``added``: F + k B, the paper's way. ``replaces``: a patch of the filling factor f = A / (R - 1) takes the
-        place of photosphere, F (1 - f) + f R (N_F / N_B) B; N are photons in the band and R is the ratio of the two surface
-        fluxes there, from blackbodies of the two temperatures.
+        place of photosphere, F (1 - f) + f R (N_F / N_B) B; N are photons in the band and R is the ratio of the two
+        surface fluxes there, from blackbodies of the two temperatures.
     photosphere_temperature_k : float, optional
         Only for ``replaces``.
 

@@ -84,7 +84,7 @@ def detect(study: Study, engine: Engine) -> DetectAnswer:
             mode=study.observation.mode,
         )
         table = found.table(study.run.fap)
-        table["name"] = label(star, quiet)
+        table.replace_column("name", [label(star, quiet)] * len(table))
         table.rename_column("name", "star")
         amplitudes = study.flare.amplitudes
         table.add_column(

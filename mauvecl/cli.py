@@ -192,9 +192,7 @@ def library(as_json: JsonFlag = False) -> None:
     for row in table:
         ratios = ", ".join(part.split()[0] for part in row["uv_quality"].split(": ")[1].split(", "))
         cells.append(tuple(row[n] for n in ("name", "alias", "spectral_type", "star")) + (ratios, row["licence"]))
-    show_table(
-        "Embedded spectra (UV: mean flux over that at 540-560 nm); origin and citation of each: --json", columns, cells
-    )
+    show_table("Embedded spectra (UV: mean flux over that at 540-560 nm); origin, citation: --json", columns, cells)
 
 
 @app.command()

@@ -221,18 +221,17 @@ class Detection:
             "name", "statistic", "dof", "expected", "mean", "std", "reduced", "threshold", "threshold_low",
             "threshold_high", "probability", "low", "high", "closed_form_threshold", "closed_form_probability",
         )  # fmt: skip
+        probability = {statistic: self.detection_probability(fap, statistic) for statistic in self.statistics}
         rows = []
-        for statistic in self.statistics:
-            probabilities = self.detection_probability(fap, statistic)
-            for flare, x in enumerate(self.flares):
-                d = self.distribution(statistic, flare)
-                cut, p = self.threshold(fap, statistic, template=flare), probabilities[flare]
+        for flare, x in enumerate(self.flares):
+            for statistic in self.statistics:
+                d, p = self.distribution(statistic, flare), probability[statistic][flare]
+                cut = self.threshold(fap, statistic, template=flare)
                 theory = self.closed_form(statistic, flare)
                 limit = self.closed_form(statistic, template=flare).isf(fap)
                 dof = self.dof(statistic)
                 row = (x.name, statistic, dof, theory.mean, d.mean, d.std, d.mean / dof)
                 rows.append((*row, cut.value, cut.low, cut.high, p.value, p.low, p.high, limit, theory.sf(limit)))
-        rows.sort(key=lambda row: [x.name for x in self.flares].index(row[0]))
         table = QTable(rows=rows, names=columns)
         for name, text in DESCRIPTIONS.items():
             table[name].info.description = text

@@ -73,7 +73,7 @@ def detection(stars: Sequence[StarDetection], amplitudes: Sequence[float], fap: 
         for row, star in zip(axes, stars, strict=True):
             for axis, statistic in zip(row, statistics, strict=True):
                 _distributions(axis, star, statistic, amplitudes, fap)
-            row[0].set_ylabel(f"{star.label}\nprobability per unit of log value")
+            row[0].set_ylabel(f"{star.label}\nrealisations, each peak = 1")
         handles, names = axes[0][0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=len(names))
         exposure = stars[0].found.quiet.exposure_s
@@ -92,23 +92,25 @@ def _distributions(axis: Any, star: StarDetection, statistic: str, amplitudes: S
     shapes += [(k, COLOURS[k % len(COLOURS)], f"flare {100 * a:g} %") for k, a in enumerate(amplitudes)]
     for flare, colour, name in shapes:
         edges, counts = found.histogram(statistic, flare, bins=120)
-        # Means lie decades apart: a logarithmic axis shows them all, and densities per its unit keep equal areas.
-        scale = edges if linear else np.log10(np.maximum(edges, 1e-9))
-        if linear:
-            scale = np.arcsinh(edges / 2)
-        density = counts / counts.sum() / np.diff(scale)
-        middle = (edges[1:] + edges[:-1]) / 2
-        axis.fill_between(middle, density, step="mid", color=colour, alpha=0.3, linewidth=0)
-        axis.step(middle, density, where="mid", color=colour, label=name)
+        middle, height = (edges[1:] + edges[:-1]) / 2, counts / counts.max()
+        axis.fill_between(middle, height, step="mid", color=colour, alpha=0.3, linewidth=0)
+        axis.step(middle, height, where="mid", color=colour, label=name)
     cut = found.threshold(fap, statistic).value
     axis.axvline(cut, color="black", linewidth=0.9, linestyle="--", label=f"threshold, fap {fap:g} per test")
+    # Means lie decades apart.
     if linear:
         axis.set_xscale("function", functions=(lambda x: np.arcsinh(x / 2), lambda y: 2 * np.sinh(y)))
         low, high = axis.get_xlim()
-        ticks = [t for t in (-4, 0, 4, 10, 30, 100, 300, 1000, 3000, 10000) if low <= t <= high]
+        ticks = [t for t in (-4, 0, 4, 10, 30, 100, 1000, 10000) if low <= t <= high]
         axis.set_xticks(ticks, [str(t) for t in ticks])
     else:
         axis.set_xscale("log")
+        low, high = axis.get_xlim()
+        # Under two decades a power of ten alone says too little.
+        ticks = [d * 10.0**e for e in range(9) for d in ((1,) if high / low > 100 else (1, 2, 5))]
+        ticks = [t for t in ticks if low <= t <= high]
+        axis.set_xticks(ticks, [f"{t:g}" if t < 1e5 else f"$10^{{{np.log10(t):.0f}}}$" for t in ticks])
+        axis.tick_params(axis="x", which="minor", labelbottom=False)
     axis.set_ylim(bottom=0)
     axis.set_xlabel(NAMES[statistic])
 

@@ -135,7 +135,8 @@ def write_spectrum(entry: Spectrum, source: Path) -> dict[str, str]:
     negative = means < 0
     treatment = "averaged over bins of 0.5 nm below 760 nm and 2 nm above, conserving flux"
     if negative.any():
-        treatment += f"; {negative.sum()} bins with a negative mean (noise), the last at {centres[negative].max():.2f} nm, set to 0"
+        last = centres[negative].max()
+        treatment += f"; {negative.sum()} bins with a negative mean (noise), the last at {last:.2f} nm, set to 0"
         means[negative] = 0.0
     if not (means[(centres > 180) & (centres < 750)] > 0).all():
         zero = centres[(means <= 0) & (centres > 180) & (centres < 750)]
