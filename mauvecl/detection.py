@@ -8,17 +8,16 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
 
 from mauvecl.host.errors import InputError
 from mauvecl.layout import FIXED_STATISTICS
 from mauvecl.scene import Scene
 from mauvecl.statistics import (
-    CONFIDENCE,
     STATISTICS,
     Interval,
     Normal,
     QuadraticForm,
+    central_counts,
     clopper_pearson,
     closed_form,
     matched_weights,
@@ -157,7 +156,7 @@ class Detection:
             If fewer than 100 realisations lie beyond: the tail is not extrapolated.
         """
         null, cut = self._cut(fap, statistic, template)
-        n_low, n_high = (int(n) for n in stats.binom.interval(CONFIDENCE, null.n, fap))
+        n_low, n_high = central_counts(null.n, fap)
         low, high = null.first_bin_with_at_most(n_high), null.first_bin_with_at_most(max(n_low - 1, 0))
         return Interval(*(float(null.edge(index)) for index in (cut, low, high)))
 
@@ -185,7 +184,7 @@ class Detection:
         probabilities = []
         for flare in range(len(self.flares)):
             null, cut = self._cut(fap, statistic, flare)
-            n_low, n_high = (int(n) for n in stats.binom.interval(CONFIDENCE, null.n, fap))
+            n_low, n_high = central_counts(null.n, fap)
             cut_low = null.first_bin_with_at_most(n_high)
             cut_high = null.first_bin_with_at_most(max(n_low - 1, 0))
             found = self._found[(statistic, "flare_on_null_grid", flare)]

@@ -28,6 +28,7 @@ PIXEL = np.dtype(
         ("used", "f4"),
         ("inverse_variance", "f4"),
         ("element_end", "u4"),
+        ("end_among_four", "u4"),
         ("inverse_element_variance", "f4"),
     ]
 )

@@ -101,7 +101,7 @@ def _distributions(axis: Any, star: StarDetection, statistic: str, amplitudes: S
     if linear:
         axis.set_xscale("function", functions=(lambda x: np.arcsinh(x / 2), lambda y: 2 * np.sinh(y)))
         low, high = axis.get_xlim()
-        ticks = [t for t in (-4, 0, 4, 10, 30, 100, 1000, 10000) if low <= t <= high]
+        ticks: list[float] = [t for t in (-4, 0, 4, 10, 30, 100, 1000, 10000) if low <= t <= high]
         axis.set_xticks(ticks, [str(t) for t in ticks])
     else:
         axis.set_xscale("log")

@@ -64,12 +64,15 @@ def alias_table(mean: float) -> AliasTable:
     Walker's method (1977, doi 10.1145/355744.355749) on whole numbers of words: the probabilities are first
     rounded to multiples of 2**-32 that sum to one, so the table then holds them without any error.
     """
-    from scipy.stats import poisson
-
     if not 0.0 <= mean <= LARGEST_MEAN:
         raise ValueError(f"Poisson mean = {mean!r}, expected 0 to {LARGEST_MEAN:g}")
+    if mean == 0.0:
+        return AliasTable(0, 1, _pack(np.array([2**WORD_BITS, 0]), 1))
+    # Takes a second to load, and most studies need no table.
+    from scipy.stats import poisson
+
     # Counts outside have less than half a word each.
-    low, high = (int(poisson.ppf(2.0**-33, mean)), int(poisson.isf(2.0**-33, mean))) if mean > 0 else (0, 0)
+    low, high = int(poisson.ppf(2.0**-33, mean)), int(poisson.isf(2.0**-33, mean))
     low = max(low - 1, 0)
     bits = max(int(high + 1 - low).bit_length(), 1)
     counts = low + np.arange(1 << bits)

@@ -216,7 +216,13 @@ def statistics(
         inside = np.zeros(len(realisation), np.float32)
         for p, pixel in enumerate(scene.pixels):
             chi2[:] = fma(x[k, p] * x[k, p], pixel["inverse_variance"], chi2)
-            inside = fma(x[k, p], pixel["used"], inside)
+            if pixel["end_among_four"]:
+                inside = fma(x[k, p], pixel["used"], inside)
+            elif p % 4 == 0:
+                used = scene.pixels["used"][p : p + 4]
+                inside = inside + (
+                    fma(x[k, p], used[0], x[k, p + 1] * used[1]) + fma(x[k, p + 2], used[2], x[k, p + 3] * used[3])
+                )
             if pixel["element_end"]:
                 chi2_element[:] = fma(inside * inside, pixel["inverse_element_variance"], chi2_element)
                 inside = np.zeros(len(realisation), np.float32)

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
     from mauvecl.study import Study
 
 
+FITS_KEYWORDS = {"name": "OBJECT", "exposure_s": "EXPTIME", "frames": "NFRAMES", "seed": "SEED"}
+
+
 def make_folder(path: Path) -> Path:
     """A folder to write to.
 
@@ -45,8 +48,8 @@ def write_table(table: Table, path: Path) -> Path:
     """A table as ECSV, or as FITS by the file's ending."""
     if path.suffix == ".fits":
         plain = table.copy()
-        # FITS headers hold no long text: the study goes beside it.
-        plain.meta = {k: v for k, v in plain.meta.items() if k != "study"}
+        # FITS keywords have eight letters and short values: the study goes beside it.
+        plain.meta = {FITS_KEYWORDS[k]: v for k, v in plain.meta.items() if k in FITS_KEYWORDS}
         plain.write(path, overwrite=True)
     else:
         table.write(path, format="ascii.ecsv", overwrite=True)

@@ -128,6 +128,7 @@ def prepare(scenarios: Sequence[Expectation], mode: Mode = "auto") -> Scene:
     real["inverse_variance"] = used / variance
     ends = np.append(np.diff(quiet.element) > 0, True)
     real["element_end"] = ends
+    pixels["end_among_four"] = np.repeat(pixels["element_end"].reshape(-1, 4).any(axis=1), 4)
     element_variance = np.bincount(quiet.element, variance * used)
     with np.errstate(divide="ignore"):
         inverse = np.where(element_variance > 0, 1.0 / element_variance, 0.0)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -42,9 +42,22 @@ def clopper_pearson(successes: int, trials: int, confidence: float = CONFIDENCE)
         Coverage, at least reached whatever the true fraction.
     """
     tail = (1.0 - confidence) / 2.0
-    low = 0.0 if successes == 0 else float(stats.beta.ppf(tail, successes, trials - successes + 1))
-    high = 1.0 if successes == trials else float(stats.beta.isf(tail, successes + 1, trials - successes))
+    low = 0.0 if successes == 0 else float(special.betaincinv(successes, trials - successes + 1, tail))
+    high = 1.0 if successes == trials else float(special.betainccinv(successes + 1, trials - successes, tail))
     return Interval(successes / trials, low, high)
+
+
+def central_counts(trials: int, probability: float, confidence: float = CONFIDENCE) -> tuple[int, int]:
+    """The smallest counts that a binomial variable stays at or below with probability 1/2 -+ confidence/2.
+
+    Order statistics at these ranks enclose a quantile with that confidence.
+    """
+    bounds = []
+    for p in ((1.0 - confidence) / 2.0, (1.0 + confidence) / 2.0):
+        count = int(np.ceil(special.bdtrik(p, trials, probability)))
+        # The inverse is continuous; the count below may do as well.
+        bounds.append(count - 1 if count > 0 and special.bdtr(count - 1, trials, probability) >= p else count)
+    return bounds[0], bounds[1]
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,11 +93,12 @@ class QuadraticForm:
         deviations out, below 1e-15 for ten terms or more; the sum stops where its terms have fallen below 1e-15.
         """
         if self._is_chi_squared():
-            return (
-                float(stats.ncx2.sf(value, self.weight.size, np.sum(self.shift**2)))
-                if self.shift.any()
-                else float(stats.chi2.sf(value, self.weight.size))
-            )
+            if not self.shift.any():
+                return float(special.chdtrc(self.weight.size, value))
+            # scipy.stats takes a second to load, and is not needed by most studies.
+            from scipy.stats import ncx2
+
+            return float(ncx2.sf(value, self.weight.size, np.sum(self.shift**2)))
         spacing = 2.0 * np.pi / (40.0 * self.std + abs(value - self.mean))
         total, k = 0.0, 0.5
         while True:
@@ -107,7 +121,7 @@ class QuadraticForm:
     def isf(self, probability: float) -> float:
         """The value exceeded with this probability."""
         if self._is_chi_squared() and not self.shift.any():
-            return float(stats.chi2.isf(probability, self.weight.size))
+            return float(special.chdtri(self.weight.size, probability))
         from scipy.optimize import brentq
 
         low, high = max(self.mean - 12 * self.std, 0.0), self.mean + 40 * self.std
@@ -126,11 +140,11 @@ class Normal:
 
     def sf(self, value: float) -> float:
         """Probability of exceeding `value`."""
-        return float(stats.norm.sf(value, self.mean, self.std))
+        return float(special.ndtr((self.mean - value) / self.std))
 
     def isf(self, probability: float) -> float:
         """The value exceeded with this probability."""
-        return float(stats.norm.isf(probability, self.mean, self.std))
+        return float(self.mean - self.std * special.ndtri(probability))
 
 
 def matched_weights(quiet: Expectation, flare: Expectation, used: NDArray[np.bool_]) -> NDArray[np.float64]:

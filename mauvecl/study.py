@@ -64,6 +64,10 @@ class Observation(_Part):
     mode: Literal["auto", "frames", "stacked"] = "auto"
 
 
+#: V mag arcsec-2 where a study says nothing of the sky: the ecliptic opposite the Sun.
+DEFAULT_SKY = 22.1
+
+
 class SkyLight(_Part):
     """What is behind the star: a surface brightness, a target and a time, or nothing."""
 
@@ -71,6 +75,11 @@ class SkyLight(_Part):
     target: str | None = None
     time: str | None = None
     none: bool = False
+
+    @model_validator(mode="before")
+    @classmethod
+    def _something(cls, given: Any) -> Any:
+        return given or {"surface_brightness": DEFAULT_SKY}
 
     @model_validator(mode="after")
     def _one_sky(self) -> Self:
@@ -81,14 +90,14 @@ class SkyLight(_Part):
         return self
 
     def sky(self) -> Sky:
-        """The sky; 22.1 V mag arcsec-2, the ecliptic opposite the Sun, where nothing is said."""
+        """What the host needs of it."""
         from mauvecl.host.sky import Sky
 
         if self.none:
             return Sky.none()
         if self.target is not None and self.time is not None:
             return Sky.at(self.target, self.time)
-        return Sky.of_brightness(22.1 if self.surface_brightness is None else self.surface_brightness)
+        return Sky.none() if self.surface_brightness is None else Sky.of_brightness(self.surface_brightness)
 
 
 class Run(_Part):
@@ -163,6 +172,8 @@ class Study(_Part):
         import tomli_w
 
         data = self.model_dump(mode="json", exclude_none=True)
+        if not self.sky.none:
+            del data["sky"]["none"]
         for star in data["star"]:
             if "file" in star:
                 star["file"] = str(Path(star["file"]).resolve())
