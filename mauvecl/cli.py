@@ -502,21 +502,13 @@ def _options(
 
 def main() -> None:
     """Run the command line; bad input is one sentence and exit code 2, never a traceback."""
-    import click
-
     from mauvecl.host.errors import InputError
 
     try:
-        sys.exit(app(standalone_mode=False))
-    except click.ClickException as error:
-        error.show()
-        sys.exit(error.exit_code)
+        app()
     except InputError as error:
         print(f"mauvecl: {error}", file=sys.stderr)
         sys.exit(2)
-    except (KeyboardInterrupt, click.Abort):
-        print("mauvecl: interrupted; files already written are complete", file=sys.stderr)
-        sys.exit(130)
     except RuntimeError as error:
         # Imported late: program is not needed by verbs that draw nothing.
         from mauvecl.program import DeviceError

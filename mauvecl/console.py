@@ -30,8 +30,10 @@ class Meter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         self._stop()
+        if kind is KeyboardInterrupt:
+            print("mauvecl: interrupted; nothing was written, and nothing is half written", file=sys.stderr)
 
     def __call__(self, done: int, total: int) -> None:
         """Take note of work done, in realisations."""

@@ -1,0 +1,252 @@
+"""The command line as a user meets it: answers, files, reruns, refusals, interruption."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import QTable
+
+COMMAND = [sys.executable, "-m", "mauvecl"]
+
+
+def run(*words: str | Path, folder: Path, code: int = 0) -> subprocess.CompletedProcess[str]:
+    done = subprocess.run(
+        [*COMMAND, *map(str, words)], cwd=folder, capture_output=True, text=True, env=os.environ | {"COLUMNS": "200"}
+    )
+    assert done.returncode == code, done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    return done
+
+
+@pytest.fixture(scope="module")
+def answered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The default question with fewer realisations."""
+    folder = tmp_path_factory.mktemp("detect")
+    return folder, run("detect", "-n", "100000", folder=folder).stdout
+
+
+def test_detect_answers_the_papers_question(answered: tuple[Path, str]) -> None:
+    folder, text = answered
+    lines = text.splitlines()
+    assert "not a flight calibration" in lines[0]
+    assert "false-alarm probability of 0.001 per test, 50 s (10 frames), 100,000 realisations" in lines[1]
+    assert "\x1b" not in text
+    table = QTable.read(folder / "mauvecl-detect" / "detection.ecsv")
+    assert len(table) == 2 * 4 * 3
+    assert set(table["star"]) == {"K3V V = 3.7", "G2V V = 7.4"}
+    assert set(table["amplitude"]) == {0.0076, 0.02, 0.081, 0.24}
+    assert set(table["statistic"]) == {"chi2", "chi2_element", "matched"}
+    assert np.all((table["low"] <= table["probability"]) & (table["probability"] <= table["high"]))
+    np.testing.assert_allclose(table["mean"], table["expected"], rtol=0.01)
+    # The calibrated answer: the 24 % flare is certain on both, the smallest is lost in the pixels' noise of the G2V.
+    row = {(r["star"][:3], r["amplitude"], r["statistic"]): r["probability"] for r in table}
+    assert row["G2V", 0.24, "chi2"] == row["K3V", 0.0076, "chi2"] == 1.0
+    assert row["G2V", 0.0076, "chi2"] < 0.01 < 0.4 < row["G2V", 0.0076, "matched"]
+
+
+def test_the_papers_pair_is_compared(answered: tuple[Path, str]) -> None:
+    """Both of the paper's values are reconstructed within 30 %, and the text says why a calibrated answer differs."""
+    _, text = answered
+    for amplitude, reduced in (("8.1 %", 0.66), ("24 %", 3.75)):
+        line = next(x for x in text.splitlines() if x.startswith(f"G2V, {amplitude} flare"))
+        assert f"reduced {reduced:g}" in line
+        ours = float(line.split("reconstructed here ")[1].split()[0])
+        assert ours == pytest.approx(reduced, rel=0.3)
+    assert "no calibrated chi-squared" in text
+
+
+def test_files_and_record(answered: tuple[Path, str]) -> None:
+    folder, text = answered
+    out = folder / "mauvecl-detect"
+    names = {"detection.ecsv", "detection.png", "spectra.png", "study.toml", "run.json"}
+    assert {path.name for path in out.iterdir()} == names
+    assert all(name in text.splitlines()[-1] for name in names)
+    record = json.loads((out / "run.json").read_text())
+    assert record["seed"] == 1
+    assert record["study"]["run"]["realisations"] == 100_000
+    assert len(record["inputs"]) == 10
+    assert all(len(entry["source digest"]) == 64 for entry in record["inputs"])
+    assert {"device", "kernels", "wall_time_s", "mauvecl", "messages"} <= set(record)
+    for picture in ("detection.png", "spectra.png"):
+        assert (out / picture).read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_the_study_gives_the_same_bits_again(answered: tuple[Path, str], tmp_path: Path) -> None:
+    folder, _ = answered
+    first = folder / "mauvecl-detect"
+    run("detect", first / "study.toml", "--no-pictures", "-o", "again", folder=tmp_path)
+    assert (tmp_path / "again" / "detection.ecsv").read_text() == (first / "detection.ecsv").read_text()
+    assert (tmp_path / "again" / "study.toml").read_text() == (first / "study.toml").read_text()
+
+
+def test_a_study_file_and_flags(tmp_path: Path) -> None:
+    """A user's own spectrum named in a study, with flags on top; JSON alone on standard output."""
+    wavelength = np.arange(170.0, 1100.0, 2.0)
+    np.savetxt(tmp_path / "mine.txt", np.column_stack([wavelength, 1e-11 * np.ones_like(wavelength)]))
+    (tmp_path / "study.toml").write_text(
+        '[[star]]\nfile = "mine.txt"\nmagnitude = 6\n[flare]\namplitudes = [0.1]\n'
+        '[observation]\nexposure_s = 12\n[sky]\ntarget = "290.68 +11.12"\ntime = "2026-09-01T12:00"\n'
+        '[run]\nrealisations = 2000\nfap = 0.05\nstatistics = ["matched"]\n'
+    )
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    done = run("detect", "../study.toml", "--seed", "7", "--sky", "none", "--json", folder=elsewhere)
+    answer = json.loads(done.stdout)
+    assert len(answer["rows"]) == 1
+    assert answer["rows"][0]["star"] == "mine V = 6"
+    assert any("15 s" in message for message in answer["messages"])
+    text = (elsewhere / "mauvecl-detect" / "study.toml").read_text()
+    assert "none = true" in text
+    assert "target" not in text
+    assert "seed = 7" in text
+
+
+def test_simulate(tmp_path: Path) -> None:
+    run("simulate", "--star", "G2V", "-m", "7.4", "-a", "0.24", "-t", "10", "-o", "out", folder=tmp_path)
+    table = QTable.read(tmp_path / "out" / "observation-2.ecsv")
+    parts = ("source", "sky", "photon_noise", "dark", "bias", "read_noise", "digitisation")
+    np.testing.assert_allclose(sum(table[name] for name in parts).value, table["raw"].value, rtol=1e-12)
+    assert np.abs(table["digitisation"].value).max() <= 0.51
+    assert table["raw"].unit == "adu"
+    with fits.open(tmp_path / "out" / "observation-2.fits") as hdus:
+        hdus.verify("exception")
+        assert hdus[1].header["EXPTIME"] == 10.0
+        np.testing.assert_array_equal(hdus[1].data["raw"], table["raw"].value)
+    assert (tmp_path / "out" / "observation-2.png").exists()
+
+
+def test_a_simulation_is_the_engines_realisation() -> None:
+    from scenes import instrument, star
+
+    from mauvecl.components import components
+    from mauvecl.engine import Engine
+
+    for options in ({"exposure": 50.0}, {"exposure": 10.0, "magnitude": -0.3}):
+        (x,) = star(payload=instrument(part=True), **options)
+        table = components(x, realisation=123, seed=4)
+        np.testing.assert_array_equal(table["raw"].value, Engine().realise(x, start=123, count=1, seed=4)[0])
+
+
+def test_the_parts_of_a_simulation_have_their_variances() -> None:
+    """Photon and read noise apart: 197 pixels x 30 realisations, each sum of squares within 5 standard errors."""
+    from scenes import instrument, star
+
+    from mauvecl.components import components
+
+    (x,) = star(magnitude=4.0, payload=instrument(part=True))
+    tables = [components(x, realisation=i, seed=4) for i in range(30)]
+    gain, n = x.gain_dn_per_electron, 30 * x.wavelength_nm.size
+    photon = np.array([t["photon_noise"].value for t in tables]) / np.sqrt(gain * x.signal_dn)
+    read = np.array([t["read_noise"].value for t in tables]) / np.sqrt(x.n_frames * 144 + (x.n_frames - 1) / 12)
+    for z in (photon, read):
+        assert abs((z**2).sum() - n) < 5 * np.sqrt(2 * n)
+    assert abs((photon * read).sum()) < 5 * np.sqrt(n)
+
+
+def test_snr(tmp_path: Path) -> None:
+    done = run("snr", "--star", "B2IV", "-m", "3.03", "-t", "5", "-n", "5000", "-o", "out", folder=tmp_path)
+    assert "S/N per 10.5 nm element" in done.stdout
+    table = QTable.read(tmp_path / "out" / "snr-1-element.ecsv")
+    np.testing.assert_allclose(table["mean"], table["expected"], rtol=1e-3)
+    assert np.all(table["q2.5"] < table["q97.5"])
+    assert {"snr-1-pixel.ecsv", "noise-budget-1.ecsv", "snr.png"} <= {p.name for p in (tmp_path / "out").iterdir()}
+
+
+def test_library_and_devices(tmp_path: Path) -> None:
+    assert "HD 40307" in run("library", folder=tmp_path).stdout
+    assert len(json.loads(run("library", "--json", folder=tmp_path).stdout)) >= 25
+    assert "Portable Computing Language" in run("devices", folder=tmp_path).stdout
+    assert json.loads(run("devices", "--json", folder=tmp_path).stdout)[0]["default"]
+    assert "mauvecl 0" in run("--version", folder=tmp_path).stdout
+
+
+def test_saturation_comes_first(tmp_path: Path) -> None:
+    done = run("simulate", "--star", "B2IV", "-m", "0.5", "-t", "5", "--no-pictures", folder=tmp_path)
+    first = done.stdout.splitlines()[0]
+    assert first.startswith("SATURATED: ")
+    assert " nm reach " in first
+    assert "the longest safe frame is " in first
+
+
+BAD = {
+    "unknown star": (["detect", "--star", "G3V"], "'G3V' is unknown"),
+    "missing file": (["detect", "--star", "no.txt"], "'no.txt' does not exist"),
+    "exposure": (["detect", "--exposure", "-5"], "exposure"),
+    "amplitude": (["detect", "-a", "-0.1"], "amplitude = -0.1"),
+    "flare temperature": (["detect", "--flare-temperature", "5"], "flare temperature = 5.0 K"),
+    "detector temperature": (["detect", "--temperature", "900"], "temperature"),
+    "coordinates": (["detect", "--target", "here", "--time", "2026-09-01"], "here"),
+    "time": (["detect", "--target", "290 11", "--time", "yesterday"], "yesterday"),
+    "only a target": (["detect", "--target", "290 11"], "only one of target and time"),
+    "the Sun": (["detect", "--target", "340 -8", "--time", "2026-03-01"], "Sun"),
+    "sky": (["detect", "--sky", "dark"], "'dark'"),
+    "instrument": (["detect", "--instrument", "hubble"], "hubble"),
+    "device": (["detect", "--device", "abacus"], "'abacus' is not here, expected one of"),
+    "statistic": (["detect", "--statistic", "chi3", "-n", "10"], "'chi3' is unknown"),
+    "rare fap": (["detect", "--fap", "1e-6", "-n", "1000", "--star", "G2V"], "ask for 100000000 realisations"),
+    "realisations": (["detect", "-n", "0"], "run.realisations = 0"),
+    "magnitudes": (["detect", "-m", "1", "-m", "2", "-m", "3"], "3 magnitudes for 2 stars"),
+    "flag": (["detect", "--nonsense"], "nonsense"),
+    "word": (["detect", "-n", "many"], "many"),
+    "study": (["detect", "no.toml"], "'no.toml' cannot be read"),
+    "output": (["detect", "-o", "/proc/nothing"], "cannot be written"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input_is_a_sentence_and_exit_code_2(name: str, tmp_path: Path) -> None:
+    words, sentence = BAD[name]
+    done = run(*words, folder=tmp_path, code=2)
+    assert sentence in done.stderr
+    assert done.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("[run]\nsead = 3", "unknown key 'run.sead', did you mean 'seed'?"),
+        ("[[star]]\nlibrary = 'G2V'\nmagnitud = 3", "unknown key 'star.0.magnitud', did you mean 'magnitude'?"),
+        ("[run\nseed = 3", "is not TOML"),
+        ("[run]\nfap = 2", "run.fap = 2"),
+        ("[flare]\namplitudes = []", "flare.amplitudes"),
+        ("[[star]]\nmagnitude = 3", "expected one of them"),
+        ("[observation]\nexposure_s = 'long'", "observation.exposure_s = 'long'"),
+    ],
+)
+def test_bad_studies_are_a_sentence(text: str, sentence: str, tmp_path: Path) -> None:
+    (tmp_path / "study.toml").write_text(text)
+    done = run("detect", "study.toml", folder=tmp_path, code=2)
+    assert sentence in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+def test_interruption_ends_cleanly(tmp_path: Path) -> None:
+    process = subprocess.Popen(
+        [*COMMAND, "detect", "-n", "2000000000"],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    time.sleep(8)
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=30)
+    assert process.returncode == 130
+    assert "interrupted" in errors
+    assert "Traceback" not in errors
+
+
+def test_nothing_heavy_is_loaded_early() -> None:
+    """Importing the package, or asking for help, loads neither OpenCL nor synphot nor astropy."""
+    heavy = "('pyopencl', 'synphot', 'astropy', 'scipy')"
+    code = f"import sys, mauvecl, mauvecl.cli; print([m for m in {heavy} if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"
