@@ -196,7 +196,7 @@ BAD = {
     "realisations": (["detect", "-n", "0"], "run.realisations = 0"),
     "magnitudes": (["detect", "-m", "1", "-m", "2", "-m", "3"], "3 magnitudes for 2 stars"),
     "flag": (["detect", "--nonsense"], "nonsense"),
-    "word": (["detect", "-n", "many"], "many"),
+    "word": (["detect", "-n", "many"], "Invalid value for '--realisations'"),
     "study": (["detect", "no.toml"], "'no.toml' cannot be read"),
     "output": (["detect", "-o", "/proc/nothing"], "cannot be written"),
 }
