@@ -1,5 +1,10 @@
 ## Every statistic of METHODS section 6 of every scenario, from one pass over common draws.
 ## t = observed - expected quiescent DN of one pixel; each work-item follows WIDTH realisations over all pixels.
+/* Four sums side by side, by pixel number modulo four: one alone would wait for each addition to end. */
+typedef struct { floatv a, b, c, d; } Four;
+#define NOTHING (Four){0.0f, 0.0f, 0.0f, 0.0f}
+#define SUM(x) (((x).a + (x).b) + ((x).c + (x).d))
+
 __kernel ${attributes}
 void statistics(const uint seed_low, const uint seed_high, const uint first_low, const uint first_high,
                 const uint pixel_count, const uint scenario_count, const uint frame_count,
@@ -9,17 +14,18 @@ void statistics(const uint seed_low, const uint seed_high, const uint first_low,
 {
     const uint item = get_global_id(0);
     const uintv realisation = (uintv)(first_low + item * ${width}u) + LANE_INDEX;
-    floatv chi2[${scenarios}], element[${scenarios}], chi2_element[${scenarios}], linear[${linears}];
+    Four chi2[${scenarios}], linear[${linears}];
+    floatv element[${scenarios}], chi2_element[${scenarios}];
 % if pair:
     floatv chi2_pair[${scenarios}];
 % endif
     for (uint k = 0; k < scenario_count; k++) {
-        chi2[k] = 0.0f; element[k] = 0.0f; chi2_element[k] = 0.0f;
+        chi2[k] = NOTHING; element[k] = 0.0f; chi2_element[k] = 0.0f;
 % if pair:
         chi2_pair[k] = 0.0f;
 % endif
     }
-    for (uint l = 0; l < linear_end[scenario_count - 1]; l++) linear[l] = 0.0f;
+    for (uint l = 0; l < linear_end[scenario_count - 1]; l++) linear[l] = NOTHING;
 % if not frames:
     const Address at = address(realisation, first_high, 0u, seed_low, seed_high);
 % endif
@@ -74,9 +80,12 @@ void statistics(const uint seed_low, const uint seed_high, const uint first_low,
             floatv *x = t;
             for (uint i = 0; i < ${chunk}u; i++) x[i] = digitise(z[i], d[i], pixel[i].dark_gain, level + i) + level[i].offset;
 % endif
-            floatv sum = chi2[k];
-            for (uint i = 0; i < ${chunk}u; i++)
-                sum = FMA(x[i] * x[i], (floatv)pixel[i].inverse_variance, sum);
+            Four sum = chi2[k];
+            for (uint i = 0; i < ${chunk}u; i += 4) {
+% for j, part in enumerate("abcd"):
+                sum.${part} = FMA(x[i + ${j}u] * x[i + ${j}u], (floatv)pixel[i + ${j}u].inverse_variance, sum.${part});
+% endfor
+            }
             chi2[k] = sum;
 % if elements:
             floatv inside = element[k], outside = chi2_element[k];
@@ -100,8 +109,12 @@ void statistics(const uint seed_low, const uint seed_high, const uint first_low,
 % endif
             for (; l < linear_end[k]; l++) {
                 __global const float *weight = weights + l * pixel_count + start;
-                floatv total = linear[l];
-                for (uint i = 0; i < ${chunk}u; i++) total = FMA(x[i], (floatv)weight[i], total);
+                Four total = linear[l];
+                for (uint i = 0; i < ${chunk}u; i += 4) {
+% for j, part in enumerate("abcd"):
+                    total.${part} = FMA(x[i + ${j}u], (floatv)weight[i + ${j}u], total.${part});
+% endfor
+                }
                 linear[l] = total;
             }
 % if pair:
@@ -118,12 +131,12 @@ void statistics(const uint seed_low, const uint seed_high, const uint first_low,
     /* One row per channel: three fixed ones a scenario, then the linear ones. */
     __global float *out = values + item * ${width}u;
     for (uint k = 0; k < scenario_count; k++) {
-        STORE(chi2[k], out + (3u * k) * stride);
+        STORE(SUM(chi2[k]), out + (3u * k) * stride);
         STORE(chi2_element[k], out + (3u * k + 1u) * stride);
 % if pair:
         STORE(chi2_pair[k], out + (3u * k + 2u) * stride);
 % endif
     }
     for (uint l = 0; l < linear_end[scenario_count - 1]; l++)
-        STORE(linear[l], out + (3u * scenario_count + l) * stride);
+        STORE(SUM(linear[l]), out + (3u * scenario_count + l) * stride);
 }

@@ -214,8 +214,8 @@ def statistics(
     for k in range(n_scenario):
         chi2, chi2_element, chi2_pair = (out[fixed * k + i] for i in range(fixed))
         inside = np.zeros(len(realisation), np.float32)
+        chi2[:] = _summed(x[k] * x[k], scene.pixels["inverse_variance"])
         for p, pixel in enumerate(scene.pixels):
-            chi2[:] = fma(x[k, p] * x[k, p], pixel["inverse_variance"], chi2)
             if pixel["end_among_four"]:
                 inside = fma(x[k, p], pixel["used"], inside)
             elif p % 4 == 0:
@@ -230,11 +230,18 @@ def statistics(
                 difference = x[k, p] - quiet[p]
                 chi2_pair[:] = fma(difference * difference, np.float32(0.5) * pixel["inverse_variance"], chi2_pair)
         for linear in range(begin, int(linear_end[k])):
-            total = out[fixed * n_scenario + linear]
-            for p in range(len(scene.pixels)):
-                total[:] = fma(x[k, p], weights[linear, p], total)
+            out[fixed * n_scenario + linear] = _summed(x[k], weights[linear])
         begin = int(linear_end[k])
     return out
+
+
+def _summed(values: NDArray[np.float32], weights: NDArray[np.float32]) -> Floats:
+    """Weighted sums over pixels, shape (n_pixel, n) to (n,): four side by side, by pixel number modulo four."""
+    parts = [np.zeros(values.shape[1], np.float32) for _ in range(4)]
+    for p, weight in enumerate(weights):
+        parts[p % 4] = fma(values[p], weight, parts[p % 4])
+    total: Floats = (parts[0] + parts[1]) + (parts[2] + parts[3])
+    return total
 
 
 def signal_to_noise(
