@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 from mauvecl.components import components
-from mauvecl.detection import Detection
+from mauvecl.detection import Detection, check_fap
 from mauvecl.paper import PAPER_G2V, WHY, reconstruct
 from mauvecl.study import PAPER_STARS, Star, Study
 
@@ -72,6 +72,7 @@ def detect(study: Study, engine: Engine) -> DetectAnswer:
     from astropy.table import vstack
 
     # Everything is looked at before anything is drawn: bad input shows at once.
+    check_fap(study.run.fap, study.run.realisations)
     prepared = [study.expectations(star) for star in study.star]
     stars, tables = [], []
     for star, (quiet, *flares) in zip(study.star, prepared, strict=True):

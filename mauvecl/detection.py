@@ -37,6 +37,23 @@ Role = Literal["null", "flare_on_null_grid", "flare"]
 Key = tuple[str, Role, int]
 
 
+def check_fap(fap: float, realisations: int) -> None:
+    """Refuse a false-alarm probability that this many realisations cannot settle.
+
+    Raises
+    ------
+    InputError
+        If it is none, or fewer than 100 realisations would lie beyond the threshold.
+    """
+    if not 0.0 < fap < 1.0:
+        raise InputError(f"fap = {fap!r}, expected a probability between 0 and 1")
+    if fap * realisations < FEWEST_IN_TAIL * (1 - 1e-9):
+        raise InputError(
+            f"fap = {fap:g} leaves {fap * realisations:.3g} of {realisations} realisations beyond the threshold, "
+            f"expected at least {FEWEST_IN_TAIL}: ask for {int(np.ceil(FEWEST_IN_TAIL / fap))} realisations"
+        )
+
+
 @dataclass(frozen=True)
 class ChannelPlan:
     """What one launch computes for a batch of flares, and how its grids are called.
@@ -243,14 +260,8 @@ class Detection:
 
     def _cut(self, fap: float, statistic: str, template: int) -> tuple[Distribution, int]:
         self._check(statistic, template)
-        if not 0.0 < fap < 1.0:
-            raise InputError(f"fap = {fap!r}, expected a probability between 0 and 1")
+        check_fap(fap, self.realisations)
         null = self._found[(statistic, "null", self._null(statistic, template))]
-        if fap * null.n < FEWEST_IN_TAIL * (1 - 1e-9):
-            raise InputError(
-                f"fap = {fap:g} leaves {fap * null.n:.3g} of {null.n} realisations beyond the threshold, "
-                f"expected at least {FEWEST_IN_TAIL}: ask for {int(np.ceil(FEWEST_IN_TAIL / fap))} realisations"
-            )
         return null, null.first_bin_with_at_most(int(np.floor(fap * null.n * (1 + 1e-12))))
 
     def _check(self, statistic: str, flare: int) -> None:
