@@ -138,8 +138,6 @@ def snr(study: Study, engine: Engine) -> SnrAnswer:
         )
         for star, x in zip(study.star, prepared, strict=True)
     ]
-    for _, result in stars:
-        result.expectation.noise_budget()
     return SnrAnswer(study, stars, told(prepared))
 
 

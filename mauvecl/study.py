@@ -23,12 +23,13 @@ class _Part(BaseModel):
 
 
 class Star(_Part):
-    """Which spectrum, how bright."""
+    """Which spectrum, behind how much dust, how bright then."""
 
     library: str | None = None
     file: Path | None = None
     magnitude: float | None = None
     band: str = "V"
+    ebv: float | None = None
 
     @model_validator(mode="after")
     def _one_spectrum(self) -> Self:
@@ -41,6 +42,8 @@ class Star(_Part):
         from mauvecl.host.source import Source
 
         found = Source.from_library(self.library) if self.library is not None else Source.read(self.file or "")
+        if self.ebv is not None:
+            found = found.reddened(self.ebv)
         return found if self.magnitude is None else found.at_magnitude(self.magnitude, self.band)
 
 

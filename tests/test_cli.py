@@ -110,6 +110,14 @@ def test_a_study_file_and_flags(tmp_path: Path) -> None:
     assert "seed = 7" in text
 
 
+def test_a_study_may_redden_its_star() -> None:
+    from mauvecl.study import Star
+
+    plain, behind = (Star(library="G2V", magnitude=7.4, ebv=e).source() for e in (None, 0.3))
+    assert behind.magnitude("V") == pytest.approx(plain.magnitude("V"), abs=1e-9)
+    assert behind.magnitude("GALEX NUV") > plain.magnitude("GALEX NUV") + 1
+
+
 def test_simulate(tmp_path: Path) -> None:
     run("simulate", "--star", "G2V", "-m", "7.4", "-a", "0.24", "-t", "10", "-o", "out", folder=tmp_path)
     table = QTable.read(tmp_path / "out" / "observation-2.ecsv")
