@@ -6,16 +6,40 @@ import json
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from mauvecl import __version__
+from mauvecl.flags import (
+    AmplitudeFlag,
+    BandFlag,
+    DeviceFlag,
+    ExposureFlag,
+    FapFlag,
+    FlareBandFlag,
+    FlareTemperatureFlag,
+    InstrumentFlag,
+    JsonFlag,
+    MagnitudeFlag,
+    OutputFlag,
+    PicturesFlag,
+    QuietFlag,
+    RealisationsFlag,
+    SeedFlag,
+    SkyFlag,
+    StarFlag,
+    StatisticFlag,
+    StudyFile,
+    TargetFlag,
+    TemperatureFlag,
+    TimeFlag,
+    study_from_flags,
+)
 
 if TYPE_CHECKING:
     from mauvecl.console import Meter
     from mauvecl.engine import Engine
-    from mauvecl.study import Study
 
 app = typer.Typer(
     name="mauvecl",
@@ -27,119 +51,6 @@ app = typer.Typer(
     "Start with `mauvecl detect`, which answers the question of the MauveSim paper. The throughput is nominal, not a "
     "flight calibration. Exit codes: 0 done, 2 bad input, 130 interrupted.",
 )
-
-StudyFile = Annotated[Path | None, typer.Argument(help="Study file (TOML); flags override it.", show_default=False)]
-StarFlag = Annotated[
-    list[str] | None,
-    typer.Option("--star", "-s", help="Library name or spectrum file; may be repeated.", show_default=False),
-]
-MagnitudeFlag = Annotated[
-    list[float] | None,
-    typer.Option("--magnitude", "-m", help="Magnitude, one for all stars or one each.", show_default=False),
-]
-BandFlag = Annotated[str | None, typer.Option(help="Band of the magnitude [V].", show_default=False)]
-ExposureFlag = Annotated[
-    float | None, typer.Option("--exposure", "-t", help="Seconds, rounded up to 5 s frames [50].", show_default=False)
-]
-InstrumentFlag = Annotated[
-    str | None, typer.Option(help="mauve, mauve-electrons, or your own TOML file [mauve].", show_default=False)
-]
-TemperatureFlag = Annotated[float | None, typer.Option(help="Detector temperature, deg C [21].", show_default=False)]
-SkyFlag = Annotated[
-    str | None, typer.Option(help="Sky brightness, V mag/arcsec^2, or none [22.1].", show_default=False)
-]
-TargetFlag = Annotated[str | None, typer.Option(help="Coordinates, with --time: zodiacal light.", show_default=False)]
-TimeFlag = Annotated[str | None, typer.Option("--time", help="UTC of the observation.", show_default=False)]
-AmplitudeFlag = Annotated[
-    list[float] | None,
-    typer.Option("--amplitude", "-a", help="Flare amplitude, 0.24 is 24 %; may be repeated.", show_default=False),
-]
-FlareTemperatureFlag = Annotated[float | None, typer.Option(help="Flare temperature, K [10000].", show_default=False)]
-FlareBandFlag = Annotated[str | None, typer.Option(help="Band of the amplitude [Kepler].", show_default=False)]
-RealisationsFlag = Annotated[
-    int | None, typer.Option("--realisations", "-n", help="Noise realisations [1000000].", show_default=False)
-]
-SeedFlag = Annotated[int | None, typer.Option(help="Seed [1].", show_default=False)]
-StatisticFlag = Annotated[
-    list[str] | None,
-    typer.Option("--statistic", help="chi2, chi2_element, chi2_pair, matched; may be repeated.", show_default=False),
-]
-FapFlag = Annotated[float | None, typer.Option(help="False-alarm probability per test [0.001].", show_default=False)]
-DeviceFlag = Annotated[
-    str | None, typer.Option(help="OpenCL device: number or part of its name [PoCL].", show_default=False)
-]
-OutputFlag = Annotated[
-    Path | None,
-    typer.Option("--output", "-o", help="Folder for tables and pictures [mauvecl-VERB].", show_default=False),
-]
-JsonFlag = Annotated[bool, typer.Option("--json", help="Print JSON and nothing else.")]
-QuietFlag = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress and no file names.")]
-PicturesFlag = Annotated[bool, typer.Option("--pictures/--no-pictures", help="Draw pictures (needs mauvecl[plot]).")]
-
-
-def _study(
-    file: Path | None,
-    *,
-    star: list[str] | None,
-    magnitude: list[float] | None,
-    band: str | None,
-    exposure: float | None,
-    instrument: str | None,
-    temperature: float | None,
-    sky: str | None,
-    target: str | None,
-    when: str | None,
-    **changes: dict[str, Any],
-) -> Study:
-    """A study file, or the default, with the flags on top."""
-    from mauvecl.host.errors import InputError
-    from mauvecl.study import Study
-
-    study = Study.read(file) if file is not None else Study()
-    skylight: dict[str, Any] = {"target": target, "time": when}
-    if sky is not None:
-        if sky.strip().lower() == "none":
-            skylight["none"] = True
-        else:
-            try:
-                skylight["surface_brightness"] = float(sky)
-            except ValueError as error:
-                raise InputError(f"--sky {sky!r}, expected V mag/arcsec^2 or none") from error
-    sections = {
-        "observation": {"exposure_s": exposure, "instrument": instrument, "temperature_c": temperature},
-        "sky": skylight,
-        **changes,
-    }
-    return study.with_changes(sections, _stars(study, star, magnitude, band))
-
-
-def _stars(
-    study: Study, names: list[str] | None, magnitudes: list[float] | None, band: str | None
-) -> list[dict[str, Any]] | None:
-    from mauvecl.host.errors import InputError
-
-    if not (names or magnitudes or band):
-        return None
-    if names:
-        # A name that is a file's is a file; anything else is looked up in the library.
-        stars: list[dict[str, Any]] = [
-            {"file": name} if Path(name).suffix or Path(name).exists() else {"library": name} for name in names
-        ]
-        for entry in stars:
-            if "file" in entry and not Path(entry["file"]).exists() and Path(entry["file"]).suffix[1:].isupper():
-                # "K2.5V" looks like a file's name and is not one.
-                entry["library"] = entry.pop("file")
-    else:
-        stars = [entry.model_dump(exclude_none=True) for entry in study.star]
-    if magnitudes:
-        if len(magnitudes) not in (1, len(stars)):
-            raise InputError(f"{len(magnitudes)} magnitudes for {len(stars)} stars, expected one for all or one each")
-        for entry, value in zip(stars, magnitudes * (len(stars) if len(magnitudes) == 1 else 1), strict=True):
-            entry["magnitude"] = value
-    if band:
-        for entry in stars:
-            entry["band"] = band
-    return stars
 
 
 def _engine(device: str | None, meter: Meter) -> Engine:
@@ -257,7 +168,7 @@ def simulate(
     from mauvecl import answer, report
 
     started = time.perf_counter()
-    study = _study(
+    study = study_from_flags(
         study_file, star=star, magnitude=magnitude, band=band, exposure=exposure, instrument=instrument,
         temperature=temperature, sky=sky, target=target, when=when,
         flare={"amplitudes": amplitude, "temperature_k": flare_temperature, "band": flare_band}, run={"seed": seed},
@@ -347,7 +258,7 @@ def snr(
     started = time.perf_counter()
     if realisations is None and study_file is None:
         realisations = 100_000
-    study = _study(
+    study = study_from_flags(
         study_file, star=star, magnitude=magnitude, band=band, exposure=exposure, instrument=instrument,
         temperature=temperature, sky=sky, target=target, when=when,
         run={"seed": seed, "realisations": realisations},
@@ -433,7 +344,7 @@ def detect(
     from mauvecl.console import Meter, show_table
 
     started = time.perf_counter()
-    study = _study(
+    study = study_from_flags(
         study_file, star=star, magnitude=magnitude, band=band, exposure=exposure, instrument=instrument,
         temperature=temperature, sky=sky, target=target, when=when,
         flare={"amplitudes": amplitude, "temperature_k": flare_temperature, "band": flare_band},

@@ -199,7 +199,7 @@ BAD = {
     "sky": (["detect", "--sky", "dark"], "'dark'"),
     "instrument": (["detect", "--instrument", "hubble"], "hubble"),
     "device": (["detect", "--device", "abacus"], "'abacus' is not here, expected one of"),
-    "statistic": (["detect", "--statistic", "chi3", "-n", "10"], "'chi3' is unknown"),
+    "statistic": (["detect", "--statistic", "chi3"], "'chi3' is unknown"),
     "rare fap": (["detect", "--fap", "1e-6", "-n", "1000", "--star", "G2V"], "ask for 100000000 realisations"),
     "realisations": (["detect", "-n", "0"], "run.realisations = 0"),
     "magnitudes": (["detect", "-m", "1", "-m", "2", "-m", "3"], "3 magnitudes for 2 stars"),
