@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,8 +34,9 @@ def read_spectrum(path: Path) -> ReadSpectrum:
     Parameters
     ----------
     path : Path
-        ``.txt``, ``.dat`` or ``.csv``: nm and erg s-1 cm-2 A-1 (the paper's rule); ``.ecsv``: any units; ``.fits``,
-        also gzipped: CALSPEC, NGSL or HST-library tables, Angstrom and erg s-1 cm-2 A-1 where no unit is named.
+        ``.txt``, ``.dat`` or ``.csv``: nm and erg s-1 cm-2 A-1 (the paper's rule); ``.ecsv``: any units, but named;
+        ``.fits``, also gzipped: CALSPEC, NGSL or HST-library tables, Angstrom and erg s-1 cm-2 A-1 where no unit is
+        named.
 
     Raises
     ------
@@ -53,9 +55,15 @@ def read_spectrum(path: Path) -> ReadSpectrum:
 
 def _read_text(path: Path) -> ReadSpectrum:
     try:
-        lines = path.read_text(encoding="utf-8").splitlines()
+        # Editors on Windows start a file with a byte-order mark.
+        text = path.read_text(encoding="utf-8-sig")
     except (UnicodeDecodeError, OSError) as error:
         raise InputError(f"spectrum file {path.name} is not text ({error}), expected two columns of numbers") from error
+    if "\0" in text:
+        raise InputError(
+            f"spectrum file {path.name} is not text (it holds null bytes), expected two columns of numbers"
+        )
+    lines = text.splitlines()
     rows = []
     for number, line in enumerate(lines, 1):
         fields = line.split("#", 1)[0].replace(",", " ").split()
@@ -86,9 +94,19 @@ def _read_ecsv(path: Path) -> ReadSpectrum:
         raise InputError(
             f"{path.name} cannot be read as ECSV ({str(error).splitlines()[0]}), expected an ECSV table"
         ) from error
-    return _from_columns(
-        table.colnames, lambda c: (table[c].data, table[c].unit), path, str(table.meta.get("name", path.stem))
-    )
+
+    def column(name: str) -> tuple[Any, Any]:
+        if table[name].unit is None:
+            raise InputError(
+                f"{path.name}: column {name} names no unit, expected one such as nm or erg / (s cm2 Angstrom)"
+            )
+        values = table[name].data
+        if isinstance(values, np.ma.MaskedArray):
+            # What lies under a mask is no measurement.
+            values = np.ma.filled(values.astype(float), np.nan)
+        return values, table[name].unit
+
+    return _from_columns(table.colnames, column, path, str(table.meta.get("name", path.stem)))
 
 
 def _read_fits(path: Path) -> ReadSpectrum:
@@ -105,8 +123,8 @@ def _read_fits(path: Path) -> ReadSpectrum:
                 raise InputError(f"{path.name} has no table, expected a FITS table with WAVELENGTH and FLUX")
             header = hdus[0].header + table.header
             columns = {c.name: (np.array(table.data[c.name]), _archive_unit(c.unit)) for c in table.columns}
-    except InputError:
-        raise
+    except InputError as error:
+        raise InputError(str(error) if path.name in str(error) else f"{path.name}: {error}") from error
     except Exception as error:  # truncated and foreign files fail in many ways
         raise InputError(f"{path.name} cannot be read as FITS ({error}), expected a FITS table") from error
     name = str(header.get("TARGNAME") or header.get("TARGETID") or header.get("OBJECT") or path.stem).strip()
@@ -117,18 +135,26 @@ def _read_fits(path: Path) -> ReadSpectrum:
 
 
 def _archive_unit(name: str | None) -> Any:
-    """Units as the space telescope archives write them."""
+    """Units as the archives write them: in capitals, in the plural, with A for Angstrom (to astropy it is ampere)."""
     import astropy.units as u
 
-    if not name:
+    if not name or not name.strip():
         return None
-    known = {
-        "angstroms": u.AA,
-        "angstrom": u.AA,
-        "flam": u.erg / (u.s * u.cm**2 * u.AA),
-        "fnu": u.erg / (u.s * u.cm**2 * u.Hz),
-    }
-    return known.get(name.strip().lower()) or name
+    known = {"flam": u.erg / (u.s * u.cm**2 * u.AA), "fnu": u.erg / (u.s * u.cm**2 * u.Hz)}
+    if name.strip().lower() in known:
+        return known[name.strip().lower()]
+    words = {
+        "a": "Angstrom", "aa": "Angstrom", "ang": "Angstrom", "angstrom": "Angstrom", "angstroms": "Angstrom",
+        "erg": "erg", "ergs": "erg", "s": "s", "sec": "s", "cm": "cm", "hz": "Hz", "nm": "nm", "um": "um",
+        "micron": "um", "microns": "um", "nanometer": "nm", "nanometers": "nm",
+    }  # fmt: skip
+    plain = re.sub(r"[A-Za-z]+", lambda word: words.get(word[0].lower(), word[0]), name.strip())
+    for spelling in (plain, name):
+        try:
+            return u.Unit(spelling)
+        except ValueError:
+            continue
+    raise InputError(f"unit {name.strip()!r} is unknown, expected one such as Angstrom or erg / (s cm2 Angstrom)")
 
 
 def _from_columns(
@@ -145,8 +171,8 @@ def _from_columns(
             raise InputError(
                 f"{path.name} has no {what} column, only {', '.join(lower)}, expected one named {what.upper()}"
             )
-        found.append(column(match))
-    (wavelength, wavelength_unit), (flux, flux_unit) = found
+        found.append(match)
+    (wavelength, wavelength_unit), (flux, flux_unit) = map(column, found)
     flam = u.erg / (u.s * u.cm**2 * u.AA)
     try:
         wave = u.Quantity(np.ravel(wavelength).astype(float), wavelength_unit or u.AA)
@@ -154,7 +180,7 @@ def _from_columns(
         values = u.Quantity(np.ravel(flux).astype(float), flux_unit or flam).to_value(flam, u.spectral_density(wave))
     except (u.UnitConversionError, ValueError, TypeError) as error:
         raise InputError(f"{path.name}: {error}, expected a wavelength and a flux density") from error
-    if wave.unit.physical_type != "length":
-        # Frequencies run the other way.
+    if wave.unit.physical_type != "length" and nm.size and nm[0] > nm[-1]:
+        # Rising frequencies are falling wavelengths.
         nm, values = nm[::-1], values[::-1]
     return ReadSpectrum(np.asarray(nm), np.asarray(values), name, f"file {path.name}", notes)

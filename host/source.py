@@ -126,9 +126,13 @@ class Source:
                 else np.asarray(wavelength) * u.nm
             )
             values = flux.to(flam, u.spectral_density(nm)) if isinstance(flux, u.Quantity) else np.asarray(flux) * flam
-        except u.UnitConversionError as error:
+        except (u.UnitConversionError, TypeError, ValueError) as error:
             raise InputError(f"spectrum {name}: {error}, expected a wavelength and a flux density") from error
-        return cls(nm.value, values.value, name, origin)
+        axis, density = np.ma.filled(nm.value, np.nan), np.ma.filled(values.value, np.nan)
+        if isinstance(wavelength, u.Quantity) and wavelength.unit.physical_type != "length" and axis[:1] > axis[-1:]:
+            # Rising frequencies are falling wavelengths.
+            axis, density = axis[::-1], density[::-1]
+        return cls(axis, density, name, origin)
 
     @classmethod
     def from_synphot(cls, spectrum: Any, *, name: str = "synphot spectrum") -> Self:
@@ -174,6 +178,7 @@ class Source:
         InputError
             As `magnitude`, or for a magnitude outside -30 to 40.
         """
+        magnitude = _number("magnitude", magnitude, "mag")
         if not (np.isfinite(magnitude) and -30.0 <= magnitude <= 40.0):
             raise InputError(f"magnitude = {magnitude!r}, expected -30 to 40")
         scale = 10.0 ** (-0.4 * (magnitude - self.magnitude(band)))
@@ -205,7 +210,7 @@ class Source:
         InputError
             For an impossible value, or a band that the spectrum does not cover.
         """
-        kelvin = _kelvin(temperature)
+        amplitude, kelvin = _number("flare amplitude", amplitude), _number("temperature", temperature, "K")
         flux = with_flare(
             self.wavelength_nm,
             self.flux_flam,
@@ -213,7 +218,9 @@ class Source:
             temperature_k=kelvin,
             band=band,
             geometry=geometry,
-            photosphere_temperature_k=None if photosphere_temperature is None else _kelvin(photosphere_temperature),
+            photosphere_temperature_k=None
+            if photosphere_temperature is None
+            else _number("photosphere temperature", photosphere_temperature, "K"),
         )
         title = f"flare of {100 * amplitude:g} % in {bands.band(band).name} at {kelvin:g} K, {geometry}"
         return self._changed(flux, title)
@@ -243,6 +250,7 @@ class Source:
             ) from error
         import astropy.units as u
 
+        ebv, rv = _number("E(B-V)", ebv, "mag"), _number("R_V", rv)
         if not (np.isfinite(ebv) and 0.0 <= ebv <= 10.0):
             raise InputError(f"E(B-V) = {ebv!r}, expected 0 to 10")
         if law not in ("G23", "F19", "CCM89"):
@@ -264,13 +272,18 @@ class Source:
         return replace(self, flux_flam=flux, history=(*self.history, what))
 
 
-def _kelvin(value: u.Quantity | float) -> float:
+def _number(what: str, value: u.Quantity | float, unit: str = "") -> float:
+    """One number, from a Quantity in the unit or a plain one."""
     import astropy.units as u
 
     try:
-        return float(u.Quantity(value, u.K).to_value(u.K)) if isinstance(value, u.Quantity) else float(value)
-    except u.UnitConversionError as error:
-        raise InputError(f"temperature = {value}, expected kelvin") from error
+        if isinstance(value, str):
+            raise TypeError("text")
+        return float(value.to_value(unit)) if isinstance(value, u.Quantity) else float(value)
+    except (u.UnitConversionError, TypeError, ValueError) as error:
+        shown = str(value) if isinstance(value, u.Quantity) else repr(value)
+        names = {"K": "kelvin", "mag": "magnitudes", "": "a number"}
+        raise InputError(f"{what} = {shown}, expected {names[unit]}") from error
 
 
 def _without_bad_ends(
