@@ -1,13 +1,15 @@
 """Rebuild host/library from public packages, so that anyone can see where each number comes from.
 
-    python tools/build_library.py
+    python tools/build_library.py [FOLDER]
 
-The packages are downloaded with pip into a temporary folder and never installed. Spectra are averaged over bins
+The packages are downloaded with pip into a temporary folder and never installed; a FOLDER that holds their wheels
+saves the download. Reading the bands needs h5py besides what mauvecl needs. Spectra are averaged over bins
 (exactly, as piecewise-linear functions), which conserves flux; Mauve's resolution is twenty times coarser.
 """
 
 from __future__ import annotations
 
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -36,7 +38,6 @@ PICKLES = {
 MUSCLES = {
     "G8V": ("WASP-77A", "wasp-77a_5605_G8V"),
     "K1V": ("HAT-P-26", "hat-p-26_5062_K1V"),
-    "K2V": ("eps Eri", "v-eps-eri_5162_K2V"),
     "K2.5V": ("HD 40307", "hd40307_4783_K3V"),
     "K5V": ("HAT-P-12", "hat-p-12_4653_K5V"),
     "K6V": ("HD 85512", "hd85512_4305_K6V"),
@@ -45,12 +46,20 @@ MUSCLES = {
 }
 #: What a library name also answers to.
 ALIASES = {"K2.5V": "K3V", "B5V": "B57V"}
+QUANTUM = "assumed per photon (optics times quantum efficiency), though pyphot tags it 'energy'"
+PHOTONS = "per photon, as pyphot tags it"
+#: Node in pyphot, magnitude system, title, and why the response is taken per photon.
 BANDS = {
-    "V": ("GROUND_JOHNSON_V", "Vega", "Johnson V"),
-    "Kepler": ("KEPLER_Kp", "Vega", "Kepler Kp"),
-    "TESS": ("TESS", "Vega", "TESS"),
-    "Gaia G": ("GaiaDR2v2_G", "Vega", "Gaia DR2 G, revised"),
-    "GALEX NUV": ("GALEX_NUV", "AB", "GALEX NUV"),
+    "V": (
+        "GROUND_JOHNSON_V",
+        "Vega",
+        "Johnson V",
+        "per photon, though pyphot tags it 'energy': only so do all Pickles classes, normalised to V = 0, agree",
+    ),
+    "Kepler": ("KEPLER_Kp", "Vega", "Kepler Kp", QUANTUM),
+    "TESS": ("TESS", "Vega", "TESS", QUANTUM),
+    "Gaia G": ("GaiaDR2v2_G", "Vega", "Gaia DR2 G, revised", PHOTONS),
+    "GALEX NUV": ("GALEX_NUV", "AB", "GALEX NUV", PHOTONS),
 }
 
 PICKLES_ORIGIN = {
@@ -58,8 +67,10 @@ PICKLES_ORIGIN = {
     "citation": "Pickles 1998, PASP 110, 863, doi 10.1086/316197",
     "licence": "published library, freely redistributed (EXOSIMS: BSD-3-Clause)",
 }
+#: The archive's description of the survey: observed from the far ultraviolet to the blue, a model beyond.
 MUSCLES_ORIGIN = {
-    "origin": f"MUSCLES treasury survey (HST), as in the package EXOSIMS {PACKAGES['EXOSIMS']}, there scaled to V = 0",
+    "origin": "MUSCLES surveys: HST spectra to the blue, a PHOENIX model atmosphere beyond; "
+    f"as in the package EXOSIMS {PACKAGES['EXOSIMS']}, there scaled to V = 0",
     "citation": "France et al. 2016, ApJ 820, 89, doi 10.3847/0004-637X/820/2/89; data doi 10.17909/T9DG6F",
     "licence": "CC BY 4.0",
 }
@@ -96,9 +107,12 @@ def entries() -> list[Spectrum]:
     return found
 
 
-def download(folder: Path) -> None:
-    """Fetch and unpack the packages, without installing them."""
+def fetch(folder: Path, given: Path | None) -> None:
+    """Unpack the packages into a folder, from given wheels or from a download, without installing them."""
     for name, version in PACKAGES.items():
+        if given:
+            shutil.copy(given / f"{name.lower()}-{version}-py3-none-any.whl", folder)
+            continue
         command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary", ":all:"]
         subprocess.run([*command, "--dest", str(folder), f"{name}=={version}"], check=True)
     for wheel in folder.glob("*.whl"):
@@ -157,10 +171,11 @@ def write_spectrum(entry: Spectrum, source: Path) -> dict[str, str]:
     return row
 
 
-def write_band(name: str, node: str, system: str, title: str, source: Path) -> None:
+def write_band(name: str, source: Path) -> None:
     """One band as ECSV, thinned where the published table is finer than needed."""
     import h5py
 
+    node, system, title, response = BANDS[name]
     with h5py.File(source / "pyphot/libs/new_filters.hd5") as file:
         data = file["filters"][node]
         wavelength, throughput = np.asarray(data["WAVELENGTH"]), np.asarray(data["THROUGHPUT"])
@@ -177,28 +192,29 @@ def write_band(name: str, node: str, system: str, title: str, source: Path) -> N
         "name": name,
         "title": title,
         "system": system,
-        "origin": f"{node} of the package pyphot {PACKAGES['pyphot']} (MIT licence)",
-        "response": "per photon",
+        "origin": f"{node} of the package pyphot {PACKAGES['pyphot']}",
+        "licence": "MIT (pyphot)",
+        "response": response,
     }
     table = Table({"wavelength": nm * u.nm, "throughput": [float(f"{t:.5g}") for t in throughput]}, meta=meta)
     table["wavelength"].info.format = ".3f"
     table.write(LIBRARY / "bands" / f"{name.lower().replace(' ', '_')}.ecsv", format="ascii.ecsv", overwrite=True)
 
 
-def main() -> None:
-    """Rebuild every file of the library."""
+def main(given: Path | None = None) -> None:
+    """Rebuild every file of the library, from the wheels in a folder if one is given."""
     for folder in ("spectra", "bands"):
         (LIBRARY / folder).mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as temporary:
         source = Path(temporary)
-        download(source)
+        fetch(source, given)
         rows = [write_spectrum(entry, source) for entry in entries()]
-        for name, (node, system, title) in BANDS.items():
-            write_band(name, node, system, title, source)
+        for name in BANDS:
+            write_band(name, source)
     Table(rows=rows).write(LIBRARY / "index.ecsv", format="ascii.ecsv", overwrite=True)
     size = sum(path.stat().st_size for path in LIBRARY.rglob("*.ecsv"))
     print(f"{len(rows)} spectra, {len(BANDS)} bands, {size / 1e6:.2f} MB")
 
 
 if __name__ == "__main__":
-    main()
+    main(Path(sys.argv[1]) if len(sys.argv) > 1 else None)

@@ -69,7 +69,7 @@ def test_ultraviolet_quality_of_known_stars() -> None:
 
 def test_unknown_names_get_the_nearest() -> None:
     assert Source.from_library(" g2v ").name == "G2V"
-    assert Source.from_library("eps Eri").name == "K2V"
+    assert Source.from_library("hd 40307").name == "K2.5V"
     with pytest.raises(InputError, match=r"'G3V' is unknown, expected a name such as .*G[258]V"):
         Source.from_library("G3V")
 
