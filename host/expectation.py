@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -43,6 +43,8 @@ class Expectation:
         Unit in which the dark is Poisson; its mean in electrons is dark_dn / gain.
     bias_dn, read_noise_dn, gain_dn_per_electron : ndarray, shape (n_pixel,)
         Mean and rms per frame, DN; DN per electron.
+    photon_noise : {"gaussian", "poisson"}
+        How photons scatter about their mean; the variance is the same.
     n_frames : int
     frame_s : float
         The exposure is n_frames * frame_s.
@@ -56,6 +58,9 @@ class Expectation:
     name, instrument : str
     provenance : mapping of str
         Where everything came from: digests, order, sky, history of the source, exposure asked for.
+    conditions : mapping of float
+        The instrument's own values of what priors may vary: ``temperature_c``, ``dark_slope_per_c``, ``light_loss``,
+        ``pointing_loss``.
     messages : tuple of str
         What the user must be told, saturation first.
     """
@@ -77,24 +82,26 @@ class Expectation:
     name: str
     instrument: str
     provenance: Mapping[str, str]
+    photon_noise: Literal["gaussian", "poisson"] = "gaussian"
+    conditions: Mapping[str, float] = field(default_factory=dict)
     messages: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            value = getattr(self, field.name)
+        for each in fields(self):
+            value = getattr(self, each.name)
             if isinstance(value, np.ndarray):
-                kept = np.array(value, np.int32 if field.name == "element" else np.float64)
+                kept = np.array(value, np.int32 if each.name == "element" else np.float64)
                 kept.setflags(write=False)
-                object.__setattr__(self, field.name, kept)
+                object.__setattr__(self, each.name, kept)
         n_pixel = self.wavelength_nm.shape
         for name in PER_PIXEL:
             values = getattr(self, name)
             if values.shape != n_pixel:
                 raise ValueError(f"{name} has the shape {values.shape}, expected {n_pixel}")
-            bad = ~(np.isfinite(values) & (values >= 0))
+            bad = ~((values >= 0) & (values <= LARGEST))
             if bad.any():
                 pixel = int(np.argmax(bad))
-                raise ValueError(f"{name}[{pixel}] = {values[pixel]:g}, expected >= 0 and finite")
+                raise InputError(f"{name}[{pixel}] = {values[pixel]:g}, expected 0 to {LARGEST:g}")
         object.__setattr__(self, "provenance", dict(self.provenance))
 
     @property
@@ -118,10 +125,14 @@ class Expectation:
         return self.signal_dn / self.n_frames + self.dark_dn + self.bias_dn
 
     @cached_property
+    def dark_step_dn(self) -> Float:
+        """DN of one count of the dark, shape (n_pixel,): one, or the gain where the dark is drawn in electrons."""
+        return self.gain_dn_per_electron if self.dark_unit == "electrons" else np.ones_like(self.dark_dn)
+
+    @cached_property
     def dark_variance_dn2(self) -> Float:
         """Variance of one frame's dark, DN^2, shape (n_pixel,): Poisson in DN, or in electrons times the gain."""
-        scale = self.gain_dn_per_electron if self.dark_unit == "electrons" else 1.0
-        return np.asarray(self.dark_dn * scale)
+        return np.asarray(self.dark_dn * self.dark_step_dn)
 
     @cached_property
     def variance_dn2(self) -> Float:
@@ -193,7 +204,9 @@ class Expectation:
             return float(np.min(np.where(rise > 0, (self.ceiling_dn - self.bias_dn) / rise, np.inf)))
 
 
-#: The arrays of one value per pixel, all finite and >= 0.
+#: Electrons or DN of one pixel and frame beyond which a mean is no mean of a detector.
+LARGEST = 1e12
+#: The arrays of one value per pixel, all from 0 to `LARGEST`.
 PER_PIXEL = (
     "source_electrons",
     "sky_electrons",
@@ -250,7 +263,7 @@ def expect(
     def per_frame(light: Source) -> Float:
         rate = electrons_per_second(instrument, light.wavelength_nm, light.flux_flam, order)
         # Quadrature can leave -1e-30 where there is no light.
-        return np.maximum(rate, 0.0) * instrument.frame_s
+        return np.maximum(rate, 0.0) * instrument.frame_s * instrument.per_pixel("response", 1.0)
 
     zodiacal = sky.spectrum(instrument.field_of_view_arcsec2)
     n_pixel = instrument.wavelength_nm.size
@@ -259,17 +272,22 @@ def expect(
         wavelength_nm=instrument.wavelength_nm,
         source_electrons=per_frame(source),
         sky_electrons=np.zeros(n_pixel) if zodiacal is None else per_frame(zodiacal),
-        dark_dn=np.full(n_pixel, instrument.dark_dn_per_s * instrument.frame_s),
+        dark_dn=instrument.per_pixel("dark", instrument.dark_dn_per_s * instrument.frame_s),
         dark_unit=instrument.dark_unit,
-        bias_dn=np.full(n_pixel, instrument.bias_dn),
-        read_noise_dn=np.full(n_pixel, instrument.read_noise_dn),
-        gain_dn_per_electron=np.full(n_pixel, instrument.gain_dn_per_electron),
+        bias_dn=instrument.per_pixel("bias_dn", instrument.bias_dn),
+        read_noise_dn=instrument.per_pixel("read_noise_dn", instrument.read_noise_dn),
+        gain_dn_per_electron=instrument.per_pixel("gain", instrument.gain_dn_per_electron),
         n_frames=n_frames,
         frame_s=instrument.frame_s,
         element=element,
         element_wavelength_nm=element_wavelength,
+        photon_noise=instrument.photon_noise,
         adc_max_dn=instrument.adc_max_dn,
         saturation_dn=instrument.saturation_dn,
+        conditions={
+            name: getattr(instrument, name)
+            for name in ("temperature_c", "dark_slope_per_c", "light_loss", "pointing_loss")
+        },
         name=source.name,
         instrument=instrument.name,
         provenance={

@@ -14,6 +14,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationEr
 
 from .curve import Curve
 from .errors import InputError
+from .pixel_map import PixelMap
 
 #: Energy of a photon times its wavelength, J nm, and the charge of an electron, C (exact SI values).
 HC_J_NM = 6.62607015e-34 * 299_792_458.0 * 1e9
@@ -27,6 +28,11 @@ def _as_curve(value: Any) -> Any:
     if isinstance(value, int | float) and not isinstance(value, bool):
         return Curve.flat(float(value))
     return Curve.read(value) if isinstance(value, str | Path) else value
+
+
+def _as_map(value: Any) -> Any:
+    """A pixel map from a map or a path."""
+    return PixelMap.read(value) if isinstance(value, str | Path) else value
 
 
 def _fraction(curve: Curve) -> Curve:
@@ -79,7 +85,11 @@ class Instrument(BaseModel):
         Dark current is dark_scale_dn_per_s * exp(dark_slope_per_c * temperature_c).
     dark_unit : {"DN", "electrons"}
         The unit in which dark counts are Poisson.
+    photon_noise : {"gaussian", "poisson"}
+        How photons scatter about their mean.
     read_noise_dn, bias_dn, frame_s : float
+    pixel_map : PixelMap, optional
+        What differs from pixel to pixel.
     """
 
     model_config = ConfigDict(
@@ -124,9 +134,11 @@ class Instrument(BaseModel):
     dark_scale_dn_per_s: NotNegative
     dark_slope_per_c: float = Field(ge=-1, le=1)
     dark_unit: Literal["DN", "electrons"]
+    photon_noise: Literal["gaussian", "poisson"] = "gaussian"
     read_noise_dn: NotNegative
     bias_dn: NotNegative
     frame_s: float = Field(gt=0, le=86_400)
+    pixel_map: Annotated[PixelMap | None, BeforeValidator(_as_map)] = None
 
     @classmethod
     def load(cls, name: str | Path) -> Instrument:
@@ -211,15 +223,32 @@ class Instrument(BaseModel):
             )
         if self.bias_dn >= min(self.saturation_dn, self.adc_max_dn):
             raise InputError(f"bias_dn = {self.bias_dn:g}, expected below saturation")
+        if self.pixel_map is not None and self.pixel_map.size != self.pixels:
+            raise InputError(f"pixel_map has {self.pixel_map.size} pixels, expected the array's {self.pixels}")
         return self
 
     @cached_property
     def wavelength_nm(self) -> Float:
         """Centres of the pixels that are read, nm, shape (n_pixel,)."""
-        centres = np.asarray(self.pixel_zero_nm + self.dispersion_nm_per_pixel * np.arange(self.pixels), np.float64)
-        chosen = centres[(centres >= self.output_min_nm) & (centres <= self.output_max_nm)]
+        chosen = self._centres_nm[self.read_pixels].copy()
         chosen.setflags(write=False)
         return chosen
+
+    @property
+    def _centres_nm(self) -> Float:
+        return np.asarray(self.pixel_zero_nm + self.dispersion_nm_per_pixel * np.arange(self.pixels), np.float64)
+
+    @cached_property
+    def read_pixels(self) -> slice:
+        """Which pixels of the array have their centres in the output range."""
+        inside = np.flatnonzero((self._centres_nm >= self.output_min_nm) & (self._centres_nm <= self.output_max_nm))
+        return slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)
+
+    def per_pixel(self, name: str, nominal: float) -> Float:
+        """A column of the pixel map over the pixels that are read, or `nominal` in each; shape (n_pixel,)."""
+        if self.pixel_map is None:
+            return np.full(self.wavelength_nm.size, nominal)
+        return self.pixel_map.over(name, self.read_pixels, nominal)
 
     @property
     def knots_nm(self) -> tuple[float, ...]:

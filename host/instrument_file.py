@@ -12,6 +12,7 @@ from typing import Any
 from .curve import Curve
 from .errors import InputError
 from .instrument import CURVES, LABELS, Instrument
+from .pixel_map import PixelMap
 
 #: Where a value comes from: the paper, a datasheet, a computation, an assumption, or the user.
 TAGS = ("P", "D", "C", "A", "U")
@@ -98,4 +99,7 @@ def _entry(name: str, entry: Any, path: Path) -> tuple[Any, str]:
         return curve, curve.source
     if name in CURVES and isinstance(entry, int | float) and not isinstance(entry, bool):
         return Curve.flat(float(entry), source), source
+    if name == "pixel_map" and isinstance(entry, str):
+        pixel_map = PixelMap.read(path.parent / entry)
+        return pixel_map, pixel_map.source
     return entry, source

@@ -1,43 +1,161 @@
-## One frame, or one stack of frames, of one pixel: METHODS section 2.
-/* Gaussian z of `count` neighbouring pixels from `start` on, both multiples of four. */
-INLINE void draw_noise(const Address *at, uint stream, uint start, uint count, floatv *z)
+## What one draw of one pixel holds: METHODS section 2. A draw is one frame, or one stack of frames.
+#define CHUNK ${chunk}u
+#define MAGIC ${magic}
+#define REFERENCE ${reference}u
+
+/* Everything that a launch reads, in one order. */
+#define SCENE __global const Job *restrict job, __global const Pixel *restrict pixels, __global const Level *restrict levels, \
+    __global const Edge *restrict edges, __global const Poisson *restrict darks, __global const Poisson *restrict photon_counts, \
+    __global const Response *restrict responses, __global const uint *restrict tables, __global const float *restrict priors
+#define SCENE_PASSED job, pixels, levels, edges, darks, photon_counts, responses, tables, priors
+
+/* What was drawn for CHUNK neighbouring pixels: normals, and what the recipe asks for beside them. */
+typedef struct {
+    floatv z[${chunk}];
+% if not joint:
+    floatv dark[${chunk}];
+% endif
+% if photons:
+    uintv photon[${chunk}];
+% endif
+% if cosmic:
+    floatv cosmic[${chunk}];
+% endif
+} Draws;
+
+/* Factors on light and dark of one draw. */
+typedef struct { floatv light, dark; } Factors;
+
+/* Words first, then normals: each is a long chain of dependent operations, and only short bodies without
+   ties between their turns keep the pipelines filled. */
+INLINE void draw_words(const Address *at, uint stream, uint group, uintv *w)
 {
-    for (uint i = 0; i < count; i += 4) {
-        Words w = words_at(at, stream, (start + i) / 4u);
-        normal_pair(w.a, w.b, z + i, z + i + 1);
-        normal_pair(w.c, w.d, z + i + 2, z + i + 3);
+    for (uint i = 0; i < CHUNK; i += 4u) {
+        Words x = words_at(at, stream, group + i / 4u);
+        w[i] = x.a; w[i + 1u] = x.b; w[i + 2u] = x.c; w[i + 3u] = x.d;
     }
 }
 
-/* Dark counts of the same pixels, relative to their tables' centres. Two loops, because one would need
-   more registers than there are. */
-INLINE void draw_dark(const Address *at, uint stream, uint start, uint count,
-                      __global const Pixel *pixels, __global const uint *tables, floatv *d)
+INLINE void normals(const uintv *w, floatv *z)
 {
-    for (uint i = 0; i < count; i += 4) {
-        Words w = words_at(at, stream, (start + i) / 4u);
-        __global const Pixel *pixel = pixels + start + i;
-% if expansion:
-        floatv g[4];
-        normal_pair(w.a, w.b, g, g + 1);
-        normal_pair(w.c, w.d, g + 2, g + 3);
-        for (uint j = 0; j < 4u; j++)
-            d[i + j] = expansion_draw(g[j], pixel[j].dark_offset, pixel[j].dark_slope, pixel[j].dark_cubic);
-% else:
-% for i, word in enumerate("abcd"):
-        d[i + ${i}] = TO_FLOAT(AS_INT(alias_draw(w.${word}, tables + pixel[${i}].table_start, pixel[${i}].table_bits)) + (intv)pixel[${i}].dark_low);
+    for (uint i = 0; i < CHUNK; i += 2u) normal_pair(w[i], w[i + 1u], z + i, z + i + 1u);
+}
+
+/* `exposure` is 0 for the observed one, REFERENCE for the other; start is a multiple of four. */
+INLINE void draw(SCENE, const Address *at, uint exposure, uint start, Draws *out)
+{
+    const uint group = job->first_group + start / 4u;
+    uintv w[${chunk}];
+    draw_words(at, exposure + ${streams["noise"]}u, group, w);
+    normals(w, out->z);
+% if not joint:
+    draw_words(at, exposure + ${streams["dark"]}u, group, w);
+    for (uint i = 0; i < CHUNK; i += 2u) poisson_pair(w[i], w[i + 1u], darks + start + i, darks + start + i + 1u, tables, out->dark + i);
+% endif
+% if photons:
+    draw_words(at, exposure + ${streams["photon"]}u, group, out->photon);
+% endif
+% if cosmic:
+    draw_words(at, exposure + ${streams["cosmic"]}u, group, w);
+    for (uint i = 0; i < CHUNK; i++)
+        out->cosmic[i] = TO_FLOAT(AS_INT(alias_draw(w[i], tables + job->cosmic_table, job->cosmic_bits)) + (intv)job->cosmic_low);
+% endif
+}
+
+% if modulated:
+/* A prior's value at the probability that a word stands for, from its table of quantiles. */
+INLINE floatv quantile(uintv word, __global const float *table)
+{
+    uintv cell = word >> (uintv)${32 - prior_bits}u;
+    floatv part = TO_FLOAT(AS_INT(word & (uintv)${2 ** (32 - prior_bits) - 1}u)) * ${1.0 / 2 ** (32 - prior_bits)}f;
+    floatv left = AS_FLOAT(look_up((__global const uint *)table, cell));
+    floatv right = AS_FLOAT(look_up((__global const uint *)table, cell + (uintv)1u));
+    return FMA(part, right - left, left);
+}
+% endif
+
+/* Factors of the realisation, the same in all its frames and pixels. */
+INLINE Factors factors_of(SCENE, uintv realisation, uint realisation_high)
+{
+    Factors f = {(floatv)1.0f, (floatv)1.0f};
+% if modulated:
+    const Address at = address(realisation, realisation_high, 0u, job->seed_low, job->seed_high);
+% for number, (name, factor) in enumerate(modulations):
+% if name != "jitter":
+    f.${factor} *= quantile(words_at(&at, ${streams[name]}u, 0u).a, priors + ${number * (2 ** prior_bits + 1)}u);
+% endif
 % endfor
 % endif
-    }
+    return f;
 }
 
-/* The raw count above the level's base, rounded to whole DN and clipped to the ADC's range: exact in
-   float, because everything large is in the base. */
-INLINE floatv digitise(floatv z, floatv d, const float dark_gain, __global const Level *level)
+/* The share of light kept by one frame, or by all frames of a stack together. */
+INLINE floatv kept(SCENE, uintv realisation, uint realisation_high, uint exposure, uint frame)
 {
-    floatv dn = nearest(FMA((floatv)level->sd, z, FMA((floatv)dark_gain, d, (floatv)level->fraction)));
-% if clip:
-    dn = least(most(dn, (floatv)level->low), (floatv)level->high);
+% if jitter is not None:
+    __global const float *table = priors + ${jitter * (2 ** prior_bits + 1)}u;
+    floatv lost = 0.0f;
+    const uint first = job->first_frame + frame, end = ${"first + 1u" if frames else "first + job->frame_count"};
+    Words w;
+    for (uint f = first; f < end; f++) {
+        /* Four frames share a block of words. */
+        if (f == first || (f & 3u) == 0u) {
+            const Address at = address(realisation, realisation_high, f / 4u, job->seed_low, job->seed_high);
+            w = words_at(&at, exposure + ${streams["jitter"]}u, 0u);
+        }
+        lost += quantile((f & 3u) == 0u ? w.a : (f & 3u) == 1u ? w.b : (f & 3u) == 2u ? w.c : w.d, table);
+    }
+    return ${"(floatv)1.0f - lost" if frames else "FMA(lost, (floatv)(-1.0f / (float)job->frame_count), (floatv)1.0f)"};
+% else:
+    return (floatv)1.0f;
 % endif
-    return dn;
+}
+
+/* The count above the level's base before the ADC; level = levels + at, at = scenario * padded_count + pixel. */
+INLINE floatv analogue(SCENE, const Draws *drawn, uint i, __global const Level *level, uint pixel, uint at, const Factors *factors)
+{
+    floatv z = drawn->z[i];
+% if modulated:
+    __global const Response *r = responses + at;
+    floatv variance = FMA(factors->light, (floatv)r->light_variance, FMA(factors->dark, (floatv)r->dark_variance, (floatv)r->other_variance));
+    floatv third = FMA(factors->light, (floatv)r->light_third, factors->dark * r->dark_third);
+    floatv fourth = FMA(factors->light, (floatv)r->light_fourth, factors->dark * r->dark_fourth);
+    floatv sd = root(variance), share = third / variance, zz = z * z;
+    /* z + k3 (z^2 - 1) / (6 s^3) + k4 (z^3 - 3 z) / (24 s^4) - k3^2 (2 z^3 - 5 z) / (36 s^6), all times s */
+    floatv cubic = (fourth * FMA(zz, (floatv)0.041666668f, (floatv)-0.125f) - third * share * FMA(zz, (floatv)0.055555556f, (floatv)-0.1388889f)) / (variance * sd);
+    floatv v = FMA(z, sd + cubic, FMA(share, FMA(zz, (floatv)0.16666667f, (floatv)-0.16666667f), (floatv)level->c0));
+    v += FMA(factors->light - 1.0f, (floatv)r->light, (factors->dark - 1.0f) * r->dark);
+% elif joint:
+% if quartic:
+    floatv v = FMA(z, (floatv)level->c4, (floatv)level->c3);
+    v = FMA(z, v, (floatv)level->c2);
+% else:
+    floatv v = FMA(z, (floatv)level->c3, (floatv)level->c2);
+% endif
+    v = FMA(z, v, (floatv)level->c1);
+    v = FMA(z, v, (floatv)level->c0);
+% else:
+    floatv v = FMA(z, (floatv)level->c1, (floatv)level->c0);
+    v = FMA(drawn->dark[i], (floatv)darks[pixel].gain, v);
+% endif
+% if photons:
+    /* The two of a pair use each other's words where the count comes from a normal. */
+    floatv both[2];
+    poisson_pair(drawn->photon[i & ~1u], drawn->photon[i | 1u], photon_counts + (at & ~1u), photon_counts + (at | 1u), tables, both);
+    v = FMA(both[i & 1u], (floatv)photon_counts[at].gain, v);
+% endif
+% if cosmic:
+    v = FMA(drawn->cosmic[i], (floatv)pixels[pixel].cosmic_gain, v);
+% endif
+    return v;
+}
+
+/* The ADC: MAGIC + whole DN above the base, clipped to its range. */
+INLINE floatv digitise(floatv v, __global const Edge *edge)
+{
+    floatv r = v + MAGIC;
+% if clip:
+    r = least(most(r, (floatv)edge->low), (floatv)edge->high);
+% endif
+    return r;
 }

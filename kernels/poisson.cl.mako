@@ -1,6 +1,6 @@
 ## Poisson counts, relative to a whole number near their mean: never a rounded normal (METHODS section 4).
-/* By an exact integer alias table: one word, one look-up, no rejection. Entry = alias << (32 - bits) | threshold. The word's top bits choose the column, the rest accept it
-   or take its alias. The outcome is a column number; the caller adds the table's lowest count. */
+/* By an exact integer alias table: one word, one look-up, no rejection. Entry = alias << (32 - bits) | threshold.
+   The word's top bits choose the column, the rest accept it or take its alias. */
 INLINE uintv alias_draw(uintv word, __global const uint *table, uint bits)
 {
     uint shift = 32u - bits;
@@ -17,4 +17,16 @@ INLINE floatv expansion_draw(floatv z, float offset, float slope, float cubic)
 {
     floatv curve = FMA(z, (floatv)cubic, (floatv)0.16666667f);
     return nearest(FMA(z, FMA(z, curve, (floatv)slope), (floatv)offset));
+}
+
+/* Counts of two neighbours from their two words, each by its own way. */
+INLINE void poisson_pair(uintv first, uintv second, __global const Poisson *a, __global const Poisson *b,
+                         __global const uint *tables, floatv *out)
+{
+    floatv z[2] = {(floatv)0.0f, (floatv)0.0f};
+    if (!a->bits || !b->bits) normal_pair(first, second, z, z + 1);
+    out[0] = a->bits ? TO_FLOAT(AS_INT(alias_draw(first, tables + a->table, a->bits)) + (intv)a->low)
+                     : expansion_draw(z[0], a->offset, a->slope, a->cubic);
+    out[1] = b->bits ? TO_FLOAT(AS_INT(alias_draw(second, tables + b->table, b->bits)) + (intv)b->low)
+                     : expansion_draw(z[1], b->offset, b->slope, b->cubic);
 }

@@ -1,142 +1,198 @@
 ## Every statistic of METHODS section 6 of every scenario, from one pass over common draws.
-## t = observed - expected quiescent DN of one pixel; each work-item follows WIDTH realisations over all pixels.
+## x = observed - template, whole DN: what is left of the template's fraction of a DN is a constant of each sum.
 /* Four sums side by side, by pixel number modulo four: one alone would wait for each addition to end. */
 typedef struct { floatv a, b, c, d; } Four;
-#define NOTHING (Four){0.0f, 0.0f, 0.0f, 0.0f}
+#define NOTHING (Four){(floatv)0.0f, (floatv)0.0f, (floatv)0.0f, (floatv)0.0f}
 #define SUM(x) (((x).a + (x).b) + ((x).c + (x).d))
 
+/* Each work-item follows ${vectors} vectors of realisations: what is read of a level serves them all. */
 __kernel ${attributes}
-void statistics(const uint seed_low, const uint seed_high, const uint first_low, const uint first_high,
-                const uint pixel_count, const uint scenario_count, const uint frame_count,
-                __global const Pixel *restrict pixels, __global const Level *restrict levels,
-                __global const uint *restrict tables, __global const float *restrict weights,
-                __global const uint *restrict linear_end, const uint stride, __global float *restrict values)
+void statistics(SCENE, const uint first_low, const uint first_high,
+                __global const uint *restrict templates, __global const float *restrict constants,
+                __global const float *restrict weights, __global const uint *restrict linear_end,
+                const uint stride, __global float *restrict values)
 {
-    const uint item = get_global_id(0);
-    const uintv realisation = (uintv)(first_low + item * ${width}u) + LANE_INDEX;
-    Four chi2[${scenarios}], linear[${linears}];
-    floatv element[${scenarios}], chi2_element[${scenarios}];
+    const uint item = get_global_id(0), padded = job->padded_count, scenario_count = job->scenario_count;
+    const uint linear_count = linear_end[scenario_count - 1u];
+    uintv realisation[${vectors}];
+    Factors steady[${vectors}];
+    Four chi2[${scenarios}][${vectors}], linear[${linears}][${vectors}];
+    floatv element[${scenarios}][${vectors}], chi2_element[${scenarios}][${vectors}], chi2_pair[${scenarios}][${vectors}];
+    for (uint v = 0; v < ${vectors}u; v++) {
+        realisation[v] = (uintv)(first_low + (item * ${vectors}u + v) * ${width}u) + LANE_INDEX;
+        steady[v] = factors_of(SCENE_PASSED, realisation[v], first_high);
+        for (uint k = 0; k < scenario_count; k++) {
+            chi2[k][v] = NOTHING;
+            element[k][v] = chi2_element[k][v] = chi2_pair[k][v] = (floatv)0.0f;
+        }
+        for (uint l = 0; l < linear_count; l++) linear[l][v] = NOTHING;
+    }
+% if not frames:
+    Address at[${vectors}];
+    Factors factors[${vectors}], other[${vectors}];
+    for (uint v = 0; v < ${vectors}u; v++) {
+        at[v] = address(realisation[v], first_high, job->first_frame, job->seed_low, job->seed_high);
+        factors[v] = other[v] = steady[v];
+        factors[v].light *= kept(SCENE_PASSED, realisation[v], first_high, 0u, 0u);
 % if pair:
-    floatv chi2_pair[${scenarios}];
-% endif
-    for (uint k = 0; k < scenario_count; k++) {
-        chi2[k] = NOTHING; element[k] = 0.0f; chi2_element[k] = 0.0f;
-% if pair:
-        chi2_pair[k] = 0.0f;
+        other[v].light *= kept(SCENE_PASSED, realisation[v], first_high, REFERENCE, 0u);
 % endif
     }
-    for (uint l = 0; l < linear_end[scenario_count - 1]; l++) linear[l] = NOTHING;
-% if not frames:
-    const Address at = address(realisation, first_high, 0u, seed_low, seed_high);
 % endif
 
-    for (uint start = 0; start < pixel_count; start += ${chunk}u) {
-        floatv z[${chunk}], d[${chunk}];
+    for (uint start = 0; start < padded; start += CHUNK) {
+        __global const Pixel *pixel = pixels + start;
+        Draws drawn[${vectors}];
 % if frames:
-        floatv t[${scenarios}][${chunk}];
-        for (uint k = 0; k < scenario_count; k++)
-            for (uint i = 0; i < ${chunk}u; i++) t[k][i] = 0.0f;
+        floatv t[${scenarios}][${vectors}][${chunk}];
+        for (uint v = 0; v < ${vectors}u; v++) {
+            for (uint k = 0; k < scenario_count; k++)
+                for (uint i = 0; i < CHUNK; i++) t[k][v][i] = (floatv)0.0f;
+            for (uint frame = 0; frame < job->draw_count; frame++) {
+                const Address at = address(realisation[v], first_high, job->first_frame + frame, job->seed_low, job->seed_high);
+                Factors factors = steady[v];
+                factors.light *= kept(SCENE_PASSED, realisation[v], first_high, 0u, frame);
+                draw(SCENE_PASSED, &at, 0u, start, drawn);
+                for (uint k = 0; k < scenario_count; k++)
+                    for (uint i = 0; i < CHUNK; i++) {
+                        const uint here = k * padded + start + i;
+                        t[k][v][i] += digitise(analogue(SCENE_PASSED, drawn, i, levels + here, start + i, here, &factors), edges + here) - MAGIC;
+                    }
+            }
+        }
 % else:
-        floatv t[${chunk}];
+        for (uint v = 0; v < ${vectors}u; v++) draw(SCENE_PASSED, at + v, 0u, start, drawn + v);
 % endif
 % if pair:
-        floatv reference[${chunk}];
-% if frames:
-        for (uint i = 0; i < ${chunk}u; i++) reference[i] = 0.0f;
-        for (uint frame = 0; frame < frame_count; frame++) {
-            const Address at = address(realisation, first_high, frame, seed_low, seed_high);
+        /* The other exposure sees the template of the scenario; scenarios with one template share it. */
+        Draws again[${vectors}];
+        floatv reference[${vectors}][${chunk}];
+        uint seen = ~0u;
+% if not frames:
+        for (uint v = 0; v < ${vectors}u; v++) draw(SCENE_PASSED, at + v, REFERENCE, start, again + v);
 % endif
-            draw_noise(&at, ${streams["reference_noise"]}u, start, ${chunk}u, z);
-            draw_dark(&at, ${streams["reference_dark"]}u, start, ${chunk}u, pixels, tables, d);
-            for (uint i = 0; i < ${chunk}u; i++)
-% if frames:
-                reference[i] += digitise(z[i], d[i], pixels[start + i].dark_gain, levels + start + i);
-        }
-        for (uint i = 0; i < ${chunk}u; i++) reference[i] += levels[start + i].offset;
-% else:
-                reference[i] = digitise(z[i], d[i], pixels[start + i].dark_gain, levels + start + i) + levels[start + i].offset;
-% endif
-% endif
-% if frames:
-        for (uint frame = 0; frame < frame_count; frame++) {
-            const Address at = address(realisation, first_high, frame, seed_low, seed_high);
-% endif
-            draw_noise(&at, ${streams["noise"]}u, start, ${chunk}u, z);
-            draw_dark(&at, ${streams["dark"]}u, start, ${chunk}u, pixels, tables, d);
-% if frames:
-            for (uint k = 0; k < scenario_count; k++)
-                for (uint i = 0; i < ${chunk}u; i++)
-                    t[k][i] += digitise(z[i], d[i], pixels[start + i].dark_gain, levels + k * pixel_count + start + i);
-        }
 % endif
         uint l = 0;
         for (uint k = 0; k < scenario_count; k++) {
-            __global const Level *level = levels + k * pixel_count + start;
-            __global const Pixel *pixel = pixels + start;
-% if frames:
-            floatv *x = t[k];
-            for (uint i = 0; i < ${chunk}u; i++) x[i] += level[i].offset;
-% else:
-            floatv *x = t;
-            for (uint i = 0; i < ${chunk}u; i++) x[i] = digitise(z[i], d[i], pixel[i].dark_gain, level + i) + level[i].offset;
-% endif
-            Four sum = chi2[k];
-            for (uint i = 0; i < ${chunk}u; i += 4) {
-% for j, part in enumerate("abcd"):
-                sum.${part} = FMA(x[i + ${j}u] * x[i + ${j}u], (floatv)pixel[i + ${j}u].inverse_variance, sum.${part});
+            const uint here = k * padded + start;
+            __global const Level *level = levels + here;
+            Four sum[${vectors}];
+            floatv inside[${vectors}], outside[${vectors}];
+% for v in range(vectors):
+            sum[${v}] = chi2[k][${v}];
+            inside[${v}] = element[k][${v}];
+            outside[${v}] = chi2_element[k][${v}];
 % endfor
-            }
-            chi2[k] = sum;
+% if linear or pair:
+            floatv x[${vectors}][${chunk}];
+% endif
+            for (uint i = 0; i < CHUNK; i += 4u) {
+                /* Four pixels at once: addresses without an index, and sums that need not wait for each other. */
+                __global const Level *four = level + i;
+                floatv y[${vectors}][4];
+% for j, part in enumerate("abcd"):
+% for v in range(vectors):
+% if frames:
+                y[${v}][${j}] = t[k][${v}][i + ${j}u] + edges[here + i + ${j}u].whole;
+% else:
+                y[${v}][${j}] = digitise(analogue(SCENE_PASSED, drawn + ${v}, i + ${j}u, four + ${j}, start + i + ${j}u, here + i + ${j}u, factors + ${v}), edges + here + i + ${j}u) - four[${j}].shift;
+% endif
+                sum[${v}].${part} = FMA(y[${v}][${j}], FMA(y[${v}][${j}], (floatv)four[${j}].inverse_variance, (floatv)four[${j}].twice), sum[${v}].${part});
+% if linear or pair:
+                x[${v}][i + ${j}u] = y[${v}][${j}];
+% endif
+% endfor
+% endfor
 % if elements:
-            floatv inside = element[k], outside = chi2_element[k];
-            for (uint i = 0; i < ${chunk}u; i += 4) {
                 if (!pixel[i].end_among_four) {
-                    /* Most of the time: four at once, one addition to wait for. */
-                    inside += FMA(x[i], (floatv)pixel[i].used, x[i + 1] * pixel[i + 1].used)
-                            + FMA(x[i + 2], (floatv)pixel[i + 2].used, x[i + 3] * pixel[i + 3].used);
-                    continue;
-                }
-                for (uint j = i; j < i + 4u; j++) {
-                    inside = FMA(x[j], (floatv)pixel[j].used, inside);
-                    if (pixel[j].element_end) {
-                        outside = FMA(inside * inside, (floatv)pixel[j].inverse_element_variance, outside);
-                        inside = 0.0f;
+                    /* Most of the time: one addition to wait for. */
+% for v in range(vectors):
+                    inside[${v}] += FMA(y[${v}][0], (floatv)pixel[i].used, y[${v}][1] * pixel[i + 1u].used)
+                                  + FMA(y[${v}][2], (floatv)pixel[i + 2u].used, y[${v}][3] * pixel[i + 3u].used);
+% endfor
+                } else {
+                    for (uint j = 0; j < 4u; j++) {
+% for v in range(vectors):
+                        inside[${v}] = FMA(y[${v}][j], (floatv)pixel[i + j].used, inside[${v}]);
+% endfor
+                        if (pixel[i + j].element_end) {
+% for v in range(vectors):
+                            inside[${v}] += edges[here + i + j].element_offset;
+                            outside[${v}] = FMA(inside[${v}] * inside[${v}], (floatv)edges[here + i + j].inverse_element_variance, outside[${v}]);
+                            inside[${v}] = (floatv)0.0f;
+% endfor
+                        }
                     }
                 }
-            }
-            element[k] = inside;
-            chi2_element[k] = outside;
 % endif
+            }
+% for v in range(vectors):
+            chi2[k][${v}] = sum[${v}];
+            element[k][${v}] = inside[${v}];
+            chi2_element[k][${v}] = outside[${v}];
+% endfor
+% if linear:
             for (; l < linear_end[k]; l++) {
-                __global const float *weight = weights + l * pixel_count + start;
-                Four total = linear[l];
-                for (uint i = 0; i < ${chunk}u; i += 4) {
+                __global const float *weight = weights + l * padded + start;
+                Four total[${vectors}];
+% for v in range(vectors):
+                total[${v}] = linear[l][${v}];
+% endfor
+                for (uint i = 0; i < CHUNK; i += 4u) {
 % for j, part in enumerate("abcd"):
-                    total.${part} = FMA(x[i + ${j}u], (floatv)weight[i + ${j}u], total.${part});
+% for v in range(vectors):
+                    total[${v}].${part} = FMA(x[${v}][i + ${j}u], (floatv)weight[i + ${j}u], total[${v}].${part});
+% endfor
 % endfor
                 }
-                linear[l] = total;
+% for v in range(vectors):
+                linear[l][${v}] = total[${v}];
+% endfor
             }
+% endif
 % if pair:
-            floatv both = chi2_pair[k];
-            for (uint i = 0; i < ${chunk}u; i++) {
-                floatv difference = x[i] - reference[i];
-                both = FMA(difference * difference, (floatv)(0.5f * pixel[i].inverse_variance), both);
+            if (templates[k] != seen) {
+                seen = templates[k];
+                const uint quiet = seen * padded + start;
+                for (uint v = 0; v < ${vectors}u; v++) {
+% if frames:
+                    for (uint i = 0; i < CHUNK; i++) reference[v][i] = (floatv)0.0f;
+                    for (uint frame = 0; frame < job->draw_count; frame++) {
+                        const Address at = address(realisation[v], first_high, job->first_frame + frame, job->seed_low, job->seed_high);
+                        Factors other = steady[v];
+                        other.light *= kept(SCENE_PASSED, realisation[v], first_high, REFERENCE, frame);
+                        draw(SCENE_PASSED, &at, REFERENCE, start, again);
+                        for (uint i = 0; i < CHUNK; i++)
+                            reference[v][i] += digitise(analogue(SCENE_PASSED, again, i, levels + quiet + i, start + i, quiet + i, &other), edges + quiet + i) - MAGIC;
+                    }
+                    for (uint i = 0; i < CHUNK; i++) reference[v][i] += edges[quiet + i].whole;
+% else:
+                    for (uint i = 0; i < CHUNK; i++)
+                        reference[v][i] = digitise(analogue(SCENE_PASSED, again + v, i, levels + quiet + i, start + i, quiet + i, other + v), edges + quiet + i) - levels[quiet + i].shift;
+% endif
+                }
             }
-            chi2_pair[k] = both;
+            for (uint v = 0; v < ${vectors}u; v++) {
+                floatv both = chi2_pair[k][v];
+                for (uint i = 0; i < CHUNK; i++) {
+                    floatv difference = x[v][i] - reference[v][i];
+                    both = FMA(difference * difference, (floatv)(0.5f * level[i].inverse_variance), both);
+                }
+                chi2_pair[k][v] = both;
+            }
 % endif
         }
     }
 
     /* One row per channel: three fixed ones a scenario, then the linear ones. */
-    __global float *out = values + item * ${width}u;
-    for (uint k = 0; k < scenario_count; k++) {
-        STORE(SUM(chi2[k]), out + (3u * k) * stride);
-        STORE(chi2_element[k], out + (3u * k + 1u) * stride);
-% if pair:
-        STORE(chi2_pair[k], out + (3u * k + 2u) * stride);
-% endif
+    for (uint v = 0; v < ${vectors}u; v++) {
+        __global float *out = values + (item * ${vectors}u + v) * ${width}u;
+        for (uint k = 0; k < scenario_count; k++) {
+            STORE(SUM(chi2[k][v]) + constants[k], out + (3u * k) * stride);
+            STORE(chi2_element[k][v], out + (3u * k + 1u) * stride);
+            STORE(chi2_pair[k][v], out + (3u * k + 2u) * stride);
+        }
+        for (uint l = 0; l < linear_count; l++)
+            STORE(SUM(linear[l][v]) + constants[scenario_count + l], out + (3u * scenario_count + l) * stride);
     }
-    for (uint l = 0; l < linear_end[scenario_count - 1]; l++)
-        STORE(SUM(linear[l]), out + (3u * scenario_count + l) * stride);
 }

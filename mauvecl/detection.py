@@ -103,8 +103,8 @@ class Detection:
         for name in self.statistics:
             if name not in STATISTICS:
                 raise InputError(f"statistic {name!r} is unknown, expected one of {', '.join(STATISTICS)}")
-        if not self.flares:
-            raise InputError("no flare given, expected at least one")
+        if not self.flares and "matched" in self.statistics:
+            raise InputError("no flare given, expected at least one for the statistic 'matched'")
         if not self.scene.used.any():
             raise InputError(f"every pixel of {self.quiet.name} is saturated, expected a fainter star")
 
@@ -124,16 +124,16 @@ class Detection:
         template : int
             For the null of ``matched``: the flare whose shape is looked for.
         """
-        self._check(statistic, template if flare is None else flare)
+        self._check(statistic, flare if flare is not None else template if statistic == "matched" else None)
         if flare is None:
             return self._found[(statistic, "null", self._null(statistic, template))]
         return self._found[(statistic, "flare", flare)]
 
     def closed_form(self, statistic: str, flare: int | None = None, *, template: int = 0) -> QuadraticForm | Normal:
         """The same distribution for Gaussian noise; parameters as for `distribution`."""
-        self._check(statistic, template if flare is None else flare)
+        self._check(statistic, flare if flare is not None else template if statistic == "matched" else None)
         observed = self.quiet if flare is None else self.flares[flare]
-        looked_for = self.flares[template if flare is None else flare]
+        looked_for = self.flares[template if flare is None else flare] if self.flares else self.quiet
         return closed_form(statistic, self.quiet, observed, looked_for, self.scene.used)
 
     def dof(self, statistic: str) -> int:
@@ -259,15 +259,15 @@ class Detection:
         return template if statistic == "matched" else 0
 
     def _cut(self, fap: float, statistic: str, template: int) -> tuple[Distribution, int]:
-        self._check(statistic, template)
+        self._check(statistic, template if statistic == "matched" else None)
         check_fap(fap, self.realisations)
         null = self._found[(statistic, "null", self._null(statistic, template))]
         return null, null.first_bin_with_at_most(int(np.floor(fap * null.n * (1 + 1e-12))))
 
-    def _check(self, statistic: str, flare: int) -> None:
+    def _check(self, statistic: str, flare: int | None) -> None:
         if statistic not in self.statistics:
             raise InputError(f"statistic {statistic!r} was not simulated, expected one of {', '.join(self.statistics)}")
-        if not 0 <= flare < len(self.flares):
+        if flare is not None and not 0 <= flare < len(self.flares):
             raise InputError(f"flare = {flare}, expected 0 to {len(self.flares) - 1}")
 
 
@@ -318,6 +318,8 @@ def plan_channels(result: Detection, batch: Sequence[int], *, first: bool) -> Ch
         keys.append((statistic, role, flare))
 
     for statistic in result.statistics:
+        if first and statistic != "matched":
+            add(statistic, "null", 0, FIXED_STATISTICS.index(statistic), result.closed_form(statistic))
         for i, flare in enumerate(batch):
             null = result.closed_form(statistic, template=flare)
             own = result.closed_form(statistic, flare)
@@ -325,10 +327,7 @@ def plan_channels(result: Detection, batch: Sequence[int], *, first: bool) -> Ch
                 null_row, row = fixed + i, fixed + len(batch) + i
                 add(statistic, "null", flare, null_row, null)
             else:
-                offset = FIXED_STATISTICS.index(statistic)
-                row = len(FIXED_STATISTICS) * (i + 1) + offset
-                if first and i == 0:
-                    add(statistic, "null", 0, offset, null)
+                row = len(FIXED_STATISTICS) * (i + 1) + FIXED_STATISTICS.index(statistic)
             add(statistic, "flare_on_null_grid", flare, row, null)
             add(statistic, "flare", flare, row, own)
     return ChannelPlan(weights, ends, fixed + len(weights), grids, keys)

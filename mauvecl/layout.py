@@ -9,44 +9,139 @@ import numpy as np
 
 WORD_BITS = 32
 
-#: Each random process draws from its own stream, the top byte of the counter's last word, so that adding
-#: one moves no other. Gaussian noise and dark of the observed
-#: exposure and of its reference; `split` takes a drawn spectrum apart.
-STREAMS = {"noise": 0, "dark": 1, "reference_noise": 2, "reference_dark": 3, "split": 4}
+#: Each random process draws from its own stream, the top byte of the counter's last word, so that adding one moves no
+#: other. `noise` is the joint Gaussian or what is Gaussian alone, `dark` and `photon` their Poisson counts where drawn
+#: apart; `split` takes a drawn spectrum apart.
+STREAMS = {
+    "noise": 0,
+    "dark": 1,
+    "photon": 2,
+    "cosmic": 3,
+    "jitter": 4,
+    "detector_temperature": 5,
+    "light_loss": 6,
+    "pointing_loss": 7,
+    "qe_scale": 8,
+    "split": 9,
+    "split_dark": 10,
+}
+#: Added to the stream for the draws of a reference exposure.
+REFERENCE = 64
 
-#: What all scenarios share in one pixel. Poisson counts come out relative to a
-#: whole number near the mean: as column + dark_low of an alias table, or from the expansion's coefficients.
-PIXEL = np.dtype(
+#: What a launch needs to know: the seed, sizes, where frames and groups of four pixels begin to be counted, and the
+#: alias table of the cosmic rays' charge.
+JOB = np.dtype(
     [
-        ("table_start", "u4"),
-        ("table_bits", "u4"),
-        ("dark_low", "i4"),
-        ("dark_offset", "f4"),
-        ("dark_slope", "f4"),
-        ("dark_cubic", "f4"),
-        ("dark_gain", "f4"),
-        ("used", "f4"),
+        ("seed_low", "u4"),
+        ("seed_high", "u4"),
+        ("pixel_count", "u4"),
+        ("padded_count", "u4"),
+        ("scenario_count", "u4"),
+        ("draw_count", "u4"),
+        ("frame_count", "u4"),
+        ("first_frame", "u4"),
+        ("first_group", "u4"),
+        ("cosmic_table", "u4"),
+        ("cosmic_bits", "u4"),
+        ("cosmic_low", "i4"),
+    ]
+)
+
+#: What all scenarios share in one pixel.
+PIXEL = np.dtype([("used", "f4"), ("element_end", "u4"), ("end_among_four", "u4"), ("cosmic_gain", "f4")])
+
+#: One scenario in one pixel, read in every inner loop: coefficients of the draw as a polynomial of z, the whole DN
+#: that separate `nearest`'s result from the template's, the template's inverse variance, and twice that times the
+#: template's fraction of a DN.
+LEVEL = np.dtype(
+    [
+        ("c0", "f4"),
+        ("c1", "f4"),
+        ("c2", "f4"),
+        ("c3", "f4"),
+        ("c4", "f4"),
+        ("shift", "f4"),
         ("inverse_variance", "f4"),
-        ("element_end", "u4"),
-        ("end_among_four", "u4"),
+        ("twice", "f4"),
+    ]
+)
+
+#: One scenario in one pixel, read where needed: whole DN of one draw's mean that the kernels leave out, the ADC's range
+#: as `nearest` sees it, whole DN from the sum of draws to the template, and, at an element's last pixel, the template's
+#: fraction of a DN and inverse variance summed over the element.
+EDGE = np.dtype(
+    [
+        ("base", "i4"),
+        ("low", "f4"),
+        ("high", "f4"),
+        ("whole", "f4"),
+        ("element_offset", "f4"),
         ("inverse_element_variance", "f4"),
     ]
 )
 
-#: One scenario in one pixel: Gaussian DN rms, the part of the mean left out of the whole-DN base, the ADC's range
-#: relative to that base, and base minus the quiescent mean.
-LEVEL = np.dtype([("sd", "f4"), ("fraction", "f4"), ("low", "f4"), ("high", "f4"), ("offset", "f4")])
+#: A Poisson count relative to a whole number near its mean: column + low of an alias table, or, with bits = 0, from the
+#: expansion's coefficients; and DN per count.
+POISSON = np.dtype(
+    [
+        ("table", "u4"),
+        ("bits", "u4"),
+        ("low", "i4"),
+        ("offset", "f4"),
+        ("slope", "f4"),
+        ("cubic", "f4"),
+        ("gain", "f4"),
+    ]
+)
 
-#: What an observer subtracts and assumes in one pixel: net = value + net_offset, noise^2 = gain max(net, 0) + variance.
-OBSERVER = np.dtype([("net_offset", "f4"), ("gain", "f4"), ("variance", "f4"), ("used", "f4")])
+#: How a joint draw follows factors on light and dark: their means, variances, third and fourth cumulants, DN.
+RESPONSE = np.dtype(
+    [
+        ("light", "f4"),
+        ("dark", "f4"),
+        ("light_variance", "f4"),
+        ("dark_variance", "f4"),
+        ("other_variance", "f4"),
+        ("light_third", "f4"),
+        ("dark_third", "f4"),
+        ("light_fourth", "f4"),
+        ("dark_fourth", "f4"),
+    ]
+)
+
+#: What an observer subtracts and assumes in one pixel: net = value + net_offset, noise^2 = gain max(net, 0) + variance;
+#: and the base-2 logarithm of its histogram's bins in DN.
+OBSERVER = np.dtype([("net_offset", "f4"), ("gain", "f4"), ("variance", "f4"), ("bin_shift", "u4")])
+
+#: A resolution element: its pixels, and the grid of its S/N's histogram.
+ELEMENT = np.dtype([("first", "u4"), ("end", "u4"), ("centre", "f4"), ("bins_per_unit", "f4")])
 
 #: One histogram: which channel of values it reads, its centre, and fine steps per unit of the statistic.
 GRID = np.dtype([("channel", "u4"), ("centre", "f4"), ("steps_per_unit", "f4")])
 
-STRUCTS = {"Pixel": PIXEL, "Level": LEVEL, "Observer": OBSERVER, "Grid": GRID}
+STRUCTS = {
+    "Job": JOB,
+    "Pixel": PIXEL,
+    "Level": LEVEL,
+    "Edge": EDGE,
+    "Poisson": POISSON,
+    "Response": RESPONSE,
+    "Observer": OBSERVER,
+    "Element": ELEMENT,
+    "Grid": GRID,
+}
 
 #: Statistics with a channel in every scenario, in the kernel's order; linear statistics follow them.
 FIXED_STATISTICS = ("chi2", "chi2_element", "chi2_pair")
+
+#: Adding and subtracting this rounds a float32 below 2**22 to the nearest whole number.
+MAGIC = 12582912.0
+
+#: Quantile tables of priors hold this many cells, between which the device interpolates.
+PRIOR_BITS = 10
+
+#: Histograms of S/N: one per pixel and element.
+OBSERVER_BINS = 2048
 
 #: A histogram has BINS bins of 2**FINE_BITS fine steps; a statistic's standard deviation is STEPS_PER_SIGMA steps.
 BINS = 32768

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from mauvecl.layout import WORD_BITS
 
@@ -68,16 +69,28 @@ def alias_table(mean: float) -> AliasTable:
         raise ValueError(f"Poisson mean = {mean!r}, expected 0 to {LARGEST_MEAN:g}")
     if mean == 0.0:
         return AliasTable(0, 1, _pack(np.array([2**WORD_BITS, 0]), 1))
-    # Takes a second to load, and most studies need no table.
-    from scipy.stats import poisson
-
     # Counts outside have less than half a word each.
-    low, high = int(poisson.ppf(2.0**-33, mean)), int(poisson.isf(2.0**-33, mean))
-    low = max(low - 1, 0)
-    bits = max(int(high + 1 - low).bit_length(), 1)
-    counts = low + np.arange(1 << bits)
-    words = _whole_words(poisson.pmf(counts, mean))
-    return AliasTable(low, bits, _pack(words, bits))
+    reach = 6.5 * np.sqrt(mean) + 16.0
+    low = max(int(mean - reach), 0)
+    high = int(mean + reach + 0.5 * reach**2 / (mean + 1.0))
+    counts = np.arange(low, high + 1)
+    p = np.exp(special.xlogy(counts, mean) - mean - special.gammaln(counts + 1.0))
+    inside = np.flatnonzero(p >= 2.0**-33)
+    return table_of(p[inside[0] : inside[-1] + 1], low + int(inside[0]))
+
+
+def table_of(probability: NDArray[np.float64], low: int = 0) -> AliasTable:
+    """The alias table of any distribution over whole numbers from `low` on.
+
+    Parameters
+    ----------
+    probability : ndarray, shape (n,)
+        Up to 2**24 values that need not sum to one.
+    """
+    bits = max(int(probability.size - 1).bit_length(), 1)
+    padded = np.zeros(1 << bits)
+    padded[: probability.size] = probability
+    return AliasTable(low, bits, _pack(_whole_words(padded), bits))
 
 
 def _whole_words(probability: NDArray[np.float64]) -> NDArray[np.int64]:
@@ -109,28 +122,28 @@ def _pack(words: NDArray[np.int64], bits: int) -> NDArray[np.uint32]:
     return np.array(entries, dtype=np.uint32)
 
 
-def table_set(means: Iterable[float]) -> tuple[list[AliasTable], NDArray[np.intp], NDArray[np.uint32]]:
-    """One table per distinct mean, laid end to end.
+def table_set(means: Iterable[float], tables: list[AliasTable]) -> tuple[list[AliasTable], list[int]]:
+    """One table per distinct mean, put behind those that are there.
+
+    Parameters
+    ----------
+    means : iterable of float
+    tables : list of AliasTable
+        Laid end to end on the device; new ones are appended.
 
     Returns
     -------
-    tables : list of AliasTable
+    found : list of AliasTable
         For each mean, its table; equal means share one.
-    starts : ndarray of int, shape (n_mean,)
+    starts : list of int
         Where each mean's table starts.
-    entries : ndarray of uint32
-        All tables, end to end.
     """
+    size = sum(table.entries.size for table in tables)
     distinct: dict[float, tuple[AliasTable, int]] = {}
-    size = 0
-    tables, starts = [], []
-    for mean in means:
+    for mean in (means := list(means)):
         if mean not in distinct:
             table = alias_table(mean)
             distinct[mean] = (table, size)
+            tables.append(table)
             size += table.entries.size
-        table, start = distinct[mean]
-        tables.append(table)
-        starts.append(start)
-    parts = [table.entries for table, _ in distinct.values()]
-    return tables, np.array(starts, dtype=np.intp), np.concatenate(parts)
+    return [distinct[mean][0] for mean in means], [distinct[mean][1] for mean in means]

@@ -56,15 +56,20 @@ class Variant:
     width: int
     vector_forms: bool
     chunk: int
+    vectors: int = 1
     scenarios: int = 16
     linears: int = 32
     frames: bool = False
     clip: bool = False
     pair: bool = False
+    linear: bool = False
     elements: bool = True
-    expansion: bool = False
-    bins: int = layout.BINS
-    fine_bits: int = layout.FINE_BITS
+    joint: bool = True
+    quartic: bool = True
+    photons: bool = False
+    cosmic: bool = False
+    modulations: tuple[tuple[str, str], ...] = ()
+    row_type: str = "int"
 
 
 def load_opencl() -> Any:
@@ -196,6 +201,14 @@ def render(rooms: tuple[str, ...], variant: Variant) -> str:
         "streams": layout.STREAMS,
         "polynomials": {k: [f"{c}f" for c in v] for k, v in layout.POLYNOMIALS.items()},
         "two_ln2": f"{layout.TWO_LN2}f",
+        "magic": f"{layout.MAGIC}f",
+        "reference": layout.REFERENCE,
+        "modulated": bool(variant.modulations),
+        "jitter": next((i for i, (name, _) in enumerate(variant.modulations) if name == "jitter"), None),
+        "prior_bits": layout.PRIOR_BITS,
+        "observer_bins": layout.OBSERVER_BINS,
+        "bins": layout.BINS,
+        "fine_bits": layout.FINE_BITS,
         "limit": layout.STEP_LIMIT,
         "structs": {name: dtype.names for name, dtype in layout.STRUCTS.items()},
     }
@@ -204,6 +217,12 @@ def render(rooms: tuple[str, ...], variant: Variant) -> str:
         text = folder.joinpath(f"{room}.cl.mako").read_text(encoding="utf-8")
         parts.append(str(Template(text, strict_undefined=True).render(**values)))
     return "\n".join(parts)
+
+
+def out_of_memory(error: Exception) -> bool:
+    """Whether an OpenCL error says that the device's memory did not suffice."""
+    told = ("MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_RESOURCES", "OUT_OF_HOST_MEMORY", "INVALID_BUFFER_SIZE")
+    return any(word in str(error) for word in told)
 
 
 def digest(source: str) -> str:

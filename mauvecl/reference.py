@@ -7,6 +7,7 @@ fused multiply-add here is rounded once, as there. Used by tests and by the self
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,7 +24,7 @@ _POLYNOMIALS = {
     name: [np.float32(float.fromhex(c)) for c in coefficients] for name, coefficients in layout.POLYNOMIALS.items()
 }
 _TWO_LN2 = np.float32(float.fromhex(layout.TWO_LN2))
-_NEAREST = np.float32(12582912.0)
+_MAGIC = np.float32(layout.MAGIC)
 
 
 def philox(counter: Sequence[ArrayLike], seed: int) -> Words:
@@ -48,7 +49,7 @@ def philox(counter: Sequence[ArrayLike], seed: int) -> Words:
     return (c0.astype(np.uint32), c1.astype(np.uint32), c2.astype(np.uint32), c3.astype(np.uint32))
 
 
-def words_at(realisation: ArrayLike, frame: int, stream: str, group: ArrayLike, seed: int) -> Words:
+def words_at(realisation: ArrayLike, frame: int, stream: str, group: ArrayLike, seed: int, exposure: int = 0) -> Words:
     """The four words that four neighbouring pixels of one realisation and frame share in a stream.
 
     Parameters
@@ -61,9 +62,11 @@ def words_at(realisation: ArrayLike, frame: int, stream: str, group: ArrayLike, 
     group : array_like of int
         Pixel index over four.
     seed : int
+    exposure : int
+        0 for the observed exposure, `layout.REFERENCE` for the other.
     """
     index = np.asarray(realisation, dtype=np.uint64)
-    last = np.uint64(layout.STREAMS[stream] << 24) | np.asarray(group, dtype=np.uint64)
+    last = np.uint64((exposure + layout.STREAMS[stream]) << 24) | np.asarray(group, dtype=np.uint64)
     return philox((index & np.uint64(0xFFFFFFFF), index >> np.uint64(32), np.uint64(frame), last), seed)
 
 
@@ -123,59 +126,180 @@ def expansion_draw(z: Floats, offset: np.float32, slope: np.float32, cubic: np.f
 
 def nearest(x: Floats) -> Floats:
     """Nearest whole number, ties to even, for values below 2**22."""
-    return (x + _NEAREST) - _NEAREST
+    return np.asarray((x + _MAGIC) - _MAGIC)
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """What was drawn for four neighbouring pixels; each entry has the shape (n_realisation,)."""
+
+    z: list[Floats]
+    dark: list[Floats]
+    photon: Words | None
+    cosmic: list[Floats]
+
+
+def poisson_draw(words: Words, i: int, source: np.void, tables: NDArray[np.uint32], pairs: Sequence[Floats]) -> Floats:
+    """One pixel's count, relative to its whole number; `pairs` are the normals of the four words."""
+    if not source["bits"]:
+        return expansion_draw(pairs[i], source["offset"], source["slope"], source["cubic"])
+    column = alias_draw(words[i], tables[int(source["table"]) :], int(source["bits"]))
+    return (column.astype(np.int32) + source["low"]).astype(np.float32)
+
+
+def four_normals(w: Words) -> list[Floats]:
+    """Normals of four neighbouring pixels."""
+    return [*normal_pair(w[0], w[1]), *normal_pair(w[2], w[3])]
 
 
 def draws(
-    scene: Scene, realisation: NDArray[np.uint64], frame: int, group: int, seed: int, *, reference: bool = False
-) -> tuple[list[Floats], list[Floats]]:
-    """Gaussian z and dark count d of four pixels, each shape (n_realisation,)."""
-    prefix = "reference_" if reference else ""
-    g = words_at(realisation, frame, f"{prefix}noise", group, seed)
-    w = words_at(realisation, frame, f"{prefix}dark", group, seed)
-    z = [*normal_pair(g[0], g[1]), *normal_pair(g[2], g[3])]
-    four = scene.pixels[4 * group : 4 * group + 4]
-    if scene.expansion:
-        y = [*normal_pair(w[0], w[1]), *normal_pair(w[2], w[3])]
-        coefficients = zip(four["dark_offset"], four["dark_slope"], four["dark_cubic"], strict=True)
-        return z, [expansion_draw(y[i], *c) for i, c in enumerate(coefficients)]
-    d = []
-    for i, pixel in enumerate(four):
-        table = scene.tables[int(pixel["table_start"]) :]
-        column = alias_draw(w[i], table, int(pixel["table_bits"]))
-        d.append((column.astype(np.int32) + pixel["dark_low"]).astype(np.float32))
-    return z, d
+    scene: Scene, realisation: NDArray[np.uint64], frame: int, group: int, seed: int, *, exposure: int = 0
+) -> Draws:
+    """Everything drawn for four pixels of one draw."""
+    job = scene.job
+    address = (realisation, int(job["first_frame"]) + frame)
+    place = (int(job["first_group"]) + group, seed, exposure)
+    z = four_normals(words_at(*address, "noise", *place))
+    dark: list[Floats] = []
+    if not scene.joint:
+        w = words_at(*address, "dark", *place)
+        y = four_normals(w)
+        four = scene.dark_counts[4 * group : 4 * group + 4]
+        dark = [poisson_draw(w, i, four[i], scene.tables, y) for i in range(4)]
+    photon = words_at(*address, "photon", *place) if scene.photons else None
+    cosmic: list[Floats] = []
+    if scene.cosmic:
+        table, bits = scene.tables[int(job["cosmic_table"]) :], int(job["cosmic_bits"])
+        cosmic = [
+            (alias_draw(word, table, bits).astype(np.int32) + job["cosmic_low"]).astype(np.float32)
+            for word in words_at(*address, "cosmic", *place)
+        ]
+    return Draws(z, dark, photon, cosmic)
 
 
-def digitise(z: Floats, d: Floats, dark_gain: np.float32, level: np.void, *, clip: bool) -> Floats:
+def quantile(word: NDArray[np.uint32], table: Floats) -> Floats:
+    """A prior's value at the probability that a word stands for."""
+    bits = layout.PRIOR_BITS
+    cell = word >> np.uint32(32 - bits)
+    part = (word & np.uint32(2 ** (32 - bits) - 1)).astype(np.float32) * np.float32(1.0 / 2 ** (32 - bits))
+    return fma(part, table[cell + 1] - table[cell], table[cell])
+
+
+def factors(
+    scene: Scene, realisation: NDArray[np.uint64], frame: int, seed: int, *, exposure: int = 0
+) -> tuple[Floats, Floats]:
+    """Factors on light and dark of one draw, each shape (n_realisation,)."""
+    found = {"light": np.ones(len(realisation), np.float32), "dark": np.ones(len(realisation), np.float32)}
+    kept = np.ones(len(realisation), np.float32)
+    first = int(scene.job["first_frame"]) + frame
+    for (name, factor), table in zip(scene.modulations, scene.priors, strict=True):
+        if name != "jitter":
+            found[factor] = found[factor] * quantile(words_at(realisation, 0, name, 0, seed)[0], table)
+            continue
+        lost = np.zeros(len(realisation), np.float32)
+        for f in range(first, first + (1 if scene.frames else scene.n_frames)):
+            lost = lost + quantile(words_at(realisation, f // 4, name, 0, seed, exposure)[f % 4], table)
+        one = np.float32(1.0)
+        kept = one - lost if scene.frames else fma(lost, np.float32(-1.0) / np.float32(scene.n_frames), one)
+    return found["light"] * kept, found["dark"]
+
+
+def analogue(scene: Scene, drawn: Draws, i: int, pixel: int, k: int, light: Floats, dark: Floats) -> Floats:
+    """The count above the level's base before the ADC, shape (n_realisation,)."""
+    level, z = scene.levels[k, pixel], drawn.z[i]
+    if scene.modulations:
+        v = _responding(scene.responses[k, pixel], level["c0"], z, light, dark)
+    elif scene.joint:
+        first, *rest = ("c4", "c3", "c2", "c1", "c0") if scene.quartic else ("c3", "c2", "c1", "c0")
+        v = np.full_like(z, level[first])
+        for name in rest:
+            v = fma(z, v, level[name])
+    else:
+        v = fma(drawn.dark[i], scene.dark_counts[pixel]["gain"], fma(z, level["c1"], level["c0"]))
+    if drawn.photon is not None:
+        source = scene.photon_counts[k, pixel]
+        # The two of a pair use each other's words where the count comes from a normal.
+        count = poisson_draw(drawn.photon, i, source, scene.tables, four_normals(drawn.photon))
+        v = fma(count, source["gain"], v)
+    if scene.cosmic:
+        v = fma(drawn.cosmic[i], scene.pixels[pixel]["cosmic_gain"], v)
+    return v
+
+
+def _responding(r: np.void, c0: np.float32, z: Floats, light: Floats, dark: Floats) -> Floats:
+    variance = fma(light, r["light_variance"], fma(dark, r["dark_variance"], r["other_variance"]))
+    third = fma(light, r["light_third"], dark * r["dark_third"])
+    fourth = fma(light, r["light_fourth"], dark * r["dark_fourth"])
+    with np.errstate(invalid="ignore", divide="ignore"):  # padded pixels have no variance
+        sd, share, zz = np.sqrt(variance), third / variance, z * z
+        curve = fourth * fma(zz, np.float32(0.041666668), np.float32(-0.125))
+        curve = curve - third * share * fma(zz, np.float32(0.055555556), np.float32(-0.1388889))
+        cubic = curve / (variance * sd)
+        v = fma(z, sd + cubic, fma(share, fma(zz, np.float32(0.16666667), np.float32(-0.16666667)), c0))
+    one = np.float32(1.0)
+    out: Floats = v + fma(light - one, r["light"], (dark - one) * r["dark"])
+    return out
+
+
+def digitise(v: Floats, edge: np.void, *, clip: bool) -> Floats:
     """DN above the level's base, rounded and clipped."""
-    dn = nearest(fma(level["sd"], z, fma(dark_gain, d, level["fraction"])))
-    return np.clip(dn, level["low"], level["high"]) if clip else dn
+    r = v + _MAGIC
+    if clip:
+        r = np.where(r < edge["low"], edge["low"], r)
+        r = np.where(r > edge["high"], edge["high"], r)
+    return np.asarray(r - _MAGIC)
 
 
 def observed(
-    scene: Scene, realisation: NDArray[np.uint64], seed: int, *, reference: bool = False
+    scene: Scene,
+    realisation: NDArray[np.uint64],
+    seed: int,
+    *,
+    exposure: int = 0,
+    scenarios: Sequence[int] | None = None,
 ) -> NDArray[np.float32]:
-    """DN above the base, summed over the draws, of every scenario.
+    """DN above the base, summed over the draws, of scenarios.
 
     Returns
     -------
     ndarray of float32, shape (n_scenario, n_padded, n_realisation)
     """
-    scenarios = scene.levels[:1] if reference else scene.levels
-    total = np.zeros((len(scenarios), len(scene.pixels), len(realisation)), np.float32)
+    chosen = range(len(scene.levels)) if scenarios is None else scenarios
+    total = np.zeros((len(chosen), len(scene.pixels), len(realisation)), np.float32)
     for frame in range(scene.n_draws):
+        light, dark = factors(scene, realisation, frame, seed, exposure=exposure)
         for group in range(len(scene.pixels) // 4):
-            z, d = draws(scene, realisation, frame, group, seed, reference=reference)
+            drawn = draws(scene, realisation, frame, group, seed, exposure=exposure)
             for i, p in enumerate(range(4 * group, 4 * group + 4)):
-                for k, levels in enumerate(scenarios):
-                    total[k, p] += digitise(z[i], d[i], scene.pixels[p]["dark_gain"], levels[p], clip=scene.clip)
+                for row, k in enumerate(chosen):
+                    v = analogue(scene, drawn, i, p, k, light, dark)
+                    total[row, p] += digitise(v, scene.edges[k, p], clip=scene.clip)
     return total
+
+
+def clipped(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray[np.int64]:
+    """Frames that each pixel of scenario 0 spends below and above the ADC's range.
+
+    Returns
+    -------
+    ndarray of int64, shape (n_realisation, n_pixel, 2)
+    """
+    count = np.zeros((len(realisation), len(scene.pixels), 2), np.int64)
+    if scene.clip:
+        for frame in range(scene.n_draws):
+            light, dark = factors(scene, realisation, frame, seed)
+            for group in range(scene.n_pixel // 4 + 1):
+                drawn = draws(scene, realisation, frame, group, seed)
+                for i, p in enumerate(range(4 * group, min(4 * group + 4, len(scene.pixels)))):
+                    r = analogue(scene, drawn, i, p, 0, light, dark) + _MAGIC
+                    count[:, p, 0] += r < scene.edges[0, p]["low"]
+                    count[:, p, 1] += r > scene.edges[0, p]["high"]
+    return count[:, : scene.n_pixel]
 
 
 def realise(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray[np.int64]:
     """Raw DN of scenario 0 summed over the frames, shape (n_realisation, n_pixel)."""
-    above = observed(scene.part([0]), realisation, seed)[0, : scene.n_pixel]
+    above = observed(scene, realisation, seed, scenarios=[0])[0, : scene.n_pixel]
     raw: NDArray[np.int64] = (above.astype(np.int64) + scene.n_draws * scene.base_dn[0][:, None]).T
     return raw
 
@@ -206,16 +330,20 @@ def statistics(
     ndarray of float32, shape (3 n_scenario + n_linear, n)
     """
     n_scenario, fixed = len(scene.levels), len(layout.FIXED_STATISTICS)
+    constants = scene.constants(weights, linear_end)
     out = np.zeros((fixed * n_scenario + len(weights), len(realisation)), np.float32)
-    x = observed(scene, realisation, seed) + scene.levels["offset"][:, :, None]
-    if pair:
-        quiet = observed(scene, realisation, seed, reference=True)[0] + scene.levels["offset"][0][:, None]
+    above = observed(scene, realisation, seed)
+    again = observed(scene, realisation, seed, exposure=layout.REFERENCE) if pair else above
+    x, again = _above_template(scene, above), _above_template(scene, again)
     begin = 0
     for k in range(n_scenario):
         chi2, chi2_element, chi2_pair = (out[fixed * k + i] for i in range(fixed))
         inside = np.zeros(len(realisation), np.float32)
-        chi2[:] = _summed(x[k] * x[k], scene.pixels["inverse_variance"])
+        level, edge = scene.levels[k], scene.edges[k]
+        parts = [np.zeros(len(realisation), np.float32) for _ in range(4)]
         for p, pixel in enumerate(scene.pixels):
+            slope = fma(x[k, p], level[p]["inverse_variance"], level[p]["twice"])
+            parts[p % 4] = fma(x[k, p], slope, parts[p % 4])
             if pixel["end_among_four"]:
                 inside = fma(x[k, p], pixel["used"], inside)
             elif p % 4 == 0:
@@ -224,15 +352,24 @@ def statistics(
                     fma(x[k, p], used[0], x[k, p + 1] * used[1]) + fma(x[k, p + 2], used[2], x[k, p + 3] * used[3])
                 )
             if pixel["element_end"]:
-                chi2_element[:] = fma(inside * inside, pixel["inverse_element_variance"], chi2_element)
+                inside = inside + edge[p]["element_offset"]
+                chi2_element[:] = fma(inside * inside, edge[p]["inverse_element_variance"], chi2_element)
                 inside = np.zeros(len(realisation), np.float32)
             if pair:
-                difference = x[k, p] - quiet[p]
-                chi2_pair[:] = fma(difference * difference, np.float32(0.5) * pixel["inverse_variance"], chi2_pair)
+                difference = x[k, p] - again[int(scene.templates[k]), p]
+                half = np.float32(0.5) * level[p]["inverse_variance"]
+                chi2_pair[:] = fma(difference * difference, half, chi2_pair)
+        chi2[:] = ((parts[0] + parts[1]) + (parts[2] + parts[3])) + constants[k]
         for linear in range(begin, int(linear_end[k])):
-            out[fixed * n_scenario + linear] = _summed(x[k], weights[linear])
+            out[fixed * n_scenario + linear] = _summed(x[k], weights[linear]) + constants[n_scenario + linear]
         begin = int(linear_end[k])
     return out
+
+
+def _above_template(scene: Scene, above: NDArray[np.float32]) -> NDArray[np.float32]:
+    if scene.frames:
+        return np.asarray(above + scene.edges["whole"][:, :, None])
+    return np.asarray((above + _MAGIC) - scene.levels["shift"][:, :, None])
 
 
 def _summed(values: NDArray[np.float32], weights: NDArray[np.float32]) -> Floats:
@@ -244,43 +381,57 @@ def _summed(values: NDArray[np.float32], weights: NDArray[np.float32]) -> Floats
     return total
 
 
-def signal_to_noise(
-    scene: Scene, observers: NDArray[np.void], realisation: NDArray[np.uint64], seed: int
-) -> tuple[Floats, Floats]:
-    """S/N per pixel, shape (n_padded, n), and per resolution element, shape (n_element, n)."""
-    above = observed(scene.part([0]), realisation, seed)[0]
-    pixels, elements = np.zeros_like(above), []
-    signal, variance = (np.zeros(len(realisation), np.float32) for _ in range(2))
-    for p, observer in enumerate(observers):
-        net = above[p] + observer["net_offset"]
-        noise2 = fma(np.maximum(net, np.float32(0.0)), observer["gain"], observer["variance"])
-        signal = signal + net * observer["used"]
-        variance = fma(noise2, observer["used"], variance)
-        pixels[p] = net / np.sqrt(noise2)
-        if scene.pixels[p]["element_end"]:
-            elements.append(signal / np.sqrt(variance))
-            signal, variance = np.zeros_like(signal), np.zeros_like(variance)
-    return pixels, np.array(elements)
+def histograms(
+    scene: Scene,
+    observers: NDArray[np.void],
+    elements: NDArray[np.void],
+    realisation: NDArray[np.uint64],
+    seed: int,
+) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
+    """The kernel `histogram`: each pixel's counts, each element's S/N, and frames clipped.
+
+    Returns
+    -------
+    pixel_counts, element_counts : ndarray of int64, shapes (n_pixel, OBSERVER_BINS) and (n_element, OBSERVER_BINS)
+    clipped : ndarray of int64, shape (n_pixel, 2)
+        Below and above the ADC's range.
+    """
+    bins, half = layout.OBSERVER_BINS, layout.OBSERVER_BINS // 2
+    n = observed(scene, realisation, seed, scenarios=[0])[0]
+    pixel_counts = np.zeros((scene.n_pixel, bins), np.int64)
+    element_counts = np.zeros((len(elements), bins), np.int64)
+    for e, element in enumerate(elements):
+        signal, variance = (np.zeros(len(realisation), np.float32) for _ in range(2))
+        for p in range(int(element["first"]), int(element["end"])):
+            observer = observers[p]
+            net = n[p] + observer["net_offset"]
+            signal = signal + net
+            variance = variance + fma(np.maximum(net, np.float32(0.0)), observer["gain"], observer["variance"])
+            whole = (n[p].astype(np.int64) >> int(observer["bin_shift"])) + half
+            pixel_counts[p] = np.bincount(np.clip(whole, 0, bins - 1), minlength=bins)
+        with np.errstate(invalid="ignore"):
+            steps = (signal / np.sqrt(variance) - element["centre"]) * element["bins_per_unit"]
+        whole = nearest(np.clip(steps, np.float32(-half), np.float32(half - 1))).astype(np.int64) + half
+        element_counts[e] = np.bincount(whole, minlength=bins)
+    return pixel_counts, element_counts, clipped(scene, realisation, seed).sum(axis=0)
 
 
-def tally(
-    values: NDArray[np.float32], grids: NDArray[np.void], bins: int, fine_bits: int
-) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
-    """Histograms, shape (n_grid, bins), and sums of fine steps and their squares, shape (n_grid, 2).
+def tally(values: NDArray[np.float32], grids: NDArray[np.void]) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
+    """Histograms, shape (n_grid, BINS), and sums of fine steps and their squares, shape (n_grid, 2).
 
     Parameters
     ----------
     values : ndarray of float32, shape (n_channel, n)
     grids : ndarray of layout.GRID, shape (n_grid,)
-    bins, fine_bits : int
     """
+    bins = layout.BINS
     histogram = np.zeros((len(grids), bins), np.uint32)
     sums = np.zeros((len(grids), 2), np.int64)
     limit = np.float32(layout.STEP_LIMIT)
     for g, grid in enumerate(grids):
         steps = (values[int(grid["channel"])] - grid["centre"]) * grid["steps_per_unit"]
         step = nearest(np.clip(steps, -limit, limit)).astype(np.int64)
-        bin_index = np.clip((step >> fine_bits) + bins // 2, 0, bins - 1)
+        bin_index = np.clip((step >> layout.FINE_BITS) + bins // 2, 0, bins - 1)
         histogram[g] = np.bincount(bin_index, minlength=bins)
         sums[g] = step.sum(), (step * step).sum()
     return histogram, sums

@@ -10,23 +10,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl import layout
+from mauvecl.cumulants import Cumulants, joint_is_exact, needs_fourth_power, polynomial
 from mauvecl.host.errors import InputError
-from mauvecl.poisson import SMALLEST_EXPANDED, table_set
+from mauvecl.poisson import SMALLEST_EXPANDED, AliasTable, table_of, table_set
+from mauvecl.processes import NONE, Processes
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
 
 Mode = Literal["auto", "frames", "stacked"]
+Recipe = Literal["auto", "joint", "apart"]
+Float = NDArray[np.float64]
 
 #: Pixels are padded to a multiple of this with ones that never contribute.
 PIXEL_BLOCK = 32
 #: `frames` is chosen where a pixel's mean is within this many sigma of a rail.
 RAIL_SIGMA = 8.0
+#: Counts further from their base than this are not rounded to whole DN by the device.
+REACH_DN = 2.0**22
+#: DN^2 in place of none at all.
+NO_VARIANCE = 1e-12
+#: Groups of four pixels have 24 bits in the counter.
+MOST_PIXELS = 65_536
 
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """Scenarios on common draws; scenario 0 is the quiescent one.
+    """Scenarios on common draws.
 
     Attributes
     ----------
@@ -36,28 +46,54 @@ class Scene:
         Frames of the exposure.
     frames : bool
         Each frame drawn, rounded and clipped (True), or their sum drawn at once.
-    expansion : bool
-        Whether the dark counts come from the expansion, all means being large, or from alias tables.
+    joint : bool
+        Whether all noise of a draw comes from one normal, through its cumulants, or Poisson counts are drawn apart.
+    quartic : bool
+        Whether a joint draw needs the fourth power of its normal.
+    photons : bool
+        Whether photon counts are drawn apart as well.
     clip : bool
         Whether single draws meet the ADC's rails.
+    modulations : tuple of (name, factor)
+        Priors that change light or dark; see `Processes`.
+    job : ndarray of layout.JOB, shape ()
+        Without the seed.
     pixels : ndarray of layout.PIXEL, shape (n_padded,)
-    levels : ndarray of layout.LEVEL, shape (n_scenario, n_padded)
+    levels, edges, photon_counts, responses : ndarray, shape (n_scenario, n_padded)
+        Of layout.LEVEL, EDGE, POISSON and RESPONSE; the last two are empty where not needed.
+    dark_counts : ndarray of layout.POISSON, shape (n_padded,)
     tables : ndarray of uint32
-        Alias tables of the dark counts, end to end.
+        Alias tables, end to end.
+    priors : ndarray of float32, shape (n_modulation, 2**PRIOR_BITS + 1)
+    templates : ndarray of uint32, shape (n_scenario,)
+        For each scenario the one whose mean and variance it is compared with.
+    fraction : ndarray, shape (n_scenario, n_padded)
+        Template rounded to whole DN less the template.
     base_dn : ndarray of int64, shape (n_scenario, n_pixel)
         Whole DN of one draw's mean that the kernels leave out.
     used : ndarray of bool, shape (n_pixel,)
-        Pixels that enter the statistics: those not saturated without a flare.
+        Pixels that enter the statistics: those no template saturates.
     """
 
     n_pixel: int
     n_frames: int
     frames: bool
-    expansion: bool
+    joint: bool
+    quartic: bool
+    photons: bool
     clip: bool
+    modulations: tuple[tuple[str, Literal["light", "dark"]], ...]
+    job: NDArray[np.void]
     pixels: NDArray[np.void]
     levels: NDArray[np.void]
+    edges: NDArray[np.void]
+    dark_counts: NDArray[np.void]
+    photon_counts: NDArray[np.void]
+    responses: NDArray[np.void]
     tables: NDArray[np.uint32]
+    priors: NDArray[np.float32]
+    templates: NDArray[np.uint32]
+    fraction: Float
     base_dn: NDArray[np.int64]
     used: NDArray[np.bool_]
 
@@ -66,10 +102,34 @@ class Scene:
         """Draws summed into one realisation of a pixel."""
         return self.n_frames if self.frames else 1
 
+    @property
+    def cosmic(self) -> bool:
+        """Whether cosmic rays are drawn."""
+        return bool(self.job["cosmic_bits"])
+
+    def constants(self, weights: NDArray[np.float32], linear_end: NDArray[np.uint32]) -> NDArray[np.float32]:
+        """What the template's fractions add to each sum: chi-squared per scenario, then each linear statistic.
+
+        Returns
+        -------
+        ndarray of float32, shape (n_scenario + n_linear,)
+        """
+        chi2 = np.sum(self.levels["inverse_variance"] * self.fraction**2, axis=1)
+        scenario = np.searchsorted(linear_end, np.arange(len(weights)), side="right")
+        linear = [float(weights[i] @ self.fraction[k]) for i, k in enumerate(scenario)]
+        return np.array([*chi2, *linear], np.float32)
+
     def part(self, scenarios: Sequence[int]) -> Scene:
-        """The same scene with some of its scenarios, in the order given."""
+        """The same scene with some of its scenarios, in the order given; their templates must be among them."""
         chosen = list(scenarios)
-        return replace(self, levels=self.levels[chosen], base_dn=self.base_dn[chosen])
+        job = self.job.copy()
+        job["scenario_count"] = len(chosen)
+        per_scenario = {
+            name: array[chosen] if len(array := getattr(self, name)) else array
+            for name in ("levels", "edges", "photon_counts", "responses", "fraction", "base_dn")
+        }
+        templates = np.array([chosen.index(t) for t in self.templates[chosen]], np.uint32)
+        return replace(self, job=job, templates=templates, **per_scenario)
 
 
 def near_rail(x: Expectation) -> NDArray[np.bool_]:
@@ -80,87 +140,218 @@ def near_rail(x: Expectation) -> NDArray[np.bool_]:
     return low | high
 
 
-def prepare(scenarios: Sequence[Expectation], mode: Mode = "auto") -> Scene:
+def prepare(
+    scenarios: Sequence[Expectation],
+    mode: Mode = "auto",
+    *,
+    processes: Processes = NONE,
+    templates: Sequence[int] | None = None,
+    recipe: Recipe = "auto",
+    first_frame: int = 0,
+    first_group: int = 0,
+) -> Scene:
     """Lay out scenarios for the device.
 
     Parameters
     ----------
     scenarios : sequence of Expectation
-        The quiescent one first, on one instrument and exposure.
+        On one instrument and exposure.
     mode : {"auto", "frames", "stacked"}
         Draw each frame, or all at once; by itself frames only near a rail.
+    processes : Processes
+    templates : sequence of int, optional
+        For each scenario the quiescent one it is compared with; the first for all by default.
+    recipe : {"auto", "joint", "apart"}
+        Draw all noise of a pixel from one normal, or Poisson counts apart; by itself apart only where the joint draw
+        would not be exact.
+    first_frame, first_group : int
+        Where frames and groups of four pixels begin to be counted in the generator's counter.
 
     Raises
     ------
     InputError
-        If the scenarios differ in anything but their light, or stacked draws are asked for near a rail.
+        If the scenarios differ in anything but their light, stacked draws are asked for near a rail, or a process
+        needs joint draws where there are none.
     """
     quiet = scenarios[0]
+    if quiet.wavelength_nm.size > MOST_PIXELS:
+        raise InputError(f"{quiet.wavelength_nm.size} pixels, expected at most {MOST_PIXELS}")
     for other in scenarios[1:]:
         _check_same_detector(quiet, other)
+    compared = np.zeros(len(scenarios), np.uint32) if templates is None else np.array(templates, np.uint32)
     frames = _draw_frames(scenarios, mode)
-    n_draw = 1 if frames else quiet.n_frames
+    each = 1 if frames else quiet.n_frames
     n_pixel = quiet.wavelength_nm.size
     padded = -(-n_pixel // PIXEL_BLOCK) * PIXEL_BLOCK
+    cumulants = [Cumulants.of(x, each) for x in scenarios]
+    joint = _joint(scenarios, cumulants, recipe)
+    shapes = [polynomial(c) for c in cumulants] if joint and not processes.modulations else []
+    quartic = any(needs_fourth_power(c, shape[4]) for c, shape in zip(cumulants, shapes, strict=False))
+    photons = not joint and quiet.photon_noise == "poisson"
+    modulations = processes.modulations
+    if modulations and not joint:
+        raise InputError(
+            f"{modulations[0][0]} varies within a run, and the noise of {quiet.name} cannot be drawn jointly, expected "
+            "Gaussian noise of 1.5 DN and more in each pixel, or no such process"
+        )
+    priors = processes.factors(quiet.conditions)
+    tables: list[AliasTable] = []
+    used = ~np.any([scenarios[t].saturated for t in np.unique(compared)], axis=0)
 
-    gain = quiet.gain_dn_per_electron
-    dark_gain = gain if quiet.dark_unit == "electrons" else np.ones(n_pixel)
-    dark_mean = n_draw * quiet.dark_dn / dark_gain
-    expansion = bool(dark_mean.min() >= SMALLEST_EXPANDED)
-    tables, starts, entries = table_set([0.0] * n_pixel if expansion else dark_mean.tolist())
-    centre = np.rint(dark_mean)
-
-    used = ~quiet.saturated
-    variance = quiet.variance_dn2
     pixels = np.zeros(padded, layout.PIXEL)
-    real = pixels[:n_pixel]
-    real["table_start"] = starts
-    real["table_bits"] = [table.bits for table in tables]
-    pixels["table_bits"][n_pixel:] = tables[0].bits
-    real["dark_low"] = np.array([table.low for table in tables]) - centre
-    if expansion:
-        root = np.sqrt(dark_mean)
-        real["dark_offset"] = dark_mean - centre - 1 / 6
-        real["dark_slope"] = root - 1 / (36 * root)
-        real["dark_cubic"] = -1 / (72 * root)
-    real["dark_gain"] = dark_gain
-    real["used"] = used
-    real["inverse_variance"] = used / variance
+    pixels["used"][:n_pixel] = used
     ends = np.append(np.diff(quiet.element) > 0, True)
-    real["element_end"] = ends
+    pixels["element_end"][:n_pixel] = ends
     pixels["end_among_four"] = np.repeat(pixels["element_end"].reshape(-1, 4).any(axis=1), 4)
-    element_variance = np.bincount(quiet.element, variance * used)
-    with np.errstate(divide="ignore"):
-        inverse = np.where(element_variance > 0, 1.0 / element_variance, 0.0)
-    real["inverse_element_variance"][ends] = inverse
+    pixels["cosmic_gain"][:n_pixel] = quiet.gain_dn_per_electron
+    darks, dark_centre = np.zeros(padded, layout.POISSON), np.zeros(n_pixel)
+    if not joint:
+        step = quiet.dark_step_dn
+        dark_centre = _counts(darks[:n_pixel], each * quiet.dark_dn / step, step, tables)
 
-    levels = np.zeros((len(scenarios), padded), layout.LEVEL)
-    base = np.zeros((len(scenarios), n_pixel), np.int64)
-    quiet_mean = quiet.n_frames * quiet.mean_raw_dn
-    for k, x in enumerate(scenarios):
-        light = x.source_electrons + x.sky_electrons
-        mean = n_draw * (gain * light + x.bias_dn) + dark_gain * centre
-        top = np.inf if n_draw > 1 else x.adc_max_dn
-        base[k] = np.clip(np.rint(mean), 0, top)
+    shape = (len(scenarios), padded)
+    levels, edges = np.zeros(shape, layout.LEVEL), np.zeros(shape, layout.EDGE)
+    counts = np.zeros(shape if photons else 0, layout.POISSON)
+    responses = np.zeros(shape if modulations else 0, layout.RESPONSE)
+    responses["other_variance"] = NO_VARIANCE
+    fraction, base = np.zeros(shape), np.zeros((len(scenarios), n_pixel), np.int64)
+    levels["shift"] = edges["low"] = edges["high"] = layout.MAGIC
+    for k, (x, c) in enumerate(zip(scenarios, cumulants, strict=True)):
+        mean = c.mean.copy()
+        if not joint:
+            mean = each * x.bias_dn + quiet.dark_step_dn * dark_centre
+            if photons:
+                mean += x.gain_dn_per_electron * _counts(counts[k, :n_pixel], c.photons, x.gain_dn_per_electron, tables)
+            else:
+                mean += x.gain_dn_per_electron * c.photons
+        base[k] = np.clip(np.rint(mean), 0, x.adc_max_dn if each == 1 else np.inf)
         level = levels[k, :n_pixel]
-        # A stack of n rounded frames has n/12 of rounding variance; its own rounding brings the last 1/12.
-        level["sd"] = np.sqrt(n_draw * (gain**2 * light + x.read_noise_dn**2) + (n_draw - 1) / 12)
-        level["fraction"] = mean - base[k]
-        level["low"] = -base[k]
-        level["high"] = x.adc_max_dn - base[k]
-        level["offset"] = (quiet.n_frames // n_draw) * base[k] - quiet_mean
+        if modulations:
+            _respond(responses[k, :n_pixel], c)
+            _check_reach(x, c, priors, modulations)
+        elif joint:
+            for name, coefficient in zip(("c0", "c1", "c2", "c3", "c4"), shapes[k], strict=True):
+                level[name] = coefficient
+        else:
+            level["c1"] = np.sqrt(c.gaussian)
+        level["c0"] += mean - base[k]
+        template = scenarios[compared[k]]
+        mean_sum = template.n_frames * template.mean_raw_dn
+        whole = (quiet.n_frames // each) * base[k] - np.rint(mean_sum)
+        fraction[k, :n_pixel] = np.rint(mean_sum) - mean_sum
+        level["shift"] = layout.MAGIC - whole
+        level["inverse_variance"] = used / template.variance_dn2
+        level["twice"] = 2.0 * fraction[k, :n_pixel] * level["inverse_variance"]
+        edge = edges[k, :n_pixel]
+        edge["base"], edge["whole"] = base[k], whole
+        edge["low"] = layout.MAGIC - base[k]
+        edge["high"] = layout.MAGIC + (x.adc_max_dn - base[k])
+        element_variance = np.bincount(quiet.element, template.variance_dn2 * used)
+        with np.errstate(divide="ignore"):
+            edge["inverse_element_variance"][ends] = np.where(element_variance > 0, 1.0 / element_variance, 0.0)
+        edge["element_offset"][ends] = np.bincount(quiet.element, fraction[k, :n_pixel] * used)
+
+    job = np.zeros((), layout.JOB)
+    job["pixel_count"], job["padded_count"], job["scenario_count"] = n_pixel, padded, len(scenarios)
+    job["draw_count"], job["frame_count"] = quiet.n_frames if frames else 1, quiet.n_frames
+    job["first_frame"], job["first_group"] = first_frame, first_group
+    if processes.cosmic_rays is not None:
+        table = table_of(processes.cosmic_rays.charge(each * quiet.frame_s))
+        job["cosmic_table"] = sum(t.entries.size for t in tables)
+        job["cosmic_bits"], job["cosmic_low"] = table.bits, table.low
+        tables.append(table)
     return Scene(
         n_pixel=n_pixel,
         n_frames=quiet.n_frames,
         frames=frames,
-        expansion=expansion,
-        clip=n_draw == 1,
+        joint=joint,
+        quartic=quartic,
+        photons=photons,
+        clip=each == 1,
+        modulations=modulations,
+        job=job,
         pixels=pixels,
         levels=levels,
-        tables=entries,
+        edges=edges,
+        dark_counts=darks,
+        photon_counts=counts,
+        responses=responses,
+        tables=np.concatenate([np.zeros(1, np.uint32)[:0], *(t.entries for t in tables)]).astype(np.uint32),
+        priors=priors,
+        templates=compared,
+        fraction=fraction,
         base_dn=base,
         used=used,
     )
+
+
+def _joint(scenarios: Sequence[Expectation], cumulants: Sequence[Cumulants], recipe: Recipe) -> bool:
+    """Whether every pixel's noise may come from one normal."""
+    if recipe not in ("auto", "joint", "apart"):
+        raise InputError(f"recipe = {recipe!r}, expected 'auto', 'joint' or 'apart'")
+    if recipe == "apart":
+        return False
+    for x, c in zip(scenarios, cumulants, strict=True):
+        exact = joint_is_exact(c)
+        if not exact.all():
+            if recipe == "joint":
+                pixel = int(np.argmin(exact))
+                raise InputError(
+                    f"recipe = 'joint', and pixel {pixel} of {x.name} has {np.sqrt(c.gaussian[pixel]):.3g} DN of "
+                    "Gaussian noise beside Poisson counts, expected recipe 'apart' or 'auto'"
+                )
+            return False
+    return True
+
+
+def _counts(out: NDArray[np.void], mean: Float, gain: Float, tables: list[AliasTable]) -> Float:
+    """Fill in how Poisson counts are drawn; returns the whole numbers they are relative to, shape (n_pixel,)."""
+    centre = np.rint(mean)
+    expanded = mean >= SMALLEST_EXPANDED
+    found, starts = table_set(mean[~expanded].tolist(), tables)
+    out["table"][~expanded] = starts
+    out["bits"][~expanded] = [t.bits for t in found]
+    out["low"][~expanded] = np.array([t.low for t in found]) - centre[~expanded]
+    root = np.sqrt(mean[expanded])
+    out["offset"][expanded] = (mean - centre)[expanded] - 1 / 6
+    out["slope"][expanded] = root - 1 / (36 * root)
+    out["cubic"][expanded] = -1 / (72 * root)
+    out["gain"] = gain
+    return centre
+
+
+def _respond(out: NDArray[np.void], c: Cumulants) -> None:
+    """How a draw follows factors on light and dark."""
+    out["light"], out["dark"] = c.light_dn, c.dark_dn
+    out["light_variance"], out["dark_variance"] = c.light_variance, c.dark_variance
+    # A pixel without any noise must not divide zero by zero.
+    out["other_variance"] = np.maximum(c.variance - c.light_variance - c.dark_variance, NO_VARIANCE)
+    out["light_third"], out["light_fourth"] = (c.photon_cumulant(r) for r in (3, 4))
+    out["dark_third"], out["dark_fourth"] = (c.dark_cumulant(r) for r in (3, 4))
+
+
+def _check_reach(
+    x: Expectation,
+    c: Cumulants,
+    priors: NDArray[np.float32],
+    modulations: tuple[tuple[str, Literal["light", "dark"]], ...],
+) -> None:
+    """Refuse what the priors could carry further than the device rounds."""
+    most = {"light": 1.0, "dark": 1.0}
+    least = {"light": 1.0, "dark": 1.0}
+    for (name, factor), table in zip(modulations, priors, strict=True):
+        values = 1.0 - table if name == "jitter" else table
+        most[factor] *= float(values.max())
+        least[factor] *= float(values.min())
+    swing = {f: max(abs(most[f] - 1.0), abs(least[f] - 1.0)) for f in most}
+    reach = swing["light"] * c.light_dn + swing["dark"] * c.dark_dn
+    reach += 8.0 * np.sqrt(c.variance + swing["light"] * c.light_variance + swing["dark"] * c.dark_variance)
+    if (reach >= REACH_DN).any():
+        pixel = int(np.argmax(reach))
+        raise InputError(
+            f"the priors carry pixel {pixel} of {x.name} {reach[pixel]:.3g} DN away from its mean, expected less than "
+            f"{REACH_DN:g}: shorten the exposure or draw frame by frame"
+        )
 
 
 def _draw_frames(scenarios: Sequence[Expectation], mode: Mode) -> bool:
@@ -193,6 +384,7 @@ def _check_same_detector(quiet: Expectation, other: Expectation) -> None:
         "n_frames",
         "frame_s",
         "dark_unit",
+        "photon_noise",
         "adc_max_dn",
     ):
         if not np.array_equal(getattr(quiet, name), getattr(other, name)):

@@ -35,16 +35,11 @@ class Tally:
     Parameters
     ----------
     grids : sequence of Grid
-    bins : int
-        Bins of each histogram.
-    fine_bits : int
-        Base-2 logarithm of the fine steps in a bin.
     """
 
-    def __init__(self, grids: Sequence[Grid], *, bins: int = layout.BINS, fine_bits: int = layout.FINE_BITS) -> None:
+    def __init__(self, grids: Sequence[Grid]) -> None:
         self.grids = tuple(grids)
-        self.bins, self.fine_bits = bins, fine_bits
-        self.counts = np.zeros((len(grids), bins), np.int64)
+        self.counts = np.zeros((len(grids), layout.BINS), np.int64)
         # Python integers: squares outgrow 64 bits in long runs.
         self.sums = np.zeros((len(grids), 2), object)
         self.n = 0
@@ -54,7 +49,7 @@ class Tally:
 
         Parameters
         ----------
-        histogram : ndarray of uint32, shape (n_grid, bins)
+        histogram : ndarray of uint32, shape (n_grid, BINS)
         sums : ndarray of int64, shape (n_grid, 2)
             Sums of fine steps and of their squares.
         n : int
@@ -71,7 +66,6 @@ class Tally:
         return Distribution(
             centre=float(packed["centre"]),
             step=1.0 / float(packed["steps_per_unit"]),
-            fine_bits=self.fine_bits,
             counts=self.counts[index].copy(),
             first=first,
             second=second,
@@ -87,7 +81,6 @@ class Distribution:
     ----------
     centre, step : float
         The statistic's value at step 0, and the size of a fine step.
-    fine_bits : int
     counts : ndarray of int64, shape (bins,)
         The first and last bins also hold everything beyond them.
     first, second : int
@@ -98,7 +91,6 @@ class Distribution:
 
     centre: float
     step: float
-    fine_bits: int
     counts: NDArray[np.int64]
     first: int
     second: int
@@ -123,7 +115,7 @@ class Distribution:
 
     def edge(self, index: int | NDArray[np.intp]) -> float | NDArray[np.float64]:
         """Lower edge of a bin."""
-        steps = (np.asarray(index) - self.counts.size // 2) * 2.0**self.fine_bits - 0.5
+        steps = (np.asarray(index) - self.counts.size // 2) * 2.0**layout.FINE_BITS - 0.5
         edges: NDArray[np.float64] = self.centre + self.step * steps
         return edges if np.ndim(index) else float(edges)
 

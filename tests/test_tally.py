@@ -11,7 +11,7 @@ from mauvecl.tally import Distribution, Grid, Tally
 
 def distribution(values: np.ndarray, grid: Grid) -> Distribution:
     tally = Tally([grid])
-    histogram, sums = reference.tally(values[None].astype(np.float32), Grid.pack([grid]), tally.bins, tally.fine_bits)
+    histogram, sums = reference.tally(values[None].astype(np.float32), Grid.pack([grid]))
     tally.add(histogram, sums, values.size)
     return tally.distribution(0)
 
@@ -69,7 +69,7 @@ def test_moments_of_long_runs_stay_exact() -> None:
     tally = Tally([Grid(0, 0.0, 1.0)])
     sums = np.array([[2**40, 2**62]])
     for _ in range(8):
-        tally.add(np.zeros((1, tally.bins), np.uint32), sums, 2**40)
+        tally.add(np.zeros((1, layout.BINS), np.uint32), sums, 2**40)
     found = tally.distribution(0)
     assert found.first == 8 * 2**40
     assert found.second == 2**65

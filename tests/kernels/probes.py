@@ -20,7 +20,7 @@ class Probes:
         self.context = self.cl.Context([handle])
         self.queue = self.cl.CommandQueue(self.context)
         self.width = width
-        variant = Variant(width=width, vector_forms=vector_forms and width > 1, chunk=32)
+        variant = Variant(width=width, vector_forms=vector_forms and width > 1, chunk=32 if width > 1 else 4)
         self.program = program.build(self.context, program.render(("probes",), variant))
 
     def run(self, name: str, items: int, out: NDArray[Any], *inputs: Any) -> NDArray[Any]:

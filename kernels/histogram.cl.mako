@@ -1,0 +1,97 @@
+## Histograms of each pixel's counts and each resolution element's S/N, over realisations.
+## An observer's S/N of a pixel is a function of its count alone, so that the count's histogram holds it.
+% if width == 1:
+/* Many work-items to an element: whole-number additions, whose order changes nothing. */
+#define COUNT(pointer) atomic_inc(pointer)
+#define ADD(pointer, n) atomic_add((pointer), (n))
+% else:
+/* An element belongs to one work-item. */
+#define COUNT(pointer) (*(pointer))++
+#define ADD(pointer, n) (*(pointer) += (n))
+% endif
+
+__kernel ${attributes}
+void histogram(SCENE, const uint first_low, const uint first_high, const uint start_row, const uint stop_row,
+               __global const Observer *restrict observers, __global const Element *restrict elements,
+               __global uint *restrict pixel_counts, __global uint *restrict element_counts, __global uint *restrict clipped)
+{
+    /* pixel_counts[pixel][bin], element_counts[element][bin], clipped[pixel][low, high] */
+    const uint e = get_global_id(0);
+    const Element element = elements[e];
+% if width == 1:
+    for (uint row = start_row + get_global_id(1); row < stop_row; row += get_global_size(1)) {
+% else:
+    for (uint row = start_row / ${width}u * ${width}u; row < stop_row; row += ${width}u) {
+% endif
+        const uintv realisation = (uintv)(first_low + row) + LANE_INDEX;
+        const uint from = row < start_row ? start_row - row : 0u, to = stop_row - row < ${width}u ? stop_row - row : ${width}u;
+        const Factors steady = factors_of(SCENE_PASSED, realisation, first_high);
+        floatv signal = 0.0f, variance = 0.0f;
+% if not frames:
+        const Address at = address(realisation, first_high, job->first_frame, job->seed_low, job->seed_high);
+        Factors factors = steady;
+        factors.light *= kept(SCENE_PASSED, realisation, first_high, 0u, 0u);
+% endif
+        for (uint start = element.first & ~3u; start < element.end; start += CHUNK) {
+            Draws drawn;
+            floatv n[${chunk}];
+% if clip:
+            uintv low[${chunk}], high[${chunk}];
+            for (uint i = 0; i < CHUNK; i++) low[i] = high[i] = 0u;
+% endif
+% if frames:
+            for (uint i = 0; i < CHUNK; i++) n[i] = 0.0f;
+            for (uint frame = 0; frame < job->draw_count; frame++) {
+                const Address at = address(realisation, first_high, job->first_frame + frame, job->seed_low, job->seed_high);
+                Factors factors = steady;
+                factors.light *= kept(SCENE_PASSED, realisation, first_high, 0u, frame);
+% endif
+                draw(SCENE_PASSED, &at, 0u, start, &drawn);
+                for (uint i = 0; i < CHUNK; i++) {
+                    floatv v = analogue(SCENE_PASSED, &drawn, i, levels + start + i, start + i, start + i, &factors);
+                    floatv r = digitise(v, edges + start + i);
+% if clip:
+                    low[i] += v + MAGIC < r ? (uintv)1u : (uintv)0u;
+                    high[i] += v + MAGIC > r ? (uintv)1u : (uintv)0u;
+% endif
+                    n[i] ${"+=" if frames else "="} r - MAGIC;
+                }
+% if frames:
+            }
+% endif
+            const uint begin = element.first > start ? element.first - start : 0u;
+            const uint end = element.end - start < CHUNK ? element.end - start : CHUNK;
+            for (uint i = begin; i < end; i++) {
+                const uint p = start + i;
+                floatv net = n[i] + observers[p].net_offset;
+                signal += net;
+                variance += FMA(most(net, (floatv)0.0f), (floatv)observers[p].gain, (floatv)observers[p].variance);
+                intv bin = (TO_INT(n[i]) >> (intv)(int)observers[p].bin_shift) + ${observer_bins // 2};
+                bin = least(most(bin, (intv)0), (intv)${observer_bins - 1});
+                int lanes[${width}];
+                STORE(bin, lanes);
+                __global uint *mine = pixel_counts + p * ${observer_bins}u;
+% if width > 1:
+                if (from == 0u && to == ${width}u) {
+                    for (uint lane = 0; lane < ${width}u; lane++) COUNT(mine + lanes[lane]);
+                } else
+% endif
+                for (uint lane = from; lane < to; lane++) COUNT(mine + lanes[lane]);
+% if clip:
+                uint below[${width}], above[${width}];
+                STORE(low[i], below);
+                STORE(high[i], above);
+                for (uint lane = from; lane < to; lane++) {
+                    if (below[lane]) ADD(clipped + 2u * p, below[lane]);
+                    if (above[lane]) ADD(clipped + 2u * p + 1u, above[lane]);
+                }
+% endif
+            }
+        }
+        floatv steps = (signal / root(variance) - element.centre) * element.bins_per_unit;
+        steps = least(most(steps, (floatv)${-(observer_bins // 2)}.0f), (floatv)${observer_bins // 2 - 1}.0f);
+        int lanes[${width}];
+        STORE(TO_INT(nearest(steps)) + ${observer_bins // 2}, lanes);
+        for (uint lane = from; lane < to; lane++) COUNT(element_counts + e * ${observer_bins}u + lanes[lane]);
+    }
+}

@@ -1,0 +1,257 @@
+"""One scene on the device: its buffers and launches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl import layout
+from mauvecl.scene import PIXEL_BLOCK, Scene
+from mauvecl.snr import Counts
+from mauvecl.tally import Grid, Tally
+
+if TYPE_CHECKING:
+    from mauvecl.engine import Engine
+    from mauvecl.program import Variant
+
+#: Realisations, times frames, counted on the device before its 32-bit bins and 64-bit sums are emptied.
+MOST_COUNTED = 2**25
+#: Work-items to an element in a histogram on a device of many.
+ITEMS_PER_ELEMENT = 1024
+
+
+@dataclass(frozen=True)
+class Tile:
+    """Realisations from `first` on, a multiple of the vector width; [start, stop) of these `size` are wanted."""
+
+    first: int
+    size: int
+    start: int
+    stop: int
+
+    @property
+    def wanted(self) -> int:
+        """How many are wanted."""
+        return self.stop - self.start
+
+    def address(self) -> tuple[np.uint32, np.uint32]:
+        """Both words of the first index."""
+        return np.uint32(self.first & 0xFFFFFFFF), np.uint32(self.first >> 32)
+
+    def rows(self) -> tuple[np.uint32, np.uint32]:
+        """Which of the tile are wanted."""
+        return np.uint32(self.start), np.uint32(self.stop)
+
+
+class Run:
+    """One scene on the device; its buffers are released at the end of the `with` block."""
+
+    def __init__(self, engine: Engine, scene: Scene, variant: Variant, seed: int) -> None:
+        self._engine, self._scene, self._variant = engine, scene, variant
+        self._cl, self._queue = engine.cl, engine.queue
+        self._buffers: list[Any] = []
+        self._named: dict[str, Any] = {}
+        self._kernels: dict[str, Any] = {}
+        self._counted = 0
+        job = scene.job.copy()
+        job["seed_low"], job["seed_high"] = seed & 0xFFFFFFFF, seed >> 32
+        self._arguments = [
+            self.upload(job.reshape(1)),
+            *(
+                self.upload(beyond(array))
+                for array in (
+                    scene.pixels,
+                    scene.levels,
+                    scene.edges,
+                    scene.dark_counts,
+                    scene.photon_counts,
+                    scene.responses,
+                )
+            ),
+            self.upload(scene.tables),
+            self.upload(scene.priors),
+        ]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._queue.finish()
+        for buffer in self._buffers:
+            buffer.release()
+
+    def upload(self, array: NDArray[Any]) -> Any:
+        """A device buffer with the contents of an array."""
+        flags = self._cl.mem_flags
+        data = np.ascontiguousarray(array if array.size else np.zeros(1, array.dtype))
+        buffer = self._cl.Buffer(self._engine.context, flags.READ_WRITE | flags.COPY_HOST_PTR, hostbuf=data)
+        self._buffers.append(buffer)
+        return buffer
+
+    def _room(self, name: str, size: int) -> Any:
+        """A buffer of at least so many bytes, kept from launch to launch."""
+        found = self._named.get(name)
+        if found is None or found.size < size:
+            if found is not None:
+                self._buffers.remove(found)
+                found.release()
+            found = self._cl.Buffer(self._engine.context, self._cl.mem_flags.READ_WRITE, size)
+            self._named[name] = found
+            self._buffers.append(found)
+        return found
+
+    def _launch(self, name: str, items: tuple[int, ...], *arguments: Any) -> None:
+        if name not in self._kernels:
+            self._kernels[name] = self._cl.Kernel(self._engine.program((name,), self._variant), name)
+        local = (1,) * len(items) if self._variant.width > 1 else None
+        self._kernels[name](self._queue, items, local, *arguments)
+
+    def realise(self, tile: Tile, out: NDArray[Any]) -> NDArray[np.uint32]:
+        """Raw spectra of a tile into the rows of `out`.
+
+        Parameters
+        ----------
+        tile : Tile
+        out : ndarray of uint16 or int32, shape (tile.wanted, n_pixel)
+
+        Returns
+        -------
+        ndarray of uint32, shape (tile.wanted,)
+            Frames of any pixel that met the ADC's range.
+        """
+        flags = self._cl.mem_flags
+        clipped = np.empty(tile.wanted, np.uint32)
+        counts = self._room("clipped", clipped.nbytes)
+        # A processor's own memory needs no copy.
+        shared = self._engine.device.kind == "cpu"
+        if shared:
+            rows = self._cl.Buffer(self._engine.context, flags.WRITE_ONLY | flags.USE_HOST_PTR, hostbuf=out)
+        else:
+            rows = self._room("rows", out.nbytes)
+        try:
+            items = (tile.size // self._variant.width,)
+            self._launch("realise", items, *self._arguments, *tile.address(), *tile.rows(), counts, rows)
+            if shared:
+                mapped, _ = self._cl.enqueue_map_buffer(
+                    self._queue, rows, self._cl.map_flags.READ, 0, out.shape, out.dtype
+                )
+                mapped.base.release(self._queue)
+            else:
+                self._cl.enqueue_copy(self._queue, out, rows)
+            self._cl.enqueue_copy(self._queue, clipped, counts)
+            self._queue.finish()
+        finally:
+            if shared:
+                rows.release()
+        return clipped
+
+    def observe(self, observers: NDArray[np.void], elements: NDArray[np.void]) -> None:
+        """Upload what the observer subtracts and assumes, and the resolution elements."""
+        self._n_element = len(elements)
+        self._observers, self._elements = self.upload(beyond(observers)), self.upload(elements)
+        shape = (self._scene.n_pixel + PIXEL_BLOCK, layout.OBSERVER_BINS)
+        self._pixel_counts = self.upload(np.zeros(shape, np.uint32))
+        self._element_counts = self.upload(np.zeros((len(elements), layout.OBSERVER_BINS), np.uint32))
+        self._clipped = self.upload(np.zeros((shape[0], 2), np.uint32))
+
+    def histogram(self, tile: Tile, counts: Counts) -> None:
+        """Count each pixel's DN and each element's S/N of a tile on the device."""
+        width = self._variant.width
+        items = (self._n_element,) if width > 1 else (self._n_element, min(tile.wanted, ITEMS_PER_ELEMENT))
+        self._launch(
+            "histogram",
+            items,
+            *self._arguments,
+            *tile.address(),
+            *tile.rows(),
+            self._observers,
+            self._elements,
+            self._pixel_counts,
+            self._element_counts,
+            self._clipped,
+        )
+        self._queue.finish()
+        self._counted += tile.wanted
+        if self._counted * self._scene.n_draws > MOST_COUNTED:
+            self.flush_counts(counts)
+
+    def flush_counts(self, counts: Counts) -> None:
+        """Move the device's histograms to the host."""
+        n = self._scene.n_pixel
+        pixels, elements, clipped = (
+            self._emptied(buffer, shape)
+            for buffer, shape in (
+                (self._pixel_counts, (n, layout.OBSERVER_BINS)),
+                (self._element_counts, (self._n_element, layout.OBSERVER_BINS)),
+                (self._clipped, (n, 2)),
+            )
+        )
+        counts.add(pixels, elements, clipped, self._counted)
+        self._counted = 0
+
+    def _emptied(self, buffer: Any, shape: tuple[int, ...], dtype: type = np.uint32) -> NDArray[Any]:
+        host: NDArray[Any] = np.empty(shape, dtype)
+        self._cl.enqueue_copy(self._queue, host, buffer)
+        self._cl.enqueue_copy(self._queue, buffer, np.zeros(shape, dtype))
+        return host
+
+    def weigh(self, weights: NDArray[np.float32], linear_end: NDArray[np.uint32]) -> None:
+        """Upload the linear statistics' weights, and where each scenario's end."""
+        self._weighing = [
+            self.upload(self._scene.templates),
+            self.upload(self._scene.constants(weights, linear_end)),
+            self.upload(weights),
+            self.upload(linear_end),
+        ]
+        self._rows = len(layout.FIXED_STATISTICS) * len(self._scene.levels) + len(weights)
+
+    def statistics(self, tile: Tile) -> None:
+        """Compute every channel of a tile into values[channel][realisation]."""
+        values = self._room("values", 4 * self._rows * tile.size)
+        items = (tile.size // (self._variant.width * self._variant.vectors),)
+        self._launch(
+            "statistics", items, *self._arguments, *tile.address(), *self._weighing, np.uint32(tile.size), values
+        )
+
+    def values(self, tile: Tile) -> NDArray[np.float32]:
+        """The channels of the tile computed last, shape (n_channel, tile.wanted)."""
+        host = np.empty((self._rows, tile.size), np.float32)
+        self._cl.enqueue_copy(self._queue, host, self._named["values"])
+        return host[:, tile.start : tile.stop]
+
+    def tally(self, tile: Tile, tally: Tally) -> None:
+        """Add a tile's channels to the histograms and integer sums on the device."""
+        if "grids" not in self._named:
+            self._named["grids"] = self.upload(Grid.pack(tally.grids))
+            self._named["histogram"] = self.upload(np.zeros((len(tally.grids), layout.BINS), np.uint32))
+            self._named["sums"] = self.upload(np.zeros((len(tally.grids), 2), np.int64))
+        named = self._named
+        self._launch(
+            "tally",
+            (len(tally.grids),),
+            *tile.rows(),
+            np.uint32(tile.size),
+            named["values"],
+            named["grids"],
+            named["histogram"],
+            named["sums"],
+        )
+        self._queue.finish()
+        self._counted += tile.wanted
+        if self._counted > MOST_COUNTED:
+            self.flush(tally)
+
+    def flush(self, tally: Tally) -> None:
+        """Move the device's histograms and sums to the host."""
+        histogram = self._emptied(self._named["histogram"], (len(tally.grids), layout.BINS))
+        sums = self._emptied(self._named["sums"], (len(tally.grids), 2), np.int64)
+        tally.add(histogram, sums, self._counted)
+        self._counted = 0
+
+
+def beyond(array: NDArray[np.void]) -> NDArray[np.void]:
+    """Per-pixel structs, end to end, and a block more: a launch may look past the last pixel, never use it."""
+    return np.concatenate([array.ravel(), np.zeros(PIXEL_BLOCK, array.dtype)])
