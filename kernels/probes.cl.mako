@@ -55,3 +55,45 @@ __kernel void probe_layout(__global uint *restrict out)
     out[i++] = (uint)sizeof(${name});
 % endfor
 }
+
+/* Every word that a work-item owns as radius, with one angle: its smallest and largest normals, and how many of
+   them are no finite numbers. */
+__kernel ${attributes}
+void probe_every_word(const uint per_item, const uint angle, __global float *restrict ends, __global uint *restrict bad)
+{
+    const uint item = get_global_id(0);
+    floatv low = (floatv)0.0f, high = (floatv)0.0f;
+    uintv wrong = (uintv)0u;
+    for (uint i = 0; i < per_item; i += ${width}u) {
+        floatv z[2];
+        normal_pair((uintv)(item * per_item + i) + LANE_INDEX, (uintv)angle, z, z + 1);
+        for (uint j = 0; j < 2u; j++) {
+            low = least(low, z[j]);
+            high = most(high, z[j]);
+            wrong += (z[j] > -7.0f) && (z[j] < 7.0f) ? (uintv)0u : (uintv)1u;
+        }
+    }
+    STORE(low, ends + (2u * item) * ${width}u);
+    STORE(high, ends + (2u * item + 1u) * ${width}u);
+    STORE(wrong, bad + item * ${width}u);
+}
+
+/* Histogram of normals from consecutive groups of a stream: counts[item][4096], bins of 1/256 from -8 on. */
+__kernel ${attributes}
+void probe_histogram(const uint seed, const uint groups, __global uint *restrict counts)
+{
+    const uint item = get_global_id(0);
+    __global uint *mine = counts + 4096u * item;
+    const Address at = address((uintv)(item * ${width}u) + LANE_INDEX, 0u, 0u, seed, 0u);
+    for (uint group = 0; group < groups; group++) {
+        Words w = words_at(&at, ${streams["noise"]}u, group);
+        floatv z[4];
+        normal_pair(w.a, w.b, z, z + 1);
+        normal_pair(w.c, w.d, z + 2, z + 3);
+        for (uint j = 0; j < 4u; j++) {
+            int bin[${width}];
+            STORE(TO_INT(FMA(z[j], (floatv)256.0f, (floatv)2048.0f)), bin);
+            for (uint lane = 0; lane < ${width}u; lane++) mine[bin[lane]]++;
+        }
+    }
+}

@@ -332,7 +332,7 @@ class Engine:
                     raise
                 if size <= self._step:
                     raise DeviceError(
-                        f"{self.device_name} has too little memory for {self._step} realisations of this study ({error})"
+                        f"{self.device_name} has too little memory for {self._step} realisations of it: {error}"
                     ) from error
                 size //= 2
                 continue

@@ -69,13 +69,13 @@ def alias_table(mean: float) -> AliasTable:
         raise ValueError(f"Poisson mean = {mean!r}, expected 0 to {LARGEST_MEAN:g}")
     if mean == 0.0:
         return AliasTable(0, 1, _pack(np.array([2**WORD_BITS, 0]), 1))
-    # Counts outside have less than half a word each.
+    # Counts further out have less than half a word together.
     reach = 6.5 * np.sqrt(mean) + 16.0
     low = max(int(mean - reach), 0)
     high = int(mean + reach + 0.5 * reach**2 / (mean + 1.0))
     counts = np.arange(low, high + 1)
     p = np.exp(special.xlogy(counts, mean) - mean - special.gammaln(counts + 1.0))
-    inside = np.flatnonzero(p >= 2.0**-33)
+    inside = np.flatnonzero((np.cumsum(p) >= 2.0**-33) & (np.cumsum(p[::-1])[::-1] >= 2.0**-33))
     return table_of(p[inside[0] : inside[-1] + 1], low + int(inside[0]))
 
 

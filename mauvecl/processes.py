@@ -89,8 +89,8 @@ class CosmicRays:
         low, high = self.electrons
         if not (0 <= self.rate_per_cm2_s <= 1e6 and 0 < self.area_cm2 < 1e4 and self.pixels > 0):
             raise InputError(
-                f"cosmic rays of {self.rate_per_cm2_s:g} per cm^2 s on {self.area_cm2:g} cm^2 and {self.pixels} pixels, "
-                "expected a rate of 0 to 1e6, an area and pixels above 0"
+                f"cosmic rays of {self.rate_per_cm2_s:g} per cm^2 s on {self.area_cm2:g} cm^2 and {self.pixels} "
+                "pixels, expected a rate of 0 to 1e6, an area and pixels above 0"
             )
         if not 1 <= low <= high <= 100_000:
             raise InputError(f"cosmic rays of {low:g} to {high:g} electrons, expected 1 to 100000, ascending")

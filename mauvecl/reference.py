@@ -144,7 +144,7 @@ def poisson_draw(words: Words, i: int, source: np.void, tables: NDArray[np.uint3
     if not source["bits"]:
         return expansion_draw(pairs[i], source["offset"], source["slope"], source["cubic"])
     column = alias_draw(words[i], tables[int(source["table"]) :], int(source["bits"]))
-    return (column.astype(np.int32) + source["low"]).astype(np.float32)
+    return np.asarray((column.astype(np.int32) + source["low"]).astype(np.float32))
 
 
 def four_normals(w: Words) -> list[Floats]:

@@ -174,6 +174,22 @@ def test_pixels_and_realisations_are_uncorrelated(engine: Engine) -> None:
         assert abs(products.sum()) < 5 * np.sqrt(products.size)
 
 
+def test_frames_are_uncorrelated(engine: Engine) -> None:
+    """Single frames 0, 1 and 2**32 - 1 of the same realisations: |z| < 5 for sums of 3e7 products."""
+    (x,) = star(exposure=5.0)
+    z = []
+    for frame in (0, 1, 2**32 - 1):
+        scene, out = prepare([x], first_frame=frame), np.empty((20_000, x.wavelength_nm.size), np.int32)
+        with engine._scene(scene, 9) as run:
+            engine._over(
+                0, 20_000, 4 * scene.n_pixel, lambda t, n, run=run, out=out: run.realise(t, out[n : n + t.wanted])
+            )
+        z.append((out - x.mean_raw_dn) / np.sqrt(x.variance_dn2))
+    for a, b in ((z[0], z[1]), (z[0], z[2]), (z[1], z[2])):
+        products = a * b
+        assert abs(products.sum()) < 5 * np.sqrt(products.size)
+
+
 def test_any_realisation_by_its_index_alone(engine: Engine) -> None:
     (quiet, *_), _ = case("stack")
     far = 734_221_008

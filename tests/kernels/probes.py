@@ -23,8 +23,19 @@ class Probes:
         variant = Variant(width=width, vector_forms=vector_forms and width > 1, chunk=32 if width > 1 else 4)
         self.program = program.build(self.context, program.render(("probes",), variant))
 
-    def run(self, name: str, items: int, out: NDArray[Any], *inputs: Any) -> NDArray[Any]:
-        """Launch a probe; arrays are uploaded, the last argument of the kernel is `out`."""
+    def run(
+        self,
+        name: str,
+        items: int,
+        out: NDArray[Any],
+        *inputs: Any,
+        out_first: NDArray[Any] | None = None,
+        start: NDArray[Any] | None = None,
+    ) -> NDArray[Any]:
+        """Launch a probe; arrays are uploaded, the last argument of the kernel is `out`, which may begin with `start`.
+
+        `out_first` is written before it.
+        """
         flags = self.cl.mem_flags
         arguments = [
             self.cl.Buffer(self.context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=np.ascontiguousarray(x))
@@ -32,10 +43,14 @@ class Probes:
             else x
             for x in inputs
         ]
-        buffer = self.cl.Buffer(self.context, flags.READ_WRITE, out.nbytes)
+        outs = [x for x in (out_first, out) if x is not None]
+        buffers = [self.cl.Buffer(self.context, flags.READ_WRITE, x.nbytes) for x in outs]
+        if start is not None:
+            self.cl.enqueue_copy(self.queue, buffers[-1], start)
         local = (1,) if self.width > 1 and name != "probe_layout" else None
-        self.cl.Kernel(self.program, name)(self.queue, (items,), local, *arguments, buffer)
-        self.cl.enqueue_copy(self.queue, out, buffer)
+        self.cl.Kernel(self.program, name)(self.queue, (items,), local, *arguments, *buffers)
+        for array, buffer in zip(outs, buffers, strict=True):
+            self.cl.enqueue_copy(self.queue, array, buffer)
         return out
 
     def philox(self, counters: NDArray[np.uint32], keys: NDArray[np.uint32]) -> NDArray[np.uint32]:

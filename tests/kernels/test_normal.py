@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 from probes import Probes
-from scipy import stats
+from scipy import special, stats
 
 from mauvecl import reference
 
@@ -60,6 +61,47 @@ def test_distribution(probes: Probes) -> None:
     a, b = z.astype(np.float64)
     for x, y in ((a, b), (a**2 - 1, b**2 - 1), (a, b**2 - 1)):
         assert abs(np.sum(x * y)) < 5 * np.sqrt(np.sum((x * y) ** 2))
+
+
+def test_every_word_is_finite(probes_fast: Probes) -> None:
+    """All 2**32 radius words, with angles at the ends of the sine's range and at the turn by pi."""
+    items, per_item = 2**14, 2**18
+    for angle in (0, 2**30, 2**31 - 1, 2**31, 2**32 - 1):
+        ends = np.empty((items, 2, probes_fast.width), np.float32)
+        bad = np.empty((items, probes_fast.width), np.uint32)
+        probes_fast.run("probe_every_word", items, bad, np.uint32(per_item), np.uint32(angle), out_first=ends)
+        assert bad.sum() == 0
+        reach = np.abs(ends).max()
+        assert 6.75 < reach < 6.77
+
+
+def test_a_thousand_million_draws(probes_fast: Probes) -> None:
+    """Pearson, Kolmogorov-Smirnov and tails to six sigma at 1e9; each fails by chance once in 1e6 new seeds."""
+    items, groups = 4096, 3815
+    counts = np.zeros((items, 4096), np.uint32)
+    probes_fast.run("probe_histogram", items, counts, np.uint32(77), np.uint32(groups), start=counts)
+    found = counts.sum(axis=0, dtype=np.int64)
+    n = int(found.sum())
+    assert n == items * groups * 4 * probes_fast.width > 1e9 - 1e6
+    edges = np.arange(4097) / 256 - 8
+    expected = n * np.where(edges[1:] <= 0, np.diff(special.ndtr(edges)), -np.diff(special.ndtr(-edges)))
+    common = expected > 20
+    statistic = np.sum((found - expected)[common] ** 2 / expected[common])
+    rare = found[~common].sum(), expected[~common].sum()
+    statistic += (rare[0] - rare[1]) ** 2 / rare[1]
+    assert 1e-6 < stats.chi2.cdf(statistic, common.sum()) < 1 - 1e-6
+    distance = np.abs(np.cumsum(found) / n - special.ndtr(edges[1:])).max()
+    assert stats.kstwobign.sf(distance * np.sqrt(n)) > 1e-6
+    for sigma in (1, 2, 3, 4, 5, 6):
+        below, above = found[edges[1:] <= -sigma].sum(), found[edges[:-1] >= sigma].sum()
+        for tail in (below, above):
+            p = stats.binom.cdf(tail, n, special.ndtr(-sigma)), stats.binom.sf(tail - 1, n, special.ndtr(-sigma))
+            assert min(p) > 1e-6
+
+
+@pytest.fixture(scope="module")
+def probes_fast() -> Probes:
+    return Probes()
 
 
 def test_the_fused_multiply_add_is_rounded_once() -> None:
