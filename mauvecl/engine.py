@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl import program
-from mauvecl.detection import Detection, plan_channels
+from mauvecl.detection import ChannelPlan, Detection, plan_channels
 from mauvecl.host.errors import InputError
 from mauvecl.processes import NONE, Processes
 from mauvecl.program import DeviceError, DeviceRecord, Variant, devices
@@ -279,14 +280,7 @@ class Engine:
                 run.statistics(tile)
                 run.tally(tile, tally)
 
-            with self._scene(
-                part,
-                seed,
-                pair="chi2_pair" in statistics,
-                elements="chi2_element" in statistics,
-                linear=len(plan.weights) > 0,
-            ) as run:
-                run.weigh(plan.weights, plan.linear_end)
+            with self._statistics(part, seed, plan, statistics) as run:
                 self._over(
                     start,
                     realisations,
@@ -298,6 +292,71 @@ class Engine:
                 run.flush(tally)
             result.collect(plan, tally)
         return result
+
+    def statistic_values(
+        self,
+        quiet: Expectation,
+        flares: Sequence[Expectation],
+        *,
+        start: int = 0,
+        count: int,
+        seed: int,
+        statistics: Sequence[str] = ("chi2", "chi2_element", "matched"),
+        mode: Mode = "auto",
+        processes: Processes = NONE,
+        recipe: Recipe = "auto",
+    ) -> NDArray[np.float32]:
+        """What `detect` counts, realisation by realisation, for up to 15 flares (7 drawn frame by frame).
+
+        Parameters
+        ----------
+        quiet, flares, seed, statistics, mode, processes, recipe
+            As for `detect`.
+        start, count : int
+            Realisations start to start + count - 1.
+
+        Returns
+        -------
+        ndarray of float32, shape (n_channel, count)
+            For each scenario chi2, chi2_element and chi2_pair, zero where not asked for; then ``matched``: for each
+            flare's template without a flare, and for each flare with its own.
+
+        Raises
+        ------
+        InputError
+            As `detect`, and for more flares than one launch holds.
+        """
+        self._check(start, count, seed)
+        scene = prepare([quiet, *flares], mode, processes=processes, recipe=recipe)
+        if len(flares) >= BATCH[scene.frames]:
+            raise InputError(f"{len(flares)} flares, expected at most {BATCH[scene.frames] - 1} in one launch")
+        result = Detection(quiet, tuple(flares), tuple(statistics), scene, count)
+        plan = plan_channels(result, range(len(flares)), first=True)
+        out = np.empty((plan.n_rows, count), np.float32)
+
+        def work(run: Run, tile: Tile, done: int) -> None:
+            run.statistics(tile)
+            out[:, done : done + tile.wanted] = run.values(tile)
+
+        with self._statistics(scene, seed, plan, statistics) as run:
+            self._over(start, count, 4 * plan.n_rows, lambda tile, done: work(run, tile, done))
+        return out
+
+    def _statistics(self, scene: Scene, seed: int, plan: ChannelPlan, statistics: Sequence[str]) -> Run:
+        run = self._scene(
+            scene,
+            seed,
+            pair="chi2_pair" in statistics,
+            elements="chi2_element" in statistics,
+            linear=len(plan.weights) > 0,
+        )
+        run.weigh(plan.weights, plan.linear_end)
+        return run
+
+    @property
+    def variant(self) -> Variant:
+        """How kernels are rendered for this device, whatever the scene."""
+        return Variant(width=self._width, vector_forms=self._vector_forms, chunk=PIXEL_BLOCK if self._width > 1 else 4)
 
     def _check(self, start: int, count: int, seed: int) -> None:
         if os.getpid() != self._pid:
@@ -373,10 +432,8 @@ class Engine:
         linear: bool = False,
         row_type: str = "int",
     ) -> Run:
-        variant = Variant(
-            width=self._width,
-            vector_forms=self._vector_forms,
-            chunk=PIXEL_BLOCK if self._width > 1 else 4,
+        variant = replace(
+            self.variant,
             vectors=1 if self._width == 1 or scene.frames else VECTORS,
             scenarios=BATCH[scene.frames],
             linears=2 * BATCH[scene.frames],

@@ -8,20 +8,23 @@ from __future__ import annotations
 import hashlib
 import os
 import shutil
-import tempfile
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.resources import files
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mauvecl import __version__, layout
+from mauvecl.kernel_cache import kernel_cache
 
 if TYPE_CHECKING:
     import pyopencl
 
 ROOMS = ("portable", "philox", "normal", "poisson", "detector")
 POCL = "Portable Computing Language"
+
+
+#: What a device with strict arithmetic promises: every draw, statistic and table as on any other such device.
+SAME_BITS = "same bits"
 
 
 class DeviceError(RuntimeError):
@@ -43,6 +46,7 @@ class DeviceRecord:
     compute_units: int
     global_memory: int
     default: bool
+    promise: str = SAME_BITS
 
     @property
     def label(self) -> str:
@@ -88,7 +92,10 @@ def load_opencl() -> Any:
             "no linker `ld` found on PATH, and PoCL needs it to link kernels: install binutils "
             "(Debian, Ubuntu: `apt-get install binutils`; Fedora: `dnf install binutils`)"
         )
-    os.environ["POCL_CACHE_DIR"] = str(cache_folder())
+    try:
+        os.environ["POCL_CACHE_DIR"] = str(kernel_cache().work)
+    except OSError as error:
+        raise DeviceError(f"{error}: set MAUVECL_CACHE_DIR to a folder that can") from error
     # pyopencl's own cache would be a second one beside PoCL's.
     os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
     try:
@@ -96,23 +103,6 @@ def load_opencl() -> Any:
     except ImportError as error:
         raise DeviceError(f"pyopencl cannot be loaded ({error}): install `pyopencl[pocl]`") from error
     return pyopencl
-
-
-@cache
-def cache_folder() -> Path:
-    """A writable folder for compiled kernels, private to this version; a temporary one where none can be made."""
-    import platformdirs
-
-    wanted = os.environ.get("MAUVECL_CACHE_DIR") or platformdirs.user_cache_dir("mauvecl")
-    folder = Path(wanted) / f"kernels-{__version__}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.NamedTemporaryFile(dir=folder) as probe:
-            probe.write(b"\0" * 4096)
-            probe.flush()
-    except OSError:
-        return Path(tempfile.mkdtemp(prefix="mauvecl-kernels-"))
-    return folder
 
 
 def _devices() -> list[Any]:
@@ -141,6 +131,23 @@ def _kind(device: Any) -> str:
     return next((name for name, bit in kinds.items() if device.type & bit), "other")
 
 
+def _promise(device: Any) -> str:
+    lacking = weaknesses(device)
+    return SAME_BITS if not lacking else f"same draws to float rounding: no {', no '.join(lacking)}"
+
+
+def weaknesses(device: Any) -> list[str]:
+    """What a device lacks of the arithmetic that gives the same bits everywhere."""
+    cl = load_opencl()
+    bits = cl.device_fp_config
+    needed = {
+        "rounding to nearest": bits.ROUND_TO_NEAREST,
+        "fused multiply-add": bits.FMA,
+        "correctly rounded division and square root": bits.CORRECTLY_ROUNDED_DIVIDE_SQRT,
+    }
+    return [name for name, bit in needed.items() if not device.single_fp_config & bit]
+
+
 def devices() -> list[DeviceRecord]:
     """Every OpenCL device here, the default one first.
 
@@ -158,6 +165,7 @@ def devices() -> list[DeviceRecord]:
             compute_units=int(device.max_compute_units),
             global_memory=int(device.global_mem_size),
             default=index == 0,
+            promise=_promise(device),
         )
         for index, device in enumerate(_devices())
     ]
@@ -192,9 +200,6 @@ def render(rooms: tuple[str, ...], variant: Variant) -> str:
     variant : Variant
         Widths and switches.
     """
-    from mako.template import Template
-
-    folder = files("mauvecl.kernels")
     local = "" if variant.width == 1 else "__attribute__((reqd_work_group_size(1, 1, 1)))"
     values = asdict(variant) | {
         "attributes": local,
@@ -212,11 +217,25 @@ def render(rooms: tuple[str, ...], variant: Variant) -> str:
         "limit": layout.STEP_LIMIT,
         "structs": {name: dtype.names for name, dtype in layout.STRUCTS.items()},
     }
-    parts = [f"/* mauvecl {__version__} */", layout.c_structs()]
-    for room in (*ROOMS, *rooms):
-        text = folder.joinpath(f"{room}.cl.mako").read_text(encoding="utf-8")
-        parts.append(str(Template(text, strict_undefined=True).render(**values)))
-    return "\n".join(parts)
+    names = (*(ROOMS if rooms != ("tally",) else ()), *rooms)
+    folder = files("mauvecl.kernels")
+    texts = [folder.joinpath(f"{name}.cl.mako").read_text(encoding="utf-8") for name in names]
+    structs = layout.c_structs()
+
+    def make() -> str:
+        parts = (str(_template(text).render(**values)) for text in texts)
+        return "\n".join((f"/* mauvecl {__version__} */", structs, *parts))
+
+    # Rendering takes longer than starting a kernel that is built already.
+    return kernel_cache().remembered(hashlib.sha256(repr((structs, values, texts)).encode()).hexdigest()[:32], make)
+
+
+@cache
+def _template(text: str) -> Any:
+    # Heavy to import.
+    from mako.template import Template
+
+    return Template(text, strict_undefined=True)
 
 
 def out_of_memory(error: Exception) -> bool:
@@ -231,7 +250,7 @@ def digest(source: str) -> str:
 
 
 def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
-    """Compile a rendered source with strict arithmetic.
+    """Compile a rendered source with strict arithmetic, or take it from the cache.
 
     Raises
     ------
@@ -241,10 +260,16 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
     cl = load_opencl()
     device = context.devices[0]
     options = ["-cl-std=CL1.2"]
-    if device.single_fp_config & cl.device_fp_config.CORRECTLY_ROUNDED_DIVIDE_SQRT:
+    if not weaknesses(device):
         options.append("-cl-fp32-correctly-rounded-divide-sqrt")
+    kept = kernel_cache()
+    key = hashlib.sha256("\0".join((source, *options, device.name, device.driver_version)).encode()).hexdigest()[:32]
     try:
-        program: pyopencl.Program = cl.Program(context, source).build(options, cache_dir=False)
+        if kept.restore(key):
+            program: pyopencl.Program = cl.Program(context, source).build(options, cache_dir=False)
+        else:
+            with kept.building(key):
+                program = cl.Program(context, source).build(options, cache_dir=False)
     except cl.Error as error:
         numbered = "\n".join(f"{i:4d}  {line}" for i, line in enumerate(source.splitlines(), 1))
         raise BuildError(f"a kernel did not compile on {device.name}\n{numbered}\n{error}") from error

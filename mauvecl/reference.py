@@ -288,7 +288,7 @@ def clipped(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray
     if scene.clip:
         for frame in range(scene.n_draws):
             light, dark = factors(scene, realisation, frame, seed)
-            for group in range(scene.n_pixel // 4 + 1):
+            for group in range(-(-scene.n_pixel // 4)):
                 drawn = draws(scene, realisation, frame, group, seed)
                 for i, p in enumerate(range(4 * group, min(4 * group + 4, len(scene.pixels)))):
                     r = analogue(scene, drawn, i, p, 0, light, dark) + _MAGIC

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import pytest
-from probes import Probes
+
+from mauvecl.engine import Engine
+from mauvecl.probes import Probes
 
 
 @pytest.fixture(scope="session", params=["vector forms", "vectors of built-ins", "scalar"])
-def probes(request: pytest.FixtureRequest) -> Probes:
+def probes(request: pytest.FixtureRequest, engine: Engine) -> Probes:
     """PoCL's fast forms, the plain OpenCL vectors that other compilers get, and what a GPU runs."""
     width = 1 if request.param == "scalar" else 16
-    return Probes(width=width, vector_forms=request.param == "vector forms")
+    return Probes(engine=engine, width=width, vector_forms=request.param == "vector forms")

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from probes import Probes
 
 from mauvecl import layout
+from mauvecl.probes import Probes
 
 
 def test_every_offset_on_the_device(probes: Probes) -> None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from probes import Probes
 from scipy import special, stats
 
 from mauvecl import reference
+from mauvecl.engine import Engine
+from mauvecl.probes import Probes
 
 #: Words at every end of every branch: zeros, ones, signs, quadrants, the split of the logarithm.
 EDGES = np.array(
@@ -100,8 +101,8 @@ def test_a_thousand_million_draws(probes_fast: Probes) -> None:
 
 
 @pytest.fixture(scope="module")
-def probes_fast() -> Probes:
-    return Probes()
+def probes_fast(engine: Engine) -> Probes:
+    return Probes(engine=engine)
 
 
 def test_the_fused_multiply_add_is_rounded_once() -> None:

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import randomgen
-from probes import Probes
 
 from mauvecl import reference
+from mauvecl.probes import Probes
 
 #: Random123's kat_vectors: counter, key, output.
 KNOWN = [

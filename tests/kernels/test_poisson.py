@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from probes import Probes
 from scipy import stats
 
 from mauvecl import reference
+from mauvecl.engine import Engine
 from mauvecl.poisson import SMALLEST_EXPANDED, alias_table, table_set
+from mauvecl.probes import Probes
 
 MEANS = [0.0, 0.5, 5.0, 64.0, 2225.0, 22250.0, 222500.0]
 
@@ -107,8 +108,8 @@ def test_the_expansion_is_the_twins(probes: Probes) -> None:
 
 
 @pytest.fixture(scope="session")
-def probes_fast() -> Probes:
-    return Probes()
+def probes_fast(engine: Engine) -> Probes:
+    return Probes(engine=engine)
 
 
 def test_moments_of_the_table() -> None:

@@ -1,8 +1,8 @@
-"""Push chosen words through the production code on the device."""
+"""Push chosen words through the production code on the device, for tests and the self-test."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,17 +10,28 @@ from numpy.typing import NDArray
 from mauvecl import program
 from mauvecl.program import Variant
 
+if TYPE_CHECKING:
+    from mauvecl.engine import Engine
+
 
 class Probes:
-    """The probe kernels of one device, at one vector width."""
+    """The probe kernels of an engine's device, in its own form or another.
 
-    def __init__(self, device: str | None = None, width: int = 16, *, vector_forms: bool = True) -> None:
-        self.cl = program.load_opencl()
-        handle, _ = program.choose_device(device)
-        self.context = self.cl.Context([handle])
-        self.queue = self.cl.CommandQueue(self.context)
-        self.width = width
-        variant = Variant(width=width, vector_forms=vector_forms and width > 1, chunk=32 if width > 1 else 4)
+    Parameters
+    ----------
+    width : int, optional
+        Realisations in a vector.
+    vector_forms : bool, optional
+        Whether PoCL's fast forms are used, or built-ins.
+    engine : Engine
+    """
+
+    def __init__(self, *, width: int | None = None, vector_forms: bool | None = None, engine: Engine) -> None:
+        self.cl, self.context, self.queue = engine.cl, engine.context, engine.queue
+        plain = engine.variant
+        self.width = width or plain.width
+        forms = plain.vector_forms if vector_forms is None else vector_forms
+        variant = Variant(width=self.width, vector_forms=forms and self.width > 1, chunk=32 if self.width > 1 else 4)
         self.program = program.build(self.context, program.render(("probes",), variant))
 
     def run(

@@ -1,0 +1,202 @@
+"""Compiled kernels kept from run to run, checked before PoCL sees them.
+
+PoCL ends the whole process on a damaged cache entry and finds no device where its folder cannot be made. So it works
+in a folder of this process alone; a store beside it keeps each program's files with their digests, and gives back only
+what still has them. A store that is damaged, full or unwritable costs a build, never a run.
+"""
+
+from __future__ import annotations
+
+import atexit
+import contextlib
+import hashlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from functools import cache
+from pathlib import Path
+
+from mauvecl import __version__
+
+#: What PoCL needs to build the kernels of a session, bytes.
+ROOM = 64 * 2**20
+#: The store's size; the programs used longest ago make room.
+MOST_STORED = 128 * 2**20
+
+
+class KernelCache:
+    """One process's working folder and the store behind it.
+
+    Attributes
+    ----------
+    work : Path
+        PoCL's cache folder.
+    store : Path
+        One folder per program, named by its key, with a manifest of digests; need not exist.
+    """
+
+    def __init__(self, base: Path | None, work: Path) -> None:
+        self.work = work
+        self.store = (base or work) / "store"
+        self._folders: dict[str, str] = {}
+        self._published: dict[str, int] = {}
+
+    def restore(self, key: str) -> bool:
+        """Bring a program's files back from the store, if all of them are as they were put there."""
+        folder = self.store / key
+        try:
+            manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+            contents = {}
+            for name, digest in manifest["files"].items():
+                contents[name] = (folder / name).read_bytes()
+                if hashlib.sha256(contents[name]).hexdigest() != digest:
+                    raise ValueError(name)
+        except FileNotFoundError:
+            return False
+        except (OSError, ValueError, KeyError, TypeError, AttributeError):
+            shutil.rmtree(folder, ignore_errors=True)
+            return False
+        for name, content in contents.items():
+            target = self.work / manifest["folder"] / name
+            target.parent.mkdir(parents=True, exist_ok=True)
+            target.write_bytes(content)
+        with contextlib.suppress(OSError):
+            os.utime(folder)
+        self._folders[key], self._published[key] = manifest["folder"], len(contents)
+        return True
+
+    @contextlib.contextmanager
+    def building(self, key: str) -> Iterator[None]:
+        """Learn which of PoCL's folders belongs to the program built inside the block."""
+        before = set(self._programs())
+        yield
+        new = [folder for folder in self._programs() if folder not in before]
+        if len(new) == 1:
+            self._folders[key] = new[0]
+
+    def _programs(self) -> Iterator[str]:
+        for path in self.work.glob("*/*/program.bc"):
+            yield path.parent.relative_to(self.work).as_posix()
+
+    def remembered(self, key: str, make: Callable[[], str]) -> str:
+        """A text kept under its own digest, or made and kept."""
+        text = self.recall(key)
+        if text is None:
+            text = make()
+            self.remember(key, text)
+        return text
+
+    def recall(self, key: str) -> str | None:
+        """A text kept, or None where there is none or it is not what was put there."""
+        with contextlib.suppress(OSError, ValueError):
+            digest, text = (self.store / f"{key}.txt").read_text(encoding="utf-8").split("\n", 1)
+            if hashlib.sha256(text.encode()).hexdigest() == digest:
+                return text
+        return None
+
+    def remember(self, key: str, text: str) -> None:
+        """Keep a text under its own digest; whatever prevents it is no fault of the run."""
+        path = self.store / f"{key}.txt"
+        with contextlib.suppress(OSError):
+            self.store.mkdir(parents=True, exist_ok=True)
+            new = path.with_name(f".{key}-{os.getpid()}")
+            new.write_text(f"{hashlib.sha256(text.encode()).hexdigest()}\n{text}", encoding="utf-8")
+            new.replace(path)
+
+    def publish(self) -> None:
+        """Put what was built since into the store; whatever prevents it is no fault of the run."""
+        with contextlib.suppress(OSError):
+            for key, folder in self._folders.items():
+                files = [
+                    path for path in (self.work / folder).rglob("*") if path.suffix in (".bc", ".so") and path.is_file()
+                ]
+                if len(files) != self._published.get(key):
+                    self._put(key, folder, files)
+                    self._published[key] = len(files)
+            self._prune()
+
+    def _put(self, key: str, folder: str, files: list[Path]) -> None:
+        self.store.mkdir(parents=True, exist_ok=True)
+        new = Path(tempfile.mkdtemp(prefix=".new-", dir=self.store))
+        try:
+            digests = {}
+            for path in files:
+                name = path.relative_to(self.work / folder).as_posix()
+                content = path.read_bytes()
+                (new / name).parent.mkdir(parents=True, exist_ok=True)
+                (new / name).write_bytes(content)
+                digests[name] = hashlib.sha256(content).hexdigest()
+            (new / "manifest.json").write_text(json.dumps({"folder": folder, "files": digests}), encoding="utf-8")
+            # A reader sees the old folder, none, or the new one.
+            shutil.rmtree(self.store / key, ignore_errors=True)
+            new.rename(self.store / key)
+        finally:
+            shutil.rmtree(new, ignore_errors=True)
+
+    def _prune(self) -> None:
+        kept = sorted(self.store.iterdir(), key=lambda p: p.stat().st_mtime, reverse=True)
+        total = 0
+        for entry in kept:
+            files = entry.rglob("*") if entry.is_dir() else [entry]
+            total += sum(path.stat().st_size for path in files if path.is_file())
+            if total > MOST_STORED:
+                shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
+
+    def close(self) -> None:
+        """Publish, and remove the working folder."""
+        self.publish()
+        shutil.rmtree(self.work, ignore_errors=True)
+
+
+@cache
+def kernel_cache() -> KernelCache:
+    """The process's cache, in ``MAUVECL_CACHE_DIR``, the user's cache folder, or a temporary one: the first with room.
+
+    Raises
+    ------
+    OSError
+        If none can be written to.
+    """
+    import platformdirs
+
+    wanted = os.environ.get("MAUVECL_CACHE_DIR") or platformdirs.user_cache_dir("mauvecl")
+    base = Path(wanted) / f"kernels-{__version__}"
+    for parent in (base, Path(tempfile.gettempdir()), Path("/dev/shm")):
+        work = _working_folder(parent)
+        if work is not None:
+            break
+    else:
+        raise OSError(f"no folder for compiled kernels can be written to with {ROOM >> 20} MiB to spare")
+    found = KernelCache(base if _writable(base) else None, work)
+    # PoCL's own threads may still write when Python ends; what they leave is swept up by a later process.
+    atexit.register(found.close)
+    return found
+
+
+def _writable(folder: Path) -> bool:
+    return folder.is_dir() and os.access(folder, os.W_OK)
+
+
+def _working_folder(parent: Path) -> Path | None:
+    """A new folder of this process under `parent`, or None where it cannot be made or would not suffice."""
+    try:
+        parent.mkdir(parents=True, exist_ok=True)
+        _sweep(parent)
+        if shutil.disk_usage(parent).free < ROOM:
+            return None
+        work = Path(tempfile.mkdtemp(prefix=f"mauvecl-work-{os.getpid()}-", dir=parent))
+        (work / "probe").write_bytes(b"\0" * 4096)
+        (work / "probe").unlink()
+    except OSError:
+        return None
+    return work
+
+
+def _sweep(parent: Path) -> None:
+    """Remove what processes that were killed have left."""
+    for folder in parent.glob("mauvecl-work-*"):
+        pid = folder.name.split("-")[2]
+        if pid.isdigit() and not Path("/proc", pid).exists() and Path("/proc").is_dir():
+            shutil.rmtree(folder, ignore_errors=True)
