@@ -3,10 +3,12 @@
 #define MAGIC ${magic}
 #define REFERENCE ${reference}u
 
-/* Everything that a launch reads, in one order. */
-#define SCENE __global const Job *restrict job, __global const Pixel *restrict pixels, __global const Level *restrict levels, \
-    __global const Edge *restrict edges, __global const Poisson *restrict darks, __global const Poisson *restrict photon_counts, \
-    __global const Response *restrict responses, __global const uint *restrict tables, __global const float *restrict priors
+/* Everything that a launch reads, in one order; helpers take the kernel's pointers without repeating its promises. */
+#define POINTERS(r) __global const Job *r job, __global const Pixel *r pixels, __global const Level *r levels, \
+    __global const Edge *r edges, __global const Poisson *r darks, __global const Poisson *r photon_counts, \
+    __global const Response *r responses, __global const uint *r tables, __global const float *r priors
+#define SCENE POINTERS(restrict)
+#define SCENE_GIVEN POINTERS()
 #define SCENE_PASSED job, pixels, levels, edges, darks, photon_counts, responses, tables, priors
 
 /* What was drawn for CHUNK neighbouring pixels: normals, and what the recipe asks for beside them. */
@@ -42,7 +44,7 @@ INLINE void normals(const uintv *w, floatv *z)
 }
 
 /* `exposure` is 0 for the observed one, REFERENCE for the other; start is a multiple of four. */
-INLINE void draw(SCENE, const Address *at, uint exposure, uint start, Draws *out)
+INLINE void draw(SCENE_GIVEN, const Address *at, uint exposure, uint start, Draws *out)
 {
     const uint group = job->first_group + start / 4u;
     uintv w[${chunk}];
@@ -75,7 +77,7 @@ INLINE floatv quantile(uintv word, __global const float *table)
 % endif
 
 /* Factors of the realisation, the same in all its frames and pixels. */
-INLINE Factors factors_of(SCENE, uintv realisation, uint realisation_high)
+INLINE Factors factors_of(SCENE_GIVEN, uintv realisation, uint realisation_high)
 {
     Factors f = {(floatv)1.0f, (floatv)1.0f};
 % if modulated:
@@ -90,20 +92,19 @@ INLINE Factors factors_of(SCENE, uintv realisation, uint realisation_high)
 }
 
 /* The share of light kept by one frame, or by all frames of a stack together. */
-INLINE floatv kept(SCENE, uintv realisation, uint realisation_high, uint exposure, uint frame)
+INLINE floatv kept(SCENE_GIVEN, uintv realisation, uint realisation_high, uint exposure, uint frame)
 {
 % if jitter is not None:
     __global const float *table = priors + ${jitter * (2 ** prior_bits + 1)}u;
     floatv lost = 0.0f;
     const uint first = job->first_frame + frame, end = ${"first + 1u" if frames else "first + job->frame_count"};
-    Words w;
-    for (uint f = first; f < end; f++) {
+    for (uint block = first / 4u; block * 4u < end; block++) {
         /* Four frames share a block of words. */
-        if (f == first || (f & 3u) == 0u) {
-            const Address at = address(realisation, realisation_high, f / 4u, job->seed_low, job->seed_high);
-            w = words_at(&at, exposure + ${streams["jitter"]}u, 0u);
-        }
-        lost += quantile((f & 3u) == 0u ? w.a : (f & 3u) == 1u ? w.b : (f & 3u) == 2u ? w.c : w.d, table);
+        const Address at = address(realisation, realisation_high, block, job->seed_low, job->seed_high);
+        const Words w = words_at(&at, exposure + ${streams["jitter"]}u, 0u);
+        const uintv word[4] = {w.a, w.b, w.c, w.d};
+        for (uint i = 0; i < 4u; i++)
+            if (block * 4u + i >= first && block * 4u + i < end) lost += quantile(word[i], table);
     }
     return ${"(floatv)1.0f - lost" if frames else "FMA(lost, (floatv)(-1.0f / (float)job->frame_count), (floatv)1.0f)"};
 % else:
@@ -112,7 +113,7 @@ INLINE floatv kept(SCENE, uintv realisation, uint realisation_high, uint exposur
 }
 
 /* The count above the level's base before the ADC; level = levels + at, at = scenario * padded_count + pixel. */
-INLINE floatv analogue(SCENE, const Draws *drawn, uint i, __global const Level *level, uint pixel, uint at, const Factors *factors)
+INLINE floatv analogue(SCENE_GIVEN, const Draws *drawn, uint i, __global const Level *level, uint pixel, uint at, const Factors *factors)
 {
     floatv z = drawn->z[i];
 % if modulated:
@@ -149,6 +150,9 @@ INLINE floatv analogue(SCENE, const Draws *drawn, uint i, __global const Level *
 % endif
     return v;
 }
+
+/* One where whole number a lies above whole number b, else zero. */
+#define PASSED(a, b) least(most((a) - (b), (floatv)0.0f), (floatv)1.0f)
 
 /* The ADC: MAGIC + whole DN above the base, clipped to its range. */
 INLINE floatv digitise(floatv v, __global const Edge *edge)

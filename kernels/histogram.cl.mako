@@ -10,6 +10,8 @@
 #define ADD(pointer, n) (*(pointer) += (n))
 % endif
 
+#define WANTED(lane) (row + (lane) >= start_row && row + (lane) < stop_row)
+
 __kernel ${attributes}
 void histogram(SCENE, const uint first_low, const uint first_high, const uint start_row, const uint stop_row,
                __global const Observer *restrict observers, __global const Element *restrict elements,
@@ -24,7 +26,7 @@ void histogram(SCENE, const uint first_low, const uint first_high, const uint st
     for (uint row = start_row / ${width}u * ${width}u; row < stop_row; row += ${width}u) {
 % endif
         const uintv realisation = (uintv)(first_low + row) + LANE_INDEX;
-        const uint from = row < start_row ? start_row - row : 0u, to = stop_row - row < ${width}u ? stop_row - row : ${width}u;
+        const bool whole = row >= start_row && row + ${width}u <= stop_row;
         const Factors steady = factors_of(SCENE_PASSED, realisation, first_high);
         floatv signal = 0.0f, variance = 0.0f;
 % if not frames:
@@ -51,18 +53,17 @@ void histogram(SCENE, const uint first_low, const uint first_high, const uint st
                     floatv v = analogue(SCENE_PASSED, &drawn, i, levels + start + i, start + i, start + i, &factors);
                     floatv r = digitise(v, edges + start + i);
 % if clip:
-                    low[i] += v + MAGIC < r ? (uintv)1u : (uintv)0u;
-                    high[i] += v + MAGIC > r ? (uintv)1u : (uintv)0u;
+                    low[i] += AS_UINT(TO_INT(PASSED(r, v + MAGIC)));
+                    high[i] += AS_UINT(TO_INT(PASSED(v + MAGIC, r)));
 % endif
                     n[i] ${"+=" if frames else "="} r - MAGIC;
                 }
 % if frames:
             }
 % endif
-            const uint begin = element.first > start ? element.first - start : 0u;
-            const uint end = element.end - start < CHUNK ? element.end - start : CHUNK;
-            for (uint i = begin; i < end; i++) {
+            for (uint i = 0; i < CHUNK; i++) {
                 const uint p = start + i;
+                if (p < element.first || p >= element.end) continue;
                 floatv net = n[i] + observers[p].net_offset;
                 signal += net;
                 variance += FMA(most(net, (floatv)0.0f), (floatv)observers[p].gain, (floatv)observers[p].variance);
@@ -71,17 +72,17 @@ void histogram(SCENE, const uint first_low, const uint first_high, const uint st
                 int lanes[${width}];
                 STORE(bin, lanes);
                 __global uint *mine = pixel_counts + p * ${observer_bins}u;
-% if width > 1:
-                if (from == 0u && to == ${width}u) {
+                if (whole) {
                     for (uint lane = 0; lane < ${width}u; lane++) COUNT(mine + lanes[lane]);
-                } else
-% endif
-                for (uint lane = from; lane < to; lane++) COUNT(mine + lanes[lane]);
+                } else {
+                    for (uint lane = 0; lane < ${width}u; lane++) if (WANTED(lane)) COUNT(mine + lanes[lane]);
+                }
 % if clip:
                 uint below[${width}], above[${width}];
                 STORE(low[i], below);
                 STORE(high[i], above);
-                for (uint lane = from; lane < to; lane++) {
+                for (uint lane = 0; lane < ${width}u; lane++) {
+                    if (!WANTED(lane)) continue;
                     if (below[lane]) ADD(clipped + 2u * p, below[lane]);
                     if (above[lane]) ADD(clipped + 2u * p + 1u, above[lane]);
                 }
@@ -92,6 +93,6 @@ void histogram(SCENE, const uint first_low, const uint first_high, const uint st
         steps = least(most(steps, (floatv)${-(observer_bins // 2)}.0f), (floatv)${observer_bins // 2 - 1}.0f);
         int lanes[${width}];
         STORE(TO_INT(nearest(steps)) + ${observer_bins // 2}, lanes);
-        for (uint lane = from; lane < to; lane++) COUNT(element_counts + e * ${observer_bins}u + lanes[lane]);
+        for (uint lane = 0; lane < ${width}u; lane++) if (WANTED(lane)) COUNT(element_counts + e * ${observer_bins}u + lanes[lane]);
     }
 }

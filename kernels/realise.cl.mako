@@ -33,7 +33,7 @@ void realise(SCENE, const uint first_low, const uint first_high, const uint star
                 floatv v = analogue(SCENE_PASSED, &drawn, i, levels + start + i, start + i, start + i, &factors);
                 floatv r = digitise(v, edges + start + i);
 % if clip:
-                met += (r != v + MAGIC) ? (uintv)1u : (uintv)0u;
+                met += AS_UINT(TO_INT(PASSED(r, v + MAGIC) + PASSED(v + MAGIC, r)));
 % endif
                 dn[i] ${"+=" if frames else "="} (AS_INT(r) - AS_INT((floatv)MAGIC)) + (intv)edges[start + i].base;
             }

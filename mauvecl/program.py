@@ -5,9 +5,11 @@ This module and `engine` are the only ones that touch pyopencl.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 import shutil
+import warnings
 from dataclasses import asdict, dataclass
 from functools import cache
 from importlib.resources import files
@@ -264,12 +266,12 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
         options.append("-cl-fp32-correctly-rounded-divide-sqrt")
     kept = kernel_cache()
     key = hashlib.sha256("\0".join((source, *options, device.name, device.driver_version)).encode()).hexdigest()[:32]
+    restored = kept.restore(key)
     try:
-        if kept.restore(key):
+        with warnings.catch_warnings(), contextlib.nullcontext() if restored else kept.building(key):
+            # Some compilers greet.
+            warnings.simplefilter("ignore", cl.CompilerWarning)
             program: pyopencl.Program = cl.Program(context, source).build(options, cache_dir=False)
-        else:
-            with kept.building(key):
-                program = cl.Program(context, source).build(options, cache_dir=False)
     except cl.Error as error:
         numbered = "\n".join(f"{i:4d}  {line}" for i, line in enumerate(source.splitlines(), 1))
         raise BuildError(f"a kernel did not compile on {device.name}\n{numbered}\n{error}") from error

@@ -1,0 +1,87 @@
+"""The same bits everywhere: digests of every kernel and statistic, side by side, for every OpenCL device found.
+
+    python bench/same_bits.py [--output FILE.ecsv]
+
+The first column is the NumPy twin's. Drivers outside the system's list are found through ``OCL_ICD_VENDORS``, a folder
+of .icd files, each naming a driver's library (Intel's is libintelocl.so of the wheel intel-opencl-rt). Oclgrind is added
+where it is installed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+
+from astropy.table import Table
+
+CHILD = """
+import json, sys
+from dataclasses import asdict
+from mauvecl import selftest
+from mauvecl.engine import Engine, devices
+for number, record in enumerate(devices()):
+    found = {}
+    for width in (None, 1):
+        engine = Engine(str(number), width=width)
+        digests = {name: selftest.digests(engine, name) for name in selftest.CASES}
+        found = found or digests
+        scalar = digests == found
+    print(json.dumps({"device": asdict(record), "digests": found, "scalar": scalar}), flush=True)
+"""
+
+
+def vendors(folder: Path) -> dict[str, str]:
+    """The environment with Oclgrind's driver beside the others."""
+    listed = Path(os.environ.get("OCL_ICD_VENDORS", "/etc/OpenCL/vendors"))
+    for icd in listed.glob("*.icd"):
+        shutil.copy(icd, folder)
+    for library in Path("/usr/lib").rglob("liboclgrind-rt-icd.so"):
+        (folder / "oclgrind.icd").write_text(f"{library}\n")
+    return os.environ | {"OCL_ICD_VENDORS": str(folder)}
+
+
+def main() -> int:
+    """Print the table; the exit code says whether all are equal."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--output", type=Path, help="write the table as ECSV")
+    output = parser.parse_args().output
+    from mauvecl import selftest
+
+    twin = {name: selftest.twin_digests(name) for name in selftest.CASES}
+    with tempfile.TemporaryDirectory() as folder:
+        run = subprocess.run(
+            [sys.executable, "-c", CHILD], env=vendors(Path(folder)), stdout=subprocess.PIPE, text=True, check=True
+        )
+    found = [json.loads(line) for line in run.stdout.splitlines()]
+    columns = {"case": [], "part": [], "twin": []} | {str(i): [] for i in range(len(found))}
+    for name, parts in twin.items():
+        for part, digest in parts.items():
+            columns["case"].append(name)
+            columns["part"].append(part)
+            columns["twin"].append(digest)
+            for i, one in enumerate(found):
+                columns[str(i)].append(one["digests"][name][part])
+    table = Table(columns)
+    same = True
+    for i, one in enumerate(found):
+        device = one["device"]
+        label = f"{device['platform']}: {device['name']}, driver {device['driver']}"
+        equal = one["scalar"] and list(table[str(i)]) == list(table["twin"])
+        same &= equal
+        print(f"{i} = {label}; promises: {device['promise']}; {'EQUAL' if equal else 'DIFFERENT'}")
+        table.meta[str(i)] = f"{label}; promises: {device['promise']}"
+    table.pprint(max_lines=-1, max_width=-1)
+    if output is not None:
+        table.write(output, format="ascii.ecsv", overwrite=True)
+    print("All equal, with vectors and with one realisation to a work-item." if same else "NOT all equal.")
+    return 0 if same else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())
