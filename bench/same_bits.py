@@ -3,8 +3,8 @@
     python bench/same_bits.py [--output FILE.ecsv]
 
 The first column is the NumPy twin's. Drivers outside the system's list are found through ``OCL_ICD_VENDORS``, a folder
-of .icd files, each naming a driver's library (Intel's is libintelocl.so of the wheel intel-opencl-rt). Oclgrind is added
-where it is installed.
+of .icd files, each naming a driver's library (Intel's is libintelocl.so of the wheel intel-opencl-rt). Oclgrind is
+added where it is installed.
 """
 
 from __future__ import annotations

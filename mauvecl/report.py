@@ -103,8 +103,17 @@ def write_record(
     if engine is not None:
         record["device"] = asdict(engine.device)
         record["kernels"] = engine.kernel_digest
-    path = folder / "run.json"
-    path.write_text(json.dumps(record, indent=2, default=str) + "\n", encoding="utf-8")
+        # What the self-test found on this device, if the user has run it.
+        from mauvecl.selftest import last
+
+        known = last(engine.device)
+        record["selftest"] = known or "not run on this device and version: mauvecl selftest"
+    return write_json(record, folder / "run.json")
+
+
+def write_json(content: Any, path: Path) -> Path:
+    """Anything plain as JSON."""
+    path.write_text(json.dumps(content, indent=2, default=str) + "\n", encoding="utf-8")
     return path
 
 

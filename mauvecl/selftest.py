@@ -244,7 +244,7 @@ def chance(engine: Engine) -> Iterator[Check]:
         x = toy(512, 1, dark=dark, read=read, light=0.0)
         counts, first = counts_of(engine, x, 100_000, recipe)
         p = pearson(counts, exact_counts(x, first))
-        yield Check(f"Pearson, {title}", p > LUCK, f"p = {p:.3g} of {counts.sum():.2g} counts")
+        yield Check(f"Pearson, {title}", bool(p > LUCK), f"p = {p:.3g} of {counts.sum():.2g} counts")
 
 
 def closed_forms(engine: Engine) -> Iterator[Check]:
@@ -255,14 +255,14 @@ def closed_forms(engine: Engine) -> Iterator[Check]:
     z = (table["mean"] - table["expected"]) / table["std"]
     # The root's curvature moves the mean by about noise over eight signals of an element, 2 % here.
     worst = float(np.abs(z).max())
-    yield Check("S/N per element, closed form", worst < 0.03 + 5 / np.sqrt(n), f"means within {worst:.3f} sigma")
+    yield Check("S/N per element, closed form", bool(worst < 0.03 + 5 / np.sqrt(n)), f"means within {worst:.3f} sigma")
     found = engine.detect(quiet, [flare], realisations=n, seed=SEED, statistics=tuple(STATISTICS))
     for statistic in STATISTICS:
         for which in (None, 0):
             ours, theory = found.distribution(statistic, which), found.closed_form(statistic, which)
             error = (ours.mean - theory.mean) / (theory.std / np.sqrt(n))
             name = f"{statistic}, mean {'with a flare' if which is not None else 'without'}"
-            yield Check(f"{name}, closed form", abs(error) < 5, f"{error:+.1f} standard errors")
+            yield Check(f"{name}, closed form", bool(abs(error) < 5), f"{error:+.1f} standard errors")
 
 
 def tiles(engine: Engine) -> Check:

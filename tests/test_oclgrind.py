@@ -9,7 +9,9 @@ from pathlib import Path
 
 import pytest
 
-ICD = next((path for root in ("/usr/lib", "/usr/local/lib") for path in Path(root).rglob("liboclgrind-rt-icd.so")), None)
+ICD = next(
+    (path for root in ("/usr/lib", "/usr/local/lib") for path in Path(root).rglob("liboclgrind-rt-icd.so")), None
+)
 pytestmark = pytest.mark.skipif(ICD is None, reason="Oclgrind is not installed (Debian: apt-get install oclgrind)")
 
 KERNELS = """
