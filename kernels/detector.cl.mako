@@ -32,15 +32,23 @@ typedef struct { floatv light, dark; } Factors;
    ties between their turns keep the pipelines filled. */
 INLINE void draw_words(const Address *at, uint stream, uint group, uintv *w)
 {
+% if chunk % 8 == 0:
+    for (uint i = 0; i < CHUNK; i += 8u) words_of_two(at, stream, group + i / 4u, w + i);
+% else:
     for (uint i = 0; i < CHUNK; i += 4u) {
         Words x = words_at(at, stream, group + i / 4u);
         w[i] = x.a; w[i + 1u] = x.b; w[i + 2u] = x.c; w[i + 3u] = x.d;
     }
+% endif
 }
 
 INLINE void normals(const uintv *w, floatv *z)
 {
-    for (uint i = 0; i < CHUNK; i += 2u) normal_pair(w[i], w[i + 1u], z + i, z + i + 1u);
+% if chunk % 8 == 0:
+    for (uint i = 0; i < CHUNK; i += 8u) four_normal_pairs(w + i, z + i);
+% else:
+    for (uint i = 0; i < CHUNK; i += 2u) normal_pair(w + i, z + i);
+% endif
 }
 
 /* `exposure` is 0 for the observed one, REFERENCE for the other; start is a multiple of four. */

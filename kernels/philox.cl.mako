@@ -68,3 +68,36 @@ INLINE Words words_at(const Address *at, uint stream, uint group)
     multiply(PHILOX_M0, y0, &high0, &low0);
     return rounds_3_to_9(at->e ^ low, at->f, high0 ^ (uintv)at->s3, low0, at->k0, at->k1);
 }
+
+/* Two neighbouring groups at once, their steps taken in turn: each is one long chain of dependent operations, and
+   a processor sees only so far ahead. */
+INLINE void words_of_two(const Address *at, uint stream, uint group, uintv *w)
+{
+    uintv h[2], l[2], h0[2], l0[2], c0[2], c1[2], c2[2], c3[2];
+    const uint k0 = at->k0, k1 = at->k1;
+% for i in range(2):
+    c2[${i}] = at->first ^ (uintv)(stream << 24 | (group + ${i}u));
+    multiply(PHILOX_M1, c2[${i}], h + ${i}, l + ${i});
+% endfor
+% for i in range(2):
+    multiply(PHILOX_M0, h[${i}] ^ (uintv)at->s1, h0 + ${i}, l0 + ${i});
+    c0[${i}] = at->e ^ l[${i}]; c1[${i}] = at->f; c2[${i}] = h0[${i}] ^ (uintv)at->s3; c3[${i}] = l0[${i}];
+% endfor
+% for r in range(3, 10):
+% for i in range(2):
+    multiply(PHILOX_M0, c0[${i}], h0 + ${i}, l0 + ${i});
+% endfor
+% for i in range(2):
+    multiply(PHILOX_M1, c2[${i}], h + ${i}, l + ${i});
+% endfor
+% for i in range(2):
+    c0[${i}] = h[${i}] ^ c1[${i}] ^ (uintv)(k0 + ${r}u * PHILOX_W0);
+    c1[${i}] = l[${i}];
+    c2[${i}] = h0[${i}] ^ c3[${i}] ^ (uintv)(k1 + ${r}u * PHILOX_W1);
+    c3[${i}] = l0[${i}];
+% endfor
+% endfor
+% for i in range(2):
+    w[${4 * i}] = c0[${i}]; w[${4 * i + 1}] = c1[${i}]; w[${4 * i + 2}] = c2[${i}]; w[${4 * i + 3}] = c3[${i}];
+% endfor
+}

@@ -23,8 +23,9 @@ INLINE floatv expansion_draw(floatv z, float offset, float slope, float cubic)
 INLINE void poisson_pair(uintv first, uintv second, __global const Poisson *a, __global const Poisson *b,
                          __global const uint *tables, floatv *out)
 {
+    const uintv w[2] = {first, second};
     floatv z[2] = {(floatv)0.0f, (floatv)0.0f};
-    if (!a->bits || !b->bits) normal_pair(first, second, z, z + 1);
+    if (!a->bits || !b->bits) normal_pair(w, z);
     out[0] = a->bits ? TO_FLOAT(AS_INT(alias_draw(first, tables + a->table, a->bits)) + (intv)a->low)
                      : expansion_draw(z[0], a->offset, a->slope, a->cubic);
     out[1] = b->bits ? TO_FLOAT(AS_INT(alias_draw(second, tables + b->table, b->bits)) + (intv)b->low)

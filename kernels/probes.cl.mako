@@ -20,10 +20,11 @@ void probe_normal(__global const uint *restrict words, __global float *restrict 
 {
     /* words[2][n] -> normals[2][n], n = WIDTH x global size */
     const uint item = get_global_id(0), n = get_global_size(0) * ${width}u;
-    floatv z0, z1;
-    normal_pair(LOAD(words + item * ${width}u), LOAD(words + n + item * ${width}u), &z0, &z1);
-    STORE(z0, out + item * ${width}u);
-    STORE(z1, out + n + item * ${width}u);
+    const uintv w[2] = {LOAD(words + item * ${width}u), LOAD(words + n + item * ${width}u)};
+    floatv z[2];
+    normal_pair(w, z);
+    STORE(z[0], out + item * ${width}u);
+    STORE(z[1], out + n + item * ${width}u);
 }
 
 __kernel ${attributes}
@@ -39,10 +40,11 @@ void probe_expansion(__global const uint *restrict words, const float offset, co
 {
     /* words[2][n] -> counts[2][n], n = WIDTH x global size */
     const uint item = get_global_id(0), n = get_global_size(0) * ${width}u;
-    floatv z0, z1;
-    normal_pair(LOAD(words + item * ${width}u), LOAD(words + n + item * ${width}u), &z0, &z1);
-    STORE(expansion_draw(z0, offset, slope, cubic), out + item * ${width}u);
-    STORE(expansion_draw(z1, offset, slope, cubic), out + n + item * ${width}u);
+    const uintv w[2] = {LOAD(words + item * ${width}u), LOAD(words + n + item * ${width}u)};
+    floatv z[2];
+    normal_pair(w, z);
+    STORE(expansion_draw(z[0], offset, slope, cubic), out + item * ${width}u);
+    STORE(expansion_draw(z[1], offset, slope, cubic), out + n + item * ${width}u);
 }
 
 __kernel void probe_layout(__global uint *restrict out)
@@ -65,8 +67,9 @@ void probe_every_word(const uint per_item, const uint angle, __global float *res
     floatv low = (floatv)0.0f, high = (floatv)0.0f;
     uintv wrong = (uintv)0u;
     for (uint i = 0; i < per_item; i += ${width}u) {
+        const uintv w[2] = {(uintv)(item * per_item + i) + LANE_INDEX, (uintv)angle};
         floatv z[2];
-        normal_pair((uintv)(item * per_item + i) + LANE_INDEX, (uintv)angle, z, z + 1);
+        normal_pair(w, z);
         for (uint j = 0; j < 2u; j++) {
             low = least(low, z[j]);
             high = most(high, z[j]);
@@ -86,10 +89,11 @@ void probe_histogram(const uint seed, const uint groups, __global uint *restrict
     __global uint *mine = counts + 4096u * item;
     const Address at = address((uintv)(item * ${width}u) + LANE_INDEX, 0u, 0u, seed, 0u);
     for (uint group = 0; group < groups; group++) {
-        Words w = words_at(&at, ${streams["noise"]}u, group);
+        const Words x = words_at(&at, ${streams["noise"]}u, group);
+        const uintv w[4] = {x.a, x.b, x.c, x.d};
         floatv z[4];
-        normal_pair(w.a, w.b, z, z + 1);
-        normal_pair(w.c, w.d, z + 2, z + 3);
+        normal_pair(w, z);
+        normal_pair(w + 2, z + 2);
         for (uint j = 0; j < 4u; j++) {
             int bin[${width}];
             STORE(TO_INT(FMA(z[j], (floatv)256.0f, (floatv)2048.0f)), bin);

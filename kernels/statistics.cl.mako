@@ -16,7 +16,7 @@ void statistics(SCENE, const uint first_low, const uint first_high,
     const uint linear_count = linear_end[scenario_count - 1u];
     uintv realisation[${vectors}];
     Factors steady[${vectors}];
-    Four chi2[${scenarios}][${vectors}], linear[${linears}][${vectors}];
+    Four chi2[${scenarios}][${vectors}], linear[${linears + 1}][${vectors}];
     floatv element[${scenarios}][${vectors}], chi2_element[${scenarios}][${vectors}], chi2_pair[${scenarios}][${vectors}];
     for (uint v = 0; v < ${vectors}u; v++) {
         realisation[v] = (uintv)(first_low + (item * ${vectors}u + v) * ${width}u) + LANE_INDEX;
@@ -25,7 +25,7 @@ void statistics(SCENE, const uint first_low, const uint first_high,
             chi2[k][v] = NOTHING;
             element[k][v] = chi2_element[k][v] = chi2_pair[k][v] = (floatv)0.0f;
         }
-        for (uint l = 0; l < linear_count; l++) linear[l][v] = NOTHING;
+        for (uint l = 0; l <= linear_count; l++) linear[l][v] = NOTHING;
     }
 % if not frames:
     Address at[${vectors}];
@@ -83,8 +83,18 @@ void statistics(SCENE, const uint first_low, const uint first_high,
             inside[${v}] = element[k][${v}];
             outside[${v}] = chi2_element[k][${v}];
 % endfor
+% if linear:
+            /* The scenario's first linear statistic is summed on the way; one without any adds nothing to the last. */
+            const uint own = l < linear_end[k] ? l++ : linear_count;
+            __global const float *own_weight = weights + own * padded + start;
+            Four own_sum[${vectors}];
+% for v in range(vectors):
+            own_sum[${v}] = linear[own][${v}];
+% endfor
+% endif
 % if linear or pair:
             floatv x[${vectors}][${chunk}];
+            const bool again_needed = ${"true" if pair else "l < linear_end[k]"};
 % endif
             for (uint i = 0; i < CHUNK; i += 4u) {
                 /* Four pixels at once: addresses without an index, and sums that need not wait for each other. */
@@ -98,11 +108,20 @@ void statistics(SCENE, const uint first_low, const uint first_high,
                 y[${v}][${j}] = digitise(analogue(SCENE_PASSED, drawn + ${v}, i + ${j}u, four + ${j}, start + i + ${j}u, here + i + ${j}u, factors + ${v}), edges + here + i + ${j}u) - four[${j}].shift;
 % endif
                 sum[${v}].${part} = FMA(y[${v}][${j}], FMA(y[${v}][${j}], (floatv)four[${j}].inverse_variance, (floatv)four[${j}].twice), sum[${v}].${part});
-% if linear or pair:
-                x[${v}][i + ${j}u] = y[${v}][${j}];
+% if linear:
+                own_sum[${v}].${part} = FMA(y[${v}][${j}], (floatv)own_weight[i + ${j}u], own_sum[${v}].${part});
 % endif
 % endfor
 % endfor
+% if linear or pair:
+                if (again_needed) {
+% for j in range(4):
+% for v in range(vectors):
+                    x[${v}][i + ${j}u] = y[${v}][${j}];
+% endfor
+% endfor
+                }
+% endif
 % if elements:
                 if (!pixel[i].end_among_four) {
                     /* Most of the time: one addition to wait for. */
@@ -132,6 +151,9 @@ void statistics(SCENE, const uint first_low, const uint first_high,
             chi2_element[k][${v}] = outside[${v}];
 % endfor
 % if linear:
+% for v in range(vectors):
+            linear[own][${v}] = own_sum[${v}];
+% endfor
             for (; l < linear_end[k]; l++) {
                 __global const float *weight = weights + l * padded + start;
                 Four total[${vectors}];

@@ -203,7 +203,8 @@ class Run:
         self._weighing = [
             self.upload(self._scene.templates),
             self.upload(self._scene.constants(weights, linear_end)),
-            self.upload(weights),
+            # A row of zeros behind them, for scenarios without any.
+            self.upload(np.concatenate([weights, np.zeros((1, len(self._scene.pixels)), np.float32)])),
             self.upload(linear_end),
         ]
         self._rows = len(layout.FIXED_STATISTICS) * len(self._scene.levels) + len(weights)
