@@ -73,7 +73,9 @@ void histogram(SCENE, const uint first_low, const uint first_high, const uint st
                 STORE(bin, lanes);
                 __global uint *mine = pixel_counts + p * ${observer_bins}u;
                 if (whole) {
-                    for (uint lane = 0; lane < ${width}u; lane++) COUNT(mine + lanes[lane]);
+% for lane in range(width):
+                    COUNT(mine + lanes[${lane}]);
+% endfor
                 } else {
                     for (uint lane = 0; lane < ${width}u; lane++) if (WANTED(lane)) COUNT(mine + lanes[lane]);
                 }
