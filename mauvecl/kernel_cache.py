@@ -45,6 +45,9 @@ class KernelCache:
 
     def restore(self, key: str) -> bool:
         """Bring a program's files back from the store, if all of them are as they were put there."""
+        if key in self._folders:
+            # Already in the working folder, and perhaps in use: a loaded kernel's file must not be written again.
+            return True
         folder = self.store / key
         try:
             manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
