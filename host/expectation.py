@@ -101,7 +101,7 @@ class Expectation:
             bad = ~((values >= 0) & (values <= LARGEST))
             if bad.any():
                 pixel = int(np.argmax(bad))
-                raise InputError(f"{name}[{pixel}] = {values[pixel]:g}, expected 0 to {LARGEST:g}")
+                raise InputError(f"{name} of pixel {pixel} = {values[pixel]:g}, expected 0 to {LARGEST:g}")
         object.__setattr__(self, "provenance", dict(self.provenance))
 
     @property

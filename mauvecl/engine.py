@@ -386,7 +386,7 @@ class Engine:
             tile = self._tile_at(start + done, count - done, size)
             try:
                 work(tile, done)
-            except (self.cl.MemoryError, self.cl.RuntimeError) as error:
+            except self.cl.Error as error:
                 if not program.out_of_memory(error):
                     raise
                 if size <= self._step:

@@ -33,12 +33,15 @@ class KernelCache:
     ----------
     work : Path
         PoCL's cache folder.
+    pid : int
+        The process that it belongs to.
     store : Path
         One folder per program, named by its key, with a manifest of digests; need not exist.
     """
 
     def __init__(self, base: Path | None, work: Path) -> None:
         self.work = work
+        self.pid = os.getpid()
         self.store = (base or work) / "store"
         self._folders: dict[str, str] = {}
         self._published: dict[str, int] = {}
@@ -148,7 +151,9 @@ class KernelCache:
                 shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
 
     def close(self) -> None:
-        """Publish, and remove the working folder."""
+        """Publish, and remove the working folder; a forked child leaves it to its parent."""
+        if os.getpid() != self.pid:
+            return
         self.publish()
         shutil.rmtree(self.work, ignore_errors=True)
 

@@ -87,7 +87,7 @@ def load_opencl() -> Any:
     Raises
     ------
     DeviceError
-        If the linker ``ld`` is not on the path or pyopencl cannot be loaded.
+        If the linker ``ld`` is not on the path, pyopencl cannot be loaded, or it was loaded before a fork.
     """
     if shutil.which("ld") is None:
         raise DeviceError(
@@ -98,6 +98,9 @@ def load_opencl() -> Any:
         os.environ["POCL_CACHE_DIR"] = str(kernel_cache().work)
     except OSError as error:
         raise DeviceError(f"{error}: set MAUVECL_CACHE_DIR to a folder that can") from error
+    if kernel_cache().pid != os.getpid():
+        # PoCL's threads do not survive a fork; its next call would wait for them for ever.
+        raise DeviceError("OpenCL was loaded before a fork, expected a process of its own start (use spawn)")
     # pyopencl's own cache would be a second one beside PoCL's.
     os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
     try:

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl import layout
+from mauvecl.program import DeviceError, out_of_memory
 from mauvecl.scene import PIXEL_BLOCK, Scene
 from mauvecl.snr import Counts
 from mauvecl.tally import Grid, Tally
@@ -84,10 +85,17 @@ class Run:
             buffer.release()
 
     def upload(self, array: NDArray[Any]) -> Any:
-        """A device buffer with the contents of an array."""
+        """A device buffer with the contents of an array; DeviceError where there is no room."""
         flags = self._cl.mem_flags
         data = np.ascontiguousarray(array if array.size else np.zeros(1, array.dtype))
-        buffer = self._cl.Buffer(self._engine.context, flags.READ_WRITE | flags.COPY_HOST_PTR, hostbuf=data)
+        try:
+            buffer = self._cl.Buffer(self._engine.context, flags.READ_WRITE | flags.COPY_HOST_PTR, hostbuf=data)
+        except self._cl.Error as error:
+            if not out_of_memory(error):
+                raise
+            raise DeviceError(
+                f"{self._engine.device_name} has too little memory for {data.nbytes} bytes of a scene: {error}"
+            ) from error
         self._buffers.append(buffer)
         return buffer
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import multiprocessing
 import os
 import subprocess
 import sys
@@ -14,7 +13,7 @@ from scipy import stats
 
 from mauvecl import reference
 from mauvecl.detection import plan_channels
-from mauvecl.engine import DeviceError, Engine, devices
+from mauvecl.engine import Engine
 from mauvecl.host.errors import InputError
 from mauvecl.host.pixel_map import PixelMap
 from mauvecl.processes import CosmicRays, Normal, Processes, Uniform
@@ -313,75 +312,3 @@ def test_statistics_and_scenarios_are_checked(engine: Engine) -> None:
     (other, *_), _ = case("one frame")
     with pytest.raises(InputError, match="n_frames of"):
         engine.detect(quiet, [other], realisations=10, seed=1)
-
-
-def test_devices_and_absent_ones() -> None:
-    present = devices()
-    assert present[0].default
-    assert "Portable" in present[0].platform
-    with pytest.raises(DeviceError, match="not here, expected one of: 0 = "):
-        Engine(device="no such device")
-    assert Engine(device="portable").device == present[0]
-    assert Engine(device="0").device == present[0]
-
-
-def test_a_missing_linker_is_named(tmp_path) -> None:
-    """PoCL would abort Python; here one sentence says what to install."""
-    code = "from mauvecl.engine import Engine, DeviceError\ntry: Engine()\nexcept DeviceError as e: print(e)"
-    run = subprocess.run(
-        [sys.executable, "-c", code],
-        env=os.environ | {"PATH": str(tmp_path)},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    assert "no linker `ld`" in run.stdout
-    assert "binutils" in run.stdout
-
-
-def test_no_device_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    from mauvecl import program
-
-    opencl = program.load_opencl()
-
-    def nothing() -> list:
-        raise opencl.LogicError("clGetPlatformIDs failed: PLATFORM_NOT_FOUND_KHR")
-
-    for empty in (nothing, list):
-        monkeypatch.setattr(opencl, "get_platforms", empty)
-        with pytest.raises(DeviceError, match="no OpenCL device found"):
-            Engine()
-
-
-def test_an_unwritable_cache_is_no_obstacle(tmp_path) -> None:
-    """A cache folder that cannot be made is replaced by a temporary one."""
-    blocked = tmp_path / "file"
-    blocked.write_text("not a folder")
-    code = "from mauvecl.engine import Engine; print(Engine().device_name)"
-    environment = os.environ | {"MAUVECL_CACHE_DIR": str(blocked)}
-    run = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
-    assert "Portable" in run.stdout
-
-
-def test_an_engine_from_before_a_fork_is_refused(engine: Engine) -> None:
-    """PoCL would wait for ever for threads that did not survive."""
-    (quiet, *_), _ = case("stack")
-    queue = multiprocessing.get_context("fork").Queue()
-
-    def child() -> None:
-        try:
-            engine.realise(quiet, count=1, seed=1)
-        except DeviceError as error:
-            queue.put(str(error))
-
-    process = multiprocessing.get_context("fork").Process(target=child)
-    process.start()
-    assert "fork" in queue.get(timeout=20)
-    process.join(timeout=20)
-
-
-def test_a_failing_build_shows_the_numbered_source(engine: Engine) -> None:
-    from mauvecl.program import BuildError, build
-
-    with pytest.raises(BuildError, match=r"   2  nonsense here"):
-        build(engine.context, "// a comment\nnonsense here\n")

@@ -204,7 +204,7 @@ def test_survives_pickling(quiet: Expectation) -> None:
 def test_bad_means_are_named(quiet: Expectation) -> None:
     bad = quiet.source_electrons.copy()
     bad[17] = -0.2
-    with pytest.raises(InputError, match=r"source_electrons\[17\] = -0\.2, expected 0 to 1e\+12"):
+    with pytest.raises(InputError, match=r"source_electrons of pixel 17 = -0\.2, expected 0 to 1e\+12"):
         replace(quiet, source_electrons=bad)
 
 
