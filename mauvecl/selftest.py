@@ -193,7 +193,7 @@ def twins(engine: Engine) -> Iterator[Check]:
 
 
 def _nearly(engine: Engine, name: str) -> tuple[bool, str]:
-    """The weaker promise: counts within one DN of the twin's and hardly any different, statistics to a fifth of their spread."""
+    """The weaker promise: hardly a count off the twin's, and by one DN; statistics within a fifth of their spread."""
     options, how = CASES[name]
     quiet, flare = toy(**options), toy(flare=0.3, **options)
     index = np.arange(START, START + COUNT, dtype=np.uint64)

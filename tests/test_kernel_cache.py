@@ -114,9 +114,10 @@ def test_a_damaged_store_is_built_again(filled: tuple[Path, str], tmp_path: Path
     assert (healed["digest"], restored) == (digest, wanted)
 
 
-@pytest.mark.parametrize(
-    "text", ["", "[]", "3", '{"files": 1}', '{"folder": "x"}', '{"folder": 3, "files": {"a": "b"}}']
-)
+MANIFESTS = ("", "[]", "3", '{"files": 1}', '{"folder": "x"}', '{"folder": 3, "files": {"a": "b"}}')
+
+
+@pytest.mark.parametrize("text", MANIFESTS)
 def test_any_manifest_is_read_without_trust(tmp_path: Path, text: str) -> None:
     cache = KernelCache(tmp_path, tmp_path / "work")
     entry = cache.store / "key"

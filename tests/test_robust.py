@@ -90,7 +90,7 @@ def test_a_failing_build_shows_the_numbered_source(engine: Engine) -> None:
 
 
 def refuse_beyond(monkeypatch: pytest.MonkeyPatch, limit: int, *, scenes: bool = False) -> list[int]:
-    """Let the device refuse buffers of more than so many bytes, and what a scene is kept in; returns the sizes refused."""
+    """Let the device refuse buffers of more than so many bytes, or what a scene is kept in; the sizes refused."""
     refused: list[int] = []
 
     def buffer(context: cl.Context, flags: int, size: int = 0, hostbuf: np.ndarray | None = None) -> cl.Buffer:
@@ -126,7 +126,7 @@ def test_too_little_memory_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> Non
     with pytest.raises(DeviceError, match="too little memory for 64 realisations"):
         Engine().detect(toy(), [toy(flare=0.3)], realisations=20_000, seed=1)
     refuse_beyond(monkeypatch, 100, scenes=True)
-    with pytest.raises(DeviceError, match="too little memory for .* bytes of a scene"):
+    with pytest.raises(DeviceError, match=r"too little memory for .* bytes of a scene"):
         Engine().realise(toy(), count=1, seed=1)
 
 
