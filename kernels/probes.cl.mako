@@ -1,8 +1,17 @@
 ## Small kernels that push chosen words through the production code, for tests and the self-test.
+/* What all lanes hold; something else where they differ. */
+INLINE uint agreed(uintv word)
+{
+    uint lanes[${width}], differ = 0u;
+    STORE(word, lanes);
+    for (uint lane = 1; lane < ${width}u; lane++) differ |= lanes[lane] ^ lanes[0];
+    return lanes[0] ^ differ;
+}
+
 __kernel ${attributes}
 void probe_philox(const uint count, __global const uint *counters, __global const uint *keys, __global uint *out)
 {
-    /* Each work-item takes one counter and key in all lanes; lane 0 is written. */
+    /* Each work-item takes one counter and key in all lanes. */
     const uint item = get_global_id(0);
     __global const uint *c = counters + 4u * item;
     Words full = philox((uintv)c[0], (uintv)c[1], (uintv)c[2], (uintv)c[3], keys[2u * item], keys[2u * item + 1u]);
@@ -10,8 +19,8 @@ void probe_philox(const uint count, __global const uint *counters, __global cons
     Words quick = words_at(&at, c[3] >> 24, c[3] & 0xffffffu);
     __global uint *o = out + 8u * item;
 % for i, word in enumerate("abcd"):
-    o[${i}] = ${"full." + word + (".s0" if width > 1 else "")};
-    o[${i + 4}] = ${"quick." + word + (".s0" if width > 1 else "")};
+    o[${i}] = agreed(full.${word});
+    o[${i + 4}] = agreed(quick.${word});
 % endfor
 }
 

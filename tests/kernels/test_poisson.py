@@ -10,6 +10,8 @@ from mauvecl import reference
 from mauvecl.engine import Engine
 from mauvecl.poisson import SMALLEST_EXPANDED, alias_table, table_set
 from mauvecl.probes import Probes
+from mauvecl.scene import prepare
+from mauvecl.selftest import toy
 
 MEANS = [0.0, 0.5, 5.0, 64.0, 2225.0, 22250.0, 222500.0]
 
@@ -86,6 +88,31 @@ def test_pearson_of_the_expansion(probes_fast: Probes, mean: float) -> None:
         counts += np.bincount(drawn.ravel() + half, minlength=counts.size)
     assert counts.sum() == 100_000_000
     assert pearson(counts, round(mean) - half, mean) > 1e-6
+
+
+def draws_to_tell(mean: float, offset: float, slope: float, cubic: float) -> float:
+    """Draws after which Pearson's test sees the expansion at five sigma, from its exact distribution."""
+    half = int(9 * np.sqrt(mean))
+    n = np.arange(-half, half + 1) + round(mean)
+    z = np.linspace(-8.9, 8.9, 400_001)
+    drawn = round(mean) + offset + z * (slope + z * (1 / 6 + z * cubic))
+    at = np.interp(np.append(n, n[-1] + 1) - 0.5, drawn, z)
+    q = np.where(at[1:] < 0, np.diff(stats.norm.cdf(at)), -np.diff(stats.norm.sf(at)))
+    p = stats.poisson.pmf(n, mean)
+    common = p > 1e-14
+    return float(5 * np.sqrt(2 * common.sum()) / np.sum((p - q)[common] ** 2 / p[common]))
+
+
+@pytest.mark.parametrize("mean", [SMALLEST_EXPANDED, 2225.0, 22250.0, 1e6])
+def test_no_number_of_draws_would_tell_the_expansion(mean: float) -> None:
+    """By what the scene gives the device; without its last term 2e10 draws of a mean of 1000 would."""
+    scene = prepare([toy(4, 1, dark=mean)], recipe="apart")
+    (source,) = scene.dark_counts[:1]
+    assert source["bits"] == 0
+    given = (float(source["offset"]), float(source["slope"]), float(source["cubic"]))
+    assert draws_to_tell(mean, *given) > 1e13
+    if mean < 1e5:  # beyond, what is left is the coefficients' own float32
+        assert draws_to_tell(mean, *given[:2], 0.0) < 1e-2 * draws_to_tell(mean, *given)
 
 
 @pytest.mark.parametrize("mean", [SMALLEST_EXPANDED, 2225.0, 22250.0])

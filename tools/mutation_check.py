@@ -1,0 +1,165 @@
+"""Break the noise on purpose, in a copy, and see the named test fail.
+
+    python tools/mutation_check.py [NAME ...]
+
+Most are made in the kernels and in their NumPy twin alike, so that it is not enough that the two differ: known answers,
+exact distributions or chance must tell. Exit code 0 if every test noticed.
+"""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+
+PHILOX, NORMAL, POISSON = (f"kernels/{name}.cl.mako" for name in ("philox", "normal", "poisson"))
+TWIN = "mauvecl/reference.py"
+
+
+@dataclass(frozen=True)
+class Mutation:
+    """Edits (file, from, to), and the test that must fail with them and passes without."""
+
+    edits: tuple[tuple[str, str, str], ...]
+    test: str
+
+
+SWAPPED = (
+    PHILOX,
+    "w[${4 * i}] = c0[${i}]; w[${4 * i + 1}] = c1[${i}]",
+    "w[${4 * i}] = c1[${i}]; w[${4 * i + 1}] = c0[${i}]",
+)
+CUMULANTS = "mauvecl/cumulants.py"
+SHAPE = "    g1, g2, g3 = c.shape()\n    sd ="
+
+MUTATIONS = {
+    "7 rounds": Mutation(
+        ((PHILOX, "range(3, 10)", "range(3, 7)"), (TWIN, "for r in range(10):", "for r in range(7):")),
+        "tests/kernels/test_philox.py::test_known_answers",
+    ),
+    "swapped words": Mutation(
+        (
+            (PHILOX, "Words out = {c0, c1, c2, c3};", "Words out = {c1, c0, c2, c3};"),
+            SWAPPED,
+            (TWIN, "return (c0.astype(np.uint32), c1.astype", "return (c1.astype(np.uint32), c0.astype"),
+        ),
+        "tests/kernels/test_philox.py::test_known_answers",
+    ),
+    "swapped words, production kernel alone": Mutation(
+        (SWAPPED,), "tests/test_extremes.py::test_extreme_words_through_the_production_kernel"
+    ),
+    "rounded normal for the dark": Mutation(
+        (
+            (POISSON, "nearest(FMA(z, FMA(z, curve, (floatv)slope), (floatv)offset))", "nearest(z * slope + offset)"),
+            (TWIN, "nearest(fma(z, fma(z, curve, slope), offset))", "nearest(z * slope + offset)"),
+        ),
+        "tests/kernels/test_poisson.py::test_pearson_of_the_expansion",
+    ),
+    "rounded normal for the joint draw": Mutation(
+        ((CUMULANTS, SHAPE, SHAPE.replace("c.shape()", "(0.0 * g for g in c.shape())")),),
+        "tests/kernels/test_joint.py::test_pearson_of_raw_counts",
+    ),
+    "skew-only expansion of the dark": Mutation(
+        (("mauvecl/scene.py", "= -1 / (72 * root)", "= 0.0"),),
+        "tests/kernels/test_poisson.py::test_no_number_of_draws_would_tell_the_expansion",
+    ),
+    "skew-only expansion of the joint draw": Mutation(
+        ((CUMULANTS, SHAPE, SHAPE.replace("    sd =", "    g2, g3 = 0 * g2, 0 * g3\n    sd =")),),
+        "tests/kernels/test_joint.py::test_no_number_of_draws_would_tell",
+    ),
+    "24-bit uniforms": Mutation(
+        (
+            (NORMAL, "TO_FLOAT(w[${2 * i}]) + 0.5f", "TO_FLOAT(w[${2 * i}] & (uintv)0xffffff00u) + 0.5f"),
+            (TWIN, "t = radius_word.astype", "t = (radius_word & np.uint32(0xFFFFFF00)).astype"),
+        ),
+        "tests/kernels/test_normal.py::test_a_thousand_million_draws",
+    ),
+    "carry of the index dropped between launches": Mutation(
+        (("mauvecl/run.py", "np.uint32(self.first >> 32)", "np.uint32(0)"),),
+        "tests/test_extremes.py::test_counter_boundaries",
+    ),
+    "carry of the index dropped within a launch": Mutation(
+        (("mauvecl/engine.py", "first = index - index % size", "first = index - index % self._step"),),
+        "tests/test_extremes.py::test_counter_boundaries",
+    ),
+    "carry of the product dropped in odd lanes": Mutation(
+        (
+            (
+                "kernels/portable.cl.mako",
+                ">> (ulong${half})32UL) * (ulong${half})factor;",
+                ">> (ulong${half})32UL) * (ulong${half})(factor & 0xffff0000u);",
+            ),
+        ),
+        "tests/kernels/test_philox.py::test_known_answers",
+    ),
+    "alias table off by one word": Mutation(
+        (("mauvecl/poisson.py", "rich << shift | left[poor]", "rich << shift | max(left[poor] - 1, 0)"),),
+        "tests/kernels/test_poisson.py::test_realised_probabilities",
+    ),
+    "alias table off by one count": Mutation(
+        (("mauvecl/poisson.py", "low + int(inside[0]))", "low + int(inside[0]) + 1)"),),
+        "tests/kernels/test_joint.py::test_pearson_of_raw_counts",
+    ),
+    "two streams alike": Mutation(
+        (("mauvecl/layout.py", '"dark": 1', '"dark": 0'),),
+        "tests/kernels/test_layout.py::test_streams_are_distinct_bytes",
+    ),
+}
+
+
+def fails(folder: Path, test: str) -> tuple[bool, str]:
+    """Whether a test fails in a copy of the project, and pytest's closing line."""
+    run = subprocess.run(
+        [sys.executable, "-m", "pytest", "-q", "-x", "-p", "no:cacheprovider", "-p", "no:xdist", test],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+    )
+    # 1: tests failed. Anything else but 0 is a broken mutation, not a noticed one.
+    if run.returncode not in (0, 1):
+        raise SystemExit(f"{test} could not be run:\n{run.stdout}{run.stderr}")
+    return run.returncode == 1, run.stdout.strip().splitlines()[-1]
+
+
+def copy(folder: Path) -> None:
+    """The project's own files, links kept."""
+    for name in ("host", "kernels", "mauvecl", "tests", "pyproject.toml"):
+        source = ROOT / name
+        if source.is_dir():
+            shutil.copytree(source, folder / name, symlinks=True, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(source, folder / name)
+
+
+def main() -> int:
+    """Print a line for each mutation."""
+    wanted = sys.argv[1:] or list(MUTATIONS)
+    unnoticed = 0
+    for name in wanted:
+        if name not in MUTATIONS:
+            raise SystemExit(f"mutation {name!r} is unknown, expected one of: {', '.join(MUTATIONS)}")
+        mutation, started = MUTATIONS[name], time.perf_counter()
+        with tempfile.TemporaryDirectory(prefix="mauvecl-mutant-") as temporary:
+            folder = Path(temporary)
+            copy(folder)
+            for file, old, new in mutation.edits:
+                text = (folder / file).read_text(encoding="utf-8")
+                if old not in text:
+                    raise SystemExit(f"mutation {name!r} is out of date: {file} no longer holds {old!r}")
+                (folder / file).write_text(text.replace(old, new), encoding="utf-8")
+            noticed, line = fails(folder, mutation.test)
+        unnoticed += not noticed
+        verdict = "noticed" if noticed else "NOT NOTICED"
+        print(f"{verdict:12s} {name}: {mutation.test} ({time.perf_counter() - started:.0f} s: {line})", flush=True)
+    print(f"{len(wanted) - unnoticed} of {len(wanted)} mutations noticed")
+    return 1 if unnoticed else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
