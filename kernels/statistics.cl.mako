@@ -1,4 +1,8 @@
 ## Every statistic of METHODS section 6 of every scenario, from one pass over common draws.
+<%
+    plain = joint and not (modulations or frames or photons or cosmic)
+    powers = (["c4"] if quartic else []) + ["c3", "c2", "c1", "c0"]
+%>\
 ## x = observed - template, whole DN: what is left of the template's fraction of a DN is a constant of each sum.
 /* Four sums side by side, by pixel number modulo four: one alone would wait for each addition to end. */
 typedef struct { floatv a, b, c, d; } Four;
@@ -99,19 +103,41 @@ void statistics(SCENE, const uint first_low, const uint first_high,
             for (uint i = 0; i < CHUNK; i += 4u) {
                 /* Four pixels at once: addresses without an index, and sums that need not wait for each other. */
                 __global const Level *four = level + i;
-                floatv y[${vectors}][4];
+                floatv y[${vectors}][4], term[${vectors}];
 % for j, part in enumerate("abcd"):
+% if plain:
+                /* As analogue() and digitise() have it, steps of the vectors in turn. */
+% for v in range(vectors):
+                y[${v}][${j}] = (floatv)four[${j}].${powers[0]};
+% endfor
+% for power in powers[1:]:
+% for v in range(vectors):
+                y[${v}][${j}] = FMA(drawn[${v}].z[i + ${j}u], y[${v}][${j}], (floatv)four[${j}].${power});
+% endfor
+% endfor
+% for v in range(vectors):
+                y[${v}][${j}] = digitise(y[${v}][${j}], edges + here + i + ${j}u) - four[${j}].shift;
+% endfor
+% else:
 % for v in range(vectors):
 % if frames:
                 y[${v}][${j}] = t[k][${v}][i + ${j}u] + edges[here + i + ${j}u].whole;
 % else:
                 y[${v}][${j}] = digitise(analogue(SCENE_PASSED, drawn + ${v}, i + ${j}u, four + ${j}, start + i + ${j}u, here + i + ${j}u, factors + ${v}), edges + here + i + ${j}u) - four[${j}].shift;
 % endif
-                sum[${v}].${part} = FMA(y[${v}][${j}], FMA(y[${v}][${j}], (floatv)four[${j}].inverse_variance, (floatv)four[${j}].twice), sum[${v}].${part});
-% if linear:
-                own_sum[${v}].${part} = FMA(y[${v}][${j}], (floatv)own_weight[i + ${j}u], own_sum[${v}].${part});
-% endif
 % endfor
+% endif
+% for v in range(vectors):
+                term[${v}] = FMA(y[${v}][${j}], (floatv)four[${j}].inverse_variance, (floatv)four[${j}].twice);
+% endfor
+% for v in range(vectors):
+                sum[${v}].${part} = FMA(y[${v}][${j}], term[${v}], sum[${v}].${part});
+% endfor
+% if linear:
+% for v in range(vectors):
+                own_sum[${v}].${part} = FMA(y[${v}][${j}], (floatv)own_weight[i + ${j}u], own_sum[${v}].${part});
+% endfor
+% endif
 % endfor
 % if linear or pair:
                 if (again_needed) {
