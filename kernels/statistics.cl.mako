@@ -149,11 +149,10 @@ void statistics(SCENE, const uint first_low, const uint first_high,
                 }
 % endif
 % if elements:
-                if (!pixel[i].end_among_four) {
+                if (!pixel[i].four_uneven) {
                     /* Most of the time: one addition to wait for. */
 % for v in range(vectors):
-                    inside[${v}] += FMA(y[${v}][0], (floatv)pixel[i].used, y[${v}][1] * pixel[i + 1u].used)
-                                  + FMA(y[${v}][2], (floatv)pixel[i + 2u].used, y[${v}][3] * pixel[i + 3u].used);
+                    inside[${v}] += (y[${v}][0] + y[${v}][1]) + (y[${v}][2] + y[${v}][3]);
 % endfor
                 } else {
                     for (uint j = 0; j < 4u; j++) {

@@ -48,7 +48,7 @@ JOB = np.dtype(
 )
 
 #: What all scenarios share in one pixel.
-PIXEL = np.dtype([("used", "f4"), ("element_end", "u4"), ("end_among_four", "u4"), ("cosmic_gain", "f4")])
+PIXEL = np.dtype([("used", "f4"), ("element_end", "u4"), ("four_uneven", "u4"), ("cosmic_gain", "f4")])
 
 #: One scenario in one pixel, read in every inner loop: coefficients of the draw as a polynomial of z, the whole DN
 #: that separate `nearest`'s result from the template's, the template's inverse variance, and twice that times the

@@ -344,13 +344,10 @@ def statistics(
         for p, pixel in enumerate(scene.pixels):
             slope = fma(x[k, p], level[p]["inverse_variance"], level[p]["twice"])
             parts[p % 4] = fma(x[k, p], slope, parts[p % 4])
-            if pixel["end_among_four"]:
+            if pixel["four_uneven"]:
                 inside = fma(x[k, p], pixel["used"], inside)
             elif p % 4 == 0:
-                used = scene.pixels["used"][p : p + 4]
-                inside = inside + (
-                    fma(x[k, p], used[0], x[k, p + 1] * used[1]) + fma(x[k, p + 2], used[2], x[k, p + 3] * used[3])
-                )
+                inside = inside + ((x[k, p] + x[k, p + 1]) + (x[k, p + 2] + x[k, p + 3]))
             if pixel["element_end"]:
                 inside = inside + edge[p]["element_offset"]
                 chi2_element[:] = fma(inside * inside, edge[p]["inverse_element_variance"], chi2_element)

@@ -202,7 +202,9 @@ def prepare(
     pixels["used"][:n_pixel] = used
     ends = np.append(np.diff(quiet.element) > 0, True)
     pixels["element_end"][:n_pixel] = ends
-    pixels["end_among_four"] = np.repeat(pixels["element_end"].reshape(-1, 4).any(axis=1), 4)
+    # Fours within one element that all count need no look at each pixel.
+    uneven = (pixels["element_end"] > 0) | (pixels["used"] == 0)
+    pixels["four_uneven"] = np.repeat(uneven.reshape(-1, 4).any(axis=1), 4)
     pixels["cosmic_gain"][:n_pixel] = quiet.gain_dn_per_electron
     darks, dark_centre = np.zeros(padded, layout.POISSON), np.zeros(n_pixel)
     if not joint:
