@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 #: Realisations, times frames, counted on the device before its 32-bit bins and 64-bit sums are emptied.
 MOST_COUNTED = 2**25
-#: Work-items to an element in a histogram on a device of many.
-ITEMS_PER_ELEMENT = 1024
+#: Work-items to an element or channel of a histogram, on a device of many.
+SHARES = 1024
 
 
 @dataclass(frozen=True)
@@ -168,7 +168,7 @@ class Run:
     def histogram(self, tile: Tile, counts: Counts) -> None:
         """Count each pixel's DN and each element's S/N of a tile on the device."""
         width = self._variant.width
-        items = (self._n_element,) if width > 1 else (self._n_element, min(tile.wanted, ITEMS_PER_ELEMENT))
+        items = (self._n_element,) if width > 1 else (self._n_element, min(tile.wanted, SHARES))
         self._launch(
             "histogram",
             items,
@@ -233,14 +233,16 @@ class Run:
 
     def tally(self, tile: Tile, tally: Tally) -> None:
         """Add a tile's channels to the histograms and integer sums on the device."""
+        count = len(tally.grids)
+        shares = 1 if self._variant.width > 1 else SHARES
         if "grids" not in self._named:
             self._named["grids"] = self.upload(Grid.pack(tally.grids))
-            self._named["histogram"] = self.upload(np.zeros((len(tally.grids), layout.BINS), np.uint32))
-            self._named["sums"] = self.upload(np.zeros((len(tally.grids), 2), np.int64))
+            self._named["histogram"] = self.upload(np.zeros((count, layout.BINS), np.uint32))
+            self._named["sums"] = self.upload(np.zeros((count, shares, 2), np.int64))
         named = self._named
         self._launch(
             "tally",
-            (len(tally.grids),),
+            (count,) if shares == 1 else (count, shares),
             *tile.rows(),
             np.uint32(tile.size),
             named["values"],
@@ -255,9 +257,10 @@ class Run:
 
     def flush(self, tally: Tally) -> None:
         """Move the device's histograms and sums to the host."""
-        histogram = self._emptied(self._named["histogram"], (len(tally.grids), layout.BINS))
-        sums = self._emptied(self._named["sums"], (len(tally.grids), 2), np.int64)
-        tally.add(histogram, sums, self._counted)
+        count = len(tally.grids)
+        histogram = self._emptied(self._named["histogram"], (count, layout.BINS))
+        sums = self._emptied(self._named["sums"], (count, self._named["sums"].size // (16 * count), 2), np.int64)
+        tally.add(histogram, sums.sum(axis=1), self._counted)
         self._counted = 0
 
 
