@@ -222,7 +222,7 @@ def render(rooms: tuple[str, ...], variant: Variant) -> str:
         "limit": layout.STEP_LIMIT,
         "structs": {name: dtype.names for name, dtype in layout.STRUCTS.items()},
     }
-    names = (*(ROOMS if rooms != ("tally",) else ()), *rooms)
+    names = (*ROOMS, *rooms)
     folder = files("mauvecl.kernels")
     texts = [folder.joinpath(f"{name}.cl.mako").read_text(encoding="utf-8") for name in names]
     structs = layout.c_structs()

@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 
 #: Realisations, times frames, counted on the device before its 32-bit bins and 64-bit sums are emptied.
 MOST_COUNTED = 2**25
+#: Kernels of a detection.
+DETECTION = ("statistics", "tally")
 #: Work-items to an element or channel of a histogram, on a device of many.
 SHARES = 1024
 
@@ -113,7 +115,9 @@ class Run:
 
     def _launch(self, name: str, items: tuple[int, ...], *arguments: Any) -> None:
         if name not in self._kernels:
-            self._kernels[name] = self._cl.Kernel(self._engine.program((name,), self._variant), name)
+            # One build for the two that are always used together.
+            rooms = DETECTION if name in DETECTION else (name,)
+            self._kernels[name] = self._cl.Kernel(self._engine.program(rooms, self._variant), name)
         local = (1,) * len(items) if self._variant.width > 1 else None
         self._kernels[name](self._queue, items, local, *arguments)
 
