@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: demo test lint docs bench clean
+.PHONY: demo test lint docs mutants clean
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "mauvecl needs Python 3.11 or newer, found " + sys.version.split()[0])'
@@ -28,5 +28,8 @@ lint: .venv/test.stamp .venv/lint.stamp
 docs: .venv/docs.stamp
 	$(BIN)/sphinx-build -W -q -b html docs docs/_build
 
+mutants: .venv/test.stamp
+	$(BIN)/python tools/mutation_check.py
+
 clean:
-	rm -rf .venv demo build docs/_build *.egg-info
+	rm -rf .venv demo build docs/_build docs/_generated *.egg-info

@@ -74,7 +74,7 @@ def main() -> None:
             print(*table[-1], flush=True)
     for name, unit, form, text in (
         ("seconds", "s", ".3f", "shortest of three"),
-        ("rate", "1 / s", ".2e", "pixel draws per second: realisations x pixels x scenarios, x frames drawn one by one"),
+        ("rate", "1 / s", ".2e", "pixel draws per second: realisations x pixels x scenarios x frames drawn one by one"),
         ("peak", "MiB", ".0f", "largest resident memory of the process"),
         ("above_start", "MiB", ".0f", "of it, beyond what the process had after its first 64 realisations"),
     ):

@@ -2,8 +2,8 @@
 
     python bench/pearson.py [--draws 1e10] [--device NAME] [--output bench/results/pearson.ecsv]
 
-Without read noise the raw count is the Poisson count, by alias table and by expansion; with it the joint draw is compared
-with the exact convolution. A sound engine gives p below 1e-6 once in a million new seeds. Exit code 1 on a p below that.
+Without read noise the raw count is the Poisson count, by alias table and by expansion; with it the joint draw is
+compared with the exact convolution. A sound engine gives p below 1e-6 once in half a million new seeds.
 """
 
 from __future__ import annotations

@@ -142,9 +142,9 @@ def main() -> None:
     for name, which in (("rate", "median"), ("best", "shortest")):
         table[name].unit = "1 / s"
         table[name].info.format = ".2e"
-        table[name].info.description = (
-            f"pixel-realisations per second, counted per scenario, by the {which} of {REPEATS} times"
-        )
+        table[
+            name
+        ].info.description = f"pixel-realisations per second, counted per scenario, by the {which} of {REPEATS} times"
     table["slower"].info.description = "how many times slower than the engine's chi2 of one scenario"
     table.meta = {
         "device": engine.device_name,

@@ -59,23 +59,23 @@ def main() -> int:
             [sys.executable, "-c", CHILD], env=vendors(Path(folder)), stdout=subprocess.PIPE, text=True, check=True
         )
     found = [json.loads(line) for line in run.stdout.splitlines()]
-    columns = {"case": [], "part": [], "twin": []} | {str(i): [] for i in range(len(found))}
+    columns = {"case": [], "part": [], "twin": []} | {f"device {i}": [] for i in range(len(found))}
     for name, parts in twin.items():
         for part, digest in parts.items():
             columns["case"].append(name)
             columns["part"].append(part)
             columns["twin"].append(digest)
             for i, one in enumerate(found):
-                columns[str(i)].append(one["digests"][name][part])
+                columns[f"device {i}"].append(one["digests"][name][part])
     table = Table(columns)
     same = True
     for i, one in enumerate(found):
         device = one["device"]
         label = f"{device['platform']}: {device['name']}, driver {device['driver']}"
-        equal = one["scalar"] and list(table[str(i)]) == list(table["twin"])
+        equal = one["scalar"] and list(table[f"device {i}"]) == list(table["twin"])
         same &= equal
         print(f"{i} = {label}; promises: {device['promise']}; {'EQUAL' if equal else 'DIFFERENT'}")
-        table.meta[str(i)] = f"{label}; promises: {device['promise']}"
+        table.meta[f"device {i}"] = f"{label}; promises: {device['promise']}"
     table.pprint(max_lines=-1, max_width=-1)
     if output is not None:
         table.write(output, format="ascii.ecsv", overwrite=True)

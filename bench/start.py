@@ -1,6 +1,6 @@
 """What a user waits for before anything is drawn: imports, help, building the kernels, starting from the cache.
 
-    python bench/start.py [--output bench/results/start.ecsv]
+python bench/start.py [--output bench/results/start.ecsv]
 """
 
 from __future__ import annotations

@@ -1,6 +1,9 @@
 """Sphinx configuration."""
 
 from importlib.metadata import version as installed
+from pathlib import Path
+
+from astropy.table import Table
 
 project = "mauvecl"
 author = "the mauvecl developers"
@@ -11,9 +14,29 @@ extensions = [
     "sphinx.ext.autodoc",
     "sphinx.ext.mathjax",
 ]
+myst_heading_anchors = 3
 myst_enable_extensions = ["dollarmath", "amsmath"]
 html_theme = "pydata_sphinx_theme"
+smartquotes = False
 html_title = "mauvecl"
-exclude_patterns = ["_build"]
+exclude_patterns = ["_build", "_generated"]
 numpydoc_show_class_members = False
 autodoc_typehints = "none"
+
+
+def bench_tables() -> None:
+    """The benches' last results as tables that a page includes."""
+    folder = Path(__file__).parent / "_generated"
+    folder.mkdir(exist_ok=True)
+    for path in (Path(__file__).parent.parent / "bench" / "results").glob("*.ecsv"):
+        table = Table.read(path)
+        head = [f"{name} ({table[name].unit})" if table[name].unit else name for name in table.colnames]
+        rows = [head, *([format(row[name], table[name].info.format or "") for name in table.colnames] for row in table)]
+        lines = [".. list-table::", "   :header-rows: 1", ""]
+        for row in rows:
+            lines += [f"   {'* -' if i == 0 else '  -'} {cell}" for i, cell in enumerate(row)]
+        lines += ["", *(f"- {key}: {value}" for key, value in table.meta.items()), ""]
+        (folder / f"{path.stem}.rst").write_text("\n".join(lines), encoding="utf-8")
+
+
+bench_tables()

@@ -82,7 +82,7 @@ def detect(study: Study, engine: Engine) -> DetectAnswer:
             realisations=study.run.realisations,
             seed=study.run.seed,
             statistics=study.run.statistics,
-            mode=study.observation.mode,
+            **study.drawing,
         )
         table = found.table(study.run.fap)
         table.replace_column("name", [label(star, quiet)] * len(table))
@@ -134,7 +134,7 @@ def snr(study: Study, engine: Engine) -> SnrAnswer:
     stars = [
         (
             label(star, x),
-            engine.snr(x, realisations=run.realisations, seed=run.seed, mode=study.observation.mode),
+            engine.snr(x, realisations=run.realisations, seed=run.seed, **study.drawing),
         )
         for star, x in zip(study.star, prepared, strict=True)
     ]
@@ -157,7 +157,7 @@ def simulate(study: Study, *, realisation: int = 0, flaring: bool = False) -> Si
         xs = study.expectations(star) if flaring else study.expect([star.source()])
         for i, x in enumerate(xs):
             title = label(star, x) + (f", flare {100 * study.flare.amplitudes[i - 1]:g} %" if i else "")
-            table = components(x, realisation=realisation, seed=study.run.seed, mode=study.observation.mode)
+            table = components(x, realisation=realisation, seed=study.run.seed, **study.drawing)
             table.meta["study"] = study.toml()
             observations.append((title, x, table))
         everything += xs

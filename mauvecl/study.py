@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import tomllib
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from mauvecl.host.instrument import Instrument
     from mauvecl.host.sky import Sky
     from mauvecl.host.source import Source
+    from mauvecl.processes import Prior, Processes
 
 
 class _Part(BaseModel):
@@ -65,6 +66,7 @@ class Observation(_Part):
     temperature_c: float | None = None
     order: Literal["paper", "physical"] = "paper"
     mode: Literal["auto", "frames", "stacked"] = "auto"
+    recipe: Literal["auto", "joint", "apart"] = "auto"
 
 
 #: V mag arcsec-2 where a study says nothing of the sky: the ecliptic opposite the Sun.
@@ -103,6 +105,66 @@ class SkyLight(_Part):
         return Sky.none() if self.surface_brightness is None else Sky.of_brightness(self.surface_brightness)
 
 
+class PriorText(_Part):
+    """What is known of a value that differs from realisation to realisation: flat, or normal and cut."""
+
+    uniform: tuple[float, float] | None = None
+    normal: tuple[float, float] | None = None
+    between: tuple[float, float] | None = None
+
+    @model_validator(mode="after")
+    def _one_shape(self) -> Self:
+        if (self.uniform is None) == (self.normal is None) or (self.normal is None) != (self.between is None):
+            raise ValueError(
+                "a prior is neither { uniform = [low, high] } nor { normal = [mean, sd], between = [low, high] }, "
+                "expected one of them"
+            )
+        self.prior()
+        return self
+
+    def prior(self) -> Prior:
+        """As the engine takes it."""
+        from mauvecl.processes import Normal, Uniform
+
+        if self.normal is not None and self.between is not None:
+            return Normal(*self.normal, *self.between)
+        return Uniform(*(self.uniform or (0.0, 0.0)))  # one of the two is there
+
+
+class Rays(_Part):
+    """Cosmic-ray hits; see `processes.CosmicRays`."""
+
+    rate_per_cm2_s: float = 1.0
+    area_cm2: float = 0.057
+    electrons: tuple[float, float] = (500.0, 1000.0)
+    weights: tuple[float, ...] | None = None
+
+
+class NoiseProcesses(_Part):
+    """Optional noise processes, all off unless named; see `processes.Processes`."""
+
+    cosmic_rays: Rays | None = None
+    jitter: PriorText | None = None
+    detector_temperature: PriorText | None = None
+    light_loss: PriorText | None = None
+    pointing_loss: PriorText | None = None
+    qe_scale: PriorText | None = None
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        self.processes()
+        return self
+
+    def processes(self) -> Processes:
+        """As the engine takes them."""
+        from mauvecl.processes import CosmicRays, Processes
+
+        rays = None if self.cosmic_rays is None else CosmicRays(**self.cosmic_rays.model_dump())
+        names = [name for name in type(self).model_fields if name != "cosmic_rays"]
+        given = {name: getattr(self, name) for name in names}
+        return Processes(rays, **{name: None if text is None else text.prior() for name, text in given.items()})
+
+
 class Run(_Part):
     """How much is drawn, and what is asked of it."""
 
@@ -123,6 +185,7 @@ class Study(_Part):
     flare: Flare = Flare()
     observation: Observation = Observation()
     sky: SkyLight = SkyLight()
+    processes: NoiseProcesses = NoiseProcesses()
     run: Run = Run()
 
     @classmethod
@@ -177,6 +240,8 @@ class Study(_Part):
         data = self.model_dump(mode="json", exclude_none=True)
         if not self.sky.none:
             del data["sky"]["none"]
+        if not data["processes"]:
+            del data["processes"]
         for star in data["star"]:
             if "file" in star:
                 star["file"] = str(Path(star["file"]).resolve())
@@ -189,6 +254,12 @@ class Study(_Part):
         found = Instrument.load(self.observation.instrument)
         wanted = self.observation.temperature_c
         return found if wanted is None else found.with_(temperature_c=wanted)
+
+    @property
+    def drawing(self) -> dict[str, Any]:
+        """How the engine is to draw: mode, recipe, processes."""
+        o = self.observation
+        return {"mode": o.mode, "recipe": o.recipe, "processes": self.processes.processes()}
 
     def expectations(self, star: Star) -> list[Expectation]:
         """A star without a flare, then with each of the flares."""
@@ -232,8 +303,13 @@ def _sentence(model: type[BaseModel], error: ValidationError) -> str:
 
 def _fields(model: type[BaseModel], path: list[str]) -> Any:
     for part in path:
-        if part.isdigit():
-            continue
-        annotation = model.model_fields[part].annotation
-        model = Star if part == "star" else annotation  # type: ignore[assignment]
+        if not part.isdigit():
+            model = _model_in(model.model_fields[part].annotation) or model
     return model.model_fields
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    """The model in a type such as `Star | None` or `tuple[Star, ...]`."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next((model for part in get_args(annotation) if (model := _model_in(part))), None)

@@ -15,6 +15,11 @@ import pytest
 from astropy.io import fits
 from astropy.table import QTable
 
+from mauvecl import answer
+from mauvecl.engine import Engine
+from mauvecl.processes import CosmicRays, Normal, Processes, Uniform
+from mauvecl.study import Star, Study
+
 COMMAND = [sys.executable, "-m", "mauvecl"]
 
 
@@ -111,11 +116,48 @@ def test_a_study_file_and_flags(tmp_path: Path) -> None:
 
 
 def test_a_study_may_redden_its_star() -> None:
-    from mauvecl.study import Star
-
     plain, behind = (Star(library="G2V", magnitude=7.4, ebv=e).source() for e in (None, 0.3))
     assert behind.magnitude("V") == pytest.approx(plain.magnitude("V"), abs=1e-9)
     assert behind.magnitude("GALEX NUV") > plain.magnitude("GALEX NUV") + 1
+
+
+PROCESSES = """
+[[star]]
+library = "G2V"
+magnitude = 6
+[flare]
+amplitudes = [0.1]
+[observation]
+exposure_s = 10
+recipe = "joint"
+[processes]
+jitter = { uniform = [0.0, 0.05] }
+detector_temperature = { normal = [21, 2], between = [13, 25] }
+[processes.cosmic_rays]
+rate_per_cm2_s = 500
+[run]
+realisations = 2000
+fap = 0.1
+"""
+
+
+def test_a_study_may_ask_for_processes(tmp_path: Path, engine: Engine) -> None:
+    """As the engine given them in Python, and written back as they were read."""
+    (tmp_path / "study.toml").write_text(PROCESSES)
+    study = Study.read(tmp_path / "study.toml")
+    processes = Processes(
+        CosmicRays(rate_per_cm2_s=500), jitter=Uniform(0.0, 0.05), detector_temperature=Normal(21, 2, 13, 25)
+    )
+    assert study.drawing == {"mode": "auto", "recipe": "joint", "processes": processes}
+    (tmp_path / "again.toml").write_text(study.toml())
+    assert Study.read(tmp_path / "again.toml") == study
+    found = answer.detect(study, engine).stars[0].found
+    quiet, *flares = study.expectations(study.star[0])
+    wanted = engine.detect(quiet, flares, realisations=2000, seed=1, processes=processes)
+    np.testing.assert_array_equal(found.distribution("chi2", 0).counts, wanted.distribution("chi2", 0).counts)
+    plain = engine.detect(quiet, flares, realisations=2000, seed=1)
+    assert (found.distribution("chi2", 0).counts != plain.distribution("chi2", 0).counts).any()
+    assert "cosmic_rays" in answer.simulate(study).observations[0][2].colnames
 
 
 def test_simulate(tmp_path: Path) -> None:
@@ -228,6 +270,11 @@ def test_bad_input_is_a_sentence_and_exit_code_2(name: str, tmp_path: Path) -> N
         ("[flare]\namplitudes = []", "flare.amplitudes"),
         ("[[star]]\nmagnitude = 3", "expected one of them"),
         ("[observation]\nexposure_s = 'long'", "observation.exposure_s = 'long'"),
+        ("[processes]\njitter = { unform = [0, 1] }", "unknown key 'processes.jitter.unform', did you mean 'uniform'?"),
+        ("[processes]\njitter = { normal = [0, 1] }", "a prior is neither"),
+        ("[processes]\njitter = { uniform = [0.05, 0] }", "a uniform prior from 0.05 to 0"),
+        ("[processes]\njitter = { uniform = [0, 0.9] }", "the prior of jitter runs from 0 to 0.9, expected 0 to 0.5"),
+        ("[processes.cosmic_rays]\nrate_per_cm2_s = -1", "cosmic rays of -1 per cm^2 s"),
     ],
 )
 def test_bad_studies_are_a_sentence(text: str, sentence: str, tmp_path: Path) -> None:
