@@ -6,11 +6,12 @@ import json
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
-from mauvecl import __version__
+from mauvecl import __version__, verbs
+from mauvecl.cli_limits import detection_map, limit
 from mauvecl.flags import (
     AmplitudeFlag,
     BandFlag,
@@ -27,6 +28,7 @@ from mauvecl.flags import (
     QuietFlag,
     RealisationsFlag,
     SeedFlag,
+    SetFlag,
     SkyFlag,
     StarFlag,
     StatisticFlag,
@@ -36,10 +38,6 @@ from mauvecl.flags import (
     TimeFlag,
     study_from_flags,
 )
-
-if TYPE_CHECKING:
-    from mauvecl.console import Meter
-    from mauvecl.engine import Engine
 
 app = typer.Typer(
     name="mauvecl",
@@ -51,36 +49,6 @@ app = typer.Typer(
     "Start with `mauvecl detect`, which answers the question of the MauveSim paper. The throughput is nominal, not a "
     "flight calibration. Exit codes: 0 done, 2 bad input, 130 interrupted.",
 )
-
-
-def _engine(device: str | None, meter: Meter) -> Engine:
-    from mauvecl.engine import Engine
-
-    return Engine(device, progress=meter)
-
-
-def _say(lines: list[str], *, as_json: bool) -> None:
-    from mauvecl.console import show
-
-    if not as_json:
-        show(lines)
-
-
-def _pictures_wanted(pictures: bool, *, quiet: bool, as_json: bool) -> bool:
-    from mauvecl.pictures import available
-
-    if pictures and not available():
-        if not quiet:
-            _say(["No pictures: matplotlib is missing, `pip install 'mauvecl[plot]'` brings it."], as_json=as_json)
-        return False
-    return pictures
-
-
-def _finish(files: list[Path], started: float, *, quiet: bool, as_json: bool) -> None:
-    if not quiet:
-        names = ", ".join(path.name for path in files)
-        seconds = time.perf_counter() - started
-        _say([f"Wrote {names} to {files[0].parent}/ in {seconds:.1f} s."], as_json=as_json)
 
 
 @app.command()
@@ -157,7 +125,7 @@ def selftest(
     started = time.perf_counter()
     folder = None if output is None else report.make_folder(output)
     with Meter(quiet=quiet or as_json) as meter:
-        engine = _engine(device, meter)
+        engine = verbs.engine(device, meter)
         checks = selftest.run(engine)
     seconds = time.perf_counter() - started
     selftest.keep(engine, checks, seconds)
@@ -170,9 +138,20 @@ def selftest(
         cells = [("PASS" if check.passed else "FAIL", check.name, check.found) for check in checks]
         show_table(f"Self-test of {engine.device_name}, driver {engine.driver}", ("", "check", "found"), cells)
         outcome = f"{failed} of {len(checks)} checks FAILED" if failed else f"All {len(checks)} checks passed"
-        _say([f"{outcome} in {seconds:.0f} s. Promise: {engine.device.promise}."], as_json=as_json)
+        verbs.say([f"{outcome} in {seconds:.0f} s. Promise: {engine.device.promise}."], as_json=as_json)
     if failed:
         raise typer.Exit(1)
+
+
+@app.command()
+def schema() -> None:
+    """Print the JSON schema of study files, for editors that check TOML.
+
+    Example: mauvecl schema > study.schema.json, and a first line #:schema study.schema.json in the study
+    """
+    from mauvecl.study import Study
+
+    print(json.dumps(Study.model_json_schema(), indent=2))
 
 
 @app.command()
@@ -191,6 +170,7 @@ def simulate(
     flare_temperature: FlareTemperatureFlag = None,
     flare_band: FlareBandFlag = None,
     seed: SeedFlag = None,
+    settings: SetFlag = None,
     realisation: Annotated[int, typer.Option(min=0, help="Which realisation to show.")] = 0,
     output: OutputFlag = None,
     as_json: JsonFlag = False,
@@ -206,14 +186,14 @@ def simulate(
     started = time.perf_counter()
     study = study_from_flags(
         study_file, star=star, magnitude=magnitude, band=band, exposure=exposure, instrument=instrument,
-        temperature=temperature, sky=sky, target=target, when=when,
+        temperature=temperature, sky=sky, target=target, when=when, settings=settings,
         flare={"amplitudes": amplitude, "temperature_k": flare_temperature, "band": flare_band}, run={"seed": seed},
     )  # fmt: skip
     folder = report.make_folder(output or Path("mauvecl-simulate"))
     found = answer.simulate(study, realisation=realisation, flaring=bool(amplitude))
-    _say(found.messages, as_json=as_json)
+    verbs.say(found.messages, as_json=as_json)
     files, summary = [], []
-    draw = _pictures_wanted(pictures, quiet=quiet, as_json=as_json)
+    draw = verbs.pictures_wanted(pictures, quiet=quiet, as_json=as_json)
     for number, (title, x, table) in enumerate(found.observations, 1):
         stem = f"observation-{number}"
         files += [report.write_table(table, folder / f"{stem}{ending}") for ending in (".ecsv", ".fits")]
@@ -259,7 +239,7 @@ def simulate(
             for s in summary
         ],
     )  # fmt: skip
-    _finish(files, started, quiet=quiet, as_json=as_json)
+    verbs.finish(files, started, quiet=quiet, as_json=as_json)
 
 
 @app.command()
@@ -278,6 +258,7 @@ def snr(
         int | None, typer.Option("--realisations", "-n", help="Noise realisations [100000].", show_default=False)
     ] = None,
     seed: SeedFlag = None,
+    settings: SetFlag = None,
     device: DeviceFlag = None,
     output: OutputFlag = None,
     as_json: JsonFlag = False,
@@ -296,14 +277,14 @@ def snr(
         realisations = 100_000
     study = study_from_flags(
         study_file, star=star, magnitude=magnitude, band=band, exposure=exposure, instrument=instrument,
-        temperature=temperature, sky=sky, target=target, when=when,
+        temperature=temperature, sky=sky, target=target, when=when, settings=settings,
         run={"seed": seed, "realisations": realisations},
     )  # fmt: skip
     folder = report.make_folder(output or Path("mauvecl-snr"))
     with Meter(quiet=quiet or as_json) as meter:
-        engine = _engine(device, meter)
+        engine = verbs.engine(device, meter)
         found = answer.snr(study, engine)
-    _say(found.messages, as_json=as_json)
+    verbs.say(found.messages, as_json=as_json)
     files, cells, data = [], [], []
     for number, (title, result) in enumerate(found.stars, 1):
         for what, table in (("pixel", result.pixel), ("element", result.element)):
@@ -317,7 +298,7 @@ def snr(
                 (title, f"{row['wavelength'].value:.1f}", f"{row['expected']:.2f}", f"{row['mean']:.2f}",
                  f"{row['std']:.2f}", f"{row['q2.5']:.2f}", f"{row['q50']:.2f}", f"{row['q97.5']:.2f}")
             )  # fmt: skip
-    if _pictures_wanted(pictures, quiet=quiet, as_json=as_json):
+    if verbs.pictures_wanted(pictures, quiet=quiet, as_json=as_json):
         from mauvecl.pictures import signal_to_noise
 
         files.append(signal_to_noise(found.stars, folder / "snr.png"))
@@ -341,7 +322,7 @@ def snr(
         ("star", "nm", "closed form", "mean", "std", "2.5 %", "50 %", "97.5 %"),
         cells,
     )
-    _finish(files, started, quiet=quiet, as_json=as_json)
+    verbs.finish(files, started, quiet=quiet, as_json=as_json)
 
 
 @app.command()
@@ -361,6 +342,7 @@ def detect(
     flare_band: FlareBandFlag = None,
     realisations: RealisationsFlag = None,
     seed: SeedFlag = None,
+    settings: SetFlag = None,
     statistic: StatisticFlag = None,
     fap: FapFlag = None,
     device: DeviceFlag = None,
@@ -382,17 +364,17 @@ def detect(
     started = time.perf_counter()
     study = study_from_flags(
         study_file, star=star, magnitude=magnitude, band=band, exposure=exposure, instrument=instrument,
-        temperature=temperature, sky=sky, target=target, when=when,
+        temperature=temperature, sky=sky, target=target, when=when, settings=settings,
         flare={"amplitudes": amplitude, "temperature_k": flare_temperature, "band": flare_band},
         run={"realisations": realisations, "seed": seed, "statistics": statistic, "fap": fap},
     )  # fmt: skip
     folder = report.make_folder(output or Path("mauvecl-detect"))
     with Meter(quiet=quiet or as_json) as meter:
-        engine = _engine(device, meter)
+        engine = verbs.engine(device, meter)
         found = answer.detect(study, engine)
-    _say(found.messages, as_json=as_json)
+    verbs.say(found.messages, as_json=as_json)
     files = [report.write_table(found.table, folder / "detection.ecsv")]
-    if _pictures_wanted(pictures, quiet=quiet, as_json=as_json):
+    if verbs.pictures_wanted(pictures, quiet=quiet, as_json=as_json):
         from mauvecl.pictures import detection, spectra
 
         amplitudes = study.flare.amplitudes
@@ -428,8 +410,12 @@ def detect(
             for row in found.table
         ],
     )  # fmt: skip
-    _say(found.paper, as_json=as_json)
-    _finish(files, started, quiet=quiet, as_json=as_json)
+    verbs.say(found.paper, as_json=as_json)
+    verbs.finish(files, started, quiet=quiet, as_json=as_json)
+
+
+app.command()(limit)
+app.command("map")(detection_map)
 
 
 def _version(wanted: bool) -> None:

@@ -20,8 +20,8 @@ class Meter:
     On a terminal it is a bar; elsewhere a plain line every ten seconds.
     """
 
-    def __init__(self, *, quiet: bool = False) -> None:
-        self._quiet = quiet
+    def __init__(self, *, quiet: bool = False, unit: str = "realisations") -> None:
+        self._quiet, self._unit = quiet, unit
         self._started = self._shown = time.monotonic()
         self._last = 0
         self._bar: Progress | None = None
@@ -36,7 +36,7 @@ class Meter:
             print("mauvecl: interrupted; nothing was written, and nothing is half written", file=sys.stderr)
 
     def __call__(self, done: int, total: int) -> None:
-        """Take note of work done, in realisations."""
+        """Take note of work done, in the meter's unit."""
         now = time.monotonic()
         if done < self._last:
             # The next star's work begins.
@@ -51,7 +51,7 @@ class Meter:
             self._shown = now
             rate = done / (now - self._started)
             print(
-                f"{done} of {total} realisations, {rate:.3g} a second, {(total - done) / rate:.0f} s left",
+                f"{done} of {total} {self._unit}, {rate:.3g} a second, {(total - done) / rate:.0f} s left",
                 file=sys.stderr,
             )
 
@@ -64,7 +64,7 @@ class Meter:
                 TextColumn("drawing"),
                 BarColumn(),
                 TaskProgressColumn(),
-                TextColumn("{task.fields[rate]} realisations/s"),
+                TextColumn(f"{{task.fields[rate]}} {self._unit}/s"),
                 TimeRemainingColumn(),
                 TextColumn("left"),
                 console=Console(stderr=True),
@@ -101,7 +101,9 @@ def show_table(title: str, columns: Sequence[str], cells: Sequence[Sequence[Any]
     if not console.is_terminal:
         # Piped: as wide as it needs to be.
         console = Console(highlight=False, width=200)
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD)
+    # A table's own title would be broken at the table's width.
+    console.print(title, markup=False, soft_wrap=True)
+    table = Table(box=box.SIMPLE_HEAD)
     for i, name in enumerate(columns):
         numeric = all(isinstance(row[i], str) and row[i][:1] in "0123456789-+.<>=" for row in cells) and bool(cells)
         table.add_column(name, justify="right" if numeric else "left", no_wrap=True)

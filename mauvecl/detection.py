@@ -14,13 +14,16 @@ from mauvecl.layout import FIXED_STATISTICS
 from mauvecl.scene import Scene
 from mauvecl.statistics import (
     STATISTICS,
+    UV_NM,
     Interval,
+    Linear,
     Normal,
     QuadraticForm,
     central_counts,
     clopper_pearson,
     closed_form,
     matched_weights,
+    uv_weights,
 )
 from mauvecl.tally import Distribution, Grid, Tally
 
@@ -85,28 +88,70 @@ class Detection:
     ----------
     quiet : Expectation
     flares : tuple of Expectation
-    statistics : tuple of str
+    asked : sequence of str or Linear
+        Statistics.
     scene : Scene
     realisations : int
+    statistics : tuple of str
+        Their names.
     """
 
     quiet: Expectation
     flares: tuple[Expectation, ...]
-    statistics: tuple[str, ...]
+    asked: Sequence[str | Linear]
     scene: Scene
     realisations: int
-    _found: dict[Key, Distribution] = field(default_factory=dict, repr=False)
+    statistics: tuple[str, ...] = field(init=False)
+    _own: dict[str, NDArray[np.float64]] = field(default_factory=dict, init=False, repr=False)
+    _found: dict[Key, Distribution] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
+        names = [one.name if isinstance(one, Linear) else one for one in self.asked]
+        self.statistics = tuple(dict.fromkeys(names))
         if not self.statistics:
             raise InputError(f"no statistic named, expected some of {', '.join(STATISTICS)}")
-        for name in self.statistics:
-            if name not in STATISTICS:
-                raise InputError(f"statistic {name!r} is unknown, expected one of {', '.join(STATISTICS)}")
+        for one in self.asked:
+            if isinstance(one, Linear):
+                self._add(one)
+            elif one not in STATISTICS:
+                raise InputError(f"statistic {one!r} is unknown, expected one of {', '.join(STATISTICS)}")
         if not self.flares and "matched" in self.statistics:
             raise InputError("no flare given, expected at least one for the statistic 'matched'")
         if not self.scene.used.any():
             raise InputError(f"every pixel of {self.quiet.name} is saturated, expected a fainter star")
+        if "uv_excess" in self.statistics and not uv_weights(self.quiet, self.scene.used).any():
+            raise InputError(
+                f"no pixel of {self.quiet.name} that counts lies at {UV_NM[0]:g}-{UV_NM[1]:g} nm, expected some for "
+                "the statistic 'uv_excess'"
+            )
+
+    def _add(self, own: Linear) -> None:
+        if own.name in self._own:
+            raise InputError(f"statistic {own.name!r} is given twice, expected different names")
+        if own.weights.size != self.scene.n_pixel:
+            raise InputError(
+                f"statistic {own.name!r} has {own.weights.size} weights, expected one for each of the "
+                f"{self.scene.n_pixel} pixels"
+            )
+        weights = own.weights * self.scene.used
+        if not weights.any():
+            raise InputError(f"statistic {own.name!r} weighs only saturated pixels, expected others")
+        self._own[own.name] = weights
+
+    def weights(self, statistic: str, template: int = 0) -> NDArray[np.float64] | None:
+        """Weights per DN of a linear statistic, shape (n_pixel,); None for the others.
+
+        Parameters
+        ----------
+        statistic : str
+        template : int
+            For ``matched``: the flare whose shape is looked for.
+        """
+        if statistic == "matched":
+            return matched_weights(self.quiet, self.flares[template], self.scene.used)
+        if statistic == "uv_excess":
+            return uv_weights(self.quiet, self.scene.used)
+        return self._own.get(statistic)
 
     def collect(self, plan: ChannelPlan, tally: Tally) -> None:
         """Take over the distributions of one batch."""
@@ -133,12 +178,12 @@ class Detection:
         """The same distribution for Gaussian noise; parameters as for `distribution`."""
         self._check(statistic, flare if flare is not None else template if statistic == "matched" else None)
         observed = self.quiet if flare is None else self.flares[flare]
-        looked_for = self.flares[template if flare is None else flare] if self.flares else self.quiet
-        return closed_form(statistic, self.quiet, observed, looked_for, self.scene.used)
+        weights = self.weights(statistic, template if flare is None else flare)
+        return closed_form(statistic, self.quiet, observed, self.scene.used, weights)
 
     def dof(self, statistic: str) -> int:
         """Degrees of freedom without a flare: pixels, resolution elements, or one."""
-        if statistic == "matched":
+        if statistic not in FIXED_STATISTICS:
             return 1
         if statistic == "chi2_element":
             return int(np.unique(self.quiet.element[self.scene.used]).size)
@@ -299,35 +344,45 @@ def plan_channels(result: Detection, batch: Sequence[int], *, first: bool) -> Ch
     first : bool
         Whether nulls shared by all batches are counted in this one.
     """
-    n_scenario = 1 + len(batch)
-    fixed = len(FIXED_STATISTICS) * n_scenario
-    matched = "matched" in result.statistics
-    weights = np.zeros((2 * len(batch) if matched else 0, len(result.scene.pixels)), np.float32)
+    n_scenario, width = 1 + len(batch), len(result.scene.pixels)
+    shared = [name for name in result.statistics if name not in (*FIXED_STATISTICS, "matched")]
+    rows: list[NDArray[np.float64]] = []
     ends = np.zeros(n_scenario, np.uint32)
-    if matched:
-        # The quiescent draws meet every template, each flare only its own.
-        ends[:] = len(batch) + np.arange(n_scenario)
-        for i, flare in enumerate(batch):
-            shape = matched_weights(result.quiet, result.flares[flare], result.scene.used)
-            weights[[i, len(batch) + i], : result.scene.n_pixel] = shape
+    #: Which row holds a linear statistic of a scenario, `matched` by the flare looked for.
+    row_of: dict[tuple[str, int, int], int] = {}
+    for scenario in range(n_scenario):
+        # The quiescent draws meet every flare's shape, each flare only its own.
+        shapes = [flare for i, flare in enumerate(batch) if scenario in (0, i + 1)]
+        wanted = [("matched", flare) for flare in shapes if "matched" in result.statistics]
+        for name, flare in (*wanted, *((name, 0) for name in shared)):
+            row_of[(name, scenario, flare)] = len(FIXED_STATISTICS) * n_scenario + len(rows)
+            weights = result.weights(name, flare)
+            assert weights is not None
+            rows.append(weights)
+        ends[scenario] = len(rows)
+    padded = np.zeros((len(rows), width), np.float32)
+    padded[:, : result.scene.n_pixel] = np.array(rows).reshape(len(rows), result.scene.n_pixel)
+
+    def row(statistic: str, scenario: int, flare: int) -> int:
+        if statistic in FIXED_STATISTICS:
+            return len(FIXED_STATISTICS) * scenario + FIXED_STATISTICS.index(statistic)
+        return row_of[(statistic, scenario, flare if statistic == "matched" else 0)]
+
     grids: list[Grid] = []
     keys: list[Key] = []
 
-    def add(statistic: str, role: Role, flare: int, row: int, shape: QuadraticForm | Normal) -> None:
-        grids.append(Grid(row, shape.mean, shape.std))
+    def add(statistic: str, role: Role, flare: int, channel: int, shape: QuadraticForm | Normal) -> None:
+        grids.append(Grid(channel, shape.mean, shape.std))
         keys.append((statistic, role, flare))
 
     for statistic in result.statistics:
         if first and statistic != "matched":
-            add(statistic, "null", 0, FIXED_STATISTICS.index(statistic), result.closed_form(statistic))
+            add(statistic, "null", 0, row(statistic, 0, 0), result.closed_form(statistic))
         for i, flare in enumerate(batch):
             null = result.closed_form(statistic, template=flare)
-            own = result.closed_form(statistic, flare)
             if statistic == "matched":
-                null_row, row = fixed + i, fixed + len(batch) + i
-                add(statistic, "null", flare, null_row, null)
-            else:
-                row = len(FIXED_STATISTICS) * (i + 1) + FIXED_STATISTICS.index(statistic)
-            add(statistic, "flare_on_null_grid", flare, row, null)
-            add(statistic, "flare", flare, row, own)
-    return ChannelPlan(weights, ends, fixed + len(weights), grids, keys)
+                add(statistic, "null", flare, row(statistic, 0, flare), null)
+            channel = row(statistic, i + 1, flare)
+            add(statistic, "flare_on_null_grid", flare, channel, null)
+            add(statistic, "flare", flare, channel, result.closed_form(statistic, flare))
+    return ChannelPlan(padded, ends, len(FIXED_STATISTICS) * n_scenario + len(rows), grids, keys)

@@ -18,6 +18,7 @@ from mauvecl.program import DeviceError, DeviceRecord, Variant, devices
 from mauvecl.run import Run, Tile
 from mauvecl.scene import PIXEL_BLOCK, Mode, Recipe, Scene, prepare
 from mauvecl.snr import Counts, SnrResult, elements, observers
+from mauvecl.statistics import Linear
 from mauvecl.tally import Tally
 
 if TYPE_CHECKING:
@@ -235,7 +236,7 @@ class Engine:
         *,
         realisations: int,
         seed: int,
-        statistics: Sequence[str] = ("chi2", "chi2_element", "matched"),
+        statistics: Sequence[str | Linear] = ("chi2", "chi2_element", "matched"),
         mode: Mode = "auto",
         start: int = 0,
         processes: Processes = NONE,
@@ -253,7 +254,7 @@ class Engine:
             Of each scenario.
         seed : int
             0 to 2**64 - 1.
-        statistics : sequence of {"chi2", "chi2_element", "chi2_pair", "matched"}
+        statistics : sequence of {"chi2", "chi2_element", "chi2_pair", "matched", "uv_excess"} or Linear
         mode : {"auto", "frames", "stacked"}
         start : int
             First realisation.
@@ -269,7 +270,7 @@ class Engine:
         self._check(start, realisations, seed)
         scene = prepare([quiet, *flares], mode, processes=processes, recipe=recipe)
         size = BATCH[scene.frames] - 1
-        result = Detection(quiet, tuple(flares), tuple(statistics), scene, realisations)
+        result = Detection(quiet, tuple(flares), statistics, scene, realisations)
         batches = [range(i, min(i + size, len(flares))) for i in range(0, len(flares), size)] or [range(0)]
         for number, batch in enumerate(batches):
             plan = plan_channels(result, batch, first=number == 0)
@@ -301,7 +302,7 @@ class Engine:
         start: int = 0,
         count: int,
         seed: int,
-        statistics: Sequence[str] = ("chi2", "chi2_element", "matched"),
+        statistics: Sequence[str | Linear] = ("chi2", "chi2_element", "matched"),
         mode: Mode = "auto",
         processes: Processes = NONE,
         recipe: Recipe = "auto",
@@ -318,8 +319,8 @@ class Engine:
         Returns
         -------
         ndarray of float32, shape (n_channel, count)
-            For each scenario chi2, chi2_element and chi2_pair, zero where not asked for; then ``matched``: for each
-            flare's template without a flare, and for each flare with its own.
+            For each scenario chi2, chi2_element and chi2_pair, zero where not asked for; then the linear ones, scenario
+            by scenario: ``matched`` (without a flare for each flare's template) and the others in the order asked for.
 
         Raises
         ------
@@ -330,7 +331,7 @@ class Engine:
         scene = prepare([quiet, *flares], mode, processes=processes, recipe=recipe)
         if len(flares) >= BATCH[scene.frames]:
             raise InputError(f"{len(flares)} flares, expected at most {BATCH[scene.frames] - 1} in one launch")
-        result = Detection(quiet, tuple(flares), tuple(statistics), scene, count)
+        result = Detection(quiet, tuple(flares), statistics, scene, count)
         plan = plan_channels(result, range(len(flares)), first=True)
         out = np.empty((plan.n_rows, count), np.float32)
 
@@ -342,13 +343,13 @@ class Engine:
             self._over(start, count, 4 * plan.n_rows, lambda tile, done: work(run, tile, done))
         return out
 
-    def _statistics(self, scene: Scene, seed: int, plan: ChannelPlan, statistics: Sequence[str]) -> Run:
+    def _statistics(self, scene: Scene, seed: int, plan: ChannelPlan, statistics: Sequence[str | Linear]) -> Run:
         run = self._scene(
             scene,
             seed,
             pair="chi2_pair" in statistics,
             elements="chi2_element" in statistics,
-            linear=len(plan.weights) > 0,
+            linears=len(plan.weights),
         )
         run.weigh(plan.weights, plan.linear_end)
         return run
@@ -429,19 +430,20 @@ class Engine:
         *,
         pair: bool = False,
         elements: bool = True,
-        linear: bool = False,
+        linears: int = 0,
         row_type: str = "int",
     ) -> Run:
         variant = replace(
             self.variant,
             vectors=1 if self._width == 1 or scene.frames else VECTORS,
             scenarios=BATCH[scene.frames],
-            linears=2 * BATCH[scene.frames],
+            # Room for so many: a power of two, so that few programs are built.
+            linears=max(32, 1 << (linears - 1).bit_length()) if linears else 0,
             frames=scene.frames,
             clip=scene.clip,
             pair=pair,
             elements=elements,
-            linear=linear,
+            linear=linears > 0,
             joint=scene.joint,
             quartic=scene.quartic,
             photons=scene.photons,

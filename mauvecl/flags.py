@@ -44,9 +44,15 @@ RealisationsFlag = Annotated[
 SeedFlag = Annotated[int | None, typer.Option(help="Seed [1].", show_default=False)]
 StatisticFlag = Annotated[
     list[str] | None,
-    typer.Option("--statistic", help="chi2, chi2_element, chi2_pair, matched; may be repeated.", show_default=False),
+    typer.Option(
+        "--statistic", help="chi2, chi2_element, chi2_pair, matched, uv_excess; may be repeated.", show_default=False
+    ),
 ]
 FapFlag = Annotated[float | None, typer.Option(help="False-alarm probability per test [0.001].", show_default=False)]
+SetFlag = Annotated[
+    list[str] | None,
+    typer.Option("--set", help="Any key of the study, as in run.fap=0.01; may be repeated.", show_default=False),
+]
 DeviceFlag = Annotated[
     str | None, typer.Option(help="OpenCL device: number or part of its name [PoCL].", show_default=False)
 ]
@@ -71,9 +77,10 @@ def study_from_flags(
     sky: str | None,
     target: str | None,
     when: str | None,
+    settings: list[str] | None = None,
     **changes: dict[str, Any],
 ) -> Study:
-    """A study file, or the default, with the flags on top."""
+    """A study file, or the default, with the flags on top, and ``--set`` on top of those."""
     from mauvecl.host.errors import InputError
     from mauvecl.study import Study
 
@@ -92,7 +99,8 @@ def study_from_flags(
         "sky": skylight,
         **changes,
     }
-    return study.with_changes(sections, _stars(study, star, magnitude, band))
+    changed = study.with_changes(sections, _stars(study, star, magnitude, band))
+    return changed.with_settings(settings) if settings else changed
 
 
 def _stars(

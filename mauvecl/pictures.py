@@ -13,6 +13,8 @@ if TYPE_CHECKING:
 
     from mauvecl.answer import StarDetection
     from mauvecl.host.expectation import Expectation
+    from mauvecl.limits import LimitResult
+    from mauvecl.maps import MapResult
     from mauvecl.snr import SnrResult
 
 #: Okabe and Ito's colours, which colour-blind readers can tell apart (jfly.uni-koeln.de/color).
@@ -37,6 +39,16 @@ NAMES = {
     "chi2_element": "chi2 over 10.5 nm elements",
     "chi2_pair": "chi2 against a noisy exposure",
     "matched": "matched filter (standard deviations)",
+    "uv_excess": "UV excess (standard deviations)",
+}
+AXES = {
+    "magnitude": "magnitude",
+    "amplitude": "flare amplitude",
+    "flare_temperature": "flare temperature (K)",
+    "exposure": "exposure (s)",
+    "detector_temperature": "detector temperature (deg C)",
+    "sky": "sky brightness (V mag / arcsec²)",
+    "star": "star",
 }
 
 
@@ -87,7 +99,7 @@ def detection(stars: Sequence[StarDetection], amplitudes: Sequence[float], fap: 
 
 def _distributions(axis: Any, star: StarDetection, statistic: str, amplitudes: Sequence[float], fap: float) -> None:
     found = star.found
-    linear = statistic == "matched"
+    linear = not statistic.startswith("chi2")
     shapes: list[tuple[int | None, str, str]] = [(None, NULL, "no flare")]
     shapes += [(k, COLOURS[k % len(COLOURS)], f"flare {100 * a:g} %") for k, a in enumerate(amplitudes)]
     for flare, colour, name in shapes:
@@ -197,3 +209,72 @@ def signal_to_noise(stars: Sequence[tuple[str, SnrResult]], path: Path) -> Path:
         for axis in axes[-1]:
             axis.set_xlabel("wavelength (nm)")
         return _save(figure, path)
+
+
+def detection_map(found: MapResult, path: Path | None) -> Any:
+    """Detection probability over two quantities, one panel per statistic; the figure where no path is given."""
+    plt = _pyplot()
+    question = found.study.map
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(
+            1, len(found.statistics), figsize=(3.6 * len(found.statistics) + 0.8, 3.4), squeeze=False, sharey=True
+        )
+        x, y = (
+            np.arange(len(values)) if isinstance(values[0], str) else np.array(values, float)
+            for values in (found.x, found.y)
+        )
+        for axis, statistic, probability in zip(axes[0], found.statistics, found.probability, strict=True):
+            mesh = axis.pcolormesh(x, y, probability, cmap="cividis", vmin=0, vmax=1, shading="nearest")
+            if min(probability.shape) > 1:
+                lines = axis.contour(x, y, probability, levels=sorted(question.contours), colors="white", linewidths=1)
+                axis.clabel(lines, fmt=lambda level: f"{100 * level:g} %", fontsize=7)
+            for which, values, place in (("x", found.x, x), ("y", found.y, y)):
+                described = getattr(question, which)
+                if isinstance(values[0], str):
+                    getattr(axis, f"set_{which}ticks")(place, values)
+                elif described.log:
+                    getattr(axis, f"set_{which}scale")("log")
+            axis.set_xlabel(AXES[question.x.quantity])
+            axis.set_title(NAMES.get(statistic, statistic))
+        axes[0][0].set_ylabel(AXES[question.y.quantity])
+        figure.colorbar(mesh, ax=list(axes[0]), label="detection probability")
+        figure.suptitle(
+            f"{found.star}, false-alarm probability {found.study.run.fap:g} per test; nominal throughput", fontsize=9
+        )
+        return figure if path is None else _save(figure, path)
+
+
+def limits(found: LimitResult, path: Path | None) -> Any:
+    """Detection probability at every simulated value, and the limits; the figure where no path is given."""
+    plt = _pyplot()
+    of, power = found.study.limit.of, found.study.limit.power
+    with plt.rc_context(STYLE):
+        figure, axis = plt.subplots(figsize=(6.4, 3.6))
+        for k, limit in enumerate(found.limits):
+            colour, marker = COLOURS[k % len(COLOURS)], "osD^vPX"[k // len(COLOURS) % 7]
+            points = sorted((*limit.points, limit.check), key=lambda p: p.value)
+            p = [point.probability for point in points]
+            error = [[q.value - q.low for q in p], [q.high - q.value for q in p]]
+            flare = "" if np.isnan(limit.amplitude) else f", {100 * limit.amplitude:g} %"
+            text = f"{limit.star}{flare}, {limit.statistic}: {limit.value.value:.4g}"
+            axis.errorbar(
+                [point.value for point in points],
+                [q.value for q in p],
+                error,
+                fmt=marker,
+                ms=4,
+                color=colour,
+                label=text,
+            )
+            axis.plot(*zip(*sorted(limit.curve), strict=True), color=colour, linewidth=0.9)
+            axis.axvspan(limit.value.low, limit.value.high, color=colour, alpha=0.25, linewidth=0)
+        axis.axhline(power, color="black", linewidth=0.8, linestyle="--")
+        if of != "magnitude":
+            axis.set_xscale("log")
+        axis.set(xlabel=AXES[of], ylabel="detection probability", ylim=(-0.02, 1.02))
+        axis.set_title(
+            f"Limits at a power of {power:g}, false-alarm probability {found.study.run.fap:g} per test\n"
+            "points: simulated, 95 %; lines: Gaussian noise; nominal throughput"
+        )
+        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+        return figure if path is None else _save(figure, path)

@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from mauvecl.host.errors import InputError
+
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
 
@@ -18,7 +20,10 @@ STATISTICS = {
     "chi2_element": "the same over sums of 10.5 nm resolution elements",
     "chi2_pair": "against a noisy quiescent exposure: twice the variance",
     "matched": "weighted sum with the flare's own shape as template, in standard deviations",
+    "uv_excess": "net counts from 200 to 360 nm, in standard deviations",
 }
+#: Where `uv_excess` looks, nm.
+UV_NM = (200.0, 360.0)
 
 CONFIDENCE = 0.95
 
@@ -147,6 +152,39 @@ class Normal:
         return float(self.mean - self.std * special.ndtri(probability))
 
 
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """A statistic of one's own: the sum over pixels of weight times (observed - template), DN of the exposure.
+
+    Attributes
+    ----------
+    name : str
+    weights : ndarray, shape (n_pixel,)
+        Per DN; pixels that a template saturates are left out.
+    """
+
+    name: str
+    weights: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        weights = np.array(self.weights, np.float64)
+        object.__setattr__(self, "weights", weights)
+        if self.name in STATISTICS:
+            raise InputError(f"statistic {self.name!r} is one of mauvecl's own, expected another name")
+        if weights.ndim != 1 or not np.isfinite(weights).all() or not weights.any():
+            bad = int((~np.isfinite(weights)).sum())
+            raise InputError(
+                f"statistic {self.name!r} has weights of the shape {weights.shape}, {bad} of them no numbers, expected "
+                "one finite value per pixel, not all zero"
+            )
+
+
+def uv_weights(quiet: Expectation, used: NDArray[np.bool_]) -> NDArray[np.float64]:
+    """Weights per DN of `uv_excess`, one over the noise of the sum, shape (n_pixel,); zero without any pixel there."""
+    inside = used & (quiet.wavelength_nm >= UV_NM[0]) & (quiet.wavelength_nm <= UV_NM[1])
+    return np.asarray(inside / (np.sqrt(np.sum(quiet.variance_dn2[inside])) or 1.0))
+
+
 def matched_weights(quiet: Expectation, flare: Expectation, used: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Weights per DN of the matched statistic, delta / v / sqrt(lambda), shape (n_pixel,).
 
@@ -162,26 +200,26 @@ def closed_form(
     statistic: str,
     quiet: Expectation,
     observed: Expectation,
-    template: Expectation,
     used: NDArray[np.bool_],
+    weights: NDArray[np.float64] | None = None,
 ) -> QuadraticForm | Normal:
     """The distribution of a statistic for Gaussian noise (METHODS section 6).
 
     Parameters
     ----------
-    statistic : {"chi2", "chi2_element", "chi2_pair", "matched"}
+    statistic : str
+        "chi2", "chi2_element" or "chi2_pair"; anything else is linear.
     quiet : Expectation
         The template and the model variances.
     observed : Expectation
         What is on the sky; `quiet` for the null.
-    template : Expectation
-        The flare that `matched` looks for.
     used : ndarray of bool, shape (n_pixel,)
         Pixels that count.
+    weights : ndarray, shape (n_pixel,), optional
+        Of a linear statistic.
     """
     delta = np.where(used, observed.signal_dn - quiet.signal_dn, 0.0)
-    if statistic == "matched":
-        weights = matched_weights(quiet, template, used)
+    if weights is not None:
         return Normal(float(weights @ delta), float(np.sqrt(weights**2 @ observed.variance_dn2)))
     model, true = quiet.variance_dn2 * used, observed.variance_dn2 * used
     if statistic == "chi2_element":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import tomllib
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, get_args
 
@@ -174,6 +175,86 @@ class Run(_Part):
     fap: Annotated[float, Field(gt=0, lt=1)] = 1e-3
 
 
+#: What a limit is asked for, or an axis of a map runs over, and where it may lie.
+QUANTITIES: dict[str, tuple[float, float]] = {
+    "magnitude": (-2.0, 25.0),
+    "amplitude": (1e-6, 1e4),
+    "flare_temperature": (1_000.0, 100_000.0),
+    "exposure": (1e-3, 1e7),
+    "detector_temperature": (-100.0, 60.0),
+    "sky": (10.0, 30.0),
+}
+
+
+class LimitQuestion(_Part):
+    """The value of one quantity at which a flare is detected with a wanted probability."""
+
+    of: Literal["magnitude", "amplitude", "exposure"] = "magnitude"
+    power: Annotated[float, Field(gt=0, lt=1)] = 0.9
+
+
+class Axis(_Part):
+    """One axis of a map: values, or so many steps from start to stop."""
+
+    quantity: Literal["magnitude", "amplitude", "flare_temperature", "exposure", "detector_temperature", "sky", "star"]
+    values: tuple[float | str, ...] | None = None
+    start: float | None = None
+    stop: float | None = None
+    steps: Annotated[int, Field(ge=2, le=1000)] | None = None
+    log: bool = False
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        spaced = (self.start, self.stop, self.steps)
+        if (self.values is None) == (None in spaced) or (self.values is not None and spaced != (None, None, None)):
+            raise ValueError(
+                f"the axis {self.quantity!r} has neither or both of values and start, stop, steps, expected one of them"
+            )
+        if self.values is not None and len(self.values) == 0:
+            raise ValueError(f"the axis {self.quantity!r} has no values, expected some")
+        for value in self.points():
+            if (self.quantity == "star") != isinstance(value, str):
+                raise ValueError(f"the axis {self.quantity!r} has the value {value!r}, expected {self._expected()}")
+            if not isinstance(value, str):
+                low, high = QUANTITIES[self.quantity]
+                if not low <= value <= high:
+                    raise ValueError(f"the axis {self.quantity!r} reaches {value:g}, expected {low:g} to {high:g}")
+        return self
+
+    def _expected(self) -> str:
+        return "names of the library" if self.quantity == "star" else "numbers"
+
+    def points(self) -> tuple[float | str, ...]:
+        """Its values."""
+        if self.values is not None:
+            return self.values
+        assert self.start is not None
+        assert self.stop is not None
+        assert self.steps is not None
+        if self.log and min(self.start, self.stop) <= 0:
+            raise ValueError(
+                f"the axis {self.quantity!r} is logarithmic from {self.start:g} to {self.stop:g}, expected > 0"
+            )
+        share = [i / (self.steps - 1) for i in range(self.steps)]
+        if self.log:
+            return tuple(self.start * (self.stop / self.start) ** s for s in share)
+        return tuple(self.start + (self.stop - self.start) * s for s in share)
+
+
+class MapQuestion(_Part):
+    """Detection probability over two quantities."""
+
+    x: Axis = Axis(quantity="magnitude", start=4.0, stop=10.0, steps=16)
+    y: Axis = Axis(quantity="amplitude", start=0.01, stop=1.0, steps=16, log=True)
+    contours: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = (0.1, 0.5, 0.9)
+
+    @model_validator(mode="after")
+    def _two(self) -> Self:
+        if self.x.quantity == self.y.quantity:
+            raise ValueError(f"both axes of the map are {self.x.quantity!r}, expected two quantities")
+        return self
+
+
 #: The paper's two stars.
 PAPER_STARS = (Star(library="K3V", magnitude=3.7), Star(library="G2V", magnitude=7.4))
 
@@ -187,6 +268,8 @@ class Study(_Part):
     sky: SkyLight = SkyLight()
     processes: NoiseProcesses = NoiseProcesses()
     run: Run = Run()
+    limit: LimitQuestion = LimitQuestion()
+    map: MapQuestion = MapQuestion()
 
     @classmethod
     def read(cls, path: Path) -> Self:
@@ -233,6 +316,22 @@ class Study(_Part):
             data["star"] = stars
         return self.build(data, "command line")
 
+    def with_settings(self, settings: Sequence[str]) -> Self:
+        """The study with keys set as text, such as ``run.fap=0.01`` or ``star.0.magnitude=6``.
+
+        Raises
+        ------
+        InputError
+            For text without "=", or a key or value that cannot be.
+        """
+        data = self.model_dump(exclude_none=True)
+        for text in settings:
+            path, equals, value = (part.strip() for part in text.partition("="))
+            if not (path and equals):
+                raise InputError(f"--set {text!r}, expected key=value, such as run.fap=0.01")
+            _put(data, path.split("."), _toml_value(value), text)
+        return self.build(data, "--set")
+
     def toml(self) -> str:
         """The study as TOML that `read` reads back."""
         import tomli_w
@@ -254,6 +353,27 @@ class Study(_Part):
         found = Instrument.load(self.observation.instrument)
         wanted = self.observation.temperature_c
         return found if wanted is None else found.with_(temperature_c=wanted)
+
+    def at(self, quantity: str, value: float | str) -> Self:
+        """The study with one quantity at another value, for all its stars.
+
+        Parameters
+        ----------
+        quantity : str
+            A key of `QUANTITIES`, or "star" with a library name.
+        value : float or str
+        """
+        change: dict[str, Any]
+        if quantity in ("magnitude", "star"):
+            change = {"magnitude": value} if quantity == "magnitude" else {"library": value, "file": None}
+            return self.model_copy(update={"star": tuple(star.model_copy(update=change) for star in self.star)})
+        if quantity in ("amplitude", "flare_temperature"):
+            change = {"amplitudes": (value,)} if quantity == "amplitude" else {"temperature_k": value}
+            return self.model_copy(update={"flare": self.flare.model_copy(update=change)})
+        if quantity == "sky":
+            return self.model_copy(update={"sky": SkyLight(surface_brightness=float(value))})
+        change = {{"exposure": "exposure_s", "detector_temperature": "temperature_c"}[quantity]: value}
+        return self.model_copy(update={"observation": self.observation.model_copy(update=change)})
 
     @property
     def drawing(self) -> dict[str, Any]:
@@ -284,6 +404,28 @@ class Study(_Part):
 
         instrument, sky, o = self.load_instrument(), self.sky.sky(), self.observation
         return [expect(s, instrument, exposure=o.exposure_s, sky=sky, order=o.order) for s in sources]
+
+
+def _toml_value(text: str) -> Any:
+    """A value as TOML has it; a bare word is text."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def _put(data: Any, path: list[str], value: Any, text: str) -> None:
+    *parents, last = path
+    for part in parents:
+        if isinstance(data, list | tuple):
+            if not (part.isdigit() and int(part) < len(data)):
+                raise InputError(f"--set {text!r}: no entry {part!r}, expected 0 to {len(data) - 1}")
+            data = data[int(part)]
+        else:
+            data = data.setdefault(part, {})
+    if not isinstance(data, dict):
+        raise InputError(f"--set {text!r}: {'.'.join(parents)} holds no keys, expected one that does")
+    data[last] = value
 
 
 def _sentence(model: type[BaseModel], error: ValidationError) -> str:

@@ -211,6 +211,64 @@ def test_snr(tmp_path: Path) -> None:
     assert {"snr-1-pixel.ecsv", "noise-budget-1.ecsv", "snr.png"} <= {p.name for p in (tmp_path / "out").iterdir()}
 
 
+def test_limit(tmp_path: Path) -> None:
+    """The table, its files, and the study that gives the same bits again."""
+    words = ("--star", "G2V", "-a", "0.24", "-n", "20000", "--fap", "0.01", "--statistic", "matched")
+    shown = run("limit", *words, folder=tmp_path).stdout
+    assert "Limit of magnitude" in shown
+    assert "agrees" in shown
+    assert "not a flight calibration" in shown
+    first = tmp_path / "mauvecl-limit"
+    assert {p.name for p in first.iterdir()} == {"limit.ecsv", "limit.png", "study.toml", "run.json"}
+    run("limit", first / "study.toml", "-o", "again", "--no-pictures", folder=tmp_path)
+    assert (tmp_path / "again" / "limit.ecsv").read_text() == (first / "limit.ecsv").read_text()
+    answer = json.loads(run("limit", *words, "--of", "exposure", "-m", "9", "--json", folder=tmp_path).stdout)
+    assert answer["rows"][0]["exposure"] % 5 == 0
+    assert "expected" in run("limit", "--of", "colour", folder=tmp_path, code=2).stderr.replace(
+        "input should be", "expected"
+    )
+
+
+def test_map(tmp_path: Path) -> None:
+    words = ("--star", "G2V", "--x", "magnitude:6:9:3", "--y", "amplitude=0.05,0.2", "-n", "20000", "--fap", "0.01")
+    shown = run("map", *words, "--statistic", "matched", folder=tmp_path).stdout
+    assert "detection probability in percent, matched" in shown
+    first = tmp_path / "mauvecl-map"
+    assert {p.name for p in first.iterdir()} == {"map.ecsv", "map.fits", "map.png", "study.toml", "run.json"}
+    run("map", first / "study.toml", "-o", "again", "--no-pictures", folder=tmp_path)
+    assert (tmp_path / "again" / "map.ecsv").read_text() == (first / "map.ecsv").read_text()
+    for axis in ("magnitude:6:9", "magnitude:a:b:3", "magnitude=a", "magnitude:6:9:3:cubic"):
+        assert f"--x '{axis}'" in run("map", "--x", axis, folder=tmp_path, code=2).stderr
+
+
+def test_any_key_can_be_set(tmp_path: Path) -> None:
+    words = ("snr", "--star", "G2V", "-m", "6", "-n", "1000", "--no-pictures", "--quiet")
+    settings = (
+        "--set",
+        "star.0.magnitude=5",
+        "--set",
+        "observation.exposure_s = 10",
+        "--set",
+        "sky.surface_brightness=21",
+    )
+    run(*words, *settings, folder=tmp_path)
+    study = Study.read(tmp_path / "mauvecl-snr" / "study.toml")
+    assert (study.star[0].magnitude, study.observation.exposure_s, study.sky.surface_brightness) == (5, 10, 21)
+    for text, sentence in (
+        ("run.fap", "expected key=value"),
+        ("run.fop=1", "unknown key 'run.fop', did you mean 'fap'?"),
+        ("star.7.magnitude=1", "no entry '7', expected 0 to 0"),
+        ("run.fap=many", "run.fap = 'many'"),
+        ("run.seed.x=1", "holds no keys"),
+    ):
+        assert sentence in run(*words, "--set", text, folder=tmp_path, code=2).stderr
+
+
+def test_the_schema_describes_every_key(tmp_path: Path) -> None:
+    schema = json.loads(run("schema", folder=tmp_path).stdout)
+    assert set(schema["properties"]) == set(Study.model_fields)
+
+
 def test_library_and_devices(tmp_path: Path) -> None:
     assert "HD 40307" in run("library", folder=tmp_path).stdout
     assert len(json.loads(run("library", "--json", folder=tmp_path).stdout)) >= 25

@@ -12,7 +12,7 @@ from scipy import stats
 from mauvecl.detection import Detection
 from mauvecl.engine import Engine
 from mauvecl.host.errors import InputError
-from mauvecl.statistics import STATISTICS
+from mauvecl.statistics import STATISTICS, Linear, matched_weights
 from mauvecl.tally import Distribution
 
 N = 1_000_000
@@ -39,7 +39,7 @@ def ks_probability(d: Distribution, sf: object) -> float:
 def test_the_null_is_its_closed_form(found: Detection, statistic: str) -> None:
     """At 1e6 realisations of a star where Gaussian limits hold; fails by chance once in 1e6 seeds."""
     d = found.distribution(statistic)
-    exact = stats.norm() if statistic == "matched" else stats.chi2(found.dof(statistic))
+    exact = stats.norm() if statistic in ("matched", "uv_excess") else stats.chi2(found.dof(statistic))
     assert ks_probability(d, exact.sf) > 1e-6
     assert d.beyond == 0
 
@@ -74,7 +74,7 @@ def test_the_paper_flares_have_an_order(found: Detection) -> None:
     probability = {s: [p.value for p in found.detection_probability(1e-3, s)] for s in STATISTICS}
     for values in probability.values():
         assert all(a <= b + 1e-3 for a, b in pairwise(values))
-    for statistic in ("chi2", "chi2_element", "chi2_pair"):
+    for statistic in set(STATISTICS) - {"matched"}:
         assert all(m >= p - 1e-3 for m, p in zip(probability["matched"], probability[statistic], strict=True))
     # Fewer numbers, less noise in their sum: elements see the smallest flare better than pixels do.
     assert probability["chi2_element"][0] > 2 * probability["chi2"][0]
@@ -155,3 +155,47 @@ def test_wider_wings_than_the_grid_are_counted(engine: Engine) -> None:
     own = found.distribution("chi2", 0)
     assert own.mean == pytest.approx(found.closed_form("chi2", 0).mean, rel=0.02)
     assert own.beyond == 0
+
+
+def test_a_statistic_of_ones_own(engine: Engine) -> None:
+    """The matched filter given as weights is the matched filter; any other follows its normal."""
+    quiet, *flares = star(amplitudes=AMPLITUDES)
+    used = np.ones(quiet.wavelength_nm.size, bool)
+    twin = Linear("twin", matched_weights(quiet, flares[1], used))
+    slope = Linear("slope", np.linspace(-1.0, 2.0, used.size))
+    found = engine.detect(
+        quiet, flares, realisations=N, seed=3, statistics=("matched", twin, "uv_excess", slope, "chi2")
+    )
+    assert found.statistics == ("matched", "twin", "uv_excess", "slope", "chi2")
+    for flare in (None, 1):
+        ours, wanted = found.distribution("twin", flare), found.distribution("matched", flare, template=1)
+        np.testing.assert_array_equal(ours.counts, wanted.counts)
+        for name in ("slope", "uv_excess"):
+            d = found.distribution(name, flare)
+            assert ks_probability(d, found.closed_form(name, flare).sf) > 1e-6
+    theory = found.closed_form("slope", 3)
+    delta = flares[3].signal_dn - quiet.signal_dn
+    assert theory.mean == pytest.approx(float(slope.weights @ delta))
+    assert found.dof("slope") == 1
+
+
+@pytest.mark.parametrize(
+    ("weights", "name", "sentence"),
+    [
+        (np.ones(5), "mine", r"has 5 weights, expected one for each of the \d+ pixels"),
+        (np.zeros(198), "mine", "not all zero"),
+        (np.full(198, np.nan), "mine", "198 of them no numbers"),
+        (np.ones((2, 99)), "mine", r"the shape \(2, 99\)"),
+        (np.ones(198), "chi2", "one of mauvecl's own"),
+    ],
+)
+def test_impossible_weights_are_refused(engine: Engine, weights: np.ndarray, name: str, sentence: str) -> None:
+    quiet, flare = star(amplitudes=(0.1,), payload=instrument(part=True))
+    with pytest.raises(InputError, match=sentence):
+        engine.detect(quiet, [flare], realisations=10, seed=1, statistics=(Linear(name, weights),))
+
+
+def test_uv_excess_needs_uv(engine: Engine) -> None:
+    quiet, flare = star(amplitudes=(0.1,), payload=instrument(output_min_nm=400.0, output_max_nm=500.0))
+    with pytest.raises(InputError, match="200-360 nm"):
+        engine.detect(quiet, [flare], realisations=10, seed=1, statistics=("uv_excess",))

@@ -1,0 +1,218 @@
+"""Detection probability over two quantities, all cells on common draws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.answer import label, told
+from mauvecl.detection import check_fap
+from mauvecl.host.errors import InputError
+from mauvecl.study import Study
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.engine import Engine
+    from mauvecl.host.expectation import Expectation
+
+#: Quantities of the flare alone: cells that differ in them share their quiescent star, and one launch.
+OF_FLARE = ("amplitude", "flare_temperature")
+UNITS = {
+    "magnitude": "mag",
+    "flare_temperature": "K",
+    "exposure": "s",
+    "detector_temperature": "deg_C",
+    "sky": "mag / arcsec2",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class MapResult:
+    """What `detection_map` answers, for the study's first star.
+
+    Attributes
+    ----------
+    study : Study
+    star : str
+    x, y : tuple
+        Values of both axes.
+    statistics : tuple of str
+    probability, low, high, closed_form : ndarray, shape (n_statistic, n_y, n_x)
+        Detection probability, its 95 % interval with the threshold's own, and the same for Gaussian noise; NaN where
+        every pixel saturates.
+    messages : list of str
+    """
+
+    study: Study
+    star: str
+    x: tuple[float | str, ...]
+    y: tuple[float | str, ...]
+    statistics: tuple[str, ...]
+    probability: NDArray[np.float64]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    closed_form: NDArray[np.float64]
+    messages: list[str]
+
+    @property
+    def table(self) -> QTable:
+        """One row per cell and statistic."""
+        import astropy.units as u
+        from astropy.table import QTable
+
+        table = QTable()
+        s, j, i = np.indices(self.probability.shape)
+        for axis, values, index in ((self.study.map.x, self.x, i), (self.study.map.y, self.y, j)):
+            column = np.array(values)[index.ravel()]
+            unit = UNITS.get(axis.quantity)
+            table[axis.quantity] = column if unit is None else column * u.Unit(unit)
+        table["statistic"] = np.array(self.statistics)[s.ravel()]
+        for name, text in (
+            ("probability", "detection probability"),
+            ("low", "its 95 % interval, lower end, with the threshold's own"),
+            ("high", "its 95 % interval, upper end, with the threshold's own"),
+            ("closed_form", "the same for Gaussian noise"),
+        ):
+            table[name] = getattr(self, name).ravel()
+            table[name].info.description = text
+        table.meta |= {
+            "star": self.star,
+            "fap": self.study.run.fap,
+            "realisations": self.study.run.realisations,
+            "study": self.study.toml(),
+        }
+        return table
+
+    def write(self, folder: str | Path) -> list[Path]:
+        """The table as ECSV and FITS, and the study that gives it again."""
+        from mauvecl.report import make_folder, write_study, write_table
+
+        place, table = make_folder(Path(folder)), self.table
+        return [*(write_table(table, place / f"map.{e}") for e in ("ecsv", "fits")), write_study(self.study, place)]
+
+    def plot(self, path: str | Path | None = None) -> object:
+        """One panel per statistic, with contours at the study's powers; needs matplotlib."""
+        from mauvecl.pictures import detection_map as draw
+
+        return draw(self, None if path is None else Path(path))
+
+
+def detection_map(
+    study: Study, engine: Engine | None = None, *, progress: Callable[[int, int], None] | None = None
+) -> MapResult:
+    """Detection probability of the study's first star and flare over its map's axes.
+
+    Parameters
+    ----------
+    study : Study
+        Its ``map`` names the axes; what no axis names stays as the study has it.
+    engine : Engine, optional
+    progress : callable, optional
+        Called as ``progress(done, total)`` in cells.
+
+    Raises
+    ------
+    InputError
+        For anything in the study that cannot be.
+    """
+    from mauvecl.engine import Engine as Default
+
+    engine = engine or Default()
+    check_fap(study.run.fap, study.run.realisations)
+    study = study.model_copy(update={"star": study.star[:1], "flare": _first_flare(study)})
+    axes = study.map.x, study.map.y
+    x, y = (axis.points() for axis in axes)
+    shape = (len(study.run.statistics), len(y), len(x))
+    found = {name: np.full(shape, np.nan) for name in ("probability", "low", "high", "closed_form")}
+    messages: list[Expectation] = []
+    groups = _groups(study, x, y)
+    done = 0
+    for cells in groups:
+        quiet, flares = _expectations(study, [(x[i], y[j]) for i, j in cells])
+        messages.append(quiet)
+        if not quiet.saturated.all():
+            _fill(found, cells, study, quiet, flares, engine)
+        done += len(cells)
+        if progress is not None:
+            progress(done, len(x) * len(y))
+    quiet = messages[0]
+    names = {axis.quantity for axis in axes}
+    star = study.star[0]
+    if "magnitude" in names:
+        star = star.model_copy(update={"magnitude": None})
+    return MapResult(
+        study=study,
+        star="stars of the axis" if "star" in names else label(star, quiet),
+        x=x,
+        y=y,
+        statistics=study.run.statistics,
+        messages=told(messages),
+        **found,
+    )
+
+
+def _first_flare(study: Study) -> object:
+    return study.flare.model_copy(update={"amplitudes": study.flare.amplitudes[:1]})
+
+
+def _groups(study: Study, x: tuple[float | str, ...], y: tuple[float | str, ...]) -> list[list[tuple[int, int]]]:
+    """Cells (i, j) that share a quiescent star."""
+    flare_x, flare_y = (axis.quantity in OF_FLARE for axis in (study.map.x, study.map.y))
+    every = [[(i, j) for i in range(len(x))] for j in range(len(y))]
+    if flare_x and flare_y:
+        return [[cell for row in every for cell in row]]
+    if flare_x:
+        return every
+    if flare_y:
+        return [list(column) for column in zip(*every, strict=True)]
+    return [[cell] for row in every for cell in row]
+
+
+def _expectations(study: Study, cells: list[tuple[float | str, float | str]]) -> tuple[Expectation, list[Expectation]]:
+    """The quiescent star that some cells share, and each cell's flare."""
+    names = study.map.x.quantity, study.map.y.quantity
+    sources, first = [], None
+    for cell in cells:
+        one = study
+        for name, value in zip(names, cell, strict=True):
+            one = one.at(name, value)
+        if first is None:
+            first = one
+            source = one.star[0].source()
+        sources.append(one.flaring(source, one.flare.amplitudes[0]))
+    if first is None:
+        raise InputError("a map without cells, expected some")
+    quiet, *flares = first.expect([source, *sources])
+    return quiet, flares
+
+
+def _fill(
+    found: dict[str, NDArray[np.float64]],
+    cells: list[tuple[int, int]],
+    study: Study,
+    quiet: Expectation,
+    flares: list[Expectation],
+    engine: Engine,
+) -> None:
+    run = study.run
+    result = engine.detect(
+        quiet,
+        flares,
+        realisations=run.realisations,
+        seed=run.seed,
+        statistics=run.statistics,
+        **study.drawing,
+    )
+    for s, statistic in enumerate(run.statistics):
+        probabilities = result.detection_probability(run.fap, statistic)
+        for k, ((i, j), p) in enumerate(zip(cells, probabilities, strict=True)):
+            at = (s, j, i)
+            found["probability"][at], found["low"][at], found["high"][at] = p.value, p.low, p.high
+            limit = result.closed_form(statistic, template=k).isf(run.fap)
+            found["closed_form"][at] = result.closed_form(statistic, k).sf(limit)
