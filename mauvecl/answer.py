@@ -72,7 +72,7 @@ def detect(study: Study, engine: Engine) -> DetectAnswer:
     from astropy.table import vstack
 
     # Everything is looked at before anything is drawn: bad input shows at once.
-    check_fap(study.run.fap, study.run.realisations)
+    check_fap(study.run.fap, study.run.realisations, study.run.tails)
     prepared = [study.expectations(star) for star in study.star]
     stars, tables = [], []
     for star, (quiet, *flares) in zip(study.star, prepared, strict=True):
@@ -82,6 +82,7 @@ def detect(study: Study, engine: Engine) -> DetectAnswer:
             realisations=study.run.realisations,
             seed=study.run.seed,
             statistics=study.run.statistics,
+            tails=study.run.tails,
             **study.drawing,
         )
         table = found.table(study.run.fap)
@@ -97,6 +98,12 @@ def detect(study: Study, engine: Engine) -> DetectAnswer:
     together = vstack(tables, metadata_conflicts="silent")
     together.meta["study"] = study.toml()
     messages = told([x for group in prepared for x in group])
+    if together.meta["tails"] != "counted":
+        worst = max(table["fap_error"].max() for table in tables)
+        messages.append(
+            f"Thresholds at a false-alarm probability of {study.run.fap:g} come from importance sampling, right to "
+            f"{100 * worst:.1f} % of it: {study.run.realisations} realisations leave fewer than 100 beyond them."
+        )
     return DetectAnswer(study, stars, together, messages, _paper(study, engine, prepared))
 
 

@@ -31,6 +31,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.host.expectation import Expectation
+    from mauvecl.tails import Tail
 
 #: A threshold needs this many realisations beyond it; a rarer tail is refused, never extrapolated.
 FEWEST_IN_TAIL = 100
@@ -38,22 +39,32 @@ FEWEST_IN_TAIL = 100
 #: Which distribution: without a flare; with it, binned around the null; with it, around its own mean.
 Role = Literal["null", "flare_on_null_grid", "flare"]
 Key = tuple[str, Role, int]
+#: Thresholds with fewer than `FEWEST_IN_TAIL` beyond them: refused, or by importance sampling.
+Tails = Literal["counted", "sampled"]
 
 
-def check_fap(fap: float, realisations: int) -> None:
+def countable(fap: float, realisations: int) -> bool:
+    """Whether enough realisations lie beyond the threshold to count them."""
+    return fap * realisations >= FEWEST_IN_TAIL * (1 - 1e-9)
+
+
+def check_fap(fap: float, realisations: int, tails: Tails = "counted") -> None:
     """Refuse a false-alarm probability that this many realisations cannot settle.
 
     Raises
     ------
     InputError
-        If it is none, or fewer than 100 realisations would lie beyond the threshold.
+        If it is none, or fewer than 100 realisations would lie beyond the threshold and tails are not sampled.
     """
     if not 0.0 < fap < 1.0:
         raise InputError(f"fap = {fap!r}, expected a probability between 0 and 1")
-    if fap * realisations < FEWEST_IN_TAIL * (1 - 1e-9):
+    if tails not in ("counted", "sampled"):
+        raise InputError(f"tails = {tails!r}, expected 'counted' or 'sampled'")
+    if tails == "counted" and not countable(fap, realisations):
         raise InputError(
             f"fap = {fap:g} leaves {fap * realisations:.3g} of {realisations} realisations beyond the threshold, "
-            f"expected at least {FEWEST_IN_TAIL}: ask for {int(np.ceil(FEWEST_IN_TAIL / fap))} realisations"
+            f"expected at least {FEWEST_IN_TAIL}: ask for {int(np.ceil(FEWEST_IN_TAIL / fap))} realisations, or for "
+            "sampled tails"
         )
 
 
@@ -92,6 +103,10 @@ class Detection:
         Statistics.
     scene : Scene
     realisations : int
+    tails : {"counted", "sampled"}
+        Whether a threshold beyond what was drawn is refused, or found by importance sampling.
+    seed : int
+        Of the draws.
     statistics : tuple of str
         Their names.
     """
@@ -101,7 +116,10 @@ class Detection:
     asked: Sequence[str | Linear]
     scene: Scene
     realisations: int
+    tails: Tails = "counted"
+    seed: int = 0
     statistics: tuple[str, ...] = field(init=False)
+    _tails: dict[tuple[str, int, float], Tail] = field(default_factory=dict, init=False, repr=False)
     _own: dict[str, NDArray[np.float64]] = field(default_factory=dict, init=False, repr=False)
     _found: dict[Key, Distribution] = field(default_factory=dict, init=False, repr=False)
 
@@ -210,17 +228,28 @@ class Detection:
         -------
         Interval
             The simulated upper quantile, rounded up to a bin's edge (1/512 of a standard deviation), and an
-            order-statistic interval.
+            order-statistic interval; from importance sampling where tails are sampled and few lie beyond.
 
         Raises
         ------
         InputError
-            If fewer than 100 realisations lie beyond: the tail is not extrapolated.
+            If fewer than 100 realisations lie beyond and tails are counted: the tail is never extrapolated.
         """
-        null, cut = self._cut(fap, statistic, template)
-        n_low, n_high = central_counts(null.n, fap)
-        low, high = null.first_bin_with_at_most(n_high), null.first_bin_with_at_most(max(n_low - 1, 0))
-        return Interval(*(float(null.edge(index)) for index in (cut, low, high)))
+        null, bins = self._cut(fap, statistic, template)
+        return Interval(*(float(null.edge(index)) for index in bins))
+
+    def tail(self, fap: float, statistic: str = "chi2", *, template: int = 0) -> Tail | None:
+        """The importance sampling behind a threshold, or None where realisations were counted."""
+        self._check(statistic, template if statistic == "matched" else None)
+        check_fap(fap, self.realisations, self.tails)
+        if countable(fap, self.realisations):
+            return None
+        key = (statistic, self._null(statistic, template), fap)
+        if key not in self._tails:
+            from mauvecl.tails import tail
+
+            self._tails[key] = tail(self, fap, statistic, template=template, seed=self.seed)
+        return self._tails[key]
 
     def false_alarm_probability(self, threshold: float, statistic: str = "chi2", *, template: int = 0) -> Interval:
         """Fraction of null realisations at or above a threshold, with its interval; the inverse of `threshold`.
@@ -245,10 +274,7 @@ class Detection:
         """
         probabilities = []
         for flare in range(len(self.flares)):
-            null, cut = self._cut(fap, statistic, flare)
-            n_low, n_high = central_counts(null.n, fap)
-            cut_low = null.first_bin_with_at_most(n_high)
-            cut_high = null.first_bin_with_at_most(max(n_low - 1, 0))
+            _, (cut, cut_low, cut_high) = self._cut(fap, statistic, flare)
             found = self._found[(statistic, "flare_on_null_grid", flare)]
             value, low, high = (clopper_pearson(found.above(index), found.n) for index in (cut, cut_high, cut_low))
             probabilities.append(Interval(value.value, low.low, high.high))
@@ -296,18 +322,41 @@ class Detection:
         table = QTable(rows=rows, names=columns)
         for name, text in DESCRIPTIONS.items():
             table[name].info.description = text
+        counted = countable(fap, self.realisations)
+        table["fap_error"] = [
+            float(np.sqrt((1 - fap) / (fap * self.realisations)))
+            if counted
+            else self._sampled(fap, statistic, flare).relative_error
+            for flare in range(len(self.flares))
+            for statistic in self.statistics
+        ]
+        table["fap_error"].info.description = "relative standard error of the false-alarm probability at the threshold"
         table.meta |= {"fap": fap, "realisations": self.realisations, "exposure_s": self.quiet.exposure_s}
+        table.meta["tails"] = "counted" if counted else "importance sampling"
         return table
+
+    def _sampled(self, fap: float, statistic: str, template: int) -> Tail:
+        found = self.tail(fap, statistic, template=template)
+        assert found is not None
+        return found
 
     def _null(self, statistic: str, template: int) -> int:
         # Only `matched` looks for a given shape; the others have one null for all flares.
         return template if statistic == "matched" else 0
 
-    def _cut(self, fap: float, statistic: str, template: int) -> tuple[Distribution, int]:
-        self._check(statistic, template if statistic == "matched" else None)
-        check_fap(fap, self.realisations)
+    def _cut(self, fap: float, statistic: str, template: int) -> tuple[Distribution, tuple[int, int, int]]:
+        """The null, and the bins whose lower edges are the threshold and the ends of its interval."""
+        sampled = self.tail(fap, statistic, template=template)
         null = self._found[(statistic, "null", self._null(statistic, template))]
-        return null, null.first_bin_with_at_most(int(np.floor(fap * null.n * (1 + 1e-12))))
+        if sampled is not None:
+            edges = np.asarray(null.edge(np.arange(null.counts.size)))
+            t = sampled.threshold
+            value, low, high = (int(np.searchsorted(edges, x)) for x in (t.value, t.low, t.high))
+            return null, (value, low, high)
+        n_low, n_high = central_counts(null.n, fap)
+        wanted = (int(np.floor(fap * null.n * (1 + 1e-12))), n_high, max(n_low - 1, 0))
+        value, low, high = (null.first_bin_with_at_most(n) for n in wanted)
+        return null, (value, low, high)
 
     def _check(self, statistic: str, flare: int | None) -> None:
         if statistic not in self.statistics:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl import program
-from mauvecl.detection import ChannelPlan, Detection, plan_channels
+from mauvecl.detection import ChannelPlan, Detection, Tails, plan_channels
 from mauvecl.host.errors import InputError
 from mauvecl.processes import NONE, Processes
 from mauvecl.program import DeviceError, DeviceRecord, Variant, devices
@@ -241,6 +241,7 @@ class Engine:
         start: int = 0,
         processes: Processes = NONE,
         recipe: Recipe = "auto",
+        tails: Tails = "counted",
     ) -> Detection:
         """Null and flare distributions of detection statistics, all on common draws (METHODS section 6).
 
@@ -261,6 +262,8 @@ class Engine:
         processes : Processes
         recipe : {"auto", "joint", "apart"}
             See `scene.prepare`.
+        tails : {"counted", "sampled"}
+            Thresholds beyond what is drawn: refused, or by importance sampling (`tails.tail`).
 
         Raises
         ------
@@ -270,7 +273,7 @@ class Engine:
         self._check(start, realisations, seed)
         scene = prepare([quiet, *flares], mode, processes=processes, recipe=recipe)
         size = BATCH[scene.frames] - 1
-        result = Detection(quiet, tuple(flares), statistics, scene, realisations)
+        result = Detection(quiet, tuple(flares), statistics, scene, realisations, tails, seed)
         batches = [range(i, min(i + size, len(flares))) for i in range(0, len(flares), size)] or [range(0)]
         for number, batch in enumerate(batches):
             plan = plan_channels(result, batch, first=number == 0)

@@ -181,6 +181,7 @@ class _Question:
             realisations=run.realisations,
             seed=seed,
             statistics=(self.statistic,),
+            tails=run.tails,
             **self.study.drawing,
         )
         (probability,) = found.detection_probability(run.fap, self.statistic)
@@ -273,7 +274,7 @@ def solve(study: Study, star: Star, amplitude: float | None, statistic: str, eng
     """
     from mauvecl.answer import label
 
-    check_fap(study.run.fap, study.run.realisations)
+    check_fap(study.run.fap, study.run.realisations, study.run.tails)
     question = _Question(study, star, amplitude, statistic, engine)
     theory = question.root()
     settle = _settle_frames if question.of == "exposure" else _settle

@@ -124,7 +124,7 @@ def detection_map(
     from mauvecl.engine import Engine as Default
 
     engine = engine or Default()
-    check_fap(study.run.fap, study.run.realisations)
+    check_fap(study.run.fap, study.run.realisations, study.run.tails)
     study = study.model_copy(update={"star": study.star[:1], "flare": _first_flare(study)})
     axes = study.map.x, study.map.y
     x, y = (axis.points() for axis in axes)
@@ -207,6 +207,7 @@ def _fill(
         realisations=run.realisations,
         seed=run.seed,
         statistics=run.statistics,
+        tails=run.tails,
         **study.drawing,
     )
     for s, statistic in enumerate(run.statistics):

@@ -173,6 +173,7 @@ class Run(_Part):
     seed: Annotated[int, Field(ge=0, lt=2**64)] = 1
     statistics: Annotated[tuple[str, ...], Field(min_length=1)] = ("chi2", "chi2_element", "matched")
     fap: Annotated[float, Field(gt=0, lt=1)] = 1e-3
+    tails: Literal["counted", "sampled"] = "counted"
 
 
 #: What a limit is asked for, or an axis of a map runs over, and where it may lie.
