@@ -10,23 +10,50 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mauvecl.engine import Engine
+    from mauvecl.exposures import exposure_for
     from mauvecl.host.errors import InputError
     from mauvecl.host.expectation import Expectation, expect
     from mauvecl.host.instrument import Instrument
     from mauvecl.host.sky import Sky
     from mauvecl.host.source import Source
+    from mauvecl.limits import limiting_magnitude, shortest_exposure, smallest_amplitude
+    from mauvecl.maps import detection_map
+    from mauvecl.statistics import Linear
+    from mauvecl.study import Study
 
 __version__ = "0.1.0"
-__all__ = ["Engine", "Expectation", "InputError", "Instrument", "Sky", "Source", "expect"]
+__all__ = [
+    "Engine",
+    "Expectation",
+    "InputError",
+    "Instrument",
+    "Linear",
+    "Sky",
+    "Source",
+    "Study",
+    "detection_map",
+    "expect",
+    "exposure_for",
+    "limiting_magnitude",
+    "shortest_exposure",
+    "smallest_amplitude",
+]
 
 _HOMES = {
     "Engine": "engine",
     "Expectation": "host.expectation",
     "InputError": "host.errors",
     "Instrument": "host.instrument",
+    "Linear": "statistics",
     "Sky": "host.sky",
     "Source": "host.source",
+    "Study": "study",
+    "detection_map": "maps",
     "expect": "host.expectation",
+    "exposure_for": "exposures",
+    "limiting_magnitude": "limits",
+    "shortest_exposure": "limits",
+    "smallest_amplitude": "limits",
 }
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+from mauvecl.campaign import campaign
 from mauvecl.components import components
 from mauvecl.detection import Detection, check_fap
 from mauvecl.paper import PAPER_G2V, WHY, reconstruct
@@ -74,6 +75,7 @@ def detect(study: Study, engine: Engine) -> DetectAnswer:
     # Everything is looked at before anything is drawn: bad input shows at once.
     check_fap(study.run.fap, study.run.realisations, study.run.tails)
     prepared = [study.expectations(star) for star in study.star]
+    campaign_told = _campaign(study, prepared[0][0])
     stars, tables = [], []
     for star, (quiet, *flares) in zip(study.star, prepared, strict=True):
         found = engine.detect(
@@ -104,7 +106,24 @@ def detect(study: Study, engine: Engine) -> DetectAnswer:
             f"Thresholds at a false-alarm probability of {study.run.fap:g} come from importance sampling, right to "
             f"{100 * worst:.1f} % of it: {study.run.realisations} realisations leave fewer than 100 beyond them."
         )
+    messages += campaign_told
     return DetectAnswer(study, stars, together, messages, _paper(study, engine, prepared))
+
+
+def _campaign(study: Study, quiet: Expectation) -> list[str]:
+    """What one test's false-alarm probability means for the campaign that the study names."""
+    asked = study.campaign
+    if asked.frames is None:
+        return []
+    found = campaign(study.run.fap, asked.frames, quiet.n_frames, step=asked.step, seed=study.run.seed)
+    text = (
+        f"A campaign of {asked.frames} frames makes {found.tests} tests: at {found.fap:g} per test the chance of any "
+        f"false alarm is {found.independent:.3g} if they are independent, and at most {found.at_most:.3g}"
+    )
+    if found.overlapping is not None:
+        o = found.overlapping
+        text += f"; with the overlap of its stacks {o.value:.3g} [{o.low:.3g}, {o.high:.3g}] for a linear statistic"
+    return [text + "."]
 
 
 def _paper(study: Study, engine: Engine, prepared: list[list[Expectation]]) -> list[str]:

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from mauvecl import __version__, verbs
-from mauvecl.cli_limits import detection_map, limit
+from mauvecl.cli_limits import detection_map, exposure, limit
 from mauvecl.flags import (
     AmplitudeFlag,
     BandFlag,
@@ -414,6 +414,7 @@ def detect(
     verbs.finish(files, started, quiet=quiet, as_json=as_json)
 
 
+app.command()(exposure)
 app.command()(limit)
 app.command("map")(detection_map)
 

@@ -245,3 +245,56 @@ def _show(found: Any, study: Study) -> None:
             (corner, *(text(x) for x in found.x)),
             rows,
         )
+
+
+def exposure(
+    snr: Annotated[float, typer.Option(help="Wanted signal-to-noise ratio.")],
+    at: Annotated[float, typer.Option(help="Wavelength, nm.")],
+    study_file: StudyFile = None,
+    per: Annotated[str, typer.Option(help="element (10.5 nm) or pixel.")] = "element",
+    star: StarFlag = None,
+    magnitude: MagnitudeFlag = None,
+    band: BandFlag = None,
+    instrument: InstrumentFlag = None,
+    temperature: TemperatureFlag = None,
+    sky: SkyFlag = None,
+    target: TargetFlag = None,
+    when: TimeFlag = None,
+    settings: SetFlag = None,
+    output: OutputFlag = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """The shortest exposure with a wanted S/N at a wavelength, by the closed form; `mauvecl snr` goes the other way.
+
+    Example: mauvecl exposure --snr 10 --at 300 --star G2V --magnitude 7.4
+    """
+    from typing import cast
+
+    from mauvecl import report
+    from mauvecl.console import show_table
+    from mauvecl.exposures import Per, exposure_for
+
+    started = time.perf_counter()
+    study = study_from_flags(
+        study_file, star=star, magnitude=magnitude, band=band, exposure=None, instrument=instrument,
+        temperature=temperature, sky=sky, target=target, when=when, settings=settings,
+    )  # fmt: skip
+    found = exposure_for(study, snr, at, per=cast(Per, per))
+    folder = report.make_folder(output or Path("mauvecl-exposure"))
+    table = found.table
+    files = [report.write_table(table, folder / "exposure.ecsv"), report.write_study(study, folder)]
+    verbs.say(list(found.messages), as_json=as_json)
+    if as_json:
+        print(json.dumps({"messages": list(found.messages), "rows": report.rows(table)}, indent=2))
+        return
+    show_table(
+        f"Exposure for an S/N of {snr:g} per {per} at {at:g} nm (closed form, whole frames)",
+        ("star", "exposure (s)", "frames", "S/N", "a frame less", ""),
+        [
+            (e.star, f"{e.exposure_s:g}", str(e.frames), f"{e.snr:.3f}", f"{e.snr_one_frame_less:.3f}",
+             "SATURATED" if e.saturated else "")
+            for e in found.exposures
+        ],
+    )  # fmt: skip
+    verbs.finish(files, started, quiet=quiet, as_json=as_json)

@@ -187,6 +187,13 @@ QUANTITIES: dict[str, tuple[float, float]] = {
 }
 
 
+class CampaignQuestion(_Part):
+    """How many tests a search makes: frames in all, and from one stack to the next."""
+
+    frames: Annotated[int, Field(ge=1)] | None = None
+    step: Annotated[int, Field(ge=1)] | None = None
+
+
 class LimitQuestion(_Part):
     """The value of one quantity at which a flare is detected with a wanted probability."""
 
@@ -269,6 +276,7 @@ class Study(_Part):
     sky: SkyLight = SkyLight()
     processes: NoiseProcesses = NoiseProcesses()
     run: Run = Run()
+    campaign: CampaignQuestion = CampaignQuestion()
     limit: LimitQuestion = LimitQuestion()
     map: MapQuestion = MapQuestion()
 
@@ -340,8 +348,9 @@ class Study(_Part):
         data = self.model_dump(mode="json", exclude_none=True)
         if not self.sky.none:
             del data["sky"]["none"]
-        if not data["processes"]:
-            del data["processes"]
+        for section in ("processes", "campaign"):
+            if not data[section]:
+                del data[section]
         for star in data["star"]:
             if "file" in star:
                 star["file"] = str(Path(star["file"]).resolve())

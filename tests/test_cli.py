@@ -229,6 +229,14 @@ def test_limit(tmp_path: Path) -> None:
     )
 
 
+def test_exposure(tmp_path: Path) -> None:
+    words = ("exposure", "--snr", "10", "--at", "300", "--star", "G2V", "-m", "7.4")
+    assert "S/N of 10 per element at 300 nm" in run(*words, folder=tmp_path).stdout
+    row = json.loads(run(*words, "--json", folder=tmp_path).stdout)["rows"][0]
+    assert row["snr_one_frame_less"] < 10 <= row["snr"]
+    assert "wavelength = 900 nm" in run(*words[:4], "900", folder=tmp_path, code=2).stderr
+
+
 def test_map(tmp_path: Path) -> None:
     words = ("--star", "G2V", "--x", "magnitude:6:9:3", "--y", "amplitude=0.05,0.2", "-n", "20000", "--fap", "0.01")
     shown = run("map", *words, "--statistic", "matched", folder=tmp_path).stdout

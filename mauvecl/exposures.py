@@ -1,0 +1,158 @@
+"""The exposure that gives a wanted S/N at a wavelength, and the S/N that an exposure gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from mauvecl.answer import label
+from mauvecl.host.errors import InputError
+from mauvecl.study import QUANTITIES, Star, Study
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.host.expectation import Expectation
+
+Per = Literal["pixel", "element"]
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """One answer: whole frames."""
+
+    star: str
+    wavelength_nm: float
+    per: Per
+    wanted: float
+    exposure_s: float
+    frames: int
+    snr: float
+    snr_one_frame_less: float
+    saturated: bool
+
+
+@dataclass(frozen=True)
+class ExposureResult:
+    """What `exposure_for` answers, one row per star.
+
+    Attributes
+    ----------
+    study : Study
+    exposures : tuple of Exposure
+    messages : tuple of str
+    """
+
+    study: Study
+    exposures: tuple[Exposure, ...]
+    messages: tuple[str, ...]
+
+    @property
+    def table(self) -> QTable:
+        """One row per star."""
+        import astropy.units as u
+        from astropy.table import QTable
+
+        table = QTable()
+        rows = self.exposures
+        table["star"] = [r.star for r in rows]
+        table["wavelength"] = [r.wavelength_nm for r in rows] * u.nm
+        table["per"] = [r.per for r in rows]
+        table["wanted"] = [r.wanted for r in rows]
+        table["exposure"] = [r.exposure_s for r in rows] * u.s
+        table["frames"] = [r.frames for r in rows]
+        table["snr"] = [r.snr for r in rows]
+        table["snr_one_frame_less"] = [r.snr_one_frame_less for r in rows]
+        table["saturated"] = [r.saturated for r in rows]
+        table["exposure"].info.description = "the fewest frames whose closed-form S/N reaches the wanted one"
+        table["saturated"].info.description = "whether the pixel, or one of the element, saturates in a single frame"
+        table.meta["study"] = self.study.toml()
+        return table
+
+
+def snr_at(x: Expectation, wavelength_nm: float, per: Per = "element") -> float:
+    """Closed-form S/N of the pixel or 10.5 nm element that holds a wavelength.
+
+    Raises
+    ------
+    InputError
+        If it lies outside the spectrum.
+    """
+    return float((x.snr_per_element() if per == "element" else x.snr())[_place(x, wavelength_nm, per)])
+
+
+def _place(x: Expectation, wavelength_nm: float, per: Per) -> int:
+    if per not in ("pixel", "element"):
+        raise InputError(f"S/N per {per!r}, expected pixel or element")
+    first, last = float(x.wavelength_nm[0]), float(x.wavelength_nm[-1])
+    if not first <= wavelength_nm <= last:
+        raise InputError(f"wavelength = {wavelength_nm:g} nm, expected {first:.1f} to {last:.1f} nm")
+    pixel = int(np.argmin(np.abs(x.wavelength_nm - wavelength_nm)))
+    return int(x.element[pixel]) if per == "element" else pixel
+
+
+def exposure_for(study: Study, snr: float, wavelength_nm: float, *, per: Per = "element") -> ExposureResult:
+    """The fewest frames whose closed-form S/N at a wavelength reaches a wanted one.
+
+    Parameters
+    ----------
+    study : Study
+        Its exposure does not matter.
+    snr : float
+    wavelength_nm : float
+    per : {"element", "pixel"}
+        A resolution element of 10.5 nm, or one pixel.
+
+    Raises
+    ------
+    InputError
+        For an S/N that no exposure up to 1e7 s reaches, or a wavelength outside the spectrum.
+    """
+    if not (np.isfinite(snr) and snr > 0):
+        raise InputError(f"wanted S/N = {snr:g}, expected a number above 0")
+    from mauvecl.answer import told
+
+    found, seen = [], []
+    for star in study.star:
+        answer, x = _one(study, star, snr, wavelength_nm, per)
+        found.append(answer)
+        seen.append(x)
+    return ExposureResult(study, tuple(found), tuple(told(seen)))
+
+
+def _one(study: Study, star: Star, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposure, Expectation]:
+    source, frame_s = star.source(), study.load_instrument().frame_s
+
+    def after(frames: int) -> Expectation:
+        return study.at("exposure", frames * frame_s).expect([source])[0]
+
+    one = snr_at(after(1), wavelength_nm, per)
+    longest = QUANTITIES["exposure"][1]
+    if not one > 0 or (snr / one) ** 2 * frame_s > longest:
+        raise InputError(
+            f"{star.library or star.file} has an S/N of {one:.3g} per {per} at {wavelength_nm:g} nm in one frame, "
+            f"expected enough for {snr:g} within {longest:g} s"
+        )
+    # S/N grows with the root of the frames, to rounding: the neighbours settle it.
+    frames = max(int(np.ceil((snr / one) ** 2)), 1)
+    while frames > 1 and snr_at(after(frames - 1), wavelength_nm, per) >= snr:
+        frames -= 1
+    while snr_at(after(frames), wavelength_nm, per) < snr:
+        frames += 1
+    x = after(frames)
+    place = _place(x, wavelength_nm, per)
+    here = x.saturated[x.element == place] if per == "element" else x.saturated[[place]]
+    answer = Exposure(
+        star=label(star, x),
+        wavelength_nm=wavelength_nm,
+        per=per,
+        wanted=snr,
+        exposure_s=x.exposure_s,
+        frames=x.n_frames,
+        snr=snr_at(x, wavelength_nm, per),
+        snr_one_frame_less=snr_at(after(frames - 1), wavelength_nm, per) if frames > 1 else 0.0,
+        saturated=bool(here.any()),
+    )
+    return answer, x
