@@ -63,6 +63,9 @@ def limit(
     seed: SeedFlag = None,
     statistic: StatisticFlag = None,
     fap: FapFlag = None,
+    assumptions: Annotated[
+        bool, typer.Option("--assumptions", help="Also: how far what is assumed of the instrument moves it.")
+    ] = False,
     settings: SetFlag = None,
     device: DeviceFlag = None,
     output: OutputFlag = None,
@@ -98,6 +101,12 @@ def limit(
     messages = [m for m in told(inputs) if not m.startswith("SATURATED")]
     verbs.say(messages, as_json=as_json)
     files = found.write(folder)
+    moved = None
+    if assumptions:
+        from mauvecl.assumptions import what_matters
+
+        moved = what_matters(study)
+        files.append(report.write_table(moved, folder / "assumptions.ecsv"))
     if verbs.pictures_wanted(pictures, quiet=quiet, as_json=as_json):
         files.append(_drawn(found, folder / "limit.png"))
     files.append(
@@ -106,7 +115,8 @@ def limit(
         )
     )
     if as_json:
-        print(json.dumps({"messages": messages, "rows": report.rows(found.table)}, indent=2))
+        rows = {"messages": messages, "rows": report.rows(found.table)}
+        print(json.dumps(rows if moved is None else rows | {"assumptions": report.rows(moved)}, indent=2))
         return
     asked, run = study.limit, study.run
     cells = []
@@ -125,6 +135,16 @@ def limit(
         ("star", "flare", "statistic", asked.of, "", "closed form", "simulated again there", "", ""),
         cells,
     )
+    if moved is not None:
+        show_table(
+            f"What is assumed, and how far it moves the closed-form limit of {asked.of}, the largest first",
+            ("star", "flare", "statistic", "assumption", "from", "to", "limit from", "to", "moves by"),
+            [
+                (m["star"], f"{100 * m['amplitude']:g} %", m["statistic"], m["assumption"], m["low_end"], m["high_end"],
+                 f"{m['at_low_end']:.3f}", f"{m['at_high_end']:.3f}", f"{m['span']:.3f}")
+                for m in moved
+            ],
+        )  # fmt: skip
     verbs.finish(files, started, quiet=quiet, as_json=as_json)
 
 

@@ -145,10 +145,12 @@ class LimitResult:
         return limits(self, None if path is None else Path(path))
 
 
-class _Question:
+class Question:
     """One star, flare and statistic: detection probability as a function of the quantity."""
 
-    def __init__(self, study: Study, star: Star, amplitude: float | None, statistic: str, engine: Engine) -> None:
+    def __init__(
+        self, study: Study, star: Star, amplitude: float | None, statistic: str, engine: Engine | None = None
+    ) -> None:
         self.study, self.statistic, self.engine = study.model_copy(update={"star": (star,)}), statistic, engine
         self.of, self.power, self.fap = study.limit.of, study.limit.power, study.run.fap
         if amplitude is not None:
@@ -172,7 +174,8 @@ class _Question:
         return found.closed_form(self.statistic, 0).sf(limit)
 
     def simulated(self, value: float, seed: int) -> Interval:
-        """Detection probability with its interval."""
+        """Detection probability with its interval, by the engine."""
+        assert self.engine is not None
         quiet, flare = self.pair(value)
         run = self.study.run
         found = self.engine.detect(
@@ -197,10 +200,16 @@ class _Question:
             values = sorted({max(round(v / frame_s), 1) * frame_s for v in values})
         return tuple((v, self.theory(v)) for v in values)
 
-    def root(self) -> float:
-        """Where the closed form crosses the power, seen from where the flare is hardest to see."""
+    def root(self, near: float | None = None) -> float:
+        """Where the closed form crosses the power, seen from where the flare is hardest to see; or near a value."""
         from scipy.optimize import brentq
 
+        if near is not None and self.of != "exposure":
+            at = _coordinate(self.of, near)
+            ends = [_value(self.of, at + step) for step in (-1.0, 1.0)]
+            if self.theory(ends[0]) < self.power <= self.theory(ends[1]):
+                low, high = sorted(ends)
+                return float(brentq(lambda v: self.theory(v) - self.power, low, high, rtol=1e-5))
         hardest, easiest = SEARCH[self.of]
         value = self.study.load_instrument().frame_s if hardest is None else hardest
         if self.theory(value) >= self.power:
@@ -275,7 +284,7 @@ def solve(study: Study, star: Star, amplitude: float | None, statistic: str, eng
     from mauvecl.answer import label
 
     check_fap(study.run.fap, study.run.realisations, study.run.tails)
-    question = _Question(study, star, amplitude, statistic, engine)
+    question = Question(study, star, amplitude, statistic, engine)
     theory = question.root()
     settle = _settle_frames if question.of == "exposure" else _settle
     value = settle(question, theory)
@@ -301,7 +310,7 @@ def solve(study: Study, star: Star, amplitude: float | None, statistic: str, eng
     )
 
 
-def _settle(question: _Question, start: float) -> Interval:
+def _settle(question: Question, start: float) -> Interval:
     """Newton's steps in the probit, with the closed form's slope; then the interval by the same slope."""
     of, seed = question.of, question.study.run.seed
     slope, goal = question.slope(start), float(special.ndtri(question.power))
@@ -325,7 +334,7 @@ def _settle(question: _Question, start: float) -> Interval:
     raise InputError(f"the limit of {of} did not settle in {MOST_EVALUATIONS} simulations near {_value(of, at):g}")
 
 
-def _settle_frames(question: _Question, start: float) -> Interval:
+def _settle_frames(question: Question, start: float) -> Interval:
     """Whole frames: the fewest that reach the power, and the fewest by either end of the interval."""
     seed, frame_s = question.study.run.seed, question.study.load_instrument().frame_s
     known: dict[int, Interval] = {}

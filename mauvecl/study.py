@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import difflib
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, get_args
 
@@ -68,6 +68,7 @@ class Observation(_Part):
     order: Literal["paper", "physical"] = "paper"
     mode: Literal["auto", "frames", "stacked"] = "auto"
     recipe: Literal["auto", "joint", "apart"] = "auto"
+    changes: dict[str, float | int | str] = Field(default_factory=dict)
 
 
 #: V mag arcsec-2 where a study says nothing of the sky: the ecliptic opposite the Sun.
@@ -348,6 +349,8 @@ class Study(_Part):
         data = self.model_dump(mode="json", exclude_none=True)
         if not self.sky.none:
             del data["sky"]["none"]
+        if not data["observation"]["changes"]:
+            del data["observation"]["changes"]
         for section in ("processes", "campaign"):
             if not data[section]:
                 del data[section]
@@ -357,12 +360,20 @@ class Study(_Part):
         return tomli_w.dumps(data)
 
     def load_instrument(self) -> Instrument:
-        """The instrument at the study's detector temperature."""
+        """The instrument with what the study changes of it: its ``changes``, and the detector's temperature."""
         from mauvecl.host.instrument import Instrument
 
-        found = Instrument.load(self.observation.instrument)
-        wanted = self.observation.temperature_c
-        return found if wanted is None else found.with_(temperature_c=wanted)
+        found, o = Instrument.load(self.observation.instrument), self.observation
+        changes = o.changes | ({} if o.temperature_c is None else {"temperature_c": o.temperature_c})
+        return found.with_(**changes) if changes else found
+
+    def with_instrument(self, changes: Mapping[str, Any]) -> Self:
+        """The study with some values of the instrument changed; see `Instrument.with_`."""
+        o = self.observation
+        update: dict[str, Any] = {"changes": o.changes | dict(changes)}
+        if "temperature_c" in changes:
+            update["temperature_c"] = None
+        return self.model_copy(update={"observation": o.model_copy(update=update)})
 
     def at(self, quantity: str, value: float | str) -> Self:
         """The study with one quantity at another value, for all its stars.

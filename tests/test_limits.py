@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
+from mauvecl.assumptions import what_matters
 from mauvecl.engine import Engine
 from mauvecl.host.errors import InputError
-from mauvecl.limits import limiting_magnitude, shortest_exposure, smallest_amplitude
+from mauvecl.limits import Question, limiting_magnitude, shortest_exposure, smallest_amplitude
 from mauvecl.study import Study
 
 STATISTICS = ("chi2", "chi2_element", "matched", "uv_excess")
@@ -117,3 +118,21 @@ def test_one_frame_is_the_shortest(engine: Engine) -> None:
     (limit,) = shortest_exposure(study(run=FEW, star=[{"library": "G2V", "magnitude": 5.0}]), engine).limits
     assert limit.value.value == 5.0
     assert limit.agrees
+
+
+def test_what_is_assumed_moves_the_limit_as_physics_says() -> None:
+    """More light or less noise is fainter; each end is the limit of an instrument changed so."""
+    asked = study(run=FEW)
+    table = what_matters(asked)
+    assert (np.diff(table["span"]) <= 0).all()
+    rows = {row["assumption"]: row for row in table}
+    for name in ("detector temperature (C)", "light loss", "pointing loss", "read noise (DN)"):
+        assert rows[name]["at_low_end"] > rows[name]["at_high_end"]
+    assert rows["quantum efficiency, scale"]["at_low_end"] < rows["quantum efficiency, scale"]["at_high_end"]
+    # Poisson in electrons has 0.77 of the dark noise.
+    assert rows["dark counts are Poisson in"]["at_high_end"] > rows["dark counts are Poisson in"]["at_low_end"]
+    lossy = asked.with_instrument({"light_loss": 0.44})
+    assert lossy.load_instrument().light_loss == 0.44
+    root = Question(lossy, lossy.star[0], 0.24, "matched").root()
+    assert rows["light loss"]["at_high_end"] == pytest.approx(root, abs=1e-3)
+    assert Study.build(lossy.model_dump(), "again") == lossy
