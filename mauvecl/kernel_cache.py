@@ -54,7 +54,7 @@ class KernelCache:
         folder = self.store / key
         try:
             manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
-            contents = {}
+            there, contents = self.work / manifest["folder"], {}
             for name, digest in manifest["files"].items():
                 contents[name] = (folder / name).read_bytes()
                 if hashlib.sha256(contents[name]).hexdigest() != digest:
@@ -65,7 +65,7 @@ class KernelCache:
             shutil.rmtree(folder, ignore_errors=True)
             return False
         for name, content in contents.items():
-            target = self.work / manifest["folder"] / name
+            target = there / name
             target.parent.mkdir(parents=True, exist_ok=True)
             target.write_bytes(content)
         with contextlib.suppress(OSError):

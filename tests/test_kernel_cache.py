@@ -114,7 +114,7 @@ def test_a_damaged_store_is_built_again(filled: tuple[Path, str], tmp_path: Path
     assert (healed["digest"], restored) == (digest, wanted)
 
 
-MANIFESTS = ("", "[]", "3", '{"files": 1}', '{"folder": "x"}', '{"folder": 3, "files": {"a": "b"}}')
+MANIFESTS = ("", "[]", "3", '{"files": {}}', '{"files": 1}', '{"folder": "x"}', '{"folder": 3, "files": {"a": "b"}}')
 
 
 @pytest.mark.parametrize("text", MANIFESTS)
