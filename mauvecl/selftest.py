@@ -19,7 +19,7 @@ from mauvecl.engine import Engine
 from mauvecl.host.expectation import Expectation
 from mauvecl.kernel_cache import kernel_cache
 from mauvecl.probes import Probes
-from mauvecl.processes import NONE, CosmicRays, Processes, Uniform
+from mauvecl.processes import CosmicRays, Processes, Uniform
 from mauvecl.program import SAME_BITS
 from mauvecl.scene import Scene, prepare
 from mauvecl.snr import elements, observers
@@ -325,6 +325,3 @@ def last(device: DeviceRecord) -> dict[str, Any] | None:
 def _key(device: DeviceRecord) -> str:
     said = f"selftest {__version__} {device.label} {device.driver}"
     return hashlib.sha256(said.encode()).hexdigest()[:32]
-
-
-__all__ = ["CASES", "NONE", "Check", "digests", "keep", "last", "run", "twin_digests"]

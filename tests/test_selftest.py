@@ -10,9 +10,11 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
-from mauvecl import program, selftest
+from mauvecl import program, report, selftest
 from mauvecl.cli import app
 from mauvecl.engine import Engine
+from mauvecl.kernel_cache import KernelCache
+from mauvecl.study import Study
 
 WEAKER = "same draws to float rounding: no fused multiply-add"
 
@@ -83,6 +85,8 @@ def test_a_device_without_strict_arithmetic_says_so(monkeypatch: pytest.MonkeyPa
 
 def test_the_command(tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
     """A table, a file, exit code 0, or 1 where a check fails; later records carry the outcome."""
+    # A store of its own: the user's must not remember what is made up here.
+    monkeypatch.setattr(selftest, "kernel_cache", lambda: KernelCache(tmp_path, tmp_path))
     checks = [selftest.Check("one thing", True, "as it should be")]
     monkeypatch.setattr(selftest, "run", lambda engine: checks)
     good = CliRunner().invoke(app, ["selftest", "--quiet", "--output", str(tmp_path)])
@@ -93,6 +97,8 @@ def test_the_command(tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyP
     assert kept["passed"] is True
     assert kept["checks"][0]["name"] == "one thing"
     assert selftest.last(engine.device) == kept
+    record = report.write_record("detect", Study(), [], tmp_path, engine=engine, seconds=0.0, messages=[])
+    assert json.loads(record.read_text())["selftest"] == kept
     checks.append(selftest.Check("another", False, "wrong"))
     bad = CliRunner().invoke(app, ["selftest", "--quiet"])
     assert bad.exit_code == 1
