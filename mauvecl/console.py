@@ -38,7 +38,7 @@ class Meter:
     def __call__(self, done: int, total: int) -> None:
         """Take note of work done, in the meter's unit."""
         now = time.monotonic()
-        if done < self._last:
+        if done <= self._last:
             # The next star's work begins.
             self._stop()
             self._started = self._shown = now
