@@ -9,6 +9,7 @@ import astropy.units as u
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .ecsv import read_ecsv
 from .errors import InputError
 
 
@@ -60,16 +61,7 @@ class Curve:
         InputError
             If the file is missing or is not such a table.
         """
-        # Heavy to import, and needed only where an instrument is read.
-        from astropy.table import Table
-
-        try:
-            table = Table.read(path, format="ascii.ecsv")
-        except FileNotFoundError:
-            raise InputError(f"curve file {path} does not exist, expected an ECSV table") from None
-        except Exception as error:  # the reader raises many kinds
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise InputError(f"curve file {path} cannot be read ({reason}), expected an ECSV table") from None
+        table = read_ecsv(path, "curve file")
         if "wavelength" not in table.colnames or len(table.colnames) != 2:
             raise InputError(
                 f"curve file {path} has the columns {', '.join(table.colnames)}, expected 'wavelength' and one value"

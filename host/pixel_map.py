@@ -10,6 +10,7 @@ import astropy.units as u
 import numpy as np
 from numpy.typing import NDArray
 
+from .ecsv import read_ecsv
 from .errors import InputError
 
 Float = NDArray[np.float64]
@@ -95,15 +96,7 @@ class PixelMap:
         InputError
             If the file is missing, is not such a table, or holds a value that cannot be.
         """
-        from astropy.table import Table
-
-        try:
-            table = Table.read(path, format="ascii.ecsv")
-        except FileNotFoundError:
-            raise InputError(f"pixel map {path} does not exist, expected an ECSV table") from None
-        except Exception as error:  # the reader raises many kinds
-            reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-            raise InputError(f"pixel map {path} cannot be read ({reason}), expected an ECSV table") from None
+        table = read_ecsv(path, "pixel map")
         unknown = [name for name in table.colnames if name not in COLUMNS and name != "pixel"]
         if unknown or table.colnames in ([], ["pixel"]):
             what = f"the column {unknown[0]!r}" if unknown else "no column of values"

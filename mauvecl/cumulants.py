@@ -20,7 +20,7 @@ Float = NDArray[np.float64]
 
 #: Gaussian noise of this many Poisson steps leaves 2 exp(-2 pi^2 1.5^2) = 1e-19 of the steps.
 SMOOTH_STEPS = 1.5
-#: Up to this skewness the expansion's error would need 1e16 draws to show (tests/test_cumulants.py).
+#: Up to this skewness the expansion's error would need 1e14 draws to show (tests/kernels/test_joint.py).
 MOST_SKEW = 0.04
 #: Up to this share of the standard deviation the fourth power's coefficient does not show.
 SMALL_FOURTH = 1e-7

@@ -187,14 +187,14 @@ class Detection:
         template : int
             For the null of ``matched``: the flare whose shape is looked for.
         """
-        self._check(statistic, flare if flare is not None else template if statistic == "matched" else None)
+        self._check(statistic, flare, template)
         if flare is None:
             return self._found[(statistic, "null", self._null(statistic, template))]
         return self._found[(statistic, "flare", flare)]
 
     def closed_form(self, statistic: str, flare: int | None = None, *, template: int = 0) -> QuadraticForm | Normal:
         """The same distribution for Gaussian noise; parameters as for `distribution`."""
-        self._check(statistic, flare if flare is not None else template if statistic == "matched" else None)
+        self._check(statistic, flare, template)
         observed = self.quiet if flare is None else self.flares[flare]
         weights = self.weights(statistic, template if flare is None else flare)
         return closed_form(statistic, self.quiet, observed, self.scene.used, weights)
@@ -240,7 +240,7 @@ class Detection:
 
     def tail(self, fap: float, statistic: str = "chi2", *, template: int = 0) -> Tail | None:
         """The importance sampling behind a threshold, or None where realisations were counted."""
-        self._check(statistic, template if statistic == "matched" else None)
+        self._check(statistic, None, template)
         check_fap(fap, self.realisations, self.tails)
         if countable(fap, self.realisations):
             return None
@@ -322,23 +322,13 @@ class Detection:
         table = QTable(rows=rows, names=columns)
         for name, text in DESCRIPTIONS.items():
             table[name].info.description = text
-        counted = countable(fap, self.realisations)
-        table["fap_error"] = [
-            float(np.sqrt((1 - fap) / (fap * self.realisations)))
-            if counted
-            else self._sampled(fap, statistic, flare).relative_error
-            for flare in range(len(self.flares))
-            for statistic in self.statistics
-        ]
+        tails = [self.tail(fap, s, template=flare) for flare in range(len(self.flares)) for s in self.statistics]
+        binomial = float(np.sqrt((1 - fap) / (fap * self.realisations)))
+        table["fap_error"] = [binomial if tail is None else tail.relative_error for tail in tails]
         table["fap_error"].info.description = "relative standard error of the false-alarm probability at the threshold"
         table.meta |= {"fap": fap, "realisations": self.realisations, "exposure_s": self.quiet.exposure_s}
-        table.meta["tails"] = "counted" if counted else "importance sampling"
+        table.meta["tails"] = "counted" if countable(fap, self.realisations) else "importance sampling"
         return table
-
-    def _sampled(self, fap: float, statistic: str, template: int) -> Tail:
-        found = self.tail(fap, statistic, template=template)
-        assert found is not None
-        return found
 
     def _null(self, statistic: str, template: int) -> int:
         # Only `matched` looks for a given shape; the others have one null for all flares.
@@ -358,9 +348,11 @@ class Detection:
         value, low, high = (null.first_bin_with_at_most(n) for n in wanted)
         return null, (value, low, high)
 
-    def _check(self, statistic: str, flare: int | None) -> None:
+    def _check(self, statistic: str, flare: int | None, template: int = 0) -> None:
         if statistic not in self.statistics:
             raise InputError(f"statistic {statistic!r} was not simulated, expected one of {', '.join(self.statistics)}")
+        if flare is None and statistic == "matched":
+            flare = template
         if flare is not None and not 0 <= flare < len(self.flares):
             raise InputError(f"flare = {flare}, expected 0 to {len(self.flares) - 1}")
 

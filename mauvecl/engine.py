@@ -446,7 +446,6 @@ class Engine:
             clip=scene.clip,
             pair=pair,
             elements=elements,
-            linear=linears > 0,
             joint=scene.joint,
             quartic=scene.quartic,
             photons=scene.photons,

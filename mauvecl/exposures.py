@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from mauvecl.answer import label
+from mauvecl.answer import label, told
 from mauvecl.host.errors import InputError
 from mauvecl.study import QUANTITIES, Star, Study
 
@@ -112,8 +112,6 @@ def exposure_for(study: Study, snr: float, wavelength_nm: float, *, per: Per = "
     """
     if not (np.isfinite(snr) and snr > 0):
         raise InputError(f"wanted S/N = {snr:g}, expected a number above 0")
-    from mauvecl.answer import told
-
     found, seen = [], []
     for star in study.star:
         answer, x = _one(study, star, snr, wavelength_nm, per)

@@ -196,7 +196,7 @@ class Question:
         at = _coordinate(self.of, value)
         values = [_value(self.of, at + step) for step in np.linspace(-0.75, 0.75, 25)]
         if self.of == "exposure":
-            frame_s = self._frame_s()
+            frame_s = self.frame_s
             values = sorted({max(round(v / frame_s), 1) * frame_s for v in values})
         return tuple((v, self.theory(v)) for v in values)
 
@@ -211,7 +211,7 @@ class Question:
                 low, high = sorted(ends)
                 return float(brentq(lambda v: self.theory(v) - self.power, low, high, rtol=1e-5))
         hardest, easiest = SEARCH[self.of]
-        value = self.study.load_instrument().frame_s if hardest is None else hardest
+        value = self.frame_s if hardest is None else hardest
         if self.theory(value) >= self.power:
             if self.of == "exposure":
                 return value
@@ -222,13 +222,15 @@ class Question:
             if self.theory(nearer) >= self.power:
                 if self.of == "exposure":
                     # Whole frames: the closed form is a staircase.
-                    return _bisect_frames(lambda v: self.theory(v) >= self.power, value, nearer, self._frame_s())
+                    return _bisect_frames(lambda v: self.theory(v) >= self.power, value, nearer, self.frame_s)
                 low, high = sorted((value, nearer))
                 return float(brentq(lambda v: self.theory(v) - self.power, low, high, xtol=1e-6 * abs(high - low)))
             value = nearer
         raise self._beyond(value, "does not reach")
 
-    def _frame_s(self) -> float:
+    @property
+    def frame_s(self) -> float:
+        """Seconds of one frame."""
         return self.study.load_instrument().frame_s
 
     def _beyond(self, value: float, verb: str) -> InputError:
@@ -336,7 +338,7 @@ def _settle(question: Question, start: float) -> Interval:
 
 def _settle_frames(question: Question, start: float) -> Interval:
     """Whole frames: the fewest that reach the power, and the fewest by either end of the interval."""
-    seed, frame_s = question.study.run.seed, question.study.load_instrument().frame_s
+    seed, frame_s = question.study.run.seed, question.frame_s
     known: dict[int, Interval] = {}
 
     def at(frames: int) -> Interval:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from mauvecl.answer import label, told
 from mauvecl.detection import check_fap
-from mauvecl.host.errors import InputError
 from mauvecl.study import Study
 
 if TYPE_CHECKING:
@@ -125,23 +124,23 @@ def detection_map(
 
     engine = engine or Default()
     check_fap(study.run.fap, study.run.realisations, study.run.tails)
-    study = study.model_copy(update={"star": study.star[:1], "flare": _first_flare(study)})
+    study = study.model_copy(update={"star": study.star[:1]}).at("amplitude", study.flare.amplitudes[0])
     axes = study.map.x, study.map.y
     x, y = (axis.points() for axis in axes)
     shape = (len(study.run.statistics), len(y), len(x))
     found = {name: np.full(shape, np.nan) for name in ("probability", "low", "high", "closed_form")}
-    messages: list[Expectation] = []
+    seen: list[Expectation] = []
     groups = _groups(study, x, y)
     done = 0
     for cells in groups:
         quiet, flares = _expectations(study, [(x[i], y[j]) for i, j in cells])
-        messages.append(quiet)
+        seen.append(quiet)
         if not quiet.saturated.all():
             _fill(found, cells, study, quiet, flares, engine)
         done += len(cells)
         if progress is not None:
             progress(done, len(x) * len(y))
-    quiet = messages[0]
+    quiet = seen[0]
     names = {axis.quantity for axis in axes}
     star = study.star[0]
     if "magnitude" in names:
@@ -152,13 +151,9 @@ def detection_map(
         x=x,
         y=y,
         statistics=study.run.statistics,
-        messages=told(messages),
+        messages=told(seen),
         **found,
     )
-
-
-def _first_flare(study: Study) -> object:
-    return study.flare.model_copy(update={"amplitudes": study.flare.amplitudes[:1]})
 
 
 def _groups(study: Study, x: tuple[float | str, ...], y: tuple[float | str, ...]) -> list[list[tuple[int, int]]]:
@@ -177,18 +172,9 @@ def _groups(study: Study, x: tuple[float | str, ...], y: tuple[float | str, ...]
 def _expectations(study: Study, cells: list[tuple[float | str, float | str]]) -> tuple[Expectation, list[Expectation]]:
     """The quiescent star that some cells share, and each cell's flare."""
     names = study.map.x.quantity, study.map.y.quantity
-    sources, first = [], None
-    for cell in cells:
-        one = study
-        for name, value in zip(names, cell, strict=True):
-            one = one.at(name, value)
-        if first is None:
-            first = one
-            source = one.star[0].source()
-        sources.append(one.flaring(source, one.flare.amplitudes[0]))
-    if first is None:
-        raise InputError("a map without cells, expected some")
-    quiet, *flares = first.expect([source, *sources])
+    studies = [study.at(names[0], a).at(names[1], b) for a, b in cells]
+    source = studies[0].star[0].source()
+    quiet, *flares = studies[0].expect([source, *(s.flaring(source, s.flare.amplitudes[0]) for s in studies)])
     return quiet, flares
 
 

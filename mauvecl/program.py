@@ -64,11 +64,10 @@ class Variant:
     chunk: int
     vectors: int = 1
     scenarios: int = 16
-    linears: int = 32
+    linears: int = 0
     frames: bool = False
     clip: bool = False
     pair: bool = False
-    linear: bool = False
     elements: bool = True
     joint: bool = True
     quartic: bool = True
@@ -213,6 +212,7 @@ def render(rooms: tuple[str, ...], variant: Variant) -> str:
         "two_ln2": f"{layout.TWO_LN2}f",
         "magic": f"{layout.MAGIC}f",
         "reference": layout.REFERENCE,
+        "linear": variant.linears > 0,
         "modulated": bool(variant.modulations),
         "jitter": next((i for i, (name, _) in enumerate(variant.modulations) if name == "jitter"), None),
         "prior_bits": layout.PRIOR_BITS,

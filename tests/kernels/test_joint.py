@@ -14,6 +14,7 @@ from mauvecl.cumulants import MOST_SKEW, Cumulants, joint_is_exact, needs_fourth
 from mauvecl.engine import Engine
 from mauvecl.host.expectation import Expectation
 from mauvecl.scene import prepare
+from mauvecl.selftest import pearson
 
 
 def one_pixel(dark: float, photons: float, read: float, *, unit: str = "DN", noise: str = "poisson") -> Expectation:
@@ -134,16 +135,3 @@ def test_pearson_of_raw_counts(engine: Engine, name: str, recipe: str) -> None:
     counts = found.counts.pixel.sum(axis=0)[low - first : low - first + size]
     assert counts.sum() == ROWS * x.wavelength_nm.size
     assert pearson(counts, exact(x, low, size)) > 1e-6
-
-
-def pearson(counts: np.ndarray, p: np.ndarray) -> float:
-    """Both tails of Pearson's statistic; rare counts are put together."""
-    expected = counts.sum() * p
-    common = expected > 20
-    observed = np.append(counts[common], counts[~common].sum())
-    wanted = np.append(expected[common], counts.sum() - expected[common].sum())
-    if wanted[-1] < 20:
-        observed, wanted = observed[:-1], wanted[:-1]
-    statistic = float(np.sum((observed - wanted) ** 2 / wanted))
-    upper = stats.chi2.sf(statistic, observed.size - 1)
-    return 2 * min(upper, 1 - upper)

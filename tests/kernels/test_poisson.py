@@ -6,12 +6,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mauvecl import reference
+from mauvecl import reference, selftest
 from mauvecl.engine import Engine
 from mauvecl.poisson import SMALLEST_EXPANDED, alias_table, table_set
 from mauvecl.probes import Probes
 from mauvecl.scene import prepare
-from mauvecl.selftest import toy
 
 MEANS = [0.0, 0.5, 5.0, 64.0, 2225.0, 22250.0, 222500.0]
 
@@ -46,17 +45,8 @@ def test_extreme_words_and_column_edges(probes: Probes, mean: float) -> None:
 
 
 def pearson(counts: np.ndarray, low: int, mean: float) -> float:
-    """Pearson's statistic as a probability of both tails; rare counts are put together."""
-    n = counts.sum()
-    expected = n * stats.poisson.pmf(low + np.arange(counts.size), mean)
-    common = expected > 20
-    observed = np.append(counts[common], counts[~common].sum())
-    wanted = np.append(expected[common], n - expected[common].sum())
-    if wanted[-1] < 20:
-        observed, wanted = observed[:-1], wanted[:-1]
-    statistic = float(np.sum((observed - wanted) ** 2 / wanted))
-    upper = stats.chi2.sf(statistic, observed.size - 1)
-    return 2 * min(upper, 1 - upper)
+    """Both tails of Pearson's statistic against scipy's probabilities of low, low + 1, ..."""
+    return selftest.pearson(counts, stats.poisson.pmf(low + np.arange(counts.size), mean))
 
 
 BLOCK = 2_500_000
@@ -106,7 +96,7 @@ def draws_to_tell(mean: float, offset: float, slope: float, cubic: float) -> flo
 @pytest.mark.parametrize("mean", [SMALLEST_EXPANDED, 2225.0, 22250.0, 1e6])
 def test_no_number_of_draws_would_tell_the_expansion(mean: float) -> None:
     """By what the scene gives the device; without its last term 2e10 draws of a mean of 1000 would."""
-    scene = prepare([toy(4, 1, dark=mean)], recipe="apart")
+    scene = prepare([selftest.toy(4, 1, dark=mean)], recipe="apart")
     (source,) = scene.dark_counts[:1]
     assert source["bits"] == 0
     given = (float(source["offset"]), float(source["slope"]), float(source["cubic"]))
