@@ -1,4 +1,5 @@
-## Every statistic of METHODS section 6 of every scenario, from one pass over common draws.
+## chi2, chi2_element and linear statistics of every scenario against its template, from one pass over common draws:
+## the fast kernel, for what is asked most. `comparison.cl.mako` knows the rest.
 <%
     plain = joint and not (modulations or frames or photons or cosmic)
     powers = (["c4"] if quartic else []) + ["c3", "c2", "c1", "c0"]
@@ -12,7 +13,7 @@ typedef struct { floatv a, b, c, d; } Four;
 /* Each work-item follows ${vectors} vectors of realisations: what is read of a level serves them all. */
 __kernel ${attributes}
 void statistics(SCENE, const uint first_low, const uint first_high,
-                __global const uint *restrict templates, __global const float *restrict constants,
+                __global const float *restrict constants,
                 __global const float *restrict weights, __global const uint *restrict linear_end,
                 const uint stride, __global float *restrict values)
 {
@@ -21,26 +22,23 @@ void statistics(SCENE, const uint first_low, const uint first_high,
     uintv realisation[${vectors}];
     Factors steady[${vectors}];
     Four chi2[${scenarios}][${vectors}], linear[${linears + 1}][${vectors}];
-    floatv element[${scenarios}][${vectors}], chi2_element[${scenarios}][${vectors}], chi2_pair[${scenarios}][${vectors}];
+    floatv element[${scenarios}][${vectors}], chi2_element[${scenarios}][${vectors}];
     for (uint v = 0; v < ${vectors}u; v++) {
         realisation[v] = (uintv)(first_low + (item * ${vectors}u + v) * ${width}u) + LANE_INDEX;
         steady[v] = factors_of(SCENE_PASSED, realisation[v], first_high);
         for (uint k = 0; k < scenario_count; k++) {
             chi2[k][v] = NOTHING;
-            element[k][v] = chi2_element[k][v] = chi2_pair[k][v] = (floatv)0.0f;
+            element[k][v] = chi2_element[k][v] = (floatv)0.0f;
         }
         for (uint l = 0; l <= linear_count; l++) linear[l][v] = NOTHING;
     }
 % if not frames:
     Address at[${vectors}];
-    Factors factors[${vectors}], other[${vectors}];
+    Factors factors[${vectors}];
     for (uint v = 0; v < ${vectors}u; v++) {
         at[v] = address(realisation[v], first_high, job->first_frame, job->seed_low, job->seed_high);
-        factors[v] = other[v] = steady[v];
+        factors[v] = steady[v];
         factors[v].light *= kept(SCENE_PASSED, realisation[v], first_high, 0u, 0u);
-% if pair:
-        other[v].light *= kept(SCENE_PASSED, realisation[v], first_high, REFERENCE, 0u);
-% endif
     }
 % endif
 
@@ -67,15 +65,6 @@ void statistics(SCENE, const uint first_low, const uint first_high,
 % else:
         for (uint v = 0; v < ${vectors}u; v++) draw(SCENE_PASSED, at + v, 0u, start, drawn + v);
 % endif
-% if pair:
-        /* The other exposure sees the template of the scenario; scenarios with one template share it. */
-        Draws again[${vectors}];
-        floatv reference[${vectors}][${chunk}];
-        uint seen = ~0u;
-% if not frames:
-        for (uint v = 0; v < ${vectors}u; v++) draw(SCENE_PASSED, at + v, REFERENCE, start, again + v);
-% endif
-% endif
         uint l = 0;
         for (uint k = 0; k < scenario_count; k++) {
             const uint here = k * padded + start;
@@ -96,9 +85,9 @@ void statistics(SCENE, const uint first_low, const uint first_high,
             own_sum[${v}] = linear[own][${v}];
 % endfor
 % endif
-% if linear or pair:
+% if linear:
             floatv x[${vectors}][${chunk}];
-            const bool again_needed = ${"true" if pair else "l < linear_end[k]"};
+            const bool again_needed = l < linear_end[k];
 % endif
             for (uint i = 0; i < CHUNK; i += 4u) {
                 /* Four pixels at once: addresses without an index, and sums that need not wait for each other. */
@@ -139,7 +128,7 @@ void statistics(SCENE, const uint first_low, const uint first_high,
 % endfor
 % endif
 % endfor
-% if linear or pair:
+% if linear:
                 if (again_needed) {
 % for j in range(4):
 % for v in range(vectors):
@@ -197,37 +186,6 @@ void statistics(SCENE, const uint first_low, const uint first_high,
 % endfor
             }
 % endif
-% if pair:
-            if (templates[k] != seen) {
-                seen = templates[k];
-                const uint quiet = seen * padded + start;
-                for (uint v = 0; v < ${vectors}u; v++) {
-% if frames:
-                    for (uint i = 0; i < CHUNK; i++) reference[v][i] = (floatv)0.0f;
-                    for (uint frame = 0; frame < job->draw_count; frame++) {
-                        const Address at = address(realisation[v], first_high, job->first_frame + frame, job->seed_low, job->seed_high);
-                        Factors other = steady[v];
-                        other.light *= kept(SCENE_PASSED, realisation[v], first_high, REFERENCE, frame);
-                        draw(SCENE_PASSED, &at, REFERENCE, start, again);
-                        for (uint i = 0; i < CHUNK; i++)
-                            reference[v][i] += digitise(analogue(SCENE_PASSED, again, i, levels + quiet + i, start + i, quiet + i, &other), edges + quiet + i) - MAGIC;
-                    }
-                    for (uint i = 0; i < CHUNK; i++) reference[v][i] += edges[quiet + i].whole;
-% else:
-                    for (uint i = 0; i < CHUNK; i++)
-                        reference[v][i] = digitise(analogue(SCENE_PASSED, again + v, i, levels + quiet + i, start + i, quiet + i, other + v), edges + quiet + i) - levels[quiet + i].shift;
-% endif
-                }
-            }
-            for (uint v = 0; v < ${vectors}u; v++) {
-                floatv both = chi2_pair[k][v];
-                for (uint i = 0; i < CHUNK; i++) {
-                    floatv difference = x[v][i] - reference[v][i];
-                    both = FMA(difference * difference, (floatv)(0.5f * level[i].inverse_variance), both);
-                }
-                chi2_pair[k][v] = both;
-            }
-% endif
         }
     }
 
@@ -237,7 +195,7 @@ void statistics(SCENE, const uint first_low, const uint first_high,
         for (uint k = 0; k < scenario_count; k++) {
             STORE(SUM(chi2[k][v]) + constants[k], out + (3u * k) * stride);
             STORE(chi2_element[k][v], out + (3u * k + 1u) * stride);
-            STORE(chi2_pair[k][v], out + (3u * k + 2u) * stride);
+            STORE((floatv)0.0f, out + (3u * k + 2u) * stride);
         }
         for (uint l = 0; l < linear_count; l++)
             STORE(SUM(linear[l][v]) + constants[scenario_count + l], out + (3u * scenario_count + l) * stride);

@@ -78,15 +78,7 @@ def detect(study: Study, engine: Engine) -> DetectAnswer:
     campaign_told = _campaign(study, prepared[0][0])
     stars, tables = [], []
     for star, (quiet, *flares) in zip(study.star, prepared, strict=True):
-        found = engine.detect(
-            quiet,
-            flares,
-            realisations=study.run.realisations,
-            seed=study.run.seed,
-            statistics=study.run.statistics,
-            tails=study.run.tails,
-            **study.drawing,
-        )
+        found = engine.detect(quiet, flares, seed=study.run.seed, **study.detecting)
         table = found.table(study.run.fap)
         table.replace_column("name", [label(star, quiet)] * len(table))
         table.rename_column("name", "star")
@@ -107,7 +99,7 @@ def detect(study: Study, engine: Engine) -> DetectAnswer:
             f"{100 * worst:.1f} % of it: {study.run.realisations} realisations leave fewer than 100 beyond them."
         )
     messages += campaign_told
-    return DetectAnswer(study, stars, together, messages, _paper(study, engine, prepared))
+    return DetectAnswer(study, stars, together, messages, _paper(study, prepared))
 
 
 def _campaign(study: Study, quiet: Expectation) -> list[str]:
@@ -126,7 +118,7 @@ def _campaign(study: Study, quiet: Expectation) -> list[str]:
     return [text + "."]
 
 
-def _paper(study: Study, engine: Engine, prepared: list[list[Expectation]]) -> list[str]:
+def _paper(study: Study, prepared: list[list[Expectation]]) -> list[str]:
     """The paper's G2V values beside their reconstruction and the calibrated ones."""
     if PAPER_STARS[1] not in study.star or study.observation.exposure_s != 50.0:
         return []
@@ -136,7 +128,7 @@ def _paper(study: Study, engine: Engine, prepared: list[list[Expectation]]) -> l
         if amplitude not in PAPER_G2V:
             continue
         chi2, reduced = PAPER_G2V[amplitude]
-        ours = reconstruct(engine, quiet, flare, seed=study.run.seed)
+        ours = reconstruct(quiet, flare)
         lines.append(
             f"G2V, {100 * amplitude:g} % flare: the paper has chi2 = {chi2:g}, reduced {reduced:g}; "
             f"reconstructed here {ours.value:.2f} ({ours.low:.2f}-{ours.high:.2f})"

@@ -27,6 +27,7 @@ from mauvecl.flags import (
     PicturesFlag,
     QuietFlag,
     RealisationsFlag,
+    ReferenceFlag,
     SeedFlag,
     SetFlag,
     SkyFlag,
@@ -36,6 +37,7 @@ from mauvecl.flags import (
     TargetFlag,
     TemperatureFlag,
     TimeFlag,
+    VariancesFlag,
     study_from_flags,
 )
 
@@ -345,6 +347,8 @@ def detect(
     settings: SetFlag = None,
     statistic: StatisticFlag = None,
     fap: FapFlag = None,
+    reference: ReferenceFlag = None,
+    variances: VariancesFlag = None,
     device: DeviceFlag = None,
     output: OutputFlag = None,
     as_json: JsonFlag = False,
@@ -366,7 +370,8 @@ def detect(
         study_file, star=star, magnitude=magnitude, band=band, exposure=exposure, instrument=instrument,
         temperature=temperature, sky=sky, target=target, when=when, settings=settings,
         flare={"amplitudes": amplitude, "temperature_k": flare_temperature, "band": flare_band},
-        run={"realisations": realisations, "seed": seed, "statistics": statistic, "fap": fap},
+        run={"realisations": realisations, "seed": seed, "statistics": statistic, "fap": fap,
+             "reference": reference, "variances": variances},
     )  # fmt: skip
     folder = report.make_folder(output or Path("mauvecl-detect"))
     with Meter(quiet=quiet or as_json) as meter:

@@ -25,6 +25,7 @@ from mauvecl.flags import (
     PicturesFlag,
     QuietFlag,
     RealisationsFlag,
+    ReferenceFlag,
     SeedFlag,
     SetFlag,
     SkyFlag,
@@ -34,6 +35,7 @@ from mauvecl.flags import (
     TargetFlag,
     TemperatureFlag,
     TimeFlag,
+    VariancesFlag,
     study_from_flags,
 )
 
@@ -63,6 +65,8 @@ def limit(
     seed: SeedFlag = None,
     statistic: StatisticFlag = None,
     fap: FapFlag = None,
+    reference: ReferenceFlag = None,
+    variances: VariancesFlag = None,
     assumptions: Annotated[
         bool, typer.Option("--assumptions", help="Also: how far what is assumed of the instrument moves it.")
     ] = False,
@@ -89,7 +93,8 @@ def limit(
         study_file, star=star, magnitude=magnitude, band=band, exposure=exposure, instrument=instrument,
         temperature=temperature, sky=sky, target=target, when=when, settings=settings,
         flare={"amplitudes": amplitude, "temperature_k": flare_temperature, "band": flare_band},
-        run={"realisations": realisations, "seed": seed, "statistics": statistic, "fap": fap},
+        run={"realisations": realisations, "seed": seed, "statistics": statistic, "fap": fap,
+             "reference": reference, "variances": variances},
         limit={"of": of, "power": power},
     )  # fmt: skip
     folder = report.make_folder(output or Path("mauvecl-limit"))
@@ -201,6 +206,8 @@ def detection_map(
     seed: SeedFlag = None,
     statistic: StatisticFlag = None,
     fap: FapFlag = None,
+    reference: ReferenceFlag = None,
+    variances: VariancesFlag = None,
     settings: SetFlag = None,
     device: DeviceFlag = None,
     output: OutputFlag = None,
@@ -226,7 +233,8 @@ def detection_map(
         study_file, star=star, magnitude=magnitude, band=band, exposure=exposure, instrument=instrument,
         temperature=temperature, sky=sky, target=target, when=when, settings=settings,
         flare={"amplitudes": amplitude, "temperature_k": flare_temperature, "band": flare_band},
-        run={"realisations": realisations, "seed": seed, "statistics": statistic, "fap": fap},
+        run={"realisations": realisations, "seed": seed, "statistics": statistic, "fap": fap,
+             "reference": reference, "variances": variances},
         map={"x": None if x is None else _axis(x, "--x"), "y": None if y is None else _axis(y, "--y")},
     )  # fmt: skip
     folder = report.make_folder(output or Path("mauvecl-map"))

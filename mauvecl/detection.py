@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -11,8 +12,11 @@ from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
 from mauvecl.layout import FIXED_STATISTICS
+from mauvecl.roc import Roc
 from mauvecl.scene import Scene
+from mauvecl.smoothing import Smoothing
 from mauvecl.statistics import (
+    SHAPED,
     STATISTICS,
     UV_NM,
     Interval,
@@ -25,7 +29,7 @@ from mauvecl.statistics import (
     matched_weights,
     uv_weights,
 )
-from mauvecl.tally import Distribution, Grid, Tally
+from mauvecl.tally import Distribution, Grid, TailSamples, Tally
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -77,8 +81,9 @@ class ChannelPlan:
     weights : ndarray of float32, shape (n_linear, n_padded)
     linear_end : ndarray of uint32, shape (n_scenario,)
         One past the last linear statistic of each scenario.
-    n_rows : int
-        Channels.
+    scales : ndarray of float32, shape (n_smoothed, n_centre)
+        Of the statistic `paper`; see `smoothing.Smoothing`.
+    scale_end : ndarray of uint32, shape (n_scenario,)
     grids : list of Grid
     keys : list of (statistic, role, flare)
         What each grid holds.
@@ -86,9 +91,20 @@ class ChannelPlan:
 
     weights: NDArray[np.float32]
     linear_end: NDArray[np.uint32]
-    n_rows: int
+    scales: NDArray[np.float32]
+    scale_end: NDArray[np.uint32]
     grids: list[Grid]
     keys: list[Key]
+
+    def tails(self) -> list[TailSamples | None]:
+        """What keeps the extremes of each grid: a null's largest values, a flare's smallest."""
+        kinds: dict[Role, bool] = {"null": True, "flare": False}
+        return [TailSamples(largest=kinds[role]) if role in kinds else None for _, role, _ in self.keys]
+
+    @property
+    def n_rows(self) -> int:
+        """Channels."""
+        return len(FIXED_STATISTICS) * len(self.linear_end) + len(self.weights) + len(self.scales)
 
 
 @dataclass(eq=False)
@@ -122,6 +138,7 @@ class Detection:
     _tails: dict[tuple[str, int, float], Tail] = field(default_factory=dict, init=False, repr=False)
     _own: dict[str, NDArray[np.float64]] = field(default_factory=dict, init=False, repr=False)
     _found: dict[Key, Distribution] = field(default_factory=dict, init=False, repr=False)
+    _samples: dict[Key, TailSamples] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         names = [one.name if isinstance(one, Linear) else one for one in self.asked]
@@ -133,8 +150,9 @@ class Detection:
                 self._add(one)
             elif one not in STATISTICS:
                 raise InputError(f"statistic {one!r} is unknown, expected one of {', '.join(STATISTICS)}")
-        if not self.flares and "matched" in self.statistics:
-            raise InputError("no flare given, expected at least one for the statistic 'matched'")
+        shaped = [name for name in self.statistics if name in SHAPED]
+        if shaped and not self.flares:
+            raise InputError(f"no flare given, expected at least one for the statistic {shaped[0]!r}")
         if not self.scene.used.any():
             raise InputError(f"every pixel of {self.quiet.name} is saturated, expected a fainter star")
         if "uv_excess" in self.statistics and not uv_weights(self.quiet, self.scene.used).any():
@@ -163,18 +181,25 @@ class Detection:
         ----------
         statistic : str
         template : int
-            For ``matched``: the flare whose shape is looked for.
+            For `SHAPED` statistics: the flare whose shape is looked for.
         """
         if statistic == "matched":
-            return matched_weights(self.quiet, self.flares[template], self.scene.used)
+            return matched_weights(self.quiet, self.flares[template], self.scene.used, self.scene.comparison)
         if statistic == "uv_excess":
-            return uv_weights(self.quiet, self.scene.used)
+            return uv_weights(self.quiet, self.scene.used, self.scene.comparison)
         return self._own.get(statistic)
 
-    def collect(self, plan: ChannelPlan, tally: Tally) -> None:
-        """Take over the distributions of one batch."""
-        for index, key in enumerate(plan.keys):
+    @cached_property
+    def smoothing(self) -> Smoothing:
+        """Of the statistic `paper`."""
+        return Smoothing.of(self.quiet, self.scene.used)
+
+    def collect(self, plan: ChannelPlan, tally: Tally, samples: Sequence[TailSamples | None]) -> None:
+        """Take over the distributions and tails of one batch."""
+        for index, (key, kept) in enumerate(zip(plan.keys, samples, strict=True)):
             self._found[key] = tally.distribution(index)
+            if kept is not None:
+                self._samples[key] = kept
 
     def distribution(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Distribution:
         """The simulated distribution of a statistic.
@@ -185,23 +210,28 @@ class Detection:
         flare : int, optional
             Which flare; None for the null.
         template : int
-            For the null of ``matched``: the flare whose shape is looked for.
+            For the null of `SHAPED` statistics: the flare whose shape is looked for.
         """
         self._check(statistic, flare, template)
         if flare is None:
-            return self._found[(statistic, "null", self._null(statistic, template))]
+            return self._found[self._null_key(statistic, template)]
         return self._found[(statistic, "flare", flare)]
 
     def closed_form(self, statistic: str, flare: int | None = None, *, template: int = 0) -> QuadraticForm | Normal:
         """The same distribution for Gaussian noise; parameters as for `distribution`."""
         self._check(statistic, flare, template)
         observed = self.quiet if flare is None else self.flares[flare]
-        weights = self.weights(statistic, template if flare is None else flare)
-        return closed_form(statistic, self.quiet, observed, self.scene.used, weights)
+        template = template if flare is None else flare
+        if statistic == "paper":
+            scale = self.smoothing.scale(self.flares[template])
+            delta = observed.signal_dn - self.quiet.signal_dn
+            return self.smoothing.form(scale, delta, observed.variance_dn2 + self.quiet.variance_dn2)
+        weights = self.weights(statistic, template)
+        return closed_form(statistic, self.quiet, observed, self.scene.used, weights, self.scene.comparison)
 
     def dof(self, statistic: str) -> int:
         """Degrees of freedom without a flare: pixels, resolution elements, or one."""
-        if statistic not in FIXED_STATISTICS:
+        if self.weights(statistic) is not None:
             return 1
         if statistic == "chi2_element":
             return int(np.unique(self.quiet.element[self.scene.used]).size)
@@ -222,7 +252,7 @@ class Detection:
             Per test.
         statistic : str
         template : int
-            For ``matched``: the flare whose shape is looked for.
+            For `SHAPED` statistics: the flare whose shape is looked for.
 
         Returns
         -------
@@ -280,19 +310,36 @@ class Detection:
             probabilities.append(Interval(value.value, low.low, high.high))
         return probabilities
 
-    def roc(self, statistic: str = "chi2", flare: int = 0) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """False-alarm probability against detection probability, at every bin edge, both descending.
+    def quantile(
+        self, probability: float, statistic: str = "chi2", flare: int | None = None, *, template: int = 0
+    ) -> Interval:
+        """A quantile of a simulated distribution with its order-statistic interval; others as for `distribution`."""
+        return self.distribution(statistic, flare, template=template).quantile_interval(probability)
+
+    def tail_samples(self, statistic: str = "chi2", flare: int | None = None, *, template: int = 0) -> QTable:
+        """The 1000 largest values of a null or the smallest of a flare, exactly, with their realisations.
+
+        The realisation's number brings its spectrum back: `Engine.realise` with the same seed.
 
         Returns
         -------
-        fap, probability : ndarray, shape (n_edge,)
+        QTable
+            ``realisation`` and ``value``, the most extreme first.
         """
+        from astropy.table import QTable
+
+        self._check(statistic, flare, template)
+        key: Key = (statistic, "flare", flare) if flare is not None else self._null_key(statistic, template)
+        kept = self._samples[key]
+        table = QTable({"realisation": kept.realisations, "value": kept.values})
+        table["value"].info.description = STATISTICS.get(statistic, "weighted sum of the difference")
+        return table
+
+    def roc(self, statistic: str = "chi2", flare: int = 0) -> Roc:
+        """False-alarm probability against detection probability, and the area under the curve."""
         self._check(statistic, flare)
-        null = self._found[(statistic, "null", self._null(statistic, flare))]
-        found = self._found[(statistic, "flare_on_null_grid", flare)]
-        fap, probability = (d.counts[::-1].cumsum()[::-1] / d.n for d in (null, found))
-        keep = np.append(True, (np.diff(fap) != 0) | (np.diff(probability) != 0))
-        return fap[keep], probability[keep]
+        null = self._found[self._null_key(statistic, flare)]
+        return Roc.of(null, self._found[(statistic, "flare_on_null_grid", flare)])
 
     def table(self, fap: float = 1e-3) -> QTable:
         """One row per flare and statistic: expected and simulated values, threshold and probability.
@@ -330,14 +377,16 @@ class Detection:
         table.meta["tails"] = "counted" if countable(fap, self.realisations) else "importance sampling"
         return table
 
+    def _null_key(self, statistic: str, template: int) -> Key:
+        return statistic, "null", self._null(statistic, template)
+
     def _null(self, statistic: str, template: int) -> int:
-        # Only `matched` looks for a given shape; the others have one null for all flares.
-        return template if statistic == "matched" else 0
+        return template if statistic in SHAPED else 0
 
     def _cut(self, fap: float, statistic: str, template: int) -> tuple[Distribution, tuple[int, int, int]]:
         """The null, and the bins whose lower edges are the threshold and the ends of its interval."""
         sampled = self.tail(fap, statistic, template=template)
-        null = self._found[(statistic, "null", self._null(statistic, template))]
+        null = self._found[self._null_key(statistic, template)]
         if sampled is not None:
             edges = np.asarray(null.edge(np.arange(null.counts.size)))
             t = sampled.threshold
@@ -351,7 +400,7 @@ class Detection:
     def _check(self, statistic: str, flare: int | None, template: int = 0) -> None:
         if statistic not in self.statistics:
             raise InputError(f"statistic {statistic!r} was not simulated, expected one of {', '.join(self.statistics)}")
-        if flare is None and statistic == "matched":
+        if flare is None and statistic in SHAPED:
             flare = template
         if flare is not None and not 0 <= flare < len(self.flares):
             raise InputError(f"flare = {flare}, expected 0 to {len(self.flares) - 1}")
@@ -386,28 +435,35 @@ def plan_channels(result: Detection, batch: Sequence[int], *, first: bool) -> Ch
         Whether nulls shared by all batches are counted in this one.
     """
     n_scenario, width = 1 + len(batch), len(result.scene.pixels)
-    shared = [name for name in result.statistics if name not in (*FIXED_STATISTICS, "matched")]
+    shared = [name for name in result.statistics if name not in (*FIXED_STATISTICS, *SHAPED)]
     rows: list[NDArray[np.float64]] = []
-    ends = np.zeros(n_scenario, np.uint32)
-    #: Which row holds a linear statistic of a scenario, `matched` by the flare looked for.
-    row_of: dict[tuple[str, int, int], int] = {}
+    scales: list[NDArray[np.float64]] = []
+    ends = np.zeros((2, n_scenario), np.uint32)
+    #: Where a statistic of a scenario is found, `SHAPED` ones by the flare looked for.
+    place_of: dict[tuple[str, int, int], tuple[list[NDArray[np.float64]], int]] = {}
     for scenario in range(n_scenario):
         # The quiescent draws meet every flare's shape, each flare only its own.
         shapes = [flare for i, flare in enumerate(batch) if scenario in (0, i + 1)]
         wanted = [("matched", flare) for flare in shapes if "matched" in result.statistics]
         for name, flare in (*wanted, *((name, 0) for name in shared)):
-            row_of[(name, scenario, flare)] = len(FIXED_STATISTICS) * n_scenario + len(rows)
+            place_of[(name, scenario, flare)] = rows, len(rows)
             weights = result.weights(name, flare)
             assert weights is not None
             rows.append(weights)
-        ends[scenario] = len(rows)
+        for flare in shapes if "paper" in result.statistics else ():
+            place_of[("paper", scenario, flare)] = scales, len(scales)
+            scales.append(result.smoothing.scale(result.flares[flare]))
+        ends[:, scenario] = len(rows), len(scales)
     padded = np.zeros((len(rows), width), np.float32)
     padded[:, : result.scene.n_pixel] = np.array(rows).reshape(len(rows), result.scene.n_pixel)
+    scaled = np.array(scales, np.float32) if scales else np.zeros((0, 1), np.float32)
 
     def row(statistic: str, scenario: int, flare: int) -> int:
+        fixed = len(FIXED_STATISTICS)
         if statistic in FIXED_STATISTICS:
-            return len(FIXED_STATISTICS) * scenario + FIXED_STATISTICS.index(statistic)
-        return row_of[(statistic, scenario, flare if statistic == "matched" else 0)]
+            return fixed * scenario + FIXED_STATISTICS.index(statistic)
+        among, place = place_of[(statistic, scenario, flare if statistic in SHAPED else 0)]
+        return fixed * n_scenario + place + (len(rows) if among is scales else 0)
 
     grids: list[Grid] = []
     keys: list[Key] = []
@@ -417,13 +473,13 @@ def plan_channels(result: Detection, batch: Sequence[int], *, first: bool) -> Ch
         keys.append((statistic, role, flare))
 
     for statistic in result.statistics:
-        if first and statistic != "matched":
+        if first and statistic not in SHAPED:
             add(statistic, "null", 0, row(statistic, 0, 0), result.closed_form(statistic))
         for i, flare in enumerate(batch):
             null = result.closed_form(statistic, template=flare)
-            if statistic == "matched":
+            if statistic in SHAPED:
                 add(statistic, "null", flare, row(statistic, 0, flare), null)
             channel = row(statistic, i + 1, flare)
             add(statistic, "flare_on_null_grid", flare, channel, null)
             add(statistic, "flare", flare, channel, result.closed_form(statistic, flare))
-    return ChannelPlan(padded, ends, len(FIXED_STATISTICS) * n_scenario + len(rows), grids, keys)
+    return ChannelPlan(padded, ends[0], scaled, ends[1], grids, keys)

@@ -5,12 +5,14 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl import program
+from mauvecl.comparison import TEMPLATE, Comparison
 from mauvecl.detection import ChannelPlan, Detection, Tails, plan_channels
 from mauvecl.host.errors import InputError
 from mauvecl.processes import NONE, Processes
@@ -19,7 +21,7 @@ from mauvecl.run import Run, Tile
 from mauvecl.scene import PIXEL_BLOCK, Mode, Recipe, Scene, prepare
 from mauvecl.snr import Counts, SnrResult, elements, observers
 from mauvecl.statistics import Linear
-from mauvecl.tally import Tally
+from mauvecl.tally import TailSamples, Tally
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -241,6 +243,7 @@ class Engine:
         start: int = 0,
         processes: Processes = NONE,
         recipe: Recipe = "auto",
+        comparison: Comparison = TEMPLATE,
         tails: Tails = "counted",
     ) -> Detection:
         """Null and flare distributions of detection statistics, all on common draws (METHODS section 6).
@@ -255,13 +258,16 @@ class Engine:
             Of each scenario.
         seed : int
             0 to 2**64 - 1.
-        statistics : sequence of {"chi2", "chi2_element", "chi2_pair", "matched", "uv_excess"} or Linear
+        statistics : sequence of str or Linear
+            Names of `statistics.STATISTICS`, and statistics of one's own.
         mode : {"auto", "frames", "stacked"}
         start : int
             First realisation.
         processes : Processes
         recipe : {"auto", "joint", "apart"}
             See `scene.prepare`.
+        comparison : Comparison
+            What is subtracted, and by whose variances; the template and the model's by default.
         tails : {"counted", "sampled"}
             Thresholds beyond what is drawn: refused, or by importance sampling (`tails.tail`).
 
@@ -271,30 +277,35 @@ class Engine:
             For an unknown statistic, scenarios that do not belong together, or an impossible number, seed or mode.
         """
         self._check(start, realisations, seed)
-        scene = prepare([quiet, *flares], mode, processes=processes, recipe=recipe)
+        scene = prepare([quiet, *flares], mode, processes=processes, recipe=recipe, comparison=comparison)
         size = BATCH[scene.frames] - 1
         result = Detection(quiet, tuple(flares), statistics, scene, realisations, tails, seed)
         batches = [range(i, min(i + size, len(flares))) for i in range(0, len(flares), size)] or [range(0)]
         for number, batch in enumerate(batches):
             plan = plan_channels(result, batch, first=number == 0)
-            tally = Tally(plan.grids)
+            tally, samples = Tally(plan.grids), plan.tails()
             part = scene.part([0, *(k + 1 for k in batch)])
 
-            def work(run: Run, tile: Tile, tally: Tally) -> None:
+            def work(
+                tile: Tile, done: int, run: Run, tally: Tally = tally, samples: list[TailSamples | None] = samples
+            ) -> None:
                 run.statistics(tile)
                 run.tally(tile, tally)
+                for grid, kept in zip(tally.grids, samples, strict=True):
+                    if kept is not None:
+                        kept.add(run.channel(tile, grid.channel), start + done)
 
-            with self._statistics(part, seed, plan, statistics) as run:
+            with self._statistics(part, seed, plan, result) as run:
                 self._over(
                     start,
                     realisations,
                     4 * plan.n_rows,
-                    lambda tile, done, run=run, tally=tally: work(run, tile, tally),  # type: ignore[misc]
+                    partial(work, run=run),
                     before=number * realisations,
                     total=len(batches) * realisations,
                 )
                 run.flush(tally)
-            result.collect(plan, tally)
+            result.collect(plan, tally, samples)
         return result
 
     def statistic_values(
@@ -309,12 +320,13 @@ class Engine:
         mode: Mode = "auto",
         processes: Processes = NONE,
         recipe: Recipe = "auto",
+        comparison: Comparison = TEMPLATE,
     ) -> NDArray[np.float32]:
         """What `detect` counts, realisation by realisation, for up to 15 flares (7 drawn frame by frame).
 
         Parameters
         ----------
-        quiet, flares, seed, statistics, mode, processes, recipe
+        quiet, flares, seed, statistics, mode, processes, recipe, comparison
             As for `detect`.
         start, count : int
             Realisations start to start + count - 1.
@@ -323,7 +335,8 @@ class Engine:
         -------
         ndarray of float32, shape (n_channel, count)
             For each scenario chi2, chi2_element and chi2_pair, zero where not asked for; then the linear ones, scenario
-            by scenario: ``matched`` (without a flare for each flare's template) and the others in the order asked for.
+            by scenario: ``matched`` (without a flare for each flare's template) and the others in the order asked for;
+            then ``paper``, as ``matched``.
 
         Raises
         ------
@@ -331,7 +344,7 @@ class Engine:
             As `detect`, and for more flares than one launch holds.
         """
         self._check(start, count, seed)
-        scene = prepare([quiet, *flares], mode, processes=processes, recipe=recipe)
+        scene = prepare([quiet, *flares], mode, processes=processes, recipe=recipe, comparison=comparison)
         if len(flares) >= BATCH[scene.frames]:
             raise InputError(f"{len(flares)} flares, expected at most {BATCH[scene.frames] - 1} in one launch")
         result = Detection(quiet, tuple(flares), statistics, scene, count)
@@ -342,19 +355,26 @@ class Engine:
             run.statistics(tile)
             out[:, done : done + tile.wanted] = run.values(tile)
 
-        with self._statistics(scene, seed, plan, statistics) as run:
+        with self._statistics(scene, seed, plan, result) as run:
             self._over(start, count, 4 * plan.n_rows, lambda tile, done: work(run, tile, done))
         return out
 
-    def _statistics(self, scene: Scene, seed: int, plan: ChannelPlan, statistics: Sequence[str | Linear]) -> Run:
+    def _statistics(self, scene: Scene, seed: int, plan: ChannelPlan, asked: Detection) -> Run:
+        bands, finished = np.zeros((1, 0, 1), np.float32), np.zeros(1, np.uint32)
+        if len(plan.scales):
+            bands, finished = asked.smoothing.bands(len(scene.pixels), self.variant.chunk)
         run = self._scene(
             scene,
             seed,
-            pair="chi2_pair" in statistics,
-            elements="chi2_element" in statistics,
+            pair="chi2_pair" in asked.statistics,
+            elements="chi2_element" in asked.statistics,
             linears=len(plan.weights),
+            smooths=len(plan.scales),
+            slots=bands.shape[1],
         )
         run.weigh(plan.weights, plan.linear_end)
+        if run.variant.compared:
+            run.compare(bands, finished, plan.scales, plan.scale_end)
         return run
 
     @property
@@ -434,17 +454,21 @@ class Engine:
         pair: bool = False,
         elements: bool = True,
         linears: int = 0,
+        smooths: int = 0,
+        slots: int = 0,
         row_type: str = "int",
     ) -> Run:
         variant = replace(
             self.variant,
-            vectors=1 if self._width == 1 or scene.frames else VECTORS,
             scenarios=BATCH[scene.frames],
-            # Room for so many: a power of two, so that few programs are built.
-            linears=max(32, 1 << (linears - 1).bit_length()) if linears else 0,
+            linears=_room_for(linears),
             frames=scene.frames,
             clip=scene.clip,
             pair=pair,
+            noisy=scene.comparison.exposures > 0,
+            estimated=scene.comparison.estimated,
+            smooths=_room_for(smooths),
+            slots=slots,
             elements=elements,
             joint=scene.joint,
             quartic=scene.quartic,
@@ -453,4 +477,10 @@ class Engine:
             modulations=scene.modulations,
             row_type=row_type,
         )
-        return Run(self, scene, variant, seed)
+        alone = self._width == 1 or scene.frames or variant.compared
+        return Run(self, scene, replace(variant, vectors=1 if alone else VECTORS), seed)
+
+
+def _room_for(count: int) -> int:
+    """Room in a kernel for so many statistics: a power of two, so that few programs are built."""
+    return max(32, 1 << (count - 1).bit_length()) if count else 0

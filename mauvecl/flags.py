@@ -45,8 +45,18 @@ SeedFlag = Annotated[int | None, typer.Option(help="Seed [1].", show_default=Fal
 StatisticFlag = Annotated[
     list[str] | None,
     typer.Option(
-        "--statistic", help="chi2, chi2_element, chi2_pair, matched, uv_excess; may be repeated.", show_default=False
+        "--statistic",
+        help="chi2, chi2_element, chi2_pair, matched, uv_excess, paper, or all; may be repeated.",
+        show_default=False,
     ),
+]
+ReferenceFlag = Annotated[
+    str | None,
+    typer.Option(help="Compared with: template, exposure (noisy), or stack:N of them [template].", show_default=False),
+]
+VariancesFlag = Annotated[
+    str | None,
+    typer.Option(help="model, or estimated from the counts as an observer must [model].", show_default=False),
 ]
 FapFlag = Annotated[float | None, typer.Option(help="False-alarm probability per test [0.001].", show_default=False)]
 SetFlag = Annotated[

@@ -28,8 +28,9 @@ STREAMS = {
 #: Added to the stream for the draws of a reference exposure.
 REFERENCE = 64
 
-#: What a launch needs to know: the seed, sizes, where frames and groups of four pixels begin to be counted, and the
-#: alias table of the cosmic rays' charge.
+#: What a launch needs to know: the seed, sizes, where frames and groups of four pixels begin to be counted, the alias
+#: table of the cosmic rays' charge, how many quiescent exposures are averaged, one over that, and by what half the
+#: inverse variance of one exposure exceeds the inverse variance used.
 JOB = np.dtype(
     [
         ("seed_low", "u4"),
@@ -44,6 +45,9 @@ JOB = np.dtype(
         ("cosmic_table", "u4"),
         ("cosmic_bits", "u4"),
         ("cosmic_low", "i4"),
+        ("reference_count", "u4"),
+        ("reference_share", "f4"),
+        ("pair_scale", "f4"),
     ]
 )
 
@@ -113,6 +117,10 @@ RESPONSE = np.dtype(
 #: and the base-2 logarithm of its histogram's bins in DN.
 OBSERVER = np.dtype([("net_offset", "f4"), ("gain", "f4"), ("variance", "f4"), ("bin_shift", "u4")])
 
+#: How an observer estimates a variance in one pixel of a scenario: net = x + net_offset, variance = gain max(net, 0) +
+#: variance; and the template's fraction of a DN, zero where noisy exposures take its place.
+ESTIMATE = np.dtype([("net_offset", "f4"), ("gain", "f4"), ("variance", "f4"), ("fraction", "f4")])
+
 #: A resolution element: its pixels, and the grid of its S/N's histogram.
 ELEMENT = np.dtype([("first", "u4"), ("end", "u4"), ("centre", "f4"), ("bins_per_unit", "f4")])
 
@@ -127,6 +135,7 @@ STRUCTS = {
     "Poisson": POISSON,
     "Response": RESPONSE,
     "Observer": OBSERVER,
+    "Estimate": ESTIMATE,
     "Element": ELEMENT,
     "Grid": GRID,
 }

@@ -166,7 +166,7 @@ class Question:
     def theory(self, value: float) -> float:
         """Detection probability for Gaussian noise; 0 where no pixel is left unsaturated."""
         quiet, flare = self.pair(value)
-        scene = prepare([quiet, flare])
+        scene = prepare([quiet, flare], comparison=self.study.run.comparison())
         if not scene.used.any():
             return 0.0
         found = Detection(quiet, (flare,), (self.statistic,), scene, self.study.run.realisations)
@@ -177,17 +177,10 @@ class Question:
         """Detection probability with its interval, by the engine."""
         assert self.engine is not None
         quiet, flare = self.pair(value)
-        run = self.study.run
         found = self.engine.detect(
-            quiet,
-            [flare],
-            realisations=run.realisations,
-            seed=seed,
-            statistics=(self.statistic,),
-            tails=run.tails,
-            **self.study.drawing,
+            quiet, [flare], seed=seed, **self.study.detecting | {"statistics": (self.statistic,)}
         )
-        (probability,) = found.detection_probability(run.fap, self.statistic)
+        (probability,) = found.detection_probability(self.fap, self.statistic)
         self.points.append(Point(value, probability, seed))
         return probability
 

@@ -187,15 +187,7 @@ def _fill(
     engine: Engine,
 ) -> None:
     run = study.run
-    result = engine.detect(
-        quiet,
-        flares,
-        realisations=run.realisations,
-        seed=run.seed,
-        statistics=run.statistics,
-        tails=run.tails,
-        **study.drawing,
-    )
+    result = engine.detect(quiet, flares, seed=run.seed, **study.detecting)
     for s, statistic in enumerate(run.statistics):
         probabilities = result.detection_probability(run.fap, statistic)
         for k, ((i, j), p) in enumerate(zip(cells, probabilities, strict=True)):

@@ -40,6 +40,7 @@ NAMES = {
     "chi2_pair": "chi2 against a noisy exposure",
     "matched": "matched filter (standard deviations)",
     "uv_excess": "UV excess (standard deviations)",
+    "paper": "the paper's sum on smoothed spectra",
 }
 AXES = {
     "magnitude": "magnitude",

@@ -68,6 +68,10 @@ class Variant:
     frames: bool = False
     clip: bool = False
     pair: bool = False
+    noisy: bool = False
+    estimated: bool = False
+    slots: int = 0
+    smooths: int = 0
     elements: bool = True
     joint: bool = True
     quartic: bool = True
@@ -75,6 +79,11 @@ class Variant:
     cosmic: bool = False
     modulations: tuple[tuple[str, str], ...] = ()
     row_type: str = "int"
+
+    @property
+    def compared(self) -> bool:
+        """Whether more is compared than the template by the model's variances."""
+        return self.pair or self.noisy or self.estimated or self.slots > 0
 
 
 def load_opencl() -> Any:

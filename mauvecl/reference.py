@@ -256,9 +256,10 @@ def observed(
     seed: int,
     *,
     exposure: int = 0,
+    number: int = 0,
     scenarios: Sequence[int] | None = None,
 ) -> NDArray[np.float32]:
-    """DN above the base, summed over the draws, of scenarios.
+    """DN above the base, summed over the draws, of scenarios; of exposure `number` of several.
 
     Returns
     -------
@@ -266,8 +267,9 @@ def observed(
     """
     chosen = range(len(scene.levels)) if scenarios is None else scenarios
     total = np.zeros((len(chosen), len(scene.pixels), len(realisation)), np.float32)
-    for frame in range(scene.n_draws):
-        light, dark = factors(scene, realisation, frame, seed, exposure=exposure)
+    for frame in range(number * scene.n_draws, (number + 1) * scene.n_draws):
+        first = frame if scene.frames else number * scene.n_frames
+        light, dark = factors(scene, realisation, first, seed, exposure=exposure)
         for group in range(len(scene.pixels) // 4):
             drawn = draws(scene, realisation, frame, group, seed, exposure=exposure)
             for i, p in enumerate(range(4 * group, 4 * group + 4)):
@@ -312,8 +314,9 @@ def statistics(
     linear_end: NDArray[np.uint32],
     *,
     pair: bool = True,
+    smoothed: Smoothed | None = None,
 ) -> NDArray[np.float32]:
-    """Every channel of the kernel `statistics`, in its order.
+    """Every channel of the kernels `statistics` and `comparison`, in their order.
 
     Parameters
     ----------
@@ -324,43 +327,116 @@ def statistics(
     linear_end : ndarray of uint32, shape (n_scenario,)
     pair : bool
         Whether `chi2_pair` is wanted; its rows are zero otherwise.
+    smoothed : Smoothed, optional
+        Where `paper` is wanted.
 
     Returns
     -------
-    ndarray of float32, shape (3 n_scenario + n_linear, n)
+    ndarray of float32, shape (3 n_scenario + n_linear + n_smoothed, n)
     """
     n_scenario, fixed = len(scene.levels), len(layout.FIXED_STATISTICS)
     constants = scene.constants(weights, linear_end)
+    estimated, exposures = scene.comparison.estimated, scene.comparison.exposures
+    share, scale = scene.job["reference_share"], scene.job["pair_scale"]
     out = np.zeros((fixed * n_scenario + len(weights), len(realisation)), np.float32)
-    above = observed(scene, realisation, seed)
-    again = observed(scene, realisation, seed, exposure=layout.REFERENCE) if pair else above
-    x, again = _above_template(scene, above), _above_template(scene, again)
+    x = _above_template(scene, observed(scene, realisation, seed))
+    drawn = max(exposures, 1) if exposures or pair or smoothed is not None else 0
+    others = [
+        _above_template(scene, observed(scene, realisation, seed, exposure=layout.REFERENCE, number=number))
+        for number in range(drawn)
+    ]
+    finished = []
     begin = 0
     for k in range(n_scenario):
-        chi2, chi2_element, chi2_pair = (out[fixed * k + i] for i in range(fixed))
-        inside = np.zeros(len(realisation), np.float32)
-        level, edge = scene.levels[k], scene.edges[k]
+        t = int(scene.templates[k])
+        raw, level = x[k], scene.levels[k]
+        y: Floats = raw
+        variance: Floats = np.zeros_like(raw)
+        if exposures:
+            total = np.sum([other[t] for other in others], axis=0, dtype=np.float32)
+            y = fma(total, -share, raw)
+        if estimated:
+            estimate = scene.estimates[k]
+            variance = _variance(raw, estimate)
+            if exposures:
+                variance = np.add(variance, share * _variance(total * share, estimate), dtype=np.float32)
+            y = np.add(y, estimate["fraction"][:, None], dtype=np.float32)
         parts = [np.zeros(len(realisation), np.float32) for _ in range(4)]
         for p, pixel in enumerate(scene.pixels):
-            slope = fma(x[k, p], level[p]["inverse_variance"], level[p]["twice"])
-            parts[p % 4] = fma(x[k, p], slope, parts[p % 4])
-            if pixel["four_uneven"]:
-                inside = fma(x[k, p], pixel["used"], inside)
-            elif p % 4 == 0:
-                inside = inside + ((x[k, p] + x[k, p + 1]) + (x[k, p + 2] + x[k, p + 3]))
-            if pixel["element_end"]:
-                inside = inside + edge[p]["element_offset"]
-                chi2_element[:] = fma(inside * inside, edge[p]["inverse_element_variance"], chi2_element)
-                inside = np.zeros(len(realisation), np.float32)
-            if pair:
-                difference = x[k, p] - again[int(scene.templates[k]), p]
-                half = np.float32(0.5) * level[p]["inverse_variance"]
-                chi2_pair[:] = fma(difference * difference, half, chi2_pair)
-        chi2[:] = ((parts[0] + parts[1]) + (parts[2] + parts[3])) + constants[k]
+            if estimated:
+                parts[p % 4] = fma(y[p] * y[p], pixel["used"] / variance[p], parts[p % 4])
+            else:
+                slope = fma(y[p], level[p]["inverse_variance"], level[p]["twice"])
+                parts[p % 4] = fma(y[p], slope, parts[p % 4])
+        out[fixed * k] = ((parts[0] + parts[1]) + (parts[2] + parts[3])) + constants[k]
+        out[fixed * k + 1] = _element_sum(scene, k, y, variance)
+        for p, pixel in enumerate(scene.pixels) if pair else ():
+            d = raw[p] - others[0][t, p]
+            if estimated:
+                both = _variance(raw, estimate)[p] + _variance(others[0][t], estimate)[p]
+                weight = pixel["used"] / both
+            else:
+                weight = scale * level[p]["inverse_variance"]
+            out[fixed * k + 2] = fma(d * d, weight, out[fixed * k + 2])
         for linear in range(begin, int(linear_end[k])):
-            out[fixed * n_scenario + linear] = _summed(x[k], weights[linear]) + constants[n_scenario + linear]
+            row = _summed(y, weights[linear])
+            if estimated:
+                row = np.divide(row, np.sqrt(_summed(variance, weights[linear] * weights[linear])), dtype=np.float32)
+            else:
+                row = row + constants[n_scenario + linear]
+            out[fixed * n_scenario + linear] = row
         begin = int(linear_end[k])
-    return out
+        if smoothed is not None:
+            finished += smoothed.sums(raw - others[0][t], k)
+    return np.concatenate([out, np.array(finished, np.float32).reshape(len(finished), len(realisation))])
+
+
+def _variance(x: Floats, estimate: NDArray[np.void]) -> Floats:
+    """What an observer takes counts for, shape (n_padded, n)."""
+    gain, known, offset = (estimate[name][:, None] for name in ("gain", "variance", "net_offset"))
+    return fma(np.maximum(x + offset, np.float32(0.0)), gain, known)
+
+
+def _element_sum(scene: Scene, k: int, y: Floats, variance: Floats) -> Floats:
+    """The statistic `chi2_element` of a scenario, shape (n,)."""
+    total: Floats = np.zeros_like(y[0])
+    inside, noise = total, total
+    estimated = scene.comparison.estimated
+    for p, (pixel, edge) in enumerate(zip(scene.pixels, scene.edges[k], strict=True)):
+        if pixel["four_uneven"] or estimated:
+            inside = fma(y[p], pixel["used"], inside)
+            noise = fma(variance[p], pixel["used"], noise)
+        elif p % 4 == 0:
+            inside = inside + ((y[p] + y[p + 1]) + (y[p + 2] + y[p + 3]))
+        if pixel["element_end"]:
+            if estimated:
+                total = np.add(total, inside * inside / np.maximum(noise, np.float32(1e-12)), dtype=np.float32)
+            else:
+                inside = np.add(inside, edge["element_offset"], dtype=np.float32)
+                total = fma(inside * inside, edge["inverse_element_variance"], total)
+            inside, noise = np.zeros_like(total), np.zeros_like(total)
+    return total
+
+
+@dataclass(frozen=True, eq=False)
+class Smoothed:
+    """What the statistic `paper` needs: weights of each centre, shape (n_centre, n_padded), and factors of squares."""
+
+    rows: NDArray[np.float32]
+    scales: NDArray[np.float32]
+    scale_end: NDArray[np.uint32]
+
+    def sums(self, difference: Floats, k: int) -> list[Floats]:
+        """The smoothed statistics of a scenario, each shape (n,)."""
+        begin = int(self.scale_end[k - 1]) if k else 0
+        out = [np.zeros(difference.shape[1], np.float32) for _ in range(begin, int(self.scale_end[k]))]
+        for centre, row in enumerate(self.rows):
+            value = np.zeros(difference.shape[1], np.float32)
+            for p in np.flatnonzero(row):
+                value = fma(difference[p], row[p], value)
+            square = value * value
+            out = [fma(square, self.scales[begin + i, centre], one) for i, one in enumerate(out)]
+        return out
 
 
 def _above_template(scene: Scene, above: NDArray[np.float32]) -> NDArray[np.float32]:

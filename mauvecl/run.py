@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 #: Realisations, times frames, counted on the device before its 32-bit bins and 64-bit sums are emptied.
 MOST_COUNTED = 2**25
-#: Kernels of a detection.
-DETECTION = ("statistics", "tally")
+#: Kernels of a detection, the first where more is compared than the template.
+COMPARED, DETECTION = ("comparison", "tally"), ("statistics", "tally")
 #: Work-items to an element or channel of a histogram, on a device of many.
 SHARES = 1024
 
@@ -53,7 +53,7 @@ class Run:
     """One scene on the device; its buffers are released at the end of the `with` block."""
 
     def __init__(self, engine: Engine, scene: Scene, variant: Variant, seed: int) -> None:
-        self._engine, self._scene, self._variant = engine, scene, variant
+        self._engine, self._scene, self.variant = engine, scene, variant
         self._cl, self._queue = engine.cl, engine.queue
         self._buffers: list[Any] = []
         self._named: dict[str, Any] = {}
@@ -116,9 +116,10 @@ class Run:
     def _launch(self, name: str, items: tuple[int, ...], *arguments: Any) -> None:
         if name not in self._kernels:
             # One build for the two that are always used together.
-            rooms = DETECTION if name in DETECTION else (name,)
-            self._kernels[name] = self._cl.Kernel(self._engine.program(rooms, self._variant), name)
-        local = (1,) * len(items) if self._variant.width > 1 else None
+            detection = COMPARED if self.variant.compared else DETECTION
+            rooms = detection if name in DETECTION else (name,)
+            self._kernels[name] = self._cl.Kernel(self._engine.program(rooms, self.variant), name)
+        local = (1,) * len(items) if self.variant.width > 1 else None
         self._kernels[name](self._queue, items, local, *arguments)
 
     def realise(self, tile: Tile, out: NDArray[Any]) -> NDArray[np.uint32]:
@@ -144,7 +145,7 @@ class Run:
         else:
             rows = self._room("rows", out.nbytes)
         try:
-            items = (tile.size // self._variant.width,)
+            items = (tile.size // self.variant.width,)
             self._launch("realise", items, *self._arguments, *tile.address(), *tile.rows(), counts, rows)
             if shared:
                 mapped, _ = self._cl.enqueue_map_buffer(
@@ -171,7 +172,7 @@ class Run:
 
     def histogram(self, tile: Tile, counts: Counts) -> None:
         """Count each pixel's DN and each element's S/N of a tile on the device."""
-        width = self._variant.width
+        width = self.variant.width
         items = (self._n_element,) if width > 1 else (self._n_element, min(tile.wanted, SHARES))
         self._launch(
             "histogram",
@@ -212,19 +213,39 @@ class Run:
 
     def weigh(self, weights: NDArray[np.float32], linear_end: NDArray[np.uint32]) -> None:
         """Upload the linear statistics' weights, and where each scenario's end."""
-        self._weighing = [
-            self.upload(self._scene.templates),
-            self.upload(self._scene.constants(weights, linear_end)),
-            # A row of zeros behind them, for scenarios without any.
-            self.upload(np.concatenate([weights, np.zeros((1, len(self._scene.pixels)), np.float32)])),
-            self.upload(linear_end),
-        ]
-        self._rows = len(layout.FIXED_STATISTICS) * len(self._scene.levels) + len(weights)
+        scene = self._scene
+        # A row of zeros behind them, for scenarios without any.
+        padded = np.concatenate([weights, np.zeros((1, len(scene.pixels)), np.float32)])
+        self._weighing = [*map(self.upload, (scene.constants(weights, linear_end), padded, linear_end))]
+        self._rows = len(layout.FIXED_STATISTICS) * len(scene.levels) + len(weights)
+
+    def compare(
+        self,
+        bands: NDArray[np.float32],
+        finished: NDArray[np.uint32],
+        scales: NDArray[np.float32],
+        scale_end: NDArray[np.uint32],
+    ) -> None:
+        """Upload what only the kernel `comparison` reads, after `weigh`.
+
+        Parameters
+        ----------
+        bands : ndarray of float32, shape (n_chunk, n_slot, chunk)
+        finished : ndarray of uint32, shape (n_chunk,)
+            See `smoothing.Smoothing.bands`.
+        scales : ndarray of float32, shape (n_smoothed, n_centre)
+        scale_end : ndarray of uint32, shape (n_scenario,)
+            One past the last smoothed statistic of each scenario.
+        """
+        scene = self._scene
+        more = map(self.upload, (beyond(scene.estimates), bands, finished, scales, scale_end))
+        self._weighing = [self.upload(scene.templates), *self._weighing, *more, np.uint32(scales.shape[1])]
+        self._rows += len(scales)
 
     def statistics(self, tile: Tile) -> None:
         """Compute every channel of a tile into values[channel][realisation]."""
         values = self._room("values", 4 * self._rows * tile.size)
-        items = (tile.size // (self._variant.width * self._variant.vectors),)
+        items = (tile.size // (self.variant.width * self.variant.vectors),)
         self._launch(
             "statistics", items, *self._arguments, *tile.address(), *self._weighing, np.uint32(tile.size), values
         )
@@ -235,10 +256,17 @@ class Run:
         self._cl.enqueue_copy(self._queue, host, self._named["values"])
         return host[:, tile.start : tile.stop]
 
+    def channel(self, tile: Tile, number: int) -> NDArray[np.float32]:
+        """One channel of the tile computed last, shape (tile.wanted,)."""
+        host = np.empty(tile.wanted, np.float32)
+        offset = 4 * (number * tile.size + tile.start)
+        self._cl.enqueue_copy(self._queue, host, self._named["values"], src_offset=offset)
+        return host
+
     def tally(self, tile: Tile, tally: Tally) -> None:
         """Add a tile's channels to the histograms and integer sums on the device."""
         count = len(tally.grids)
-        shares = 1 if self._variant.width > 1 else SHARES
+        shares = 1 if self.variant.width > 1 else SHARES
         if "grids" not in self._named:
             self._named["grids"] = self.upload(Grid.pack(tally.grids))
             self._named["histogram"] = self.upload(np.zeros((count, layout.BINS), np.uint32))

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl import layout
+from mauvecl.comparison import TEMPLATE, Comparison
 from mauvecl.cumulants import Cumulants, joint_is_exact, needs_fourth_power, polynomial
 from mauvecl.host.errors import InputError
 from mauvecl.poisson import SMALLEST_EXPANDED, AliasTable, table_of, table_set
@@ -68,7 +69,10 @@ class Scene:
     templates : ndarray of uint32, shape (n_scenario,)
         For each scenario the one whose mean and variance it is compared with.
     fraction : ndarray, shape (n_scenario, n_padded)
-        Template rounded to whole DN less the template.
+        Template rounded to whole DN less the template; zero where noisy exposures take its place.
+    estimates : ndarray of layout.ESTIMATE, shape (n_scenario, n_padded)
+        Empty where variances are the model's.
+    comparison : Comparison
     base_dn : ndarray of int64, shape (n_scenario, n_pixel)
         Whole DN of one draw's mean that the kernels leave out.
     used : ndarray of bool, shape (n_pixel,)
@@ -94,6 +98,8 @@ class Scene:
     priors: NDArray[np.float32]
     templates: NDArray[np.uint32]
     fraction: Float
+    estimates: NDArray[np.void]
+    comparison: Comparison
     base_dn: NDArray[np.int64]
     used: NDArray[np.bool_]
 
@@ -126,7 +132,7 @@ class Scene:
         job["scenario_count"] = len(chosen)
         per_scenario = {
             name: array[chosen] if len(array := getattr(self, name)) else array
-            for name in ("levels", "edges", "photon_counts", "responses", "fraction", "base_dn")
+            for name in ("levels", "edges", "photon_counts", "responses", "fraction", "estimates", "base_dn")
         }
         templates = np.array([chosen.index(t) for t in self.templates[chosen]], np.uint32)
         return replace(self, job=job, templates=templates, **per_scenario)
@@ -147,6 +153,7 @@ def prepare(
     processes: Processes = NONE,
     templates: Sequence[int] | None = None,
     recipe: Recipe = "auto",
+    comparison: Comparison = TEMPLATE,
     first_frame: int = 0,
     first_group: int = 0,
 ) -> Scene:
@@ -164,6 +171,8 @@ def prepare(
     recipe : {"auto", "joint", "apart"}
         Draw all noise of a pixel from one normal, or Poisson counts apart; by itself apart only where the joint draw
         would not be exact.
+    comparison : Comparison
+        What is subtracted, and by whose variances.
     first_frame, first_group : int
         Where frames and groups of four pixels begin to be counted in the generator's counter.
 
@@ -217,6 +226,9 @@ def prepare(
     responses = np.zeros(shape if modulations else 0, layout.RESPONSE)
     responses["other_variance"] = NO_VARIANCE
     fraction, base = np.zeros(shape), np.zeros((len(scenarios), n_pixel), np.int64)
+    estimates = np.zeros(shape if comparison.estimated else 0, layout.ESTIMATE)
+    # What is subtracted adds its noise to the null's variance.
+    noisier = 1.0 + comparison.share
     levels["shift"] = edges["low"] = edges["high"] = layout.MAGIC
     for k, (x, c) in enumerate(zip(scenarios, cumulants, strict=True)):
         mean = c.mean.copy()
@@ -240,15 +252,19 @@ def prepare(
         template = scenarios[compared[k]]
         mean_sum = template.n_frames * template.mean_raw_dn
         whole = (quiet.n_frames // each) * base[k] - np.rint(mean_sum)
-        fraction[k, :n_pixel] = np.rint(mean_sum) - mean_sum
+        if not comparison.exposures:
+            fraction[k, :n_pixel] = np.rint(mean_sum) - mean_sum
         level["shift"] = layout.MAGIC - whole
-        level["inverse_variance"] = used / template.variance_dn2
+        variance = noisier * template.variance_dn2
+        level["inverse_variance"] = used / variance
         level["twice"] = 2.0 * fraction[k, :n_pixel] * level["inverse_variance"]
         edge = edges[k, :n_pixel]
         edge["base"], edge["whole"] = base[k], whole
         edge["low"] = layout.MAGIC - base[k]
         edge["high"] = layout.MAGIC + (x.adc_max_dn - base[k])
-        element_variance = np.bincount(quiet.element, template.variance_dn2 * used)
+        if comparison.estimated:
+            _estimate(estimates[k], template, fraction[k], np.rint(mean_sum))
+        element_variance = np.bincount(quiet.element, variance * used)
         with np.errstate(divide="ignore"):
             edge["inverse_element_variance"][ends] = np.where(element_variance > 0, 1.0 / element_variance, 0.0)
         edge["element_offset"][ends] = np.bincount(quiet.element, fraction[k, :n_pixel] * used)
@@ -257,6 +273,8 @@ def prepare(
     job["pixel_count"], job["padded_count"], job["scenario_count"] = n_pixel, padded, len(scenarios)
     job["draw_count"], job["frame_count"] = quiet.n_frames if frames else 1, quiet.n_frames
     job["first_frame"], job["first_group"] = first_frame, first_group
+    job["reference_count"], job["reference_share"] = comparison.exposures, comparison.share
+    job["pair_scale"] = noisier / 2.0
     if processes.cosmic_rays is not None:
         table = table_of(processes.cosmic_rays.charge(each * quiet.frame_s))
         job["cosmic_table"] = sum(t.entries.size for t in tables)
@@ -282,6 +300,8 @@ def prepare(
         priors=priors,
         templates=compared,
         fraction=fraction,
+        estimates=estimates,
+        comparison=comparison,
         base_dn=base,
         used=used,
     )
@@ -320,6 +340,16 @@ def _counts(out: NDArray[np.void], mean: Float, gain: Float, tables: list[AliasT
     out["cubic"][expanded] = -1 / (72 * root)
     out["gain"] = gain
     return centre
+
+
+def _estimate(out: NDArray[np.void], template: Expectation, fraction: Float, mean_sum: Float) -> None:
+    """How an observer who knows the detector estimates variances; padding has some, to divide by."""
+    n_pixel, known = template.wavelength_nm.size, template.read_noise_dn**2 + template.dark_variance_dn2 + 1 / 12
+    out["variance"] = 1.0
+    out["fraction"] = fraction
+    out["net_offset"][:n_pixel] = mean_sum - template.n_frames * (template.bias_dn + template.dark_dn)
+    out["gain"][:n_pixel] = template.gain_dn_per_electron
+    out["variance"][:n_pixel] = np.maximum(template.n_frames * known, NO_VARIANCE)
 
 
 def _respond(out: NDArray[np.void], c: Cumulants) -> None:

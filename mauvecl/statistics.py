@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from mauvecl.comparison import TEMPLATE, Comparison
 from mauvecl.host.errors import InputError
 
 if TYPE_CHECKING:
@@ -21,7 +22,12 @@ STATISTICS = {
     "chi2_pair": "against a noisy quiescent exposure: twice the variance",
     "matched": "weighted sum with the flare's own shape as template, in standard deviations",
     "uv_excess": "net counts from 200 to 360 nm, in standard deviations",
+    "paper": "the MauveSim paper's sum of (F - Q)^2 / F on smoothed spectra in DN/s, Q a noisy exposure; F the flare's",
 }
+#: Statistics that look for one flare's shape: each flare has a null of its own.
+SHAPED = ("matched", "paper")
+#: Statistics that compare with one noisy exposure, whatever the others are compared with.
+PAIRED = ("chi2_pair", "paper")
 #: Where `uv_excess` looks, nm.
 UV_NM = (200.0, 360.0)
 
@@ -179,20 +185,25 @@ class Linear:
             )
 
 
-def uv_weights(quiet: Expectation, used: NDArray[np.bool_]) -> NDArray[np.float64]:
+def uv_weights(quiet: Expectation, used: NDArray[np.bool_], comparison: Comparison = TEMPLATE) -> NDArray[np.float64]:
     """Weights per DN of `uv_excess`, one over the noise of the sum, shape (n_pixel,); zero without any pixel there."""
     inside = used & (quiet.wavelength_nm >= UV_NM[0]) & (quiet.wavelength_nm <= UV_NM[1])
-    return np.asarray(inside / (np.sqrt(np.sum(quiet.variance_dn2[inside])) or 1.0))
+    noise = np.sqrt((1.0 + comparison.share) * np.sum(quiet.variance_dn2[inside]))
+    return np.asarray(inside / (noise or 1.0))
 
 
-def matched_weights(quiet: Expectation, flare: Expectation, used: NDArray[np.bool_]) -> NDArray[np.float64]:
+def matched_weights(
+    quiet: Expectation, flare: Expectation, used: NDArray[np.bool_], comparison: Comparison = TEMPLATE
+) -> NDArray[np.float64]:
     """Weights per DN of the matched statistic, delta / v / sqrt(lambda), shape (n_pixel,).
 
-    The statistic then has variance one without a flare, and mean sqrt(lambda) with it, lambda = sum delta^2 / v.
+    The statistic then has variance one without a flare, and mean sqrt(lambda) with it, lambda = sum delta^2 / v; v is
+    the variance of the difference, that of what is subtracted included.
     """
     delta = np.where(used, flare.signal_dn - quiet.signal_dn, 0.0)
-    strength = float(np.sqrt(np.sum(delta**2 / quiet.variance_dn2)))
-    weights: NDArray[np.float64] = delta / quiet.variance_dn2 / (strength or 1.0)
+    variance = (1.0 + comparison.share) * quiet.variance_dn2
+    strength = float(np.sqrt(np.sum(delta**2 / variance)))
+    weights: NDArray[np.float64] = delta / variance / (strength or 1.0)
     return weights
 
 
@@ -202,6 +213,7 @@ def closed_form(
     observed: Expectation,
     used: NDArray[np.bool_],
     weights: NDArray[np.float64] | None = None,
+    comparison: Comparison = TEMPLATE,
 ) -> QuadraticForm | Normal:
     """The distribution of a statistic for Gaussian noise (METHODS section 6).
 
@@ -217,15 +229,20 @@ def closed_form(
         Pixels that count.
     weights : ndarray, shape (n_pixel,), optional
         Of a linear statistic.
+    comparison : Comparison
+        Estimated variances are taken for the true ones, which is what they are on average.
     """
     delta = np.where(used, observed.signal_dn - quiet.signal_dn, 0.0)
     if weights is not None:
-        return Normal(float(weights @ delta), float(np.sqrt(weights**2 @ observed.variance_dn2)))
-    model, true = quiet.variance_dn2 * used, observed.variance_dn2 * used
+        spread = float(np.sqrt(weights**2 @ (observed.variance_dn2 + comparison.share * quiet.variance_dn2)))
+        # By estimated variances a linear statistic comes in its own standard deviations.
+        mean = float(weights @ delta)
+        return Normal(mean / spread, 1.0) if comparison.estimated else Normal(mean, spread)
+    share = 1.0 if statistic in PAIRED else comparison.share
+    true = (observed.variance_dn2 + share * quiet.variance_dn2) * used
+    model = true if comparison.estimated else (1.0 + share) * quiet.variance_dn2 * used
     if statistic == "chi2_element":
         delta, model, true = (quiet.per_element(values) for values in (delta, model, true))
-    if statistic == "chi2_pair":
-        model, true = 2.0 * model, true + model
     counts = model > 0
     delta, model, true = delta[counts], model[counts], true[counts]
     return QuadraticForm(true / model, delta / np.sqrt(true))

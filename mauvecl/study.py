@@ -8,11 +8,12 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
 
 from mauvecl.host.errors import InputError
 
 if TYPE_CHECKING:
+    from mauvecl.comparison import Comparison
     from mauvecl.host.expectation import Expectation
     from mauvecl.host.instrument import Instrument
     from mauvecl.host.sky import Sky
@@ -175,6 +176,26 @@ class Run(_Part):
     statistics: Annotated[tuple[str, ...], Field(min_length=1)] = ("chi2", "chi2_element", "matched")
     fap: Annotated[float, Field(gt=0, lt=1)] = 1e-3
     tails: Literal["counted", "sampled"] = "counted"
+    reference: str = "template"
+    variances: Literal["model", "estimated"] = "model"
+
+    @field_validator("statistics")
+    @classmethod
+    def _all(cls, given: tuple[str, ...]) -> tuple[str, ...]:
+        from mauvecl.statistics import STATISTICS
+
+        return tuple(STATISTICS) if "all" in given else given
+
+    @model_validator(mode="after")
+    def _comparable(self) -> Self:
+        self.comparison()
+        return self
+
+    def comparison(self) -> Comparison:
+        """What an observed spectrum is compared with, as the engine takes it."""
+        from mauvecl.comparison import Comparison
+
+        return Comparison.of(self.reference, self.variances)
 
 
 #: What a limit is asked for, or an axis of a map runs over, and where it may lie.
@@ -401,6 +422,13 @@ class Study(_Part):
         """How the engine is to draw: mode, recipe, processes."""
         o = self.observation
         return {"mode": o.mode, "recipe": o.recipe, "processes": self.processes.processes()}
+
+    @property
+    def detecting(self) -> dict[str, Any]:
+        """How the engine is to draw and compare: everything that `Engine.detect` takes but stars and seed."""
+        run = self.run
+        how = {"realisations": run.realisations, "statistics": run.statistics, "tails": run.tails}
+        return self.drawing | how | {"comparison": run.comparison()}
 
     def expectations(self, star: Star) -> list[Expectation]:
         """A star without a flare, then with each of the flares."""

@@ -16,7 +16,7 @@ from scipy import special
 
 from mauvecl import layout
 from mauvecl.host.errors import InputError
-from mauvecl.statistics import CONFIDENCE, Interval
+from mauvecl.statistics import CONFIDENCE, PAIRED, Interval
 
 if TYPE_CHECKING:
     from mauvecl.detection import Detection
@@ -32,6 +32,8 @@ WANTED_ERROR = 0.02
 BLOCK = 500
 #: Second half of the generator's key: draws of tails are no draws of the engine.
 TAIL_KEY = 0x7461696C
+#: Quiescent exposures averaged at most: each is drawn on the host.
+MOST_AVERAGED = 30
 #: Smaller ones lie beyond what the polynomial of the draw was tested for.
 SMALLEST_FAP = 1e-10
 
@@ -73,16 +75,18 @@ def tail(found: Detection, fap: float, statistic: str, *, template: int = 0, see
     Raises
     ------
     InputError
-        If the noise is not drawn jointly and as stacks, processes act, or the error stays too large.
+        If the noise is not drawn jointly and as stacks, processes act, more than 30 quiescent exposures are averaged,
+        or the error stays too large.
     """
     if not SMALLEST_FAP <= fap <= 0.1:
         raise InputError(f"fap = {fap:g}, expected {SMALLEST_FAP:g} to 0.1 for importance sampling")
     _check(found.scene)
     null = found.closed_form(statistic, template=template)
+    how = _Tilt.towards(null.isf(fap), found, statistic, template)
     values, logs = np.empty(0), np.empty(0)
     goal = FEWEST
     while True:
-        more = _tilted(found, statistic, template, null.isf(fap), seed, values.size, goal)
+        more = _tilted(found, statistic, template, how, seed, values.size, goal)
         values, logs = (np.concatenate(pair) for pair in zip((values, logs), more, strict=True))
         cut, low, high, error = _threshold(values, logs, fap)
         if error <= WANTED_ERROR:
@@ -101,11 +105,13 @@ def _check(scene: Scene) -> None:
         "frames drawn one by one": scene.frames,
         "cosmic rays": scene.cosmic,
         "priors": bool(scene.modulations),
+        f"{scene.comparison.exposures} averaged exposures": scene.comparison.exposures > MOST_AVERAGED,
     }
     for reason, holds in reasons.items():
         if holds:
             raise InputError(
-                f"importance sampling with {reason}, expected stacks of joint draws: draw enough realisations"
+                f"importance sampling with {reason}, expected stacks of joint draws and at most {MOST_AVERAGED} "
+                "averaged exposures: draw enough realisations"
             )
 
 
@@ -128,58 +134,127 @@ def _threshold(values: Float, logs: Float, fap: float) -> tuple[float, float, fl
     return float(ordered[at]), low, high, relative
 
 
+@dataclass(frozen=True, eq=False)
+class _Tilt:
+    """How draws are moved towards an alarm: by `shift` along the first direction, or `stretch`ed along all of them.
+
+    Attributes
+    ----------
+    directions : ndarray, shape (n_direction, n_pixel)
+        Orthonormal, in standard deviations of each pixel's difference.
+    stretch : ndarray, shape (n_direction,)
+    shift : float
+    """
+
+    directions: Float
+    stretch: Float
+    shift: float = 0.0
+
+    @classmethod
+    def towards(cls, goal: float, found: Detection, statistic: str, template: int) -> _Tilt:
+        """Such that the statistic comes near `goal` on average."""
+        scene, quiet = found.scene, found.quiet
+        sd = np.sqrt((1.0 + _share(found, statistic)) * quiet.variance_dn2) * scene.used
+        weights = found.weights(statistic, template)
+        if weights is not None:
+            # Linear: the mean moves along the statistic's own direction.
+            length = float(np.linalg.norm(weights * sd))
+            unit = 1.0 if scene.comparison.estimated else length
+            return cls((weights * sd / length)[None], np.ones(1), goal / unit)
+        # Quadratic: the spread grows, by exponential tilting of each independent square.
+        if statistic == "paper":
+            scale = found.smoothing.scale(found.flares[template])
+            square, modes = found.smoothing.modes(scale, sd**2)
+            directions = modes * sd / np.sqrt(square)[:, None]
+        elif statistic == "chi2_element":
+            member = quiet.element[None, :] == np.unique(quiet.element[scene.used])[:, None]
+            directions = member * sd
+            directions /= np.linalg.norm(directions, axis=1)[:, None]
+            square = np.ones(len(directions))
+        else:
+            directions = np.eye(scene.n_pixel)[scene.used]
+            square = np.ones(len(directions))
+        return cls(directions, _stretch(square, goal))
+
+    def moved(self, difference: Float) -> tuple[Float, Float]:
+        """What is added to differences, shape (n, n_pixel), and the logarithms of the draws' weights."""
+        along = difference @ self.directions.T
+        if self.shift:
+            there = along + self.shift
+            return self.shift * self.directions[0], self.shift**2 / 2 - self.shift * there[:, 0]
+        there = along * self.stretch
+        # The ratio of standard normal densities to those of spread `stretch`.
+        logs = np.log(self.stretch).sum() - 0.5 * there**2 @ (1.0 - 1.0 / self.stretch**2)
+        return (there - along) @ self.directions, np.asarray(logs)
+
+
+def _stretch(square: Float, goal: float) -> Float:
+    """Spreads of normals whose weighted squares then sum to `goal` on average."""
+    from scipy.optimize import brentq
+
+    most = float(square.max())
+
+    def excess(share: float) -> float:
+        return float(np.sum(square / (1.0 - share * square / most))) - goal
+
+    share = 0.0 if excess(0.0) >= 0 else float(brentq(excess, 0.0, 1.0 - 1e-12))
+    return np.asarray(1.0 / np.sqrt(1.0 - share * square / most))
+
+
+def _share(found: Detection, statistic: str) -> float:
+    return 1.0 if statistic in PAIRED else found.scene.comparison.share
+
+
 def _tilted(
-    found: Detection, statistic: str, template: int, goal: float, seed: int, start: int, stop: int
+    found: Detection, statistic: str, template: int, tilt: _Tilt, seed: int, start: int, stop: int
 ) -> tuple[Float, Float]:
     """Values of tilted draws number start to stop - 1, whole blocks, and the logarithms of their weights."""
-    parts = [_block(found, statistic, template, goal, seed, b) for b in range(start // BLOCK, stop // BLOCK)]
+    parts = [_block(found, statistic, template, tilt, seed, b) for b in range(start // BLOCK, stop // BLOCK)]
     values, logs = (np.concatenate(part) for part in zip(*parts, strict=True))
     return values, logs
 
 
-def _block(found: Detection, statistic: str, template: int, goal: float, seed: int, block: int) -> tuple[Float, Float]:
-    scene, used = found.scene, found.scene.used
-    sd = np.sqrt(found.quiet.variance_dn2) * used
-    z = _normals(scene.n_pixel, seed, block, 0)
+def _block(found: Detection, statistic: str, template: int, tilt: _Tilt, seed: int, block: int) -> tuple[Float, Float]:
+    scene = found.scene
+    exposures = 1 if statistic in PAIRED else scene.comparison.exposures
+    z, *others = (_normals(scene.n_pixel, seed, block, exposure) for exposure in range(1 + exposures))
+    share = _share(found, statistic)
+    # Only the difference is tilted; what it does not see stays as drawn.
+    root = np.sqrt(1.0 + share)
+    difference = (z - share * sum(others)) / root
+    move, logs = tilt.moved(difference)
+    excess = _excess(scene, z + move / root)
+    subtracted = [_excess(scene, other - share * move / root) for other in others]
+    mean = share * np.sum(subtracted, axis=0) if subtracted else np.zeros_like(excess)
+    return _value(found, statistic, template, excess, mean), logs
+
+
+def _value(found: Detection, statistic: str, template: int, excess: Float, mean: Float) -> Float:
+    """The statistic of each draw, from observed less template and subtracted less template, DN, (n, n_pixel)."""
+    scene, quiet, share = found.scene, found.quiet, _share(found, statistic)
+    x = excess - mean
+    if statistic == "paper":
+        smoothed = x @ found.smoothing.rows.T
+        return np.asarray(smoothed**2 @ found.smoothing.scale(found.flares[template]))
+    variance = np.broadcast_to((1.0 + share) * quiet.variance_dn2, x.shape)
+    if scene.comparison.estimated:
+        variance = _estimated(scene, excess) + share * _estimated(scene, mean)
     weights = found.weights(statistic, template)
     if weights is not None:
-        # Linear: the mean moves along the statistic's own direction.
-        length = float(np.linalg.norm(weights * sd))
-        direction, shift = weights * sd / length, goal / length
-        z += shift * direction
-        return _excess(scene, z) @ weights, shift**2 / 2 - shift * (z @ direction)
-    if statistic == "chi2":
-        # Quadratic: the spread grows, in every pixel alike...
-        stretch = np.sqrt(goal / used.sum())
-        z[:, used] *= stretch
-        return _excess(scene, z) ** 2 @ _inverse_variance(scene), _log_weight(z[:, used], stretch)
-    if statistic == "chi2_pair":
-        # ... of the difference of both exposures...
-        other = _normals(scene.n_pixel, seed, block, 1)
-        stretch = np.sqrt(goal / used.sum())
-        difference = np.where(used, (z - other) / np.sqrt(2.0), 0.0)
-        move = (stretch - 1.0) * difference / np.sqrt(2.0)
-        x = _excess(scene, z + move) - _excess(scene, other - move)
-        return 0.5 * x**2 @ _inverse_variance(scene), _log_weight(stretch * difference[:, used], stretch)
-    # ... and of each element's sum.
-    starts = np.flatnonzero(np.append(True, np.diff(found.quiet.element) > 0))
-    size = np.diff(np.append(starts, scene.n_pixel))
-    variance = np.add.reduceat(sd**2, starts)
-    counts = variance > 0
-    scale = np.sqrt(np.where(counts, variance, 1.0))
-    direction = sd / np.repeat(scale, size)
-    along = np.add.reduceat(z * direction, starts, axis=1)
-    stretch = np.sqrt(goal / counts.sum())
-    z += direction * np.repeat((stretch - 1.0) * along, size, axis=1)
-    sums = np.add.reduceat(_excess(scene, z) * used, starts, axis=1)
-    value = np.sum((sums[:, counts] / scale[counts]) ** 2, axis=1)
-    return value, _log_weight(stretch * along[:, counts], stretch)
+        total = x @ weights
+        return np.asarray(total / np.sqrt(variance @ weights**2) if scene.comparison.estimated else total)
+    x, variance = x * scene.used, variance * scene.used
+    if statistic == "chi2_element":
+        starts = np.flatnonzero(np.append(True, np.diff(quiet.element) > 0))
+        x, variance = (np.add.reduceat(values, starts, axis=1) for values in (x, variance))
+    return np.asarray(np.sum(np.divide(x**2, variance, out=np.zeros_like(x), where=variance > 0), axis=1))
 
 
-def _log_weight(stretched: Float, stretch: float) -> Float:
-    """Log ratio of standard normal densities to those of spread `stretch`, summed over the last axis."""
-    share = 0.5 * (1.0 - 1.0 / stretch**2)
-    return np.asarray(stretched.shape[1] * np.log(stretch) - share * np.sum(stretched**2, axis=1))
+def _estimated(scene: Scene, excess: Float) -> Float:
+    """Variances as an observer estimates them, DN^2, shape (n, n_pixel)."""
+    estimate = scene.estimates[0, : scene.n_pixel]
+    net = excess - scene.fraction[0, : scene.n_pixel] + estimate["net_offset"]
+    return np.asarray(np.maximum(net, 0.0) * estimate["gain"] + estimate["variance"])
 
 
 def _normals(n_pixel: int, seed: int, block: int, exposure: int) -> Float:
@@ -203,7 +278,3 @@ def _excess(scene: Scene, z: Float) -> Float:
     if scene.clip:
         counts = np.clip(counts, edge["low"] - layout.MAGIC, edge["high"] - layout.MAGIC)
     return np.asarray(counts + edge["whole"] + scene.fraction[0, :n])
-
-
-def _inverse_variance(scene: Scene) -> Float:
-    return scene.levels[0, : scene.n_pixel]["inverse_variance"].astype(np.float64)

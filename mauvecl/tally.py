@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl import layout
+from mauvecl.host.errors import InputError
+from mauvecl.statistics import Interval, central_counts
 
 
 @dataclass(frozen=True)
@@ -137,6 +139,20 @@ class Distribution:
         edges = np.asarray(self.edge(span))
         return np.asarray(np.interp(probability, cumulative[span], edges))
 
+    def quantile_interval(self, probability: float) -> Interval:
+        """One quantile with the 95 % interval of order statistics, its ends rounded outwards to edges of bins."""
+        if not 0.0 < probability < 1.0:
+            raise InputError(f"quantile at {probability!r}, expected a probability between 0 and 1")
+        # As many values lie below the quantile as a binomial variable counts: between these ranks with 95 %.
+        low, high = central_counts(self.n, probability)
+        cumulative = self.counts.cumsum()
+        first, last = (int(np.searchsorted(cumulative, rank)) for rank in (low, high + 1))
+        ends = (
+            float(self.edge(first)) if low else -np.inf,
+            float(self.edge(last + 1)) if high < self.n else np.inf,
+        )
+        return Interval(float(self.quantile(probability)), *ends)
+
     def histogram(self, bins: int = 200) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Edges and counts over the filled range, in at most `bins` equal bins, for pictures.
 
@@ -154,3 +170,35 @@ class Distribution:
         counts[: part.size] = part
         edges = np.asarray(self.edge(np.arange(low, high + 1, group)))
         return edges, counts.reshape(-1, group).sum(axis=1)
+
+
+#: Values of each tail that are kept as they are, with their realisations.
+TAIL_SAMPLES = 1000
+
+
+class TailSamples:
+    """The most extreme values of a channel and the realisations they came from.
+
+    Parameters
+    ----------
+    largest : bool
+        The largest values, or the smallest.
+    """
+
+    def __init__(self, *, largest: bool) -> None:
+        self._sign = np.float32(1.0 if largest else -1.0)
+        self.values = np.empty(0, np.float32)
+        self.realisations = np.empty(0, np.int64)
+
+    def add(self, values: NDArray[np.float32], first: int) -> None:
+        """Look through the values of realisations `first` and on; of equal ones the earlier realisation stays."""
+        if self.values.size == TAIL_SAMPLES:
+            found = np.flatnonzero(self._sign * values > self._sign * self.values[-1])
+        else:
+            found = np.arange(values.size)
+        if not found.size:
+            return
+        merged = np.concatenate([self.values, values[found]])
+        realisations = np.concatenate([self.realisations, first + found])
+        order = np.lexsort((realisations, -self._sign * merged))[:TAIL_SAMPLES]
+        self.values, self.realisations = merged[order], realisations[order]

@@ -18,6 +18,7 @@ from astropy.table import QTable
 from mauvecl import answer
 from mauvecl.engine import Engine
 from mauvecl.processes import CosmicRays, Normal, Processes, Uniform
+from mauvecl.statistics import STATISTICS
 from mauvecl.study import Star, Study
 
 COMMAND = [sys.executable, "-m", "mauvecl"]
@@ -83,6 +84,16 @@ def test_files_and_record(answered: tuple[Path, str]) -> None:
     assert {"device", "kernels", "wall_time_s", "mauvecl", "messages"} <= set(record)
     for picture in ("detection.png", "spectra.png"):
         assert (out / picture).read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_everything_side_by_side(tmp_path: Path) -> None:
+    """Six statistics against noisy exposures and by estimated variances, and the study that says so."""
+    words = ("detect", "--star", "G2V", "-m", "7.4", "-a", "0.1", "-n", "20000", "--fap", "0.01", "--no-pictures")
+    shown = run(*words, "--statistic", "all", "--reference", "stack:3", "--variances", "estimated", folder=tmp_path)
+    for statistic in STATISTICS:
+        assert f" {statistic} " in shown.stdout
+    asked = Study.read(tmp_path / "mauvecl-detect" / "study.toml").run
+    assert (asked.reference, asked.variances, asked.statistics) == ("stack:3", "estimated", tuple(STATISTICS))
 
 
 def test_the_study_gives_the_same_bits_again(answered: tuple[Path, str], tmp_path: Path) -> None:
@@ -308,6 +319,8 @@ BAD = {
     "instrument": (["detect", "--instrument", "hubble"], "hubble"),
     "device": (["detect", "--device", "abacus"], "'abacus' is not here, expected one of"),
     "statistic": (["detect", "--statistic", "chi3"], "'chi3' is unknown"),
+    "reference": (["detect", "--reference", "stack"], "reference = 'stack', expected 'template', 'exposure' or"),
+    "variances": (["detect", "--variances", "guessed"], "run.variances = 'guessed'"),
     "rare fap": (["detect", "--fap", "1e-6", "-n", "1000", "--star", "G2V"], "ask for 100000000 realisations"),
     "realisations": (["detect", "-n", "0"], "run.realisations = 0"),
     "magnitudes": (["detect", "-m", "1", "-m", "2", "-m", "3"], "3 magnitudes for 2 stars"),

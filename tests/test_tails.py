@@ -7,6 +7,7 @@ import pytest
 from scenes import instrument, star
 from scipy import special
 
+from mauvecl.comparison import Comparison
 from mauvecl.detection import Detection
 from mauvecl.engine import Engine
 from mauvecl.host.errors import InputError
@@ -28,7 +29,7 @@ def found(engine: Engine) -> Detection:
 @pytest.mark.parametrize("statistic", STATISTICS)
 @pytest.mark.parametrize("fap", [1e-2, 1e-4, 1e-6])
 def test_brute_force_agrees(found: Detection, statistic: str, fap: float) -> None:
-    """Realisations beyond the sampled threshold: |z| < 4.5 with both errors, 15 values, 1e-4 by chance."""
+    """Realisations beyond the sampled threshold: |z| < 4.5 with both errors, 18 values, 1e-4 by chance."""
     sampled = tail(found, fap, statistic, seed=3)
     null = found.distribution(statistic)
     edges = np.asarray(null.edge(np.arange(null.counts.size)))
@@ -105,3 +106,29 @@ def test_what_cannot_be_tilted_is_refused(engine: Engine, options: dict, sentenc
     plain = engine.detect(quiet, [flare], realisations=100, seed=1, statistics=("chi2",), tails="sampled")
     with pytest.raises(InputError, match="fap = 1e-12"):
         plain.threshold(1e-12)
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+@pytest.mark.parametrize(
+    "comparison", [Comparison(4), Comparison(0, True), Comparison(1, True)], ids=["stack", "estimated", "both"]
+)
+def test_brute_force_agrees_whatever_is_compared(engine: Engine, statistic: str, comparison: Comparison) -> None:
+    """At 1e-4 of 1e6 realisations: |z| < 4.5 with both errors, 18 values, 1e-4 by chance."""
+    n, fap = 1_000_000, 1e-4
+    quiet, flare = star(amplitudes=(0.1,), payload=instrument(output_min_nm=345.0, output_max_nm=360.0))
+    found = engine.detect(
+        quiet, [flare], realisations=n, seed=12, statistics=(statistic,), comparison=comparison, tails="sampled"
+    )
+    sampled = tail(found, fap, statistic, seed=4)
+    # Half a bin, 1/1024 of a standard deviation, moves this by less than 1 %.
+    beyond = found.false_alarm_probability(sampled.threshold.value, statistic).value * n
+    error = np.hypot(np.sqrt(fap * n), sampled.relative_error * fap * n)
+    assert abs(beyond - fap * n) < 4.5 * error + 0.01 * fap * n
+
+
+def test_too_many_exposures_are_refused(engine: Engine) -> None:
+    quiet, flare = star(amplitudes=(0.1,), payload=instrument(**PART))
+    kind = {"realisations": 100, "seed": 1, "statistics": ("chi2",), "tails": "sampled"}
+    found = engine.detect(quiet, [flare], comparison=Comparison(40), **kind)
+    with pytest.raises(InputError, match="40 averaged exposures"):
+        found.threshold(1e-6)

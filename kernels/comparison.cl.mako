@@ -1,0 +1,231 @@
+## Every statistic of every scenario where more is compared than the template: noisy quiescent exposures, variances
+## estimated from the counts, smoothed spectra. What `statistics.cl.mako` knows too comes out here with the same bits.
+<%
+    single = pair or slots
+    exposures = "job->reference_count" if noisy else "1u"
+%>\
+typedef struct { floatv a, b, c, d; } Four;
+#define NOTHING (Four){(floatv)0.0f, (floatv)0.0f, (floatv)0.0f, (floatv)0.0f}
+#define SUM(x) (((x).a + (x).b) + ((x).c + (x).d))
+% if estimated:
+/* What an observer takes a count for: photons as seen, the dark's and the readout's noise as known. */
+INLINE floatv variance_of(floatv x, __global const Estimate *e)
+{
+    return FMA(most(x + e->net_offset, (floatv)0.0f), (floatv)e->gain, (floatv)e->variance);
+}
+% endif
+
+__kernel ${attributes}
+void statistics(SCENE, const uint first_low, const uint first_high,
+                __global const uint *restrict templates, __global const float *restrict constants,
+                __global const float *restrict weights, __global const uint *restrict linear_end,
+                __global const Estimate *restrict estimates, __global const float *restrict bands,
+                __global const uint *restrict finished, __global const float *restrict scales,
+                __global const uint *restrict scale_end, const uint smoothed_count,
+                const uint stride, __global float *restrict values)
+{
+    const uint item = get_global_id(0), padded = job->padded_count, scenario_count = job->scenario_count;
+    const uint linear_count = linear_end[scenario_count - 1u], scale_count = scale_end[scenario_count - 1u];
+    const uintv realisation = (uintv)(first_low + item * ${width}u) + LANE_INDEX;
+    const Factors steady = factors_of(SCENE_PASSED, realisation, first_high);
+    Four chi2[${scenarios}], linear[${linears + 1}];
+    floatv element[${scenarios}], chi2_element[${scenarios}], chi2_pair[${scenarios}];
+% if estimated:
+    Four linear_variance[${linears + 1}];
+    floatv element_variance[${scenarios}];
+% endif
+% if slots:
+    /* Smoothed values under way; the one in slot 0 is finished first. */
+    floatv window[${scenarios}][${slots}], smoothed[${smooths}];
+    uint centre = 0;
+    for (uint r = 0; r < scale_count; r++) smoothed[r] = (floatv)0.0f;
+% endif
+    for (uint k = 0; k < scenario_count; k++) {
+        chi2[k] = NOTHING;
+        element[k] = chi2_element[k] = chi2_pair[k] = (floatv)0.0f;
+% if estimated:
+        element_variance[k] = (floatv)0.0f;
+% endif
+% if slots:
+        for (uint s = 0; s < ${slots}u; s++) window[k][s] = (floatv)0.0f;
+% endif
+    }
+    for (uint l = 0; l < linear_count; l++) {
+        linear[l] = NOTHING;
+% if estimated:
+        linear_variance[l] = NOTHING;
+% endif
+    }
+
+    for (uint start = 0; start < padded; start += CHUNK) {
+        __global const Pixel *pixel = pixels + start;
+        Draws drawn;
+        floatv t[${scenarios}][${chunk}];
+        for (uint k = 0; k < scenario_count; k++)
+            for (uint i = 0; i < CHUNK; i++) t[k][i] = (floatv)edges[k * padded + start + i].whole;
+        for (uint frame = 0; frame < job->draw_count; frame++) {
+            const Address at = address(realisation, first_high, job->first_frame + frame, job->seed_low, job->seed_high);
+            Factors factors = steady;
+            factors.light *= kept(SCENE_PASSED, realisation, first_high, 0u, frame);
+            draw(SCENE_PASSED, &at, 0u, start, &drawn);
+            for (uint k = 0; k < scenario_count; k++)
+                for (uint i = 0; i < CHUNK; i++) {
+                    const uint here = k * padded + start + i;
+                    t[k][i] += digitise(analogue(SCENE_PASSED, &drawn, i, levels + here, start + i, here, &factors), edges + here) - MAGIC;
+                }
+        }
+% if noisy or single:
+        /* The first quiescent exposure, and the sum of all; scenarios with one template share them. */
+        floatv first[${chunk}], sum[${chunk}];
+        uint seen = ~0u;
+% endif
+        uint l = 0, r = 0;
+% if slots:
+        uint reached = centre;
+% endif
+        for (uint k = 0; k < scenario_count; k++) {
+            __global const Level *level = levels + k * padded + start;
+            __global const Edge *edge = edges + k * padded + start;
+% if noisy or single:
+            if (templates[k] != seen) {
+                seen = templates[k];
+                const uint quiet = seen * padded + start;
+                for (uint i = 0; i < CHUNK; i++) sum[i] = (floatv)0.0f;
+                for (uint exposure = 0; exposure < ${exposures}; exposure++) {
+                    for (uint frame = exposure * job->draw_count; frame < (exposure + 1u) * job->draw_count; frame++) {
+                        const Address at = address(realisation, first_high, job->first_frame + frame, job->seed_low, job->seed_high);
+                        Factors other = steady;
+                        other.light *= kept(SCENE_PASSED, realisation, first_high, REFERENCE, ${"frame" if frames else "exposure * job->frame_count"});
+                        draw(SCENE_PASSED, &at, REFERENCE, start, &drawn);
+                        for (uint i = 0; i < CHUNK; i++)
+                            sum[i] += digitise(analogue(SCENE_PASSED, &drawn, i, levels + quiet + i, start + i, quiet + i, &other), edges + quiet + i) - MAGIC;
+                    }
+                    for (uint i = 0; i < CHUNK; i++) sum[i] += (floatv)edges[quiet + i].whole;
+                    if (exposure == 0u)
+                        for (uint i = 0; i < CHUNK; i++) first[i] = sum[i];
+                }
+            }
+% endif
+            floatv x[${chunk}];
+% if estimated:
+            __global const Estimate *estimate = estimates + k * padded + start;
+            floatv variance[${chunk}];
+% endif
+% if single:
+            floatv apart[${chunk}];
+            for (uint i = 0; i < CHUNK; i++) apart[i] = t[k][i] - first[i];
+% endif
+% if pair:
+            for (uint i = 0; i < CHUNK; i++) {
+% if estimated:
+                const floatv both = variance_of(t[k][i], estimate + i) + variance_of(first[i], estimate + i);
+                chi2_pair[k] = FMA(apart[i] * apart[i], (floatv)pixel[i].used / both, chi2_pair[k]);
+% else:
+                chi2_pair[k] = FMA(apart[i] * apart[i], (floatv)(job->pair_scale * level[i].inverse_variance), chi2_pair[k]);
+% endif
+            }
+% endif
+            for (uint i = 0; i < CHUNK; i++) {
+                x[i] = ${"FMA(sum[i], (floatv)-job->reference_share, t[k][i])" if noisy else "t[k][i]"};
+% if estimated:
+                variance[i] = variance_of(t[k][i], estimate + i);
+% if noisy:
+                variance[i] += job->reference_share * variance_of(sum[i] * job->reference_share, estimate + i);
+% endif
+                x[i] += estimate[i].fraction;
+% endif
+            }
+            for (uint i = 0; i < CHUNK; i += 4u) {
+% for j, part in enumerate("abcd"):
+% if estimated:
+                chi2[k].${part} = FMA(x[i + ${j}u] * x[i + ${j}u], (floatv)pixel[i + ${j}u].used / variance[i + ${j}u], chi2[k].${part});
+% else:
+                chi2[k].${part} = FMA(x[i + ${j}u], FMA(x[i + ${j}u], (floatv)level[i + ${j}u].inverse_variance, (floatv)level[i + ${j}u].twice), chi2[k].${part});
+% endif
+% endfor
+            }
+% if elements:
+            for (uint i = 0; i < CHUNK; i += 4u) {
+% if not estimated:
+                if (!pixel[i].four_uneven) {
+                    element[k] += (x[i] + x[i + 1u]) + (x[i + 2u] + x[i + 3u]);
+                    continue;
+                }
+% endif
+                for (uint j = i; j < i + 4u; j++) {
+                    element[k] = FMA(x[j], (floatv)pixel[j].used, element[k]);
+% if estimated:
+                    element_variance[k] = FMA(variance[j], (floatv)pixel[j].used, element_variance[k]);
+% endif
+                    if (pixel[j].element_end) {
+% if estimated:
+                        /* An element without a pixel that counts adds 0 / 1e-12. */
+                        chi2_element[k] += element[k] * element[k] / most(element_variance[k], (floatv)1e-12f);
+                        element_variance[k] = (floatv)0.0f;
+% else:
+                        element[k] += edge[j].element_offset;
+                        chi2_element[k] = FMA(element[k] * element[k], (floatv)edge[j].inverse_element_variance, chi2_element[k]);
+% endif
+                        element[k] = (floatv)0.0f;
+                    }
+                }
+            }
+% endif
+            for (; l < linear_end[k]; l++) {
+                __global const float *weight = weights + l * padded + start;
+                for (uint i = 0; i < CHUNK; i += 4u) {
+% for j, part in enumerate("abcd"):
+                    linear[l].${part} = FMA(x[i + ${j}u], (floatv)weight[i + ${j}u], linear[l].${part});
+% if estimated:
+                    linear_variance[l].${part} = FMA((floatv)(weight[i + ${j}u] * weight[i + ${j}u]), variance[i + ${j}u], linear_variance[l].${part});
+% endif
+% endfor
+                }
+            }
+% if slots:
+            __global const float *band = bands + (size_t)(start / CHUNK) * ${slots}u * CHUNK;
+            for (uint s = 0; s < ${slots}u; s += 4u) {
+                /* Four at a time, none of which waits for another. */
+                floatv a = window[k][s], b = window[k][s + 1u], c = window[k][s + 2u], d = window[k][s + 3u];
+                for (uint i = 0; i < CHUNK; i++) {
+% for j, part in enumerate("abcd"):
+                    ${part} = FMA(apart[i], (floatv)band[(s + ${j}u) * CHUNK + i], ${part});
+% endfor
+                }
+                window[k][s] = a; window[k][s + 1u] = b; window[k][s + 2u] = c; window[k][s + 3u] = d;
+            }
+            reached = centre;
+            for (uint n = 0; n < finished[start / CHUNK]; n++, reached++) {
+                const floatv square = window[k][0] * window[k][0];
+                for (uint q = r; q < scale_end[k]; q++) smoothed[q] = FMA(square, (floatv)scales[q * smoothed_count + reached], smoothed[q]);
+                for (uint s = 1u; s < ${slots}u; s++) window[k][s - 1u] = window[k][s];
+                window[k][${slots - 1}] = (floatv)0.0f;
+            }
+            r = scale_end[k];
+% endif
+        }
+% if slots:
+        centre = reached;
+% endif
+    }
+
+    /* One row per channel: three fixed ones a scenario, then the linear ones, then the smoothed ones. */
+    __global float *out = values + item * ${width}u;
+    for (uint k = 0; k < scenario_count; k++) {
+        STORE(SUM(chi2[k]) + constants[k], out + (3u * k) * stride);
+        STORE(chi2_element[k], out + (3u * k + 1u) * stride);
+        STORE(chi2_pair[k], out + (3u * k + 2u) * stride);
+    }
+    out += 3u * scenario_count * stride;
+    for (uint l = 0; l < linear_count; l++) {
+% if estimated:
+        STORE(SUM(linear[l]) / root(SUM(linear_variance[l])), out + l * stride);
+% else:
+        STORE(SUM(linear[l]) + constants[scenario_count + l], out + l * stride);
+% endif
+    }
+% if slots:
+    out += linear_count * stride;
+    for (uint q = 0; q < scale_count; q++) STORE(smoothed[q], out + q * stride);
+% endif
+}

@@ -1,0 +1,73 @@
+"""What an observed spectrum is compared with, and by whose variances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal, Self
+
+from mauvecl.host.errors import InputError
+
+Variances = Literal["model", "estimated"]
+
+#: Quiescent exposures that one stack may hold.
+MOST_EXPOSURES = 1000
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """The quiescent spectrum that is subtracted, and the variances that are divided by.
+
+    Attributes
+    ----------
+    exposures : int
+        Noisy quiescent exposures whose mean is subtracted; 0 for the noise-free template.
+    estimated : bool
+        Variances from the counts themselves, as an observer must, or from the model.
+    """
+
+    exposures: int = 0
+    estimated: bool = False
+
+    @classmethod
+    def of(cls, reference: str = "template", variances: str = "model") -> Self:
+        """From words.
+
+        Parameters
+        ----------
+        reference : str
+            ``"template"``, ``"exposure"`` or ``"stack:n"`` with n of 1 and more exposures.
+        variances : {"model", "estimated"}
+
+        Raises
+        ------
+        InputError
+            For other words.
+        """
+        if variances not in ("model", "estimated"):
+            raise InputError(f"variances = {variances!r}, expected 'model' or 'estimated'")
+        return cls(_exposures(reference), variances == "estimated")
+
+    @property
+    def share(self) -> float:
+        """Variance of what is subtracted, as a share of one exposure's."""
+        return 1.0 / self.exposures if self.exposures else 0.0
+
+    @property
+    def plain(self) -> bool:
+        """Whether nothing but the template and the model's variances is needed."""
+        return not (self.exposures or self.estimated)
+
+
+def _exposures(reference: str) -> int:
+    word, colon, number = reference.partition(":")
+    if not colon and word in ("template", "exposure"):
+        return int(word == "exposure")
+    if word == "stack" and number.isdecimal() and 1 <= int(number) <= MOST_EXPOSURES:
+        return int(number)
+    raise InputError(
+        f"reference = {reference!r}, expected 'template', 'exposure' or 'stack:n' with n from 1 to {MOST_EXPOSURES}"
+    )
+
+
+#: The noise-free template and the model's variances.
+TEMPLATE = Comparison()
