@@ -5,15 +5,19 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from mauvecl.campaign import campaign
 from mauvecl.components import components
-from mauvecl.detection import Detection, check_fap
+from mauvecl.detection import Detection, check_fap, countable
 from mauvecl.paper import PAPER_G2V, WHY, reconstruct
+from mauvecl.statistics import SHAPED, Linear, matched_weights
 from mauvecl.study import PAPER_STARS, Star, Study
 
 if TYPE_CHECKING:
     from astropy.table import QTable
 
+    from mauvecl.departures import Departure
     from mauvecl.engine import Engine
     from mauvecl.host.expectation import Expectation
     from mauvecl.snr import SnrResult
@@ -25,6 +29,28 @@ class StarDetection:
 
     label: str
     found: Detection
+    amplitudes: tuple[float, ...] = ()
+
+    def curves(self) -> dict[str, QTable]:
+        """For files: every ROC, and the exact tails of every null and flare, with their realisations."""
+        from astropy.table import vstack
+
+        rocs, tails = [], []
+        for statistic in self.found.statistics:
+            for flare, amplitude in enumerate(self.amplitudes):
+                curve = self.found.roc(statistic, flare).table()
+                area = {name: curve.meta.pop(name) for name in ("area", "area_low", "area_high")}
+                for name, value in area.items():
+                    curve[name] = value
+                rocs.append(_named(curve, statistic, amplitude))
+                tails.append(_named(self.found.tail_samples(statistic, flare), statistic, amplitude))
+                if statistic in SHAPED or flare == 0:
+                    null = self.found.tail_samples(statistic, template=flare)
+                    tails.append(_named(null, statistic, 0.0))
+        found = {"roc": vstack(rocs), "tails": vstack(tails)}
+        found["roc"]["area"].info.description = "under the curve; 95 % interval by DeLong's method"
+        found["tails"].meta["seed"] = self.found.seed
+        return found
 
 
 @dataclass(eq=False)
@@ -37,6 +63,9 @@ class DetectAnswer:
     stars : list of StarDetection
     table : QTable
         One row per star, flare and statistic.
+    departures : QTable
+        One row per star and statistic, and flare where its shape matters: where the simulated null differs from the
+        closed form, and why.
     messages : list of str
         What the reader must be told, worst first.
     paper : list of str
@@ -46,8 +75,15 @@ class DetectAnswer:
     study: Study
     stars: list[StarDetection]
     table: QTable
+    departures: QTable
     messages: list[str]
     paper: list[str] = field(default_factory=list)
+
+
+def _named(table: QTable, statistic: str, amplitude: float) -> QTable:
+    table.add_column([statistic] * len(table), name="statistic", index=0)
+    table.add_column([amplitude] * len(table), name="amplitude", index=1)
+    return table
 
 
 def label(star: Star, x: Expectation) -> str:
@@ -72,23 +108,27 @@ def detect(study: Study, engine: Engine) -> DetectAnswer:
     """
     from astropy.table import vstack
 
+    from mauvecl.departures import departures
+
     # Everything is looked at before anything is drawn: bad input shows at once.
     check_fap(study.run.fap, study.run.realisations, study.run.tails)
     prepared = [study.expectations(star) for star in study.star]
     campaign_told = _campaign(study, prepared[0][0])
-    stars, tables = [], []
+    stars, tables, differing = [], [], []
     for star, (quiet, *flares) in zip(study.star, prepared, strict=True):
-        found = engine.detect(quiet, flares, seed=study.run.seed, **study.detecting)
+        how = study.detecting
+        how["statistics"] = (*study.run.statistics, *_other_templates(study, star, quiet))
+        found = engine.detect(quiet, flares, seed=study.run.seed, **how)
         table = found.table(study.run.fap)
         table.replace_column("name", [label(star, quiet)] * len(table))
         table.rename_column("name", "star")
         amplitudes = study.flare.amplitudes
-        table.add_column(
-            [amplitudes[i // len(study.run.statistics)] for i in range(len(table))], name="amplitude", index=1
-        )
+        table.add_column([amplitudes[i // len(found.statistics)] for i in range(len(table))], name="amplitude", index=1)
         table["amplitude"].info.description = f"relative rise of the photons in the band {study.flare.band}"
-        stars.append(StarDetection(label(star, quiet), found))
+        stars.append(StarDetection(label(star, quiet), found, amplitudes))
         tables.append(table)
+        if countable(study.run.fap, study.run.realisations):
+            differing += [(label(star, quiet), amplitudes, d) for d in departures(found, study.run.fap)]
     together = vstack(tables, metadata_conflicts="silent")
     together.meta["study"] = study.toml()
     messages = told([x for group in prepared for x in group])
@@ -99,7 +139,65 @@ def detect(study: Study, engine: Engine) -> DetectAnswer:
             f"{100 * worst:.1f} % of it: {study.run.realisations} realisations leave fewer than 100 beyond them."
         )
     messages += campaign_told
-    return DetectAnswer(study, stars, together, messages, _paper(study, prepared))
+    messages += [text for star in stars for text in _template_costs(study, star)]
+    return DetectAnswer(study, stars, together, _departures(differing), messages, _paper(study, prepared))
+
+
+def _other_templates(study: Study, star: Star, quiet: Expectation) -> list[Linear]:
+    """Matched statistics that look for flares of other temperatures than the study's."""
+    found = []
+    for temperature in study.run.template_temperatures_k:
+        source = star.source()
+        other = study.at("flare_temperature", temperature)
+        (shape,) = other.expect([other.flaring(source, study.flare.amplitudes[0])])
+        weights = matched_weights(quiet, shape, ~quiet.saturated, study.run.comparison())
+        found.append(Linear(f"matched {temperature:g} K", weights))
+    return found
+
+
+def _template_costs(study: Study, star: StarDetection) -> list[str]:
+    """What looking for the wrong temperature costs, for Gaussian noise."""
+    found, lines = star.found, []
+    for temperature in study.run.template_temperatures_k:
+        right = float(np.sqrt(_strength(found, 0)))
+        kept = found.closed_form(f"matched {temperature:g} K", 0).mean / right if right else 0.0
+        lines.append(
+            f"{star.label}: looking for a flare of {temperature:g} K in one of {study.flare.temperature_k:g} K keeps "
+            f"{100 * kept:.1f} % of the matched statistic's S/N."
+        )
+    return lines
+
+
+def _strength(found: Detection, flare: int) -> float:
+    """The largest S/N that any linear statistic can have, squared."""
+    delta = np.where(found.scene.used, found.flares[flare].signal_dn - found.quiet.signal_dn, 0.0)
+    return float(np.sum(delta**2 / found.quiet.variance_dn2)) / (1.0 + found.scene.comparison.share)
+
+
+def _departures(rows: list[tuple[str, tuple[float, ...], Departure]]) -> QTable:
+    """The departures of all stars as a table."""
+    from astropy.table import QTable
+
+    table = QTable()
+    table["star"] = np.array([star for star, _, _ in rows], str)
+    table["statistic"] = np.array([d.statistic for _, _, d in rows], str)
+    table["amplitude"] = [a[d.template] if d.statistic in SHAPED else np.nan for _, a, d in rows]
+    for name, values, text in (
+        ("gaussian_threshold", [d.threshold for _, _, d in rows], "threshold for Gaussian noise"),
+        ("fap", [d.simulated.value for _, _, d in rows], "simulated false-alarm probability there"),
+        ("fap_low", [d.simulated.low for _, _, d in rows], "its 95 % interval, lower end"),
+        ("fap_high", [d.simulated.high for _, _, d in rows], "its 95 % interval, upper end"),
+        ("ratio", [d.ratio for _, _, d in rows], "simulated over wanted false-alarm probability"),
+        ("ratio_error", [d.error for _, _, d in rows], "standard error of the ratio"),
+        ("skew", [d.skew for _, _, d in rows], "predicted change of the ratio by the noise's skew and kurtosis"),
+        ("rounding", [d.rounding for _, _, d in rows], "predicted change of the ratio by the ADC's steps"),
+        ("clipping", [d.clipping for _, _, d in rows], "predicted change of the ratio by the ADC's ends"),
+        ("differs", [d.differs for _, _, d in rows], "whether chance does not explain the ratio (4 standard errors)"),
+    ):
+        table[name] = values
+        table[name].info.description = text
+    table["why"] = np.array([d.why for _, _, d in rows], str)
+    return table
 
 
 def _campaign(study: Study, quiet: Expectation) -> list[str]:

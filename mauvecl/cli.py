@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -36,10 +37,14 @@ from mauvecl.flags import (
     StudyFile,
     TargetFlag,
     TemperatureFlag,
+    TemplateFlag,
     TimeFlag,
     VariancesFlag,
     study_from_flags,
 )
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
 
 app = typer.Typer(
     name="mauvecl",
@@ -349,6 +354,7 @@ def detect(
     fap: FapFlag = None,
     reference: ReferenceFlag = None,
     variances: VariancesFlag = None,
+    template: TemplateFlag = None,
     device: DeviceFlag = None,
     output: OutputFlag = None,
     as_json: JsonFlag = False,
@@ -371,7 +377,7 @@ def detect(
         temperature=temperature, sky=sky, target=target, when=when, settings=settings,
         flare={"amplitudes": amplitude, "temperature_k": flare_temperature, "band": flare_band},
         run={"realisations": realisations, "seed": seed, "statistics": statistic, "fap": fap,
-             "reference": reference, "variances": variances},
+             "reference": reference, "variances": variances, "template_temperatures_k": template},
     )  # fmt: skip
     folder = report.make_folder(output or Path("mauvecl-detect"))
     with Meter(quiet=quiet or as_json) as meter:
@@ -379,6 +385,9 @@ def detect(
         found = answer.detect(study, engine)
     verbs.say(found.messages, as_json=as_json)
     files = [report.write_table(found.table, folder / "detection.ecsv")]
+    files.append(report.write_table(found.departures, folder / "departures.ecsv"))
+    for number, entry in enumerate(found.stars, 1):
+        files += [report.write_table(table, folder / f"{name}-{number}.ecsv") for name, table in entry.curves().items()]
     if verbs.pictures_wanted(pictures, quiet=quiet, as_json=as_json):
         from mauvecl.pictures import detection, spectra
 
@@ -399,7 +408,8 @@ def detect(
         )
     )
     if as_json:
-        out = {"messages": found.messages, "paper": found.paper, "rows": report.rows(found.table)}
+        out = {"messages": found.messages, "paper": found.paper, "rows": report.rows(found.table),
+               "departures": report.rows(found.departures)}  # fmt: skip
         print(json.dumps(out, indent=2))
         return
     run = study.run
@@ -415,8 +425,33 @@ def detect(
             for row in found.table
         ],
     )  # fmt: skip
+    _show_departures(found.departures, run.fap)
     verbs.say(found.paper, as_json=as_json)
     verbs.finish(files, started, quiet=quiet, as_json=as_json)
+
+
+def _show_departures(table: QTable, fap: float) -> None:
+    """Where the simulation differs from the closed form, or that it does not."""
+    from mauvecl.console import show_table
+
+    differing = table[table["differs"]]
+    if len(table) and not len(differing):
+        verbs.say(
+            [f"At the thresholds for Gaussian noise the simulated false-alarm probability is {fap:g} within 4 standard "
+             "errors, for every statistic."], as_json=False,
+        )  # fmt: skip
+    if len(differing):
+        flares = ["" if math.isnan(a) else f"{100 * a:g} %" for a in differing["amplitude"]]
+        show_table(
+            f"Where the simulation differs from the closed form: false-alarm probability at the threshold that should "
+            f"give {fap:g}",
+            ("star", "statistic", "flare", "simulated", "", "ratio", "why"),
+            [
+                (row["star"], row["statistic"], flare, f"{row['fap']:.3g}",
+                 f"[{row['fap_low']:.3g}, {row['fap_high']:.3g}]", f"{row['ratio']:.3f}", row["why"])
+                for row, flare in zip(differing, flares, strict=True)
+            ],
+        )  # fmt: skip
 
 
 app.command()(exposure)

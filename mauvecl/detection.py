@@ -332,7 +332,7 @@ class Detection:
         key: Key = (statistic, "flare", flare) if flare is not None else self._null_key(statistic, template)
         kept = self._samples[key]
         table = QTable({"realisation": kept.realisations, "value": kept.values})
-        table["value"].info.description = STATISTICS.get(statistic, "weighted sum of the difference")
+        table["value"].info.description = "of the statistic, as the device computed it"
         return table
 
     def roc(self, statistic: str = "chi2", flare: int = 0) -> Roc:

@@ -58,6 +58,14 @@ VariancesFlag = Annotated[
     str | None,
     typer.Option(help="model, or estimated from the counts as an observer must [model].", show_default=False),
 ]
+TemplateFlag = Annotated[
+    list[float] | None,
+    typer.Option(
+        "--template",
+        help="Look also for flares of this temperature, K: what a wrong template costs; may be repeated.",
+        show_default=False,
+    ),
+]
 FapFlag = Annotated[float | None, typer.Option(help="False-alarm probability per test [0.001].", show_default=False)]
 SetFlag = Annotated[
     list[str] | None,

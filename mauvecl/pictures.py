@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 #: Okabe and Ito's colours, which colour-blind readers can tell apart (jfly.uni-koeln.de/color).
 COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7", "#000000")
 NULL = "#777777"
+#: Panels side by side.
+MOST_COLUMNS = 3
 
 STYLE = {
     "font.size": 9,
@@ -79,14 +81,20 @@ def detection(stars: Sequence[StarDetection], amplitudes: Sequence[float], fap: 
     """Null and flare distributions: a row per star, a column per statistic."""
     plt = _pyplot()
     statistics = stars[0].found.statistics
+    columns = min(len(statistics), MOST_COLUMNS)
+    rows = -(-len(statistics) // columns)
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(
-            len(stars), len(statistics), figsize=(3.6 * len(statistics), 2.6 * len(stars) + 0.4), squeeze=False
+            rows * len(stars), columns, figsize=(3.6 * columns, 2.6 * rows * len(stars) + 0.4), squeeze=False
         )
-        for row, star in zip(axes, stars, strict=True):
-            for axis, statistic in zip(row, statistics, strict=True):
+        for k, star in enumerate(stars):
+            panels = axes[k * rows : (k + 1) * rows]
+            for axis, statistic in zip(panels.ravel(), statistics, strict=False):
                 _distributions(axis, star, statistic, amplitudes, fap)
-            row[0].set_ylabel(f"{star.label}\nrealisations, each peak = 1")
+            for axis in panels.ravel()[len(statistics) :]:
+                axis.set_visible(False)
+            for axis in panels[:, 0]:
+                axis.set_ylabel(f"{star.label}\nrealisations, each peak = 1")
         handles, names = axes[0][0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=len(names))
         exposure = stars[0].found.quiet.exposure_s
@@ -100,7 +108,7 @@ def detection(stars: Sequence[StarDetection], amplitudes: Sequence[float], fap: 
 
 def _distributions(axis: Any, star: StarDetection, statistic: str, amplitudes: Sequence[float], fap: float) -> None:
     found = star.found
-    linear = not statistic.startswith("chi2")
+    linear = found.weights(statistic) is not None
     shapes: list[tuple[int | None, str, str]] = [(None, NULL, "no flare")]
     shapes += [(k, COLOURS[k % len(COLOURS)], f"flare {100 * a:g} %") for k, a in enumerate(amplitudes)]
     for flare, colour, name in shapes:
@@ -108,8 +116,13 @@ def _distributions(axis: Any, star: StarDetection, statistic: str, amplitudes: S
         middle, height = (edges[1:] + edges[:-1]) / 2, counts / counts.max()
         axis.fill_between(middle, height, step="mid", color=colour, alpha=0.3, linewidth=0)
         axis.step(middle, height, where="mid", color=colour, label=name)
-    cut = found.threshold(fap, statistic).value
-    axis.axvline(cut, color="black", linewidth=0.9, linestyle="--", label=f"threshold, fap {fap:g} per test")
+    # Where a statistic is scaled by the flare, each has a threshold of its own.
+    own = range(len(amplitudes)) if statistic == "paper" else range(1)
+    for k in own:
+        cut = found.threshold(fap, statistic, template=k).value
+        colour = COLOURS[k % len(COLOURS)] if len(own) > 1 else "black"
+        name = f"threshold, fap {fap:g} per test"
+        axis.axvline(cut, color=colour, linewidth=0.9, linestyle="--", label=None if len(own) > 1 else name)
     # Means lie decades apart.
     if linear:
         axis.set_xscale("function", functions=(lambda x: np.arcsinh(x / 2), lambda y: 2 * np.sinh(y)))
@@ -120,12 +133,19 @@ def _distributions(axis: Any, star: StarDetection, statistic: str, amplitudes: S
         axis.set_xscale("log")
         low, high = axis.get_xlim()
         # Under two decades a power of ten alone says too little.
-        ticks = [d * 10.0**e for e in range(9) for d in ((1,) if high / low > 100 else (1, 2, 5))]
+        digits = (
+            (1,)
+            if high / low > 100
+            else (1, 2, 5)
+            if high / low > 3
+            else (1, 1.2, 1.4, 1.6, 1.8, 2, 2.5, 3, 4, 5, 6, 8)
+        )
+        ticks = [d * 10.0**e for e in range(9) for d in digits]
         ticks = [t for t in ticks if low <= t <= high]
         axis.set_xticks(ticks, [f"{t:g}" if t < 1e5 else f"$10^{{{np.log10(t):.0f}}}$" for t in ticks])
         axis.tick_params(axis="x", which="minor", labelbottom=False)
     axis.set_ylim(bottom=0)
-    axis.set_xlabel(NAMES[statistic])
+    axis.set_xlabel(NAMES.get(statistic, statistic))
 
 
 def spectra(

@@ -178,6 +178,7 @@ class Run(_Part):
     tails: Literal["counted", "sampled"] = "counted"
     reference: str = "template"
     variances: Literal["model", "estimated"] = "model"
+    template_temperatures_k: tuple[float, ...] = ()
 
     @field_validator("statistics")
     @classmethod
