@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import tomllib
+from functools import cache
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
@@ -26,7 +27,16 @@ def shipped() -> tuple[str, ...]:
 
 def read_instrument(name: str | Path) -> Instrument:
     """Read an instrument by name or path; see `Instrument.load`."""
-    path = _find(name, Path())
+    # What ships does not change while it is used; a user's own file may.
+    return _shipped(name) if name in shipped() else _built(_find(name, Path()))
+
+
+@cache
+def _shipped(name: str) -> Instrument:
+    return _built(_find(name, Path()))
+
+
+def _built(path: Path) -> Instrument:
     values, sources = _read(path, ())
     return Instrument.build({**values, "sources": sources}, path.name)
 

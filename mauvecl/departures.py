@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -10,9 +11,12 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.cumulants import Cumulants
+from mauvecl.detection import countable
 from mauvecl.statistics import PAIRED, SHAPED, Interval, Normal, QuadraticForm
 
 if TYPE_CHECKING:
+    from astropy.table import QTable
+
     from mauvecl.detection import Detection
     from mauvecl.host.expectation import Expectation
 
@@ -131,6 +135,42 @@ def departures(found: Detection, fap: float) -> list[Departure]:
                 )
             )
     return rows
+
+
+def departure_table(found: Detection, amplitudes: Sequence[float], fap: float) -> QTable:
+    """The departures of a detection, one row each; none where thresholds cannot be counted.
+
+    Parameters
+    ----------
+    found : Detection
+    amplitudes : sequence of float
+        Of its flares.
+    fap : float
+    """
+    from astropy.table import QTable
+
+    rows = departures(found, fap) if countable(fap, found.realisations) else []
+    table = QTable()
+    table["statistic"] = np.array([d.statistic for d in rows], str)
+    table["amplitude"] = np.array([amplitudes[d.template] if d.statistic in SHAPED else np.nan for d in rows])
+    for name, values, text in (
+        ("gaussian_threshold", [d.threshold for d in rows], "threshold for Gaussian noise"),
+        ("fap", [d.simulated.value for d in rows], "simulated false-alarm probability there"),
+        ("fap_low", [d.simulated.low for d in rows], "its 95 % interval, lower end"),
+        ("fap_high", [d.simulated.high for d in rows], "its 95 % interval, upper end"),
+        ("ratio", [d.ratio for d in rows], "simulated over wanted false-alarm probability"),
+        ("ratio_error", [d.error for d in rows], "standard error of the ratio"),
+        ("skew", [d.skew for d in rows], "predicted change of the ratio by the noise's skew and kurtosis"),
+        ("rounding", [d.rounding for d in rows], "predicted change of the ratio by the ADC's steps"),
+        ("clipping", [d.clipping for d in rows], "predicted change of the ratio by the ADC's ends"),
+    ):
+        table[name] = np.array(values, float)
+        table[name].info.description = text
+    table["differs"] = np.array([d.differs for d in rows], bool)
+    table["differs"].info.description = "whether chance does not explain the ratio: 4 standard errors"
+    table["why"] = np.array([d.why for d in rows], str)
+    table.meta["fap"] = fap
+    return table
 
 
 def _skewed(found: Detection, statistic: str, template: int, null: QuadraticForm | Normal, cut: float) -> float:

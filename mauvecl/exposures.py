@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
-from mauvecl.answer import label, told
 from mauvecl.host.errors import InputError
+from mauvecl.labels import label, told
 from mauvecl.study import QUANTITIES, Star, Study
 
 if TYPE_CHECKING:
@@ -80,10 +80,17 @@ def snr_at(x: Expectation, wavelength_nm: float, per: Per = "element") -> float:
     InputError
         If it lies outside the spectrum.
     """
-    return float((x.snr_per_element() if per == "element" else x.snr())[_place(x, wavelength_nm, per)])
+    return float((x.snr_per_element() if per == "element" else x.snr())[place_of(x, wavelength_nm, per)])
 
 
-def _place(x: Expectation, wavelength_nm: float, per: Per) -> int:
+def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
+    """Index of the pixel or element that holds a wavelength.
+
+    Raises
+    ------
+    InputError
+        If it lies outside the spectrum.
+    """
     if per not in ("pixel", "element"):
         raise InputError(f"S/N per {per!r}, expected pixel or element")
     first, last = float(x.wavelength_nm[0]), float(x.wavelength_nm[-1])
@@ -140,7 +147,7 @@ def _one(study: Study, star: Star, snr: float, wavelength_nm: float, per: Per) -
     while snr_at(after(frames), wavelength_nm, per) < snr:
         frames += 1
     x = after(frames)
-    place = _place(x, wavelength_nm, per)
+    place = place_of(x, wavelength_nm, per)
     here = x.saturated[x.element == place] if per == "element" else x.saturated[[place]]
     answer = Exposure(
         star=label(star, x),

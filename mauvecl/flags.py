@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_type_hints
 
 import typer
 
@@ -71,6 +74,25 @@ SetFlag = Annotated[
     list[str] | None,
     typer.Option("--set", help="Any key of the study, as in run.fap=0.01; may be repeated.", show_default=False),
 ]
+SweepFlag = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--sweep",
+        help="Values of a quantity, as in exposure=5,50,600 or magnitude:4:10:7; several give every combination.",
+        show_default=False,
+    ),
+]
+AsListFlag = Annotated[bool, typer.Option("--as-list", help="Sweep side by side instead of every combination.")]
+OfFlag = Annotated[str | None, typer.Option(help="magnitude, amplitude or exposure [magnitude].", show_default=False)]
+PowerFlag = Annotated[float | None, typer.Option(help="Wanted detection probability [0.9].", show_default=False)]
+UnknownFlag = Annotated[
+    int | None,
+    typer.Option(
+        "--unknown", help="Average over so many draws of what is unknown of the instrument [0].", show_default=False
+    ),
+]
+XFlag = Annotated[str | None, typer.Option(help="Such as magnitude:4:10:16, or exposure=5,50,600.", show_default=False)]
+YFlag = Annotated[str | None, typer.Option(help="Such as amplitude:0.01:1:16:log.", show_default=False)]
 DeviceFlag = Annotated[
     str | None, typer.Option(help="OpenCL device: number or part of its name [PoCL].", show_default=False)
 ]
@@ -83,42 +105,175 @@ QuietFlag = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progres
 PicturesFlag = Annotated[bool, typer.Option("--pictures/--no-pictures", help="Draw pictures (needs mauvecl[plot]).")]
 
 
-def study_from_flags(
+class Option(NamedTuple):
+    """A flag, and the key of the study that it sets; `convert` makes the key's value of the flag's."""
+
+    kind: Any
+    section: str = ""
+    key: str = ""
+    convert: Callable[[Any], Any] | None = None
+
+
+def axis_of(text: str, flag: str) -> dict[str, Any]:
+    """An axis as a word: magnitude:4:10:16, amplitude:0.01:1:16:log, or exposure=5,50,600."""
+    from mauvecl.host.errors import InputError
+
+    if "=" in text:
+        quantity, _, values = text.partition("=")
+        words = [word.strip() for word in values.split(",")]
+        try:
+            return {"quantity": quantity, "values": words if quantity == "star" else [float(word) for word in words]}
+        except ValueError as error:
+            raise InputError(f"{flag} {text!r}, expected numbers, such as {quantity}=5,50,600") from error
+    parts = text.split(":")
+    try:
+        quantity, start, stop, steps, *rest = parts
+        found = {"quantity": quantity, "start": float(start), "stop": float(stop), "steps": int(steps)}
+    except ValueError as error:
+        raise InputError(
+            f"{flag} {text!r}, expected quantity:start:stop:steps, with :log behind it if wanted, or quantity=a,b,c"
+        ) from error
+    if rest not in ([], ["log"]):
+        raise InputError(f"{flag} {text!r} ends in {':'.join(rest)!r}, expected log or nothing")
+    return found | {"log": bool(rest)}
+
+
+#: What every verb takes; the first ones are put together by `_stars` and `_sky`.
+OBSERVATION = {
+    "star": Option(StarFlag),
+    "magnitude": Option(MagnitudeFlag),
+    "band": Option(BandFlag),
+    "exposure": Option(ExposureFlag, "observation", "exposure_s"),
+    "instrument": Option(InstrumentFlag, "observation", "instrument"),
+    "temperature": Option(TemperatureFlag, "observation", "temperature_c"),
+    "sky": Option(SkyFlag),
+    "target": Option(TargetFlag),
+    "when": Option(TimeFlag),
+}
+FLARE = {
+    "amplitude": Option(AmplitudeFlag, "flare", "amplitudes"),
+    "flare_temperature": Option(FlareTemperatureFlag, "flare", "temperature_k"),
+    "flare_band": Option(FlareBandFlag, "flare", "band"),
+}
+DRAWS = {
+    "realisations": Option(RealisationsFlag, "run", "realisations"),
+    "seed": Option(SeedFlag, "run", "seed"),
+}
+DETECTION = {
+    "statistic": Option(StatisticFlag, "run", "statistics"),
+    "fap": Option(FapFlag, "run", "fap"),
+    "reference": Option(ReferenceFlag, "run", "reference"),
+    "variances": Option(VariancesFlag, "run", "variances"),
+}
+TEMPLATE = {"template": Option(TemplateFlag, "run", "template_temperatures_k")}
+LIMIT = {"of": Option(OfFlag, "limit", "of"), "power": Option(PowerFlag, "limit", "power")}
+MAP = {
+    "x": Option(XFlag, "map", "x", partial(axis_of, flag="--x")),
+    "y": Option(YFlag, "map", "y", partial(axis_of, flag="--y")),
+}
+UNKNOWN = {"unknown": Option(UnknownFlag, "unknowns", "draws")}
+SWEEP = {
+    "sweep": Option(SweepFlag, "sweep", "axes", lambda texts: [axis_of(text, "--sweep") for text in texts]),
+    "as_list": Option(AsListFlag, "sweep", "how", lambda wanted: "list" if wanted else None),
+}
+SETTINGS = {"settings": Option(SetFlag)}
+#: Where a verb asks for fewer realisations than a detection, unless told.
+FEWER = 100_000
+
+
+def takes_study(
+    *groups: Mapping[str, Option],
+    without: str = "",
+    fewer: bool = False,
+    default: Callable[[dict[str, Any]], Study] | None = None,
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Let a verb take a study file and flags, and hand it the study that they make.
+
+    Parameters
+    ----------
+    *groups : mapping of Option
+        Flags beside those of the observation.
+    without : str
+        A flag of the observation that the verb does not take.
+    fewer : bool
+        Whether `FEWER` realisations are the default.
+    default : callable, optional
+        Makes the study where no file is given, from the flags; the paper's question by default.
+
+    Returns
+    -------
+    callable
+        A decorator for functions whose first parameter is the study. One named `given` receives the flags.
+    """
+    options = {n: o for group in (OBSERVATION, *groups, SETTINGS) for n, o in group.items() if n != without}
+
+    def decorate(verb: Callable[..., None]) -> Callable[..., None]:
+        from typing import Any as Study
+
+        kinds = get_type_hints(verb, localns={"Study": Study}, include_extras=True)
+        _, *own = inspect.signature(verb).parameters.values()
+
+        def command(study_file: Path | None = None, **values: Any) -> None:
+            given = {name: values.pop(name, None) for name in options}
+            if fewer and study_file is None and given["realisations"] is None:
+                given["realisations"] = FEWER
+            if "given" in kinds:
+                values["given"] = given
+            verb(_study(study_file, given, options, default), **values)
+
+        named = inspect.Parameter.KEYWORD_ONLY
+        parameters = [
+            inspect.Parameter("study_file", named, default=None, annotation=StudyFile),
+            *(
+                inspect.Parameter(name, named, default=False if o.kind is AsListFlag else None, annotation=o.kind)
+                for name, o in options.items()
+            ),
+            *(p.replace(kind=named, annotation=kinds[p.name]) for p in own if p.name != "given"),
+        ]
+        # Required options come first.
+        parameters.sort(key=lambda p: p.default is not inspect.Parameter.empty)
+        command.__name__, command.__doc__ = verb.__name__, verb.__doc__
+        command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        command.__annotations__ = {p.name: p.annotation for p in parameters}
+        return command
+
+    return decorate
+
+
+def _study(
     file: Path | None,
-    *,
-    star: list[str] | None,
-    magnitude: list[float] | None,
-    band: str | None,
-    exposure: float | None,
-    instrument: str | None,
-    temperature: float | None,
-    sky: str | None,
-    target: str | None,
-    when: str | None,
-    settings: list[str] | None = None,
-    **changes: dict[str, Any],
+    given: dict[str, Any],
+    options: Mapping[str, Option],
+    default: Callable[[dict[str, Any]], Study] | None,
 ) -> Study:
     """A study file, or the default, with the flags on top, and ``--set`` on top of those."""
-    from mauvecl.host.errors import InputError
     from mauvecl.study import Study
 
-    study = Study.read(file) if file is not None else Study()
-    skylight: dict[str, Any] = {"target": target, "time": when}
-    if sky is not None:
-        if sky.strip().lower() == "none":
-            skylight["none"] = True
-        else:
-            try:
-                skylight["surface_brightness"] = float(sky)
-            except ValueError as error:
-                raise InputError(f"--sky {sky!r}, expected V mag/arcsec^2 or none") from error
-    sections = {
-        "observation": {"exposure_s": exposure, "instrument": instrument, "temperature_c": temperature},
-        "sky": skylight,
-        **changes,
-    }
-    changed = study.with_changes(sections, _stars(study, star, magnitude, band))
-    return changed.with_settings(settings) if settings else changed
+    study = Study.read(file) if file is not None else default(given) if default else Study()
+    changes: dict[str, dict[str, Any]] = {"sky": _sky(given)}
+    for name, option in options.items():
+        if option.section:
+            value = given[name]
+            if value is not None and option.convert is not None:
+                value = option.convert(value)
+            changes.setdefault(option.section, {})[option.key] = value
+    changed = study.with_changes(changes, _stars(study, given["star"], given["magnitude"], given["band"]))
+    return changed.with_settings(given["settings"]) if given["settings"] else changed
+
+
+def _sky(given: dict[str, Any]) -> dict[str, Any]:
+    from mauvecl.host.errors import InputError
+
+    found: dict[str, Any] = {"target": given["target"], "time": given["when"]}
+    text = given["sky"]
+    if text is not None and text.strip().lower() == "none":
+        found["none"] = True
+    elif text is not None:
+        try:
+            found["surface_brightness"] = float(text)
+        except ValueError as error:
+            raise InputError(f"--sky {text!r}, expected V mag/arcsec^2 or none") from error
+    return found
 
 
 def _stars(

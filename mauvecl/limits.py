@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
+import itertools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.detection import Detection, check_fap
 from mauvecl.host.errors import InputError
+from mauvecl.labels import label, put_first
 from mauvecl.scene import prepare
 from mauvecl.statistics import Interval
-from mauvecl.study import QUANTITIES, Star, Study
+from mauvecl.study import QUANTITIES, UNITS, Star, Study
+from mauvecl.unknowns import Draws, average, drawn, draws_table, shares
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -28,7 +33,6 @@ STEPS = {"magnitude": -0.5, "amplitude": 2.0, "exposure": 2.0}
 SEARCH = {"magnitude": (20.0, -2.0), "amplitude": (1e-5, 1e3), "exposure": (None, 1e6)}
 #: Simulated evaluations at most; each moves by the closed form's slope, so that two or three suffice.
 MOST_EVALUATIONS = 8
-UNITS = {"magnitude": "mag", "amplitude": "", "exposure": "s"}
 
 
 @dataclass(frozen=True)
@@ -38,6 +42,30 @@ class Point:
     value: float
     probability: Interval
     seed: int
+
+
+@dataclass(frozen=True, eq=False)
+class Unknown:
+    """What the unknown does to a limit.
+
+    Attributes
+    ----------
+    draws : Draws
+    limits : ndarray, shape (n_draw,)
+        The closed-form limit of each draw; NaN where there is none.
+    shares : dict of float
+        Share of the limits' variance that each unknown explains, the largest first.
+    """
+
+    draws: Draws
+    limits: NDArray[np.float64]
+    shares: dict[str, float]
+
+    @property
+    def range(self) -> tuple[float, float]:
+        """The central 95 % of the limits."""
+        low, high = np.nanquantile(self.limits, (0.025, 0.975))
+        return float(low), float(high)
 
 
 @dataclass(frozen=True)
@@ -61,6 +89,10 @@ class Limit:
         What was simulated on the way.
     curve : tuple of (value, probability)
         The closed form around the limit.
+    at : mapping
+        What the study sweeps over.
+    unknown : Unknown, optional
+        Where the limit is averaged over what is unknown.
     """
 
     star: str
@@ -74,6 +106,8 @@ class Limit:
     check: Point
     points: tuple[Point, ...]
     curve: tuple[tuple[float, float], ...]
+    at: Mapping[str, float | str] = field(default_factory=dict)
+    unknown: Unknown | None = None
 
     @property
     def agrees(self) -> bool:
@@ -103,10 +137,14 @@ class LimitResult:
         from astropy.table import QTable
 
         of = self.study.limit.of
-        unit = u.Unit(UNITS[of])
+        unit = UNITS.get(of)
         rows = self.limits
         table = QTable()
         table["star"] = [r.star for r in rows]
+        for axis in self.study.sweep.axes:
+            if axis.quantity != "amplitude":
+                swept = np.array([r.at[axis.quantity] for r in rows])
+                table[axis.quantity] = swept * u.Unit(UNITS[axis.quantity]) if axis.quantity in UNITS else swept
         if of != "amplitude":
             table["amplitude"] = [r.amplitude for r in rows]
         table["statistic"] = [r.statistic for r in rows]
@@ -116,13 +154,21 @@ class LimitResult:
             ("high", [r.value.high for r in rows], "its 95 % interval, upper end, with the threshold's own"),
             ("closed_form", [r.closed_form for r in rows], "the same for Gaussian noise"),
         ):
-            table[name] = np.array(values) * unit if UNITS[of] else values
+            table[name] = values if unit is None else np.array(values) * u.Unit(unit)
             table[name].info.description = text
         for name, value in (("check", "value"), ("check_low", "low"), ("check_high", "high")):
             table[name] = [getattr(r.check.probability, value) for r in rows]
             table[name].info.description = "detection probability there, with a fresh seed" + (
                 "" if name == "check" else f"; 95 % interval, {name[6:]}er end"
             )
+        if self.study.unknowns.draws:
+            unknowns = [r.unknown for r in rows if r.unknown is not None]
+            table["unknown_low"], table["unknown_high"] = np.array([one.range for one in unknowns]).T
+            table["unknown_low"].info.description = "central 95 % of the limits over what is unknown, lower end"
+            table["unknown_high"].info.description = "central 95 % of the limits over what is unknown, upper end"
+            table["matters_most"] = [next(iter(one.shares)) for one in unknowns]
+            table["its_share"] = [next(iter(one.shares.values())) for one in unknowns]
+            table["its_share"].info.description = "share of the limits' variance that this unknown explains"
         table.meta |= {
             "power": self.study.limit.power,
             "fap": self.study.run.fap,
@@ -131,12 +177,30 @@ class LimitResult:
         }
         return table
 
+    @property
+    def draws(self) -> QTable:
+        """One row per limit and draw of the unknown: its values and the closed-form limit."""
+        from astropy.table import vstack
+
+        parts = []
+        for one in self.limits:
+            assert one.unknown is not None
+            table = draws_table(one.unknown.draws, {self.study.limit.of: one.unknown.limits})
+            amplitude = {} if np.isnan(one.amplitude) else {"amplitude": one.amplitude}
+            swept = {k: v for k, v in one.at.items() if k != "amplitude"}
+            put_first(table, {"star": one.star, **swept, **amplitude, "statistic": one.statistic})
+            parts.append(table)
+        return vstack(parts)
+
     def write(self, folder: str | Path) -> list[Path]:
-        """The table as ECSV, and the study that gives it again."""
+        """The table as ECSV, that of the unknown's draws where there are any, and the study that gives them again."""
         from mauvecl.report import make_folder, write_study, write_table
 
         place = make_folder(Path(folder))
-        return [write_table(self.table, place / "limit.ecsv"), write_study(self.study, place)]
+        files = [write_table(self.table, place / "limit.ecsv")]
+        if self.study.unknowns.draws:
+            files.append(write_table(self.draws, place / "unknowns.ecsv"))
+        return [*files, write_study(self.study, place)]
 
     def plot(self, path: str | Path | None = None) -> object:
         """Detection probability against the quantity: every simulated point and the limits; needs matplotlib."""
@@ -156,6 +220,7 @@ class Question:
         if amplitude is not None:
             self.study = self.study.at("amplitude", amplitude)
         self.points: list[Point] = []
+        self._base: tuple[float, Expectation, Expectation] | None = None
 
     def pair(self, value: float) -> tuple[Expectation, Expectation]:
         """Without and with the flare."""
@@ -163,9 +228,25 @@ class Question:
         quiet, flare = study.expectations(study.star[0])
         return quiet, flare
 
+    def scaled(self, value: float) -> tuple[Expectation, Expectation]:
+        """`pair` for the closed form: light is linear, so that one pair gives all others without reading anything."""
+        if self._base is None:
+            at = {"magnitude": 10.0, "amplitude": 0.1, "exposure": self.frame_s}[self.of]
+            self._base = at, *self.pair(at)
+        at, quiet, flare = self._base
+        if self.of == "exposure":
+            frames = max(round(value / self.frame_s), 1)
+            return replace(quiet, n_frames=frames), replace(flare, n_frames=frames)
+        if self.of == "amplitude":
+            more = value / at * (flare.source_electrons - quiet.source_electrons)
+            return quiet, replace(flare, source_electrons=quiet.source_electrons + more)
+        fainter = 10 ** (-0.4 * (value - at))
+        dimmed = (replace(x, source_electrons=fainter * x.source_electrons) for x in (quiet, flare))
+        return next(dimmed), next(dimmed)
+
     def theory(self, value: float) -> float:
         """Detection probability for Gaussian noise; 0 where no pixel is left unsaturated."""
-        quiet, flare = self.pair(value)
+        quiet, flare = self.scaled(value)
         scene = prepare([quiet, flare], comparison=self.study.run.comparison())
         if not scene.used.any():
             return 0.0
@@ -221,7 +302,7 @@ class Question:
             value = nearer
         raise self._beyond(value, "does not reach")
 
-    @property
+    @cached_property
     def frame_s(self) -> float:
         """Seconds of one frame."""
         return self.study.load_instrument().frame_s
@@ -238,6 +319,38 @@ class Question:
         values = (_value(self.of, at - width), _value(self.of, at + width))
         below, above = (special.ndtri(np.clip(self.theory(v), 1e-9, 1 - 1e-9)) for v in values)
         return float((above - below) / (2 * width))
+
+
+class MarginalQuestion(Question):
+    """The same, averaged over what is unknown of the instrument."""
+
+    def __init__(
+        self, study: Study, star: Star, amplitude: float | None, statistic: str, engine: Engine | None = None
+    ) -> None:
+        super().__init__(study, star, amplitude, statistic, engine)
+        self.draws = drawn(study)
+        self.each = [Question(one, star, amplitude, statistic, engine) for one in self.draws.studies]
+
+    def theory(self, value: float) -> float:
+        """Mean over the draws of the unknown."""
+        return float(np.mean([one.theory(value) for one in self.each]))
+
+    def simulated(self, value: float, seed: int) -> Interval:
+        """Mean over the draws of the unknown, each with its own template and threshold."""
+        found = average([one.simulated(value, seed) for one in self.each])
+        self.points.append(Point(value, found, seed))
+        return found
+
+    def unknown(self, near: float) -> Unknown:
+        """The closed-form limit of each draw, and which unknown moves it most."""
+        limits = []
+        for one in self.each:
+            try:
+                limits.append(one.root(near=near))
+            except InputError:
+                limits.append(float("nan"))
+        found = np.array(limits)
+        return Unknown(self.draws, found, shares(self.draws, found))
 
 
 def _further(of: str) -> Callable[[float, float], float]:
@@ -268,19 +381,28 @@ def _bisect_frames(seen: Callable[[float], bool], low: float, high: float, frame
     return many * frame_s
 
 
-def solve(study: Study, star: Star, amplitude: float | None, statistic: str, engine: Engine) -> Limit:
+def solve(
+    study: Study,
+    star: Star,
+    amplitude: float | None,
+    statistic: str,
+    engine: Engine,
+    at: Mapping[str, float | str] | None = None,
+) -> Limit:
     """One limit: the closed form's root, moved by what is simulated, and simulated again there.
+
+    Averaged over what is unknown of the instrument where the study asks for draws of it.
 
     Raises
     ------
     InputError
         If the power is not crossed in the range searched, or the false-alarm probability cannot be settled.
     """
-    from mauvecl.answer import label
-
     check_fap(study.run.fap, study.run.realisations, study.run.tails)
-    question = Question(study, star, amplitude, statistic, engine)
-    theory = question.root()
+    kind = MarginalQuestion if study.unknowns.draws else Question
+    question = kind(study, star, amplitude, statistic, engine)
+    # The nominal instrument's root is near, and quickly found.
+    theory = question.root(near=Question(study, star, amplitude, statistic).root() if study.unknowns.draws else None)
     settle = _settle_frames if question.of == "exposure" else _settle
     value = settle(question, theory)
     simulated = tuple(question.points)
@@ -302,6 +424,8 @@ def solve(study: Study, star: Star, amplitude: float | None, statistic: str, eng
         check=check,
         points=simulated,
         curve=question.curve(value.value),
+        at=at or {},
+        unknown=question.unknown(theory) if isinstance(question, MarginalQuestion) else None,
     )
 
 
@@ -369,10 +493,12 @@ def limiting_magnitude(study: Study, engine: Engine | None = None) -> LimitResul
 
     engine = engine or Default()
     result = LimitResult(study)
-    amplitudes = (None,) if study.limit.of == "amplitude" else study.flare.amplitudes
-    for star in study.star:
-        for amplitude in amplitudes:
-            result.limits += [solve(study, star, amplitude, s, engine) for s in study.run.statistics]
+    if any(axis.quantity == study.limit.of for axis in study.sweep.axes):
+        raise InputError(f"the sweep runs over the {study.limit.of} that is asked for, expected other quantities")
+    for at, cell in study.cells():
+        amplitudes = (None,) if study.limit.of == "amplitude" else cell.flare.amplitudes
+        for star, amplitude, statistic in itertools.product(cell.star, amplitudes, study.run.statistics):
+            result.limits.append(solve(cell, star, amplitude, statistic, engine, at))
     return result
 
 

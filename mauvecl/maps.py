@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answer import label, told
 from mauvecl.detection import check_fap
-from mauvecl.study import Study
+from mauvecl.labels import label, told
+from mauvecl.statistics import Interval
+from mauvecl.study import UNITS, Study
+from mauvecl.unknowns import average, drawn, shares
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -22,13 +24,6 @@ if TYPE_CHECKING:
 
 #: Quantities of the flare alone: cells that differ in them share their quiescent star, and one launch.
 OF_FLARE = ("amplitude", "flare_temperature")
-UNITS = {
-    "magnitude": "mag",
-    "flare_temperature": "K",
-    "exposure": "s",
-    "detector_temperature": "deg_C",
-    "sky": "mag / arcsec2",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,6 +41,9 @@ class MapResult:
         Detection probability, its 95 % interval with the threshold's own, and the same for Gaussian noise; NaN where
         every pixel saturates.
     messages : list of str
+    shares : dict of dict of float
+        By statistic, where the map is averaged over what is unknown: the share of the variance of its mean probability
+        that each unknown explains, the largest first.
     """
 
     study: Study
@@ -58,6 +56,7 @@ class MapResult:
     high: NDArray[np.float64]
     closed_form: NDArray[np.float64]
     messages: list[str]
+    shares: dict[str, dict[str, float]] = field(default_factory=dict)
 
     @property
     def table(self) -> QTable:
@@ -127,19 +126,24 @@ def detection_map(
     study = study.model_copy(update={"star": study.star[:1]}).at("amplitude", study.flare.amplitudes[0])
     axes = study.map.x, study.map.y
     x, y = (axis.points() for axis in axes)
-    shape = (len(study.run.statistics), len(y), len(x))
-    found = {name: np.full(shape, np.nan) for name in ("probability", "low", "high", "closed_form")}
+    unknown = drawn(study) if study.unknowns.draws else None
+    studies = (study,) if unknown is None else unknown.studies
     seen: list[Expectation] = []
-    groups = _groups(study, x, y)
-    done = 0
-    for cells in groups:
-        quiet, flares = _expectations(study, [(x[i], y[j]) for i, j in cells])
-        seen.append(quiet)
-        if not quiet.saturated.all():
-            _fill(found, cells, study, quiet, flares, engine)
-        done += len(cells)
-        if progress is not None:
-            progress(done, len(x) * len(y))
+    maps = []
+    for number, one in enumerate(studies):
+
+        def told_of(done: int, number: int = number) -> None:
+            if progress is not None:
+                cells = len(x) * len(y)
+                progress(number * cells + done, len(studies) * cells)
+
+        maps.append(_map(one, x, y, engine, seen, told_of))
+    found, parts = maps[0], {}
+    if unknown is not None:
+        found = _averaged(maps)
+        for s, statistic in enumerate(study.run.statistics):
+            means = [float(np.nanmean(one["probability"][s])) for one in maps]
+            parts[statistic] = shares(unknown, np.array(means))
     quiet = seen[0]
     names = {axis.quantity for axis in axes}
     star = study.star[0]
@@ -152,8 +156,44 @@ def detection_map(
         y=y,
         statistics=study.run.statistics,
         messages=told(seen),
+        shares=parts,
         **found,
     )
+
+
+Arrays = dict[str, NDArray[np.float64]]
+
+
+def _map(
+    study: Study,
+    x: tuple[float | str, ...],
+    y: tuple[float | str, ...],
+    engine: Engine,
+    seen: list[Expectation],
+    told_of: Callable[[int], None],
+) -> Arrays:
+    """The map on one instrument; quiescent stars are added to `seen`."""
+    shape = (len(study.run.statistics), len(y), len(x))
+    found = {name: np.full(shape, np.nan) for name in ("probability", "low", "high", "closed_form")}
+    done = 0
+    for cells in _groups(study, x, y):
+        quiet, flares = _expectations(study, [(x[i], y[j]) for i, j in cells])
+        seen.append(quiet)
+        if not quiet.saturated.all():
+            _fill(found, cells, study, quiet, flares, engine)
+        done += len(cells)
+        told_of(done)
+    return found
+
+
+def _averaged(maps: list[Arrays]) -> Arrays:
+    """The mean over draws of the unknown, with its interval; NaN where a draw has none."""
+    found = {name: np.mean([one[name] for one in maps], axis=0) for name in ("probability", "closed_form")}
+    found |= {name: np.full_like(found["probability"], np.nan) for name in ("low", "high")}
+    for at in zip(*np.nonzero(np.isfinite(found["probability"])), strict=True):
+        p = average([Interval(*(float(one[name][at]) for name in ("probability", "low", "high"))) for one in maps])
+        found["low"][at], found["high"][at] = p.low, p.high
+    return found
 
 
 def _groups(study: Study, x: tuple[float | str, ...], y: tuple[float | str, ...]) -> list[list[tuple[int, int]]]:

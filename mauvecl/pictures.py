@@ -8,14 +8,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.labels import titled
+
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-    from mauvecl.answer import StarDetection
-    from mauvecl.host.expectation import Expectation
+    from mauvecl.detect_study import StarDetection
+    from mauvecl.gaussian import GaussianReport
     from mauvecl.limits import LimitResult
     from mauvecl.maps import MapResult
     from mauvecl.snr import SnrResult
+    from mauvecl.snr_study import SnrAnswer
 
 #: Okabe and Ito's colours, which colour-blind readers can tell apart (jfly.uni-koeln.de/color).
 COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7", "#000000")
@@ -77,7 +80,7 @@ def _save(figure: Any, path: Path) -> Path:
     return path
 
 
-def detection(stars: Sequence[StarDetection], amplitudes: Sequence[float], fap: float, path: Path) -> Path:
+def detection(stars: Sequence[StarDetection], fap: float, path: Path) -> Path:
     """Null and flare distributions: a row per star, a column per statistic."""
     plt = _pyplot()
     statistics = stars[0].found.statistics
@@ -90,24 +93,24 @@ def detection(stars: Sequence[StarDetection], amplitudes: Sequence[float], fap: 
         for k, star in enumerate(stars):
             panels = axes[k * rows : (k + 1) * rows]
             for axis, statistic in zip(panels.ravel(), statistics, strict=False):
-                _distributions(axis, star, statistic, amplitudes, fap)
+                _distributions(axis, star, statistic, fap)
             for axis in panels.ravel()[len(statistics) :]:
                 axis.set_visible(False)
             for axis in panels[:, 0]:
-                axis.set_ylabel(f"{star.label}\nrealisations, each peak = 1")
+                axis.set_ylabel(f"{star.title}\nrealisations, each peak = 1")
         handles, names = axes[0][0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=len(names))
-        exposure = stars[0].found.quiet.exposure_s
+        exposures = " and ".join(sorted({f"{star.found.quiet.exposure_s:g} s" for star in stars}))
         figure.suptitle(
-            f"Detection statistics without a flare and with one, {exposure:g} s, "
+            f"Detection statistics without a flare and with one, {exposures}, "
             f"{stars[0].found.realisations:,} realisations each; nominal throughput",
             fontsize=10,
         )
         return _save(figure, path)
 
 
-def _distributions(axis: Any, star: StarDetection, statistic: str, amplitudes: Sequence[float], fap: float) -> None:
-    found = star.found
+def _distributions(axis: Any, star: StarDetection, statistic: str, fap: float) -> None:
+    found, amplitudes = star.found, star.amplitudes
     linear = found.weights(statistic) is not None
     shapes: list[tuple[int | None, str, str]] = [(None, NULL, "no flare")]
     shapes += [(k, COLOURS[k % len(COLOURS)], f"flare {100 * a:g} %") for k, a in enumerate(amplitudes)]
@@ -148,14 +151,13 @@ def _distributions(axis: Any, star: StarDetection, statistic: str, amplitudes: S
     axis.set_xlabel(NAMES.get(statistic, statistic))
 
 
-def spectra(
-    groups: Sequence[tuple[str, Expectation, Sequence[Expectation]]], amplitudes: Sequence[float], path: Path
-) -> Path:
+def spectra(stars: Sequence[StarDetection], path: Path) -> Path:
     """Quiescent and flare spectra per second, with one standard deviation of a pixel's noise."""
     plt = _pyplot()
+    groups = [(star.title, star.amplitudes, star.found.quiet, star.found.flares) for star in stars]
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(len(groups), 1, figsize=(7.2, 2.9 * len(groups) + 0.3), squeeze=False, sharex=True)
-        for axis, (title, quiet, flares) in zip(axes[:, 0], groups, strict=True):
+        for axis, (title, amplitudes, quiet, flares) in zip(axes[:, 0], groups, strict=True):
             for k in reversed(range(len(flares))):
                 x = flares[k]
                 axis.plot(
@@ -224,7 +226,7 @@ def signal_to_noise(stars: Sequence[tuple[str, SnrResult]], path: Path) -> Path:
                     )  # fmt: skip
                 axis.plot(wavelength, table["expected"], color="black", linewidth=0.9, label="closed form")
                 axis.set_ylabel(f"S/N {what}")
-                axis.set_title(f"{title}, {result.expectation.exposure_s:g} s")
+                axis.set_title(title)
                 axis.set_xlim(200, 700)
         axes[0][0].legend()
         for axis in axes[-1]:
@@ -298,4 +300,103 @@ def limits(found: LimitResult, path: Path | None) -> Any:
             "points: simulated, 95 %; lines: Gaussian noise; nominal throughput"
         )
         axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+        return figure if path is None else _save(figure, path)
+
+
+#: Noise by origin, in the colours of the paper's figure as far as colour-blind readers can tell them apart.
+ORIGINS = {
+    "source_photon": ("source photons", "#009E73"),
+    "dark": ("dark current", "#CC79A7"),
+    "read": ("read noise", "#E69F00"),
+    "zodiacal_photon": ("zodiacal photons", "#0072B2"),
+    "total": ("total", "#000000"),
+}
+
+
+def noise_budgets(found: SnrAnswer, path: Path) -> Path:
+    """Noise of a pixel by origin against wavelength, one panel per star and cell, as the paper's figure has it."""
+    plt = _pyplot()
+    each = len(found.study.cells())
+    stars = len(found.stars) // each
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(
+            stars, each, figsize=(3.4 * min(each, 6) + 0.6, 2.3 * stars + 0.5), squeeze=False, sharex=True, sharey="col"
+        )
+        for k, star in enumerate(found.stars):
+            axis, budget = axes[k % stars][k // stars], star.result.expectation.noise_budget()
+            for name, (text, colour) in ORIGINS.items():
+                axis.plot(budget["wavelength"].value, budget[name].value, color=colour, label=text, linewidth=1.0)
+            axis.set_title(star.title if star.at else f"{star.title}, {star.result.expectation.exposure_s:g} s")
+            axis.set_yscale("log")
+            axis.set_xlim(200, 700)
+        # Zodiacal light can be far below everything else.
+        for axis in axes.ravel():
+            axis.set_ylim(bottom=max(axis.get_ylim()[0], axis.get_ylim()[1] * 1e-4))
+        for axis in axes[:, 0]:
+            axis.set_ylabel("noise (DN rms per pixel)")
+        for axis in axes[-1]:
+            axis.set_xlabel("wavelength (nm)")
+        handles, names = axes[0][0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower center", ncols=len(names))
+        figure.suptitle("Noise budgets; nominal throughput, not a flight calibration", fontsize=10)
+        return _save(figure, path)
+
+
+def snr_sweep(found: SnrAnswer, path: Path) -> Path:
+    """S/N of some elements against what is swept first, a line for each value of the rest."""
+    from mauvecl.exposures import place_of
+
+    plt = _pyplot()
+    first = found.study.sweep.axes[0].quantity
+    shown = [w for w in (250.0, 300.0, 400.0, 550.0)
+             if found.stars[0].result.expectation.wavelength_nm[[0, -1]][0] <= w
+             <= found.stars[0].result.expectation.wavelength_nm[-1]]  # fmt: skip
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(1, len(shown), figsize=(3.0 * len(shown) + 0.4, 3.2), squeeze=False, sharey=True)
+        for axis, wavelength in zip(axes[0], shown, strict=True):
+            lines: dict[str, list[tuple[Any, Any]]] = {}
+            for star in found.stars:
+                name = star.label if first != "magnitude" else star.label.split(" V = ")[0]
+                rest = titled(name, {k: v for k, v in star.at.items() if k != first})
+                row = star.result.element[place_of(star.result.expectation, wavelength, "element")]
+                lines.setdefault(rest, []).append((star.at[first], row))
+            for k, (name, points) in enumerate(lines.items()):
+                x = [value for value, _ in points]
+                low, high = ([max(row[q], 1e-3) for _, row in points] for q in ("q2.5", "q97.5"))
+                colour = COLOURS[k % len(COLOURS)]
+                axis.fill_between(x, low, high, color=colour, alpha=0.25, linewidth=0)
+                axis.plot(x, [row["expected"] for _, row in points], "o-", color=colour, ms=3, label=name)
+            axis.set_yscale("log")
+            axis.set_ylim(bottom=0.1)
+            if first == "exposure":
+                axis.set_xscale("log")
+            axis.set_title(f"{wavelength:g} nm")
+            axis.set_xlabel(AXES[first])
+        axes[0][0].set_ylabel("S/N per 10.5 nm element")
+        handles, names = axes[0][0].get_legend_handles_labels()
+        figure.legend(handles, names, loc="outside lower center", ncols=min(len(names), 4))
+        figure.suptitle("S/N: closed form, and 95 % of realisations; nominal throughput", fontsize=10)
+        return _save(figure, path)
+
+
+def gaussian(found: GaussianReport, path: Path | None) -> Any:
+    """How far each promise of the usual formula holds in every cell; the figure where no path is given."""
+    plt = _pyplot()
+    cells = found.cells
+    panels = (
+        ("snr_off_by", "mean S/N less formula"),
+        ("coverage_low", "1-sigma intervals, worst element"),
+        ("fap_ratio", "false alarms over promised"),
+    )
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(1, 3, figsize=(10.0, 0.28 * len(cells) + 1.4), sharey=True)
+        names = [titled(s.label, s.at) for s in found.signal.stars]
+        for axis, (column, text) in zip(axes, panels, strict=True):
+            axis.plot(cells[column], np.arange(len(cells)), "o", color=COLOURS[0], ms=4)
+            axis.axvline({"snr_off_by": 0.0, "coverage_low": 0.6827, "fap_ratio": 1.0}[column], color=NULL, linewidth=1)
+            axis.set_xlabel(text)
+            axis.grid(axis="y", linewidth=0.3)
+        axes[0].set_yticks(np.arange(len(cells)), names)
+        axes[0].invert_yaxis()
+        figure.suptitle("The root-of-N formula beside the simulation; grey: as promised", fontsize=10)
         return figure if path is None else _save(figure, path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import itertools
 import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -208,6 +209,14 @@ QUANTITIES: dict[str, tuple[float, float]] = {
     "detector_temperature": (-100.0, 60.0),
     "sky": (10.0, 30.0),
 }
+#: Units of these, where they have any.
+UNITS = {
+    "magnitude": "mag",
+    "flare_temperature": "K",
+    "exposure": "s",
+    "detector_temperature": "deg_C",
+    "sky": "mag / arcsec2",
+}
 
 
 class CampaignQuestion(_Part):
@@ -222,6 +231,41 @@ class LimitQuestion(_Part):
 
     of: Literal["magnitude", "amplitude", "exposure"] = "magnitude"
     power: Annotated[float, Field(gt=0, lt=1)] = 0.9
+
+
+class Unknowns(_Part):
+    """What is unknown of the instrument and the same in every exposure; nothing unless draws are asked for.
+
+    The priors are those of the documentation's page on what is nominal.
+    """
+
+    draws: Annotated[int, Field(ge=0, le=4096)] = 0
+    temperature_c: PriorText | None = PriorText(uniform=(13.0, 21.0))
+    light_loss: PriorText | None = PriorText(normal=(0.34, 0.10), between=(0.04, 0.64))
+    pointing_loss: PriorText | None = PriorText(uniform=(0.0, 0.05))
+    qe_scale: PriorText | None = PriorText(normal=(1.0, 0.3), between=(0.3, 1.7))
+    conversion_uv_per_electron: PriorText | None = PriorText(uniform=(20.0, 25.0))
+    read_noise_dn: PriorText | None = PriorText(normal=(12.0, 1.0), between=(9.0, 15.0))
+    known: tuple[str, ...] = ()
+
+    @model_validator(mode="after")
+    def _enough(self) -> Self:
+        if self.draws == 1:
+            raise ValueError("unknowns.draws = 1, expected 0 or at least 2")
+        other = next((name for name in self.known if name not in self._names()), None)
+        if other is not None:
+            raise ValueError(f"unknowns.known names {other!r}, expected some of {', '.join(self._names())}")
+        self.priors()
+        return self
+
+    @classmethod
+    def _names(cls) -> list[str]:
+        return [name for name in cls.model_fields if name not in ("draws", "known")]
+
+    def priors(self) -> dict[str, Prior]:
+        """The priors of what is not known, by the instrument's names, and `qe_scale`."""
+        given = {name: getattr(self, name) for name in self._names() if name not in self.known}
+        return {name: text.prior() for name, text in given.items() if text is not None}
 
 
 class Axis(_Part):
@@ -286,6 +330,31 @@ class MapQuestion(_Part):
         return self
 
 
+class Sweep(_Part):
+    """Quantities that take several values: in every combination, or side by side as a list."""
+
+    how: Literal["product", "list"] = "product"
+    axes: tuple[Axis, ...] = ()
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        names = [axis.quantity for axis in self.axes]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise ValueError(f"the sweep has the quantity {twice!r} twice, expected different ones")
+        lengths = {axis.quantity: len(axis.points()) for axis in self.axes}
+        if self.how == "list" and len(set(lengths.values())) > 1:
+            told = ", ".join(f"{n} of {name}" for name, n in lengths.items())
+            raise ValueError(f"the sweep is a list of {told}, expected as many of each")
+        return self
+
+    def cells(self) -> list[dict[str, float | str]]:
+        """The values of each cell; one cell without any where nothing is swept."""
+        values = [axis.points() for axis in self.axes]
+        together = zip(*values, strict=True) if self.how == "list" and values else itertools.product(*values)
+        return [{a.quantity: v for a, v in zip(self.axes, cell, strict=True)} for cell in together]
+
+
 #: The paper's two stars.
 PAPER_STARS = (Star(library="K3V", magnitude=3.7), Star(library="G2V", magnitude=7.4))
 
@@ -302,6 +371,8 @@ class Study(_Part):
     campaign: CampaignQuestion = CampaignQuestion()
     limit: LimitQuestion = LimitQuestion()
     map: MapQuestion = MapQuestion()
+    sweep: Sweep = Sweep()
+    unknowns: Unknowns = Unknowns()
 
     @classmethod
     def read(cls, path: Path) -> Self:
@@ -373,6 +444,10 @@ class Study(_Part):
             del data["sky"]["none"]
         if not data["observation"]["changes"]:
             del data["observation"]["changes"]
+        if not self.sweep.axes:
+            del data["sweep"]
+        if not self.unknowns.draws:
+            del data["unknowns"]
         for section in ("processes", "campaign"):
             if not data[section]:
                 del data[section]
@@ -418,6 +493,30 @@ class Study(_Part):
         change = {{"exposure": "exposure_s", "detector_temperature": "temperature_c"}[quantity]: value}
         return self.model_copy(update={"observation": self.observation.model_copy(update=change)})
 
+    def unknown_priors(self) -> dict[str, Prior]:
+        """Priors of what is unknown of the instrument; what the study states of it is known.
+
+        Raises
+        ------
+        InputError
+            If nothing is left unknown, and draws are asked for.
+        """
+        stated = {*self.observation.changes, *(() if self.observation.temperature_c is None else ("temperature_c",))}
+        found = {name: prior for name, prior in self.unknowns.priors().items() if name not in stated}
+        if self.unknowns.draws and not found:
+            raise InputError("everything is known of the instrument, expected a prior, or unknowns.draws = 0")
+        return found
+
+    def cells(self) -> list[tuple[dict[str, float | str], Self]]:
+        """The values that the study sweeps over, and the study at each; itself where it sweeps over nothing."""
+        found = []
+        for values in self.sweep.cells():
+            study = self.model_copy(update={"sweep": Sweep()})
+            for quantity, value in values.items():
+                study = study.at(quantity, value)
+            found.append((values, study))
+        return found
+
     @property
     def drawing(self) -> dict[str, Any]:
         """How the engine is to draw: mode, recipe, processes."""
@@ -454,6 +553,14 @@ class Study(_Part):
 
         instrument, sky, o = self.load_instrument(), self.sky.sky(), self.observation
         return [expect(s, instrument, exposure=o.exposure_s, sky=sky, order=o.order) for s in sources]
+
+
+#: The paper's noise budgets (its section "Noise"): the Be star HD 37202 and both flare stars, 50 s and 600 s.
+PAPER_BUDGETS = Study(
+    star=(Star(library="B2IV", magnitude=3.03), *PAPER_STARS),
+    run=Run(realisations=100_000),
+    sweep=Sweep(axes=(Axis(quantity="exposure", values=(50.0, 600.0)),)),
+)
 
 
 def _toml_value(text: str) -> Any:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mauvecl import answer
 from mauvecl.campaign import campaign
+from mauvecl.detect_study import detect
 from mauvecl.engine import Engine
 from mauvecl.host.errors import InputError
 from mauvecl.study import Study
@@ -70,7 +70,7 @@ def test_a_detection_tells_both(engine: Engine) -> None:
         },
         "test",
     )
-    said = [m for m in answer.detect(study, engine).messages if "campaign" in m]
+    said = [m for m in detect(study, engine).messages if "campaign" in m]
     assert len(said) == 1
     assert "17271 tests" in said[0]
     assert "at 0.01 per test" in said[0]

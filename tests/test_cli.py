@@ -15,9 +15,10 @@ import pytest
 from astropy.io import fits
 from astropy.table import QTable
 
-from mauvecl import answer
+from mauvecl.detect_study import detect
 from mauvecl.engine import Engine
 from mauvecl.processes import CosmicRays, Normal, Processes, Uniform
+from mauvecl.simulate_study import simulate
 from mauvecl.statistics import STATISTICS
 from mauvecl.study import Star, Study
 
@@ -73,7 +74,8 @@ def test_the_papers_pair_is_compared(answered: tuple[Path, str]) -> None:
 def test_files_and_record(answered: tuple[Path, str]) -> None:
     folder, text = answered
     out = folder / "mauvecl-detect"
-    names = {"detection.ecsv", "detection.png", "spectra.png", "study.toml", "run.json"}
+    tables = {"detection.ecsv", "departures.ecsv", "roc.ecsv", "tails.ecsv"}
+    names = tables | {"detection.png", "spectra.png", "study.toml", "run.json"}
     assert {path.name for path in out.iterdir()} == names
     assert all(name in text.splitlines()[-1] for name in names)
     record = json.loads((out / "run.json").read_text())
@@ -162,13 +164,13 @@ def test_a_study_may_ask_for_processes(tmp_path: Path, engine: Engine) -> None:
     assert study.drawing == {"mode": "auto", "recipe": "joint", "processes": processes}
     (tmp_path / "again.toml").write_text(study.toml())
     assert Study.read(tmp_path / "again.toml") == study
-    found = answer.detect(study, engine).stars[0].found
+    found = detect(study, engine).stars[0].found
     quiet, *flares = study.expectations(study.star[0])
     wanted = engine.detect(quiet, flares, realisations=2000, seed=1, processes=processes)
     np.testing.assert_array_equal(found.distribution("chi2", 0).counts, wanted.distribution("chi2", 0).counts)
     plain = engine.detect(quiet, flares, realisations=2000, seed=1)
     assert (found.distribution("chi2", 0).counts != plain.distribution("chi2", 0).counts).any()
-    assert "cosmic_rays" in answer.simulate(study).observations[0][2].colnames
+    assert "cosmic_rays" in simulate(study).observations[0][2].colnames
 
 
 def test_simulate(tmp_path: Path) -> None:
@@ -216,10 +218,49 @@ def test_the_parts_of_a_simulation_have_their_variances() -> None:
 def test_snr(tmp_path: Path) -> None:
     done = run("snr", "--star", "B2IV", "-m", "3.03", "-t", "5", "-n", "5000", "-o", "out", folder=tmp_path)
     assert "S/N per 10.5 nm element" in done.stdout
-    table = QTable.read(tmp_path / "out" / "snr-1-element.ecsv")
+    table = QTable.read(tmp_path / "out" / "snr-element.ecsv")
     np.testing.assert_allclose(table["mean"], table["expected"], rtol=1e-3)
     assert np.all(table["q2.5"] < table["q97.5"])
-    assert {"snr-1-pixel.ecsv", "noise-budget-1.ecsv", "snr.png"} <= {p.name for p in (tmp_path / "out").iterdir()}
+    names = {"snr-pixel.ecsv", "noise-budget.ecsv", "noise-budget.png", "snr.png"}
+    assert names <= {p.name for p in (tmp_path / "out").iterdir()}
+
+
+def test_snr_of_the_papers_budgets_and_a_sweep(tmp_path: Path) -> None:
+    """Without arguments the paper's three stars at 50 s and 600 s; with a sweep every combination, or a list."""
+    shown = run("snr", "-n", "500", folder=tmp_path).stdout
+    for name in ("B2IV V = 3.03", "K3V V = 3.7", "G2V V = 7.4"):
+        assert len([line for line in shown.splitlines() if name in line and " 600 " in line]) == 8
+    assert {"noise-budget.png", "snr-sweep.png"} <= {p.name for p in (tmp_path / "mauvecl-snr").iterdir()}
+    words = ("snr", "--star", "G2V", "--sweep", "magnitude=5,7", "--sweep", "exposure=5,50", "-n", "500", "-q")
+    for more, cells in (((), 4), (("--as-list",), 2)):
+        run(*words, *more, "--no-pictures", "-o", "swept", folder=tmp_path)
+        table = QTable.read(tmp_path / "swept" / "snr-element.ecsv")
+        assert len({(m.value, t.value) for m, t in zip(table["magnitude"], table["exposure"], strict=True)}) == cells
+    run("snr", tmp_path / "swept" / "study.toml", "--no-pictures", "-o", "again", folder=tmp_path)
+    assert (tmp_path / "again" / "snr-element.ecsv").read_text() == (
+        tmp_path / "swept" / "snr-element.ecsv"
+    ).read_text()
+    assert "--sweep 'magnitude=a'" in run("snr", "--sweep", "magnitude=a", folder=tmp_path, code=2).stderr
+
+
+def test_gaussian(tmp_path: Path) -> None:
+    words = ("--star", "G2V", "-n", "10000", "--fap", "0.01", "--sweep", "magnitude=6,9", "--statistic", "matched")
+    shown = run("gaussian", *words, folder=tmp_path).stdout
+    assert "The root-of-N formula beside 10,000 realisations" in shown
+    names = {"gaussian.ecsv", "elements.ecsv", "thresholds.ecsv", "gaussian.png", "study.toml", "run.json"}
+    assert {p.name for p in (tmp_path / "mauvecl-gaussian").iterdir()} == names
+
+
+def test_a_wrong_template_costs(tmp_path: Path) -> None:
+    """Looked for as 5000 K a flare of 10000 K is seen less often, and the text says how much S/N is kept."""
+    words = ("--star", "G2V", "-m", "7.4", "-a", "0.01", "-n", "50000", "--statistic", "matched", "--no-pictures")
+    shown = run("detect", *words, "--template", "5000", "--template", "10000", folder=tmp_path).stdout
+    kept = [float(line.split(" keeps ")[1].split()[0]) for line in shown.splitlines() if " keeps " in line]
+    assert 50 < kept[0] < 95
+    assert kept[1] == 100.0
+    table = QTable.read(tmp_path / "mauvecl-detect" / "detection.ecsv")
+    p = dict(zip(table["statistic"], table["probability"], strict=True))
+    assert p["matched 5000 K"] < p["matched"] == p["matched 10000 K"]
 
 
 def test_limit(tmp_path: Path) -> None:
@@ -255,6 +296,10 @@ def test_map(tmp_path: Path) -> None:
     first = tmp_path / "mauvecl-map"
     assert {p.name for p in first.iterdir()} == {"map.ecsv", "map.fits", "map.png", "study.toml", "run.json"}
     run("map", first / "study.toml", "-o", "again", "--no-pictures", folder=tmp_path)
+    averaged = run(
+        "map", *words, "--statistic", "matched", "--unknown", "2", "-o", "u", "--no-pictures", folder=tmp_path
+    )
+    assert "averaged over 2 draws of what is unknown" in averaged.stdout
     assert (tmp_path / "again" / "map.ecsv").read_text() == (first / "map.ecsv").read_text()
     for axis in ("magnitude:6:9", "magnitude:a:b:3", "magnitude=a", "magnitude:6:9:3:cubic"):
         assert f"--x '{axis}'" in run("map", "--x", axis, folder=tmp_path, code=2).stderr

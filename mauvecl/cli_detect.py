@@ -1,0 +1,200 @@
+"""The verbs of detection: would these flares be seen, and how far is the usual formula to be trusted."""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mauvecl import verbs
+from mauvecl.flags import (
+    DETECTION,
+    DRAWS,
+    FLARE,
+    SWEEP,
+    TEMPLATE,
+    DeviceFlag,
+    JsonFlag,
+    OutputFlag,
+    PicturesFlag,
+    QuietFlag,
+    takes_study,
+)
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.study import Study
+
+
+#: Stars, or cells of a sweep, in one picture.
+MOST_DRAWN = 6
+
+
+@takes_study(FLARE, DRAWS, DETECTION, TEMPLATE, SWEEP)
+def detect(
+    study: Study,
+    device: DeviceFlag = None,
+    output: OutputFlag = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+    pictures: PicturesFlag = True,
+) -> None:
+    """Would these flares be seen? Thresholds, detection probabilities, distributions.
+
+    Without arguments: the paper's K3V star of V = 3.7 and G2V star of V = 7.4 with flares of 0.76, 2, 8.1 and 24 %,
+    50 s, one million realisations.
+
+    Example: mauvecl detect --star K5V --magnitude 6 --amplitude 0.05 --amplitude 0.1 --exposure 30
+    """
+    from mauvecl import report
+    from mauvecl.console import Meter, show_table
+    from mauvecl.detect_study import detect as compute
+
+    started = time.perf_counter()
+    folder = report.make_folder(output or Path("mauvecl-detect"))
+    with Meter(quiet=quiet or as_json) as meter:
+        engine = verbs.engine(device, meter)
+        found = compute(study, engine)
+    verbs.say(found.messages, as_json=as_json)
+    files = [report.write_table(found.table, folder / "detection.ecsv")]
+    files.append(report.write_table(found.departures, folder / "departures.ecsv"))
+    files.append(report.write_table(found.roc, folder / "roc.ecsv"))
+    files.append(report.write_table(found.tails, folder / "tails.ecsv"))
+    if verbs.pictures_wanted(pictures, quiet=quiet, as_json=as_json):
+        from mauvecl.pictures import detection, spectra
+
+        # More would be too small to read; the tables hold all of them.
+        files.append(detection(found.stars[:MOST_DRAWN], study.run.fap, folder / "detection.png"))
+        files.append(spectra(found.stars[:MOST_DRAWN], folder / "spectra.png"))
+    files.append(report.write_study(study, folder))
+    files.append(
+        report.write_record(
+            "detect",
+            study,
+            [x for s in found.stars for x in (s.found.quiet, *s.found.flares)],
+            folder,
+            engine=engine,
+            seconds=time.perf_counter() - started,
+            messages=[*found.messages, *found.paper],
+        )
+    )
+    if as_json:
+        out = {"messages": found.messages, "paper": found.paper, "rows": report.rows(found.table),
+               "departures": report.rows(found.departures)}  # fmt: skip
+        print(json.dumps(out, indent=2))
+        return
+    run = study.run
+    exposures = " and ".join(
+        dict.fromkeys(f"{x.exposure_s:g} s ({x.n_frames} frames)" for x in (s.found.quiet for s in found.stars))
+    )
+    swept = [axis.quantity for axis in study.sweep.axes if axis.quantity != "amplitude"]
+    columns = ("flare", "statistic", "expected", "simulated", "reduced", "threshold", "detected", "", "closed form")
+    cells = []
+    for row in found.table:
+        amplitude, digits = f"{100 * row['amplitude']:g} %", (row["expected"], row["mean"])
+        probability = f"{row['probability']:.4f}", f"[{row['low']:.4f}, {row['high']:.4f}]"
+        cells.append(
+            (row["star"], *(_short(row[name]) for name in swept), amplitude, row["statistic"],
+             *(f"{value:.2f}" for value in digits), f"{row['reduced']:.3f}", f"{row['threshold']:.2f}", *probability,
+             f"{row['closed_form_probability']:.4f}")
+        )  # fmt: skip
+    show_table(
+        f"Detection at a false-alarm probability of {run.fap:g} per test, {exposures}, {run.realisations:,} "
+        "realisations; [95 % interval]",
+        ("star", *swept, *columns),
+        cells,
+    )
+    _show_departures(found.departures, run.fap)
+    verbs.say(found.paper, as_json=as_json)
+    verbs.finish(files, started, quiet=quiet, as_json=as_json)
+
+
+def _short(value: Any) -> str:
+    """A cell's value for the terminal, without its unit."""
+    value = getattr(value, "value", value)
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+def _show_departures(table: QTable, fap: float) -> None:
+    """Where the simulation differs from the closed form, or that it does not."""
+    from mauvecl.console import show_table
+
+    differing = table[table["differs"]]
+    if len(table) and not len(differing):
+        verbs.say(
+            [f"At the thresholds for Gaussian noise the simulated false-alarm probability is {fap:g} within 4 standard "
+             "errors, for every statistic."], as_json=False,
+        )  # fmt: skip
+    if len(differing):
+        flares = ["" if math.isnan(a) else f"{100 * a:g} %" for a in differing["amplitude"]]
+        show_table(
+            f"Where the simulation differs from the closed form: false-alarm probability at the threshold that should "
+            f"give {fap:g}",
+            ("star", "statistic", "flare", "simulated", "", "ratio", "why"),
+            [
+                (row["star"], row["statistic"], flare, f"{row['fap']:.3g}",
+                 f"[{row['fap_low']:.3g}, {row['fap_high']:.3g}]", f"{row['ratio']:.3f}", row["why"])
+                for row, flare in zip(differing, flares, strict=True)
+            ],
+        )  # fmt: skip
+
+
+@takes_study(DRAWS, DETECTION, SWEEP, fewer=True)
+def gaussian(
+    study: Study,
+    device: DeviceFlag = None,
+    output: OutputFlag = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+    pictures: PicturesFlag = True,
+) -> None:
+    """Where the usual root-of-N formula is wrong: its S/N, its intervals, its false alarms.
+
+    Without a sweep: magnitudes from 4 to 12, exposures of 5, 50 and 600 s.
+
+    Example: mauvecl gaussian --star G2V --sweep magnitude=6,10 --sweep exposure=5,50
+    """
+    from mauvecl import report
+    from mauvecl.console import Meter, show_table
+    from mauvecl.gaussian import gaussian_report
+
+    started = time.perf_counter()
+    folder = report.make_folder(output or Path("mauvecl-gaussian"))
+    with Meter(quiet=quiet or as_json) as meter:
+        engine = verbs.engine(device, meter)
+        found = gaussian_report(study, engine)
+    messages = found.detection.messages
+    verbs.say(messages, as_json=as_json)
+    tables = {"gaussian": found.cells, "elements": found.elements, "thresholds": found.thresholds}
+    files = [report.write_table(table, folder / f"{name}.ecsv") for name, table in tables.items()]
+    if verbs.pictures_wanted(pictures, quiet=quiet, as_json=as_json):
+        from mauvecl.pictures import gaussian as draw
+
+        files.append(draw(found, folder / "gaussian.png"))
+    files.append(report.write_study(found.study, folder))
+    inputs = [star.result.expectation for star in found.signal.stars]
+    seconds = time.perf_counter() - started
+    files.append(
+        report.write_record("gaussian", found.study, inputs, folder, engine=engine, seconds=seconds, messages=messages)
+    )
+    if as_json:
+        print(json.dumps({"messages": messages, "rows": report.rows(tables["gaussian"])}, indent=2))
+        return
+    swept = [axis.quantity for axis in found.study.sweep.axes]
+    show_table(
+        f"The root-of-N formula beside {study.run.realisations:,} realisations; promised: no difference in S/N, "
+        f"68.3 % of 1-sigma intervals, a ratio of 1 at a false-alarm probability of {study.run.fap:g}",
+        ("star", *swept, "best S/N", "S/N off by", "at nm", "1-sigma intervals", "false alarms", "statistic", "why",
+         "detection off by"),
+        [
+            (row["star"], *(_short(row[name]) for name in swept), f"{row['best_snr']:.2f}", f"{row['snr_off_by']:+.3f}",
+             "" if math.isnan(row["at_nm"]) else f"{row['at_nm']:.0f}",
+             f"{100 * row['coverage_low']:.2f}-{100 * row['coverage_high']:.2f} %", f"{row['fap_ratio']:.3f}",
+             row["statistic"], row["why"], f"{row['probability_off_by']:+.4f}")
+            for row in tables["gaussian"]
+        ],
+    )  # fmt: skip
+    verbs.finish(files, started, quiet=quiet, as_json=as_json)

@@ -1,0 +1,246 @@
+"""The verbs that look at a star: one observation, its signal to noise, the exposure for a wanted one."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mauvecl import verbs
+from mauvecl.flags import (
+    DRAWS,
+    FLARE,
+    SWEEP,
+    DeviceFlag,
+    JsonFlag,
+    OutputFlag,
+    PicturesFlag,
+    QuietFlag,
+    takes_study,
+)
+
+if TYPE_CHECKING:
+    from mauvecl.snr_study import SnrAnswer
+    from mauvecl.study import Study
+
+
+@takes_study(FLARE, {"seed": DRAWS["seed"]})
+def simulate(
+    study: Study,
+    given: dict[str, Any],
+    realisation: Annotated[int, typer.Option(min=0, help="Which realisation to show.")] = 0,
+    output: OutputFlag = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+    pictures: PicturesFlag = True,
+) -> None:
+    """One observation and what it is made of: star, sky, photon noise, dark, bias, read noise.
+
+    Example: mauvecl simulate --star G2V --magnitude 7.4 --exposure 50 --amplitude 0.24
+    """
+    from mauvecl import report
+    from mauvecl.simulate_study import simulate as compute
+
+    started = time.perf_counter()
+    folder = report.make_folder(output or Path("mauvecl-simulate"))
+    found = compute(study, realisation=realisation, flaring=bool(given["amplitude"]))
+    verbs.say(found.messages, as_json=as_json)
+    files, summary = [], []
+    draw = verbs.pictures_wanted(pictures, quiet=quiet, as_json=as_json)
+    for number, (title, x, table) in enumerate(found.observations, 1):
+        stem = f"observation-{number}"
+        files += [report.write_table(table, folder / f"{stem}{ending}") for ending in (".ecsv", ".fits")]
+        if draw:
+            from mauvecl.pictures import observation
+
+            files.append(observation(title, table, folder / f"{stem}.png"))
+        peak = int(x.signal_dn.argmax())
+        summary.append(
+            {
+                "observation": title,
+                "frames": x.n_frames,
+                "peak_nm": float(x.wavelength_nm[peak]),
+                "peak_dn": float(x.signal_dn[peak]),
+                "snr_pixel": float(x.snr().max()),
+                "snr_element": float(x.snr_per_element().max()),
+                "saturated_pixels": int(x.saturated.sum()),
+            }
+        )
+    files.append(report.write_study(study, folder))
+    files.append(
+        report.write_record(
+            "simulate",
+            study,
+            [x for _, x, _ in found.observations],
+            folder,
+            engine=None,
+            seconds=time.perf_counter() - started,
+            messages=found.messages,
+        )
+    )
+    if as_json:
+        print(json.dumps({"messages": found.messages, "observations": summary}, indent=2))
+        return
+    from mauvecl.console import show_table
+
+    show_table(
+        "One observation each (closed-form S/N)",
+        ("observation", "frames", "peak (nm)", "peak signal (DN)", "best S/N pixel", "best S/N element", "saturated"),
+        [
+            (s["observation"], str(s["frames"]), f"{s['peak_nm']:.1f}", f"{s['peak_dn']:.0f}", f"{s['snr_pixel']:.2f}",
+             f"{s['snr_element']:.1f}", str(s["saturated_pixels"]))
+            for s in summary
+        ],
+    )  # fmt: skip
+    verbs.finish(files, started, quiet=quiet, as_json=as_json)
+
+
+def _budgets_or_star(given: dict[str, Any]) -> Study:
+    """The paper's noise budgets where nothing is named, else the paper's stars."""
+    from mauvecl.study import PAPER_BUDGETS, Study
+
+    named = any(given[name] for name in ("star", "magnitude", "exposure", "sweep"))
+    return Study() if named else PAPER_BUDGETS
+
+
+@takes_study(DRAWS, SWEEP, fewer=True, default=_budgets_or_star)
+def snr(
+    study: Study,
+    device: DeviceFlag = None,
+    output: OutputFlag = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+    pictures: PicturesFlag = True,
+) -> None:
+    """Distributions of the signal-to-noise ratio per pixel and per resolution element, and noise budgets.
+
+    Without arguments: the three stars of the paper's noise budgets, 50 s and 600 s.
+
+    Examples: mauvecl snr --star B2IV --magnitude 3.03 --exposure 5
+
+    mauvecl snr --star G2V --sweep magnitude=4,6,8,10 --sweep exposure=5,50,600
+    """
+    from mauvecl import report
+    from mauvecl.console import Meter
+    from mauvecl.snr_study import snr as compute
+
+    started = time.perf_counter()
+    folder = report.make_folder(output or Path("mauvecl-snr"))
+    with Meter(quiet=quiet or as_json) as meter:
+        engine = verbs.engine(device, meter)
+        found = compute(study, engine)
+    verbs.say(found.messages, as_json=as_json)
+    tables = {"snr-pixel": found.pixel, "snr-element": found.element, "noise-budget": found.noise_budget}
+    files = [report.write_table(table, folder / f"{name}.ecsv") for name, table in tables.items()]
+    if verbs.pictures_wanted(pictures, quiet=quiet, as_json=as_json):
+        files += _snr_pictures(found, folder)
+    files.append(report.write_study(study, folder))
+    files.append(
+        report.write_record(
+            "snr",
+            study,
+            [star.result.expectation for star in found.stars],
+            folder,
+            engine=engine,
+            seconds=time.perf_counter() - started,
+            messages=found.messages,
+        )
+    )
+    if as_json:
+        out = {name: report.rows(tables[name]) for name in ("snr-element", "noise-budget")}
+        print(json.dumps({"messages": found.messages} | out, indent=2))
+        return
+    _show_snr(found)
+    verbs.finish(files, started, quiet=quiet, as_json=as_json)
+
+
+def _snr_pictures(found: SnrAnswer, folder: Path) -> list[Path]:
+    from mauvecl.pictures import noise_budgets, signal_to_noise, snr_sweep
+
+    files = [noise_budgets(found, folder / "noise-budget.png")]
+    if len(found.stars) <= 6:
+        files.append(signal_to_noise([(s.title, s.result) for s in found.stars], folder / "snr.png"))
+    if found.study.sweep.axes:
+        files.append(snr_sweep(found, folder / "snr-sweep.png"))
+    return files
+
+
+#: Wavelengths of the elements that the terminal shows, nm.
+SHOWN_NM = (250.0, 300.0, 400.0, 550.0)
+
+
+def _show_snr(found: SnrAnswer) -> None:
+    """S/N and noise at some wavelengths; all of them are in the files."""
+    from mauvecl.console import show_table
+    from mauvecl.exposures import place_of
+
+    cells, budgets = [], []
+    for star in found.stars:
+        x, table = star.result.expectation, star.result.element
+        budget = x.noise_budget()
+        name = (star.label, *(f"{v:g}" if isinstance(v, float) else str(v) for v in star.at.values()))
+        for wavelength in SHOWN_NM:
+            if not x.wavelength_nm[0] <= wavelength <= x.wavelength_nm[-1]:
+                continue
+            row, noise = table[place_of(x, wavelength, "element")], budget[place_of(x, wavelength, "pixel")]
+            cells.append(
+                (*name, f"{row['wavelength'].value:.1f}", f"{row['expected']:.2f}", f"{row['mean']:.2f}",
+                 f"{row['std']:.2f}", f"{row['q2.5']:.2f}", f"{row['q50']:.2f}", f"{row['q97.5']:.2f}")
+            )  # fmt: skip
+            parts = ("source_photon", "zodiacal_photon", "dark", "read", "total")
+            budgets.append((*name, f"{wavelength:g}", *(f"{noise[part].value:.2f}" for part in parts)))
+    swept = tuple(axis.quantity for axis in found.study.sweep.axes)
+    show_table(
+        "S/N per 10.5 nm element; all of them in the files",
+        ("star", *swept, "nm", "closed form", "mean", "std", "2.5 %", "50 %", "97.5 %"),
+        cells,
+    )
+    show_table(
+        "Noise of a pixel by origin, DN rms",
+        ("star", *swept, "nm", "source photons", "zodiacal photons", "dark", "read", "total"),
+        budgets,
+    )
+
+
+@takes_study(without="exposure")
+def exposure(
+    study: Study,
+    snr: Annotated[float, typer.Option(help="Wanted signal-to-noise ratio.")],
+    at: Annotated[float, typer.Option(help="Wavelength, nm.")],
+    per: Annotated[str, typer.Option(help="element (10.5 nm) or pixel.")] = "element",
+    output: OutputFlag = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """The shortest exposure with a wanted S/N at a wavelength, by the closed form; `mauvecl snr` goes the other way.
+
+    Example: mauvecl exposure --snr 10 --at 300 --star G2V --magnitude 7.4
+    """
+    from typing import cast
+
+    from mauvecl import report
+    from mauvecl.console import show_table
+    from mauvecl.exposures import Per, exposure_for
+
+    started = time.perf_counter()
+    found = exposure_for(study, snr, at, per=cast(Per, per))
+    folder = report.make_folder(output or Path("mauvecl-exposure"))
+    table = found.table
+    files = [report.write_table(table, folder / "exposure.ecsv"), report.write_study(study, folder)]
+    verbs.say(list(found.messages), as_json=as_json)
+    if as_json:
+        print(json.dumps({"messages": list(found.messages), "rows": report.rows(table)}, indent=2))
+        return
+    show_table(
+        f"Exposure for an S/N of {snr:g} per {per} at {at:g} nm (closed form, whole frames)",
+        ("star", "exposure (s)", "frames", "S/N", "a frame less", ""),
+        [
+            (e.star, f"{e.exposure_s:g}", str(e.frames), f"{e.snr:.3f}", f"{e.snr_one_frame_less:.3f}",
+             "SATURATED" if e.saturated else "")
+            for e in found.exposures
+        ],
+    )  # fmt: skip
+    verbs.finish(files, started, quiet=quiet, as_json=as_json)

@@ -1,0 +1,186 @@
+"""Where the usual root-of-N formula is wrong, and by how much, over magnitude and exposure.
+
+The formula promises three things: the S/N of a spectrum, that the true signal lies within one estimated standard
+deviation of the observed one in 68.27 % of all spectra, and the false-alarm probability of a threshold.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from mauvecl import layout
+from mauvecl.detect_study import DetectAnswer, detect
+from mauvecl.labels import put_first
+from mauvecl.snr_study import SnrAnswer, snr
+from mauvecl.study import UNITS, Axis, Study, Sweep
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.engine import Engine
+    from mauvecl.snr import SnrResult
+
+#: Share of normal values within one standard deviation.
+ONE_SIGMA = float(special.ndtr(1.0) - special.ndtr(-1.0))
+#: Looked at where a study sweeps over nothing.
+GRID = Sweep(
+    axes=(
+        Axis(quantity="magnitude", values=(4.0, 6.0, 8.0, 10.0, 12.0)),
+        Axis(quantity="exposure", values=(5.0, 50.0, 600.0)),
+    )
+)
+
+
+def coverage(result: SnrResult) -> NDArray[np.float64]:
+    """Share of realisations whose observed signal plus or minus its estimated noise holds the true one.
+
+    Returns
+    -------
+    ndarray, shape (n_pixel,)
+        The estimate is the observer's: photons as seen, dark and read noise as known. Interpolated within bins of the
+        counts' histogram, 1/64 of a standard deviation or less.
+    """
+    seen = result.observers[: result.scene.n_pixel]
+    signal = result.expectation.signal_dn
+    gain, known = seen["gain"].astype(float), seen["variance"].astype(float)
+    # Ends of the observed signals whose interval reaches the true one: net -+ sqrt(gain max(net, 0) + known) = signal.
+    root = np.sqrt(gain**2 / 4 + gain * signal + known)
+    high = signal + gain / 2 + root
+    low = signal + gain / 2 - root
+    low = np.where(low < 0, signal - np.sqrt(known), low)
+    width = 2.0 ** seen["bin_shift"].astype(float)
+    shares = np.empty(signal.size)
+    for p, counts in enumerate(result.counts.pixel):
+        edges = width[p] * (np.arange(layout.OBSERVER_BINS + 1) - layout.OBSERVER_BINS // 2) - 0.5
+        below = np.concatenate([[0], counts.cumsum()]) / result.counts.n
+        ends = np.interp([low[p], high[p]], edges + float(seen["net_offset"][p]), below)
+        shares[p] = ends[1] - ends[0]
+    return shares
+
+
+@dataclass(eq=False)
+class GaussianReport:
+    """What `gaussian_report` answers.
+
+    Attributes
+    ----------
+    study : Study
+    signal : SnrAnswer
+    detection : DetectAnswer
+    """
+
+    study: Study
+    signal: SnrAnswer
+    detection: DetectAnswer
+
+    @property
+    def elements(self) -> QTable:
+        """One row per star, cell and resolution element: what the formula promises and what the simulation finds."""
+        from astropy.table import vstack
+
+        parts = []
+        for star in self.signal.stars:
+            table = star.result.element["wavelength", "expected", "mean", "std"]
+            x, n = star.result.expectation, star.result.counts.n
+            table["error"] = table["std"] / np.sqrt(n)
+            with np.errstate(divide="ignore", invalid="ignore"):
+                table["bias"] = table["mean"] / table["expected"] - 1.0
+            table["coverage"] = x.per_element(coverage(star.result)) / x.per_element(np.ones(x.wavelength_nm.size))
+            for name, text in (
+                ("expected", "S/N by the formula"),
+                ("mean", "mean S/N of the realisations"),
+                ("error", "standard error of the mean"),
+                ("bias", "mean over expected S/N, less one"),
+                ("coverage", "share of 1-sigma intervals of its pixels that hold the truth; 0.6827 promised"),
+            ):
+                table[name].info.description = text
+            table.meta = {}
+            put_first(table, {"star": star.label, **star.at})
+            parts.append(table)
+        found = vstack(parts)
+        found.meta |= {"realisations": self.study.run.realisations, "study": self.study.toml()}
+        return found
+
+    @property
+    def thresholds(self) -> QTable:
+        """One row per star, cell and statistic: false-alarm probabilities at the formula's thresholds, and why."""
+        return self.detection.departures
+
+    @property
+    def cells(self) -> QTable:
+        """One row per star and cell: the worst of each promise."""
+        import astropy.units as u
+        from astropy.table import QTable
+
+        rows = []
+        elements, thresholds = self.elements, self.thresholds
+        flares = self.detection.table
+        each, tests, powers = (len(t) // len(self.signal.stars) for t in (elements, thresholds, flares))
+        for k, star in enumerate(self.signal.stars):
+            here = elements[k * each : (k + 1) * each]
+            sure = here[np.abs(here["mean"] - here["expected"]) > 4 * here["error"]]
+            worst = sure[np.argmax(np.abs(sure["mean"] - sure["expected"]))] if len(sure) else None
+            tested = thresholds[k * tests : (k + 1) * tests]
+            off = tested[tested["differs"]]
+            wrong = off[np.argmax(np.abs(np.log(np.maximum(off["ratio"], 1e-3))))] if len(off) else None
+            power = flares[k * powers : (k + 1) * powers]
+            missed = power["probability"] - power["closed_form_probability"]
+            # Beyond 4 standard errors, the threshold's own included.
+            missed = np.where(np.abs(missed) > (power["high"] - power["low"]) * 4 / 3.92, missed, 0.0)
+            rows.append(
+                {"star": star.label, **star.at}
+                | {
+                    "best_snr": float(here["expected"].max()),
+                    "snr_off_by": 0.0 if worst is None else float(worst["mean"] - worst["expected"]),
+                    "at_nm": np.nan if worst is None else float(worst["wavelength"].value),
+                    "coverage_low": float(here["coverage"].min()),
+                    "coverage_high": float(here["coverage"].max()),
+                    "fap_ratio": 1.0 if wrong is None else float(wrong["ratio"]),
+                    "statistic": "" if wrong is None else str(wrong["statistic"]),
+                    "why": "" if wrong is None else str(wrong["why"]),
+                    "probability_off_by": float(missed[np.argmax(np.abs(missed))]),
+                }
+            )
+        table = QTable(rows=rows)
+        for axis in self.study.sweep.axes:
+            if axis.quantity in UNITS:
+                table[axis.quantity] = table[axis.quantity] * u.Unit(UNITS[axis.quantity])
+        for name, text in (
+            ("best_snr", "largest S/N per element by the formula"),
+            ("snr_off_by", "largest significant (4 standard errors) difference of the mean S/N from it; 0 if none"),
+            ("at_nm", "where"),
+            ("coverage_low", "smallest share of 1-sigma intervals that hold the truth, of all elements"),
+            ("coverage_high", "largest"),
+            ("probability_off_by", "largest significant difference of a detection probability from the closed form"),
+            ("fap_ratio", "most wrong false-alarm probability over the promised one; 1 if none differs"),
+        ):
+            table[name].info.description = text
+        table.meta |= {"fap": self.study.run.fap, "study": self.study.toml()}
+        return table
+
+
+def gaussian_report(study: Study, engine: Engine | None = None) -> GaussianReport:
+    """The usual formula beside the simulation, over magnitude and exposure or what else the study sweeps.
+
+    Parameters
+    ----------
+    study : Study
+        Without a sweep: magnitudes from 4 to 12, exposures of 5, 50 and 600 s.
+    engine : Engine, optional
+
+    Raises
+    ------
+    InputError
+        For anything in the study that cannot be.
+    """
+    from mauvecl.engine import Engine as Default
+
+    engine = engine or Default()
+    if not study.sweep.axes:
+        study = study.model_copy(update={"sweep": GRID})
+    return GaussianReport(study, snr(study, engine), detect(study, engine))

@@ -1,0 +1,38 @@
+"""One observation of every star of a study, taken apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from mauvecl.components import components
+from mauvecl.labels import label, told
+from mauvecl.study import Study
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.host.expectation import Expectation
+
+
+@dataclass(eq=False)
+class SimulateAnswer:
+    """What `mauvecl simulate` answers: one table of components per star and stage."""
+
+    study: Study
+    observations: list[tuple[str, Expectation, QTable]]
+    messages: list[str]
+
+
+def simulate(study: Study, *, realisation: int = 0, flaring: bool = False) -> SimulateAnswer:
+    """One observation of every star of a study, taken apart; with its flares too where asked."""
+    observations, everything = [], []
+    for star in study.star:
+        xs = study.expectations(star) if flaring else study.expect([star.source()])
+        for i, x in enumerate(xs):
+            title = label(star, x) + (f", flare {100 * study.flare.amplitudes[i - 1]:g} %" if i else "")
+            table = components(x, realisation=realisation, seed=study.run.seed, **study.drawing)
+            table.meta["study"] = study.toml()
+            observations.append((title, x, table))
+        everything += xs
+    return SimulateAnswer(study, observations, told(everything))
