@@ -15,8 +15,8 @@ from astropy.table import vstack
 
 from mauvecl import Study, limiting_magnitude
 from mauvecl.assumptions import what_matters
+from mauvecl.statistics import STATISTICS
 
-STATISTICS = ("chi2", "chi2_element", "chi2_pair", "matched", "uv_excess")
 KEPT = ("amplitude", "exposure", "statistic", "magnitude", "low", "high", "closed_form", "check")
 
 

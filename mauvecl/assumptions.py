@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
+from mauvecl.labels import described
 from mauvecl.limits import Question
 from mauvecl.study import Star, Study
 
@@ -109,7 +110,7 @@ def what_matters(study: Study) -> QTable:
         table[name].info.format = ".3f"
     table["span"].info.description = f"how far the closed-form limit of {of} moves from end to end"
     table.meta |= {"power": study.limit.power, "fap": study.run.fap, "study": study.toml()}
-    return table
+    return described(table)
 
 
 def _moves(study: Study, star: Star, amplitude: float | None, statistic: str) -> list[Moved]:

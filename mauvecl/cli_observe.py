@@ -214,6 +214,7 @@ def exposure(
     output: OutputFlag = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
+    pictures: PicturesFlag = True,
 ) -> None:
     """The shortest exposure with a wanted S/N at a wavelength, by the closed form; `mauvecl snr` goes the other way.
 
@@ -228,8 +229,10 @@ def exposure(
     started = time.perf_counter()
     found = exposure_for(study, snr, at, per=cast(Per, per))
     folder = report.make_folder(output or Path("mauvecl-exposure"))
-    table = found.table
-    files = [report.write_table(table, folder / "exposure.ecsv"), report.write_study(study, folder)]
+    table, files = found.table, found.write(folder)
+    if verbs.pictures_wanted(pictures, quiet=quiet, as_json=as_json):
+        found.plot(folder / "exposure.png")
+        files.append(folder / "exposure.png")
     verbs.say(list(found.messages), as_json=as_json)
     if as_json:
         print(json.dumps({"messages": list(found.messages), "rows": report.rows(table)}, indent=2))

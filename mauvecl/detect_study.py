@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,7 +13,8 @@ import numpy as np
 from mauvecl.campaign import campaign
 from mauvecl.departures import departure_table
 from mauvecl.detection import Detection, check_fap, countable
-from mauvecl.labels import label, put_first, titled, told
+from mauvecl.host.errors import InputError
+from mauvecl.labels import described, label, put_first, titled, told
 from mauvecl.paper import PAPER_G2V, WHY, reconstruct
 from mauvecl.statistics import SHAPED, Linear, matched_weights
 from mauvecl.study import PAPER_STARS, Star, Study
@@ -102,7 +104,7 @@ class DetectAnswer:
             put_first(table, {"star": star.label} | {k: v for k, v in star.at.items() if k != "amplitude"})
         found = vstack(parts, metadata_conflicts="silent")
         found.meta |= {"study": self.study.toml()}
-        return found
+        return described(found)
 
 
 def _rocs(star: StarDetection) -> QTable:
@@ -153,7 +155,8 @@ def detect(study: Study, engine: Engine) -> DetectAnswer:
     stars, costs = [], []
     for at, cell, star, (quiet, *flares) in prepared:
         how = cell.detecting
-        how["statistics"] = (*run.statistics, *_other_templates(cell, star, quiet))
+        own = [_own(name, path, quiet) for name, path in run.weights.items()]
+        how["statistics"] = (*run.statistics, *own, *_other_templates(cell, star, quiet))
         found = engine.detect(quiet, flares, seed=run.seed, **how)
         stars.append(StarDetection(label(star, quiet), at, cell.flare.amplitudes, found))
         costs += _template_costs(cell, stars[-1])
@@ -168,6 +171,20 @@ def detect(study: Study, engine: Engine) -> DetectAnswer:
     answer.messages = list(dict.fromkeys([*messages, *campaign_told, *costs]))
     answer.paper = _paper(study, [group for *_, group in prepared])
     return answer
+
+
+def _own(name: str, path: Path, quiet: Expectation) -> Linear:
+    """A linear statistic from a file of wavelengths, nm, and weights per DN: straight between them, zero beyond."""
+    try:
+        columns = np.loadtxt(path, ndmin=2)
+    except (OSError, ValueError) as error:
+        raise InputError(f"weights {path.name} of {name!r} cannot be read ({error}), expected two columns") from error
+    if columns.shape[1] != 2 or not np.all(np.diff(columns[:, 0]) > 0):
+        raise InputError(
+            f"weights {path.name} of {name!r} have {columns.shape[1]} columns, expected ascending wavelengths in nm "
+            "and weights"
+        )
+    return Linear(name, np.interp(quiet.wavelength_nm, columns[:, 0], columns[:, 1], left=0.0, right=0.0))
 
 
 def _other_templates(study: Study, star: Star, quiet: Expectation) -> list[Linear]:

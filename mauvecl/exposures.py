@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from mauvecl.host.errors import InputError
-from mauvecl.labels import label, told
+from mauvecl.labels import described, label, told
 from mauvecl.study import QUANTITIES, Star, Study
 
 if TYPE_CHECKING:
@@ -69,7 +70,20 @@ class ExposureResult:
         table["exposure"].info.description = "the fewest frames whose closed-form S/N reaches the wanted one"
         table["saturated"].info.description = "whether the pixel, or one of the element, saturates in a single frame"
         table.meta["study"] = self.study.toml()
-        return table
+        return described(table)
+
+    def write(self, folder: str | Path) -> list[Path]:
+        """The table as ECSV, and the study that gives it again."""
+        from mauvecl.report import make_folder, write_study, write_table
+
+        place = make_folder(Path(folder))
+        return [write_table(self.table, place / "exposure.ecsv"), write_study(self.study, place)]
+
+    def plot(self, path: str | Path | None = None) -> object:
+        """S/N against exposure, and the answers on it; needs matplotlib."""
+        from mauvecl.pictures import exposures
+
+        return exposures(self, None if path is None else Path(path))
 
 
 def snr_at(x: Expectation, wavelength_nm: float, per: Per = "element") -> float:

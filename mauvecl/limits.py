@@ -15,7 +15,7 @@ from scipy import special
 
 from mauvecl.detection import Detection, check_fap
 from mauvecl.host.errors import InputError
-from mauvecl.labels import label, put_first
+from mauvecl.labels import described, label, put_first
 from mauvecl.scene import prepare
 from mauvecl.statistics import Interval
 from mauvecl.study import QUANTITIES, UNITS, Star, Study
@@ -175,7 +175,7 @@ class LimitResult:
             "realisations": self.study.run.realisations,
             "study": self.study.toml(),
         }
-        return table
+        return described(table)
 
     @property
     def draws(self) -> QTable:
@@ -190,7 +190,9 @@ class LimitResult:
             swept = {k: v for k, v in one.at.items() if k != "amplitude"}
             put_first(table, {"star": one.star, **swept, **amplitude, "statistic": one.statistic})
             parts.append(table)
-        return vstack(parts)
+        found = vstack(parts)
+        found.meta["study"] = self.study.toml()
+        return described(found)
 
     def write(self, folder: str | Path) -> list[Path]:
         """The table as ECSV, that of the unknown's draws where there are any, and the study that gives them again."""

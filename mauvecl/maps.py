@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.detection import check_fap
-from mauvecl.labels import label, told
+from mauvecl.labels import described, label, told
 from mauvecl.statistics import Interval
 from mauvecl.study import UNITS, Study
 from mauvecl.unknowns import average, drawn, shares
@@ -85,7 +85,7 @@ class MapResult:
             "realisations": self.study.run.realisations,
             "study": self.study.toml(),
         }
-        return table
+        return described(table)
 
     def write(self, folder: str | Path) -> list[Path]:
         """The table as ECSV and FITS, and the study that gives it again."""

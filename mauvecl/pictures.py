@@ -14,6 +14,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.detect_study import StarDetection
+    from mauvecl.exposures import ExposureResult
     from mauvecl.gaussian import GaussianReport
     from mauvecl.limits import LimitResult
     from mauvecl.maps import MapResult
@@ -383,20 +384,45 @@ def gaussian(found: GaussianReport, path: Path | None) -> Any:
     """How far each promise of the usual formula holds in every cell; the figure where no path is given."""
     plt = _pyplot()
     cells = found.cells
+    # Column, what it is, what is promised, and the least that an axis shows to either side of it.
     panels = (
-        ("snr_off_by", "mean S/N less formula"),
-        ("coverage_low", "1-sigma intervals, worst element"),
-        ("fap_ratio", "false alarms over promised"),
+        ("snr_off_by", "mean S/N less formula", 0.0, 0.1),
+        ("coverage_low", "1-sigma intervals that hold the truth", 0.6827, 0.03),
+        ("five_sigma", "pixels beyond 5 sigma over normal", 1.0, 0.5),
+        ("fap_ratio", "false alarms over promised", 1.0, 0.2),
     )
     with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(1, 3, figsize=(10.0, 0.28 * len(cells) + 1.4), sharey=True)
-        names = [titled(s.label, s.at) for s in found.signal.stars]
-        for axis, (column, text) in zip(axes, panels, strict=True):
-            axis.plot(cells[column], np.arange(len(cells)), "o", color=COLOURS[0], ms=4)
-            axis.axvline({"snr_off_by": 0.0, "coverage_low": 0.6827, "fap_ratio": 1.0}[column], color=NULL, linewidth=1)
+        figure, axes = plt.subplots(1, len(panels), figsize=(11.0, 0.28 * len(cells) + 1.4), sharey=True)
+        rows = np.arange(len(cells))
+        for axis, (column, text, promised, least) in zip(axes, panels, strict=True):
+            if column == "coverage_low":
+                axis.hlines(rows, cells["coverage_low"], cells["coverage_high"], color=COLOURS[0], linewidth=3)
+            else:
+                axis.plot(cells[column], rows, "o", color=COLOURS[0], ms=4)
+            axis.axvline(promised, color=NULL, linewidth=1)
+            low, high = axis.get_xlim()
+            axis.set_xlim(min(low, promised - least), max(high, promised + least))
             axis.set_xlabel(text)
             axis.grid(axis="y", linewidth=0.3)
-        axes[0].set_yticks(np.arange(len(cells)), names)
+        axes[0].set_yticks(rows, [titled(s.label, s.at) for s in found.signal.stars])
         axes[0].invert_yaxis()
         figure.suptitle("The root-of-N formula beside the simulation; grey: as promised", fontsize=10)
+        return figure if path is None else _save(figure, path)
+
+
+def exposures(found: ExposureResult, path: Path | None) -> Any:
+    """S/N against exposure for each star, which grows with the root of it; the figure where no path is given."""
+    plt = _pyplot()
+    with plt.rc_context(STYLE):
+        figure, axis = plt.subplots(figsize=(5.2, 3.4))
+        for k, e in enumerate(found.exposures):
+            colour = COLOURS[k % len(COLOURS)]
+            x = np.geomspace(e.exposure_s / e.frames, 4 * e.exposure_s, 50)
+            axis.plot(x, e.snr * np.sqrt(x / e.exposure_s), color=colour, label=f"{e.star}: {e.exposure_s:g} s")
+            axis.plot([e.exposure_s], [e.snr], "o", color=colour, ms=5)
+        first = found.exposures[0]
+        axis.axhline(first.wanted, color=NULL, linestyle="--", linewidth=1)
+        axis.set(xscale="log", yscale="log", xlabel="exposure (s)", ylabel=f"S/N per {first.per}")
+        axis.set_title(f"S/N at {first.wavelength_nm:g} nm; dashed: the one wanted; nominal throughput")
+        axis.legend()
         return figure if path is None else _save(figure, path)

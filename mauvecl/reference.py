@@ -8,12 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl import layout
 from mauvecl.scene import Scene
+
+if TYPE_CHECKING:
+    from mauvecl.detection import ChannelPlan, Detection
 
 Words = tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.uint32], NDArray[np.uint32]]
 Floats = NDArray[np.float32]
@@ -425,6 +429,13 @@ class Smoothed:
     rows: NDArray[np.float32]
     scales: NDArray[np.float32]
     scale_end: NDArray[np.uint32]
+
+    @classmethod
+    def of(cls, found: Detection, plan: ChannelPlan) -> Smoothed:
+        """Of a detection's channels."""
+        rows = np.zeros((len(found.smoothing.rows), len(found.scene.pixels)), np.float32)
+        rows[:, : found.scene.n_pixel] = found.smoothing.rows
+        return cls(rows, plan.scales, plan.scale_end)
 
     def sums(self, difference: Floats, k: int) -> list[Floats]:
         """The smoothed statistics of a scenario, each shape (n,)."""

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl import __version__, layout, reference
+from mauvecl.comparison import Comparison
 from mauvecl.detection import ChannelPlan, Detection, plan_channels
 from mauvecl.engine import Engine
 from mauvecl.host.expectation import Expectation
@@ -23,7 +24,7 @@ from mauvecl.processes import CosmicRays, Processes, Uniform
 from mauvecl.program import SAME_BITS
 from mauvecl.scene import Scene, prepare
 from mauvecl.snr import elements, observers
-from mauvecl.statistics import STATISTICS
+from mauvecl.statistics import PAIRED, STATISTICS
 from mauvecl.tally import Grid
 
 if TYPE_CHECKING:
@@ -101,6 +102,8 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "apart": ({}, {"recipe": "apart"}),
     "apart, tables": ({"frames": 2, "dark": 30.0, "read": 0.4, "photon_noise": "poisson"}, {"mode": "frames"}),
     "cosmic rays": ({}, {"processes": Processes(_RAYS)}),
+    "noisy references": ({"frames": 4}, {"comparison": Comparison(3)}),
+    "estimated variances": ({"frames": 2}, {"mode": "frames", "comparison": Comparison(1, estimated=True)}),
     "priors": (
         {"frames": 5},
         {"processes": Processes(_RAYS, Uniform(0.0, 0.05), Uniform(13.0, 21.0), Uniform(0.24, 0.44))},
@@ -110,6 +113,8 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
         {"mode": "frames", "processes": Processes(None, Uniform(0.0, 0.05), Uniform(13.0, 21.0))},
     ),
 }
+#: Statistics that the fast kernel knows, where nothing but the template is compared.
+FAST = tuple(name for name in STATISTICS if name not in PAIRED)
 #: Across the boundary of the counter's first word.
 START, COUNT, SEED = 2**40 - 13, 40, 2**63 + 20_261_121
 
@@ -118,18 +123,19 @@ def digests(engine: Engine, name: str) -> dict[str, str]:
     """Short digests of what a device makes of a case: raw counts, statistics, histograms."""
     options, how = CASES[name]
     quiet, flare = toy(**options), toy(flare=0.3, **options)
-    raw, clipped = engine.realise_and_count(quiet, start=START, count=COUNT, seed=SEED, **how)
-    seen = engine.snr(quiet, realisations=COUNT, start=START, seed=SEED, **how)
-    values = engine.statistic_values(
-        quiet, [flare], start=START, count=COUNT, seed=SEED, statistics=tuple(STATISTICS), **how
+    place: dict[str, Any] = {"start": START, "seed": SEED}
+    raw, clipped = engine.realise_and_count(quiet, count=COUNT, **place, **_drawing(how))
+    seen = engine.snr(quiet, realisations=COUNT, **place, **_drawing(how))
+    values, fast = (
+        engine.statistic_values(quiet, [flare], count=COUNT, statistics=names, **place, **how)
+        for names in (tuple(STATISTICS), FAST)
     )
-    found = engine.detect(
-        quiet, [flare], realisations=COUNT, start=START, seed=SEED, statistics=tuple(STATISTICS), **how
-    )
+    found = engine.detect(quiet, [flare], realisations=COUNT, statistics=tuple(STATISTICS), **place, **how)
     null = found.distribution("chi2")
     return {
         "raw": _digest(raw.astype(np.int64), clipped),
         "statistics": _digest(values.view(np.uint32)),
+        "fast statistics": _digest(fast.view(np.uint32)),
         "histograms": _digest(seen.counts.pixel, seen.counts.element, seen.counts.clipped),
         "tally": _digest(null.counts, np.array([null.first, null.second])),
     }
@@ -149,6 +155,7 @@ def twin_digests(name: str) -> dict[str, str]:
     return {
         "raw": _digest(raw.astype(np.int64), clipped.sum(axis=(1, 2)).astype(np.uint32)),
         "statistics": _digest(values.view(np.uint32)),
+        "fast statistics": _digest(_fast(values, plan).view(np.uint32)),
         "histograms": _digest(pixels, parts, rails),
         "tally": _digest(counts[0].astype(np.int64), sums[0]),
     }
@@ -158,9 +165,23 @@ def _statistics(name: str, scene: Scene) -> tuple[NDArray[np.float32], ChannelPl
     """Every statistic of a case by the twin, and which is which."""
     options, _ = CASES[name]
     quiet, flare = toy(**options), toy(flare=0.3, **options)
-    plan = plan_channels(Detection(quiet, (flare,), tuple(STATISTICS), scene, COUNT), range(1), first=True)
+    found = Detection(quiet, (flare,), tuple(STATISTICS), scene, COUNT)
+    plan = plan_channels(found, range(1), first=True)
     index = np.arange(START, START + COUNT, dtype=np.uint64)
-    return reference.statistics(scene, index, SEED, plan.weights, plan.linear_end), plan
+    smoothed = reference.Smoothed.of(found, plan)
+    return reference.statistics(scene, index, SEED, plan.weights, plan.linear_end, smoothed=smoothed), plan
+
+
+def _drawing(how: dict[str, Any]) -> dict[str, Any]:
+    """How a case is drawn, whatever it is compared with."""
+    return {key: value for key, value in how.items() if key != "comparison"}
+
+
+def _fast(values: NDArray[np.float32], plan: ChannelPlan) -> NDArray[np.float32]:
+    """The channels of the fast kernel among all, those that it does not know left at zero."""
+    known = values[: plan.n_rows - len(plan.scales)].copy()
+    known[[2, 5]] = 0.0
+    return known
 
 
 def _digest(*arrays: NDArray[Any]) -> str:
@@ -197,7 +218,7 @@ def _nearly(engine: Engine, name: str) -> tuple[bool, str]:
     options, how = CASES[name]
     quiet, flare = toy(**options), toy(flare=0.3, **options)
     index = np.arange(START, START + COUNT, dtype=np.uint64)
-    raw = engine.realise(quiet, start=START, count=COUNT, seed=SEED, **how).astype(np.int64)
+    raw = engine.realise(quiet, start=START, count=COUNT, seed=SEED, **_drawing(how)).astype(np.int64)
     off = np.abs(raw - reference.realise(prepare([quiet], **how), index, SEED))
     share = float(np.mean(off > 0))
     ours = engine.statistic_values(

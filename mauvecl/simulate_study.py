@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from mauvecl.components import components
-from mauvecl.labels import label, told
+from mauvecl.labels import described, label, told
 from mauvecl.study import Study
 
 if TYPE_CHECKING:
@@ -33,6 +33,6 @@ def simulate(study: Study, *, realisation: int = 0, flaring: bool = False) -> Si
             title = label(star, x) + (f", flare {100 * study.flare.amplitudes[i - 1]:g} %" if i else "")
             table = components(x, realisation=realisation, seed=study.run.seed, **study.drawing)
             table.meta["study"] = study.toml()
-            observations.append((title, x, table))
+            observations.append((title, x, described(table)))
         everything += xs
     return SimulateAnswer(study, observations, told(everything))

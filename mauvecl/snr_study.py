@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from mauvecl.labels import label, put_first, titled, told
+from mauvecl.labels import described, label, put_first, titled, told
 from mauvecl.study import Study
 
 if TYPE_CHECKING:
@@ -72,7 +72,7 @@ class SnrAnswer:
             parts.append(table)
         found = vstack(parts)
         found.meta |= {"realisations": self.study.run.realisations, "study": self.study.toml()}
-        return found
+        return described(found)
 
 
 def snr(study: Study, engine: Engine) -> SnrAnswer:

@@ -180,6 +180,7 @@ class Run(_Part):
     reference: str = "template"
     variances: Literal["model", "estimated"] = "model"
     template_temperatures_k: tuple[float, ...] = ()
+    weights: dict[str, Path] = Field(default_factory=dict)
 
     @field_validator("statistics")
     @classmethod
@@ -376,7 +377,7 @@ class Study(_Part):
 
     @classmethod
     def read(cls, path: Path) -> Self:
-        """A study file.
+        """A study file, or the study that an answer's ECSV table was made by.
 
         Raises
         ------
@@ -385,7 +386,7 @@ class Study(_Part):
         """
         try:
             text = path.read_text(encoding="utf-8")
-            data = tomllib.loads(text)
+            data = tomllib.loads(_study_of(path) if path.suffix == ".ecsv" else text)
         except OSError as error:
             raise InputError(
                 f"study file {str(path)!r} cannot be read ({error.strerror}), expected a TOML file"
@@ -396,6 +397,9 @@ class Study(_Part):
             # Files are named as seen from the study.
             if isinstance(star, dict) and isinstance(star.get("file"), str):
                 star["file"] = str(path.parent / star["file"])
+        run = data.get("run")
+        if isinstance(run, dict) and isinstance(run.get("weights"), dict):
+            run["weights"] = {k: str(path.parent / v) if isinstance(v, str) else v for k, v in run["weights"].items()}
         return cls.build(data, path.name)
 
     @classmethod
@@ -451,6 +455,9 @@ class Study(_Part):
         for section in ("processes", "campaign"):
             if not data[section]:
                 del data[section]
+        data["run"]["weights"] = {name: str(Path(file).resolve()) for name, file in data["run"]["weights"].items()}
+        if not data["run"]["weights"]:
+            del data["run"]["weights"]
         for star in data["star"]:
             if "file" in star:
                 star["file"] = str(Path(star["file"]).resolve())
@@ -561,6 +568,17 @@ PAPER_BUDGETS = Study(
     run=Run(realisations=100_000),
     sweep=Sweep(axes=(Axis(quantity="exposure", values=(50.0, 600.0)),)),
 )
+
+
+def _study_of(path: Path) -> str:
+    """The study in an answer's meta data."""
+    from astropy.table import Table
+
+    try:
+        study = Table.read(path, format="ascii.ecsv").meta["study"]
+    except (ValueError, KeyError) as error:
+        raise InputError(f"{path.name} holds no study, expected an answer's ECSV table") from error
+    return str(study)
 
 
 def _toml_value(text: str) -> Any:

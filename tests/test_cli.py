@@ -106,6 +106,36 @@ def test_the_study_gives_the_same_bits_again(answered: tuple[Path, str], tmp_pat
     assert (tmp_path / "again" / "study.toml").read_text() == (first / "study.toml").read_text()
 
 
+def test_a_table_is_read_back_into_its_study(answered: tuple[Path, str], tmp_path: Path) -> None:
+    folder, _ = answered
+    table = folder / "mauvecl-detect" / "detection.ecsv"
+    assert Study.read(table) == Study.read(folder / "mauvecl-detect" / "study.toml")
+    (tmp_path / "no.ecsv").write_text("a b\n1 2\n")
+    assert "no.ecsv holds no study" in run("detect", "no.ecsv", folder=tmp_path, code=2).stderr
+
+
+def test_weights_of_ones_own_in_a_study(tmp_path: Path) -> None:
+    """A band around 280 nm: its closed form and its simulation agree, and bad files are a sentence."""
+    (tmp_path / "band.txt").write_text("# nm, per DN\n270 1\n290 1\n")
+    words = ("detect", "study.toml", "-n", "20000", "--fap", "0.01", "--no-pictures")
+    study = (
+        "[[star]]\nlibrary = 'G2V'\nmagnitude = 7.4\n[flare]\namplitudes = [0.03]\n[run.weights]\nband = 'band.txt'\n"
+    )
+    (tmp_path / "study.toml").write_text(study)
+    run(*words, folder=tmp_path)
+    table = QTable.read(tmp_path / "mauvecl-detect" / "detection.ecsv")
+    (row,) = table[table["statistic"] == "band"]
+    assert row["mean"] == pytest.approx(row["expected"], rel=0.02)
+    assert abs(row["probability"] - row["closed_form_probability"]) < 0.03
+    for text, sentence in (
+        ("270\n290\n", "have 1 columns"),
+        ("a b\n", "cannot be read"),
+        ("290 1\n270 1\n", "ascending"),
+    ):
+        (tmp_path / "band.txt").write_text(text)
+        assert sentence in run(*words, folder=tmp_path, code=2).stderr
+
+
 def test_a_study_file_and_flags(tmp_path: Path) -> None:
     """A user's own spectrum named in a study, with flags on top; JSON alone on standard output."""
     wavelength = np.arange(170.0, 1100.0, 2.0)
@@ -231,15 +261,14 @@ def test_snr_of_the_papers_budgets_and_a_sweep(tmp_path: Path) -> None:
     for name in ("B2IV V = 3.03", "K3V V = 3.7", "G2V V = 7.4"):
         assert len([line for line in shown.splitlines() if name in line and " 600 " in line]) == 8
     assert {"noise-budget.png", "snr-sweep.png"} <= {p.name for p in (tmp_path / "mauvecl-snr").iterdir()}
-    words = ("snr", "--star", "G2V", "--sweep", "magnitude=5,7", "--sweep", "exposure=5,50", "-n", "500", "-q")
-    for more, cells in (((), 4), (("--as-list",), 2)):
-        run(*words, *more, "--no-pictures", "-o", "swept", folder=tmp_path)
-        table = QTable.read(tmp_path / "swept" / "snr-element.ecsv")
-        assert len({(m.value, t.value) for m, t in zip(table["magnitude"], table["exposure"], strict=True)}) == cells
-    run("snr", tmp_path / "swept" / "study.toml", "--no-pictures", "-o", "again", folder=tmp_path)
-    assert (tmp_path / "again" / "snr-element.ecsv").read_text() == (
-        tmp_path / "swept" / "snr-element.ecsv"
-    ).read_text()
+    words = ("snr", "--star", "G2V", "--sweep", "magnitude=5,7", "--sweep", "exposure=5,50", "--as-list", "-n", "500")
+    run(*words, "--no-pictures", "-o", "swept", folder=tmp_path)
+    table = QTable.read(tmp_path / "swept" / "snr-element.ecsv")
+    assert {(m.value, t.value) for m, t in zip(table["magnitude"], table["exposure"], strict=True)} == {(5, 5), (7, 50)}
+    # Read back from a table, the study gives it again.
+    run("snr", tmp_path / "swept" / "snr-element.ecsv", "--no-pictures", "-o", "again", folder=tmp_path)
+    for name in ("snr-element.ecsv", "snr-pixel.ecsv"):
+        assert (tmp_path / "again" / name).read_text() == (tmp_path / "swept" / name).read_text()
     assert "--sweep 'magnitude=a'" in run("snr", "--sweep", "magnitude=a", folder=tmp_path, code=2).stderr
 
 
@@ -253,8 +282,8 @@ def test_gaussian(tmp_path: Path) -> None:
 
 def test_a_wrong_template_costs(tmp_path: Path) -> None:
     """Looked for as 5000 K a flare of 10000 K is seen less often, and the text says how much S/N is kept."""
-    words = ("--star", "G2V", "-m", "7.4", "-a", "0.01", "-n", "50000", "--statistic", "matched", "--no-pictures")
-    shown = run("detect", *words, "--template", "5000", "--template", "10000", folder=tmp_path).stdout
+    words = ("--star", "G2V", "-m", "7.4", "-a", "0.01", "-n", "50000", "--fap", "0.01", "--statistic", "matched")
+    shown = run("detect", *words, "--no-pictures", "--template", "5000", "--template", "10000", folder=tmp_path).stdout
     kept = [float(line.split(" keeps ")[1].split()[0]) for line in shown.splitlines() if " keeps " in line]
     assert 50 < kept[0] < 95
     assert kept[1] == 100.0

@@ -95,9 +95,7 @@ def test_raw_spectra_are_the_twins(any_width: Engine, name: str) -> None:
 
 def _twin(found: Detection, plan: ChannelPlan) -> np.ndarray:
     """Every channel of a detection by the twin."""
-    rows = np.zeros((len(found.smoothing.rows), len(found.scene.pixels)), np.float32)
-    rows[:, : found.scene.n_pixel] = found.smoothing.rows
-    smoothed = reference.Smoothed(rows, plan.scales, plan.scale_end)
+    smoothed = reference.Smoothed.of(found, plan)
     return reference.statistics(found.scene, INDEX, SEED, plan.weights, plan.linear_end, smoothed=smoothed)
 
 

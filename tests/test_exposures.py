@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -61,3 +63,11 @@ def test_fainter_is_longer_and_saturation_is_told() -> None:
 def test_impossible_wishes_are_a_sentence(snr: float, wavelength: float, per: str, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         exposure_for(study(), snr, wavelength, per=per)
+
+
+def test_the_answer_is_written_and_drawn(tmp_path: Path) -> None:
+    found = exposure_for(study(), 10.0, 300.0)
+    assert [path.name for path in found.write(tmp_path)] == ["exposure.ecsv", "study.toml"]
+    assert Study.read(tmp_path / "exposure.ecsv") == found.study
+    found.plot(tmp_path / "exposure.png")
+    assert (tmp_path / "exposure.png").read_bytes()[:4] == b"\x89PNG"

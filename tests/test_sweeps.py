@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import tomllib
 from typing import Any
 
 import numpy as np
 import pytest
 from scenes import instrument, star
+from scipy import stats
 
+from mauvecl.assumptions import what_matters
 from mauvecl.detect_study import detect
 from mauvecl.engine import Engine
-from mauvecl.gaussian import ONE_SIGMA, coverage, gaussian_report
+from mauvecl.exposures import exposure_for
+from mauvecl.gaussian import ONE_SIGMA, beyond, coverage, gaussian_report
 from mauvecl.host.errors import InputError
 from mauvecl.limits import limiting_magnitude
+from mauvecl.maps import detection_map
+from mauvecl.simulate_study import simulate
 from mauvecl.snr_study import snr
 from mauvecl.study import PAPER_BUDGETS, Study
 
@@ -148,3 +154,45 @@ def test_the_formula_holds_for_the_payload_and_fails_at_the_rail(engine: Engine)
     assert abs(faint["snr_off_by"]) > 0.1
     assert faint["why"] == "clipping"
     assert faint["fap_ratio"] != 1.0
+
+
+@pytest.mark.parametrize("name", ["mauve", "mauve-electrons"])
+@pytest.mark.parametrize("temperature", [21.0, -30.0])
+@pytest.mark.parametrize("sigmas", [3.0, 5.0])
+def test_pixels_beyond_five_sigma(name: str, temperature: float, sigmas: float) -> None:
+    """The saddle point against the exact sum over dark counts, to 0.3 %: more than a normal has."""
+    (quiet,) = star(exposure=5.0, payload=instrument(name, part=True, temperature_c=temperature))
+    p, step = 90, float(quiet.dark_step_dn[90])
+    poisson = quiet.photon_noise == "poisson"
+    # Photons and dark are then Poisson in electrons alike.
+    mean = quiet.dark_dn[p] / step + (quiet.source_electrons + quiet.sky_electrons)[p] * poisson
+    goal = sigmas * np.sqrt(quiet.variance_dn2[p] - 1 / 12)
+    sd = np.sqrt(quiet.read_noise_dn[p] ** 2 + quiet.gain_dn_per_electron[p] * quiet.signal_dn[p] * (not poisson))
+    counts = np.arange(int(mean + 14 * np.sqrt(mean) + 30))
+    exact = stats.poisson.pmf(counts, mean) @ stats.norm.sf((goal - (counts - mean) * step) / sd)
+    found = beyond(quiet, sigmas)[p]
+    assert found == pytest.approx(exact, rel=3e-3)
+    assert found > stats.norm.sf(sigmas)
+
+
+def test_every_column_is_described_and_every_answer_knows_its_study(engine: Engine) -> None:
+    """Tables of every kind of answer: a description for each column, and the study that is read back from each."""
+    asked = study([{"quantity": "sky", "values": [21.0, 22.0]}])
+    plain = study([]).with_settings(
+        ["map.x={quantity='magnitude',values=[7.0]}", "map.y={quantity='amplitude',values=[0.1]}"]
+    )
+    unknown = asked.model_copy(update={"unknowns": type(asked.unknowns)(draws=2)})
+    detected, seen, usual = detect(asked, engine), snr(asked, engine), gaussian_report(asked, engine)
+    limits, exposures = limiting_magnitude(unknown, engine), exposure_for(plain, 5.0, 300.0)
+    tables = [
+        (asked, [detected.table, detected.departures, detected.roc, detected.tails]),
+        (asked, [seen.pixel, seen.element, seen.noise_budget, usual.cells, usual.elements, usual.thresholds]),
+        (unknown, [limits.table, limits.draws]),
+        (plain, [exposures.table, what_matters(plain), simulate(plain).observations[0][2]]),
+    ]
+    found = detection_map(plain, engine)
+    tables.append((found.study, [found.table]))
+    for made_by, group in tables:
+        for table in group:
+            assert [name for name in table.colnames if not table[name].info.description] == []
+            assert Study.build(tomllib.loads(table.meta["study"]), "table") == made_by
