@@ -47,7 +47,7 @@ class Engine:
     device : str, optional
         Number, or part of a platform's or device's name, as `devices` lists them; PoCL on the CPU by default.
     progress : callable, optional
-        Called as ``progress(done, total)`` between tiles, in realisations. It may raise to stop the work.
+        Called as ``progress(done, total)`` before and between tiles, in realisations. It may raise to stop the work.
     tile : int, optional
         Realisations in one launch, for tests; chosen from the device and the work by default. Never changes a result.
     width : int, optional
@@ -406,6 +406,8 @@ class Engine:
         """Work through realisations tile by tile, with smaller ones where the device's memory does not suffice."""
         size = self._tile_size(bytes_each)
         done = 0
+        if self._progress is not None and not before:
+            self._progress(0, count if total is None else total)
         while done < count:
             tile = self._tile_at(start + done, count - done, size)
             try:
