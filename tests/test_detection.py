@@ -34,7 +34,8 @@ def found(engine: Engine) -> Detection:
 def ks_probability(d: Distribution, sf: object) -> float:
     """Kolmogorov-Smirnov at edges of the filled bins, 32 to a standard deviation."""
     filled = np.flatnonzero(d.counts)
-    edges = np.arange(filled[0], filled[-1] + 2, 16)
+    # The last edge, too: all values in one bin are no distribution.
+    edges = np.unique(np.append(np.arange(filled[0], filled[-1] + 2, 16), filled[-1] + 1))
     ours = np.array([d.above(int(i)) / d.n for i in edges])
     theirs = np.array([sf(float(x)) for x in np.asarray(d.edge(edges))])
     return float(stats.kstwo.sf(np.abs(ours - theirs).max(), d.n))

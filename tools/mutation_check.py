@@ -110,6 +110,21 @@ MUTATIONS = {
         (("mauvecl/layout.py", '"dark": 1', '"dark": 0'),),
         "tests/kernels/test_layout.py::test_streams_are_distinct_bytes",
     ),
+    "noise of what is subtracted forgotten": Mutation(
+        (("mauvecl/scene.py", "noisier = 1.0 + comparison.share", "noisier = 1.0"),),
+        "tests/test_tails.py::test_brute_force_agrees_whatever_is_compared",
+    ),
+    "quiescent exposures with the observed draws": Mutation(
+        (("mauvecl/layout.py", "REFERENCE = 64", "REFERENCE = 0"),),
+        "tests/test_detection.py::test_the_null_is_its_closed_form",
+    ),
+    "one smoothed value in four dropped": Mutation(
+        (
+            ("kernels/comparison.cl.mako", "[k][s + 3u] = d;", "[k][s + 3u] = 0.0f;"),
+            ("mauvecl/reference.py", "for centre, row in enumerate(self.rows):", "for centre, row in enumerate([]):"),
+        ),
+        "tests/test_detection.py::test_the_null_is_its_closed_form",
+    ),
 }
 
 
