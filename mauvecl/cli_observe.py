@@ -13,6 +13,7 @@ from mauvecl import verbs
 from mauvecl.flags import (
     DRAWS,
     FLARE,
+    SIGNAL,
     SWEEP,
     DeviceFlag,
     JsonFlag,
@@ -205,12 +206,9 @@ def _show_snr(found: SnrAnswer) -> None:
     )
 
 
-@takes_study(without="exposure")
+@takes_study(SIGNAL, without="exposure")
 def exposure(
     study: Study,
-    snr: Annotated[float, typer.Option(help="Wanted signal-to-noise ratio.")],
-    at: Annotated[float, typer.Option(help="Wavelength, nm.")],
-    per: Annotated[str, typer.Option(help="element (10.5 nm) or pixel.")] = "element",
     output: OutputFlag = None,
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
@@ -220,14 +218,12 @@ def exposure(
 
     Example: mauvecl exposure --snr 10 --at 300 --star G2V --magnitude 7.4
     """
-    from typing import cast
-
     from mauvecl import report
     from mauvecl.console import show_table
-    from mauvecl.exposures import Per, exposure_for
+    from mauvecl.exposures import exposure_for
 
     started = time.perf_counter()
-    found = exposure_for(study, snr, at, per=cast(Per, per))
+    found, wanted = exposure_for(study), study.signal
     folder = report.make_folder(output or Path("mauvecl-exposure"))
     table, files = found.table, found.write(folder)
     if verbs.pictures_wanted(pictures, quiet=quiet, as_json=as_json):
@@ -238,7 +234,8 @@ def exposure(
         print(json.dumps({"messages": list(found.messages), "rows": report.rows(table)}, indent=2))
         return
     show_table(
-        f"Exposure for an S/N of {snr:g} per {per} at {at:g} nm (closed form, whole frames)",
+        f"Exposure for an S/N of {wanted.snr:g} per {wanted.per} at {wanted.wavelength_nm:g} nm "
+        "(closed form, whole frames)",
         ("star", "exposure (s)", "frames", "S/N", "a frame less", ""),
         [
             (e.star, f"{e.exposure_s:g}", str(e.frames), f"{e.snr:.3f}", f"{e.snr_one_frame_less:.3f}",

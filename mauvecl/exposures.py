@@ -114,16 +114,18 @@ def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
     return int(x.element[pixel]) if per == "element" else pixel
 
 
-def exposure_for(study: Study, snr: float, wavelength_nm: float, *, per: Per = "element") -> ExposureResult:
+def exposure_for(
+    study: Study, snr: float | None = None, wavelength_nm: float | None = None, *, per: Per | None = None
+) -> ExposureResult:
     """The fewest frames whose closed-form S/N at a wavelength reaches a wanted one.
 
     Parameters
     ----------
     study : Study
         Its exposure does not matter.
-    snr : float
-    wavelength_nm : float
-    per : {"element", "pixel"}
+    snr, wavelength_nm : float, optional
+        In place of those of the study's ``signal``.
+    per : {"element", "pixel"}, optional
         A resolution element of 10.5 nm, or one pixel.
 
     Raises
@@ -131,8 +133,11 @@ def exposure_for(study: Study, snr: float, wavelength_nm: float, *, per: Per = "
     InputError
         For an S/N that no exposure up to 1e7 s reaches, or a wavelength outside the spectrum.
     """
-    if not (np.isfinite(snr) and snr > 0):
-        raise InputError(f"wanted S/N = {snr:g}, expected a number above 0")
+    study = study.with_changes({"signal": {"snr": snr, "wavelength_nm": wavelength_nm, "per": per}}, None, "exposure")
+    snr, wavelength_nm, per = study.signal.snr, study.signal.wavelength_nm, study.signal.per
+    if snr is None or wavelength_nm is None:
+        missing = "S/N" if snr is None else "wavelength"
+        raise InputError(f"no wanted {missing}, expected --snr and --at, or snr and wavelength_nm of a study's signal")
     found, seen = [], []
     for star in study.star:
         answer, x = _one(study, star, snr, wavelength_nm, per)

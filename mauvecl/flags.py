@@ -13,7 +13,10 @@ import typer
 if TYPE_CHECKING:
     from mauvecl.study import Study
 
-StudyFile = Annotated[Path | None, typer.Argument(help="Study file (TOML); flags override it.", show_default=False)]
+StudyFile = Annotated[
+    Path | None,
+    typer.Argument(help="Study (TOML), or the ECSV table of an answer; flags override it.", show_default=False),
+]
 StarFlag = Annotated[
     list[str] | None,
     typer.Option("--star", "-s", help="Library name or spectrum file; may be repeated.", show_default=False),
@@ -85,6 +88,9 @@ SweepFlag = Annotated[
 AsListFlag = Annotated[bool, typer.Option("--as-list", help="Sweep side by side instead of every combination.")]
 OfFlag = Annotated[str | None, typer.Option(help="magnitude, amplitude or exposure [magnitude].", show_default=False)]
 PowerFlag = Annotated[float | None, typer.Option(help="Wanted detection probability [0.9].", show_default=False)]
+SnrFlag = Annotated[float | None, typer.Option(help="Wanted signal-to-noise ratio.", show_default=False)]
+AtFlag = Annotated[float | None, typer.Option(help="Wavelength, nm.", show_default=False)]
+PerFlag = Annotated[str | None, typer.Option(help="element (10.5 nm) or pixel [element].", show_default=False)]
 UnknownFlag = Annotated[
     int | None,
     typer.Option(
@@ -166,6 +172,11 @@ DETECTION = {
     "variances": Option(VariancesFlag, "run", "variances"),
 }
 TEMPLATE = {"template": Option(TemplateFlag, "run", "template_temperatures_k")}
+SIGNAL = {
+    "snr": Option(SnrFlag, "signal", "snr"),
+    "at": Option(AtFlag, "signal", "wavelength_nm"),
+    "per": Option(PerFlag, "signal", "per"),
+}
 LIMIT = {"of": Option(OfFlag, "limit", "of"), "power": Option(PowerFlag, "limit", "power")}
 MAP = {
     "x": Option(XFlag, "map", "x", partial(axis_of, flag="--x")),
@@ -230,8 +241,6 @@ def takes_study(
             ),
             *(p.replace(kind=named, annotation=kinds[p.name]) for p in own if p.name != "given"),
         ]
-        # Required options come first.
-        parameters.sort(key=lambda p: p.default is not inspect.Parameter.empty)
         command.__name__, command.__doc__ = verb.__name__, verb.__doc__
         command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         command.__annotations__ = {p.name: p.annotation for p in parameters}

@@ -227,6 +227,14 @@ class CampaignQuestion(_Part):
     step: Annotated[int, Field(ge=1)] | None = None
 
 
+class SignalQuestion(_Part):
+    """The S/N that an exposure is wanted for."""
+
+    snr: Annotated[float, Field(gt=0)] | None = None
+    wavelength_nm: float | None = None
+    per: Literal["element", "pixel"] = "element"
+
+
 class LimitQuestion(_Part):
     """The value of one quantity at which a flare is detected with a wanted probability."""
 
@@ -370,6 +378,7 @@ class Study(_Part):
     processes: NoiseProcesses = NoiseProcesses()
     run: Run = Run()
     campaign: CampaignQuestion = CampaignQuestion()
+    signal: SignalQuestion = SignalQuestion()
     limit: LimitQuestion = LimitQuestion()
     map: MapQuestion = MapQuestion()
     sweep: Sweep = Sweep()
@@ -410,7 +419,9 @@ class Study(_Part):
         except ValidationError as error:
             raise InputError(f"{where}: {_sentence(cls, error)}") from error
 
-    def with_changes(self, changes: dict[str, dict[str, Any]], stars: list[dict[str, Any]] | None) -> Self:
+    def with_changes(
+        self, changes: dict[str, dict[str, Any]], stars: list[dict[str, Any]] | None, where: str = "command line"
+    ) -> Self:
         """The study with a section's values replaced where they are not None, and with other stars."""
         data = self.model_dump()
         for section, values in changes.items():
@@ -421,7 +432,7 @@ class Study(_Part):
             data[section].update(given)
         if stars is not None:
             data["star"] = stars
-        return self.build(data, "command line")
+        return self.build(data, where)
 
     def with_settings(self, settings: Sequence[str]) -> Self:
         """The study with keys set as text, such as ``run.fap=0.01`` or ``star.0.magnitude=6``.
@@ -452,6 +463,8 @@ class Study(_Part):
             del data["sweep"]
         if not self.unknowns.draws:
             del data["unknowns"]
+        if self.signal.snr is None:
+            del data["signal"]
         for section in ("processes", "campaign"):
             if not data[section]:
                 del data[section]

@@ -54,9 +54,9 @@ def test_fainter_is_longer_and_saturation_is_told() -> None:
 @pytest.mark.parametrize(
     ("snr", "wavelength", "per", "sentence"),
     [
-        (-1.0, 300.0, "element", "wanted S/N = -1"),
+        (-1.0, 300.0, "element", "signal.snr = -1"),
         (10.0, 900.0, "element", "wavelength = 900 nm"),
-        (10.0, 300.0, "line", "S/N per 'line'"),
+        (10.0, 300.0, "line", "signal.per = 'line'"),
         (1e9, 300.0, "element", "expected enough for 1e"),
     ],
 )
@@ -68,6 +68,9 @@ def test_impossible_wishes_are_a_sentence(snr: float, wavelength: float, per: st
 def test_the_answer_is_written_and_drawn(tmp_path: Path) -> None:
     found = exposure_for(study(), 10.0, 300.0)
     assert [path.name for path in found.write(tmp_path)] == ["exposure.ecsv", "study.toml"]
-    assert Study.read(tmp_path / "exposure.ecsv") == found.study
+    again = exposure_for(Study.read(tmp_path / "exposure.ecsv"))
+    assert (again.study, again.exposures) == (found.study, found.exposures)
+    with pytest.raises(InputError, match="no wanted wavelength"):
+        exposure_for(study(), 10.0)
     found.plot(tmp_path / "exposure.png")
     assert (tmp_path / "exposure.png").read_bytes()[:4] == b"\x89PNG"
