@@ -9,8 +9,10 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from mauvecl.comparison import Comparison
     from mauvecl.engine import Engine
     from mauvecl.exposures import exposure_for
+    from mauvecl.gaussian import gaussian_report
     from mauvecl.host.errors import InputError
     from mauvecl.host.expectation import Expectation, expect
     from mauvecl.host.instrument import Instrument
@@ -23,6 +25,7 @@ if TYPE_CHECKING:
 
 __version__ = "0.1.0"
 __all__ = [
+    "Comparison",
     "Engine",
     "Expectation",
     "InputError",
@@ -34,12 +37,14 @@ __all__ = [
     "detection_map",
     "expect",
     "exposure_for",
+    "gaussian_report",
     "limiting_magnitude",
     "shortest_exposure",
     "smallest_amplitude",
 ]
 
 _HOMES = {
+    "Comparison": "comparison",
     "Engine": "engine",
     "Expectation": "host.expectation",
     "InputError": "host.errors",
@@ -51,6 +56,7 @@ _HOMES = {
     "detection_map": "maps",
     "expect": "host.expectation",
     "exposure_for": "exposures",
+    "gaussian_report": "gaussian",
     "limiting_magnitude": "limits",
     "shortest_exposure": "limits",
     "smallest_amplitude": "limits",

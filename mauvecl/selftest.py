@@ -130,7 +130,7 @@ def digests(engine: Engine, name: str) -> dict[str, str]:
         engine.statistic_values(quiet, [flare], count=COUNT, statistics=names, **place, **how)
         for names in (tuple(STATISTICS), FAST)
     )
-    found = engine.detect(quiet, [flare], realisations=COUNT, statistics=tuple(STATISTICS), **place, **how)
+    found = engine.detect(quiet, [flare], realisations=COUNT, statistics=FAST, **place, **how)
     null = found.distribution("chi2")
     return {
         "raw": _digest(raw.astype(np.int64), clipped),
