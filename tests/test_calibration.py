@@ -21,13 +21,13 @@ STARS = ("B2IV", "A0V", "F5V", "G2V", "K3V", "K5V", "M0V")
 
 
 def scene(number: int) -> tuple:
-    """A star, magnitude, exposure, temperature, sky, instrument and 20 nm of spectrum, all at random."""
+    """A star, magnitude, exposure, temperature, sky, instrument and 12 nm of spectrum, all at random."""
     generator = np.random.default_rng([2026, number])
     first = generator.uniform(200.0, 330.0)
     payload = Instrument.load(str(generator.choice(["mauve", "mauve-electrons"]))).with_(
         temperature_c=float(generator.uniform(-10.0, 25.0)),
         output_min_nm=float(first),
-        output_max_nm=float(first + 20.0),
+        output_max_nm=float(first + 12.0),
     )
     source = Source.from_library(str(generator.choice(STARS))).at_magnitude(float(generator.uniform(3.0, 10.0)))
     sky = Sky.of_brightness(float(generator.uniform(18.0, 23.0)))

@@ -109,11 +109,9 @@ def test_what_cannot_be_tilted_is_refused(engine: Engine, options: dict, sentenc
 
 
 @pytest.mark.parametrize("statistic", STATISTICS)
-@pytest.mark.parametrize(
-    "comparison", [Comparison(4), Comparison(0, True), Comparison(1, True)], ids=["stack", "estimated", "both"]
-)
+@pytest.mark.parametrize("comparison", [Comparison(4), Comparison(1, True)], ids=["stack", "estimated"])
 def test_brute_force_agrees_whatever_is_compared(engine: Engine, statistic: str, comparison: Comparison) -> None:
-    """At 1e-4 of 1e6 realisations: |z| < 4.5 with both errors, 18 values, 1e-4 by chance."""
+    """At 1e-4 of 1e6 realisations: |z| < 4.5 with both errors, 12 values, 1e-4 by chance."""
     n, fap = 1_000_000, 1e-4
     quiet, flare = star(amplitudes=(0.1,), payload=instrument(output_min_nm=345.0, output_max_nm=360.0))
     found = engine.detect(
