@@ -188,7 +188,8 @@ def test_every_column_is_described_and_every_answer_knows_its_study(engine: Engi
         (asked, [detected.table, detected.departures, detected.roc, detected.tails]),
         (asked, [seen.pixel, seen.element, seen.noise_budget, usual.cells, usual.elements, usual.thresholds]),
         (unknown, [limits.table, limits.draws]),
-        (plain, [exposures.table, what_matters(plain), simulate(plain).observations[0][2]]),
+        (exposures.study, [exposures.table]),
+        (plain, [what_matters(plain), simulate(plain).observations[0][2]]),
     ]
     found = detection_map(plain, engine)
     tables.append((found.study, [found.table]))
