@@ -71,7 +71,7 @@ def beyond(x: Expectation, sigmas: float) -> NDArray[np.float64]:
     Notes
     -----
     By the saddle point (Lugannani & Rice 1980, doi 10.2307/1426607) of Gaussian and Poisson parts together; right to
-    1e-3 of the probability. For normal noise it would be the same in every pixel.
+    3e-3 of the probability. For normal noise it would be the same in every pixel.
     """
     c = Cumulants.of(x, x.n_frames)
     photons = np.where(c.photon_step > 0, c.photons, 0.0)

@@ -387,8 +387,8 @@ def gaussian(found: GaussianReport, path: Path | None) -> Any:
     # Column, what it is, what is promised, and the least that an axis shows to either side of it.
     panels = (
         ("snr_off_by", "mean S/N less formula", 0.0, 0.1),
-        ("coverage_low", "1-sigma intervals that hold the truth", 0.6827, 0.03),
-        ("five_sigma", "pixels beyond 5 sigma over normal", 1.0, 0.5),
+        ("coverage_low", "share of 1-sigma intervals right", 0.6827, 0.03),
+        ("five_sigma", "5-sigma pixels over normal", 1.0, 0.5),
         ("fap_ratio", "false alarms over promised", 1.0, 0.2),
     )
     with plt.rc_context(STYLE):
