@@ -6,7 +6,7 @@ import json
 import math
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mauvecl import verbs
 from mauvecl.flags import (
@@ -97,7 +97,7 @@ def detect(
         amplitude, digits = f"{100 * row['amplitude']:g} %", (row["expected"], row["mean"])
         probability = f"{row['probability']:.4f}", f"[{row['low']:.4f}, {row['high']:.4f}]"
         cells.append(
-            (row["star"], *(_short(row[name]) for name in swept), amplitude, row["statistic"],
+            (row["star"], *(verbs.short(row[name]) for name in swept), amplitude, row["statistic"],
              *(f"{value:.2f}" for value in digits), f"{row['reduced']:.3f}", f"{row['threshold']:.2f}", *probability,
              f"{row['closed_form_probability']:.4f}")
         )  # fmt: skip
@@ -110,12 +110,6 @@ def detect(
     _show_departures(found.departures, run.fap)
     verbs.say(found.paper, as_json=as_json)
     verbs.finish(files, started, quiet=quiet, as_json=as_json)
-
-
-def _short(value: Any) -> str:
-    """A cell's value for the terminal, without its unit."""
-    value = getattr(value, "value", value)
-    return value if isinstance(value, str) else f"{value:g}"
 
 
 def _show_departures(table: QTable, fap: float) -> None:
@@ -190,8 +184,8 @@ def gaussian(
         ("star", *swept, "best S/N", "S/N off by", "at nm", "1-sigma intervals", "5-sigma pixels", "false alarms",
          "statistic", "why", "detection off by"),
         [
-            (row["star"], *(_short(row[name]) for name in swept), f"{row['best_snr']:.2f}", f"{row['snr_off_by']:+.3f}",
-             "" if math.isnan(row["at_nm"]) else f"{row['at_nm']:.0f}",
+            (row["star"], *(verbs.short(row[name]) for name in swept), f"{row['best_snr']:.2f}",
+             f"{row['snr_off_by']:+.3f}", "" if math.isnan(row["at_nm"]) else f"{row['at_nm']:.0f}",
              f"{100 * row['coverage_low']:.2f}-{100 * row['coverage_high']:.2f} %", f"{row['five_sigma']:.2f}",
              f"{row['fap_ratio']:.3f}",
              row["statistic"], row["why"], f"{row['probability_off_by']:+.4f}")

@@ -88,7 +88,7 @@ def limit(
     for one in found.limits:
         p, value = one.check.probability, one.value
         flare = "" if asked.of == "amplitude" else f"{100 * one.amplitude:g} %"
-        at = [f"{v:g}" if isinstance(v, float) else str(v) for k, v in one.at.items() if k != "amplitude"]
+        at = [verbs.short(v) for k, v in one.at.items() if k != "amplitude"]
         cells.append(
             (one.star, *at, flare, one.statistic, f"{value.value:{digits}}",
              f"[{value.low:{digits}}, {value.high:{digits}}]", f"{one.closed_form:{digits}}",

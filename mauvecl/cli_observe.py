@@ -169,10 +169,6 @@ def _snr_pictures(found: SnrAnswer, folder: Path) -> list[Path]:
     return files
 
 
-#: Wavelengths of the elements that the terminal shows, nm.
-SHOWN_NM = (250.0, 300.0, 400.0, 550.0)
-
-
 def _show_snr(found: SnrAnswer) -> None:
     """S/N and noise at some wavelengths; all of them are in the files."""
     from mauvecl.console import show_table
@@ -182,10 +178,8 @@ def _show_snr(found: SnrAnswer) -> None:
     for star in found.stars:
         x, table = star.result.expectation, star.result.element
         budget = x.noise_budget()
-        name = (star.label, *(f"{v:g}" if isinstance(v, float) else str(v) for v in star.at.values()))
-        for wavelength in SHOWN_NM:
-            if not x.wavelength_nm[0] <= wavelength <= x.wavelength_nm[-1]:
-                continue
+        name = (star.label, *map(verbs.short, star.at.values()))
+        for wavelength in star.shown_nm:
             row, noise = table[place_of(x, wavelength, "element")], budget[place_of(x, wavelength, "pixel")]
             cells.append(
                 (*name, f"{row['wavelength'].value:.1f}", f"{row['expected']:.2f}", f"{row['mean']:.2f}",

@@ -14,7 +14,7 @@ from mauvecl.campaign import campaign
 from mauvecl.departures import departure_table
 from mauvecl.detection import Detection, check_fap, countable
 from mauvecl.host.errors import InputError
-from mauvecl.labels import described, label, put_first, titled, told
+from mauvecl.labels import label, put_first, stacked, titled, told
 from mauvecl.paper import PAPER_G2V, WHY, reconstruct
 from mauvecl.statistics import SHAPED, Linear, matched_weights
 from mauvecl.study import PAPER_STARS, Star, Study
@@ -96,15 +96,12 @@ class DetectAnswer:
         return departure_table(star.found, star.amplitudes, self.study.run.fap)
 
     def _together(self, table_of: Callable[[StarDetection], QTable]) -> QTable:
-        from astropy.table import vstack
-
-        parts = [table_of(star) for star in self.stars]
-        for star, table in zip(self.stars, parts, strict=True):
+        parts = []
+        for star in self.stars:
             # A flare's amplitude has its own column.
-            put_first(table, {"star": star.label} | {k: v for k, v in star.at.items() if k != "amplitude"})
-        found = vstack(parts, metadata_conflicts="silent")
-        found.meta |= {"study": self.study.toml()}
-        return described(found)
+            swept = {name: value for name, value in star.at.items() if name != "amplitude"}
+            parts.append(({"star": star.label, **swept}, table_of(star)))
+        return stacked(parts, study=self.study.toml())
 
 
 def _rocs(star: StarDetection) -> QTable:

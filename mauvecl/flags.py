@@ -219,9 +219,7 @@ def takes_study(
     options = {n: o for group in (OBSERVATION, *groups, SETTINGS) for n, o in group.items() if n != without}
 
     def decorate(verb: Callable[..., None]) -> Callable[..., None]:
-        from typing import Any as Study
-
-        kinds = get_type_hints(verb, localns={"Study": Study}, include_extras=True)
+        kinds = get_type_hints(verb, localns={"Study": Any}, include_extras=True)
         _, *own = inspect.signature(verb).parameters.values()
 
         def command(study_file: Path | None = None, **values: Any) -> None:

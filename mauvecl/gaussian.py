@@ -7,6 +7,7 @@ deviation of the observed one in 68.27 % of all spectra, and the false-alarm pro
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,7 +17,7 @@ from scipy import special
 from mauvecl import layout
 from mauvecl.cumulants import Cumulants
 from mauvecl.detect_study import DetectAnswer, detect
-from mauvecl.labels import described, put_first
+from mauvecl.labels import described
 from mauvecl.snr_study import SnrAnswer, snr
 from mauvecl.study import UNITS, Axis, Study, Sweep
 
@@ -96,6 +97,25 @@ def beyond(x: Expectation, sigmas: float) -> NDArray[np.float64]:
     return np.asarray(special.ndtr(-w) + np.exp(-(w**2) / 2) / np.sqrt(2 * np.pi) * (1 / v - 1 / w))
 
 
+def _promises(result: SnrResult) -> QTable:
+    """The formula's S/N and intervals beside the simulation's, one row per resolution element."""
+    table = result.element["wavelength", "expected", "mean", "std"]
+    x = result.expectation
+    table["error"] = table["std"] / np.sqrt(result.counts.n)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        table["bias"] = table["mean"] / table["expected"] - 1.0
+    table["coverage"] = x.per_element(coverage(result)) / x.per_element(np.ones(x.wavelength_nm.size))
+    for name, text in (
+        ("expected", "S/N by the formula"),
+        ("mean", "mean S/N of the realisations"),
+        ("error", "standard error of the mean"),
+        ("bias", "mean over expected S/N, less one"),
+        ("coverage", "share of 1-sigma intervals of its pixels that hold the truth; 0.6827 promised"),
+    ):
+        table[name].info.description = text
+    return table
+
+
 @dataclass(eq=False)
 class GaussianReport:
     """What `gaussian_report` answers.
@@ -111,40 +131,17 @@ class GaussianReport:
     signal: SnrAnswer
     detection: DetectAnswer
 
-    @property
+    @cached_property
     def elements(self) -> QTable:
         """One row per star, cell and resolution element: what the formula promises and what the simulation finds."""
-        from astropy.table import vstack
-
-        parts = []
-        for star in self.signal.stars:
-            table = star.result.element["wavelength", "expected", "mean", "std"]
-            x, n = star.result.expectation, star.result.counts.n
-            table["error"] = table["std"] / np.sqrt(n)
-            with np.errstate(divide="ignore", invalid="ignore"):
-                table["bias"] = table["mean"] / table["expected"] - 1.0
-            table["coverage"] = x.per_element(coverage(star.result)) / x.per_element(np.ones(x.wavelength_nm.size))
-            for name, text in (
-                ("expected", "S/N by the formula"),
-                ("mean", "mean S/N of the realisations"),
-                ("error", "standard error of the mean"),
-                ("bias", "mean over expected S/N, less one"),
-                ("coverage", "share of 1-sigma intervals of its pixels that hold the truth; 0.6827 promised"),
-            ):
-                table[name].info.description = text
-            table.meta = {}
-            put_first(table, {"star": star.label, **star.at})
-            parts.append(table)
-        found = vstack(parts)
-        found.meta |= {"realisations": self.study.run.realisations, "study": self.study.toml()}
-        return described(found)
+        return self.signal.together(_promises)
 
     @property
     def thresholds(self) -> QTable:
         """One row per star, cell and statistic: false-alarm probabilities at the formula's thresholds, and why."""
         return self.detection.departures
 
-    @property
+    @cached_property
     def cells(self) -> QTable:
         """One row per star and cell: the worst of each promise."""
         import astropy.units as u

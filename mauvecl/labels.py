@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -34,6 +34,29 @@ def put_first(table: QTable, values: Mapping[str, float | str]) -> None:
     for place, (name, value) in enumerate(values.items()):
         column = np.full(len(table), value)
         table.add_column(column * u.Unit(UNITS[name]) if name in UNITS else column, name=name, index=place)
+
+
+def stacked(parts: Iterable[tuple[Mapping[str, float | str], QTable]], **meta: object) -> QTable:
+    """One table of many, each with columns of its own values in front; of their meta data what all agree on.
+
+    Parameters
+    ----------
+    parts : iterable of (mapping, QTable)
+    **meta
+        Meta data of the whole.
+    """
+    from astropy.table import vstack
+
+    tables = []
+    for values, table in parts:
+        put_first(table, values)
+        tables.append(table)
+    shared = {k: v for k, v in tables[0].meta.items() if all(k in t.meta and t.meta[k] == v for t in tables)}
+    for table in tables:
+        table.meta = {}
+    found = vstack(tables)
+    found.meta |= shared | meta
+    return described(found)
 
 
 def titled(name: str, at: Mapping[str, float | str]) -> str:

@@ -15,7 +15,7 @@ from scipy import special
 
 from mauvecl.detection import Detection, check_fap
 from mauvecl.host.errors import InputError
-from mauvecl.labels import described, label, put_first
+from mauvecl.labels import described, label, stacked
 from mauvecl.scene import prepare
 from mauvecl.statistics import Interval
 from mauvecl.study import QUANTITIES, UNITS, Star, Study
@@ -180,19 +180,14 @@ class LimitResult:
     @property
     def draws(self) -> QTable:
         """One row per limit and draw of the unknown: its values and the closed-form limit."""
-        from astropy.table import vstack
-
         parts = []
         for one in self.limits:
             assert one.unknown is not None
             table = draws_table(one.unknown.draws, {self.study.limit.of: one.unknown.limits})
             amplitude = {} if np.isnan(one.amplitude) else {"amplitude": one.amplitude}
             swept = {k: v for k, v in one.at.items() if k != "amplitude"}
-            put_first(table, {"star": one.star, **swept, **amplitude, "statistic": one.statistic})
-            parts.append(table)
-        found = vstack(parts)
-        found.meta["study"] = self.study.toml()
-        return described(found)
+            parts.append(({"star": one.star, **swept, **amplitude, "statistic": one.statistic}, table))
+        return stacked(parts, study=self.study.toml())
 
     def write(self, folder: str | Path) -> list[Path]:
         """The table as ECSV, that of the unknown's draws where there are any, and the study that gives them again."""

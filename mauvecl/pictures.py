@@ -349,17 +349,16 @@ def snr_sweep(found: SnrAnswer, path: Path) -> Path:
 
     plt = _pyplot()
     first = found.study.sweep.axes[0].quantity
-    shown = [w for w in (250.0, 300.0, 400.0, 550.0)
-             if found.stars[0].result.expectation.wavelength_nm[[0, -1]][0] <= w
-             <= found.stars[0].result.expectation.wavelength_nm[-1]]  # fmt: skip
+    shown = found.stars[0].shown_nm
+    tables = [star.result.element for star in found.stars]
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(1, len(shown), figsize=(3.0 * len(shown) + 0.4, 3.2), squeeze=False, sharey=True)
         for axis, wavelength in zip(axes[0], shown, strict=True):
             lines: dict[str, list[tuple[Any, Any]]] = {}
-            for star in found.stars:
+            for star, table in zip(found.stars, tables, strict=True):
                 name = star.label if first != "magnitude" else star.label.split(" V = ")[0]
                 rest = titled(name, {k: v for k, v in star.at.items() if k != first})
-                row = star.result.element[place_of(star.result.expectation, wavelength, "element")]
+                row = table[place_of(star.result.expectation, wavelength, "element")]
                 lines.setdefault(rest, []).append((star.at[first], row))
             for k, (name, points) in enumerate(lines.items()):
                 x = [value for value, _ in points]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from mauvecl.labels import described, label, put_first, titled, told
+from mauvecl.labels import label, stacked, titled, told
 from mauvecl.study import Study
 
 if TYPE_CHECKING:
@@ -14,6 +14,10 @@ if TYPE_CHECKING:
 
     from mauvecl.engine import Engine
     from mauvecl.snr import SnrResult
+
+
+#: Wavelengths of the elements that terminal and pictures show, nm; the tables hold all of them.
+SHOWN_NM = (250.0, 300.0, 400.0, 550.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,6 +32,12 @@ class StarSnr:
     def title(self) -> str:
         """The star and what is swept, for pictures."""
         return titled(self.label, self.at)
+
+    @property
+    def shown_nm(self) -> list[float]:
+        """Those of `SHOWN_NM` that the spectrum holds."""
+        first, last = self.result.expectation.wavelength_nm[[0, -1]]
+        return [wavelength for wavelength in SHOWN_NM if first <= wavelength <= last]
 
 
 @dataclass(eq=False)
@@ -49,30 +59,22 @@ class SnrAnswer:
     @property
     def pixel(self) -> QTable:
         """S/N per pixel, one row per star, cell and pixel."""
-        return self._together(lambda result: result.pixel)
+        return self.together(lambda result: result.pixel)
 
     @property
     def element(self) -> QTable:
         """S/N per resolution element of 10.5 nm, one row per star, cell and element."""
-        return self._together(lambda result: result.element)
+        return self.together(lambda result: result.element)
 
     @property
     def noise_budget(self) -> QTable:
         """Noise by origin, DN rms per pixel, one row per star, cell and pixel."""
-        return self._together(lambda result: result.expectation.noise_budget())
+        return self.together(lambda result: result.expectation.noise_budget())
 
-    def _together(self, table_of: Callable[[SnrResult], QTable]) -> QTable:
-        from astropy.table import vstack
-
-        parts = []
-        for star in self.stars:
-            table = table_of(star.result)
-            table.meta = {}
-            put_first(table, {"star": star.label, **star.at})
-            parts.append(table)
-        found = vstack(parts)
-        found.meta |= {"realisations": self.study.run.realisations, "study": self.study.toml()}
-        return described(found)
+    def together(self, table_of: Callable[[SnrResult], QTable]) -> QTable:
+        """A table of each star and cell as one, with the star and what is swept in front."""
+        parts = (({"star": star.label, **star.at}, table_of(star.result)) for star in self.stars)
+        return stacked(parts, realisations=self.study.run.realisations, study=self.study.toml())
 
 
 def snr(study: Study, engine: Engine) -> SnrAnswer:

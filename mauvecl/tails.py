@@ -8,7 +8,7 @@ the normals (skew of the dark, rounding, clipping, the statistic itself) is the 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,19 +140,21 @@ class _Tilt:
 
     Attributes
     ----------
-    directions : ndarray, shape (n_direction, n_pixel)
+    directions : ndarray or sparse array, shape (n_direction, n_pixel)
         Orthonormal, in standard deviations of each pixel's difference.
     stretch : ndarray, shape (n_direction,)
     shift : float
     """
 
-    directions: Float
+    directions: Any
     stretch: Float
     shift: float = 0.0
 
     @classmethod
     def towards(cls, goal: float, found: Detection, statistic: str, template: int) -> _Tilt:
         """Such that the statistic comes near `goal` on average."""
+        from scipy.sparse import eye_array
+
         scene, quiet = found.scene, found.quiet
         sd = np.sqrt((1.0 + _share(found, statistic)) * quiet.variance_dn2) * scene.used
         weights = found.weights(statistic, template)
@@ -172,8 +174,8 @@ class _Tilt:
             directions /= np.linalg.norm(directions, axis=1)[:, None]
             square = np.ones(len(directions))
         else:
-            directions = np.eye(scene.n_pixel)[scene.used]
-            square = np.ones(len(directions))
+            directions = eye_array(scene.n_pixel, format="csr")[scene.used]
+            square = np.ones(directions.shape[0])
         return cls(directions, _stretch(square, goal))
 
     def moved(self, difference: Float) -> tuple[Float, Float]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from mauvecl.console import Meter
@@ -43,3 +43,9 @@ def finish(files: list[Path], started: float, *, quiet: bool, as_json: bool) -> 
         names = ", ".join(path.name for path in files)
         seconds = time.perf_counter() - started
         say([f"Wrote {names} to {files[0].parent}/ in {seconds:.1f} s."], as_json=as_json)
+
+
+def short(value: Any) -> str:
+    """What a cell of a sweep has, for the terminal, without its unit."""
+    value = getattr(value, "value", value)
+    return value if isinstance(value, str) else f"{value:g}"
