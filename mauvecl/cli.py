@@ -9,7 +9,8 @@ from typing import Annotated
 
 import typer
 
-from mauvecl import __version__, verbs
+from mauvecl import __version__
+from mauvecl.cli_bulk import export, realise, verify
 from mauvecl.cli_detect import detect, gaussian
 from mauvecl.cli_limits import detection_map, limit
 from mauvecl.cli_observe import exposure, simulate, snr
@@ -23,7 +24,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Would the Mauve satellite see this stellar flare, and how sure can one be?\n\n"
     "Start with `mauvecl detect`, which answers the question of the MauveSim paper. The throughput is nominal, not a "
-    "flight calibration. Exit codes: 0 done, 2 bad input, 130 interrupted.",
+    "flight calibration. Exit codes: 0 done, 1 a check found something, 2 bad input, 130 interrupted, 143 terminated.",
 )
 
 
@@ -96,12 +97,13 @@ def selftest(
     from dataclasses import asdict
 
     from mauvecl import report, selftest
-    from mauvecl.console import Meter, show_table
+    from mauvecl.console import Meter, show, show_table
+    from mauvecl.engine import Engine
 
     started = time.perf_counter()
     folder = None if output is None else report.make_folder(output)
     with Meter(quiet=quiet or as_json) as meter:
-        engine = verbs.engine(device, meter)
+        engine = Engine(device, progress=meter)
         checks = selftest.run(engine)
     seconds = time.perf_counter() - started
     selftest.keep(engine, checks, seconds)
@@ -114,7 +116,7 @@ def selftest(
         cells = [("PASS" if check.passed else "FAIL", check.name, check.found) for check in checks]
         show_table(f"Self-test of {engine.device_name}, driver {engine.driver}", ("", "check", "found"), cells)
         outcome = f"{failed} of {len(checks)} checks FAILED" if failed else f"All {len(checks)} checks passed"
-        verbs.say([f"{outcome} in {seconds:.0f} s. Promise: {engine.device.promise}."], as_json=as_json)
+        show([f"{outcome} in {seconds:.0f} s. Promise: {engine.device.promise}."])
     if failed:
         raise typer.Exit(1)
 
@@ -133,6 +135,8 @@ def schema() -> None:
 for verb in (simulate, snr, exposure, detect, gaussian, limit):
     app.command()(verb)
 app.command("map")(detection_map)
+for verb in (realise, verify, export):
+    app.command()(verb)
 
 
 def _version(wanted: bool) -> None:

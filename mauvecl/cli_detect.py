@@ -2,30 +2,23 @@
 
 from __future__ import annotations
 
-import json
 import math
-import time
-from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mauvecl import verbs
+from mauvecl.console import short
 from mauvecl.flags import (
     DETECTION,
     DRAWS,
     FLARE,
     SWEEP,
     TEMPLATE,
-    DeviceFlag,
-    JsonFlag,
-    OutputFlag,
-    PicturesFlag,
-    QuietFlag,
     takes_study,
 )
 
 if TYPE_CHECKING:
     from astropy.table import QTable
 
+    from mauvecl.session import Session
     from mauvecl.study import Study
 
 
@@ -36,11 +29,7 @@ MOST_DRAWN = 6
 @takes_study(FLARE, DRAWS, DETECTION, TEMPLATE, SWEEP)
 def detect(
     study: Study,
-    device: DeviceFlag = None,
-    output: OutputFlag = None,
-    as_json: JsonFlag = False,
-    quiet: QuietFlag = False,
-    pictures: PicturesFlag = True,
+    session: Session,
 ) -> None:
     """Would these flares be seen? Thresholds, detection probabilities, distributions.
 
@@ -50,41 +39,28 @@ def detect(
     Example: mauvecl detect --star K5V --magnitude 6 --amplitude 0.05 --amplitude 0.1 --exposure 30
     """
     from mauvecl import report
-    from mauvecl.console import Meter, show_table
+    from mauvecl.console import show_table
     from mauvecl.detect_study import detect as compute
 
-    started = time.perf_counter()
-    folder = report.make_folder(output or Path("mauvecl-detect"))
-    with Meter(quiet=quiet or as_json) as meter:
-        engine = verbs.engine(device, meter)
+    with session.pool() as engine:
         found = compute(study, engine)
-    verbs.say(found.messages, as_json=as_json)
-    files = [report.write_table(found.table, folder / "detection.ecsv")]
-    files.append(report.write_table(found.departures, folder / "departures.ecsv"))
-    files.append(report.write_table(found.roc, folder / "roc.ecsv"))
-    files.append(report.write_table(found.tails, folder / "tails.ecsv"))
-    if verbs.pictures_wanted(pictures, quiet=quiet, as_json=as_json):
+    session.say(found.messages)
+    session.write(found.table, "detection.ecsv")
+    session.write(found.departures, "departures.ecsv")
+    session.write(found.roc, "roc.ecsv")
+    session.write(found.tails, "tails.ecsv")
+    if session.draws_pictures:
         from mauvecl.pictures import detection, spectra
 
         # More would be too small to read; the tables hold all of them.
-        files.append(detection(found.stars[:MOST_DRAWN], study.run.fap, folder / "detection.png"))
-        files.append(spectra(found.stars[:MOST_DRAWN], folder / "spectra.png"))
-    files.append(report.write_study(study, folder))
-    files.append(
-        report.write_record(
-            "detect",
-            study,
-            [x for s in found.stars for x in (s.found.quiet, *s.found.flares)],
-            folder,
-            engine=engine,
-            seconds=time.perf_counter() - started,
-            messages=[*found.messages, *found.paper],
-        )
-    )
-    if as_json:
+        session.files.append(detection(found.stars[:MOST_DRAWN], study.run.fap, session.folder / "detection.png"))
+        session.files.append(spectra(found.stars[:MOST_DRAWN], session.folder / "spectra.png"))
+    inputs = [x for s in found.stars for x in (s.found.quiet, *s.found.flares)]
+    session.record(study, inputs, [*found.messages, *found.paper])
+    if session.as_json:
         out = {"messages": found.messages, "paper": found.paper, "rows": report.rows(found.table),
                "departures": report.rows(found.departures)}  # fmt: skip
-        print(json.dumps(out, indent=2))
+        session.print_json(out)
         return
     run = study.run
     exposures = " and ".join(
@@ -97,7 +73,7 @@ def detect(
         amplitude, digits = f"{100 * row['amplitude']:g} %", (row["expected"], row["mean"])
         probability = f"{row['probability']:.4f}", f"[{row['low']:.4f}, {row['high']:.4f}]"
         cells.append(
-            (row["star"], *(verbs.short(row[name]) for name in swept), amplitude, row["statistic"],
+            (row["star"], *(short(row[name]) for name in swept), amplitude, row["statistic"],
              *(f"{value:.2f}" for value in digits), f"{row['reduced']:.3f}", f"{row['threshold']:.2f}", *probability,
              f"{row['closed_form_probability']:.4f}")
         )  # fmt: skip
@@ -108,19 +84,19 @@ def detect(
         cells,
     )
     _show_departures(found.departures, run.fap)
-    verbs.say(found.paper, as_json=as_json)
-    verbs.finish(files, started, quiet=quiet, as_json=as_json)
+    session.say(found.paper)
+    session.finish()
 
 
 def _show_departures(table: QTable, fap: float) -> None:
     """Where the simulation differs from the closed form, or that it does not."""
-    from mauvecl.console import show_table
+    from mauvecl.console import show, show_table
 
     differing = table[table["differs"]]
     if len(table) and not len(differing):
-        verbs.say(
+        show(
             [f"At the thresholds for Gaussian noise the simulated false-alarm probability is {fap:g} within 4 standard "
-             "errors, for every statistic."], as_json=False,
+             "errors, for every statistic."]
         )  # fmt: skip
     if len(differing):
         flares = ["" if math.isnan(a) else f"{100 * a:g} %" for a in differing["amplitude"]]
@@ -139,11 +115,7 @@ def _show_departures(table: QTable, fap: float) -> None:
 @takes_study(DRAWS, DETECTION, SWEEP, fewer=True)
 def gaussian(
     study: Study,
-    device: DeviceFlag = None,
-    output: OutputFlag = None,
-    as_json: JsonFlag = False,
-    quiet: QuietFlag = False,
-    pictures: PicturesFlag = True,
+    session: Session,
 ) -> None:
     """Where the usual root-of-N formula is wrong: its S/N, its intervals, its false alarms.
 
@@ -152,30 +124,23 @@ def gaussian(
     Example: mauvecl gaussian --star G2V --sweep magnitude=6,10 --sweep exposure=5,50
     """
     from mauvecl import report
-    from mauvecl.console import Meter, show_table
+    from mauvecl.console import show_table
     from mauvecl.gaussian import gaussian_report
 
-    started = time.perf_counter()
-    folder = report.make_folder(output or Path("mauvecl-gaussian"))
-    with Meter(quiet=quiet or as_json) as meter:
-        engine = verbs.engine(device, meter)
+    with session.pool() as engine:
         found = gaussian_report(study, engine)
     messages = found.detection.messages
-    verbs.say(messages, as_json=as_json)
+    session.say(messages)
     tables = {"gaussian": found.cells, "elements": found.elements, "thresholds": found.thresholds}
-    files = [report.write_table(table, folder / f"{name}.ecsv") for name, table in tables.items()]
-    if verbs.pictures_wanted(pictures, quiet=quiet, as_json=as_json):
+    for name, table in tables.items():
+        session.write(table, f"{name}.ecsv")
+    if session.draws_pictures:
         from mauvecl.pictures import gaussian as draw
 
-        files.append(draw(found, folder / "gaussian.png"))
-    files.append(report.write_study(found.study, folder))
-    inputs = [star.result.expectation for star in found.signal.stars]
-    seconds = time.perf_counter() - started
-    files.append(
-        report.write_record("gaussian", found.study, inputs, folder, engine=engine, seconds=seconds, messages=messages)
-    )
-    if as_json:
-        print(json.dumps({"messages": messages, "rows": report.rows(tables["gaussian"])}, indent=2))
+        session.files.append(draw(found, session.folder / "gaussian.png"))
+    session.record(found.study, [star.result.expectation for star in found.signal.stars], messages)
+    if session.as_json:
+        session.print_json({"messages": messages, "rows": report.rows(tables["gaussian"])})
         return
     swept = [axis.quantity for axis in found.study.sweep.axes]
     show_table(
@@ -184,7 +149,7 @@ def gaussian(
         ("star", *swept, "best S/N", "S/N off by", "at nm", "1-sigma intervals", "5-sigma pixels", "false alarms",
          "statistic", "why", "detection off by"),
         [
-            (row["star"], *(verbs.short(row[name]) for name in swept), f"{row['best_snr']:.2f}",
+            (row["star"], *(short(row[name]) for name in swept), f"{row['best_snr']:.2f}",
              f"{row['snr_off_by']:+.3f}", "" if math.isnan(row["at_nm"]) else f"{row['at_nm']:.0f}",
              f"{100 * row['coverage_low']:.2f}-{100 * row['coverage_high']:.2f} %", f"{row['five_sigma']:.2f}",
              f"{row['fap_ratio']:.3f}",
@@ -192,4 +157,4 @@ def gaussian(
             for row in tables["gaussian"]
         ],
     )  # fmt: skip
-    verbs.finish(files, started, quiet=quiet, as_json=as_json)
+    session.finish()

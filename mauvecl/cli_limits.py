@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mauvecl import verbs
+from mauvecl.console import short
 from mauvecl.flags import (
     DETECTION,
     DRAWS,
@@ -18,30 +16,22 @@ from mauvecl.flags import (
     MAP,
     SWEEP,
     UNKNOWN,
-    DeviceFlag,
-    JsonFlag,
-    OutputFlag,
-    PicturesFlag,
-    QuietFlag,
     takes_study,
 )
 
 if TYPE_CHECKING:
     from mauvecl.limits import Limit
+    from mauvecl.session import Session
     from mauvecl.study import Study
 
 
 @takes_study(LIMIT, FLARE, DRAWS, DETECTION, UNKNOWN, SWEEP)
 def limit(
     study: Study,
+    session: Session,
     assumptions: Annotated[
         bool, typer.Option("--assumptions", help="Also: how far what is assumed of the instrument moves it.")
     ] = False,
-    device: DeviceFlag = None,
-    output: OutputFlag = None,
-    as_json: JsonFlag = False,
-    quiet: QuietFlag = False,
-    pictures: PicturesFlag = True,
 ) -> None:
     """The limiting magnitude of a flare, its smallest amplitude, or the shortest exposure that shows it.
 
@@ -50,36 +40,29 @@ def limit(
     Example: mauvecl limit --star G2V --amplitude 0.24 --exposure 50
     """
     from mauvecl import report
-    from mauvecl.console import Meter, show_table
+    from mauvecl.console import show_table
     from mauvecl.labels import told
     from mauvecl.limits import limiting_magnitude
 
-    started = time.perf_counter()
-    folder = report.make_folder(output or Path("mauvecl-limit"))
-    with Meter(quiet=quiet or as_json) as meter:
-        engine = verbs.engine(device, meter)
+    with session.pool() as engine:
         found = limiting_magnitude(study, engine)
     inputs = [study.expect([entry.source()])[0] for entry in study.star]
     # What is told of a star at its own magnitude need not hold at the limit.
     messages = [m for m in told(inputs) if not m.startswith("SATURATED")]
-    verbs.say(messages, as_json=as_json)
-    files = found.write(folder)
+    session.say(messages)
+    session.files += found.write(session.folder)
     moved = None
     if assumptions:
         from mauvecl.assumptions import what_matters
 
         moved = what_matters(study)
-        files.append(report.write_table(moved, folder / "assumptions.ecsv"))
-    if verbs.pictures_wanted(pictures, quiet=quiet, as_json=as_json):
-        files.append(_drawn(found, folder / "limit.png"))
-    files.append(
-        report.write_record(
-            "limit", study, inputs, folder, engine=engine, seconds=time.perf_counter() - started, messages=messages
-        )
-    )
-    if as_json:
+        session.write(moved, "assumptions.ecsv")
+    if session.draws_pictures:
+        session.files.append(_drawn(found, session.folder / "limit.png"))
+    session.record(study, inputs, messages)
+    if session.as_json:
         rows = {"messages": messages, "rows": report.rows(found.table)}
-        print(json.dumps(rows if moved is None else rows | {"assumptions": report.rows(moved)}, indent=2))
+        session.print_json(rows if moved is None else rows | {"assumptions": report.rows(moved)})
         return
     asked, run = study.limit, study.run
     swept = [axis.quantity for axis in study.sweep.axes if axis.quantity != "amplitude"]
@@ -88,7 +71,7 @@ def limit(
     for one in found.limits:
         p, value = one.check.probability, one.value
         flare = "" if asked.of == "amplitude" else f"{100 * one.amplitude:g} %"
-        at = [verbs.short(v) for k, v in one.at.items() if k != "amplitude"]
+        at = [short(v) for k, v in one.at.items() if k != "amplitude"]
         cells.append(
             (one.star, *at, flare, one.statistic, f"{value.value:{digits}}",
              f"[{value.low:{digits}}, {value.high:{digits}}]", f"{one.closed_form:{digits}}",
@@ -117,7 +100,7 @@ def limit(
                 for m in moved
             ],
         )  # fmt: skip
-    verbs.finish(files, started, quiet=quiet, as_json=as_json)
+    session.finish()
 
 
 def _unknown(one: Limit, digits: str) -> tuple[str, str]:
@@ -133,14 +116,10 @@ def _drawn(found: Any, path: Path) -> Path:
     return path
 
 
-@takes_study(MAP, FLARE, DRAWS, DETECTION, UNKNOWN, fewer=True)
+@takes_study(MAP, FLARE, DRAWS, DETECTION, UNKNOWN, name="map", fewer=True)
 def detection_map(
     study: Study,
-    device: DeviceFlag = None,
-    output: OutputFlag = None,
-    as_json: JsonFlag = False,
-    quiet: QuietFlag = False,
-    pictures: PicturesFlag = True,
+    session: Session,
 ) -> None:
     """Detection probability over two quantities, for one star.
 
@@ -150,34 +129,26 @@ def detection_map(
     Example: mauvecl map --star G2V --x magnitude:4:10:16 --y amplitude:0.01:1:16:log
     """
     from mauvecl import report
-    from mauvecl.console import Meter
     from mauvecl.maps import detection_map as compute
 
-    started = time.perf_counter()
-    folder = report.make_folder(output or Path("mauvecl-map"))
-    with Meter(quiet=quiet or as_json, unit="cells") as meter:
-        engine = verbs.engine(device, None)
-        found = compute(study, engine, progress=meter)
-    verbs.say(found.messages, as_json=as_json)
-    files = found.write(folder)
-    if verbs.pictures_wanted(pictures, quiet=quiet, as_json=as_json):
-        files.append(_drawn(found, folder / "map.png"))
+    with session.pool(unit="cells") as engine:
+        found = compute(study, engine, progress=session.meter)
+    session.say(found.messages)
+    session.files += found.write(session.folder)
+    if session.draws_pictures:
+        session.files.append(_drawn(found, session.folder / "map.png"))
     inputs = [found.study.expect([found.study.star[0].source()])[0]]
-    files.append(
-        report.write_record(
-            "map", study, inputs, folder, engine=engine, seconds=time.perf_counter() - started, messages=found.messages
-        )
-    )
-    if as_json:
-        print(json.dumps({"messages": found.messages, "rows": report.rows(found.table)}, indent=2))
+    session.record(study, inputs, found.messages)
+    if session.as_json:
+        session.print_json({"messages": found.messages, "rows": report.rows(found.table)})
         return
     _show(found, study)
-    verbs.finish(files, started, quiet=quiet, as_json=as_json)
+    session.finish()
 
 
 def _show(found: Any, study: Study) -> None:
     """The map as tables of percentages, one per statistic."""
-    from mauvecl.console import show_table
+    from mauvecl.console import show, show_table
 
     def text(value: float | str) -> str:
         return value if isinstance(value, str) else f"{value:.3g}"
@@ -185,7 +156,7 @@ def _show(found: Any, study: Study) -> None:
     for statistic, parts in found.shares.items():
         told = ", ".join(f"{name} {100 * share:.0f} %" for name, share in list(parts.items())[:3])
         draws = f"{study.unknowns.draws} draws of what is unknown"
-        verbs.say([f"{statistic}, averaged over {draws}: its scatter is from {told}."], as_json=False)
+        show([f"{statistic}, averaged over {draws}: its scatter is from {told}."])
     corner = f"{study.map.y.quantity}, {study.map.x.quantity}"
     for statistic, probability in zip(found.statistics, found.probability, strict=True):
         rows = [(text(y), *(f"{100 * p:.0f}" for p in row)) for y, row in zip(found.y, probability, strict=True)]

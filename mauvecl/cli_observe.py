@@ -2,62 +2,50 @@
 
 from __future__ import annotations
 
-import json
-import time
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mauvecl import verbs
+from mauvecl.console import short
 from mauvecl.flags import (
     DRAWS,
     FLARE,
     SIGNAL,
     SWEEP,
-    DeviceFlag,
-    JsonFlag,
-    OutputFlag,
-    PicturesFlag,
-    QuietFlag,
     takes_study,
 )
 
 if TYPE_CHECKING:
+    from mauvecl.session import Session
     from mauvecl.snr_study import SnrAnswer
     from mauvecl.study import Study
 
 
-@takes_study(FLARE, {"seed": DRAWS["seed"]})
+@takes_study(FLARE, {"seed": DRAWS["seed"]}, draws=False)
 def simulate(
     study: Study,
+    session: Session,
     given: dict[str, Any],
     realisation: Annotated[int, typer.Option(min=0, help="Which realisation to show.")] = 0,
-    output: OutputFlag = None,
-    as_json: JsonFlag = False,
-    quiet: QuietFlag = False,
-    pictures: PicturesFlag = True,
 ) -> None:
     """One observation and what it is made of: star, sky, photon noise, dark, bias, read noise.
 
     Example: mauvecl simulate --star G2V --magnitude 7.4 --exposure 50 --amplitude 0.24
     """
-    from mauvecl import report
     from mauvecl.simulate_study import simulate as compute
 
-    started = time.perf_counter()
-    folder = report.make_folder(output or Path("mauvecl-simulate"))
     found = compute(study, realisation=realisation, flaring=bool(given["amplitude"]))
-    verbs.say(found.messages, as_json=as_json)
-    files, summary = [], []
-    draw = verbs.pictures_wanted(pictures, quiet=quiet, as_json=as_json)
+    session.say(found.messages)
+    summary = []
     for number, (title, x, table) in enumerate(found.observations, 1):
         stem = f"observation-{number}"
-        files += [report.write_table(table, folder / f"{stem}{ending}") for ending in (".ecsv", ".fits")]
-        if draw:
+        for ending in (".ecsv", ".fits"):
+            session.write(table, f"{stem}{ending}")
+        if session.draws_pictures:
             from mauvecl.pictures import observation
 
-            files.append(observation(title, table, folder / f"{stem}.png"))
+            session.files.append(observation(title, table, session.folder / f"{stem}.png"))
         peak = int(x.signal_dn.argmax())
         summary.append(
             {
@@ -70,20 +58,9 @@ def simulate(
                 "saturated_pixels": int(x.saturated.sum()),
             }
         )
-    files.append(report.write_study(study, folder))
-    files.append(
-        report.write_record(
-            "simulate",
-            study,
-            [x for _, x, _ in found.observations],
-            folder,
-            engine=None,
-            seconds=time.perf_counter() - started,
-            messages=found.messages,
-        )
-    )
-    if as_json:
-        print(json.dumps({"messages": found.messages, "observations": summary}, indent=2))
+    session.record(study, [x for _, x, _ in found.observations], found.messages)
+    if session.as_json:
+        session.print_json({"messages": found.messages, "observations": summary})
         return
     from mauvecl.console import show_table
 
@@ -96,7 +73,7 @@ def simulate(
             for s in summary
         ],
     )  # fmt: skip
-    verbs.finish(files, started, quiet=quiet, as_json=as_json)
+    session.finish()
 
 
 def _budgets_or_star(given: dict[str, Any]) -> Study:
@@ -110,11 +87,7 @@ def _budgets_or_star(given: dict[str, Any]) -> Study:
 @takes_study(DRAWS, SWEEP, fewer=True, default=_budgets_or_star)
 def snr(
     study: Study,
-    device: DeviceFlag = None,
-    output: OutputFlag = None,
-    as_json: JsonFlag = False,
-    quiet: QuietFlag = False,
-    pictures: PicturesFlag = True,
+    session: Session,
 ) -> None:
     """Distributions of the signal-to-noise ratio per pixel and per resolution element, and noise budgets.
 
@@ -125,37 +98,23 @@ def snr(
     mauvecl snr --star G2V --sweep magnitude=4,6,8,10 --sweep exposure=5,50,600
     """
     from mauvecl import report
-    from mauvecl.console import Meter
     from mauvecl.snr_study import snr as compute
 
-    started = time.perf_counter()
-    folder = report.make_folder(output or Path("mauvecl-snr"))
-    with Meter(quiet=quiet or as_json) as meter:
-        engine = verbs.engine(device, meter)
+    with session.pool() as engine:
         found = compute(study, engine)
-    verbs.say(found.messages, as_json=as_json)
+    session.say(found.messages)
     tables = {"snr-pixel": found.pixel, "snr-element": found.element, "noise-budget": found.noise_budget}
-    files = [report.write_table(table, folder / f"{name}.ecsv") for name, table in tables.items()]
-    if verbs.pictures_wanted(pictures, quiet=quiet, as_json=as_json):
-        files += _snr_pictures(found, folder)
-    files.append(report.write_study(study, folder))
-    files.append(
-        report.write_record(
-            "snr",
-            study,
-            [star.result.expectation for star in found.stars],
-            folder,
-            engine=engine,
-            seconds=time.perf_counter() - started,
-            messages=found.messages,
-        )
-    )
-    if as_json:
+    for name, table in tables.items():
+        session.write(table, f"{name}.ecsv")
+    if session.draws_pictures:
+        session.files += _snr_pictures(found, session.folder)
+    session.record(study, [star.result.expectation for star in found.stars], found.messages)
+    if session.as_json:
         out = {name: report.rows(tables[name]) for name in ("snr-element", "noise-budget")}
-        print(json.dumps({"messages": found.messages} | out, indent=2))
+        session.print_json({"messages": found.messages} | out)
         return
     _show_snr(found)
-    verbs.finish(files, started, quiet=quiet, as_json=as_json)
+    session.finish()
 
 
 def _snr_pictures(found: SnrAnswer, folder: Path) -> list[Path]:
@@ -178,7 +137,7 @@ def _show_snr(found: SnrAnswer) -> None:
     for star in found.stars:
         x, table = star.result.expectation, star.result.element
         budget = x.noise_budget()
-        name = (star.label, *map(verbs.short, star.at.values()))
+        name = (star.label, *map(short, star.at.values()))
         for wavelength in star.shown_nm:
             row, noise = table[place_of(x, wavelength, "element")], budget[place_of(x, wavelength, "pixel")]
             cells.append(
@@ -200,13 +159,10 @@ def _show_snr(found: SnrAnswer) -> None:
     )
 
 
-@takes_study(SIGNAL, without="exposure")
+@takes_study(SIGNAL, without="exposure", draws=False)
 def exposure(
     study: Study,
-    output: OutputFlag = None,
-    as_json: JsonFlag = False,
-    quiet: QuietFlag = False,
-    pictures: PicturesFlag = True,
+    session: Session,
 ) -> None:
     """The shortest exposure with a wanted S/N at a wavelength, by the closed form; `mauvecl snr` goes the other way.
 
@@ -216,16 +172,14 @@ def exposure(
     from mauvecl.console import show_table
     from mauvecl.exposures import exposure_for
 
-    started = time.perf_counter()
     found, wanted = exposure_for(study), study.signal
-    folder = report.make_folder(output or Path("mauvecl-exposure"))
-    table, files = found.table, found.write(folder)
-    if verbs.pictures_wanted(pictures, quiet=quiet, as_json=as_json):
-        found.plot(folder / "exposure.png")
-        files.append(folder / "exposure.png")
-    verbs.say(list(found.messages), as_json=as_json)
-    if as_json:
-        print(json.dumps({"messages": list(found.messages), "rows": report.rows(table)}, indent=2))
+    session.files += found.write(session.folder)
+    if session.draws_pictures:
+        found.plot(session.folder / "exposure.png")
+        session.files.append(session.folder / "exposure.png")
+    session.say(list(found.messages))
+    if session.as_json:
+        session.print_json({"messages": list(found.messages), "rows": report.rows(found.table)})
         return
     show_table(
         f"Exposure for an S/N of {wanted.snr:g} per {wanted.per} at {wanted.wavelength_nm:g} nm "
@@ -237,4 +191,4 @@ def exposure(
             for e in found.exposures
         ],
     )  # fmt: skip
-    verbs.finish(files, started, quiet=quiet, as_json=as_json)
+    session.finish()

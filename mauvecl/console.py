@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Self
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
+
+    from mauvecl.pool import Standing
 
 #: Work shorter than this shows no progress.
 PATIENCE_S = 2.0
@@ -18,7 +20,14 @@ class Meter:
     """Progress with rate and time left, on standard error, for work longer than two seconds.
 
     On a terminal it is a bar; elsewhere a plain line every ten seconds.
+
+    Attributes
+    ----------
+    standing : callable, optional
+        Tells how far a pool is: shares done, and counted again.
     """
+
+    standing: Callable[[], Standing] | None = None
 
     def __init__(self, *, quiet: bool = False, unit: str = "realisations") -> None:
         self._quiet, self._unit = quiet, unit
@@ -30,10 +39,8 @@ class Meter:
     def __enter__(self) -> Self:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+    def __exit__(self, *_: object) -> None:
         self._stop()
-        if kind is KeyboardInterrupt:
-            print("mauvecl: interrupted; nothing was written, and nothing is half written", file=sys.stderr)
 
     def __call__(self, done: int, total: int) -> None:
         """Take note of work done, in the meter's unit."""
@@ -49,11 +56,22 @@ class Meter:
             self._draw(done, total)
         elif now - self._shown >= 10.0:
             self._shown = now
-            rate = done / (now - self._started)
-            print(
-                f"{done} of {total} {self._unit}, {rate:.3g} a second, {(total - done) / rate:.0f} s left",
-                file=sys.stderr,
-            )
+            rate = self._rate(done)
+            left = f"{(total - done) / rate:.0f} s left" if rate else "time left unknown"
+            print(f"{done} of {total} {self._unit}, {rate:.3g} a second, {left}{self._shares()}", file=sys.stderr)
+
+    def _rate(self, done: int) -> float:
+        """Work done a second, without what was taken from a checkpoint."""
+        resumed = self.standing().resumed if self.standing is not None and self._unit == "realisations" else 0
+        return (done - resumed) / max(time.monotonic() - self._started, 1e-9)
+
+    def _shares(self) -> str:
+        """What a pool tells beside that, where there is more than one share."""
+        if self.standing is None:
+            return ""
+        s = self.standing()
+        told = f", {s.shares} of {s.of} shares" if s.of > 1 else ""
+        return told + (f", {s.retries} counted again" if s.retries else "")
 
     def _draw(self, done: int, total: int) -> None:
         from rich.console import Console
@@ -66,20 +84,27 @@ class Meter:
                 TaskProgressColumn(),
                 TextColumn(f"{{task.fields[rate]}} {self._unit}/s"),
                 TimeRemainingColumn(),
-                TextColumn("left"),
+                TextColumn("left{task.fields[shares]}"),
                 console=Console(stderr=True),
                 transient=True,
             )
             self._bar.start()
-            self._task = self._bar.add_task("", total=total, rate="")
-        rate = done / (time.monotonic() - self._started)
+            self._task = self._bar.add_task("", total=total, rate="", shares="")
         assert self._task is not None
-        self._bar.update(self._task, completed=done, rate=f"{rate:,.0f}")
+        self._bar.update(
+            self._task, completed=done, total=total, rate=f"{self._rate(done):,.0f}", shares=self._shares()
+        )
 
     def _stop(self) -> None:
         if self._bar is not None:
             self._bar.stop()
             self._bar = None
+
+
+def short(value: Any) -> str:
+    """What a cell of a sweep has, for the terminal, without its unit."""
+    value = getattr(value, "value", value)
+    return value if isinstance(value, str) else f"{value:g}"
 
 
 def show(lines: Sequence[str]) -> None:

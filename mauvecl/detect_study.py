@@ -16,6 +16,7 @@ from mauvecl.detection import Detection, check_fap, countable
 from mauvecl.host.errors import InputError
 from mauvecl.labels import label, put_first, stacked, titled, told
 from mauvecl.paper import PAPER_G2V, WHY, reconstruct
+from mauvecl.pool import Pool, together
 from mauvecl.statistics import SHAPED, Linear, matched_weights
 from mauvecl.study import PAPER_STARS, Star, Study
 
@@ -136,7 +137,7 @@ def _tails(star: StarDetection) -> QTable:
     return found
 
 
-def detect(study: Study, engine: Engine) -> DetectAnswer:
+def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
     """Null and flare distributions of every star of a study, in every cell of its sweep.
 
     Raises
@@ -149,14 +150,19 @@ def detect(study: Study, engine: Engine) -> DetectAnswer:
     check_fap(run.fap, run.realisations, run.tails)
     prepared = [(at, cell, star, cell.expectations(star)) for at, cell in study.cells() for star in cell.star]
     campaign_told = [text for _, cell, _, (quiet, *_) in prepared for text in _campaign(cell, quiet)]
-    stars, costs = [], []
-    for at, cell, star, (quiet, *flares) in prepared:
+
+    def answered(one: tuple[Mapping[str, float | str], Study, Star, list[Expectation]]) -> StarDetection:
+        at, cell, star, (quiet, *flares) = one
         how = cell.detecting
         own = [_own(name, path, quiet) for name, path in run.weights.items()]
         how["statistics"] = (*run.statistics, *own, *_other_templates(cell, star, quiet))
         found = engine.detect(quiet, flares, seed=run.seed, **how)
-        stars.append(StarDetection(label(star, quiet), at, cell.flare.amplitudes, found))
-        costs += _template_costs(cell, stars[-1])
+        return StarDetection(label(star, quiet), at, cell.flare.amplitudes, found)
+
+    if isinstance(engine, Pool):
+        engine.expect(len(prepared) * run.realisations)
+    stars = list(together(engine, answered, prepared))
+    costs = [text for (_, cell, *_), star in zip(prepared, stars, strict=True) for text in _template_costs(cell, star)]
     answer = DetectAnswer(study, stars)
     messages = told([x for *_, group in prepared for x in group])
     if not countable(run.fap, run.realisations):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,8 +17,9 @@ from mauvecl.host.errors import InputError
 from mauvecl.processes import NONE, Processes
 from mauvecl.program import DeviceError, DeviceRecord, Variant, devices
 from mauvecl.run import Run, Tile
-from mauvecl.scene import PIXEL_BLOCK, Mode, Recipe, Scene, prepare
-from mauvecl.snr import Counts, SnrResult, elements, observers
+from mauvecl.scene import BATCH, PIXEL_BLOCK, Mode, Recipe, Scene, prepare
+from mauvecl.shards import DetectRequest, SnrRequest
+from mauvecl.snr import Counts, SnrResult
 from mauvecl.statistics import Linear
 from mauvecl.tally import TailSamples, Tally
 
@@ -35,8 +35,6 @@ TILE_BYTES = 64 * 2**20
 LARGEST_TILE = 2**16
 #: Vectors of realisations that one work-item of `statistics` follows on a processor.
 VECTORS = 4
-#: Scenarios in one launch: drawn as stacks, or frame by frame, which needs room for each.
-BATCH = {False: 16, True: 8}
 
 
 class Engine:
@@ -106,6 +104,7 @@ class Engine:
         mode: Mode = "auto",
         processes: Processes = NONE,
         recipe: Recipe = "auto",
+        first_frame: int = 0,
         out: NDArray[Any] | None = None,
     ) -> NDArray[Any]:
         """Raw spectra, each addressed by its realisation index alone.
@@ -121,6 +120,9 @@ class Engine:
         processes : Processes
         recipe : {"auto", "joint", "apart"}
             See `scene.prepare`.
+        first_frame : int
+            Where frames are counted from: one frame k of an exposure is drawn with an expectation of one frame and
+            ``first_frame=k``.
         out : ndarray, shape (count, n_pixel), optional
             Where to write, contiguous and of the type below.
 
@@ -142,6 +144,7 @@ class Engine:
             mode=mode,
             processes=processes,
             recipe=recipe,
+            first_frame=first_frame,
             out=out,
         )[0]
 
@@ -155,6 +158,7 @@ class Engine:
         mode: Mode = "auto",
         processes: Processes = NONE,
         recipe: Recipe = "auto",
+        first_frame: int = 0,
         out: NDArray[Any] | None = None,
     ) -> tuple[NDArray[Any], NDArray[np.uint32]]:
         """`realise`, with the number of clipped samples of each realisation: pixels times frames that met a rail.
@@ -165,7 +169,7 @@ class Engine:
         clipped : ndarray of uint32, shape (count,)
         """
         self._check(start, count, seed)
-        scene = prepare([expectation], mode, processes=processes, recipe=recipe)
+        scene = prepare([expectation], mode, processes=processes, recipe=recipe, first_frame=first_frame)
         narrow = scene.n_frames == 1 and expectation.adc_max_dn < 2**16
         shape, dtype = (count, scene.n_pixel), np.dtype(np.uint16 if narrow else np.int32)
         if scene.n_frames * expectation.adc_max_dn >= 2**31:
@@ -222,14 +226,17 @@ class Engine:
             For an impossible number, seed or mode.
         """
         self._check(start, realisations, seed)
-        scene = prepare([expectation], mode, processes=processes, recipe=recipe)
-        seen, parts = observers(expectation, scene), elements(expectation)
-        counts = Counts(scene.n_pixel, len(parts))
-        with self._scene(scene, seed) as run:
-            run.observe(seen, parts)
-            self._over(start, realisations, 0, lambda tile, done: run.histogram(tile, counts))
+        request = SnrRequest(expectation, realisations, seed, mode, start, processes, recipe)
+        self.count_snr(request, start, realisations, request.answer.counts)
+        return request.answer
+
+    def count_snr(self, request: SnrRequest, start: int, count: int, counts: Counts) -> None:
+        """Add some realisations of a request to counts; `shards` cuts it into such shares."""
+        asked = request.answer
+        with self._scene(asked.scene, request.seed) as run:
+            run.observe(asked.observers, asked.elements)
+            self._over(start, count, 0, lambda tile, done: run.histogram(tile, counts))
             run.flush_counts(counts)
-        return SnrResult(expectation, scene, seen, parts, counts)
 
     def detect(
         self,
@@ -277,36 +284,41 @@ class Engine:
             For an unknown statistic, scenarios that do not belong together, or an impossible number, seed or mode.
         """
         self._check(start, realisations, seed)
-        scene = prepare([quiet, *flares], mode, processes=processes, recipe=recipe, comparison=comparison)
-        size = BATCH[scene.frames] - 1
-        result = Detection(quiet, tuple(flares), statistics, scene, realisations, tails, seed)
-        batches = [range(i, min(i + size, len(flares))) for i in range(0, len(flares), size)] or [range(0)]
-        for number, batch in enumerate(batches):
-            plan = plan_channels(result, batch, first=number == 0)
+        how = (mode, start, processes, recipe, comparison, tails)
+        request = DetectRequest(quiet, tuple(flares), realisations, seed, statistics, *how)
+        for part, (plan, _) in enumerate(request.plans):
             tally, samples = Tally(plan.grids), plan.tails()
-            part = scene.part([0, *(k + 1 for k in batch)])
+            done, total = part * realisations, request.parts * realisations
+            self.count_detection(request, part, start, realisations, tally, samples, before=done, total=total)
+            request.answer.collect(plan, tally, samples)
+        return request.answer
 
-            def work(
-                tile: Tile, done: int, run: Run, tally: Tally = tally, samples: list[TailSamples | None] = samples
-            ) -> None:
-                run.statistics(tile)
-                run.tally(tile, tally)
-                for grid, kept in zip(tally.grids, samples, strict=True):
-                    if kept is not None:
-                        kept.add(run.channel(tile, grid.channel), start + done)
+    def count_detection(
+        self,
+        request: DetectRequest,
+        part: int,
+        start: int,
+        count: int,
+        tally: Tally,
+        samples: list[TailSamples | None],
+        *,
+        before: int = 0,
+        total: int | None = None,
+    ) -> None:
+        """Add some realisations of one part of a request to a tally; `shards` cuts it into such shares."""
+        plan, scene = request.plans[part]
 
-            with self._statistics(part, seed, plan, result) as run:
-                self._over(
-                    start,
-                    realisations,
-                    4 * plan.n_rows,
-                    partial(work, run=run),
-                    before=number * realisations,
-                    total=len(batches) * realisations,
-                )
-                run.flush(tally)
-            result.collect(plan, tally, samples)
-        return result
+        def work(run: Run, tile: Tile, done: int) -> None:
+            run.statistics(tile)
+            run.tally(tile, tally)
+            for grid, kept in zip(tally.grids, samples, strict=True):
+                if kept is not None:
+                    kept.add(run.channel(tile, grid.channel), start + done)
+
+        with self._statistics(scene, request.seed, plan, request.answer) as run:
+            each = 4 * plan.n_rows
+            self._over(start, count, each, lambda tile, done: work(run, tile, done), before=before, total=total)
+            run.flush(tally)
 
     def statistic_values(
         self,

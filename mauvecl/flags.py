@@ -85,7 +85,9 @@ SweepFlag = Annotated[
         show_default=False,
     ),
 ]
-AsListFlag = Annotated[bool, typer.Option("--as-list", help="Sweep side by side instead of every combination.")]
+AsListFlag = Annotated[
+    bool | None, typer.Option("--as-list", help="Sweep side by side instead of every combination.", show_default=False)
+]
 OfFlag = Annotated[str | None, typer.Option(help="magnitude, amplitude or exposure [magnitude].", show_default=False)]
 PowerFlag = Annotated[float | None, typer.Option(help="Wanted detection probability [0.9].", show_default=False)]
 SnrFlag = Annotated[float | None, typer.Option(help="Wanted signal-to-noise ratio.", show_default=False)]
@@ -99,9 +101,31 @@ UnknownFlag = Annotated[
 ]
 XFlag = Annotated[str | None, typer.Option(help="Such as magnitude:4:10:16, or exposure=5,50,600.", show_default=False)]
 YFlag = Annotated[str | None, typer.Option(help="Such as amplitude:0.01:1:16:log.", show_default=False)]
-DeviceFlag = Annotated[
-    str | None, typer.Option(help="OpenCL device: number or part of its name [PoCL].", show_default=False)
+FramesFlag = Annotated[
+    str | None,
+    typer.Option(
+        help="stack (an exposure's sum), all, or numbers of frames such as 0,4,9 [stack].", show_default=False
+    ),
 ]
+ComponentsFlag = Annotated[
+    bool | None,
+    typer.Option("--components", help="Keep also mean star, sky and noise of each pixel.", show_default=False),
+]
+DeviceFlag = Annotated[
+    str | None,
+    typer.Option(
+        help="OpenCL device: number or part of its name; 0,1 for several together [PoCL].", show_default=False
+    ),
+]
+ClusterFlag = Annotated[
+    str | None,
+    typer.Option(
+        help="Draw on Dask workers: local:N, tcp://host:8786, or a scheduler file (needs mauvecl[cluster]).",
+        show_default=False,
+    ),
+]
+ResumeFlag = Annotated[bool, typer.Option("--resume", help="Go on with the unfinished run in the output folder.")]
+RestartFlag = Annotated[bool, typer.Option("--restart", help="Forget the unfinished run in the output folder.")]
 OutputFlag = Annotated[
     Path | None,
     typer.Option("--output", "-o", help="Folder for tables and pictures [mauvecl-VERB].", show_default=False),
@@ -109,6 +133,10 @@ OutputFlag = Annotated[
 JsonFlag = Annotated[bool, typer.Option("--json", help="Print JSON and nothing else.")]
 QuietFlag = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progress and no file names.")]
 PicturesFlag = Annotated[bool, typer.Option("--pictures/--no-pictures", help="Draw pictures (needs mauvecl[plot]).")]
+
+KeepAfterFlag = Annotated[
+    float, typer.Option("--keep-after", min=0.0, help="Seconds after which finished shares are kept on the disk.")
+]
 
 
 class Option(NamedTuple):
@@ -187,57 +215,96 @@ SWEEP = {
     "sweep": Option(SweepFlag, "sweep", "axes", lambda texts: [axis_of(text, "--sweep") for text in texts]),
     "as_list": Option(AsListFlag, "sweep", "how", lambda wanted: "list" if wanted else None),
 }
+
+
+def _frames_of(text: str) -> str | list[int]:
+    """Which frames are kept, as a word: stack, all, or 0,4,9."""
+    from mauvecl.host.errors import InputError
+
+    if text in ("stack", "all"):
+        return text
+    try:
+        return [int(word) for word in text.split(",")]
+    except ValueError as error:
+        raise InputError(f"--frames {text!r}, expected stack, all, or numbers such as 0,4,9") from error
+
+
+BULK = {
+    "frames": Option(FramesFlag, "bulk", "frames", _frames_of),
+    "components": Option(ComponentsFlag, "bulk", "components"),
+}
 SETTINGS = {"settings": Option(SetFlag)}
+#: Where a verb writes and how much it says, and who draws for it: values of its `Session`, with their defaults.
+OUTPUT = {"output": (OutputFlag, None), "as_json": (JsonFlag, False), "quiet": (QuietFlag, False)}
+PICTURES = {"pictures": (PicturesFlag, True)}
+WORKERS = {
+    "device": (DeviceFlag, None),
+    "cluster": (ClusterFlag, None),
+    "resume": (ResumeFlag, False),
+    "restart": (RestartFlag, False),
+    "keep_after": (KeepAfterFlag, 20.0),
+}
 #: Where a verb asks for fewer realisations than a detection, unless told.
 FEWER = 100_000
 
 
 def takes_study(
     *groups: Mapping[str, Option],
+    name: str = "",
     without: str = "",
     fewer: bool = False,
     default: Callable[[dict[str, Any]], Study] | None = None,
+    draws: bool = True,
+    pictures: bool = True,
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """Let a verb take a study file and flags, and hand it the study that they make.
+    """Let a verb take a study file and flags, and hand it the study and the session that they make.
 
     Parameters
     ----------
     *groups : mapping of Option
         Flags beside those of the observation.
+    name : str
+        The verb's, where it is not the function's.
     without : str
         A flag of the observation that the verb does not take.
     fewer : bool
         Whether `FEWER` realisations are the default.
     default : callable, optional
         Makes the study where no file is given, from the flags; the paper's question by default.
+    draws, pictures : bool
+        Whether the verb draws realisations, and pictures.
 
     Returns
     -------
     callable
-        A decorator for functions whose first parameter is the study. One named `given` receives the flags.
+        A decorator for functions whose first parameters are the study and the session. One named `given` receives the
+        flags; others are options of its own.
     """
     options = {n: o for group in (OBSERVATION, *groups, SETTINGS) for n, o in group.items() if n != without}
+    around = OUTPUT | (PICTURES if pictures else {}) | (WORKERS if draws else {})
 
     def decorate(verb: Callable[..., None]) -> Callable[..., None]:
-        kinds = get_type_hints(verb, localns={"Study": Any}, include_extras=True)
-        _, *own = inspect.signature(verb).parameters.values()
+        kinds = get_type_hints(verb, localns={"Study": Any, "Session": Any}, include_extras=True)
+        _, _, *own = inspect.signature(verb).parameters.values()
 
         def command(study_file: Path | None = None, **values: Any) -> None:
-            given = {name: values.pop(name, None) for name in options}
+            from mauvecl.session import Session
+
+            given = {key: values.pop(key, None) for key in options}
             if fewer and study_file is None and given["realisations"] is None:
                 given["realisations"] = FEWER
+            how = {key: values.pop(key, usual) for key, (_, usual) in around.items()}
             if "given" in kinds:
                 values["given"] = given
-            verb(_study(study_file, given, options, default), **values)
+            study = _study(study_file, given, options, default)
+            verb(study, Session(name or verb.__name__, study, **how), **values)
 
         named = inspect.Parameter.KEYWORD_ONLY
         parameters = [
             inspect.Parameter("study_file", named, default=None, annotation=StudyFile),
-            *(
-                inspect.Parameter(name, named, default=False if o.kind is AsListFlag else None, annotation=o.kind)
-                for name, o in options.items()
-            ),
+            *(inspect.Parameter(key, named, default=None, annotation=o.kind) for key, o in options.items()),
             *(p.replace(kind=named, annotation=kinds[p.name]) for p in own if p.name != "given"),
+            *(inspect.Parameter(key, named, default=usual, annotation=kind) for key, (kind, usual) in around.items()),
         ]
         command.__name__, command.__doc__ = verb.__name__, verb.__doc__
         command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
 
     from mauvecl.engine import Engine
     from mauvecl.host.expectation import Expectation
+    from mauvecl.pool import Pool
     from mauvecl.snr import SnrResult
 
 #: Share of normal values within one standard deviation.
@@ -196,14 +197,14 @@ class GaussianReport:
         return described(table)
 
 
-def gaussian_report(study: Study, engine: Engine | None = None) -> GaussianReport:
+def gaussian_report(study: Study, engine: Engine | Pool | None = None) -> GaussianReport:
     """The usual formula beside the simulation, over magnitude and exposure or what else the study sweeps.
 
     Parameters
     ----------
     study : Study
         Without a sweep: magnitudes from 4 to 12, exposures of 5, 50 and 600 s.
-    engine : Engine, optional
+    engine : Engine or Pool, optional
 
     Raises
     ------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -26,6 +25,7 @@ if TYPE_CHECKING:
 
     from mauvecl.engine import Engine
     from mauvecl.host.expectation import Expectation
+    from mauvecl.pool import Pool
 
 #: The search for the closed form's root begins where a flare is hardest to see, in steps of this.
 STEPS = {"magnitude": -0.5, "amplitude": 2.0, "exposure": 2.0}
@@ -210,7 +210,7 @@ class Question:
     """One star, flare and statistic: detection probability as a function of the quantity."""
 
     def __init__(
-        self, study: Study, star: Star, amplitude: float | None, statistic: str, engine: Engine | None = None
+        self, study: Study, star: Star, amplitude: float | None, statistic: str, engine: Engine | Pool | None = None
     ) -> None:
         self.study, self.statistic, self.engine = study.model_copy(update={"star": (star,)}), statistic, engine
         self.of, self.power, self.fap = study.limit.of, study.limit.power, study.run.fap
@@ -322,7 +322,7 @@ class MarginalQuestion(Question):
     """The same, averaged over what is unknown of the instrument."""
 
     def __init__(
-        self, study: Study, star: Star, amplitude: float | None, statistic: str, engine: Engine | None = None
+        self, study: Study, star: Star, amplitude: float | None, statistic: str, engine: Engine | Pool | None = None
     ) -> None:
         super().__init__(study, star, amplitude, statistic, engine)
         self.draws = drawn(study)
@@ -383,7 +383,7 @@ def solve(
     star: Star,
     amplitude: float | None,
     statistic: str,
-    engine: Engine,
+    engine: Engine | Pool,
     at: Mapping[str, float | str] | None = None,
 ) -> Limit:
     """One limit: the closed form's root, moved by what is simulated, and simulated again there.
@@ -472,14 +472,14 @@ def _settle_frames(question: Question, start: float) -> Interval:
     return Interval(value, low, high)
 
 
-def limiting_magnitude(study: Study, engine: Engine | None = None) -> LimitResult:
+def limiting_magnitude(study: Study, engine: Engine | Pool | None = None) -> LimitResult:
     """Limits of a study's stars and flares, by every statistic it names.
 
     Parameters
     ----------
     study : Study
         Its ``limit`` says of what (magnitude, amplitude or exposure) and at which power.
-    engine : Engine, optional
+    engine : Engine or Pool, optional
 
     Raises
     ------
@@ -487,24 +487,34 @@ def limiting_magnitude(study: Study, engine: Engine | None = None) -> LimitResul
         As `solve`.
     """
     from mauvecl.engine import Engine as Default
+    from mauvecl.pool import together
 
     engine = engine or Default()
     result = LimitResult(study)
     if any(axis.quantity == study.limit.of for axis in study.sweep.axes):
         raise InputError(f"the sweep runs over the {study.limit.of} that is asked for, expected other quantities")
-    for at, cell in study.cells():
-        amplitudes = (None,) if study.limit.of == "amplitude" else cell.flare.amplitudes
-        for star, amplitude, statistic in itertools.product(cell.star, amplitudes, study.run.statistics):
-            result.limits.append(solve(cell, star, amplitude, statistic, engine, at))
+    asked = [
+        (cell, star, amplitude, statistic, at)
+        for at, cell in study.cells()
+        for star in cell.star
+        for amplitude in ((None,) if study.limit.of == "amplitude" else cell.flare.amplitudes)
+        for statistic in study.run.statistics
+    ]
+
+    def solved(one: tuple[Study, Star, float | None, str, Mapping[str, float | str]]) -> Limit:
+        cell, star, amplitude, statistic, at = one
+        return solve(cell, star, amplitude, statistic, engine, at)
+
+    result.limits.extend(together(engine, solved, asked))
     return result
 
 
-def smallest_amplitude(study: Study, engine: Engine | None = None) -> LimitResult:
+def smallest_amplitude(study: Study, engine: Engine | Pool | None = None) -> LimitResult:
     """The smallest flare that is detected; as `limiting_magnitude`."""
     return limiting_magnitude(_asking(study, "amplitude"), engine)
 
 
-def shortest_exposure(study: Study, engine: Engine | None = None) -> LimitResult:
+def shortest_exposure(study: Study, engine: Engine | Pool | None = None) -> LimitResult:
     """The shortest exposure in which the flares are detected; as `limiting_magnitude`."""
     return limiting_magnitude(_asking(study, "exposure"), engine)
 

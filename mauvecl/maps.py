@@ -21,6 +21,7 @@ if TYPE_CHECKING:
 
     from mauvecl.engine import Engine
     from mauvecl.host.expectation import Expectation
+    from mauvecl.pool import Pool
 
 #: Quantities of the flare alone: cells that differ in them share their quiescent star, and one launch.
 OF_FLARE = ("amplitude", "flare_temperature")
@@ -102,7 +103,7 @@ class MapResult:
 
 
 def detection_map(
-    study: Study, engine: Engine | None = None, *, progress: Callable[[int, int], None] | None = None
+    study: Study, engine: Engine | Pool | None = None, *, progress: Callable[[int, int], None] | None = None
 ) -> MapResult:
     """Detection probability of the study's first star and flare over its map's axes.
 
@@ -110,7 +111,7 @@ def detection_map(
     ----------
     study : Study
         Its ``map`` names the axes; what no axis names stays as the study has it.
-    engine : Engine, optional
+    engine : Engine or Pool, optional
     progress : callable, optional
         Called as ``progress(done, total)`` in cells.
 
@@ -168,20 +169,26 @@ def _map(
     study: Study,
     x: tuple[float | str, ...],
     y: tuple[float | str, ...],
-    engine: Engine,
+    engine: Engine | Pool,
     seen: list[Expectation],
     told_of: Callable[[int], None],
 ) -> Arrays:
     """The map on one instrument; quiescent stars are added to `seen`."""
+    from mauvecl.pool import together
+
     shape = (len(study.run.statistics), len(y), len(x))
     found = {name: np.full(shape, np.nan) for name in ("probability", "low", "high", "closed_form")}
-    done = 0
-    for cells in _groups(study, x, y):
+
+    def filled(cells: list[tuple[int, int]]) -> tuple[Expectation, int]:
         quiet, flares = _expectations(study, [(x[i], y[j]) for i, j in cells])
-        seen.append(quiet)
         if not quiet.saturated.all():
             _fill(found, cells, study, quiet, flares, engine)
-        done += len(cells)
+        return quiet, len(cells)
+
+    done = 0
+    for quiet, count in together(engine, filled, _groups(study, x, y)):
+        seen.append(quiet)
+        done += count
         told_of(done)
     return found
 
@@ -224,7 +231,7 @@ def _fill(
     study: Study,
     quiet: Expectation,
     flares: list[Expectation],
-    engine: Engine,
+    engine: Engine | Pool,
 ) -> None:
     run = study.run
     result = engine.detect(quiet, flares, seed=run.seed, **study.detecting)

@@ -16,8 +16,8 @@ from mauvecl.host.errors import InputError
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from mauvecl.engine import Engine
     from mauvecl.host.expectation import Expectation
+    from mauvecl.pool import Pool
     from mauvecl.study import Study
 
 
@@ -69,7 +69,7 @@ def write_record(
     expectations: Sequence[Expectation],
     folder: Path,
     *,
-    engine: Engine | None,
+    pool: Pool | None,
     seconds: float,
     messages: Sequence[str],
 ) -> Path:
@@ -82,7 +82,8 @@ def write_record(
     expectations : sequence of Expectation
         Their provenance holds the digests of the inputs.
     folder : Path
-    engine : Engine, optional
+    pool : Pool, optional
+        Who drew.
     seconds : float
         Wall time.
     messages : sequence of str
@@ -100,14 +101,15 @@ def write_record(
         "python": platform.python_version(),
         "packages": _versions("numpy", "scipy", "astropy", "synphot", "pyopencl"),
     }
-    if engine is not None:
-        record["device"] = asdict(engine.device)
-        record["kernels"] = engine.kernel_digest
-        # What the self-test found on this device, if the user has run it.
+    if pool is not None:
+        # What the self-test found on these devices, if the user has run it.
         from mauvecl.selftest import last
 
-        known = last(engine.device)
-        record["selftest"] = known or "not run on this device and version: mauvecl selftest"
+        record["devices"] = [asdict(device) for device in pool.devices]
+        record["kernels"] = pool.kernel_digest
+        record["shares"] = asdict(pool.standing)
+        told = "not run on this device and version: mauvecl selftest"
+        record["selftest"] = [last(device) or told for device in pool.devices]
     return write_json(record, folder / "run.json")
 
 

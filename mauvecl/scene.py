@@ -19,6 +19,8 @@ from mauvecl.processes import NONE, Processes
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
 
+#: Scenarios in one launch: drawn as stacks, or frame by frame, which needs room for each.
+BATCH = {False: 16, True: 8}
 Mode = Literal["auto", "frames", "stacked"]
 Recipe = Literal["auto", "joint", "apart"]
 Float = NDArray[np.float64]

@@ -82,7 +82,9 @@ class Counts:
         self.clipped = np.zeros((n_pixel, 2), np.int64)
         self.n = 0
 
-    def add(self, pixel: NDArray[np.uint32], element: NDArray[np.uint32], clipped: NDArray[np.uint32], n: int) -> None:
+    def add(
+        self, pixel: NDArray[np.integer], element: NDArray[np.integer], clipped: NDArray[np.integer], n: int
+    ) -> None:
         """Add what one or more tiles counted."""
         self.pixel += pixel
         self.element += element

@@ -7,12 +7,14 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from mauvecl.labels import label, stacked, titled, told
+from mauvecl.pool import Pool, together
 from mauvecl.study import Study
 
 if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.engine import Engine
+    from mauvecl.host.expectation import Expectation
     from mauvecl.snr import SnrResult
 
 
@@ -77,7 +79,7 @@ class SnrAnswer:
         return stacked(parts, realisations=self.study.run.realisations, study=self.study.toml())
 
 
-def snr(study: Study, engine: Engine) -> SnrAnswer:
+def snr(study: Study, engine: Engine | Pool) -> SnrAnswer:
     """S/N distributions of every star of a study, without flares, in every cell of its sweep.
 
     Raises
@@ -93,8 +95,12 @@ def snr(study: Study, engine: Engine) -> SnrAnswer:
         for x in cell.expect([star.source()])
     ]
     run = study.run
-    stars = [
-        StarSnr(name, at, engine.snr(x, realisations=run.realisations, seed=run.seed, **study.drawing))
-        for name, at, x in prepared
-    ]
+
+    def answered(one: tuple[str, Mapping[str, float | str], Expectation]) -> StarSnr:
+        name, at, x = one
+        return StarSnr(name, at, engine.snr(x, realisations=run.realisations, seed=run.seed, **study.drawing))
+
+    if isinstance(engine, Pool):
+        engine.expect(len(prepared) * run.realisations)
+    stars = list(together(engine, answered, prepared))
     return SnrAnswer(study, stars, told([x for _, _, x in prepared]))

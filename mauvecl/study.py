@@ -235,6 +235,35 @@ class SignalQuestion(_Part):
     per: Literal["element", "pixel"] = "element"
 
 
+class BulkQuestion(_Part):
+    """What is kept of each realisation: the exposure's sum, or its frames; and the mean components beside it."""
+
+    frames: Literal["stack", "all"] | Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] = "stack"
+    components: bool = False
+
+    @model_validator(mode="after")
+    def _ascending(self) -> Self:
+        if not isinstance(self.frames, str) and list(self.frames) != sorted(set(self.frames)):
+            raise ValueError(f"bulk.frames = {list(self.frames)}, expected ascending numbers")
+        return self
+
+    def chosen(self, n_frames: int) -> tuple[int, ...] | None:
+        """Frames kept apart, of so many; None where they are summed.
+
+        Raises
+        ------
+        InputError
+            If one of them is not there.
+        """
+        if self.frames == "stack":
+            return None
+        if isinstance(self.frames, str):
+            return tuple(range(n_frames))
+        if self.frames[-1] >= n_frames:
+            raise InputError(f"bulk.frames names frame {self.frames[-1]}, expected 0 to {n_frames - 1}")
+        return self.frames
+
+
 class LimitQuestion(_Part):
     """The value of one quantity at which a flare is detected with a wanted probability."""
 
@@ -381,6 +410,7 @@ class Study(_Part):
     signal: SignalQuestion = SignalQuestion()
     limit: LimitQuestion = LimitQuestion()
     map: MapQuestion = MapQuestion()
+    bulk: BulkQuestion = BulkQuestion()
     sweep: Sweep = Sweep()
     unknowns: Unknowns = Unknowns()
 
@@ -465,6 +495,8 @@ class Study(_Part):
             del data["unknowns"]
         if self.signal.snr is None:
             del data["signal"]
+        if self.bulk == BulkQuestion():
+            del data["bulk"]
         for section in ("processes", "campaign"):
             if not data[section]:
                 del data[section]

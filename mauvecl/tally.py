@@ -46,13 +46,13 @@ class Tally:
         self.sums = np.zeros((len(grids), 2), object)
         self.n = 0
 
-    def add(self, histogram: NDArray[np.uint32], sums: NDArray[np.int64], n: int) -> None:
+    def add(self, histogram: NDArray[np.integer], sums: NDArray[np.generic], n: int) -> None:
         """Add what one or more tiles counted.
 
         Parameters
         ----------
-        histogram : ndarray of uint32, shape (n_grid, BINS)
-        sums : ndarray of int64, shape (n_grid, 2)
+        histogram : ndarray of uint32 or int64, shape (n_grid, BINS)
+        sums : ndarray of int64 or Python integers, shape (n_grid, 2)
             Sums of fine steps and of their squares.
         n : int
             Realisations counted.
@@ -200,5 +200,12 @@ class TailSamples:
             return
         merged = np.concatenate([self.values, values[found]])
         realisations = np.concatenate([self.realisations, first + found])
-        order = np.lexsort((realisations, -self._sign * merged))[:TAIL_SAMPLES]
-        self.values, self.realisations = merged[order], realisations[order]
+        self._keep(merged, realisations)
+
+    def merge(self, values: NDArray[np.float32], realisations: NDArray[np.int64]) -> None:
+        """Add what was found in other realisations, in any order."""
+        self._keep(np.concatenate([self.values, values]), np.concatenate([self.realisations, realisations]))
+
+    def _keep(self, values: NDArray[np.float32], realisations: NDArray[np.int64]) -> None:
+        order = np.lexsort((realisations, -self._sign * values))[:TAIL_SAMPLES]
+        self.values, self.realisations = values[order], realisations[order]

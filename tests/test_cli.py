@@ -83,7 +83,7 @@ def test_files_and_record(answered: tuple[Path, str]) -> None:
     assert record["study"]["run"]["realisations"] == 100_000
     assert len(record["inputs"]) == 10
     assert all(len(entry["source digest"]) == 64 for entry in record["inputs"])
-    assert {"device", "kernels", "wall_time_s", "mauvecl", "messages"} <= set(record)
+    assert {"devices", "kernels", "wall_time_s", "mauvecl", "messages"} <= set(record)
     for picture in ("detection.png", "spectra.png"):
         assert (out / picture).read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 

@@ -14,6 +14,7 @@ from mauvecl import program, report, selftest
 from mauvecl.cli import app
 from mauvecl.engine import Engine
 from mauvecl.kernel_cache import KernelCache
+from mauvecl.pool import LocalWorkers, Pool
 from mauvecl.study import Study
 
 WEAKER = "same draws to float rounding: no fused multiply-add"
@@ -97,8 +98,9 @@ def test_the_command(tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyP
     assert kept["passed"] is True
     assert kept["checks"][0]["name"] == "one thing"
     assert selftest.last(engine.device) == kept
-    record = report.write_record("detect", Study(), [], tmp_path, engine=engine, seconds=0.0, messages=[])
-    assert json.loads(record.read_text())["selftest"] == kept
+    pool = Pool(LocalWorkers([None], make=lambda device, progress: engine))
+    record = report.write_record("detect", Study(), [], tmp_path, pool=pool, seconds=0.0, messages=[])
+    assert json.loads(record.read_text())["selftest"] == [kept]
     checks.append(selftest.Check("another", False, "wrong"))
     bad = CliRunner().invoke(app, ["selftest", "--quiet"])
     assert bad.exit_code == 1

@@ -1,0 +1,170 @@
+"""The verbs of raw spectra in bulk: draw them, verify them, put some into one file."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mauvecl.flags import BULK, DRAWS, FLARE, SWEEP, DeviceFlag, JsonFlag, QuietFlag, takes_study
+
+if TYPE_CHECKING:
+    from mauvecl.session import Session
+    from mauvecl.store import Store
+    from mauvecl.study import Study
+
+StoreArgument = Annotated[Path, typer.Argument(help="Store that `mauvecl realise` wrote.")]
+RowsFlag = Annotated[
+    str | None, typer.Option(help="Realisations, as in 1000:2000, the last not included.", show_default=False)
+]
+
+
+@takes_study(FLARE, DRAWS, SWEEP, BULK, fewer=True, pictures=False)
+def realise(study: Study, session: Session) -> None:
+    """Raw spectra in bulk: a Zarr store, or a FITS or HDF5 file of fewer than 4 GiB.
+
+    An array per star and flare, a row per realisation, with calibration, units and the study. What was written stays:
+    --resume draws what is missing.
+
+    Examples: mauvecl realise study.toml -n 1000000 --output frames.zarr
+
+    mauvecl realise --star G2V --magnitude 7.4 --amplitude 0.24 --exposure 5 -n 1000 --output frames.fits
+    """
+    from mauvecl import bulk
+    from mauvecl.export import ENDINGS, Selection, export
+    from mauvecl.host.errors import InputError
+    from mauvecl.session import told_of_interrupts, working
+
+    place = session.output or Path("mauvecl-frames.zarr")
+    one_file = place.suffix in ENDINGS
+    if not one_file and place.suffix not in ("", ".zarr"):
+        raise InputError(f"--output {str(place)!r}, expected a name ending in .zarr, {', '.join(ENDINGS)}")
+    folder = place.with_name(f".unfinished-{place.name}.zarr") if one_file else place
+    if session.restart:
+        bulk.forget(folder)
+    with (
+        told_of_interrupts(lambda: f"what was written to {str(folder)!r} is kept, and --resume draws the rest"),
+        session.metered("spectra") as meter,
+        working(session.device, session.cluster) as workers,
+    ):
+        from mauvecl.pool import Pool
+
+        pool = Pool(workers)
+        meter.standing = lambda: pool.standing
+        store = bulk.realise(study, folder, pool, resume=session.resume, progress=meter)
+    if one_file:
+        export(Selection.of(store), place)
+        bulk.forget(folder)
+    _tell(store, place, session)
+
+
+def _tell(store: Store, place: Path, session: Session) -> None:
+    from mauvecl.console import show_table
+    from mauvecl.labels import told
+
+    messages = told([scene.expectation for scene in store.scenes])
+    session.say(messages)
+    rows = [
+        {
+            "array": scene.path,
+            "star": scene.star,
+            "amplitude": scene.amplitude,
+            "shape": [store.rows, *scene.row],
+            "type": scene.dtype.name,
+        }
+        for scene in store.scenes
+    ]
+    if session.as_json:
+        session.print_json({"messages": messages, "store": str(place), "bytes": store.n_bytes, "arrays": rows})
+        return
+    show_table(
+        f"Raw spectra, DN; seed {store.study.run.seed}. Rows of the same number share their random numbers, rows of "
+        "different number are independent.",
+        ("array", "star", "flare", "shape", "type"),
+        [
+            (row["array"], row["star"], f"{100 * float(str(row['amplitude'])):g} %",
+             " x ".join(str(n) for n in (store.rows, *scene.row)), row["type"])
+            for row, scene in zip(rows, store.scenes, strict=True)
+        ],
+    )  # fmt: skip
+    if not session.quiet:
+        seconds = time.perf_counter() - session.started
+        session.say([f"Wrote {store.n_bytes / 2**20:.0f} MiB to {place} in {seconds:.1f} s."])
+
+
+def verify(
+    store: StoreArgument,
+    repair: Annotated[bool, typer.Option("--repair", help="Draw again what is wrong, to the same bits.")] = False,
+    redraw: Annotated[
+        bool, typer.Option("--redraw", help="Draw every spectrum again and compare, not only digests.")
+    ] = False,
+    rows: RowsFlag = None,
+    device: DeviceFlag = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Is a store as it was written? Finds flipped bytes, missing and foreign chunks, and repairs them.
+
+    Exit code 1 if anything is wrong and not repaired.
+
+    Example: mauvecl verify frames.zarr --repair
+    """
+    from dataclasses import asdict
+
+    from mauvecl import bulk
+    from mauvecl.console import Meter, show, show_table
+    from mauvecl.engine import Engine
+
+    engine = Engine(device) if repair or redraw else None
+    with Meter(quiet=quiet or as_json, unit="chunks") as meter:
+        found = bulk.verify(store, engine, repair=repair, redraw=redraw, rows=_rows_of(rows), progress=meter)
+    left = sum(not fault.mended for fault in found)
+    if as_json:
+        print(json.dumps([asdict(fault) for fault in found], indent=2))
+    else:
+        if found:
+            cells = [(fault.key, fault.state, "repaired" if fault.mended else "") for fault in found]
+            show_table(f"Not as it was written: {store}", ("file", "what", ""), cells)
+        told = "with what was written" if not redraw else "with what the engine draws"
+        show([f"{len(found) - left} repaired, {left} left as found." if found else f"Everything agrees {told}."])
+    if left:
+        raise typer.Exit(1)
+
+
+def export(
+    store: StoreArgument,
+    file: Annotated[Path, typer.Argument(help="Ending in .fits, .h5 or .hdf5.")],
+    array: Annotated[
+        list[str] | None,
+        typer.Option("--array", help="Such as star-1/flare-2; may be repeated [all].", show_default=False),
+    ] = None,
+    rows: RowsFlag = None,
+    quiet: QuietFlag = False,
+) -> None:
+    """Some of a store as one FITS or HDF5 file.
+
+    Example: mauvecl export frames.zarr some.fits --array star-1/quiescent --rows 0:1000
+    """
+    from mauvecl.console import show
+    from mauvecl.export import Selection
+    from mauvecl.export import export as write
+    from mauvecl.store import Store
+
+    write(Selection.of(Store.open(store), array, _rows_of(rows)), file)
+    if not quiet:
+        show([f"Wrote {file}, {file.stat().st_size / 2**20:.1f} MiB."])
+
+
+def _rows_of(text: str | None) -> tuple[int, int] | None:
+    from mauvecl.host.errors import InputError
+
+    if text is None:
+        return None
+    first, _, stop = text.partition(":")
+    try:
+        return int(first), int(stop)
+    except ValueError as error:
+        raise InputError(f"--rows {text!r}, expected a range such as 1000:2000") from error

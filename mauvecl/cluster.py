@@ -1,0 +1,236 @@
+"""Dask workers as the workers of a pool: processes of this machine, or of a cluster that is there already."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import threading
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mauvecl import __version__
+from mauvecl.host.errors import InputError
+from mauvecl.program import DeviceError, DeviceRecord
+from mauvecl.shards import Arrays, Countable, Share
+
+if TYPE_CHECKING:
+    from distributed import Client
+    from distributed import Future as DaskFuture
+
+    from mauvecl.engine import Engine
+
+#: Seconds to find a scheduler, and then a first worker.
+PATIENCE_S, WORKER_PATIENCE_S = 10.0, 120.0
+#: A share is sent out so often before the run ends: workers die by twos and threes on a cluster that is taken back.
+TRIES = 8
+#: What tells PoCL, old and new, how many threads it may use.
+THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
+
+
+class DaskWorkers:
+    """Workers of a Dask cluster, each with an engine of its own.
+
+    Parameters
+    ----------
+    where : str
+        ``local:N`` for N processes of this machine; the address of a scheduler, such as ``tcp://host:8786``; or a
+        scheduler file.
+    device : str, optional
+        As `Engine` takes it, on each worker.
+
+    Raises
+    ------
+    InputError
+        For another word, or where Dask is missing.
+    DeviceError
+        If no scheduler or worker answers, a worker has another version of mauvecl, or has no such device.
+    """
+
+    first: Engine | None = None
+
+    def __init__(self, where: str, device: str | None = None) -> None:
+        try:
+            import distributed
+        except ImportError as error:
+            raise InputError("Dask is missing, expected it for --cluster: pip install 'mauvecl[cluster]'") from error
+        self._where, self._device, self.retries = where, device, 0
+        self._lock = threading.Lock()
+        self._closing = False
+        self._given: dict[str, DaskFuture[Any]] = {}
+        self._sent: set[DaskFuture[Any]] = set()
+        self._open = contextlib.ExitStack()
+        try:
+            self._client: Client = self._open.enter_context(_client(where, distributed))
+            try:
+                self._client.wait_for_workers(1, timeout=WORKER_PATIENCE_S)
+            except TimeoutError as error:
+                raise DeviceError(
+                    f"cluster {where} has no worker, expected one within {WORKER_PATIENCE_S:g} s"
+                ) from error
+            found = self._client.run(_introduce, device, on_error="return")
+            for worker, answer in found.items():
+                if isinstance(answer, BaseException):
+                    raise DeviceError(
+                        f"worker {worker} cannot work ({answer}), expected mauvecl {__version__} and OpenCL there"
+                    )
+                if answer[0] != __version__:
+                    raise DeviceError(f"worker {worker} has mauvecl {answer[0]}, expected {__version__} as here")
+            self._devices = [record for _, record in found.values()]
+        except BaseException:
+            self._open.close()
+            raise
+
+    @property
+    def count(self) -> int:
+        """Workers now."""
+        return max(len(self._client.nthreads()), 1)
+
+    def describe(self) -> list[DeviceRecord]:
+        """The devices of the workers that were there at the beginning."""
+        return self._devices
+
+    def submit(self, request: Countable, key: str, share: Share, tick: Callable[[int], None]) -> Future[Arrays]:
+        """Have a share counted by whichever worker is free."""
+        found: Future[Arrays] = Future()
+        self._send(found, request, key, share, 1)
+        return found
+
+    def _send(self, found: Future[Arrays], request: Countable, key: str, share: Share, tried: int) -> None:
+        with self._lock:
+            if self._closing:
+                found.cancel()
+                return
+            if key not in self._given:
+                # A task rather than scattered data: the scheduler can make it again where a worker took it along.
+                self._given = {key: self._client.submit(_keep, request, key=f"mauvecl-request-{key}")}
+            name = f"mauvecl-{key}-{share.name}-{tried}"
+            sent = self._client.submit(_count, self._given[key], share, self._device, key=name, pure=False)
+            self._sent.add(sent)
+        sent.add_done_callback(partial(self._came, found, request, key, share, tried))
+
+    def _came(
+        self, found: Future[Arrays], request: Countable, key: str, share: Share, tried: int, sent: DaskFuture[Any]
+    ) -> None:
+        with self._lock:
+            self._sent.discard(sent)
+        try:
+            if sent.status == "finished":
+                found.set_result(sent.result())
+                return
+            error = sent.exception() if sent.status == "error" else None
+            known = isinstance(error, InputError | DeviceError)
+            if self._closing:
+                found.cancel()
+            elif known or tried == TRIES:
+                told = error if known else f"{error or 'the scheduler is gone'}"
+                found.set_exception(
+                    DeviceError(f"cluster {self._where} failed at realisations {share.start} to "
+                                f"{share.start + share.count - 1}: {told}")
+                )  # fmt: skip
+            elif sent.status in ("cancelled", "lost") and self._client.status != "running":
+                found.set_exception(DeviceError(f"the scheduler of cluster {self._where} is gone, expected it to stay"))
+            else:
+                with self._lock:
+                    self.retries += 1
+                    if error is None:
+                        # The request itself was lost with its worker.
+                        self._given.clear()
+                self._send(found, request, key, share, tried + 1)
+        except BaseException as error:
+            if not found.done():
+                found.set_exception(error)
+
+    def stop(self) -> None:
+        """Take back what was sent out; a worker ends the share in its hands."""
+        with self._lock:
+            self._closing = True
+            sent = list(self._sent)
+        self._client.cancel(sent)
+
+    def close(self) -> None:
+        """Let the workers go; those of this machine end."""
+        self._closing = True
+        self._given.clear()
+        self._open.close()
+
+
+@contextlib.contextmanager
+def _client(where: str, distributed: Any) -> Iterator[Client]:
+    """A connection to the cluster, which is made first where it is this machine's."""
+    import dask
+
+    with contextlib.ExitStack() as stack:
+        word, _, number = where.partition(":")
+        if word == "local":
+            if not number.isdecimal() or not 1 <= int(number) <= 1024:
+                raise InputError(f"--cluster {where!r}, expected local:N with N from 1 to 1024")
+            threads = max((os.cpu_count() or 1) // int(number), 1)
+            # Deaths are counted and shares sent out again here, so that they are told.
+            quiet: dict[str, Any] = {"distributed.scheduler.allowed-failures": 0, "distributed.admin.tick.limit": "1h"}
+            stack.enter_context(dask.config.set(quiet | {"logging": dict.fromkeys(LOGS, "critical")}))
+            for name in LOGS:
+                logging.getLogger(name).setLevel(logging.CRITICAL)
+            cluster = distributed.LocalCluster(
+                n_workers=int(number),
+                threads_per_worker=1,
+                processes=True,
+                dashboard_address=None,
+                memory_limit=0,
+                silence_logs=logging.CRITICAL,
+                env=dict.fromkeys(THREADS, str(threads)),
+            )
+            how: dict[str, Any] = {"address": stack.enter_context(cluster)}
+        elif "://" in where:
+            how = {"address": where}
+        elif Path(where).is_file():
+            how = {"scheduler_file": where}
+        else:
+            raise InputError(
+                f"--cluster {where!r}, expected local:N, an address such as tcp://host:8786, or a scheduler file"
+            )
+        try:
+            client = stack.enter_context(distributed.Client(**how, timeout=PATIENCE_S, set_as_default=False))
+        except (OSError, ValueError, TimeoutError) as error:
+            raise DeviceError(f"no scheduler answers at {where}, expected one within {PATIENCE_S:g} s") from error
+        yield client
+
+
+LOGS = ("distributed", "distributed.nanny", "distributed.worker", "distributed.scheduler", "distributed.core")
+
+# On a worker.
+
+_engine: Engine | None = None
+_one_at_a_time = threading.Lock()
+
+
+def _keep(request: Countable) -> Countable:
+    return request
+
+
+def _engine_here(device: str | None, threads: int) -> Engine:
+    """The worker's engine, with as many of PoCL's threads as Dask gives it."""
+    from mauvecl.engine import Engine
+
+    global _engine
+    if _engine is None:
+        for name in THREADS:
+            os.environ.setdefault(name, str(threads))
+        _engine = Engine(device)
+    return _engine
+
+
+def _introduce(device: str | None, dask_worker: Any = None) -> tuple[str, DeviceRecord]:
+    with _one_at_a_time:
+        return __version__, _engine_here(device, dask_worker.state.nthreads).device
+
+
+def _count(request: Countable, share: Share, device: str | None) -> Arrays:
+    from distributed import get_worker
+
+    with _one_at_a_time:
+        engine = _engine_here(device, get_worker().state.nthreads)
+        return request.count(engine, share.part, share.start, share.count)

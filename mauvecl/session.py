@@ -1,0 +1,204 @@
+"""What every verb of the command line does around its answer: who draws, where it is written, how much is said."""
+
+from __future__ import annotations
+
+import json
+import signal
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+    from mauvecl.checkpoint import Checkpoint
+    from mauvecl.console import Meter
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.pool import Pool, Workers
+    from mauvecl.study import Study
+
+
+class Terminated(KeyboardInterrupt):
+    """SIGTERM, as the end of a batch job's time or a shutdown sends it."""
+
+
+@dataclass(eq=False)
+class Session:
+    """One call of a verb.
+
+    Attributes
+    ----------
+    verb : str
+    study : Study
+    output : Path, optional
+        Folder for everything written.
+    as_json, quiet, pictures : bool
+    device : str, optional
+        As `Engine` takes it; several with commas between them.
+    cluster : str, optional
+        As `cluster.DaskWorkers` takes it.
+    resume, restart : bool
+        What is to become of an unfinished run that is there.
+    keep_after : float
+        Seconds after which finished shares are kept on the disk.
+    """
+
+    verb: str
+    study: Study
+    output: Path | None = None
+    as_json: bool = False
+    quiet: bool = False
+    pictures: bool = True
+    device: str | None = None
+    cluster: str | None = None
+    resume: bool = False
+    restart: bool = False
+    keep_after: float = 20.0
+    files: list[Path] = field(default_factory=list)
+    started: float = field(default_factory=time.perf_counter)
+    _pool: Pool | None = None
+
+    @cached_property
+    def folder(self) -> Path:
+        """Where everything is written."""
+        from mauvecl.report import make_folder
+
+        return make_folder(self.output or Path(f"mauvecl-{self.verb}"))
+
+    @contextmanager
+    def pool(self, *, unit: str = "realisations") -> Iterator[Pool]:
+        """Everyone who draws, with progress and a checkpoint; interruptions are told.
+
+        Parameters
+        ----------
+        unit : str
+            What progress counts: realisations, which the pool tells, or something that the caller tells `meter`.
+        """
+        from mauvecl.checkpoint import Checkpoint
+        from mauvecl.pool import Pool
+
+        how = {"resume": self.resume, "restart": self.restart}
+        checkpoint = Checkpoint(self.folder, self.verb, self.study, patience_s=self.keep_after, **how)
+        self.meter = self.metered(unit)
+        with ExitStack() as stack:
+            stack.enter_context(told_of_interrupts(lambda: self._kept(checkpoint)))
+            stack.enter_context(checkpoint)
+            self.say(checkpoint.messages)
+            stack.enter_context(self.meter)
+            workers = stack.enter_context(working(self.device, self.cluster))
+            progress = self.meter if unit == "realisations" else None
+            self._pool = Pool(workers, checkpoint=checkpoint, progress=progress)
+            self.meter.standing = lambda: self._pool.standing
+            yield self._pool
+            if checkpoint.damaged:
+                self.say(
+                    [f"{checkpoint.damaged} files of {str(checkpoint.folder)!r} were damaged and are drawn again."]
+                )
+        self._checkpoint = checkpoint
+
+    def metered(self, unit: str) -> Meter:
+        """Progress in a unit, to be used in a `with` block."""
+        from mauvecl.console import Meter
+
+        return Meter(quiet=self.quiet or self.as_json, unit=unit)
+
+    def _kept(self, checkpoint: Checkpoint) -> str:
+        kept = checkpoint.kept
+        if not kept:
+            return "nothing was written, and nothing is half written"
+        shares = f"{kept} share{'s' if kept > 1 else ''} of the work"
+        return f"{shares} kept in {str(checkpoint.folder)!r}, and the same command with --resume goes on from there"
+
+    def say(self, lines: Sequence[str]) -> None:
+        """Tell the reader, unless standard output is for JSON alone."""
+        from mauvecl.console import show
+
+        if not self.as_json:
+            show(lines)
+
+    @cached_property
+    def draws_pictures(self) -> bool:
+        """Whether pictures are to be drawn; tells where matplotlib is missing."""
+        from mauvecl.pictures import available
+
+        if self.pictures and not available():
+            if not self.quiet:
+                self.say(["No pictures: matplotlib is missing, `pip install 'mauvecl[plot]'` brings it."])
+            return False
+        return self.pictures
+
+    def write(self, table: Table, name: str) -> None:
+        """A table into the folder, by its name's ending."""
+        from mauvecl.report import write_table
+
+        self.files.append(write_table(table, self.folder / name))
+
+    def record(self, study: Study, inputs: Sequence[Expectation], messages: Sequence[str]) -> None:
+        """The study and the run's record into the folder; what was kept for a resume is no longer needed."""
+        from mauvecl.report import write_record, write_study
+
+        if self.folder / "study.toml" not in self.files:
+            self.files.append(write_study(study, self.folder))
+        seconds = time.perf_counter() - self.started
+        pool = self._pool
+        self.files.append(
+            write_record(self.verb, study, inputs, self.folder, pool=pool, seconds=seconds, messages=messages)
+        )
+        if self._pool is not None:
+            self._checkpoint.forget()
+
+    def print_json(self, content: dict[str, Any]) -> None:
+        """The answer for machines."""
+        print(json.dumps(content, indent=2))
+
+    def finish(self) -> None:
+        """Name the files written."""
+        if not self.quiet:
+            names = ", ".join(path.name for path in self.files)
+            self.say([f"Wrote {names} to {self.folder}/ in {time.perf_counter() - self.started:.1f} s."])
+
+
+@contextmanager
+def working(device: str | None, cluster: str | None) -> Iterator[Workers]:
+    """The workers asked for; let go at the end, at once where the work ended early."""
+    from mauvecl.pool import LocalWorkers
+
+    if cluster is not None:
+        from mauvecl.cluster import DaskWorkers
+
+        workers: Workers = DaskWorkers(cluster, device)
+    else:
+        workers = LocalWorkers([None] if device is None else [word.strip() for word in device.split(",")])
+    try:
+        yield workers
+    except BaseException:
+        workers.stop()
+        raise
+    finally:
+        workers.close()
+
+
+@contextmanager
+def told_of_interrupts(kept: Callable[[], str]) -> Iterator[None]:
+    """Ctrl-C and SIGTERM end the work in order, with a sentence of what is kept; exit codes 130 and 143."""
+
+    def terminate(*_: object) -> None:
+        raise Terminated
+
+    main = threading.current_thread() is threading.main_thread()
+    before = signal.signal(signal.SIGTERM, terminate) if main else None
+    try:
+        yield
+    except KeyboardInterrupt as stop:
+        terminated = isinstance(stop, Terminated)
+        print(f"mauvecl: {'terminated' if terminated else 'interrupted'}; {kept()}", file=sys.stderr)
+        sys.exit(143 if terminated else 130)
+    finally:
+        if main:
+            signal.signal(signal.SIGTERM, before)

@@ -1,0 +1,372 @@
+"""The form of a store of raw spectra: a Zarr v3 hierarchy, its chunks and their digests.
+
+A group per star holds an array per scene (``quiescent``, ``flare-1``, ...), one row per realisation, and its pixels'
+calibration. Each chunk ends in its own CRC, which any Zarr reader checks; beside each array a list of its chunks'
+digests tells a foreign chunk from ours. Chunks are written whole or not at all.
+"""
+
+from __future__ import annotations
+
+import json
+import tempfile
+import tomllib
+import warnings
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl import __version__
+from mauvecl.durable import UNFINISHED, differing_keys, write_whole
+from mauvecl.host.errors import InputError
+from mauvecl.labels import label, titled
+from mauvecl.labels import told as messages_of
+from mauvecl.study import Study
+
+if TYPE_CHECKING:
+    from mauvecl.host.expectation import Expectation
+
+#: Bytes of one chunk, about.
+CHUNK_BYTES = 16 * 2**20
+#: Per pixel and frame, kept with each star, with their units.
+CALIBRATION = {
+    "wavelength_nm": "nm",
+    "bias_dn": "DN",
+    "dark_dn": "DN",
+    "read_noise_dn": "DN",
+    "gain_dn_per_electron": "DN / electron",
+}
+DIGESTS = "digests.txt"
+COMMON_DRAWS = (
+    "row i of every array is drawn with the same random numbers, so that a flare is the only difference between two "
+    "arrays; rows of different number are independent"
+)
+NOMINAL = "the throughput is nominal, not a flight calibration"
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One array of a store: a star without a flare, or with one."""
+
+    group: str
+    name: str
+    star: str
+    amplitude: float
+    expectation: Expectation
+    frames: tuple[int, ...] | None
+    at: Mapping[str, float | str]
+
+    @property
+    def path(self) -> str:
+        """Its place in the store."""
+        return f"{self.group}/{self.name}"
+
+    @property
+    def row(self) -> tuple[int, ...]:
+        """Shape of one realisation: pixels, or frames and pixels."""
+        n_pixel = self.expectation.wavelength_nm.size
+        return (n_pixel,) if self.frames is None else (len(self.frames), n_pixel)
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """16 bits for single frames of a 16-bit ADC, 32 for sums of several."""
+        x = self.expectation
+        single = self.frames is not None or x.n_frames == 1
+        return np.dtype("<u2" if single and x.adc_max_dn < 2**16 else "<i4")
+
+    def chunk_rows(self, realisations: int) -> int:
+        """Realisations in one chunk."""
+        fit = CHUNK_BYTES // (int(np.prod(self.row)) * self.dtype.itemsize)
+        return max(min(fit, realisations), 1)
+
+
+def scenes(study: Study) -> list[Scene]:
+    """What a study's store holds: every star in every cell of the sweep, without and with each of its flares."""
+    found = []
+    number = 0
+    for at, cell in study.cells():
+        for star in cell.star:
+            number += 1
+            quiet, *flares = cell.expectations(star)
+            chosen = cell.bulk.chosen(quiet.n_frames)
+            # A flare's amplitude stands with its own array.
+            swept = {name: value for name, value in at.items() if name != "amplitude"}
+            name = titled(label(star, quiet), swept)
+            found.append(Scene(f"star-{number}", "quiescent", name, 0.0, quiet, chosen, swept))
+            for k, (amplitude, x) in enumerate(zip(cell.flare.amplitudes, flares, strict=True), 1):
+                found.append(Scene(f"star-{number}", f"flare-{k}", name, amplitude, x, chosen, swept))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Chunk:
+    """One chunk of one scene: rows `start` to `stop` - 1 of its array."""
+
+    scene: Scene
+    number: int
+    start: int
+    stop: int
+
+    @property
+    def name(self) -> str:
+        """Its file under the array's folder."""
+        return "/".join(["c", str(self.number), *["0"] * len(self.scene.row)])
+
+    @property
+    def key(self) -> str:
+        """Its file in the store."""
+        return f"{self.scene.path}/{self.name}"
+
+
+@dataclass(eq=False)
+class Store:
+    """A store and the study that made it, whose ``run.realisations`` are the rows of each array.
+
+    Attributes
+    ----------
+    path : Path
+    study : Study
+    digests : dict of str
+        By chunk, of what was written.
+    """
+
+    path: Path
+    study: Study
+    digests: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        missing = [name for name in ("zarr", "xxhash", "google_crc32c") if find_spec(name) is None]
+        if missing:
+            raise InputError(f"{missing[0]} is missing, expected it for stores: pip install 'mauvecl[bulk]'")
+
+    @classmethod
+    def open(cls, path: str | Path) -> Store:
+        """One that was written before; from the copy of its study where the root's is damaged.
+
+        Raises
+        ------
+        InputError
+            If it is none of mauvecl's.
+        """
+        path = Path(path)
+        for place in (path / "zarr.json", *sorted(path.glob("*/*/zarr.json"))):
+            try:
+                text = json.loads(place.read_text(encoding="utf-8"))["attributes"]["study"]
+                found = cls(path, Study.build(tomllib.loads(text), path.name))
+            except (OSError, ValueError, KeyError, TypeError, InputError):
+                continue
+            found.read_digests()
+            return found
+        raise InputError(f"{str(path)!r} is no store of spectra, expected a folder that `mauvecl realise` wrote")
+
+    @cached_property
+    def scenes(self) -> list[Scene]:
+        """Its arrays of spectra."""
+        return scenes(self.study)
+
+    def scene(self, path: str) -> Scene:
+        """One of them, such as ``star-1/flare-2``.
+
+        Raises
+        ------
+        InputError
+            If there is none.
+        """
+        found = next((scene for scene in self.scenes if scene.path == path), None)
+        if found is None:
+            raise InputError(
+                f"no array {path!r} in {self.path.name}, expected one of {', '.join(s.path for s in self.scenes)}"
+            )
+        return found
+
+    @property
+    def rows(self) -> int:
+        """Realisations of each array."""
+        return self.study.run.realisations
+
+    @property
+    def n_bytes(self) -> int:
+        """Bytes of all spectra."""
+        return sum(self.rows * int(np.prod(s.row)) * s.dtype.itemsize for s in self.scenes)
+
+    def chunks(self) -> Iterator[Chunk]:
+        """All chunks, scene by scene."""
+        for scene in self.scenes:
+            rows = scene.chunk_rows(self.rows)
+            for number, start in enumerate(range(0, self.rows, rows)):
+                yield Chunk(scene, number, start, min(start + rows, self.rows))
+
+    def make(self) -> None:
+        """Write what describes the arrays, nothing of them yet; or see that it is there already.
+
+        Raises
+        ------
+        InputError
+            If another study's store is there, with the keys that differ; or the folder cannot be written.
+        """
+        root = self.path / "zarr.json"
+        if root.exists():
+            self._check_same()
+            self.read_digests()
+            return
+        ours = {scene.group for scene in self.scenes}
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            other = [p.name for p in self.path.iterdir() if p.name not in ours and not p.name.startswith(UNFINISHED)]
+        except OSError as error:
+            raise InputError(
+                f"store {str(self.path)!r} cannot be made ({error.strerror}), expected a writable folder"
+            ) from error
+        if other:
+            raise InputError(f"{str(self.path)!r} holds {min(other)!r} and no store, expected an empty or a new folder")
+        # The root comes last: where it is, everything else is.
+        made = self.description()
+        for name in sorted(made, key=lambda name: name == root.name):
+            write_whole(self.path / name, made[name])
+
+    def description(self) -> dict[str, bytes]:
+        """Every file of the store but its spectra, by its place."""
+        with tempfile.TemporaryDirectory() as folder:
+            describe(self, Path(folder))
+            files = [p for p in Path(folder).rglob("*") if p.is_file()]
+            return {str(p.relative_to(folder)): p.read_bytes() for p in files}
+
+    def _check_same(self) -> None:
+        there = Store.open(self.path).study
+        differing = differing_keys(self.study.model_dump(mode="json"), there.model_dump(mode="json"))
+        if differing:
+            raise InputError(
+                f"store {str(self.path)!r} was begun by another study, which differs in {', '.join(differing)}, "
+                "expected the same study or another place"
+            )
+
+    def read_digests(self) -> None:
+        """Look up what was written; lines that are not whole say nothing."""
+        self.digests = {}
+        for scene in self.scenes:
+            try:
+                text = (self.path / scene.path / DIGESTS).read_text(encoding="utf-8", errors="replace")
+            except OSError:
+                continue
+            for line in text.splitlines():
+                name, _, rest = line.partition(" ")
+                found, _, check = rest.partition(" ")
+                if check == _check(name, found):
+                    self.digests[f"{scene.path}/{name}"] = found
+
+    def note(self, chunk: Chunk, found: str) -> None:
+        """Add a chunk's digest to its array's list."""
+        self.digests[chunk.key] = found
+        line = f"{chunk.name} {found} {_check(chunk.name, found)}\n"
+        try:
+            # One short write at the end of the file; a line cut short by a full disk is closed by the next.
+            with (self.path / chunk.scene.path / DIGESTS).open("a+b", buffering=0) as file:
+                file.seek(0, 2)
+                if file.tell():
+                    file.seek(-1, 2)
+                    line = line if file.read(1) == b"\n" else "\n" + line
+                file.write(line.encode())
+        except OSError as error:
+            raise InputError(
+                f"{chunk.scene.path}/{DIGESTS} of {self.path.name} cannot be written ({error.strerror}), expected a "
+                "writable disk with room; what was written before is kept"
+            ) from error
+
+    def encode(self, chunk: Chunk, rows: NDArray[Any]) -> tuple[memoryview, bytes]:
+        """A chunk as Zarr's codecs `bytes` and `crc32c` have it: whole, the last one filled with zeros."""
+        import google_crc32c
+
+        full = chunk.scene.chunk_rows(self.rows)
+        if len(rows) < full:
+            rows = np.concatenate([rows, np.zeros((full - len(rows), *chunk.scene.row), rows.dtype)])
+        data = memoryview(np.ascontiguousarray(rows, chunk.scene.dtype).data).cast("B")
+        return data, int(google_crc32c.value(data.obj)).to_bytes(4, "little")
+
+    def place(self, chunk: Chunk, rows: NDArray[Any]) -> str:
+        """Write a chunk, whole or not at all; returns its digest."""
+        data, check = self.encode(chunk, rows)
+        write_whole(self.path / chunk.key, data, check)
+        return digest(data, check)
+
+    def has(self, chunk: Chunk) -> bool:
+        """Whether a chunk was written, by the list of digests and its size; `verify.state` looks into it."""
+        try:
+            size = (self.path / chunk.key).stat().st_size
+        except OSError:
+            return False
+        rows = chunk.scene.chunk_rows(self.rows)
+        return (
+            chunk.key in self.digests and size == rows * int(np.prod(chunk.scene.row)) * chunk.scene.dtype.itemsize + 4
+        )
+
+
+def digest(*parts: bytes | memoryview) -> str:
+    """XXH3, 128 bits, of some parts together."""
+    import xxhash
+
+    found = xxhash.xxh3_128()
+    for part in parts:
+        found.update(part)
+    return found.hexdigest()
+
+
+def _check(*words: str) -> str:
+    return digest(" ".join(words).encode())[:8]
+
+
+def describe(store: Store, folder: Path) -> None:
+    """Everything of a store but its spectra: groups, arrays' descriptions, calibration."""
+    import zarr
+    from zarr.codecs import Crc32cCodec
+
+    study = store.study.toml()
+    with warnings.catch_warnings():
+        # A folder that holds nothing yet.
+        warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
+        root = zarr.open_group(folder, mode="w", zarr_format=3)
+        run: dict[str, Any] = {"study": study, "seed": store.study.run.seed, "realisations": store.rows}
+        root.attrs.update(run | {"mauvecl": __version__, "draws": COMMON_DRAWS, "throughput": NOMINAL})
+        for scene in store.scenes:
+            x, group = scene.expectation, root.require_group(scene.group)
+            if scene.name == "quiescent":
+                group.attrs.update({"star": scene.star, **scene.at})
+                group.attrs.update({"exposure_s": x.exposure_s, "frames": x.n_frames, "messages": messages_of([x])})
+                for name, unit in CALIBRATION.items():
+                    _values(group, name, np.asarray(getattr(x, name)), unit, ["pixel"])
+                if scene.frames is not None:
+                    _values(group, "frame", np.array(scene.frames), "", ["frame"])
+            if store.study.bulk.components:
+                n = x.n_frames if scene.frames is None else 1
+                gain = n * x.gain_dn_per_electron
+                for name, values in (
+                    ("source", gain * x.source_electrons),
+                    ("sky", gain * x.sky_electrons),
+                    ("noise", np.sqrt(x.variance_dn2 * n / x.n_frames)),
+                ):
+                    _values(group, f"{scene.name}-{name}", values, "DN", ["pixel"])
+            dimensions = ["realisation", *(["frame"] if scene.frames is not None else []), "pixel"]
+            array = group.create_array(
+                scene.name,
+                shape=(store.rows, *scene.row),
+                chunks=(scene.chunk_rows(store.rows), *scene.row),
+                dtype=scene.dtype,
+                compressors=[Crc32cCodec()],
+                fill_value=0,
+                dimension_names=dimensions,
+            )
+            origin: dict[str, Any] = {"star": scene.star, "provenance": dict(x.provenance), "study": study}
+            array.attrs.update(origin | {"units": "DN", "amplitude": scene.amplitude})
+
+
+def _values(group: Any, name: str, values: NDArray[Any], unit: str, dimensions: list[str]) -> None:
+    from zarr.codecs import Crc32cCodec
+
+    array = group.create_array(
+        name, data=values, chunks=values.shape, compressors=[Crc32cCodec()], dimension_names=dimensions
+    )
+    array.attrs["units"] = unit
