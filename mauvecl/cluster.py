@@ -6,6 +6,7 @@ import contextlib
 import logging
 import os
 import threading
+import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
 from functools import partial
@@ -27,6 +28,8 @@ if TYPE_CHECKING:
 PATIENCE_S, WORKER_PATIENCE_S = 10.0, 120.0
 #: A share is sent out so often before the run ends: workers die by twos and threes on a cluster that is taken back.
 TRIES = 8
+#: Seconds between two looks at how many workers there are; requests kept with the workers at a time.
+RECOUNT_S, REQUESTS = 5.0, 32
 #: What tells PoCL, old and new, how many threads it may use.
 THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
 
@@ -80,14 +83,23 @@ class DaskWorkers:
                 if answer[0] != __version__:
                     raise DeviceError(f"worker {worker} has mauvecl {answer[0]}, expected {__version__} as here")
             self._devices = [record for _, record in found.values()]
+            self._counted = len(found), time.monotonic()
         except BaseException:
             self._open.close()
             raise
 
     @property
     def count(self) -> int:
-        """Workers now."""
-        return max(len(self._client.nthreads()), 1)
+        """Workers, as they were not long ago."""
+        if time.monotonic() > self._counted[1] + RECOUNT_S:
+            try:
+                self._counted = max(len(self._client.nthreads()), 1), time.monotonic()
+            except OSError as error:
+                raise self._gone() from error
+        return self._counted[0]
+
+    def _gone(self) -> DeviceError:
+        return DeviceError(f"the scheduler of cluster {self._where} is gone, expected it to stay to the end")
 
     def describe(self) -> list[DeviceRecord]:
         """The devices of the workers that were there at the beginning."""
@@ -104,11 +116,18 @@ class DaskWorkers:
             if self._closing:
                 found.cancel()
                 return
-            if key not in self._given:
-                # A task rather than scattered data: the scheduler can make it again where a worker took it along.
-                self._given = {key: self._client.submit(_keep, request, key=f"mauvecl-request-{key}")}
-            name = f"mauvecl-{key}-{share.name}-{tried}"
-            sent = self._client.submit(_count, self._given[key], share, self._device, key=name, pure=False)
+            try:
+                if key not in self._given:
+                    # A task rather than scattered data: the scheduler can make it again where a worker took it along.
+                    self._given[key] = self._client.submit(_keep, request, key=f"mauvecl-request-{key}")
+                    if len(self._given) > REQUESTS:
+                        del self._given[next(iter(self._given))]
+                name = f"mauvecl-{key}-{share.name}-{tried}"
+                sent = self._client.submit(_count, self._given[key], share, self._device, key=name, pure=False)
+            except (OSError, RuntimeError) as error:
+                # Dask raises either where its client has lost the scheduler.
+                found.set_exception(self._gone().with_traceback(error.__traceback__))
+                return
             self._sent.add(sent)
         sent.add_done_callback(partial(self._came, found, request, key, share, tried))
 
@@ -132,13 +151,13 @@ class DaskWorkers:
                                 f"{share.start + share.count - 1}: {told}")
                 )  # fmt: skip
             elif sent.status in ("cancelled", "lost") and self._client.status != "running":
-                found.set_exception(DeviceError(f"the scheduler of cluster {self._where} is gone, expected it to stay"))
+                found.set_exception(self._gone())
             else:
                 with self._lock:
                     self.retries += 1
                     if error is None:
                         # The request itself was lost with its worker.
-                        self._given.clear()
+                        self._given.pop(key, None)
                 self._send(found, request, key, share, tried + 1)
         except BaseException as error:
             if not found.done():
@@ -149,7 +168,8 @@ class DaskWorkers:
         with self._lock:
             self._closing = True
             sent = list(self._sent)
-        self._client.cancel(sent)
+        with contextlib.suppress(OSError, RuntimeError):
+            self._client.cancel(sent)
 
     def close(self) -> None:
         """Let the workers go; those of this machine end."""
@@ -163,6 +183,10 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
     """A connection to the cluster, which is made first where it is this machine's."""
     import dask
 
+    for name in LOGS:
+        # What the user must know is told in a sentence.
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    how: dict[str, Any]
     with contextlib.ExitStack() as stack:
         word, _, number = where.partition(":")
         if word == "local":
@@ -170,20 +194,18 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
                 raise InputError(f"--cluster {where!r}, expected local:N with N from 1 to 1024")
             threads = max((os.cpu_count() or 1) // int(number), 1)
             # Deaths are counted and shares sent out again here, so that they are told.
-            quiet: dict[str, Any] = {"distributed.scheduler.allowed-failures": 0, "distributed.admin.tick.limit": "1h"}
-            stack.enter_context(dask.config.set(quiet | {"logging": dict.fromkeys(LOGS, "critical")}))
-            for name in LOGS:
-                logging.getLogger(name).setLevel(logging.CRITICAL)
+            how = {"distributed.scheduler.allowed-failures": 0, "distributed.admin.tick.limit": "1h"}
+            stack.enter_context(dask.config.set(how | {"logging": dict.fromkeys(LOGS, "critical")}))
             cluster = distributed.LocalCluster(
                 n_workers=int(number),
                 threads_per_worker=1,
                 processes=True,
-                dashboard_address=None,
+                dashboard_address="127.0.0.1:0",
                 memory_limit=0,
                 silence_logs=logging.CRITICAL,
                 env=dict.fromkeys(THREADS, str(threads)),
             )
-            how: dict[str, Any] = {"address": stack.enter_context(cluster)}
+            how = {"address": stack.enter_context(cluster)}
         elif "://" in where:
             how = {"address": where}
         elif Path(where).is_file():
@@ -199,7 +221,7 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
         yield client
 
 
-LOGS = ("distributed", "distributed.nanny", "distributed.worker", "distributed.scheduler", "distributed.core")
+LOGS = ("distributed", *(f"distributed.{part}" for part in ("client", "nanny", "worker", "scheduler", "core")))
 
 # On a worker.
 

@@ -437,20 +437,38 @@ def test_bad_studies_are_a_sentence(text: str, sentence: str, tmp_path: Path) ->
     assert len(done.stderr.splitlines()) == 1
 
 
-def test_interruption_ends_cleanly(tmp_path: Path) -> None:
-    process = subprocess.Popen(
-        [*COMMAND, "detect", "-n", "2000000000"],
-        cwd=tmp_path,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-    )
-    time.sleep(8)
-    process.send_signal(signal.SIGINT)
-    _, errors = process.communicate(timeout=30)
-    assert process.returncode == 130
-    assert "interrupted" in errors
+LONG = ("detect", "--star", "G2V", "-m", "7.4", "--statistic", "chi2", "-n", "3200000", "--no-pictures")
+
+
+@pytest.fixture(scope="module")
+def never_stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The answer of a run of four shares that nobody stopped."""
+    folder = tmp_path_factory.mktemp("long")
+    run(*LONG, "--output", "out", folder=folder)
+    return folder / "out"
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_stopped_and_resumed_as_if_never_stopped(stop: signal.Signals, tmp_path: Path, never_stopped: Path) -> None:
+    """Ctrl-C, the end of a batch job, kill -9: a second run goes on, and writes the same tables."""
+    command = [*COMMAND, *LONG, "--keep-after", "0", "--output", "out"]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    shares = tmp_path / "out" / "checkpoint"
+    while not list(shares.glob("*.npz")):
+        time.sleep(0.02)
+        assert process.poll() is None
+    process.send_signal(stop)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -9}[stop]
     assert "Traceback" not in errors
+    if stop != signal.SIGKILL:
+        assert "kept in 'out/checkpoint', and the same command with --resume goes on from there" in errors
+    kept = sum(int(p.stem.split("-")[-1]) for p in shares.glob("*.npz"))
+    run(*LONG, "--output", "out", "--resume", folder=tmp_path)
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["shares"]["resumed"] == kept > 0
+    assert not shares.exists()
+    for name in ("detection.ecsv", "tails.ecsv", "roc.ecsv", "departures.ecsv"):
+        assert (tmp_path / "out" / name).read_bytes() == (never_stopped / name).read_bytes()
 
 
 def test_nothing_heavy_is_loaded_early() -> None:

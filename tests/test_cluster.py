@@ -1,0 +1,180 @@
+"""Dask workers in processes of their own: the same bits, whoever dies."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.testing import CliRunner
+
+from mauvecl import bulk, shards
+from mauvecl.cli import app
+from mauvecl.cluster import DaskWorkers
+from mauvecl.engine import DeviceError, Engine
+from mauvecl.host.errors import InputError
+from mauvecl.host.expectation import Expectation
+from mauvecl.pool import Pool
+from tests.scenes import instrument, star
+from tests.test_pool import N, same, same_snr, small
+
+
+@pytest.fixture(autouse=True)
+def small_shares(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shares of 4096 realisations."""
+    monkeypatch.setattr(shards, "SHARE", 1)
+
+
+@pytest.fixture(scope="module")
+def scene() -> list[Expectation]:
+    return star(amplitudes=(0.05, 0.24), payload=instrument(part=True))
+
+
+@pytest.fixture(scope="module")
+def workers() -> Iterator[DaskWorkers]:
+    """Two processes; tests that kill some find new ones there afterwards."""
+    found = DaskWorkers("local:2")
+    yield found
+    found.close()
+
+
+def test_two_processes_give_one_answer(workers: DaskWorkers, engine: Engine, scene: list[Expectation]) -> None:
+    quiet, *flares = scene
+    pool = Pool(workers)
+    assert workers.count == 2
+    same(pool.detect(quiet, flares, realisations=N, seed=5), engine.detect(quiet, flares, realisations=N, seed=5))
+    same_snr(pool.snr(quiet, realisations=N, seed=5), engine.snr(quiet, realisations=N, seed=5))
+    assert pool.standing.shares == 16
+    assert [device.name for device in pool.devices] == [engine.device.name] * 2
+
+
+def test_a_worker_killed_in_mid_run(workers: DaskWorkers, engine: Engine, scene: list[Expectation]) -> None:
+    """SIGKILL to a process that is counting: its share is counted by another, and the answer keeps its bits."""
+    quiet, *flares = scene
+    n, pids = 150_000, list(workers._client.run(os.getpid).values())
+    pool = Pool(workers)
+
+    def kill() -> None:
+        while pool.standing.shares < 10:
+            time.sleep(0.005)
+        os.kill(pids[0], signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    found = pool.detect(quiet, flares, realisations=n, seed=6)
+    killer.join()
+    same(found, engine.detect(quiet, flares, realisations=n, seed=6))
+    assert pids[0] not in workers._client.run(os.getpid).values()
+    assert pool.standing.retries >= 1, "the share in its hands was counted again"
+
+
+def test_raw_spectra_by_two_processes(workers: DaskWorkers, tmp_path: Path, engine: Engine) -> None:
+    study = small().with_settings(["run.realisations=500"])
+    bulk.realise(study, tmp_path / "s.zarr", Pool(workers))
+    assert bulk.verify(tmp_path / "s.zarr", engine, redraw=True) == []
+
+
+def test_a_mistake_on_a_worker_is_a_sentence(workers: DaskWorkers, scene: list[Expectation]) -> None:
+    """An error that another try would not mend is not tried again."""
+    before = workers.retries
+
+    class Impossible:
+        def count(self, *given: Any) -> Any:
+            raise InputError("frames = -1, expected at least 1")
+
+    with pytest.raises(DeviceError, match=r"cluster local:2 failed at realisations 0 to 9: .*frames = -1"):
+        workers.submit(Impossible(), "key", shards.Share(0, 0, 10), lambda done: None).result()
+    assert workers.retries == before
+
+
+@contextmanager
+def by_hand(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], Path]]:
+    """A scheduler and a worker started by hand, as on a cluster; the scheduler and its file."""
+    file, dask = folder / "scheduler.json", Path(sys.executable).with_name("dask")
+
+    def start(*words: str | Path) -> subprocess.Popen[bytes]:
+        command = [dask, *words, "--scheduler-file", file, "--no-dashboard"]
+        return subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    scheduler = start("scheduler", "--port", "0", "--host", "127.0.0.1")
+    while not file.exists() or not file.read_text().strip():
+        time.sleep(0.05)
+    worker = start("worker", "--nthreads", "1")
+    try:
+        yield scheduler, file
+    finally:
+        for process in (worker, scheduler):
+            process.terminate()
+            process.wait(20)
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:
+    """Its address and its file."""
+    with by_hand(tmp_path_factory.mktemp("cluster")) as (_, file):
+        yield json.loads(file.read_text())["address"], file
+
+
+@pytest.mark.parametrize("by", ["address", "file"])
+def test_a_cluster_that_is_there(
+    cluster: tuple[str, Path], by: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By address and by scheduler file, from the command line; the tables are those of one machine."""
+    monkeypatch.chdir(tmp_path)
+    Path("study.toml").write_text(small().toml())
+    flags = ["detect", "study.toml", "--no-pictures", "--quiet"]
+    where = cluster[0] if by == "address" else str(cluster[1])
+    for folder, more in (("one", []), ("many", ["--cluster", where])):
+        done = CliRunner().invoke(app, [*flags, "--output", folder, *more])
+        assert done.exit_code == 0, done.output
+    for name in ("detection.ecsv", "tails.ecsv", "roc.ecsv", "departures.ecsv"):
+        assert Path("many", name).read_bytes() == Path("one", name).read_bytes()
+    assert '"retries": 0' in Path("many/run.json").read_text()
+
+
+def test_a_scheduler_that_dies(tmp_path: Path, scene: list[Expectation]) -> None:
+    with by_hand(tmp_path) as (scheduler, file):
+        workers = DaskWorkers(str(file))
+        pool = Pool(workers)
+
+        def kill() -> None:
+            while pool.standing.shares < 5:
+                time.sleep(0.005)
+            scheduler.kill()
+
+        threading.Thread(target=kill).start()
+        with pytest.raises(DeviceError, match=r"the scheduler of cluster .* is gone, expected it to stay"):
+            pool.detect(scene[0], scene[1:], realisations=1_000_000, seed=1)
+        workers.stop()
+        workers.close()
+
+
+@pytest.mark.parametrize(
+    ("where", "kind", "sentence"),
+    [
+        ("local:0", InputError, "--cluster 'local:0', expected local:N with N from 1"),
+        ("nowhere.json", InputError, "expected local:N, an address such as tcp://host:8786, or a scheduler file"),
+        ("tcp://127.0.0.1:1", DeviceError, "no scheduler answers at tcp://127.0.0.1:1, expected one within"),
+    ],
+)
+def test_no_cluster_is_a_sentence(
+    where: str, kind: type[Exception], sentence: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mauvecl.cluster.PATIENCE_S", 1.0)
+    with pytest.raises(kind, match=sentence.replace("(", r"\(")):
+        DaskWorkers(where)
+
+
+def test_without_dask(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"Dask is missing.*pip install 'mauvecl\[cluster\]'"):
+        DaskWorkers("local:2")
