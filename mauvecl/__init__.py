@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mauvecl.host.source import Source
     from mauvecl.limits import limiting_magnitude, shortest_exposure, smallest_amplitude
     from mauvecl.maps import detection_map
+    from mauvecl.pool import Pool
     from mauvecl.statistics import Linear
     from mauvecl.study import Study
 
@@ -31,6 +32,7 @@ __all__ = [
     "InputError",
     "Instrument",
     "Linear",
+    "Pool",
     "Sky",
     "Source",
     "Study",
@@ -50,6 +52,7 @@ _HOMES = {
     "InputError": "host.errors",
     "Instrument": "host.instrument",
     "Linear": "statistics",
+    "Pool": "pool",
     "Sky": "host.sky",
     "Source": "host.source",
     "Study": "study",

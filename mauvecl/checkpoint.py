@@ -179,7 +179,7 @@ class Checkpoint:
         while self._held:
             name, share = self._held[0]
             body = io.BytesIO()
-            np.savez_compressed(body, **share)  # type: ignore[arg-type]
+            np.savez(body, **share)  # type: ignore[arg-type]
             data = body.getvalue()
             write_whole(self.folder / f"{name}.npz", data, _named(name, data))
             self._held.pop(0)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from mauvecl.engine import Engine
 
 #: Seconds to find a scheduler, and then a first worker.
-PATIENCE_S, WORKER_PATIENCE_S = 10.0, 120.0
+PATIENCE_S, WORKER_PATIENCE_S = 30.0, 120.0
 #: A share is sent out so often before the run ends: workers die by twos and threes on a cluster that is taken back.
 TRIES = 8
 #: Seconds between two looks at how many workers there are; requests kept with the workers at a time.

@@ -72,6 +72,7 @@ class Engine:
         self._progress = progress
         self._tile = tile
         self._programs: dict[str, Any] = {}
+        self._kernels: dict[tuple[str, str], Any] = {}
         self._pid = os.getpid()
         cpu = self.device.kind == "cpu"
         self._width = width or (16 if cpu else 1)
@@ -453,12 +454,14 @@ class Engine:
         need = -(-stop // self._step) * self._step
         return Tile(first + skip, need - skip, start - skip, stop - skip)
 
-    def program(self, rooms: tuple[str, ...], variant: Variant) -> Any:
-        """The built program of one template."""
+    def kernel(self, rooms: tuple[str, ...], variant: Variant, name: str) -> Any:
+        """A kernel of the built program of some templates; both are made once."""
         source = program.render(rooms, variant)
         if source not in self._programs:
             self._programs[source] = program.build(self.context, source)
-        return self._programs[source]
+        if (source, name) not in self._kernels:
+            self._kernels[source, name] = self.cl.Kernel(self._programs[source], name)
+        return self._kernels[source, name]
 
     def _scene(
         self,

@@ -118,7 +118,7 @@ class Run:
             # One build for the two that are always used together.
             detection = COMPARED if self.variant.compared else DETECTION
             rooms = detection if name in DETECTION else (name,)
-            self._kernels[name] = self._cl.Kernel(self._engine.program(rooms, self.variant), name)
+            self._kernels[name] = self._engine.kernel(rooms, self.variant, name)
         local = (1,) * len(items) if self.variant.width > 1 else None
         self._kernels[name](self._queue, items, local, *arguments)
 

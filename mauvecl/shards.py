@@ -32,6 +32,9 @@ Arrays = dict[str, NDArray[Any]]
 
 #: Realisations times pixels times scenarios of one share, about: some seconds of a processor's work.
 SHARE = 2**34
+#: Shares of one part of a request, about, at most: larger requests have larger shares, so that one process can add up
+#: what a thousand count.
+MOST = 2**13
 
 
 class Countable(Protocol):
@@ -80,7 +83,8 @@ class Share:
 
 def shares(request: Request) -> list[Share]:
     """All shares of a request: cut at multiples of a power of two, whatever counts them."""
-    size = 1 << max((SHARE // request.work).bit_length() - 1, 12)
+    wanted = max(SHARE // request.work, request.realisations // MOST)
+    size = 1 << max(wanted.bit_length() - 1, 12)
     first, end = request.start, request.start + request.realisations
     cuts = [first, *range(first - first % size + size, end, size), end]
     return [Share(part, a, b - a) for part in range(request.parts) for a, b in itertools.pairwise(cuts)]
@@ -242,14 +246,18 @@ def _asked(request: Any) -> dict[str, Any]:
 
 
 def _sparse(name: str, counts: NDArray[np.int64]) -> Arrays:
-    """Where counts are not zero, and what they are: most bins are empty."""
+    """Steps from one bin that is not empty to the next, and what these hold, in as few bytes as they need."""
     where = np.flatnonzero(counts)
-    return {f"{name}-where": where.astype(np.uint32), name: counts.ravel()[where]}
+    return {f"{name}-steps": _narrow(np.diff(where, prepend=0)), name: _narrow(counts.ravel()[where])}
+
+
+def _narrow(values: NDArray[np.int64]) -> NDArray[np.unsignedinteger]:
+    return values.astype(np.min_scalar_type(int(values.max(initial=0))))
 
 
 def _dense(name: str, share: Arrays, shape: tuple[int, ...]) -> NDArray[np.int64]:
     counts = np.zeros(int(np.prod(shape)), np.int64)
-    counts[share[f"{name}-where"]] = share[name]
+    counts[np.cumsum(share[f"{name}-steps"], dtype=np.int64)] = share[name]
     return counts.reshape(shape)
 
 

@@ -192,8 +192,12 @@ class TailSamples:
 
     def add(self, values: NDArray[np.float32], first: int) -> None:
         """Look through the values of realisations `first` and on; of equal ones the earlier realisation stays."""
+        signed = self._sign * values
         if self.values.size == TAIL_SAMPLES:
-            found = np.flatnonzero(self._sign * values > self._sign * self.values[-1])
+            found = np.flatnonzero(signed > self._sign * self.values[-1])
+        elif values.size > TAIL_SAMPLES:
+            # None below the thousandth can be kept, and sorting few is fast.
+            found = np.flatnonzero(signed >= np.partition(signed, -TAIL_SAMPLES)[-TAIL_SAMPLES])
         else:
             found = np.arange(values.size)
         if not found.size:

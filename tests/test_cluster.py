@@ -119,9 +119,30 @@ def by_hand(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], Path]]:
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:
-    """Its address and its file."""
-    with by_hand(tmp_path_factory.mktemp("cluster")) as (_, file):
-        yield json.loads(file.read_text())["address"], file
+    """What the documentation's example for batch systems starts; its address and its file."""
+    pytest.importorskip("dask_jobqueue")
+    folder = tmp_path_factory.mktemp("cluster")
+    example, file = Path(__file__).parent.parent / "docs" / "examples" / "batch_cluster.py", folder / "scheduler.json"
+    words = ["local", "--jobs", "1", "--cores", "1", "--memory", "2GB"]
+    script = subprocess.Popen([sys.executable, example, *words], cwd=folder, stdout=subprocess.DEVNULL)
+    while not file.exists():
+        time.sleep(0.05)
+        assert script.poll() is None
+    yield json.loads(file.read_text())["address"], file
+    script.terminate()
+    script.wait(20)
+    assert not file.exists()
+
+
+@pytest.mark.parametrize(("system", "line"), [("slurm", "#SBATCH -p astro"), ("pbs", "#PBS -q astro")])
+def test_the_example_for_batch_systems(system: str, line: str) -> None:
+    pytest.importorskip("dask_jobqueue")
+    example = Path(__file__).parent.parent / "docs" / "examples" / "batch_cluster.py"
+    command = [sys.executable, example, system, "--queue", "astro", "--cores", "4", "--show"]
+    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert line in told
+    assert "--nthreads 1" in told
+    assert "--nworkers 4" in told
 
 
 @pytest.mark.parametrize("by", ["address", "file"])

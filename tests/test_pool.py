@@ -254,6 +254,16 @@ def test_shares_do_not_depend_on_the_number_of_realisations(scene: list[Expectat
         assert sum(share.count for share in request_shares) == n
 
 
+def test_large_requests_have_larger_shares(scene: list[Expectation], monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that there are never more than one process can add up."""
+    monkeypatch.setattr(shards, "SHARE", 2**34)
+    for n in (10**6, 10**9, 10**12, 10**15):
+        found = shards.shares(DetectRequest(scene[0], tuple(scene[1:]), n, 5, ("chi2",)))
+        assert len(found) <= 2 * shards.MOST + 1
+        assert sum(share.count for share in found) == n
+        assert all(share.count & (share.count - 1) == 0 for share in found[:-1])
+
+
 def interrupting(after: int) -> Callable[[int, int], None]:
     def progress(done: int, total: int) -> None:
         if done >= after:

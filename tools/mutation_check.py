@@ -39,6 +39,24 @@ CUMULANTS = "mauvecl/cumulants.py"
 SHAPE = "    g1, g2, g3 = c.shape()\n    sd ="
 
 MUTATIONS = {
+    "a share under another's name": Mutation(
+        (("mauvecl/checkpoint.py", 'name.encode() + b"\\0" + body', "body"),),
+        "tests/test_pool.py::test_a_share_in_anothers_place",
+    ),
+    "foreign chunks unseen": Mutation(
+        (("mauvecl/bulk.py", 'return "good" if digest(data) == known else "foreign"', 'return "good"'),),
+        "tests/test_bulk.py::test_faults_are_found_and_repaired_to_the_bit",
+    ),
+    "half a failed share kept": Mutation(
+        (
+            (
+                "mauvecl/shards.py",
+                "        tally, samples = Tally(plan.grids), plan.tails()\n",
+                "        tally, samples = self._sums[part]\n",
+            ),
+        ),
+        "tests/test_pool.py::test_a_failed_launch_is_counted_again",
+    ),
     "7 rounds": Mutation(
         ((PHILOX, "range(3, 10)", "range(3, 7)"), (TWIN, "for r in range(10):", "for r in range(7):")),
         "tests/kernels/test_philox.py::test_known_answers",

@@ -1,0 +1,138 @@
+"""What it costs to cut work into shares, on one machine and on Dask workers, and what that means for a thousand cores.
+
+    python bench/shares.py [--shares N] [--repeats K] [--output bench/results/shares.ecsv]
+
+In turn, several times, of which the best counts: one request by an engine; the same by a pool with one device and a
+checkpoint; and by two Dask processes of one thread each. Then the parts of a share's overhead, one by one, and a plan
+for 1e15 pixel-realisations made of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import os
+import pickle
+import tempfile
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from astropy.table import Table
+
+from mauvecl.checkpoint import Checkpoint
+from mauvecl.cluster import DaskWorkers
+from mauvecl.engine import Engine
+from mauvecl.pool import LocalWorkers, Pool
+from mauvecl.shards import DetectRequest, fingerprint, shares
+from mauvecl.study import Run, Study
+
+#: The plan's work, pixel-realisations, and its cores.
+PLAN, CORES = 1e15, 1000
+
+
+def timed(work: Callable[[], Any], repeats: int = 5) -> tuple[float, Any]:
+    """The shortest of some times, s, and what came of it."""
+    seconds, found = [], None
+    for _ in range(repeats):
+        started = time.perf_counter()
+        found = work()
+        seconds.append(time.perf_counter() - started)
+    return min(seconds), found
+
+
+def main() -> None:
+    """Print the table and write it."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--shares", type=int, default=8, help="an even number")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results" / "shares.ecsv")
+    given = parser.parse_args()
+    study = Study().model_copy(update={"star": Study().star[1:], "run": Run()})
+    quiet, *flares = study.expectations(study.star[0])
+    how = (study.run.statistics,)
+    one = DetectRequest(quiet, tuple(flares), 1 << 40, 1, *how)
+    size = shares(DetectRequest(quiet, tuple(flares), 1 << 30, 1, *how))[0].count
+    n = given.shares * size
+    draws = n * one.work
+
+    engine = Engine()
+    workers = DaskWorkers("local:2")
+    clustered = Pool(workers)
+    with tempfile.TemporaryDirectory() as folder, Checkpoint(Path(folder), "bench", study, patience_s=0.0) as kept:
+        local = Pool(LocalWorkers(), checkpoint=kept)
+        ways = {"engine, 2 threads": engine, "pool with checkpoint": local, "2 Dask processes of 1 thread": clustered}
+        rates: dict[str, list[float]] = {name: [] for name in ways}
+        for way in ways.values():
+            way.detect(quiet, flares, realisations=size, seed=10**6)
+        for seed in range(given.repeats):
+            for name, way in ways.items():
+                started = time.perf_counter()
+                way.detect(quiet, flares, realisations=n, seed=seed)
+                rates[name].append(draws / (time.perf_counter() - started))
+        # What else a machine does only slows: the best of each.
+        best = {name: max(values) for name, values in rates.items()}
+        rows = [(f"{name} (pixel-realisations/s)", f"{rate:.3g}") for name, rate in best.items()]
+        base = best["engine, 2 threads"]
+        rows += [(f"{name} / engine", f"{rate / base:.3f}") for name, rate in best.items() if rate != base]
+
+        # The parts of one share's overhead.
+        request = DetectRequest(quiet, tuple(flares), n, 1, *how)
+        prepared = timed(lambda: pickle.loads(pickle.dumps(request)).plans)[0]
+        counting, share = timed(lambda: request.count(engine, 0, 0, size))
+        bare = timed(lambda: engine.detect(quiet, flares, realisations=size, seed=1))[0]
+        packing, sent = timed(lambda: pickle.dumps(share))
+        adding = timed(lambda: DetectRequest(quiet, tuple(flares), n, 1, *how).add(0, pickle.loads(sent)))[0]
+        adding -= timed(lambda: DetectRequest(quiet, tuple(flares), n, 1, *how).plans)[0]
+        body = io.BytesIO()
+        np.savez(body, **share)
+        key = fingerprint(request)
+        keeping = timed(lambda: kept.put(f"{key}-bench", share))[0]
+        # What Dask itself takes: a task that does nothing, as many as shares would be.
+        client = workers._client
+        tasks = 500
+        asking = timed(lambda: client.gather([client.submit(abs, k, pure=False) for k in range(tasks)]), 3)[0] / tasks
+        client_s = adding + keeping + asking
+        rows += [
+            ("realisations of a share", f"{size}"),
+            ("pixel-realisations of a share", f"{size * one.work:.2e}"),
+            ("share on 2 threads (s)", f"{bare:.2f}"),
+            ("request prepared, once a worker (s)", f"{prepared:.3f}"),
+            ("share counted and packed, beyond the same by the engine (s)", f"{counting - bare:+.3f}"),
+            ("share pickled (s)", f"{packing:.4f}"),
+            ("share added (s)", f"{max(adding, 0.0):.4f}"),
+            ("share kept on the disk (s)", f"{keeping:.3f}"),
+            ("Dask, a task (s)", f"{asking:.4f}"),
+            ("request as a message (MB)", f"{len(pickle.dumps(request)) / 1e6:.2f}"),
+            ("share as a message (MB)", f"{len(sent) / 1e6:.2f}"),
+            ("share on the disk (MB)", f"{len(body.getvalue()) / 1e6:.2f}"),
+        ]
+    # The plan: by the clustered rate of a core here, with the shares that a request of that size is cut into.
+    core = best["2 Dask processes of 1 thread"] / 2
+    large = shares(DetectRequest(quiet, tuple(flares), int(PLAN / one.work), 1, *how))
+    count, each = len(large), large[0].count * one.work
+    seconds = PLAN / (core * CORES)
+    rows += [
+        (f"plan: {PLAN:g} pixel-realisations on {CORES} cores (s)", f"{seconds:.0f}"),
+        ("plan: shares", f"{count}"),
+        ("plan: seconds of a core for one share", f"{each / core:.1f}"),
+        ("plan: shares a second", f"{count / seconds:.1f}"),
+        ("plan: of the client's time, adding, keeping and asking", f"{count * client_s / seconds:.2f}"),
+        ("plan: cores idle while the last shares end, at most", f"{CORES / count:.2f}"),
+        ("plan: to the client (MB/s)", f"{count * len(sent) / 1e6 / seconds:.1f}"),
+        ("plan: files kept (GB)", f"{count * len(body.getvalue()) / 1e9:.1f}"),
+    ]
+    workers.close()
+    table = Table(rows=rows, names=("what", "value"))
+    scene = f"5 scenarios of {quiet.wavelength_nm.size} pixels, chi2, chi2_element and matched"
+    table.meta["run"] = (
+        f"{scene}; the best of {given.repeats} turns of {n} realisations; {os.cpu_count()} cores, {engine.device_name}"
+    )
+    table.pprint(max_lines=-1, max_width=-1)
+    table.write(given.output, format="ascii.ecsv", overwrite=True)
+
+
+if __name__ == "__main__":
+    main()
