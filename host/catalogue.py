@@ -45,20 +45,37 @@ def _names() -> dict[str, str]:
 
 
 def library_table() -> Table:
-    """The embedded spectra.
+    """The embedded spectra, and those of one's own behind them.
 
     Returns
     -------
     astropy.table.Table
-        Columns name, alias, spectral_type, star, origin, citation, licence, treatment, uv_quality (all text).
+        Columns name, alias, spectral_type, star, origin, citation, licence, treatment, uv_quality, kept (all text; the
+        last is "embedded" or "yours").
     """
+    from . import own_stars
+
     table = _read("index.ecsv")
     table.remove_columns(["file", "source_file"])
+    table["kept"] = "embedded"
+    for star in own_stars.kept():
+        row = dict.fromkeys(table.colnames, "") | {"name": star.name, "star": star.name, "origin": star.origin}
+        row |= {"treatment": "; ".join(star.notes), "kept": "yours"}
+        for name in table.colnames:
+            # Columns of text are as wide as their longest entry.
+            table[name] = table[name].astype(object)
+        table.add_row(row)
     return table
 
 
+def embedded(name: str) -> dict[str, str] | None:
+    """The index entry of an embedded spectrum by name, alias or star, in any case, or None."""
+    key = _names().get(name.strip().casefold())
+    return None if key is None else _index()[key]
+
+
 def find(name: str) -> dict[str, str]:
-    """The index entry of a library spectrum.
+    """The index entry of an embedded spectrum.
 
     Parameters
     ----------
@@ -68,16 +85,18 @@ def find(name: str) -> dict[str, str]:
     Raises
     ------
     InputError
-        If there is none; the message holds the nearest names.
+        If there is none; the message holds the nearest names, kept stars' among them.
     """
-    key = _names().get(name.strip().casefold())
-    if key is None:
-        near = difflib.get_close_matches(name.strip().casefold(), _names(), n=4, cutoff=0.3)
-        known = [_index()[_names()[n]]["name"] for n in near] or [entry["name"] for entry in _index().values()]
-        raise InputError(
-            f"library spectrum {name!r} is unknown, expected a name such as {', '.join(dict.fromkeys(known))}"
-        )
-    return _index()[key]
+    from . import own_stars
+
+    entry = embedded(name)
+    if entry is not None:
+        return entry
+    known = {key: _index()[value]["name"] for key, value in _names().items()}
+    known |= {star.name.casefold(): star.name for star in own_stars.kept()}
+    near = difflib.get_close_matches(name.strip().casefold(), known, n=4, cutoff=0.3)
+    names = [known[one] for one in near] or [entry["name"] for entry in _index().values()]
+    raise InputError(f"library spectrum {name!r} is unknown, expected a name such as {', '.join(dict.fromkeys(names))}")
 
 
 def spectrum_table(file: str) -> Table:

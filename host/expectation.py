@@ -312,6 +312,11 @@ def expect(
             f"The exposure of {asked_s:g} s is rounded up to {plain.exposure_s:g} s, "
             f"{n_frames} frame{'s' if n_frames > 1 else ''} of {instrument.frame_s:g} s."
         )
+    if any(note.startswith("dereddened") for note in source.notes) and not any("redden" in h for h in source.history):
+        messages.append(
+            f"{source.name} was freed of its dust by its archive: brighter in the ultraviolet than it is seen, unless "
+            "it is reddened again (ebv)."
+        )
     if instrument.notice:
         messages.append(instrument.notice)
     return replace(plain, messages=tuple(messages))

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from . import bands, catalogue
+from . import bands, catalogue, own_stars
 from .errors import InputError
 from .flare import Geometry, with_flare
 from .formats import read_spectrum
@@ -68,13 +68,16 @@ class Source:
 
     @classmethod
     def from_library(cls, name: str) -> Self:
-        """An embedded spectrum, by name in any case; `catalogue.library_table` lists them.
+        """An embedded spectrum, or one of one's own, by name in any case; `catalogue.library_table` lists them.
 
         Raises
         ------
         InputError
             For an unknown name, with the nearest ones.
         """
+        mine = own_stars.find(name) if catalogue.embedded(name) is None else None
+        if mine is not None:
+            return cls(*own_stars.spectrum(mine), mine.name, mine.origin, mine.notes)
         entry = catalogue.find(name)
         table = catalogue.spectrum_table(entry["file"])
         return cls(

@@ -12,6 +12,7 @@ import typer
 from mauvecl import __version__
 from mauvecl.cli_bulk import export, realise, verify
 from mauvecl.cli_detect import detect, gaussian
+from mauvecl.cli_library import app as library
 from mauvecl.cli_limits import detection_map, limit
 from mauvecl.cli_observe import exposure, simulate, snr
 from mauvecl.flags import DeviceFlag, JsonFlag, OutputFlag, QuietFlag
@@ -26,29 +27,6 @@ app = typer.Typer(
     "Start with `mauvecl detect`, which answers the question of the MauveSim paper. The throughput is nominal, not a "
     "flight calibration. Exit codes: 0 done, 1 a check found something, 2 bad input, 130 interrupted, 143 terminated.",
 )
-
-
-@app.command()
-def library(as_json: JsonFlag = False) -> None:
-    """List the embedded spectra.
-
-    Example: mauvecl library
-    """
-    from mauvecl.host.catalogue import library_table
-    from mauvecl.report import rows
-
-    table = library_table()
-    if as_json:
-        print(json.dumps(rows(table), indent=2))
-        return
-    from mauvecl.console import show_table
-
-    columns = ("name", "also", "type", "star", "UV at 190-210, 240-260, 290-310 nm", "licence")
-    cells = []
-    for row in table:
-        ratios = ", ".join(part.split()[0] for part in row["uv_quality"].split(": ")[1].split(", "))
-        cells.append(tuple(row[n] for n in ("name", "alias", "spectral_type", "star")) + (ratios, row["licence"]))
-    show_table("Embedded spectra (UV: mean flux over that at 540-560 nm); origin, citation: --json", columns, cells)
 
 
 @app.command()
@@ -132,6 +110,7 @@ def schema() -> None:
     print(json.dumps(Study.model_json_schema(), indent=2))
 
 
+app.add_typer(library, name="library")
 for verb in (simulate, snr, exposure, detect, gaussian, limit):
     app.command()(verb)
 app.command("map")(detection_map)

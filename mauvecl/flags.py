@@ -26,6 +26,10 @@ MagnitudeFlag = Annotated[
     typer.Option("--magnitude", "-m", help="Magnitude, one for all stars or one each.", show_default=False),
 ]
 BandFlag = Annotated[str | None, typer.Option(help="Band of the magnitude [V].", show_default=False)]
+EbvFlag = Annotated[
+    float | None,
+    typer.Option(help="Dust before the star, E(B-V), mag (needs mauvecl[extinction]).", show_default=False),
+]
 ExposureFlag = Annotated[
     float | None, typer.Option("--exposure", "-t", help="Seconds, rounded up to 5 s frames [50].", show_default=False)
 ]
@@ -177,6 +181,7 @@ OBSERVATION = {
     "star": Option(StarFlag),
     "magnitude": Option(MagnitudeFlag),
     "band": Option(BandFlag),
+    "ebv": Option(EbvFlag),
     "exposure": Option(ExposureFlag, "observation", "exposure_s"),
     "instrument": Option(InstrumentFlag, "observation", "instrument"),
     "temperature": Option(TemperatureFlag, "observation", "temperature_c"),
@@ -331,7 +336,7 @@ def _study(
             if value is not None and option.convert is not None:
                 value = option.convert(value)
             changes.setdefault(option.section, {})[option.key] = value
-    changed = study.with_changes(changes, _stars(study, given["star"], given["magnitude"], given["band"]))
+    changed = study.with_changes(changes, _stars(study, given))
     return changed.with_settings(given["settings"]) if given["settings"] else changed
 
 
@@ -350,12 +355,12 @@ def _sky(given: dict[str, Any]) -> dict[str, Any]:
     return found
 
 
-def _stars(
-    study: Study, names: list[str] | None, magnitudes: list[float] | None, band: str | None
-) -> list[dict[str, Any]] | None:
+def _stars(study: Study, given: dict[str, Any]) -> list[dict[str, Any]] | None:
     from mauvecl.host.errors import InputError
 
-    if not (names or magnitudes or band):
+    names, magnitudes = given["star"], given["magnitude"]
+    same = {key: given[key] for key in ("band", "ebv") if given[key] is not None}
+    if not (names or magnitudes or same):
         return None
     if names:
         # A name that is a file's is a file; anything else is looked up in the library.
@@ -373,7 +378,4 @@ def _stars(
             raise InputError(f"{len(magnitudes)} magnitudes for {len(stars)} stars, expected one for all or one each")
         for entry, value in zip(stars, magnitudes * (len(stars) if len(magnitudes) == 1 else 1), strict=True):
             entry["magnitude"] = value
-    if band:
-        for entry in stars:
-            entry["band"] = band
-    return stars
+    return [entry | same for entry in stars]

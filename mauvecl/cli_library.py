@@ -1,0 +1,121 @@
+"""The verb of spectra: list them, keep one's own, fetch public ones."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mauvecl.flags import JsonFlag, QuietFlag
+
+if TYPE_CHECKING:
+    from mauvecl.host.own_stars import OwnStar
+
+app = typer.Typer(invoke_without_command=True, rich_markup_mode=None)
+ReplaceFlag = Annotated[bool, typer.Option("--replace", help="Take the place of a kept star of that name.")]
+
+
+@app.callback()
+def library(context: typer.Context, as_json: JsonFlag = False) -> None:
+    """List the embedded spectra and your own; `add`, `fetch` and `remove` change yours.
+
+    Examples: mauvecl library
+
+    mauvecl library add my-star.txt
+
+    mauvecl library fetch "ngsl:HD 37202"
+    """
+    if context.invoked_subcommand is not None:
+        return
+    from mauvecl.host.catalogue import library_table
+    from mauvecl.report import rows
+
+    table = library_table()
+    if as_json:
+        print(json.dumps(rows(table), indent=2))
+        return
+    from mauvecl.console import show_table
+
+    ours = table[table["kept"] == "embedded"]
+    columns = ("name", "also", "type", "star", "UV at 190-210, 240-260, 290-310 nm", "licence")
+    cells = []
+    for row in ours:
+        ratios = ", ".join(part.split()[0] for part in row["uv_quality"].split(": ")[1].split(", "))
+        cells.append(tuple(row[n] for n in ("name", "alias", "spectral_type", "star")) + (ratios, row["licence"]))
+    show_table("Embedded spectra (UV: mean flux over that at 540-560 nm); origin, citation: --json", columns, cells)
+    yours = table[table["kept"] == "yours"]
+    if len(yours):
+        show_table(
+            "Your own", ("name", "origin", "notes"), [(row["name"], row["origin"], row["treatment"]) for row in yours]
+        )
+
+
+@app.command()
+def add(
+    files: Annotated[list[Path], typer.Argument(help="Text (nm, erg s-1 cm-2 A-1), ECSV or FITS tables.")],
+    name: Annotated[str | None, typer.Option(help="For one file: another name.", show_default=False)] = None,
+    replace: ReplaceFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Keep spectra of your own under a name, for --star.
+
+    Example: mauvecl library add my-star.txt --name "HD 1234"
+    """
+    from mauvecl.host.errors import InputError
+    from mauvecl.host.own_stars import add
+
+    if name is not None and len(files) > 1:
+        raise InputError(f"--name {name!r} for {len(files)} files, expected one file")
+    for file in files:
+        _tell(add(file, name, replace=replace), quiet)
+
+
+@app.command()
+def fetch(
+    names: Annotated[
+        list[str], typer.Argument(help="Stars, such as ngsl:HD 37202; in calspec, ngsl or lowlib, or in any of them.")
+    ],
+    base: Annotated[
+        str | None, typer.Option("--from", help="Another address of the collection: a mirror.", show_default=False)
+    ] = None,
+    replace: ReplaceFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Fetch stars of public collections of HST spectra and keep them.
+
+    Example: mauvecl library fetch "calspec:18sco"
+    """
+    import sys
+
+    from mauvecl.host.own_stars import fetch
+
+    for name in names:
+        _tell(fetch(name, base=base, replace=replace, show_progress=not quiet and sys.stderr.isatty()), quiet)
+
+
+@app.command()
+def remove(names: Annotated[list[str], typer.Argument(help="Names of kept stars.")], quiet: QuietFlag = False) -> None:
+    """Forget spectra of your own.
+
+    Example: mauvecl library remove "HD 1234"
+    """
+    from mauvecl.console import show
+    from mauvecl.host.own_stars import remove
+
+    for name in names:
+        remove(name)
+        if not quiet:
+            show([f"Removed {name}."])
+
+
+def _tell(star: OwnStar, quiet: bool) -> None:
+    from mauvecl.console import show
+
+    if quiet:
+        return
+    lines = [f"Kept {star.name}: --star {json.dumps(star.name) if ' ' in star.name else star.name}", *star.notes]
+    if star.dereddened:
+        lines.append("Without its dust it is too bright in the ultraviolet: --ebv reddens it again.")
+    show(lines)

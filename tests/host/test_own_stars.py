@@ -1,0 +1,250 @@
+"""Stars of one's own: kept from files, and fetched from a server of this machine that plays the archives."""
+
+from __future__ import annotations
+
+import http.server
+import io
+import threading
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from typer.testing import CliRunner
+
+from mauvecl.cli import app
+from mauvecl.host import own_stars
+from mauvecl.host.catalogue import library_table
+from mauvecl.host.errors import InputError
+from mauvecl.host.expectation import expect
+from mauvecl.host.instrument import Instrument
+from mauvecl.host.source import Source
+from mauvecl.study import Study
+
+
+@pytest.fixture(autouse=True)
+def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A data folder of the test's own."""
+    monkeypatch.setenv("MAUVECL_DATA_DIR", str(tmp_path / "data"))
+    return tmp_path / "data" / "stars"
+
+
+WAVELENGTH_NM = np.linspace(170.0, 1000.0, 500)
+FLUX = 1e-12 * np.exp(-(((WAVELENGTH_NM - 500) / 200) ** 2))
+
+
+def text_file(path: Path, scale: float = 1.0) -> Path:
+    np.savetxt(path, np.transpose([WAVELENGTH_NM, scale * FLUX]))
+    return path
+
+
+def archive_file(units: tuple[str, str], **header: Any) -> bytes:
+    """A table as the archives have it."""
+    columns = [
+        fits.Column("WAVELENGTH", "D", unit=units[0], array=10 * WAVELENGTH_NM),
+        fits.Column("FLUX", "E", unit=units[1], array=FLUX),
+    ]
+    primary = fits.PrimaryHDU()
+    primary.header.update(header)
+    out = io.BytesIO()
+    fits.HDUList([primary, fits.BinTableHDU.from_columns(columns)]).writeto(out)
+    return out.getvalue()
+
+
+def test_a_kept_star_is_a_star_of_the_library(tmp_path: Path, own_folder: Path) -> None:
+    file = text_file(tmp_path / "mine.txt")
+    kept = own_stars.add(file, "HD 1234")
+    assert kept.path.parent == own_folder
+    star = Source.from_library("hd 1234")
+    np.testing.assert_array_equal(star.wavelength_nm, Source.read(file).wavelength_nm)
+    np.testing.assert_array_equal(star.flux_flam, Source.read(file).flux_flam)
+    assert star.digest == Source.read(file).digest
+    row = library_table()[-1]
+    assert (row["name"], row["kept"]) == ("HD 1234", "yours")
+    asked = Study.build({"star": [{"library": "HD 1234", "magnitude": 7.0}]}, "test")
+    assert asked.expectations(asked.star[0])[0].name == "HD 1234"
+    own_stars.remove("hd 1234")
+    with pytest.raises(InputError, match="'HD 1234' is unknown, expected a name such as"):
+        Source.from_library("HD 1234")
+    with pytest.raises(InputError, match="no kept star 'HD 1234', expected one of: none is kept"):
+        own_stars.remove("HD 1234")
+
+
+def test_names_that_cannot_be(tmp_path: Path) -> None:
+    file = text_file(tmp_path / "mine.txt")
+    with pytest.raises(InputError, match="'g2v' is one of the embedded library's"):
+        own_stars.add(file, "g2v")
+    with pytest.raises(InputError, match="expected up to 64 letters"):
+        own_stars.add(file, "../escape")
+    own_stars.add(file, "twin")
+    with pytest.raises(InputError, match="'twin' is kept already, expected another name, or --replace"):
+        own_stars.add(file, "twin")
+    own_stars.add(text_file(tmp_path / "other.txt", 2.0), "Twin", replace=True)
+    assert len(own_stars.kept()) == 1
+    np.testing.assert_allclose(Source.from_library("twin").flux_flam, 2 * Source.read(file).flux_flam, rtol=1e-15)
+    with pytest.raises(InputError, match="too much like another kept star's"):
+        own_stars.add(file, "a b") and own_stars.add(file, "a_b")
+
+
+def test_a_changed_file_is_noticed(tmp_path: Path) -> None:
+    kept = own_stars.add(text_file(tmp_path / "mine.txt"), "mine")
+    text = kept.path.read_text()
+    kept.path.write_text(text.replace("e-13", "e-12", 1))
+    with pytest.raises(InputError, match=r"'mine' is not as it was kept \(its digest differs\)"):
+        Source.from_library("mine")
+    kept.path.write_text("garbage")
+    with pytest.raises(InputError, match="cannot be read"):
+        Source.from_library("mine")
+    own_stars.remove("mine")
+    assert own_stars.kept() == []
+
+
+class Archive(http.server.BaseHTTPRequestHandler):
+    """Serves `files`; addresses in `broken` break off, hang or fail."""
+
+    files: ClassVar[dict[str, bytes]] = {}
+    protocol_version = "HTTP/1.1"
+
+    def do_GET(self) -> None:
+        path = self.path.lstrip("/")
+        if path.endswith("hang"):
+            time.sleep(3)
+        if path not in self.files:
+            self.send_error(503 if "busy" in path else 404)
+            return
+        content = self.files[path]
+        self.send_response(200)
+        self.send_header("Content-Length", str(len(content) * (2 if "cut" in path else 1)))
+        self.end_headers()
+        self.wfile.write(content)
+        self.close_connection = "cut" in path
+
+    def log_message(self, *_: Any) -> None:
+        pass
+
+
+@pytest.fixture
+def archive() -> Iterator[str]:
+    """The archives' files on this machine; the address."""
+    calspec = archive_file(("ANGSTROMS", "FLAM"), TARGETID="18SCO")
+    ngsl = archive_file(("Angstrom", "erg/s/cm2/A"), TARGNAME="HD037202", DATAQUAL="good", OFFSETPX=0.1)
+    names = (
+        "18sco_stis_004.fits",
+        "18sco_stis_006.fits",
+        "18sco_stis_005.fits",
+        "18sco_mod_009.fits",
+        "cut_stis_001.fits",
+    )
+    links = "".join(f'<a href="{name}">{name}</a>' for name in names)
+    lowlib = "hlsp_lowlib_hst_stis_{}_g230lb-g430l-g750l_v1.0_spect.fits"
+    Archive.files = {
+        "calspec/": f"<html>{links}</html>".encode(),
+        "calspec/18sco_stis_006.fits": calspec,
+        "calspec/cut_stis_001.fits": calspec,
+        "ngsl/hd037202/h_stis_ngsl_hd037202_v2.fits": ngsl,
+        "ngsl/hd000001/h_stis_ngsl_hd000001_v2.fits": ngsl[: len(ngsl) // 2],
+        "ngsl/hd000002/h_stis_ngsl_hd000002_v2.fits": b"<html>Sorry</html>",
+        f"lowlib/{lowlib.format('hd146233')}": archive_file(("Angstrom", "erg/s/cm2/A")),
+    }
+    server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Archive)
+    threading.Thread(target=server.serve_forever, daemon=True).start()
+    yield f"http://127.0.0.1:{server.server_port}"
+    server.shutdown()
+    server.server_close()
+
+
+def test_a_calspec_star_by_its_newest_file(archive: str) -> None:
+    kept = own_stars.fetch("calspec:18 Sco", base=f"{archive}/calspec/", show_progress=False)
+    assert kept.name == "18 Sco"
+    assert "18sco_stis_006.fits" in kept.origin
+    assert "doi 10.1086/677655" in kept.origin
+    star = Source.from_library("18 sco")
+    np.testing.assert_allclose(star.flux_flam, np.float32(FLUX), rtol=1e-12)
+    np.testing.assert_allclose(star.wavelength_nm, WAVELENGTH_NM, rtol=1e-12)
+
+
+def test_an_ngsl_star(archive: str) -> None:
+    kept = own_stars.fetch("ngsl:HD 37202", base=f"{archive}/ngsl", show_progress=False)
+    assert "DATAQUAL = good" in kept.notes
+    assert not kept.dereddened
+
+
+def test_a_star_freed_of_its_dust_is_marked_and_reddened_again(archive: str) -> None:
+    kept = own_stars.fetch("lowlib:HD146233", base=f"{archive}/lowlib/", show_progress=False)
+    assert kept.dereddened
+    star, mauve = Source.from_library("HD146233").at_magnitude(7.0), Instrument.load("mauve")
+    plain = expect(star, mauve, exposure=5.0)
+    assert any("freed of its dust by its archive" in m for m in plain.messages)
+    dusty = Study.build({"star": [{"library": "HD146233", "magnitude": 7.0, "ebv": 0.1}]}, "test")
+    reddened = dusty.expectations(dusty.star[0])[0]
+    assert not any("freed of its dust" in m for m in reddened.messages)
+    ratio = (reddened.source_electrons / plain.source_electrons)[[100, -100]]
+    assert ratio[0] < 0.8 < ratio[1]
+
+
+def test_any_collection_is_searched(archive: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    from dataclasses import replace
+
+    here = tuple(replace(c, base=f"{archive}/{c.name}/") for c in own_stars.COLLECTIONS)
+    monkeypatch.setattr(own_stars, "COLLECTIONS", here)
+    assert "Spectral Library" in own_stars.fetch("HD 37202", show_progress=False).origin
+    with pytest.raises(InputError, match=r"no star 'HD 99999' in CALSPEC.* or Next Generation.* or the HST stellar"):
+        own_stars.fetch("HD 99999", show_progress=False)
+
+
+@pytest.mark.parametrize(
+    ("name", "below", "sentence"),
+    [
+        ("ngsl:HD 1", "ngsl", r"h_stis_ngsl_hd000001_v2.fits came, and is no usable spectrum .* expected a whole file"),
+        ("ngsl:HD 2", "ngsl", r"h_stis_ngsl_hd000002_v2.fits came, and is no usable spectrum .* expected a whole file"),
+        ("calspec:cut", "calspec", r"cut_stis_001.fits (broke off|cannot be reached)"),
+        ("ngsl:HD 3", "ngsl", r"no star 'HD 3' in Next Generation Spectral Library.*expected its name there"),
+        ("calspec:nobody", "calspec", r"no star 'nobody' in CALSPEC"),
+        ("ngsl:HD 3", "busy", r"answers 503 .* expected the file: try again later"),
+        ("calspec:x", "hang", r"cannot be reached \(.*timed out.*expected a network; without one bring the file"),
+    ],
+)
+def test_what_goes_wrong_is_a_sentence(
+    archive: str, name: str, below: str, sentence: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(own_stars, "TIMEOUT_S", 0.5)
+    base = f"{archive}/{below}" if below != "hang" else f"{archive}/x"
+    if below == "hang":
+        collection = own_stars.Collection("calspec", "CALSPEC", "", base, lambda star, listing: "hang")
+        monkeypatch.setattr(own_stars, "COLLECTIONS", (collection,))
+    with pytest.raises(InputError, match=sentence):
+        own_stars.fetch(name, base=base, show_progress=False)
+    assert own_stars.kept() == []
+
+
+def test_without_a_network() -> None:
+    with pytest.raises(InputError, match=r"cannot be reached \(.*refused.*mauvecl library add"):
+        own_stars.fetch("ngsl:HD 37202", base="http://127.0.0.1:9/", show_progress=False)
+    with pytest.raises(InputError, match="collection 'mast' is unknown, expected one of calspec, ngsl, lowlib"):
+        own_stars.fetch("mast:HD 37202")
+    with pytest.raises(InputError, match="expected its collection too, such as ngsl:HD 37202"):
+        own_stars.fetch("HD 37202", base="http://127.0.0.1:9/")
+
+
+def test_the_verbs(tmp_path: Path, archive: str) -> None:
+    run = CliRunner().invoke
+    files = [str(text_file(tmp_path / f"{name}.txt")) for name in ("one", "two")]
+    added = run(app, ["library", "add", *files])
+    assert added.exit_code == 0, added.output
+    assert "Kept one: --star one" in added.output
+    fetched = run(app, ["library", "fetch", "lowlib:HD 146233", "--from", f"{archive}/lowlib"])
+    assert fetched.exit_code == 0, fetched.output
+    assert '--star "HD 146233"' in fetched.output
+    assert "--ebv reddens it again" in fetched.output
+    listed = run(app, ["library"])
+    assert "Your own" in listed.output
+    assert "HST stellar library of 513 stars" in listed.output
+    simulated = run(
+        app, ["simulate", "--star", "HD 146233", "-m", "8", "--ebv", "0.1", "--no-pictures", "-o", str(tmp_path / "s")]
+    )
+    assert simulated.exit_code == 0, simulated.output
+    assert run(app, ["library", "remove", "one", "two", "HD 146233"]).exit_code == 0
+    assert "Your own" not in run(app, ["library"]).output
