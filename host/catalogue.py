@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from functools import cache
+from functools import cache, lru_cache
 from importlib.resources import files
 from typing import TYPE_CHECKING
 
@@ -99,6 +99,7 @@ def find(name: str) -> dict[str, str]:
     raise InputError(f"library spectrum {name!r} is unknown, expected a name such as {', '.join(dict.fromkeys(names))}")
 
 
+@lru_cache(8)
 def spectrum_table(file: str) -> Table:
     """A library spectrum: columns wavelength (nm) and flux (erg s-1 cm-2 A-1)."""
     return _read("spectra", file)

@@ -15,6 +15,7 @@ from mauvecl.cli_detect import detect, gaussian
 from mauvecl.cli_library import app as library
 from mauvecl.cli_limits import detection_map, limit
 from mauvecl.cli_observe import exposure, simulate, snr
+from mauvecl.cli_serve import serve
 from mauvecl.flags import DeviceFlag, JsonFlag, OutputFlag, QuietFlag
 
 app = typer.Typer(
@@ -114,7 +115,7 @@ app.add_typer(library, name="library")
 for verb in (simulate, snr, exposure, detect, gaussian, limit):
     app.command()(verb)
 app.command("map")(detection_map)
-for verb in (realise, verify, export):
+for verb in (realise, verify, export, serve):
     app.command()(verb)
 
 

@@ -136,6 +136,9 @@ class Detection:
     seed: int = 0
     statistics: tuple[str, ...] = field(init=False)
     _tails: dict[tuple[str, int, float], Tail] = field(default_factory=dict, init=False, repr=False)
+    _forms: dict[tuple[str, int | None, int], QuadraticForm | Normal] = field(
+        default_factory=dict, init=False, repr=False
+    )
     _own: dict[str, NDArray[np.float64]] = field(default_factory=dict, init=False, repr=False)
     _found: dict[Key, Distribution] = field(default_factory=dict, init=False, repr=False)
     _samples: dict[Key, TailSamples] = field(default_factory=dict, init=False, repr=False)
@@ -220,6 +223,12 @@ class Detection:
     def closed_form(self, statistic: str, flare: int | None = None, *, template: int = 0) -> QuadraticForm | Normal:
         """The same distribution for Gaussian noise; parameters as for `distribution`."""
         self._check(statistic, flare, template)
+        key = statistic, flare, template
+        if key not in self._forms:
+            self._forms[key] = self._closed_form(statistic, flare, template)
+        return self._forms[key]
+
+    def _closed_form(self, statistic: str, flare: int | None, template: int) -> QuadraticForm | Normal:
         observed = self.quiet if flare is None else self.flares[flare]
         template = template if flare is None else flare
         if statistic == "paper":

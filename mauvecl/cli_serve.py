@@ -1,0 +1,31 @@
+"""The verb that serves the page."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from typing import Annotated
+
+import typer
+
+
+def serve(
+    address: Annotated[str, typer.Option(help="Who may come: 127.0.0.1 is this machine alone.")] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port.")] = 5006,
+    show: Annotated[bool, typer.Option("--show", help="Open a browser.")] = False,
+) -> None:
+    """A page in your browser: controls, closed forms at once, simulations, downloads.
+
+    Example: mauvecl serve --show
+    """
+    from mauvecl.host.errors import InputError
+
+    if find_spec("panel") is None:
+        raise InputError("Panel is missing, expected it for the page: pip install 'mauvecl[web]'")
+    from mauvecl.web.server import serve
+
+    try:
+        serve(address, port, show=show)
+    except OSError as error:
+        raise InputError(
+            f"port {port} of {address} cannot be used ({error.strerror}), expected another: --port"
+        ) from error

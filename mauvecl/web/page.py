@@ -1,0 +1,554 @@
+"""The page of one visitor: controls on the left, alerts on top, a tab for each kind of answer."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+import zipfile
+from collections.abc import Callable
+from concurrent.futures import CancelledError, Future
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+import numpy as np
+import panel as pn
+import param
+from bokeh.models.widgets import Div
+from panel.theme import fast
+
+from mauvecl.detect_study import DetectAnswer, detect
+from mauvecl.detection import Detection
+from mauvecl.host.errors import InputError
+from mauvecl.labels import told
+from mauvecl.limits import LimitResult, limiting_magnitude
+from mauvecl.maps import MapResult, detection_map
+from mauvecl.program import DeviceError
+from mauvecl.scene import prepare
+from mauvecl.study import Study
+from mauvecl.web.question import ENDINGS, UPLOADED, Question, star_names, write_spectrum
+from mauvecl.web.views import Distributions, NoiseBudget, Observation, Roc, SignalToNoise, Smooth
+from mauvecl.web.work import Cancelled, Job
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.pool import Pool
+
+#: Milliseconds between two looks at a simulation, and from a change to a drawn spectrum.
+LOOK_MS, DRAW_MS = 250, 500
+#: The map of the page: cells along each axis, and realisations of each.
+MAP_STEPS, MAP_REALISATIONS = 8, 20_000
+NOMINAL = (
+    "Nominal throughput, pieced together from the paper, datasheets and assumptions: not a flight calibration. "
+    "Sensible uncertainty: 30 %, and 50 % below 250 nm."
+)
+ABOUT = (
+    "Would the Mauve satellite see this stellar flare, and how sure can one be? Closed forms follow every change at "
+    "once; *Simulate* refines them with noise realisations."
+)
+#: Arrows beside numbers have no name for a screen reader; the keyboard's do the same.
+NO_ARROWS = ".bk-spin-btn { display: none !important; }"
+# Labels that screen readers meet too are the widgets' names.
+FIELDS = (
+    ("Star", ("magnitude", "band")),
+    ("Observation", ("exposure_s", "temperature_c", "instrument", "sky", "sky_brightness", "target", "time")),
+    ("Flare", ("amplitude_percent", "flare_temperature_k")),
+    ("Detection", ("statistic", "fap", "realisations", "seed")),
+)
+
+
+class Fast(fast.Fast):
+    """Panel's design with the system's letters: no visitor's browser asks another server for them.
+
+    Its name is Panel's own, by which the design's files are found.
+    """
+
+    _resources: ClassVar[Any] = {**fast.Fast._resources, "font": {}}
+
+
+class Page:
+    """Controls, answers and downloads of one visitor."""
+
+    def __init__(self) -> None:
+        self.question = Question()
+        self.job: Job | None = None
+        self.quiet: Expectation | None = None
+        self.flare: Expectation | None = None
+        self.theory: Detection | None = None
+        self.found: dict[str, Any] = {}
+        self._folder = tempfile.TemporaryDirectory(prefix="mauvecl-page-")
+        self._asked = 0
+        self._document = pn.state.curdoc
+        self._link_fault = ""
+        self._told: list[tuple[str, str]] = []
+        self.alerts = pn.Column(sizing_mode="stretch_width")
+        # A plain model: its text changes without a look at the whole page.
+        self.summary = Div(sizing_mode="stretch_width", styles={"font-size": "110%"})
+        self.status = pn.pane.Markdown("", sizing_mode="stretch_width")
+        self.bar = pn.indicators.Progress(name="Progress", value=0, max=100, sizing_mode="stretch_width", visible=False)
+        self.views = Observation(), SignalToNoise(), NoiseBudget(), Distributions(), Roc()
+        self.table = pn.pane.DataFrame(None, index=False, sizing_mode="stretch_width", escape=True)
+        self.limit = pn.Column(sizing_mode="stretch_width")
+        self.map = pn.Column(sizing_mode="stretch_width")
+        self._make_controls()
+        self.tabs = self._make_tabs()
+        self.tabs.param.watch(self._show_tab, "active")
+        self._stale: set[int] = set()
+        if pn.state.location is not None:
+            pn.state.location.sync(self.question, list(self._shared()), on_error=self._bad_link)
+        self.question.param.watch(self._changed, list(self._shared()))
+        self.refresh()
+
+    @staticmethod
+    def _shared() -> dict[str, str]:
+        """What a link holds."""
+        return {name: name for name in Question.param if name != "name"}
+
+    def _bad_link(self, bad: dict[str, Any]) -> None:
+        self._link_fault = (
+            f"The link holds {', '.join(sorted(map(str, bad)))} that cannot be; the usual values stand there."
+        )
+
+    # Controls
+
+    def _make_controls(self) -> None:
+        q = self.question
+        names = [*star_names(), UPLOADED]
+        self.star = pn.widgets.AutocompleteInput(
+            name="Library star", options=names, value=q.star, case_sensitive=False, restrict=True, min_characters=1,
+            search_strategy="includes", placeholder="type to search, such as K or HD", sizing_mode="stretch_width",
+        )  # fmt: skip
+        self.star.link(q, callbacks={"value": lambda *events: self._star_chosen(events[-1].new)})
+        q.param.watch(lambda event: setattr(self.star, "value", event.new), "star")
+        self.file = pn.widgets.FileInput(
+            accept=",".join(ENDINGS), name="Your own spectrum", sizing_mode="stretch_width", multiple=False
+        )
+        self.file.param.watch(self._uploaded, "value")
+        widgets: dict[str, Any] = {}
+        for name in (name for _, fields in FIELDS for name in fields):
+            about = q.param[name]
+            widgets[name] = _kind(about).from_param(
+                about, name=about.doc, sizing_mode="stretch_width", description=None
+            )
+            widgets[name].stylesheets = [NO_ARROWS]
+        self.widgets = widgets
+
+        def asked(name: str) -> Callable[[str], bool]:
+            return lambda sky: sky == {"sky_brightness": "brightness"}.get(name, "target and time")
+
+        for name in ("sky_brightness", "target", "time"):
+            widgets[name].visible = pn.bind(asked(name), q.param.sky)
+        self.run = pn.widgets.Button(name="Simulate", button_type="primary", width=240)
+        self.cancel = pn.widgets.Button(name="Cancel", disabled=True, width=120)
+        self.run_limit = pn.widgets.Button(name="Find the limiting magnitude", button_type="primary")
+        self.run_map = pn.widgets.Button(name="Draw the map", button_type="primary")
+        self.run.on_click(partial(self._simulate, "detection", detect, self._show_detection))
+        self.run_limit.on_click(partial(self._simulate, "limit", limiting_magnitude, self._show_limit))
+        self.run_map.on_click(partial(self._simulate, "map", _map, self._show_map))
+        self.cancel.on_click(lambda event: self.job.cancel() if self.job is not None else None)
+        upload = "or upload nm and erg/s/cm²/Å (text, ECSV, FITS; up to 4 MiB)"
+        rows: list[Any] = [pn.pane.Markdown("## Star"), self.star, pn.pane.Markdown(upload), self.file]
+        for title, fields in FIELDS:
+            if title != "Star":
+                rows.append(pn.pane.Markdown(f"## {title}"))
+            rows += [widgets[name] for name in fields]
+        self.controls = pn.Column(*rows, sizing_mode="stretch_width")
+
+    def _star_chosen(self, name: str) -> None:
+        if name:
+            self.question.star = name
+
+    def _uploaded(self, event: Any) -> None:
+        if event.new is None:
+            return
+        try:
+            self.question.upload(str(self.file.filename), event.new)
+        except InputError as error:
+            self._alert(str(error), "danger")
+
+    # Closed forms
+
+    def _changed(self, *_: Any) -> None:
+        if self.job is not None:
+            self.job.cancel()
+        self.refresh()
+
+    def refresh(self) -> None:
+        """Everything that has a closed form."""
+        self._asked += 1
+        self._forget()
+        # One message for all changes.
+        with pn.io.hold():
+            try:
+                study = self.study()
+                self._show_closed(study)
+            except InputError as error:
+                self.quiet = None
+                self._tell([(str(error), "danger")])
+                self.summary.text = ""
+                self.run.disabled = True
+                return
+        self.run.disabled = self.job is not None
+        if self._document is not None:
+            # Not before the closed forms are shown, and not while a value is still being chosen.
+            self._document.add_timeout_callback(partial(self._draw_one, self._asked, study), DRAW_MS)
+
+    def _forget(self) -> None:
+        """Answers of an earlier question go."""
+        if self.found:
+            self.found = {}
+            self.table.object = None
+            self.limit.clear()
+            self.map.clear()
+
+    def _show_closed(self, study: Study) -> None:
+        q = self.question
+        quiet, flare = self.quiet, self.flare = study.expectations(study.star[0])
+        scene = prepare([quiet, flare], comparison=study.run.comparison())
+        self.theory = Detection(
+            quiet, (flare,), study.run.statistics, scene, study.run.realisations, seed=study.run.seed
+        )
+        self._cut = self.theory.closed_form(q.statistic).isf(q.fap)
+        self.summary.text = self._closed_summary()
+        fault = [(self._link_fault, "warning")] if self._link_fault else []
+        kinds = [(m, "danger" if m.startswith("SATURATED") else "info") for m in told([quiet, flare])]
+        self._tell([*fault, *kinds])
+        self._stale = set(range(len(self.tabs)))
+        self._show_tab()
+
+    def _show_tab(self, *_: Any) -> None:
+        """Closed forms of the tab in front, once after a change; the others follow when they come to the front."""
+        if self.quiet is None or self.flare is None or self.theory is None or self.tabs.active not in self._stale:
+            return
+        self._stale.discard(self.tabs.active)
+        q, theory = self.question, self.theory
+        observation, snr, budget, distributions, roc = self.views
+        if self.tabs.active == 0:
+            observation.show(self.quiet, self.flare)
+        elif self.tabs.active == 1:
+            snr.show(self.quiet)
+        elif self.tabs.active == 2:
+            budget.show(self.quiet)
+        elif self.tabs.active == 3:
+            null, with_flare = (Smooth(theory.closed_form(q.statistic, k)) for k in (None, 0))
+            distributions.show(null, with_flare, self._cut, q.statistic, q.fap)
+            roc.show(null, with_flare)
+            if "detection" in self.found:
+                self._show_simulated(self.found["detection"])
+
+    def _closed_summary(self) -> str:
+        assert self.theory is not None
+        assert self.quiet is not None
+        q, theory = self.question, self.theory
+        chance = theory.closed_form(q.statistic, 0).sf(self._cut)
+        return (
+            f"<b>{_percent(chance)}</b> of such flares are detected by {q.statistic} at a false-alarm probability of "
+            f"{q.fap:g} per test: threshold {self._cut:.5g}, closed form for Gaussian noise. Best S/N "
+            f"{self.quiet.snr().max():.3g} a pixel, {self.quiet.snr_per_element().max():.3g} an element; exposure "
+            f"{self.quiet.exposure_s:g} s in {self.quiet.n_frames} frames."
+        )
+
+    def _draw_one(self, asked: int, study: Study) -> None:
+        """One raw spectrum with the flare, drawn in the background."""
+        quiet, flare = self.quiet, self.flare
+        if asked != self._asked or quiet is None or flare is None:
+            return
+
+        def show(raw: Any) -> None:
+            if asked == self._asked and 0 not in self._stale:
+                self.views[0].add(quiet, raw)
+
+        def came(future: Future[Any]) -> None:
+            if not future.cancelled() and future.exception() is None:
+                self._later(partial(show, future.result()))
+
+        how = study.drawing | {"seed": study.run.seed}
+        Job(lambda pool: pool.realise(flare, count=1, **how)[0]).future.add_done_callback(came)
+
+    def _later(self, work: Callable[[], None]) -> None:
+        """Change the page from another thread, when it is its turn."""
+        if self._document is not None:
+            self._document.add_next_tick_callback(work)
+
+    # Simulations
+
+    def _simulate(self, kind: str, ask: Callable[[Study, Pool], Any], show: Callable[[Any], None], event: Any) -> None:
+        if self.job is not None or self.quiet is None:
+            return
+        asked, study = self._asked, self.study()
+        job = self.job = Job(partial(ask, study))
+        self._busy(True)
+        looker = pn.state.add_periodic_callback(partial(self._look, job), LOOK_MS)
+
+        def ended() -> None:
+            looker.stop()
+            self.job = None
+            self._busy(False)
+            try:
+                found = job.future.result()
+            except (Cancelled, CancelledError):
+                self.status.object = "Cancelled."
+            except (InputError, DeviceError) as error:
+                self.status.object = ""
+                self._alert(str(error), "danger")
+            else:
+                self.status.object = f"Done: {job.told}."
+                if asked == self._asked:
+                    self.found[kind] = found
+                    show(found)
+
+        job.future.add_done_callback(lambda future: self._later(ended))
+
+    def _busy(self, busy: bool) -> None:
+        self.cancel.disabled = not busy
+        for button in (self.run, self.run_limit, self.run_map):
+            button.disabled = busy
+        self.bar.visible = busy
+        self.bar.value = 0
+
+    def _look(self, job: Job) -> None:
+        self.status.object = job.told
+        standing = job.standing
+        if standing is not None and standing.total:
+            self.bar.value = min(int(100 * standing.done / standing.total), 100)
+
+    def _show_detection(self, answer: DetectAnswer) -> None:
+        q = self.question
+        if 3 not in self._stale:
+            self._show_simulated(answer)
+        frame = answer.table.to_pandas()
+        columns = {
+            "statistic": "statistic", "mean": "mean with flare", "threshold": "threshold",
+            "probability": "detected", "low": "95 % from", "high": "to", "closed_form_probability": "closed form",
+        }  # fmt: skip
+        self.table.object = frame[list(columns)].rename(columns=columns)
+        (row,) = (r for r in answer.table if r["statistic"] == q.statistic)
+        self.summary.text = (
+            f"<b>{_percent(row['probability'])}</b> [{_percent(row['low'])}, {_percent(row['high'])}] of "
+            f"{q.realisations:,} simulated flares are detected by {q.statistic} at a false-alarm probability of "
+            f"{q.fap:g} per test; closed form {_percent(row['closed_form_probability'])}."
+        )
+
+    def _show_simulated(self, answer: DetectAnswer) -> None:
+        q, (star,) = self.question, answer.stars
+        _, _, _, distributions, roc = self.views
+        distributions.add(star, q.statistic, q.fap)
+        roc.add(star, q.statistic)
+
+    def _show_limit(self, found: LimitResult) -> None:
+        rows = [
+            f"- `{one.statistic}`: **{one.value.value:.3f}** [{one.value.low:.3f}, {one.value.high:.3f}], closed form "
+            f"{one.closed_form:.3f}; simulated again there: {_percent(one.check.probability.value)}"
+            for one in found.limits
+        ]
+        power, fap = found.study.limit.power, found.study.run.fap
+        title = f"Magnitude at which {100 * power:g} % of such flares are detected, false-alarm probability {fap:g}:"
+        self.limit.objects = [pn.pane.Markdown("\n".join([title, "", *rows])), _picture(found, "Limiting magnitude")]
+
+    def _show_map(self, found: MapResult) -> None:
+        self.map.objects = [_picture(found, "Detection probability over magnitude and flare amplitude")]
+
+    # Alerts
+
+    def _tell(self, alerts: list[tuple[str, str]]) -> None:
+        """Alerts on top; the same ones stay as they are."""
+        if alerts != self._told:
+            self._told = alerts
+            self.alerts.objects = [
+                pn.pane.Alert(text.replace("<", "&lt;"), alert_type=kind, sizing_mode="stretch_width")
+                for text, kind in alerts
+            ]
+
+    def _alert(self, text: str, kind: str) -> None:
+        self._tell([(text, kind), *self._told])
+
+    # Downloads
+
+    def study(self) -> Study:
+        """The question as it stands."""
+        return self.question.study(Path(self._folder.name))
+
+    def study_file(self) -> io.BytesIO:
+        """The study for the command line; an uploaded star beside it, in a zip."""
+        study = self.study()
+        if self.question.star != UPLOADED or self.question.uploaded is None:
+            return io.BytesIO(study.toml().encode())
+        out = io.BytesIO()
+        with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(out, "w") as archive:
+            file = write_spectrum(self.question.uploaded, Path(folder))
+            archive.write(file, file.name)
+            # Files are named as seen from the study.
+            archive.writestr("study.toml", study.toml().replace(str(study.star[0].file), file.name))
+        out.seek(0)
+        return out
+
+    def _tables(self) -> dict[str, Callable[[], Table]]:
+        quiet = self.quiet
+        if quiet is None:
+            raise InputError("there is no answer to download, expected a question that has one")
+        answers: dict[str, Callable[[], Table]] = {
+            "noise-budget": quiet.noise_budget,
+            "observation": self._observed,
+        }
+        if "detection" in self.found:
+            answers["detection"] = lambda: self.found["detection"].table
+            answers["roc"] = lambda: self.found["detection"].roc
+        for kind in ("limit", "map"):
+            if kind in self.found:
+                answers[kind] = lambda kind=kind: self.found[kind].table  # type: ignore[misc]
+        return answers
+
+    def _observed(self) -> Table:
+        from mauvecl.simulate_study import simulate
+
+        return simulate(self.study(), flaring=True).observations[1][2]
+
+    def download(self, name: str, ending: str) -> io.BytesIO:
+        """A table or a picture as a file.
+
+        Raises
+        ------
+        InputError
+            If it is not computed yet.
+        """
+        from mauvecl.report import write_table
+
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / f"{name}.{ending}"
+            if ending == "png":
+                self._write_picture(name, path)
+            else:
+                tables = self._tables()
+                if name not in tables:
+                    raise InputError(f"no {name} is computed yet, expected a simulation first")
+                write_table(tables[name](), path)
+            return io.BytesIO(path.read_bytes())
+
+    def _write_picture(self, name: str, path: Path) -> None:
+        from mauvecl import pictures
+
+        if name == "observation":
+            pictures.observation(self.question.star, self._observed(), path)
+        elif name == "detection" and name in self.found:
+            pictures.detection(self.found[name].stars, self.question.fap, path)
+        elif name in ("limit", "map") and name in self.found:
+            self.found[name].plot(path)
+        else:
+            raise InputError(f"no {name} is computed yet, expected a simulation first")
+
+    def _downloads(self, name: str, endings: tuple[str, ...]) -> Any:
+        return pn.FlexBox(*(
+            pn.widgets.FileDownload(
+                callback=partial(self._safely, partial(self.download, name, ending)),
+                filename=f"mauvecl-{name}.{ending}", label=f"{name} ({ending})", embed=False, auto=True, width=200,
+            )
+            for ending in endings
+        ))  # fmt: skip
+
+    def _safely(self, make: Callable[[], io.BytesIO]) -> io.BytesIO:
+        try:
+            return make()
+        except InputError as error:
+            self._alert(str(error), "warning")
+            return io.BytesIO(f"{error}\n".encode())
+
+    # Everything together
+
+    def _make_tabs(self) -> Any:
+        observation, snr, budget, distributions, roc = (view.plot for view in self.views)
+        tables = ("ecsv", "fits")
+        return pn.Tabs(
+            ("Simulated observation", pn.Column(observation, self._downloads("observation", (*tables, "png")))),
+            ("S/N", pn.Column(snr)),
+            ("Noise budget", pn.Column(budget, self._downloads("noise-budget", tables))),
+            (
+                "Flare detection",
+                pn.Column(
+                    self.table, distributions, roc, self._downloads("detection", (*tables, "png")),
+                    self._downloads("roc", tables),
+                ),
+            ),
+            (
+                "Limiting magnitude and map",
+                pn.Column(
+                    pn.FlexBox(self.run_limit, self.run_map), self.limit, self.map,
+                    self._downloads("limit", ("ecsv", "png")), self._downloads("map", ("ecsv", "fits", "png")),
+                ),
+            ),
+            dynamic=False,
+            sizing_mode="stretch_width",
+        )  # fmt: skip
+
+    def layout(self) -> Any:
+        """The whole page."""
+        study = pn.widgets.FileDownload(
+            callback=partial(self._safely, self.study_file), label="Study for the command line", embed=False, auto=True,
+            width=260,
+        )  # fmt: skip
+
+        def named(star: str) -> str:
+            return "study.zip" if star == UPLOADED else "study.toml"
+
+        study.filename = self.question.param.star.rx.pipe(named)
+        head = pn.Column(
+            self.alerts,
+            self.summary,
+            pn.FlexBox(self.run, self.cancel, study, sizing_mode="stretch_width"),
+            self.bar,
+            self.status,
+            sizing_mode="stretch_width",
+        )
+        # Side by side where there is room, below each other on a phone.
+        asked = pn.Column(self.controls, styles={"flex": "1 1 280px"}, max_width=420)
+        answered = pn.Column(self.tabs, styles={"flex": "4 1 340px"}, min_width=300)
+        template = pn.template.FastListTemplate(
+            title="mauvecl",
+            main=[
+                pn.Column(pn.pane.Markdown(ABOUT), head, sizing_mode="stretch_width"),
+                pn.FlexBox(asked, answered, sizing_mode="stretch_width", gap="20px"),
+                pn.pane.Markdown(f"*{NOMINAL}*"),
+            ],
+            accent_base_color="#0072B2",
+            header_background="#0072B2",
+            theme_toggle=False,
+            main_layout=None,
+            design=Fast,
+        )
+        template.font, template.font_url = "system-ui", ""
+        return template
+
+
+def _kind(about: Any) -> Any:
+    """The control for a kind of value."""
+    kinds = ((param.Integer, pn.widgets.IntInput), (param.Number, pn.widgets.FloatInput))
+    others = ((param.Selector, pn.widgets.Select), (param.String, pn.widgets.TextInput))
+    return next(widget for kind, widget in (*kinds, *others) if isinstance(about, kind))
+
+
+def _percent(value: float) -> str:
+    return f"{100 * float(value):.2f} %"
+
+
+def _map(study: Study, pool: Pool) -> MapResult:
+    """A coarse map around the question's own star."""
+    star, amplitude = study.star[0], study.flare.amplitudes[0]
+    middle = 7.0 if star.magnitude is None else star.magnitude
+    x = {"quantity": "magnitude", "start": middle - 2.5, "stop": middle + 2.5, "steps": MAP_STEPS}
+    y = {"quantity": "amplitude", "start": amplitude / 10, "stop": amplitude * 3, "steps": MAP_STEPS, "log": True}
+    # A statistic alone, and as few realisations as the false-alarm probability allows.
+    fewest = int(np.ceil(100 / study.run.fap))
+    n = min(max(MAP_REALISATIONS, fewest), study.run.realisations)
+    run = {"realisations": n, "statistics": [study.run.statistics[-1]]}
+    data = study.model_dump()
+    data["map"] |= {"x": x, "y": y}
+    data["run"] |= run
+    return detection_map(Study.build(data, "page"), pool)
+
+
+def _picture(found: LimitResult | MapResult, alternative: str) -> Any:
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "picture.png"
+        found.plot(path)
+        return pn.pane.PNG(path.read_bytes(), alt_text=alternative, sizing_mode="scale_width", max_width=900)

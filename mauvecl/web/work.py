@@ -1,0 +1,85 @@
+"""Simulations in the background: bounded for the server, one at a time for a visitor, and stopped at a word."""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+from typing import Any
+
+from mauvecl.engine import Engine
+from mauvecl.pool import LocalWorkers, Pool, Standing
+
+#: Simulations that a server computes at the same time; others wait.
+TOGETHER = 2
+_threads = ThreadPoolExecutor(TOGETHER, thread_name_prefix="mauvecl-page")
+_own = threading.local()
+
+
+class Cancelled(Exception):  # noqa: N818
+    """The visitor has asked for the end."""
+
+
+def _engine(progress: Callable[[int, int], None]) -> Engine:
+    """This thread's engine, which tells this job's progress."""
+    if not hasattr(_own, "engine"):
+        _own.engine = Engine(progress=lambda done, total: _own.progress(done, total))
+    _own.progress = progress
+    engine: Engine = _own.engine
+    return engine
+
+
+@dataclass(eq=False)
+class Job:
+    """One simulation of a visitor's.
+
+    Parameters
+    ----------
+    ask : callable
+        Makes the answer with a pool.
+    """
+
+    ask: Callable[[Pool], Any]
+    _cancelled: threading.Event = field(default_factory=threading.Event)
+    _pool: Pool | None = None
+    _started: float | None = None
+
+    def __post_init__(self) -> None:
+        self.future: Future[Any] = _threads.submit(self._run)
+
+    def _run(self) -> Any:
+        self._check()
+        self._started = time.monotonic()
+        workers = LocalWorkers([None], make=lambda device, progress: _engine(progress))
+        self._pool = Pool(workers, progress=lambda done, total: self._check())
+        return self.ask(self._pool)
+
+    def _check(self) -> None:
+        if self._cancelled.is_set():
+            raise Cancelled
+
+    def cancel(self) -> None:
+        """Stop between two tiles, or before it begins."""
+        self._cancelled.set()
+        self.future.cancel()
+
+    @property
+    def standing(self) -> Standing | None:
+        """How far it is, or None while it waits for its turn."""
+        return None if self._pool is None else self._pool.standing
+
+    @property
+    def told(self) -> str:
+        """How far it is, in words."""
+        s = self.standing
+        if s is None or self._started is None:
+            return "waiting for its turn"
+        rate = s.done / max(time.monotonic() - self._started, 1e-9)
+        left = f", {(s.total - s.done) / rate:.0f} s left" if rate and s.total > s.done else ""
+        return (
+            f"{s.done:,} of {s.total:,} realisations, {rate:,.0f} a second{left}"
+            + (f", {s.shares} of {s.of} shares" if s.of > 1 else "")
+            + (f", {s.retries} counted again" if s.retries else "")
+        )
