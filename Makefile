@@ -32,4 +32,4 @@ mutants: .venv/test.stamp
 	$(BIN)/python tools/mutation_check.py
 
 clean:
-	rm -rf .venv demo build docs/_build docs/_generated *.egg-info
+	rm -rf .venv demo build docs/_build docs/_generated docs/jupyter_execute *.egg-info

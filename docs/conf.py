@@ -9,17 +9,22 @@ project = "mauvecl"
 author = "the mauvecl developers"
 release = version = installed("mauvecl")
 extensions = [
-    "myst_parser",
+    "myst_nb",
     "numpydoc",
     "sphinx.ext.autodoc",
     "sphinx.ext.mathjax",
 ]
 myst_heading_anchors = 3
 myst_enable_extensions = ["dollarmath", "amsmath"]
+# Notebooks and the gallery are executed at every build; an error in one is an error of the build.
+nb_execution_mode = "force"
+nb_execution_raise_on_error = True
+nb_execution_timeout = 300
+nb_merge_streams = True
 html_theme = "pydata_sphinx_theme"
 smartquotes = False
 html_title = "mauvecl"
-exclude_patterns = ["_build", "_generated"]
+exclude_patterns = ["_build", "_generated", "jupyter_execute", "**.ipynb_checkpoints"]
 numpydoc_show_class_members = False
 autodoc_typehints = "none"
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import html
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
@@ -85,6 +86,37 @@ class Expectation:
     photon_noise: Literal["gaussian", "poisson"] = "gaussian"
     conditions: Mapping[str, float] = field(default_factory=dict)
     messages: tuple[str, ...] = ()
+
+    def to_specutils(self) -> Any:
+        """The mean net signal of the exposure, DN, with its standard deviation, as a specutils Spectrum.
+
+        Raises
+        ------
+        InputError
+            If specutils, the extra ``spectra``, is missing.
+        """
+        import astropy.units as u
+
+        try:
+            from astropy.nddata import StdDevUncertainty
+            from specutils import Spectrum
+        except ImportError as error:
+            raise InputError("specutils is missing, expected `pip install 'mauvecl[spectra]'`") from error
+        return Spectrum(
+            spectral_axis=self.wavelength_nm * u.nm,
+            flux=self.signal_dn * u.adu,
+            uncertainty=StdDevUncertainty(np.sqrt(self.variance_dn2)),
+            mask=self.saturated,
+            meta=dict(self.provenance),
+        )
+
+    def _repr_html_(self) -> str:
+        told = "".join(f"<br><small>{html.escape(text)}</small>" for text in self.messages)
+        name, where = html.escape(self.name), html.escape(self.instrument)
+        return (
+            f"<b>{name}</b> on {where}, {self.exposure_s:g} s in {self.n_frames} frames: best "
+            f"S/N {self.snr().max():.3g} a pixel, {self.snr_per_element().max():.3g} an element{told}"
+        )
 
     def __post_init__(self) -> None:
         for each in fields(self):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import html
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -147,8 +148,12 @@ class Source:
         if own is None:
             raise InputError(f"{name} has no wavelengths of its own, expected a spectrum with a waveset")
         grid = np.arange(160.0, 1150.0, 0.5)
-        nm = own.to_value(u.nm)
-        grid = np.union1d(nm, grid[(grid > nm[0]) & (grid < nm[-1])])
+        nm = np.unique(own.to_value(u.nm))
+        inside = grid[(grid > nm[0]) & (grid < nm[-1])]
+        # A hair beside one of its own a wavelength says nothing new.
+        at = np.searchsorted(nm, inside)
+        alone = np.minimum(inside - nm[at - 1], nm[at] - inside) > 1e-3
+        grid = np.union1d(nm, inside[alone])
         flux = spectrum(grid * u.nm, flux_unit=FLAM).value
         return cls(grid, flux, name, f"synphot {type(spectrum).__name__}")
 
@@ -162,6 +167,30 @@ class Source:
 
         order = np.argsort(axis.to_value(u.nm, u.spectral()))
         return cls.from_arrays(u.Quantity(axis)[order], u.Quantity(flux)[order], name=name, origin="specutils Spectrum")
+
+    def to_synphot(self) -> Any:
+        """The spectrum as a synphot SourceSpectrum, linear between its points."""
+        return bands.synphot_spectrum(self.wavelength_nm, self.flux_flam)
+
+    def to_specutils(self) -> Any:
+        """The spectrum as a specutils Spectrum (needs the extra ``spectra``)."""
+        import astropy.units as u
+
+        try:
+            from specutils import Spectrum
+        except ImportError as error:
+            raise InputError("specutils is missing, expected `pip install 'mauvecl[spectra]'`") from error
+        flam = u.erg / (u.s * u.cm**2 * u.AA)
+        return Spectrum(
+            spectral_axis=self.wavelength_nm * u.nm,
+            flux=self.flux_flam * flam,
+            meta={"name": self.name, "origin": self.origin, "history": list(self.history)},
+        )
+
+    def _repr_html_(self) -> str:
+        notes = "".join(f"<br><small>{html.escape(text)}</small>" for text in (self.origin, *self.history))
+        span = f"{self.wavelength_nm[0]:.0f}-{self.wavelength_nm[-1]:.0f} nm, {self.wavelength_nm.size} points"
+        return f"<b>{html.escape(self.name)}</b>, {span}{notes}"
 
     def magnitude(self, band: str = "V") -> float:
         """Synthetic magnitude; Vega system, AB for GALEX NUV.

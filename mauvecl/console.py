@@ -19,7 +19,7 @@ PATIENCE_S = 2.0
 class Meter:
     """Progress with rate and time left, on standard error, for work longer than two seconds.
 
-    On a terminal it is a bar; elsewhere a plain line every ten seconds.
+    On a terminal and in a notebook it is a bar; elsewhere a plain line every ten seconds.
 
     Attributes
     ----------
@@ -52,7 +52,7 @@ class Meter:
         self._last = done
         if self._quiet or now - self._started < PATIENCE_S:
             return
-        if sys.stderr.isatty():
+        if sys.stderr.isatty() or "ipykernel" in sys.modules:
             self._draw(done, total)
         elif now - self._shown >= 10.0:
             self._shown = now

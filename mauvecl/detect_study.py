@@ -85,6 +85,15 @@ class DetectAnswer:
         """The extremes of every null (amplitude 0) and flare, with their realisations."""
         return self._together(_tails)
 
+    def _repr_html_(self) -> str:
+        return str(self.table._repr_html_())
+
+    def plot(self, path: str | Path | None = None) -> object:
+        """Null and flare distributions of every star and statistic; needs matplotlib."""
+        from mauvecl.pictures import detection
+
+        return detection(self.stars, self.study.run.fap, None if path is None else Path(path))
+
     def _detections(self, star: StarDetection) -> QTable:
         table = star.found.table(self.study.run.fap)
         table.remove_column("name")

@@ -46,6 +46,14 @@ AmplitudeFlag = Annotated[
     list[float] | None,
     typer.Option("--amplitude", "-a", help="Flare amplitude, 0.24 is 24 %; may be repeated.", show_default=False),
 ]
+FlaresFlag = Annotated[
+    Path | None,
+    typer.Option(
+        "--flares",
+        help="Amplitudes from a table of flares (CSV, ECSV, FITS; AltaiPony's ampl_rec).",
+        show_default=False,
+    ),
+]
 FlareTemperatureFlag = Annotated[float | None, typer.Option(help="Flare temperature, K [10000].", show_default=False)]
 FlareBandFlag = Annotated[str | None, typer.Option(help="Band of the amplitude [Kepler].", show_default=False)]
 RealisationsFlag = Annotated[
@@ -176,6 +184,13 @@ def axis_of(text: str, flag: str) -> dict[str, Any]:
     return found | {"log": bool(rest)}
 
 
+def _amplitudes_of(path: Path) -> list[float]:
+    """Those of a table of flares, each once."""
+    from mauvecl.host.flare_table import read_flares
+
+    return sorted({float(value) for value in read_flares(path)["amplitude"]})
+
+
 #: What every verb takes; the first ones are put together by `_stars` and `_sky`.
 OBSERVATION = {
     "star": Option(StarFlag),
@@ -190,6 +205,7 @@ OBSERVATION = {
     "when": Option(TimeFlag),
 }
 FLARE = {
+    "flares": Option(FlaresFlag, "flare", "amplitudes", _amplitudes_of),
     "amplitude": Option(AmplitudeFlag, "flare", "amplitudes"),
     "flare_temperature": Option(FlareTemperatureFlag, "flare", "temperature_k"),
     "flare_band": Option(FlareBandFlag, "flare", "band"),
@@ -333,9 +349,8 @@ def _study(
     for name, option in options.items():
         if option.section:
             value = given[name]
-            if value is not None and option.convert is not None:
-                value = option.convert(value)
-            changes.setdefault(option.section, {})[option.key] = value
+            if value is not None:
+                changes.setdefault(option.section, {})[option.key] = option.convert(value) if option.convert else value
     changed = study.with_changes(changes, _stars(study, given))
     return changed.with_settings(given["settings"]) if given["settings"] else changed
 

@@ -189,6 +189,9 @@ class LimitResult:
             parts.append(({"star": one.star, **swept, **amplitude, "statistic": one.statistic}, table))
         return stacked(parts, study=self.study.toml())
 
+    def _repr_html_(self) -> str:
+        return str(self.table._repr_html_())
+
     def write(self, folder: str | Path) -> list[Path]:
         """The table as ECSV, that of the unknown's draws where there are any, and the study that gives them again."""
         from mauvecl.report import make_folder, write_study, write_table

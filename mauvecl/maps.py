@@ -88,6 +88,9 @@ class MapResult:
         }
         return described(table)
 
+    def _repr_html_(self) -> str:
+        return str(self.table._repr_html_())
+
     def write(self, folder: str | Path) -> list[Path]:
         """The table as ECSV and FITS, and the study that gives it again."""
         from mauvecl.report import make_folder, write_study, write_table

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from mauvecl.gaussian import GaussianReport
     from mauvecl.limits import LimitResult
     from mauvecl.maps import MapResult
+    from mauvecl.roc import Roc
     from mauvecl.snr import SnrResult
     from mauvecl.snr_study import SnrAnswer
 
@@ -66,24 +67,31 @@ def available() -> bool:
     return find_spec("matplotlib") is not None
 
 
-def _pyplot() -> Any:
+def pyplot() -> Any:
+    """Matplotlib's pyplot, without windows unless a notebook or the user has chosen how figures are shown."""
+    import os
+
     import matplotlib as mpl
 
-    mpl.use("Agg")
+    if "MPLBACKEND" not in os.environ:
+        mpl.use("Agg")
     import matplotlib.pyplot as plt
 
     return plt
 
 
-def _save(figure: Any, path: Path) -> Path:
+def finished(figure: Any, path: Path | None) -> Any:
+    """Save a figure under a path, in the form of its ending (.png, .pdf, .svg), or hand it out; pyplot forgets it."""
+    pyplot().close(figure)
+    if path is None:
+        return figure
     figure.savefig(path)
-    _pyplot().close(figure)
     return path
 
 
-def detection(stars: Sequence[StarDetection], fap: float, path: Path) -> Path:
+def detection(stars: Sequence[StarDetection], fap: float, path: Path | None = None) -> Any:
     """Null and flare distributions: a row per star, a column per statistic."""
-    plt = _pyplot()
+    plt = pyplot()
     statistics = stars[0].found.statistics
     columns = min(len(statistics), MOST_COLUMNS)
     rows = -(-len(statistics) // columns)
@@ -107,7 +115,7 @@ def detection(stars: Sequence[StarDetection], fap: float, path: Path) -> Path:
             f"{stars[0].found.realisations:,} realisations each; nominal throughput",
             fontsize=10,
         )
-        return _save(figure, path)
+        return finished(figure, path)
 
 
 def _distributions(axis: Any, star: StarDetection, statistic: str, fap: float) -> None:
@@ -152,9 +160,28 @@ def _distributions(axis: Any, star: StarDetection, statistic: str, fap: float) -
     axis.set_xlabel(NAMES.get(statistic, statistic))
 
 
-def spectra(stars: Sequence[StarDetection], path: Path) -> Path:
+def roc(curves: Sequence[tuple[str, Roc]], path: Path | None = None) -> Any:
+    """Receiver operating characteristics with their areas."""
+    plt = pyplot()
+    with plt.rc_context(STYLE):
+        figure, axis = plt.subplots(figsize=(3.6, 2.9))
+        for colour, (name, curve) in zip(COLOURS, curves, strict=False):
+            table = curve.table()
+            seen = np.asarray(table["fap"]) > 0
+            text = f"{name}: area {curve.area.value:.4f}"
+            axis.semilogx(table["fap"][seen], table["probability"][seen], color=colour, label=text)
+            axis.fill_between(
+                table["fap"][seen], table["probability_low"][seen], table["probability_high"][seen], color=colour,
+                alpha=0.3, linewidth=0,
+            )  # fmt: skip
+        axis.set(xlabel="false-alarm probability per test", ylabel="detection probability", ylim=(0, 1.02))
+        axis.legend(loc="lower right")
+        return finished(figure, path)
+
+
+def spectra(stars: Sequence[StarDetection], path: Path | None = None) -> Any:
     """Quiescent and flare spectra per second, with one standard deviation of a pixel's noise."""
-    plt = _pyplot()
+    plt = pyplot()
     groups = [(star.title, star.amplitudes, star.found.quiet, star.found.flares) for star in stars]
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(len(groups), 1, figsize=(7.2, 2.9 * len(groups) + 0.3), squeeze=False, sharex=True)
@@ -181,12 +208,12 @@ def spectra(stars: Sequence[StarDetection], path: Path) -> Path:
         figure.suptitle(
             "Mean spectra as Mauve would see them; nominal throughput, not a flight calibration", fontsize=10
         )
-        return _save(figure, path)
+        return finished(figure, path)
 
 
-def observation(title: str, table: QTable, path: Path) -> Path:
+def observation(title: str, table: QTable, path: Path | None = None) -> Any:
     """One raw spectrum and what it is made of, as the paper's figure of components."""
-    plt = _pyplot()
+    plt = pyplot()
     panels = (
         ("raw", "raw spectrum"),
         ("source", "star"),
@@ -206,12 +233,12 @@ def observation(title: str, table: QTable, path: Path) -> Path:
         axes[-1].set_xlabel("wavelength (nm)")
         axes[-1].set_xlim(200, 700)
         figure.suptitle(f"{title}: one observation of {table.meta['exposure_s']:g} s; nominal throughput", fontsize=10)
-        return _save(figure, path)
+        return finished(figure, path)
 
 
-def signal_to_noise(stars: Sequence[tuple[str, SnrResult]], path: Path) -> Path:
+def signal_to_noise(stars: Sequence[tuple[str, SnrResult]], path: Path | None = None) -> Any:
     """S/N per pixel and per resolution element: closed form, and the spread of the realisations."""
-    plt = _pyplot()
+    plt = pyplot()
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(len(stars), 2, figsize=(7.6, 2.6 * len(stars) + 0.4), squeeze=False, sharex=True)
         for row, (title, result) in zip(axes, stars, strict=True):
@@ -232,12 +259,12 @@ def signal_to_noise(stars: Sequence[tuple[str, SnrResult]], path: Path) -> Path:
         axes[0][0].legend()
         for axis in axes[-1]:
             axis.set_xlabel("wavelength (nm)")
-        return _save(figure, path)
+        return finished(figure, path)
 
 
 def detection_map(found: MapResult, path: Path | None) -> Any:
     """Detection probability over two quantities, one panel per statistic; the figure where no path is given."""
-    plt = _pyplot()
+    plt = pyplot()
     question = found.study.map
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(
@@ -265,12 +292,12 @@ def detection_map(found: MapResult, path: Path | None) -> Any:
         figure.suptitle(
             f"{found.star}, false-alarm probability {found.study.run.fap:g} per test; nominal throughput", fontsize=9
         )
-        return figure if path is None else _save(figure, path)
+        return finished(figure, path)
 
 
 def limits(found: LimitResult, path: Path | None) -> Any:
     """Detection probability at every simulated value, and the limits; the figure where no path is given."""
-    plt = _pyplot()
+    plt = pyplot()
     of, power = found.study.limit.of, found.study.limit.power
     with plt.rc_context(STYLE):
         figure, axis = plt.subplots(figsize=(6.4, 3.6))
@@ -301,7 +328,7 @@ def limits(found: LimitResult, path: Path | None) -> Any:
             "points: simulated, 95 %; lines: Gaussian noise; nominal throughput"
         )
         axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
-        return figure if path is None else _save(figure, path)
+        return finished(figure, path)
 
 
 #: Noise by origin, in the colours of the paper's figure as far as colour-blind readers can tell them apart.
@@ -314,9 +341,9 @@ ORIGINS = {
 }
 
 
-def noise_budgets(found: SnrAnswer, path: Path) -> Path:
+def noise_budgets(found: SnrAnswer, path: Path | None = None) -> Any:
     """Noise of a pixel by origin against wavelength, one panel per star and cell, as the paper's figure has it."""
-    plt = _pyplot()
+    plt = pyplot()
     each = len(found.study.cells())
     stars = len(found.stars) // each
     with plt.rc_context(STYLE):
@@ -340,14 +367,14 @@ def noise_budgets(found: SnrAnswer, path: Path) -> Path:
         handles, names = axes[0][0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=len(names))
         figure.suptitle("Noise budgets; nominal throughput, not a flight calibration", fontsize=10)
-        return _save(figure, path)
+        return finished(figure, path)
 
 
-def snr_sweep(found: SnrAnswer, path: Path) -> Path:
+def snr_sweep(found: SnrAnswer, path: Path | None = None) -> Any:
     """S/N of some elements against what is swept first, a line for each value of the rest."""
     from mauvecl.exposures import place_of
 
-    plt = _pyplot()
+    plt = pyplot()
     first = found.study.sweep.axes[0].quantity
     shown = found.stars[0].shown_nm
     tables = [star.result.element for star in found.stars]
@@ -376,12 +403,12 @@ def snr_sweep(found: SnrAnswer, path: Path) -> Path:
         handles, names = axes[0][0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=min(len(names), 4))
         figure.suptitle("S/N: closed form, and 95 % of realisations; nominal throughput", fontsize=10)
-        return _save(figure, path)
+        return finished(figure, path)
 
 
 def gaussian(found: GaussianReport, path: Path | None) -> Any:
     """How far each promise of the usual formula holds in every cell; the figure where no path is given."""
-    plt = _pyplot()
+    plt = pyplot()
     cells = found.cells
     # Column, what it is, what is promised, and the least that an axis shows to either side of it.
     panels = (
@@ -406,12 +433,12 @@ def gaussian(found: GaussianReport, path: Path | None) -> Any:
         axes[0].set_yticks(rows, [titled(s.label, s.at) for s in found.signal.stars])
         axes[0].invert_yaxis()
         figure.suptitle("The root-of-N formula beside the simulation; grey: as promised", fontsize=10)
-        return figure if path is None else _save(figure, path)
+        return finished(figure, path)
 
 
 def exposures(found: ExposureResult, path: Path | None) -> Any:
     """S/N against exposure for each star, which grows with the root of it; the figure where no path is given."""
-    plt = _pyplot()
+    plt = pyplot()
     with plt.rc_context(STYLE):
         figure, axis = plt.subplots(figsize=(5.2, 3.4))
         for k, e in enumerate(found.exposures):
@@ -424,4 +451,4 @@ def exposures(found: ExposureResult, path: Path | None) -> Any:
         axis.set(xscale="log", yscale="log", xlabel="exposure (s)", ylabel=f"S/N per {first.per}")
         axis.set_title(f"S/N at {first.wavelength_nm:g} nm; dashed: the one wanted; nominal throughput")
         axis.legend()
-        return figure if path is None else _save(figure, path)
+        return finished(figure, path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -67,6 +68,12 @@ class Roc:
         keep = np.append(True, (np.diff(fap) != 0) | (np.diff(probability) != 0))
         edges = np.asarray(null.edge(np.flatnonzero(keep)))
         return cls(edges, fap[keep], probability[keep], null.n, Interval(area, low, high))
+
+    def plot(self, path: str | Path | None = None, *, name: str = "") -> object:
+        """Detection probability against false-alarm probability; needs matplotlib."""
+        from mauvecl.pictures import roc
+
+        return roc([(name, self)], None if path is None else Path(path))
 
     def table(self, rows: int = 200) -> QTable:
         """Some rows of the curve, both probabilities with their Clopper-Pearson intervals; the area in the meta data.

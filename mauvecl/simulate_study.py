@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mauvecl.components import components
@@ -22,6 +23,13 @@ class SimulateAnswer:
     study: Study
     observations: list[tuple[str, Expectation, QTable]]
     messages: list[str]
+
+    def plot(self, path: str | Path | None = None, *, number: int = 0) -> object:
+        """One of the observations and what it is made of; needs matplotlib."""
+        from mauvecl.pictures import observation
+
+        title, _, table = self.observations[number]
+        return observation(title, table, None if path is None else Path(path))
 
 
 def simulate(study: Study, *, realisation: int = 0, flaring: bool = False) -> SimulateAnswer:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mauvecl.labels import label, stacked, titled, told
@@ -72,6 +73,15 @@ class SnrAnswer:
     def noise_budget(self) -> QTable:
         """Noise by origin, DN rms per pixel, one row per star, cell and pixel."""
         return self.together(lambda result: result.expectation.noise_budget())
+
+    def _repr_html_(self) -> str:
+        return str(self.element._repr_html_())
+
+    def plot(self, path: str | Path | None = None) -> object:
+        """S/N per pixel and element, closed form and realisations; needs matplotlib."""
+        from mauvecl.pictures import signal_to_noise
+
+        return signal_to_noise([(s.title, s.result) for s in self.stars], None if path is None else Path(path))
 
     def together(self, table_of: Callable[[SnrResult], QTable]) -> QTable:
         """A table of each star and cell as one, with the star and what is swept in front."""

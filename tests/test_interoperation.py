@@ -1,0 +1,127 @@
+"""What goes in from other packages, and out to them."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import QTable, Table
+from typer.testing import CliRunner
+
+from mauvecl import Source
+from mauvecl.cli import app
+from mauvecl.host.errors import InputError
+from mauvecl.host.flare_table import flares_of, read_flares
+from tests.scenes import star
+
+
+def test_a_synphot_spectrum_in_and_out() -> None:
+    source = Source.from_library("G2V").at_magnitude(7.4)
+    back = Source.from_synphot(source.to_synphot(), name="G2V")
+    np.testing.assert_allclose(
+        np.interp(source.wavelength_nm, back.wavelength_nm, back.flux_flam), source.flux_flam, rtol=1e-10, atol=1e-25
+    )
+    assert back.magnitude("V") == pytest.approx(7.4, abs=1e-4)
+
+
+def test_a_synphot_blackbody_as_stsynphot_makes_its_stars() -> None:
+    """stsynphot's grids hand out synphot SourceSpectrum objects, as this is one."""
+    from synphot import SourceSpectrum
+    from synphot.models import BlackBodyNorm1D
+
+    hot, cool = (Source.from_synphot(SourceSpectrum(BlackBodyNorm1D, temperature=t)) for t in (10_000, 5_000))
+    assert hot.magnitude("GALEX NUV") - hot.magnitude("V") < cool.magnitude("GALEX NUV") - cool.magnitude("V")
+
+
+def test_a_specutils_spectrum_in_and_out() -> None:
+    pytest.importorskip("specutils")
+    source = Source.from_library("K3V").at_magnitude(6.0)
+    out = source.to_specutils()
+    assert out.flux.unit.is_equivalent(u.erg / (u.s * u.cm**2 * u.AA))
+    back = Source.from_specutils(out, name="K3V")
+    np.testing.assert_array_equal(back.flux_flam, source.flux_flam)
+    np.testing.assert_array_equal(back.wavelength_nm, source.wavelength_nm)
+
+
+def test_an_expectation_as_a_specutils_spectrum() -> None:
+    pytest.importorskip("specutils")
+    (quiet,) = star()
+    out = quiet.to_specutils()
+    np.testing.assert_array_equal(out.flux.value, quiet.signal_dn)
+    np.testing.assert_allclose(out.uncertainty.array, np.sqrt(quiet.variance_dn2))
+    assert not out.mask.any()
+
+
+ALTAIPONY = """istart,istop,cstart,cstop,tstart,tstop,ed_rec,ed_rec_err,ampl_rec,dur,total_n_valid_data_points
+10,14,1,5,1325.301,1325.304,12.1,0.3,0.081,0.0028,18000
+90,95,81,86,1330.117,1330.121,40.5,0.5,0.24,0.0035,18000
+99,102,90,93,1331.2,1331.203,1.1,0.2,0.081,0.002,18000
+"""
+
+
+def test_a_table_of_altaipony(tmp_path: Path) -> None:
+    """The columns that its FlareLightCurve.flares writes to CSV."""
+    file = tmp_path / "flares.csv"
+    file.write_text(ALTAIPONY)
+    table = read_flares(file)
+    np.testing.assert_array_equal(table["amplitude"], [0.081, 0.24, 0.081])
+    np.testing.assert_array_equal(table["start"].to_value("d"), [1325.301, 1330.117, 1331.2])
+    done = CliRunner().invoke(
+        app,
+        ["detect", "--star", "G2V", "-m", "7.4", "--flares", str(file), "--flare-band", "TESS", "-n", "100000",
+         "--no-pictures", "--quiet", "-o", str(tmp_path / "out")],
+    )  # fmt: skip
+    assert done.exit_code == 0, done.output
+    found = QTable.read(tmp_path / "out" / "detection.ecsv", format="ascii.ecsv")
+    assert sorted(set(found["amplitude"])) == [0.081, 0.24], "each amplitude once"
+
+
+def test_a_data_frame_and_a_fits_table(tmp_path: Path) -> None:
+    pandas = pytest.importorskip("pandas")
+    frame = pandas.DataFrame({"Amplitude": [0.1, 0.2], "Start": [1.0, 2.0]})
+    np.testing.assert_array_equal(flares_of(frame)["amplitude"], [0.1, 0.2])
+    Table({"amp": [0.3]}).write(tmp_path / "f.fits")
+    np.testing.assert_array_equal(read_flares(tmp_path / "f.fits")["amplitude"], [0.3])
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("time,flux\n1,2\n", "has the columns time, flux, expected one named ampl_rec"),
+        ("ampl_rec\n0.1\n-0.2\n", "the amplitude of flare 1 is -0.2, expected a relative rise above 0"),
+        ("ampl_rec\n", "holds 0 flares, expected 1 to 500"),
+    ],
+)
+def test_tables_that_cannot_be(tmp_path: Path, text: str, sentence: str) -> None:
+    (tmp_path / "f.csv").write_text(text)
+    with pytest.raises(InputError, match=sentence):
+        read_flares(tmp_path / "f.csv")
+    with pytest.raises(InputError, match=r"'nowhere\.csv' does not exist"):
+        read_flares("nowhere.csv")
+
+
+def test_fits_tables_read_by_astropy_and_clean(tmp_path: Path) -> None:
+    done = CliRunner().invoke(
+        app, ["simulate", "--star", "G2V", "-m", "7.4", "--no-pictures", "--quiet", "-o", str(tmp_path)]
+    )
+    assert done.exit_code == 0, done.output
+    file = tmp_path / "observation-1.fits"
+    with fits.open(file) as hdus:
+        assert hdus[1].columns["wavelength"].unit == "nm"
+    table = QTable.read(file)
+    assert table["raw"].unit == u.adu
+    if shutil.which("fitsverify"):
+        told = subprocess.run(["fitsverify", file], capture_output=True, text=True, check=True).stdout
+        assert "0 warning(s) and 0 error(s)" in told, told
+
+
+def test_rich_displays() -> None:
+    (quiet,) = star()
+    assert "best S/N" in quiet._repr_html_()
+    source = Source.from_arrays(np.linspace(170, 800, 50), np.ones(50), name="<script>")
+    assert "<script>" not in source._repr_html_()
