@@ -415,7 +415,7 @@ class Study(_Part):
     unknowns: Unknowns = Unknowns()
 
     @classmethod
-    def read(cls, path: Path) -> Self:
+    def read(cls, path: str | Path) -> Self:
         """A study file, or the study that an answer's ECSV table was made by.
 
         Raises
@@ -423,6 +423,7 @@ class Study(_Part):
         InputError
             If it is missing, not TOML (naming the line), or holds an unknown key or an impossible value.
         """
+        path = Path(path)
         try:
             text = path.read_text(encoding="utf-8")
             data = tomllib.loads(_study_of(path) if path.suffix == ".ecsv" else text)
