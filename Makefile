@@ -18,7 +18,7 @@ demo: .venv/plot.stamp
 	$(BIN)/mauvecl detect --output demo
 
 test: .venv/test.stamp
-	$(BIN)/python -m pytest -n 2
+	$(BIN)/python -m pytest -n 3 --dist worksteal
 
 lint: .venv/test.stamp .venv/lint.stamp
 	$(BIN)/ruff check .

@@ -187,7 +187,7 @@ class Checkpoint:
     @property
     def kept(self) -> int:
         """Files of shares that are there."""
-        return sum(1 for _ in self.folder.glob("*.npz")) if self.folder.exists() else 0
+        return sum(1 for _ in self.folder.glob("[!.]*.npz"))
 
     def forget(self) -> None:
         """Remove it: the answer is written."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import io
 import tempfile
-import zipfile
 from collections.abc import Callable
 from concurrent.futures import CancelledError, Future
 from functools import partial
@@ -13,7 +12,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 import panel as pn
-import param
 from bokeh.models.widgets import Div
 from panel.theme import fast
 
@@ -25,14 +23,15 @@ from mauvecl.limits import LimitResult, limiting_magnitude
 from mauvecl.maps import MapResult, detection_map
 from mauvecl.program import DeviceError
 from mauvecl.scene import prepare
+from mauvecl.snr_study import SnrAnswer, snr
 from mauvecl.study import Study
-from mauvecl.web.question import ENDINGS, UPLOADED, Question, star_names, write_spectrum
-from mauvecl.web.views import Distributions, NoiseBudget, Observation, Roc, SignalToNoise, Smooth
+from mauvecl.web.controls import controls
+from mauvecl.web.downloads import as_file, study_file
+from mauvecl.web.question import UPLOADED, Question
+from mauvecl.web.views import Distributions, InputSpectrum, NoiseBudget, Observation, Roc, SignalToNoise, Smooth
 from mauvecl.web.work import Cancelled, Job
 
 if TYPE_CHECKING:
-    from astropy.table import Table
-
     from mauvecl.host.expectation import Expectation
     from mauvecl.pool import Pool
 
@@ -47,15 +46,6 @@ NOMINAL = (
 ABOUT = (
     "Would the Mauve satellite see this stellar flare, and how sure can one be? Closed forms follow every change at "
     "once; *Simulate* refines them with noise realisations."
-)
-#: Arrows beside numbers have no name for a screen reader; the keyboard's do the same.
-NO_ARROWS = ".bk-spin-btn { display: none !important; }"
-# Labels that screen readers meet too are the widgets' names.
-FIELDS = (
-    ("Star", ("magnitude", "band")),
-    ("Observation", ("exposure_s", "temperature_c", "instrument", "sky", "sky_brightness", "target", "time")),
-    ("Flare", ("amplitude_percent", "flare_temperature_k")),
-    ("Detection", ("statistic", "fap", "realisations", "seed")),
 )
 
 
@@ -74,6 +64,7 @@ class Page:
     def __init__(self) -> None:
         self.question = Question()
         self.job: Job | None = None
+        self._drawing: Job | None = None
         self.quiet: Expectation | None = None
         self.flare: Expectation | None = None
         self.theory: Detection | None = None
@@ -88,11 +79,15 @@ class Page:
         self.summary = Div(sizing_mode="stretch_width", styles={"font-size": "110%"})
         self.status = pn.pane.Markdown("", sizing_mode="stretch_width")
         self.bar = pn.indicators.Progress(name="Progress", value=0, max=100, sizing_mode="stretch_width", visible=False)
+        self.spectrum = InputSpectrum()
         self.views = Observation(), SignalToNoise(), NoiseBudget(), Distributions(), Roc()
         self.table = pn.pane.DataFrame(None, index=False, sizing_mode="stretch_width", escape=True)
         self.limit = pn.Column(sizing_mode="stretch_width")
         self.map = pn.Column(sizing_mode="stretch_width")
-        self._make_controls()
+        if self._document is not None:
+            pn.state.on_session_destroyed(lambda context: self._left())
+        self._make_buttons()
+        self.controls = controls(self.question, lambda text: self._alert(text, "danger"))
         self.tabs = self._make_tabs()
         self.tabs.param.watch(self._show_tab, "active")
         self._stale: set[int] = set()
@@ -111,62 +106,22 @@ class Page:
             f"The link holds {', '.join(sorted(map(str, bad)))} that cannot be; the usual values stand there."
         )
 
-    # Controls
+    def _left(self) -> None:
+        """The visitor is gone: nothing more is computed for them."""
+        for job in (self.job, self._drawing):
+            if job is not None:
+                job.cancel()
+        self._folder.cleanup()
 
-    def _make_controls(self) -> None:
-        q = self.question
-        names = [*star_names(), UPLOADED]
-        self.star = pn.widgets.AutocompleteInput(
-            name="Library star", options=names, value=q.star, case_sensitive=False, restrict=True, min_characters=1,
-            search_strategy="includes", placeholder="type to search, such as K or HD", sizing_mode="stretch_width",
-        )  # fmt: skip
-        self.star.link(q, callbacks={"value": lambda *events: self._star_chosen(events[-1].new)})
-        q.param.watch(lambda event: setattr(self.star, "value", event.new), "star")
-        self.file = pn.widgets.FileInput(
-            accept=",".join(ENDINGS), name="Your own spectrum", sizing_mode="stretch_width", multiple=False
-        )
-        self.file.param.watch(self._uploaded, "value")
-        widgets: dict[str, Any] = {}
-        for name in (name for _, fields in FIELDS for name in fields):
-            about = q.param[name]
-            widgets[name] = _kind(about).from_param(
-                about, name=about.doc, sizing_mode="stretch_width", description=None
-            )
-            widgets[name].stylesheets = [NO_ARROWS]
-        self.widgets = widgets
-
-        def asked(name: str) -> Callable[[str], bool]:
-            return lambda sky: sky == {"sky_brightness": "brightness"}.get(name, "target and time")
-
-        for name in ("sky_brightness", "target", "time"):
-            widgets[name].visible = pn.bind(asked(name), q.param.sky)
+    def _make_buttons(self) -> None:
         self.run = pn.widgets.Button(name="Simulate", button_type="primary", width=240)
         self.cancel = pn.widgets.Button(name="Cancel", disabled=True, width=120)
         self.run_limit = pn.widgets.Button(name="Find the limiting magnitude", button_type="primary")
         self.run_map = pn.widgets.Button(name="Draw the map", button_type="primary")
-        self.run.on_click(partial(self._simulate, "detection", detect, self._show_detection))
+        self.run.on_click(partial(self._simulate, "detection", _refined, self._show_refined))
         self.run_limit.on_click(partial(self._simulate, "limit", limiting_magnitude, self._show_limit))
         self.run_map.on_click(partial(self._simulate, "map", _map, self._show_map))
         self.cancel.on_click(lambda event: self.job.cancel() if self.job is not None else None)
-        upload = "or upload nm and erg/s/cm²/Å (text, ECSV, FITS; up to 4 MiB)"
-        rows: list[Any] = [pn.pane.Markdown("## Star"), self.star, pn.pane.Markdown(upload), self.file]
-        for title, fields in FIELDS:
-            if title != "Star":
-                rows.append(pn.pane.Markdown(f"## {title}"))
-            rows += [widgets[name] for name in fields]
-        self.controls = pn.Column(*rows, sizing_mode="stretch_width")
-
-    def _star_chosen(self, name: str) -> None:
-        if name:
-            self.question.star = name
-
-    def _uploaded(self, event: Any) -> None:
-        if event.new is None:
-            return
-        try:
-            self.question.upload(str(self.file.filename), event.new)
-        except InputError as error:
-            self._alert(str(error), "danger")
 
     # Closed forms
 
@@ -205,6 +160,7 @@ class Page:
 
     def _show_closed(self, study: Study) -> None:
         q = self.question
+        self._source = study.star[0].source()
         quiet, flare = self.quiet, self.flare = study.expectations(study.star[0])
         scene = prepare([quiet, flare], comparison=study.run.comparison())
         self.theory = Detection(
@@ -227,8 +183,12 @@ class Page:
         observation, snr, budget, distributions, roc = self.views
         if self.tabs.active == 0:
             observation.show(self.quiet, self.flare)
+            amplitude, kelvin = self.question.amplitude_percent / 100, self.question.flare_temperature_k
+            self.spectrum.show(self._source, self._source.flaring(amplitude, kelvin))
         elif self.tabs.active == 1:
             snr.show(self.quiet)
+            if "snr" in self.found:
+                snr.add(self.found["snr"].element)
         elif self.tabs.active == 2:
             budget.show(self.quiet)
         elif self.tabs.active == 3:
@@ -264,8 +224,11 @@ class Page:
             if not future.cancelled() and future.exception() is None:
                 self._later(partial(show, future.result()))
 
+        if self._drawing is not None:
+            self._drawing.cancel()
         how = study.drawing | {"seed": study.run.seed}
-        Job(lambda pool: pool.realise(flare, count=1, **how)[0]).future.add_done_callback(came)
+        self._drawing = Job(lambda pool: pool.realise(flare, count=1, **how)[0])
+        self._drawing.future.add_done_callback(came)
 
     def _later(self, work: Callable[[], None]) -> None:
         """Change the page from another thread, when it is its turn."""
@@ -313,6 +276,12 @@ class Page:
         standing = job.standing
         if standing is not None and standing.total:
             self.bar.value = min(int(100 * standing.done / standing.total), 100)
+
+    def _show_refined(self, answers: tuple[DetectAnswer, SnrAnswer]) -> None:
+        self.found["detection"], self.found["snr"] = answers
+        self._show_detection(answers[0])
+        if 1 not in self._stale:
+            self.views[1].add(answers[1].element)
 
     def _show_detection(self, answer: DetectAnswer) -> None:
         q = self.question
@@ -370,82 +339,19 @@ class Page:
         """The question as it stands."""
         return self.question.study(Path(self._folder.name))
 
-    def study_file(self) -> io.BytesIO:
-        """The study for the command line; an uploaded star beside it, in a zip."""
-        study = self.study()
-        if self.question.star != UPLOADED or self.question.uploaded is None:
-            return io.BytesIO(study.toml().encode())
-        out = io.BytesIO()
-        with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(out, "w") as archive:
-            file = write_spectrum(self.question.uploaded, Path(folder))
-            archive.write(file, file.name)
-            # Files are named as seen from the study.
-            archive.writestr("study.toml", study.toml().replace(str(study.star[0].file), file.name))
-        out.seek(0)
-        return out
-
-    def _tables(self) -> dict[str, Callable[[], Table]]:
-        quiet = self.quiet
-        if quiet is None:
-            raise InputError("there is no answer to download, expected a question that has one")
-        answers: dict[str, Callable[[], Table]] = {
-            "noise-budget": quiet.noise_budget,
-            "observation": self._observed,
-        }
-        if "detection" in self.found:
-            answers["detection"] = lambda: self.found["detection"].table
-            answers["roc"] = lambda: self.found["detection"].roc
-        for kind in ("limit", "map"):
-            if kind in self.found:
-                answers[kind] = lambda kind=kind: self.found[kind].table  # type: ignore[misc]
-        return answers
-
-    def _observed(self) -> Table:
-        from mauvecl.simulate_study import simulate
-
-        return simulate(self.study(), flaring=True).observations[1][2]
-
-    def download(self, name: str, ending: str) -> io.BytesIO:
-        """A table or a picture as a file.
-
-        Raises
-        ------
-        InputError
-            If it is not computed yet.
-        """
-        from mauvecl.report import write_table
-
-        with tempfile.TemporaryDirectory() as folder:
-            path = Path(folder) / f"{name}.{ending}"
-            if ending == "png":
-                self._write_picture(name, path)
-            else:
-                tables = self._tables()
-                if name not in tables:
-                    raise InputError(f"no {name} is computed yet, expected a simulation first")
-                write_table(tables[name](), path)
-            return io.BytesIO(path.read_bytes())
-
-    def _write_picture(self, name: str, path: Path) -> None:
-        from mauvecl import pictures
-
-        if name == "observation":
-            pictures.observation(self.question.star, self._observed(), path)
-        elif name == "detection" and name in self.found:
-            pictures.detection(self.found[name].stars, self.question.fap, path)
-        elif name in ("limit", "map") and name in self.found:
-            self.found[name].plot(path)
-        else:
-            raise InputError(f"no {name} is computed yet, expected a simulation first")
-
     def _downloads(self, name: str, endings: tuple[str, ...]) -> Any:
         return pn.FlexBox(*(
             pn.widgets.FileDownload(
-                callback=partial(self._safely, partial(self.download, name, ending)),
+                callback=partial(self._safely, partial(self._file, name, ending)),
                 filename=f"mauvecl-{name}.{ending}", label=f"{name} ({ending})", embed=False, auto=True, width=200,
             )
             for ending in endings
         ))  # fmt: skip
+
+    def _file(self, name: str, ending: str) -> io.BytesIO:
+        if self.quiet is None:
+            raise InputError("there is no answer to download, expected a question that has one")
+        return as_file(name, ending, self.study(), self.quiet, self.found)
 
     def _safely(self, make: Callable[[], io.BytesIO]) -> io.BytesIO:
         try:
@@ -459,9 +365,10 @@ class Page:
     def _make_tabs(self) -> Any:
         observation, snr, budget, distributions, roc = (view.plot for view in self.views)
         tables = ("ecsv", "fits")
+        taken = self._downloads("observation", (*tables, "png"))
         return pn.Tabs(
-            ("Simulated observation", pn.Column(observation, self._downloads("observation", (*tables, "png")))),
-            ("S/N", pn.Column(snr)),
+            ("Simulated observation", pn.Column(observation, self.spectrum.plot, taken)),
+            ("S/N", pn.Column(snr, self._downloads("snr", tables))),
             ("Noise budget", pn.Column(budget, self._downloads("noise-budget", tables))),
             (
                 "Flare detection",
@@ -474,7 +381,7 @@ class Page:
                 "Limiting magnitude and map",
                 pn.Column(
                     pn.FlexBox(self.run_limit, self.run_map), self.limit, self.map,
-                    self._downloads("limit", ("ecsv", "png")), self._downloads("map", ("ecsv", "fits", "png")),
+                    self._downloads("limit", ("ecsv", "fits", "png")), self._downloads("map", ("ecsv", "fits", "png")),
                 ),
             ),
             dynamic=False,
@@ -484,9 +391,12 @@ class Page:
     def layout(self) -> Any:
         """The whole page."""
         study = pn.widgets.FileDownload(
-            callback=partial(self._safely, self.study_file), label="Study for the command line", embed=False, auto=True,
+            callback=partial(self._safely, lambda: study_file(self.question, self.study())),
+            label="Study for the command line",
+            embed=False,
+            auto=True,
             width=260,
-        )  # fmt: skip
+        )
 
         def named(star: str) -> str:
             return "study.zip" if star == UPLOADED else "study.toml"
@@ -520,15 +430,14 @@ class Page:
         return template
 
 
-def _kind(about: Any) -> Any:
-    """The control for a kind of value."""
-    kinds = ((param.Integer, pn.widgets.IntInput), (param.Number, pn.widgets.FloatInput))
-    others = ((param.Selector, pn.widgets.Select), (param.String, pn.widgets.TextInput))
-    return next(widget for kind, widget in (*kinds, *others) if isinstance(about, kind))
-
-
 def _percent(value: float) -> str:
     return f"{100 * float(value):.2f} %"
+
+
+def _refined(study: Study, pool: Pool) -> tuple[DetectAnswer, SnrAnswer]:
+    """Everything that *Simulate* refines."""
+    pool.expect(2 * study.run.realisations)
+    return detect(study, pool), snr(study, pool)
 
 
 def _map(study: Study, pool: Pool) -> MapResult:

@@ -14,10 +14,12 @@ from scipy.interpolate import PchipInterpolator
 from mauvecl.pictures import COLOURS, NULL
 
 if TYPE_CHECKING:
+    from astropy.table import QTable
     from numpy.typing import NDArray
 
     from mauvecl.detect_study import StarDetection
     from mauvecl.host.expectation import Expectation
+    from mauvecl.host.source import Source
     from mauvecl.statistics import Normal, QuadraticForm
 
 HEIGHT = 380
@@ -93,22 +95,50 @@ class Observation:
         self.lines.show(raw_spectrum_with_flare=(quiet.wavelength_nm, raw), **self._parts)
 
 
-class SignalToNoise:
-    """Closed-form S/N per pixel and element."""
+class InputSpectrum:
+    """The star's spectrum at the telescope, without and with the flare."""
 
     def __init__(self) -> None:
-        names = ("per element of 10.5 nm", "per pixel")
-        self.lines = Lines("Signal to noise without a flare, closed form", "wavelength (nm)", "S/N", names)
+        self.lines = Lines(
+            "Spectrum at the telescope",
+            "wavelength (nm)",
+            "flux (erg / s / cm2 / Å)",
+            ("star", "star with flare"),
+            y_axis_type="log",
+            x_range=(200, 700),
+        )
         self.plot = self.lines.plot
 
+    def show(self, star: Source, flare: Source) -> None:
+        """Where the instrument looks; logarithms show nothing of zero."""
+        shown = (star.wavelength_nm >= 190) & (star.wavelength_nm <= 710)
+        wavelength = star.wavelength_nm[shown]
+        one, two = (np.where(s.flux_flam > 0, s.flux_flam, np.nan)[shown] for s in (star, flare))
+        self.lines.show(star=(wavelength, one), star_with_flare=(wavelength, two))
+
+
+class SignalToNoise:
+    """S/N per pixel and element: closed form at once, the spread of the realisations when it is there."""
+
+    def __init__(self) -> None:
+        names = ("per element of 10.5 nm", "per pixel", "2.5 % of realisations", "97.5 % of realisations")
+        self.lines = Lines("Signal to noise without a flare", "wavelength (nm)", "S/N", names)
+        self.plot = self.lines.plot
+        self._theory: dict[str, Any] = {}
+
     def show(self, quiet: Expectation) -> None:
-        """Of one star."""
-        self.lines.show(
-            **{
-                "per_element_of_10.5_nm": (quiet.element_wavelength_nm, quiet.snr_per_element()),
-                "per_pixel": (quiet.wavelength_nm, quiet.snr()),
-            }
-        )
+        """The closed forms of one star; an earlier simulation goes."""
+        self._theory = {
+            "per_element_of_10.5_nm": (quiet.element_wavelength_nm, quiet.snr_per_element()),
+            "per_pixel": (quiet.wavelength_nm, quiet.snr()),
+        }
+        self.lines.show(**self._theory)
+
+    def add(self, element: QTable) -> None:
+        """Quantiles of the realisations, per element."""
+        wavelength = element["wavelength"].to_value("nm")
+        spread = {f"{q}_%_of_realisations": (wavelength, np.asarray(element[f"q{q}"])) for q in ("2.5", "97.5")}
+        self.lines.show(**self._theory, **spread)
 
 
 class NoiseBudget:

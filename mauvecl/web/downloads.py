@@ -1,0 +1,104 @@
+"""What visitors take along: tables, pictures, and the study that gives them again."""
+
+from __future__ import annotations
+
+import io
+import tempfile
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mauvecl.host.errors import InputError
+from mauvecl.web.question import UPLOADED, Question, write_spectrum
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.study import Study
+
+
+def study_file(question: Question, study: Study) -> io.BytesIO:
+    """The study for the command line; an uploaded star beside it, in a zip."""
+    if question.star != UPLOADED or question.uploaded is None:
+        return io.BytesIO(study.toml().encode())
+    out = io.BytesIO()
+    with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(out, "w") as archive:
+        file = write_spectrum(question.uploaded, Path(folder))
+        archive.write(file, file.name)
+        # Files are named as seen from the study.
+        archive.writestr("study.toml", study.toml().replace(str(study.star[0].file), file.name))
+    out.seek(0)
+    return out
+
+
+def as_file(name: str, ending: str, study: Study, quiet: Expectation, found: Mapping[str, Any]) -> io.BytesIO:
+    """A table or a picture.
+
+    Parameters
+    ----------
+    name : str
+        observation, snr, noise-budget, detection, roc, limit or map.
+    ending : {"ecsv", "fits", "png"}
+    study : Study
+    quiet : Expectation
+    found : mapping
+        Answers that are simulated, by name.
+
+    Raises
+    ------
+    InputError
+        If it is not computed yet.
+    """
+    from mauvecl.report import write_table
+
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / f"{name}.{ending}"
+        if ending == "png":
+            _draw(name, study, found, path)
+        else:
+            write_table(_table(name, study, quiet, found), path)
+        return io.BytesIO(path.read_bytes())
+
+
+def _table(name: str, study: Study, quiet: Expectation, found: Mapping[str, Any]) -> Table:
+    tables: dict[str, Callable[[], Table]] = {
+        "noise-budget": quiet.noise_budget,
+        "observation": lambda: _observed(study),
+        "snr": lambda: found["snr"].element if "snr" in found else _closed_snr(quiet),
+    }
+    if "detection" in found:
+        tables |= {"detection": lambda: found["detection"].table, "roc": lambda: found["detection"].roc}
+    tables |= {kind: lambda kind=kind: found[kind].table for kind in ("limit", "map") if kind in found}  # type: ignore[misc]
+    if name not in tables:
+        raise InputError(f"no {name} is computed yet, expected a simulation first")
+    return tables[name]()
+
+
+def _draw(name: str, study: Study, found: Mapping[str, Any], path: Path) -> None:
+    from mauvecl import pictures
+
+    if name == "observation":
+        pictures.observation(study.star[0].library or UPLOADED, _observed(study), path)
+    elif name in found:
+        found[name].plot(path)
+    else:
+        raise InputError(f"no {name} is computed yet, expected a simulation first")
+
+
+def _observed(study: Study) -> Table:
+    """One observation with the flare, taken apart."""
+    from mauvecl.simulate_study import simulate
+
+    return simulate(study, flaring=True).observations[1][2]
+
+
+def _closed_snr(quiet: Expectation) -> Table:
+    """S/N per element where nothing is simulated yet."""
+    from astropy.table import QTable
+
+    table = QTable({"wavelength": quiet.element_wavelength_nm, "expected": quiet.snr_per_element()})
+    table["wavelength"].unit = "nm"
+    table["expected"].info.description = "closed-form S/N per resolution element of 10.5 nm"
+    return table
