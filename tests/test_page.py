@@ -174,7 +174,7 @@ def test_cancel_stops_at_once(page: Page) -> None:
     started = time.monotonic()
     page.get_by_role("button", name="Cancel").click()
     page.get_by_text("Cancelled.").wait_for()
-    assert time.monotonic() - started < 5, "a tile, not the rest"
+    assert time.monotonic() - started < 10, "a tile, not the rest"
     page.get_by_label("Realisations").select_option("10000")
     before = page.get_by_text(SIMULATED).count()
     assert before == 0
@@ -185,6 +185,10 @@ def test_cancel_stops_at_once(page: Page) -> None:
 
 def test_a_second_visitor_is_served_while_the_first_computes(browser: Browser, address: str) -> None:
     first, second = fresh(browser, address), fresh(browser, address)
+    # Minutes of work.
+    before = summary(first)
+    first.get_by_label("Detection statistic").select_option("chi2_pair")
+    changed(first, before)
     first.get_by_label("Realisations").select_option("4000000")
     first.get_by_role("button", name="Simulate", exact=True).click()
     first.get_by_text(re.compile(r"of 8,000,000 realisations")).wait_for()
