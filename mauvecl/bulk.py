@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from mauvecl.durable import UNFINISHED, alone, write_whole
 from mauvecl.host.errors import InputError
 from mauvecl.pool import Pool, together
-from mauvecl.store import DIGESTS, Chunk, Scene, Store, digest
+from mauvecl.store import CRC_BYTES, DIGESTS, Chunk, Scene, Store, crc, digest
 from mauvecl.study import Study
 
 if TYPE_CHECKING:
@@ -205,17 +205,11 @@ class Fault:
 
 def state(store: Store, chunk: Chunk) -> str:
     """``good``, or what a chunk's bytes show to be wrong; see `Fault`."""
-    import google_crc32c
-
     try:
         data = (store.path / chunk.key).read_bytes()
     except FileNotFoundError:
         return "missing"
-    body, check = memoryview(data)[:-4], data[-4:]
-    rows = chunk.scene.chunk_rows(store.rows)
-    if len(body) != rows * int(np.prod(chunk.scene.row)) * chunk.scene.dtype.itemsize:
-        return "damaged"
-    if int(google_crc32c.value(data[:-4])).to_bytes(4, "little") != check:
+    if len(data) != store.chunk_bytes(chunk) or crc(data[:-CRC_BYTES]) != data[-CRC_BYTES:]:
         return "damaged"
     known = store.digests.get(chunk.key)
     if known is None:
@@ -283,8 +277,9 @@ def _fault(store: Store, chunk: Chunk, engine: Engine | Pool | None, repair: boo
     seen = state(store, chunk)
     if seen == "good" and not redraw:
         return None
-    if engine is None:
+    if seen != "good" and not repair:
         return Fault(chunk.key, seen, False)
+    assert engine is not None
     rows = draw(store.study, chunk.scene, engine, chunk.start, chunk.stop - chunk.start)
     drawn = digest(*store.encode(chunk, rows))
     if seen == "good":

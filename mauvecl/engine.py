@@ -226,13 +226,13 @@ class Engine:
         InputError
             For an impossible number, seed or mode.
         """
-        self._check(start, realisations, seed)
         request = SnrRequest(expectation, realisations, seed, mode, start, processes, recipe)
         self.count_snr(request, start, realisations, request.answer.counts)
         return request.answer
 
     def count_snr(self, request: SnrRequest, start: int, count: int, counts: Counts) -> None:
         """Add some realisations of a request to counts; `shards` cuts it into such shares."""
+        self._check(start, count, request.seed)
         asked = request.answer
         with self._scene(asked.scene, request.seed) as run:
             run.observe(asked.observers, asked.elements)
@@ -284,7 +284,6 @@ class Engine:
         InputError
             For an unknown statistic, scenarios that do not belong together, or an impossible number, seed or mode.
         """
-        self._check(start, realisations, seed)
         how = (mode, start, processes, recipe, comparison, tails)
         request = DetectRequest(quiet, tuple(flares), realisations, seed, statistics, *how)
         for part, (plan, _) in enumerate(request.plans):
@@ -307,6 +306,7 @@ class Engine:
         total: int | None = None,
     ) -> None:
         """Add some realisations of one part of a request to a tally; `shards` cuts it into such shares."""
+        self._check(start, count, request.seed)
         plan, scene = request.plans[part]
 
         def work(run: Run, tile: Tile, done: int) -> None:

@@ -57,7 +57,7 @@ class Selection:
             raise InputError(f"rows {first}:{stop}, expected a range within 0:{store.rows}")
         chosen = [store.scene(name) for name in scenes] if scenes else store.scenes
         found = cls(store, chosen, first, stop)
-        size = sum((stop - first) * int(np.prod(s.row)) * s.dtype.itemsize for s in chosen)
+        size = sum((stop - first) * scene.row_bytes for scene in chosen)
         if size > LARGEST:
             raise InputError(
                 f"{size / 2**30:.1f} GiB of spectra, expected at most {LARGEST // 2**30} GiB in one file: choose rows"

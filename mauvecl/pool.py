@@ -13,9 +13,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from numpy.typing import NDArray
 
-from mauvecl.comparison import TEMPLATE, Comparison
 from mauvecl.engine import DeviceError, DeviceRecord, Engine, Progress
-from mauvecl.processes import NONE, Processes
 from mauvecl.shards import (
     Arrays,
     Countable,
@@ -30,11 +28,9 @@ from mauvecl.shards import (
 
 if TYPE_CHECKING:
     from mauvecl.checkpoint import Checkpoint
-    from mauvecl.detection import Detection, Tails
+    from mauvecl.detection import Detection
     from mauvecl.host.expectation import Expectation
-    from mauvecl.scene import Mode, Recipe
     from mauvecl.snr import SnrResult
-    from mauvecl.statistics import Linear
 
 #: A share is tried so often before the run ends with what went wrong.
 TRIES = 3
@@ -216,7 +212,7 @@ class Pool:
         self.checkpoint, self._progress = checkpoint, progress
         self._lock = threading.RLock()
         self._done = self._total = self._shares = self._of = self._resumed = self._expected = 0
-        self._partly: dict[object, int] = {}
+        self._partly: dict[str, int] = {}
         self._stopping = False
 
     def expect(self, realisations: int) -> None:
@@ -246,61 +242,27 @@ class Pool:
         total = max(self._total, self._expected)
         return Standing(self._done + partly, total, self._shares, self._of, self.workers.retries, self._resumed)
 
-    def detect(
-        self,
-        quiet: Expectation,
-        flares: Sequence[Expectation],
-        *,
-        realisations: int,
-        seed: int,
-        statistics: Sequence[str | Linear] = ("chi2", "chi2_element", "matched"),
-        mode: Mode = "auto",
-        start: int = 0,
-        processes: Processes = NONE,
-        recipe: Recipe = "auto",
-        comparison: Comparison = TEMPLATE,
-        tails: Tails = "counted",
-    ) -> Detection:
-        """As `Engine.detect`."""
-        how = (mode, start, processes, recipe, comparison, tails)
-        request = DetectRequest(quiet, tuple(flares), realisations, seed, statistics, *how)
+    def detect(self, quiet: Expectation, flares: Sequence[Expectation], **how: Any) -> Detection:
+        """As `Engine.detect`, with the same keywords."""
+        request = DetectRequest(quiet, tuple(flares), **how)
         self._answer(request)
         return request.answer
 
-    def snr(
-        self,
-        expectation: Expectation,
-        *,
-        realisations: int,
-        seed: int,
-        mode: Mode = "auto",
-        start: int = 0,
-        processes: Processes = NONE,
-        recipe: Recipe = "auto",
-    ) -> SnrResult:
-        """As `Engine.snr`."""
-        request = SnrRequest(expectation, realisations, seed, mode, start, processes, recipe)
+    def snr(self, expectation: Expectation, **how: Any) -> SnrResult:
+        """As `Engine.snr`, with the same keywords."""
+        request = SnrRequest(expectation, **how)
         self._answer(request)
         return request.answer
 
     def realise(
-        self,
-        expectation: Expectation,
-        *,
-        start: int = 0,
-        count: int,
-        seed: int,
-        mode: Mode = "auto",
-        processes: Processes = NONE,
-        recipe: Recipe = "auto",
-        first_frame: int = 0,
-        out: NDArray[Any] | None = None,
+        self, expectation: Expectation, *, count: int, out: NDArray[Any] | None = None, **how: Any
     ) -> NDArray[Any]:
-        """As `Engine.realise`, by one worker; several calls at a time keep all of them busy."""
+        """As `Engine.realise`, with the same keywords, by one worker; several calls at a time keep all of them busy."""
         # A worker of this process writes into `out` itself.
         here = out if self.workers.first is not None else None
-        request = RealiseRequest(expectation, count, seed, mode, start, processes, recipe, first_frame, here)
-        found = self.workers.submit(request, uuid.uuid4().hex, Share(0, start, count), lambda done: None)
+        request = RealiseRequest(expectation, count, out=here, **how)
+        share = Share(0, request.start, count)
+        found = self.workers.submit(request, uuid.uuid4().hex, share, lambda done: None)
         rows: NDArray[Any] = found.result()["rows"]
         if out is None or here is not None:
             return rows
@@ -320,13 +282,13 @@ class Pool:
             known = None if self.checkpoint is None else self.checkpoint.get(name)
             if known is not None:
                 request.add(share.part, known)
-                self._finished(share, resumed=True)
+                self._finished(name, share, resumed=True)
                 continue
             if self._stopping:
                 raise Stopped
             while len(waiting) >= self.workers.count * AHEAD:
                 self._collect(request, key, waiting)
-            tick = partial(self._tick, share)
+            tick = partial(self._tick, name)
             waiting[self.workers.submit(request, key, share, tick)] = share
         while waiting:
             self._collect(request, key, waiting)
@@ -337,18 +299,19 @@ class Pool:
             share = waiting.pop(future)
             found = future.result()
             request.add(share.part, found)
+            name = f"{key}-{share.name}"
             if self.checkpoint is not None:
-                self.checkpoint.put(f"{key}-{share.name}", found)
-            self._finished(share)
+                self.checkpoint.put(name, found)
+            self._finished(name, share)
 
-    def _tick(self, share: Share, done: int) -> None:
+    def _tick(self, name: str, done: int) -> None:
         with self._lock:
-            self._partly[share] = done
+            self._partly[name] = done
         self._told()
 
-    def _finished(self, share: Share, *, resumed: bool = False) -> None:
+    def _finished(self, name: str, share: Share, *, resumed: bool = False) -> None:
         with self._lock:
-            self._partly.pop(share, None)
+            self._partly.pop(name, None)
             self._done += share.count
             self._shares += 1
             self._resumed += share.count if resumed else 0

@@ -98,7 +98,7 @@ class DetectRequest:
     flares: tuple[Expectation, ...]
     realisations: int
     seed: int
-    statistics: Sequence[str | Linear]
+    statistics: Sequence[str | Linear] = ("chi2", "chi2_element", "matched")
     mode: Mode = "auto"
     start: int = 0
     processes: Processes = NONE

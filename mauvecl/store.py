@@ -42,6 +42,7 @@ CALIBRATION = {
     "gain_dn_per_electron": "DN / electron",
 }
 DIGESTS = "digests.txt"
+CRC_BYTES = 4
 COMMON_DRAWS = (
     "row i of every array is drawn with the same random numbers, so that a flare is the only difference between two "
     "arrays; rows of different number are independent"
@@ -79,10 +80,14 @@ class Scene:
         single = self.frames is not None or x.n_frames == 1
         return np.dtype("<u2" if single and x.adc_max_dn < 2**16 else "<i4")
 
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of one realisation."""
+        return int(np.prod(self.row)) * self.dtype.itemsize
+
     def chunk_rows(self, realisations: int) -> int:
         """Realisations in one chunk."""
-        fit = CHUNK_BYTES // (int(np.prod(self.row)) * self.dtype.itemsize)
-        return max(min(fit, realisations), 1)
+        return max(min(CHUNK_BYTES // self.row_bytes, realisations), 1)
 
 
 def scenes(study: Study) -> list[Scene]:
@@ -192,7 +197,7 @@ class Store:
     @property
     def n_bytes(self) -> int:
         """Bytes of all spectra."""
-        return sum(self.rows * int(np.prod(s.row)) * s.dtype.itemsize for s in self.scenes)
+        return sum(self.rows * scene.row_bytes for scene in self.scenes)
 
     def chunks(self) -> Iterator[Chunk]:
         """All chunks, scene by scene."""
@@ -279,13 +284,11 @@ class Store:
 
     def encode(self, chunk: Chunk, rows: NDArray[Any]) -> tuple[memoryview, bytes]:
         """A chunk as Zarr's codecs `bytes` and `crc32c` have it: whole, the last one filled with zeros."""
-        import google_crc32c
-
         full = chunk.scene.chunk_rows(self.rows)
         if len(rows) < full:
             rows = np.concatenate([rows, np.zeros((full - len(rows), *chunk.scene.row), rows.dtype)])
-        data = memoryview(np.ascontiguousarray(rows, chunk.scene.dtype).data).cast("B")
-        return data, int(google_crc32c.value(data.obj)).to_bytes(4, "little")
+        whole = np.ascontiguousarray(rows, chunk.scene.dtype)
+        return memoryview(whole.data).cast("B"), crc(whole)
 
     def place(self, chunk: Chunk, rows: NDArray[Any]) -> str:
         """Write a chunk, whole or not at all; returns its digest."""
@@ -299,10 +302,18 @@ class Store:
             size = (self.path / chunk.key).stat().st_size
         except OSError:
             return False
-        rows = chunk.scene.chunk_rows(self.rows)
-        return (
-            chunk.key in self.digests and size == rows * int(np.prod(chunk.scene.row)) * chunk.scene.dtype.itemsize + 4
-        )
+        return chunk.key in self.digests and size == self.chunk_bytes(chunk)
+
+    def chunk_bytes(self, chunk: Chunk) -> int:
+        """Bytes of a chunk's file: whole rows, and their CRC."""
+        return chunk.scene.chunk_rows(self.rows) * chunk.scene.row_bytes + CRC_BYTES
+
+
+def crc(data: bytes | NDArray[Any]) -> bytes:
+    """CRC-32C as Zarr's codec of that name writes it."""
+    import google_crc32c
+
+    return int(google_crc32c.value(data)).to_bytes(CRC_BYTES, "little")
 
 
 def digest(*parts: bytes | memoryview) -> str:

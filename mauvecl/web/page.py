@@ -160,8 +160,9 @@ class Page:
 
     def _show_closed(self, study: Study) -> None:
         q = self.question
-        self._source = study.star[0].source()
-        quiet, flare = self.quiet, self.flare = study.expectations(study.star[0])
+        source = study.star[0].source()
+        self._light = source, study.flaring(source, study.flare.amplitudes[0])
+        quiet, flare = self.quiet, self.flare = study.expect(list(self._light))
         scene = prepare([quiet, flare], comparison=study.run.comparison())
         self.theory = Detection(
             quiet, (flare,), study.run.statistics, scene, study.run.realisations, seed=study.run.seed
@@ -183,8 +184,7 @@ class Page:
         observation, snr, budget, distributions, roc = self.views
         if self.tabs.active == 0:
             observation.show(self.quiet, self.flare)
-            amplitude, kelvin = self.question.amplitude_percent / 100, self.question.flare_temperature_k
-            self.spectrum.show(self._source, self._source.flaring(amplitude, kelvin))
+            self.spectrum.show(*self._light)
         elif self.tabs.active == 1:
             snr.show(self.quiet)
             if "snr" in self.found:
