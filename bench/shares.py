@@ -26,8 +26,9 @@ from mauvecl.checkpoint import Checkpoint
 from mauvecl.cluster import DaskWorkers
 from mauvecl.engine import Engine
 from mauvecl.pool import LocalWorkers, Pool
+from mauvecl.sections import Run
 from mauvecl.shards import DetectRequest, fingerprint, shares
-from mauvecl.study import Run, Study
+from mauvecl.study import Study
 
 #: The plan's work, pixel-realisations, and its cores.
 PLAN, CORES = 1e15, 1000

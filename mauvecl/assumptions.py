@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.labels import described
-from mauvecl.limits import Question
-from mauvecl.study import Star, Study
+from mauvecl.limit_search import Question
+from mauvecl.sections import Star
+from mauvecl.study import Study
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

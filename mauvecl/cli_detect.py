@@ -53,7 +53,8 @@ def detect(
         from mauvecl.pictures import detection, spectra
 
         # More would be too small to read; the tables hold all of them.
-        session.files.append(detection(found.stars[:MOST_DRAWN], study.run.fap, session.folder / "detection.png"))
+        shown = [(star.title, star.found, star.flare_names) for star in found.stars[:MOST_DRAWN]]
+        session.files.append(detection(shown, study.run.fap, session.folder / "detection.png"))
         session.files.append(spectra(found.stars[:MOST_DRAWN], session.folder / "spectra.png"))
     inputs = [x for s in found.stars for x in (s.found.quiet, *s.found.flares)]
     session.record(study, inputs, [*found.messages, *found.paper])
@@ -135,7 +136,7 @@ def gaussian(
     for name, table in tables.items():
         session.write(table, f"{name}.ecsv")
     if session.draws_pictures:
-        from mauvecl.pictures import gaussian as draw
+        from mauvecl.planning_pictures import gaussian as draw
 
         session.files.append(draw(found, session.folder / "gaussian.png"))
     session.record(found.study, [star.result.expectation for star in found.signal.stars], messages)

@@ -118,7 +118,8 @@ def snr(
 
 
 def _snr_pictures(found: SnrAnswer, folder: Path) -> list[Path]:
-    from mauvecl.pictures import noise_budgets, signal_to_noise, snr_sweep
+    from mauvecl.pictures import signal_to_noise
+    from mauvecl.planning_pictures import noise_budgets, snr_sweep
 
     files = [noise_budgets(found, folder / "noise-budget.png")]
     if len(found.stars) <= 6:

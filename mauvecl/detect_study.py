@@ -17,8 +17,9 @@ from mauvecl.host.errors import InputError
 from mauvecl.labels import label, put_first, stacked, titled, told
 from mauvecl.paper import PAPER_G2V, WHY, reconstruct
 from mauvecl.pool import Pool, together
+from mauvecl.sections import Star
 from mauvecl.statistics import SHAPED, Linear, matched_weights
-from mauvecl.study import PAPER_STARS, Star, Study
+from mauvecl.study import PAPER_STARS, Study
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -40,6 +41,11 @@ class StarDetection:
     def title(self) -> str:
         """The star and what is swept, for pictures."""
         return titled(self.label, self.at)
+
+    @property
+    def flare_names(self) -> list[str]:
+        """The flares, for pictures."""
+        return [f"flare {100 * amplitude:g} %" for amplitude in self.amplitudes]
 
 
 @dataclass(eq=False)
@@ -92,7 +98,8 @@ class DetectAnswer:
         """Null and flare distributions of every star and statistic; needs matplotlib."""
         from mauvecl.pictures import detection
 
-        return detection(self.stars, self.study.run.fap, None if path is None else Path(path))
+        shown = [(star.title, star.found, star.flare_names) for star in self.stars]
+        return detection(shown, self.study.run.fap, None if path is None else Path(path))
 
     def _detections(self, star: StarDetection) -> QTable:
         table = star.found.table(self.study.run.fap)

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl import program
+from mauvecl.channels import ChannelPlan, plan_channels
 from mauvecl.comparison import TEMPLATE, Comparison
-from mauvecl.detection import ChannelPlan, Detection, Tails, plan_channels
+from mauvecl.detection import Detection, Tails
 from mauvecl.host.errors import InputError
 from mauvecl.processes import NONE, Processes
 from mauvecl.program import DeviceError, DeviceRecord, Variant, devices

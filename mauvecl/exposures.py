@@ -10,7 +10,9 @@ import numpy as np
 
 from mauvecl.host.errors import InputError
 from mauvecl.labels import described, label, told
-from mauvecl.study import QUANTITIES, Star, Study
+from mauvecl.questions import QUANTITIES
+from mauvecl.sections import Star
+from mauvecl.study import Study
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -81,7 +83,7 @@ class ExposureResult:
 
     def plot(self, path: str | Path | None = None) -> object:
         """S/N against exposure, and the answers on it; needs matplotlib."""
-        from mauvecl.pictures import exposures
+        from mauvecl.planning_pictures import exposures
 
         return exposures(self, None if path is None else Path(path))
 

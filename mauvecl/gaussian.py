@@ -18,8 +18,9 @@ from mauvecl import layout
 from mauvecl.cumulants import Cumulants
 from mauvecl.detect_study import DetectAnswer, detect
 from mauvecl.labels import described
+from mauvecl.questions import UNITS, Axis, Sweep
 from mauvecl.snr_study import SnrAnswer, snr
-from mauvecl.study import UNITS, Axis, Study, Sweep
+from mauvecl.study import Study
 
 if TYPE_CHECKING:
     from astropy.table import QTable

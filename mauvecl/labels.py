@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mauvecl.study import UNITS, Star
+from mauvecl.questions import UNITS
+from mauvecl.sections import Star
 
 if TYPE_CHECKING:
     from astropy.table import QTable

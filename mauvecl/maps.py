@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from mauvecl.detection import check_fap
 from mauvecl.labels import described, label, told
+from mauvecl.questions import UNITS
 from mauvecl.statistics import Interval
-from mauvecl.study import UNITS, Study
+from mauvecl.study import Study
 from mauvecl.unknowns import average, drawn, shares
 
 if TYPE_CHECKING:
@@ -100,7 +101,7 @@ class MapResult:
 
     def plot(self, path: str | Path | None = None) -> object:
         """One panel per statistic, with contours at the study's powers; needs matplotlib."""
-        from mauvecl.pictures import detection_map as draw
+        from mauvecl.planning_pictures import detection_map as draw
 
         return draw(self, None if path is None else Path(path))
 

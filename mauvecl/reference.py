@@ -1,4 +1,4 @@
-"""A slow NumPy twin of every kernel: the same counters, the same arithmetic, the same order of sums.
+"""The slow NumPy twin of the kernels: what they draw. The same counters, the same arithmetic, the same order of sums.
 
 Integers are equal to the device's; so are floats where the device's arithmetic is strict, because every
 fused multiply-add here is rounded once, as there. Used by tests and by the self-test.
@@ -17,7 +17,7 @@ from mauvecl import layout
 from mauvecl.scene import Scene
 
 if TYPE_CHECKING:
-    from mauvecl.detection import ChannelPlan, Detection
+    pass
 
 Words = tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.uint32], NDArray[np.uint32]]
 Floats = NDArray[np.float32]
@@ -28,7 +28,7 @@ _POLYNOMIALS = {
     name: [np.float32(float.fromhex(c)) for c in coefficients] for name, coefficients in layout.POLYNOMIALS.items()
 }
 _TWO_LN2 = np.float32(float.fromhex(layout.TWO_LN2))
-_MAGIC = np.float32(layout.MAGIC)
+MAGIC = np.float32(layout.MAGIC)
 
 
 def philox(counter: Sequence[ArrayLike], seed: int) -> Words:
@@ -130,7 +130,7 @@ def expansion_draw(z: Floats, offset: np.float32, slope: np.float32, cubic: np.f
 
 def nearest(x: Floats) -> Floats:
     """Nearest whole number, ties to even, for values below 2**22."""
-    return np.asarray((x + _MAGIC) - _MAGIC)
+    return np.asarray((x + MAGIC) - MAGIC)
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,11 +247,11 @@ def _responding(r: np.void, c0: np.float32, z: Floats, light: Floats, dark: Floa
 
 def digitise(v: Floats, edge: np.void, *, clip: bool) -> Floats:
     """DN above the level's base, rounded and clipped."""
-    r = v + _MAGIC
+    r = v + MAGIC
     if clip:
         r = np.where(r < edge["low"], edge["low"], r)
         r = np.where(r > edge["high"], edge["high"], r)
-    return np.asarray(r - _MAGIC)
+    return np.asarray(r - MAGIC)
 
 
 def observed(
@@ -297,7 +297,7 @@ def clipped(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray
             for group in range(-(-scene.n_pixel // 4)):
                 drawn = draws(scene, realisation, frame, group, seed)
                 for i, p in enumerate(range(4 * group, min(4 * group + 4, len(scene.pixels)))):
-                    r = analogue(scene, drawn, i, p, 0, light, dark) + _MAGIC
+                    r = analogue(scene, drawn, i, p, 0, light, dark) + MAGIC
                     count[:, p, 0] += r < scene.edges[0, p]["low"]
                     count[:, p, 1] += r > scene.edges[0, p]["high"]
     return count[:, : scene.n_pixel]
@@ -308,214 +308,3 @@ def realise(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray
     above = observed(scene, realisation, seed, scenarios=[0])[0, : scene.n_pixel]
     raw: NDArray[np.int64] = (above.astype(np.int64) + scene.n_draws * scene.base_dn[0][:, None]).T
     return raw
-
-
-def statistics(
-    scene: Scene,
-    realisation: NDArray[np.uint64],
-    seed: int,
-    weights: NDArray[np.float32],
-    linear_end: NDArray[np.uint32],
-    *,
-    pair: bool = True,
-    smoothed: Smoothed | None = None,
-) -> NDArray[np.float32]:
-    """Every channel of the kernels `statistics` and `comparison`, in their order.
-
-    Parameters
-    ----------
-    scene : Scene
-    realisation : ndarray of uint64, shape (n,)
-    seed : int
-    weights : ndarray of float32, shape (n_linear, n_padded)
-    linear_end : ndarray of uint32, shape (n_scenario,)
-    pair : bool
-        Whether `chi2_pair` is wanted; its rows are zero otherwise.
-    smoothed : Smoothed, optional
-        Where `paper` is wanted.
-
-    Returns
-    -------
-    ndarray of float32, shape (3 n_scenario + n_linear + n_smoothed, n)
-    """
-    n_scenario, fixed = len(scene.levels), len(layout.FIXED_STATISTICS)
-    constants = scene.constants(weights, linear_end)
-    estimated, exposures = scene.comparison.estimated, scene.comparison.exposures
-    share, scale = scene.job["reference_share"], scene.job["pair_scale"]
-    out = np.zeros((fixed * n_scenario + len(weights), len(realisation)), np.float32)
-    x = _above_template(scene, observed(scene, realisation, seed))
-    drawn = max(exposures, 1) if exposures or pair or smoothed is not None else 0
-    others = [
-        _above_template(scene, observed(scene, realisation, seed, exposure=layout.REFERENCE, number=number))
-        for number in range(drawn)
-    ]
-    finished = []
-    begin = 0
-    for k in range(n_scenario):
-        t = int(scene.templates[k])
-        raw, level = x[k], scene.levels[k]
-        y: Floats = raw
-        variance: Floats = np.zeros_like(raw)
-        if exposures:
-            total = np.sum([other[t] for other in others], axis=0, dtype=np.float32)
-            y = fma(total, -share, raw)
-        if estimated:
-            estimate = scene.estimates[k]
-            variance = _variance(raw, estimate)
-            if exposures:
-                variance = np.add(variance, share * _variance(total * share, estimate), dtype=np.float32)
-            y = np.add(y, estimate["fraction"][:, None], dtype=np.float32)
-        parts = [np.zeros(len(realisation), np.float32) for _ in range(4)]
-        for p, pixel in enumerate(scene.pixels):
-            if estimated:
-                parts[p % 4] = fma(y[p] * y[p], pixel["used"] / variance[p], parts[p % 4])
-            else:
-                slope = fma(y[p], level[p]["inverse_variance"], level[p]["twice"])
-                parts[p % 4] = fma(y[p], slope, parts[p % 4])
-        out[fixed * k] = ((parts[0] + parts[1]) + (parts[2] + parts[3])) + constants[k]
-        out[fixed * k + 1] = _element_sum(scene, k, y, variance)
-        for p, pixel in enumerate(scene.pixels) if pair else ():
-            d = raw[p] - others[0][t, p]
-            if estimated:
-                both = _variance(raw, estimate)[p] + _variance(others[0][t], estimate)[p]
-                weight = pixel["used"] / both
-            else:
-                weight = scale * level[p]["inverse_variance"]
-            out[fixed * k + 2] = fma(d * d, weight, out[fixed * k + 2])
-        for linear in range(begin, int(linear_end[k])):
-            row = _summed(y, weights[linear])
-            if estimated:
-                row = np.divide(row, np.sqrt(_summed(variance, weights[linear] * weights[linear])), dtype=np.float32)
-            else:
-                row = row + constants[n_scenario + linear]
-            out[fixed * n_scenario + linear] = row
-        begin = int(linear_end[k])
-        if smoothed is not None:
-            finished += smoothed.sums(raw - others[0][t], k)
-    return np.concatenate([out, np.array(finished, np.float32).reshape(len(finished), len(realisation))])
-
-
-def _variance(x: Floats, estimate: NDArray[np.void]) -> Floats:
-    """What an observer takes counts for, shape (n_padded, n)."""
-    gain, known, offset = (estimate[name][:, None] for name in ("gain", "variance", "net_offset"))
-    return fma(np.maximum(x + offset, np.float32(0.0)), gain, known)
-
-
-def _element_sum(scene: Scene, k: int, y: Floats, variance: Floats) -> Floats:
-    """The statistic `chi2_element` of a scenario, shape (n,)."""
-    total: Floats = np.zeros_like(y[0])
-    inside, noise = total, total
-    estimated = scene.comparison.estimated
-    for p, (pixel, edge) in enumerate(zip(scene.pixels, scene.edges[k], strict=True)):
-        if pixel["four_uneven"] or estimated:
-            inside = fma(y[p], pixel["used"], inside)
-            noise = fma(variance[p], pixel["used"], noise)
-        elif p % 4 == 0:
-            inside = inside + ((y[p] + y[p + 1]) + (y[p + 2] + y[p + 3]))
-        if pixel["element_end"]:
-            if estimated:
-                total = np.add(total, inside * inside / np.maximum(noise, np.float32(1e-12)), dtype=np.float32)
-            else:
-                inside = np.add(inside, edge["element_offset"], dtype=np.float32)
-                total = fma(inside * inside, edge["inverse_element_variance"], total)
-            inside, noise = np.zeros_like(total), np.zeros_like(total)
-    return total
-
-
-@dataclass(frozen=True, eq=False)
-class Smoothed:
-    """What the statistic `paper` needs: weights of each centre, shape (n_centre, n_padded), and factors of squares."""
-
-    rows: NDArray[np.float32]
-    scales: NDArray[np.float32]
-    scale_end: NDArray[np.uint32]
-
-    @classmethod
-    def of(cls, found: Detection, plan: ChannelPlan) -> Smoothed:
-        """Of a detection's channels."""
-        rows = np.zeros((len(found.smoothing.rows), len(found.scene.pixels)), np.float32)
-        rows[:, : found.scene.n_pixel] = found.smoothing.rows
-        return cls(rows, plan.scales, plan.scale_end)
-
-    def sums(self, difference: Floats, k: int) -> list[Floats]:
-        """The smoothed statistics of a scenario, each shape (n,)."""
-        begin = int(self.scale_end[k - 1]) if k else 0
-        out = [np.zeros(difference.shape[1], np.float32) for _ in range(begin, int(self.scale_end[k]))]
-        for centre, row in enumerate(self.rows):
-            value = np.zeros(difference.shape[1], np.float32)
-            for p in np.flatnonzero(row):
-                value = fma(difference[p], row[p], value)
-            square = value * value
-            out = [fma(square, self.scales[begin + i, centre], one) for i, one in enumerate(out)]
-        return out
-
-
-def _above_template(scene: Scene, above: NDArray[np.float32]) -> NDArray[np.float32]:
-    if scene.frames:
-        return np.asarray(above + scene.edges["whole"][:, :, None])
-    return np.asarray((above + _MAGIC) - scene.levels["shift"][:, :, None])
-
-
-def _summed(values: NDArray[np.float32], weights: NDArray[np.float32]) -> Floats:
-    """Weighted sums over pixels, shape (n_pixel, n) to (n,): four side by side, by pixel number modulo four."""
-    parts = [np.zeros(values.shape[1], np.float32) for _ in range(4)]
-    for p, weight in enumerate(weights):
-        parts[p % 4] = fma(values[p], weight, parts[p % 4])
-    total: Floats = (parts[0] + parts[1]) + (parts[2] + parts[3])
-    return total
-
-
-def histograms(
-    scene: Scene,
-    observers: NDArray[np.void],
-    elements: NDArray[np.void],
-    realisation: NDArray[np.uint64],
-    seed: int,
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """The kernel `histogram`: each pixel's counts, each element's S/N, and frames clipped.
-
-    Returns
-    -------
-    pixel_counts, element_counts : ndarray of int64, shapes (n_pixel, OBSERVER_BINS) and (n_element, OBSERVER_BINS)
-    clipped : ndarray of int64, shape (n_pixel, 2)
-        Below and above the ADC's range.
-    """
-    bins, half = layout.OBSERVER_BINS, layout.OBSERVER_BINS // 2
-    n = observed(scene, realisation, seed, scenarios=[0])[0]
-    pixel_counts = np.zeros((scene.n_pixel, bins), np.int64)
-    element_counts = np.zeros((len(elements), bins), np.int64)
-    for e, element in enumerate(elements):
-        signal, variance = (np.zeros(len(realisation), np.float32) for _ in range(2))
-        for p in range(int(element["first"]), int(element["end"])):
-            observer = observers[p]
-            net = n[p] + observer["net_offset"]
-            signal = signal + net
-            variance = variance + fma(np.maximum(net, np.float32(0.0)), observer["gain"], observer["variance"])
-            whole = (n[p].astype(np.int64) >> int(observer["bin_shift"])) + half
-            pixel_counts[p] = np.bincount(np.clip(whole, 0, bins - 1), minlength=bins)
-        with np.errstate(invalid="ignore"):
-            steps = (signal / np.sqrt(variance) - element["centre"]) * element["bins_per_unit"]
-        whole = nearest(np.clip(steps, np.float32(-half), np.float32(half - 1))).astype(np.int64) + half
-        element_counts[e] = np.bincount(whole, minlength=bins)
-    return pixel_counts, element_counts, clipped(scene, realisation, seed).sum(axis=0)
-
-
-def tally(values: NDArray[np.float32], grids: NDArray[np.void]) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
-    """Histograms, shape (n_grid, BINS), and sums of fine steps and their squares, shape (n_grid, 2).
-
-    Parameters
-    ----------
-    values : ndarray of float32, shape (n_channel, n)
-    grids : ndarray of layout.GRID, shape (n_grid,)
-    """
-    bins = layout.BINS
-    histogram = np.zeros((len(grids), bins), np.uint32)
-    sums = np.zeros((len(grids), 2), np.int64)
-    limit = np.float32(layout.STEP_LIMIT)
-    for g, grid in enumerate(grids):
-        steps = (values[int(grid["channel"])] - grid["centre"]) * grid["steps_per_unit"]
-        step = nearest(np.clip(steps, -limit, limit)).astype(np.int64)
-        bin_index = np.clip((step >> layout.FINE_BITS) + bins // 2, 0, bins - 1)
-        histogram[g] = np.bincount(bin_index, minlength=bins)
-        sums[g] = step.sum(), (step * step).sum()
-    return histogram, sums

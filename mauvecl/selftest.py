@@ -13,9 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl import __version__, layout, reference
+from mauvecl import __version__, layout, reference, reference_sums
+from mauvecl.channels import ChannelPlan, plan_channels
 from mauvecl.comparison import Comparison
-from mauvecl.detection import ChannelPlan, Detection, plan_channels
+from mauvecl.detection import Detection
 from mauvecl.engine import Engine
 from mauvecl.host.expectation import Expectation
 from mauvecl.kernel_cache import kernel_cache
@@ -149,9 +150,9 @@ def twin_digests(name: str) -> dict[str, str]:
     both = prepare([quiet, flare], **how)
     raw = reference.realise(scene, index, SEED)
     clipped = reference.clipped(scene, index, SEED)
-    pixels, parts, rails = reference.histograms(scene, observers(quiet, scene), elements(quiet), index, SEED)
+    pixels, parts, rails = reference_sums.histograms(scene, observers(quiet, scene), elements(quiet), index, SEED)
     values, plan = _statistics(name, both)
-    counts, sums = reference.tally(values, Grid.pack(plan.grids[plan.keys.index(("chi2", "null", 0)) :][:1]))
+    counts, sums = reference_sums.tally(values, Grid.pack(plan.grids[plan.keys.index(("chi2", "null", 0)) :][:1]))
     return {
         "raw": _digest(raw.astype(np.int64), clipped.sum(axis=(1, 2)).astype(np.uint32)),
         "statistics": _digest(values.view(np.uint32)),
@@ -168,8 +169,8 @@ def _statistics(name: str, scene: Scene) -> tuple[NDArray[np.float32], ChannelPl
     found = Detection(quiet, (flare,), tuple(STATISTICS), scene, COUNT)
     plan = plan_channels(found, range(1), first=True)
     index = np.arange(START, START + COUNT, dtype=np.uint64)
-    smoothed = reference.Smoothed.of(found, plan)
-    return reference.statistics(scene, index, SEED, plan.weights, plan.linear_end, smoothed=smoothed), plan
+    smoothed = reference_sums.Smoothed.of(found, plan)
+    return reference_sums.statistics(scene, index, SEED, plan.weights, plan.linear_end, smoothed=smoothed), plan
 
 
 def _drawing(how: dict[str, Any]) -> dict[str, Any]:

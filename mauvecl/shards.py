@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.channels import ChannelPlan, plan_channels
 from mauvecl.comparison import TEMPLATE, Comparison
-from mauvecl.detection import ChannelPlan, Detection, Tails, plan_channels
+from mauvecl.detection import Detection, Tails
 from mauvecl.processes import NONE, Processes
 from mauvecl.scene import BATCH, Mode, Recipe, Scene, prepare
 from mauvecl.snr import Counts, SnrResult, elements, observers

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -149,6 +150,12 @@ class SnrResult:
         centres = self.elements["centre"][:, None] + step[:, None] * steps[:-1]
         edges = self.elements["centre"][:, None] + step[:, None] * (steps - 0.5)
         return self._table(x.element_wavelength_nm, x.snr_per_element(), self.counts.element, centres, edges)
+
+    def plot(self, path: str | Path | None = None) -> object:
+        """S/N per pixel and element, closed form and realisations; needs matplotlib."""
+        from mauvecl.pictures import signal_to_noise
+
+        return signal_to_noise([(self.expectation.name, self)], None if path is None else Path(path))
 
     def _table(
         self,

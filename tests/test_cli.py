@@ -18,9 +18,10 @@ from astropy.table import QTable
 from mauvecl.detect_study import detect
 from mauvecl.engine import Engine
 from mauvecl.processes import CosmicRays, Normal, Processes, Uniform
+from mauvecl.sections import Star
 from mauvecl.simulate_study import simulate
 from mauvecl.statistics import STATISTICS
-from mauvecl.study import Star, Study
+from mauvecl.study import Study
 
 COMMAND = [sys.executable, "-m", "mauvecl"]
 

@@ -9,7 +9,7 @@ import pytest
 from scenes import instrument, star
 from scipy import stats
 
-from mauvecl import reference
+from mauvecl import reference_sums
 from mauvecl.detection import Detection
 from mauvecl.engine import Engine
 from mauvecl.host.errors import InputError
@@ -134,7 +134,7 @@ def test_delongs_interval_is_that_of_draws_made_apart() -> None:
         for centre in (0.0, 1.0):
             tally = Tally([grid])
             values = rng.normal(centre, 1.0, (1, 400)).astype(np.float32)
-            tally.add(*reference.tally(values, Grid.pack([grid])), 400)
+            tally.add(*reference_sums.tally(values, Grid.pack([grid])), 400)
             parts.append(tally.distribution(0))
         area = Roc.of(*parts).area
         held += area.low <= exact <= area.high

@@ -11,9 +11,10 @@ import pytest
 from scenes import instrument, star
 from scipy import stats
 
-from mauvecl import reference
+from mauvecl import reference, reference_sums
+from mauvecl.channels import ChannelPlan, plan_channels
 from mauvecl.comparison import Comparison
-from mauvecl.detection import ChannelPlan, Detection, plan_channels
+from mauvecl.detection import Detection
 from mauvecl.engine import Engine
 from mauvecl.host.errors import InputError
 from mauvecl.host.pixel_map import PixelMap
@@ -95,8 +96,8 @@ def test_raw_spectra_are_the_twins(any_width: Engine, name: str) -> None:
 
 def _twin(found: Detection, plan: ChannelPlan) -> np.ndarray:
     """Every channel of a detection by the twin."""
-    smoothed = reference.Smoothed.of(found, plan)
-    return reference.statistics(found.scene, INDEX, SEED, plan.weights, plan.linear_end, smoothed=smoothed)
+    smoothed = reference_sums.Smoothed.of(found, plan)
+    return reference_sums.statistics(found.scene, INDEX, SEED, plan.weights, plan.linear_end, smoothed=smoothed)
 
 
 @pytest.mark.parametrize("name", CASES)
@@ -113,7 +114,7 @@ def test_every_statistic_is_the_twins(any_width: Engine, name: str) -> None:
     alone = any_width.statistic_values(quiet, flares, count=INDEX.size, statistics=fast, **kind)
     same = [row for row in range(len(alone)) if row % 3 != 2 or row >= 9]
     np.testing.assert_array_equal(alone[same], values[: len(alone)][same])
-    histogram, sums = reference.tally(values, Grid.pack(plan.grids))
+    histogram, sums = reference_sums.tally(values, Grid.pack(plan.grids))
     for i, (statistic, role, flare) in enumerate(plan.keys):
         if role == "flare_on_null_grid":
             continue
@@ -149,7 +150,7 @@ def test_signal_to_noise_is_the_twins(any_width: Engine, name: str) -> None:
     (quiet, *_), how = case(name)
     scene = prepare([quiet], **how)
     found = any_width.snr(quiet, realisations=INDEX.size, start=START, seed=SEED, **how)
-    pixels, parts, clipped = reference.histograms(scene, observers(quiet, scene), elements(quiet), INDEX, SEED)
+    pixels, parts, clipped = reference_sums.histograms(scene, observers(quiet, scene), elements(quiet), INDEX, SEED)
     np.testing.assert_array_equal(found.counts.pixel, pixels)
     np.testing.assert_array_equal(found.counts.element, parts)
     np.testing.assert_array_equal(found.counts.clipped, clipped)

@@ -12,7 +12,8 @@ from astropy.table import QTable
 from mauvecl.assumptions import what_matters
 from mauvecl.engine import Engine
 from mauvecl.host.errors import InputError
-from mauvecl.limits import Question, limiting_magnitude, shortest_exposure, smallest_amplitude
+from mauvecl.limit_search import Question
+from mauvecl.limits import limiting_magnitude, shortest_exposure, smallest_amplitude
 from mauvecl.study import Study
 
 STATISTICS = ("chi2", "chi2_element", "matched", "uv_excess")

@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mauvecl import layout, reference
+from mauvecl import layout, reference_sums
 from mauvecl.host.errors import InputError
 from mauvecl.tally import Distribution, Grid, Tally
 
 
 def distribution(values: np.ndarray, grid: Grid) -> Distribution:
     tally = Tally([grid])
-    histogram, sums = reference.tally(values[None].astype(np.float32), Grid.pack([grid]))
+    histogram, sums = reference_sums.tally(values[None].astype(np.float32), Grid.pack([grid]))
     tally.add(histogram, sums, values.size)
     return tally.distribution(0)
 

@@ -10,7 +10,8 @@ from scipy import stats
 
 from mauvecl.engine import Engine
 from mauvecl.host.errors import InputError
-from mauvecl.limits import MarginalQuestion, Question, limiting_magnitude
+from mauvecl.limit_search import MarginalQuestion, Question
+from mauvecl.limits import limiting_magnitude
 from mauvecl.maps import detection_map
 from mauvecl.statistics import Interval
 from mauvecl.study import Study

@@ -56,7 +56,7 @@ def as_file(name: str, ending: str, study: Study, quiet: Expectation, found: Map
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"{name}.{ending}"
         if ending == "png":
-            _draw(name, study, found, path)
+            _draw(name, study, quiet, found, path)
         else:
             write_table(_table(name, study, quiet, found), path)
         return io.BytesIO(path.read_bytes())
@@ -76,11 +76,19 @@ def _table(name: str, study: Study, quiet: Expectation, found: Mapping[str, Any]
     return tables[name]()
 
 
-def _draw(name: str, study: Study, found: Mapping[str, Any], path: Path) -> None:
-    from mauvecl import pictures
+def _draw(name: str, study: Study, quiet: Expectation, found: Mapping[str, Any], path: Path) -> None:
+    from mauvecl import pictures, planning_pictures
 
+    title = study.star[0].library or UPLOADED
     if name == "observation":
-        pictures.observation(study.star[0].library or UPLOADED, _observed(study), path)
+        pictures.observation(title, _observed(study), path)
+    elif name == "noise-budget":
+        planning_pictures.noise_budget([(f"{title}, {quiet.exposure_s:g} s", quiet)], path=path)
+    elif name == "snr" and name not in found:
+        pictures.signal_to_noise([(title, quiet)], path)
+    elif name == "roc" and "detection" in found:
+        (star,) = found["detection"].stars
+        pictures.roc([(one, star.found.roc(one)) for one in star.found.statistics], path)
     elif name in found:
         found[name].plot(path)
     else:

@@ -364,24 +364,24 @@ class Page:
 
     def _make_tabs(self) -> Any:
         observation, snr, budget, distributions, roc = (view.plot for view in self.views)
-        tables = ("ecsv", "fits")
-        taken = self._downloads("observation", (*tables, "png"))
+        endings = ("ecsv", "fits", "png")
+        taken = self._downloads("observation", endings)
         return pn.Tabs(
             ("Simulated observation", pn.Column(observation, self.spectrum.plot, taken)),
-            ("S/N", pn.Column(snr, self._downloads("snr", tables))),
-            ("Noise budget", pn.Column(budget, self._downloads("noise-budget", tables))),
+            ("S/N", pn.Column(snr, self._downloads("snr", endings))),
+            ("Noise budget", pn.Column(budget, self._downloads("noise-budget", endings))),
             (
                 "Flare detection",
                 pn.Column(
-                    self.table, distributions, roc, self._downloads("detection", (*tables, "png")),
-                    self._downloads("roc", tables),
+                    self.table, distributions, roc, self._downloads("detection", endings),
+                    self._downloads("roc", endings),
                 ),
             ),
             (
                 "Limiting magnitude and map",
                 pn.Column(
                     pn.FlexBox(self.run_limit, self.run_map), self.limit, self.map,
-                    self._downloads("limit", ("ecsv", "fits", "png")), self._downloads("map", ("ecsv", "fits", "png")),
+                    self._downloads("limit", endings), self._downloads("map", endings),
                 ),
             ),
             dynamic=False,
