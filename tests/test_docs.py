@@ -4,20 +4,45 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
+import tomllib
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+from typer.main import get_command
 
+from mauvecl.cli import app
+from mauvecl.host.instrument import Instrument
 from mauvecl.study import Study
 
 ROOT = Path(__file__).parent.parent
 #: Pages whose Python runs as it stands; others need files or a cluster, and say so.
-PAGES = ("README.md", "docs/tutorial.md", "docs/signal.md", "docs/limits.md", "docs/detection.md", "docs/processes.md")
+PAGES = (
+    "README.md",
+    "docs/tutorial.md",
+    "docs/my-star.md",
+    "docs/my-instrument.md",
+    "docs/my-statistic.md",
+    "docs/limits.md",
+    "docs/detection.md",
+)
+#: `mauvecl/roc.py`, or with a name in it: `mauvecl/roc.py: Roc`.
+NAMED = re.compile(r"`((?:host|kernels|mauvecl|tests|bench|tools|docs)/[\w./*-]+\.\w+)(?::\s*(\w+))?[^`]*`")
+#: What defines a name, by a file's ending.
+DEFINITIONS = {
+    ".py": r"^\s*(?:def|class) {0}\b|^{0}\b.* = |^    {0}: ",
+    ".mako": r"^(?:INLINE )?\w+ {0}\(",
+}
 
 
 def blocks(page: str) -> list[str]:
     return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL)
+
+
+def all_pages() -> list[Path]:
+    return [*sorted((ROOT / "docs").glob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 
 
 @pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)])
@@ -40,6 +65,57 @@ def test_no_page_is_left_out_of_the_contents() -> None:
     pages += list((ROOT / "docs" / "notebooks").glob("*.ipynb"))
     for page in pages:
         assert str(page.relative_to(ROOT / "docs").with_suffix("")) in contents
+
+
+def test_what_the_documentation_names_is_there() -> None:
+    """Files, and where it says `file: name`, the name's definition in it."""
+    named = [(page.name, *found) for page in all_pages() for found in NAMED.findall(page.read_text(encoding="utf-8"))]
+    missing = [(page, file) for page, file, _ in named if not list(ROOT.glob(file))]
+    assert not missing
+    undefined = [
+        (page, file, name)
+        for page, file, name in named
+        if name
+        and not re.search(
+            DEFINITIONS[Path(file).suffix].format(name), (ROOT / file).read_text(encoding="utf-8"), re.MULTILINE
+        )
+    ]
+    assert not undefined
+    assert len([name for *_, name in named if name]) > 40
+
+
+def test_studies_and_instruments_shown_are_valid() -> None:
+    seen = 0
+    for page in all_pages():
+        for text in re.findall(r"```toml\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL):
+            data = tomllib.loads(text)
+            if "extends" in data:
+                values = {key: v["value"] if isinstance(v, dict) else v for key, v in data.items() if key != "extends"}
+                # Files of the reader's are not here.
+                Instrument.load(data["extends"]).with_(**{k: v for k, v in values.items() if ".ecsv" not in str(v)})
+                assert set(values) <= set(Instrument.model_fields)
+            else:
+                Study.build(data, page.name)
+            seen += 1
+    assert seen > 10
+
+
+def test_commands_shown_have_those_verbs_and_flags() -> None:
+    verbs: Any = get_command(app)
+    seen = 0
+    for page in all_pages():
+        text = page.read_text(encoding="utf-8")
+        for line in re.findall(r"^    (mauvecl .*)$", text, re.MULTILINE) + re.findall(r"`(mauvecl [^`\n]*)`", text):
+            words = shlex.split(line.replace("...", ""), comments=True)[1:]
+            command = verbs
+            while words and words[0] in getattr(command, "commands", {}):
+                command = command.commands[words.pop(0)]
+            assert words[:1] == [] or words[0] == "VERB" or words[0].startswith("-") or command is not verbs, line
+            flags = {flag for parameter in command.params for flag in (*parameter.opts, *parameter.secondary_opts)}
+            flags |= {"--help"}
+            assert {word.split("=")[0] for word in words if re.match("--?[a-z]", word)} <= flags, (page.name, line)
+            seen += 1
+    assert seen > 40
 
 
 def test_notebooks_are_kept_without_their_output() -> None:
