@@ -1,5 +1,5 @@
 """`python -m mauvecl`."""
 
-from mauvecl.cli import main
+from mauvecl.cli.app import main
 
 main()

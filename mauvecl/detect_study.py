@@ -96,7 +96,7 @@ class DetectAnswer:
 
     def plot(self, path: str | Path | None = None) -> object:
         """Null and flare distributions of every star and statistic; needs matplotlib."""
-        from mauvecl.pictures import detection
+        from mauvecl.pictures.answers import detection
 
         shown = [(star.title, star.found, star.flare_names) for star in self.stars]
         return detection(shown, self.study.run.fap, None if path is None else Path(path))

@@ -315,7 +315,7 @@ class Detection:
 
     def plot(self, path: str | Path | None = None, *, fap: float = 1e-3) -> object:
         """Null and flare distributions by every statistic, with thresholds; needs matplotlib."""
-        from mauvecl.pictures import detection
+        from mauvecl.pictures.answers import detection
 
         flares = [f"flare {k + 1}" for k in range(len(self.flares))]
         return detection([(self.quiet.name, self, flares)], fap, None if path is None else Path(path))

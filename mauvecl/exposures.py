@@ -83,7 +83,7 @@ class ExposureResult:
 
     def plot(self, path: str | Path | None = None) -> object:
         """S/N against exposure, and the answers on it; needs matplotlib."""
-        from mauvecl.planning_pictures import exposures
+        from mauvecl.pictures.plans import exposures
 
         return exposures(self, None if path is None else Path(path))
 

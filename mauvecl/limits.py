@@ -162,7 +162,7 @@ class LimitResult:
 
     def plot(self, path: str | Path | None = None) -> object:
         """Detection probability against the quantity: every simulated point and the limits; needs matplotlib."""
-        from mauvecl.planning_pictures import limits
+        from mauvecl.pictures.plans import limits
 
         return limits(self, None if path is None else Path(path))
 

@@ -101,7 +101,7 @@ class MapResult:
 
     def plot(self, path: str | Path | None = None) -> object:
         """One panel per statistic, with contours at the study's powers; needs matplotlib."""
-        from mauvecl.planning_pictures import detection_map as draw
+        from mauvecl.pictures.plans import detection_map as draw
 
         return draw(self, None if path is None else Path(path))
 

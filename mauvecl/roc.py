@@ -71,7 +71,7 @@ class Roc:
 
     def plot(self, path: str | Path | None = None, *, name: str = "") -> object:
         """Detection probability against false-alarm probability; needs matplotlib."""
-        from mauvecl.pictures import roc
+        from mauvecl.pictures.answers import roc
 
         return roc([(name, self)], None if path is None else Path(path))
 

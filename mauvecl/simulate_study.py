@@ -26,7 +26,7 @@ class SimulateAnswer:
 
     def plot(self, path: str | Path | None = None, *, number: int = 0) -> object:
         """One of the observations and what it is made of; needs matplotlib."""
-        from mauvecl.pictures import observation
+        from mauvecl.pictures.answers import observation
 
         title, _, table = self.observations[number]
         return observation(title, table, None if path is None else Path(path))

@@ -153,7 +153,7 @@ class SnrResult:
 
     def plot(self, path: str | Path | None = None) -> object:
         """S/N per pixel and element, closed form and realisations; needs matplotlib."""
-        from mauvecl.pictures import signal_to_noise
+        from mauvecl.pictures.answers import signal_to_noise
 
         return signal_to_noise([(self.expectation.name, self)], None if path is None else Path(path))
 

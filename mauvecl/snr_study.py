@@ -79,7 +79,7 @@ class SnrAnswer:
 
     def plot(self, path: str | Path | None = None) -> object:
         """S/N per pixel and element, closed form and realisations; needs matplotlib."""
-        from mauvecl.pictures import signal_to_noise
+        from mauvecl.pictures.answers import signal_to_noise
 
         return signal_to_noise([(s.title, s.result) for s in self.stars], None if path is None else Path(path))
 

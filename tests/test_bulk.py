@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from typer.testing import CliRunner
 
 from mauvecl import bulk, durable, store
-from mauvecl.cli import app
+from mauvecl.cli.app import app
 from mauvecl.durable import alone
 from mauvecl.engine import Engine
 from mauvecl.export import Selection, export

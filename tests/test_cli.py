@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
+from dataclasses import dataclass
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import QTable
 
+from mauvecl.cli.app import main
 from mauvecl.detect_study import detect
 from mauvecl.engine import Engine
 from mauvecl.processes import CosmicRays, Normal, Processes, Uniform
@@ -26,20 +31,45 @@ from mauvecl.study import Study
 COMMAND = [sys.executable, "-m", "mauvecl"]
 
 
-def run(*words: str | Path, folder: Path, code: int = 0) -> subprocess.CompletedProcess[str]:
+@dataclass(frozen=True)
+class Done:
+    stdout: str
+    stderr: str
+
+
+def run(*words: str | Path, folder: Path, code: int = 0) -> Done:
+    """In this process, which spares most tests a start of Python; `started` makes one of its own."""
+    out, told = io.StringIO(), io.StringIO()
+    ended = 0
+    with (
+        contextlib.chdir(folder),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(told),
+        mock.patch.object(sys, "argv", ["mauvecl", *map(str, words)]),
+        mock.patch.dict(os.environ, {"COLUMNS": "200"}),
+    ):
+        try:
+            main()
+        except SystemExit as end:
+            ended = end.code or 0
+    assert ended == code, out.getvalue() + told.getvalue()
+    return Done(out.getvalue(), told.getvalue())
+
+
+def started(*words: str | Path, folder: Path, code: int = 0) -> Done:
     done = subprocess.run(
         [*COMMAND, *map(str, words)], cwd=folder, capture_output=True, text=True, env=os.environ | {"COLUMNS": "200"}
     )
     assert done.returncode == code, done.stdout + done.stderr
     assert "Traceback" not in done.stderr
-    return done
+    return Done(done.stdout, done.stderr)
 
 
 @pytest.fixture(scope="module")
 def answered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     """The default question with fewer realisations."""
     folder = tmp_path_factory.mktemp("detect")
-    return folder, run("detect", "-n", "100000", folder=folder).stdout
+    return folder, started("detect", "-n", "100000", folder=folder).stdout
 
 
 def test_detect_answers_the_papers_question(answered: tuple[Path, str]) -> None:
@@ -442,7 +472,7 @@ def test_bad_studies_are_a_sentence(text: str, sentence: str, tmp_path: Path) ->
 SMALL_SHARES = [
     sys.executable,
     "-c",
-    "import mauvecl.shards as s; s.SHARE = 2**29; from mauvecl.cli import main; main()",
+    "import mauvecl.shards as s; s.SHARE = 2**29; from mauvecl.cli.app import main; main()",
 ]
 LONG = (
     "detect",
@@ -495,5 +525,5 @@ def test_stopped_and_resumed_as_if_never_stopped(stop: signal.Signals, tmp_path:
 def test_nothing_heavy_is_loaded_early() -> None:
     """Importing the package, or asking for help, loads neither OpenCL nor synphot nor astropy."""
     heavy = "('pyopencl', 'synphot', 'astropy', 'scipy')"
-    code = f"import sys, mauvecl, mauvecl.cli; print([m for m in {heavy} if m in sys.modules])"
+    code = f"import sys, mauvecl, mauvecl.cli.app; print([m for m in {heavy} if m in sys.modules])"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

@@ -18,7 +18,7 @@ import pytest
 from typer.testing import CliRunner
 
 from mauvecl import bulk, shards
-from mauvecl.cli import app
+from mauvecl.cli.app import app
 from mauvecl.cluster import DaskWorkers
 from mauvecl.engine import DeviceError, Engine
 from mauvecl.host.errors import InputError

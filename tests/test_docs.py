@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from typer.main import get_command
 
-from mauvecl.cli import app
+from mauvecl.cli.app import app
 from mauvecl.host.instrument import Instrument
 from mauvecl.study import Study
 

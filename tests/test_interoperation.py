@@ -14,7 +14,7 @@ from astropy.table import QTable, Table
 from typer.testing import CliRunner
 
 from mauvecl import Source
-from mauvecl.cli import app
+from mauvecl.cli.app import app
 from mauvecl.host.errors import InputError
 from mauvecl.host.flare_table import flares_of, read_flares
 from tests.scenes import star

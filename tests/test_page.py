@@ -120,9 +120,13 @@ def test_the_papers_star_from_a_fresh_page_to_the_same_bits_on_the_command_line(
     table, study = download(page, "detection (ecsv)"), download(page, "Study for the command line")
     picture, roc = download(page, "detection (png)"), download(page, "roc (fits)")
     assert picture.startswith(b"\x89PNG")
+    assert download(page, "roc (png)").startswith(b"\x89PNG")
     assert roc.startswith(b"SIMPLE")
     page.get_by_text("S/N", exact=True).first.click()
     assert b"q97.5" in download(page, "snr (ecsv)"), "simulated as well"
+    assert download(page, "snr (png)").startswith(b"\x89PNG")
+    page.get_by_text("Noise budget", exact=True).first.click()
+    assert download(page, "noise-budget (png)").startswith(b"\x89PNG")
     (tmp_path / "study.toml").write_bytes(study)
     command = [sys.executable, "-m", "mauvecl", "detect", "study.toml", "--no-pictures", "--quiet", "-o", "out"]
     subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
@@ -195,6 +199,7 @@ def test_a_second_visitor_is_served_while_the_first_computes(browser: Browser, a
     before = summary(second)
     enter(second, "Magnitude of the star", "12")
     changed(second, before)
+    second.get_by_label("Realisations").select_option("10000")
     second.get_by_role("button", name="Simulate", exact=True).click()
     summary(second, SIMULATED)
     assert first.get_by_text(SIMULATED).count() == 0, "the first is still at it"

@@ -365,7 +365,7 @@ def test_short_runs_leave_no_files(tmp_path: Path, engine: Engine) -> None:
 
 def test_clocks_may_jump(tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
     """Wall time runs backwards and leaps; neither shares nor progress care."""
-    from mauvecl.console import Meter
+    from mauvecl.cli.console import Meter
 
     leaps = iter(np.resize([1e9, -1e9, 0.0, 5e9], 100_000))
     real = time.time

@@ -11,7 +11,7 @@ import pytest
 from typer.testing import CliRunner
 
 from mauvecl import program, report, selftest
-from mauvecl.cli import app
+from mauvecl.cli.app import app
 from mauvecl.engine import Engine
 from mauvecl.kernel_cache import KernelCache
 from mauvecl.pool import LocalWorkers, Pool

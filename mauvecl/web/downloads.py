@@ -77,18 +77,18 @@ def _table(name: str, study: Study, quiet: Expectation, found: Mapping[str, Any]
 
 
 def _draw(name: str, study: Study, quiet: Expectation, found: Mapping[str, Any], path: Path) -> None:
-    from mauvecl import pictures, planning_pictures
+    from mauvecl.pictures import answers, plans
 
     title = study.star[0].library or UPLOADED
     if name == "observation":
-        pictures.observation(title, _observed(study), path)
+        answers.observation(title, _observed(study), path)
     elif name == "noise-budget":
-        planning_pictures.noise_budget([(f"{title}, {quiet.exposure_s:g} s", quiet)], path=path)
+        plans.noise_budget([(f"{title}, {quiet.exposure_s:g} s", quiet)], path=path)
     elif name == "snr" and name not in found:
-        pictures.signal_to_noise([(title, quiet)], path)
+        answers.signal_to_noise([(title, quiet)], path)
     elif name == "roc" and "detection" in found:
         (star,) = found["detection"].stars
-        pictures.roc([(one, star.found.roc(one)) for one in star.found.statistics], path)
+        answers.roc([(one, star.found.roc(one)) for one in star.found.statistics], path)
     elif name in found:
         found[name].plot(path)
     else:

@@ -11,7 +11,7 @@ from bokeh.plotting import figure
 from scipy import special
 from scipy.interpolate import PchipInterpolator
 
-from mauvecl.pictures import COLOURS, NULL
+from mauvecl.pictures.style import COLOURS, NULL
 
 if TYPE_CHECKING:
     from astropy.table import QTable

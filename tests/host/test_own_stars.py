@@ -15,7 +15,7 @@ import pytest
 from astropy.io import fits
 from typer.testing import CliRunner
 
-from mauvecl.cli import app
+from mauvecl.cli.app import app
 from mauvecl.host import own_stars
 from mauvecl.host.catalogue import library_table
 from mauvecl.host.errors import InputError

@@ -309,7 +309,7 @@ def takes_study(
         _, _, *own = inspect.signature(verb).parameters.values()
 
         def command(study_file: Path | None = None, **values: Any) -> None:
-            from mauvecl.session import Session
+            from mauvecl.cli.session import Session
 
             given = {key: values.pop(key, None) for key in options}
             if fewer and study_file is None and given["realisations"] is None:

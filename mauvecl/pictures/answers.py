@@ -1,4 +1,4 @@
-"""Pictures of answers, with matplotlib (the extra ``plot``). Nothing is computed here."""
+"""Pictures of answers: detections, curves, spectra, one observation, S/N."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.pictures.style import COLOURS, MOST_COLUMNS, NAMES, NULL, STYLE, finished, pyplot
+
 if TYPE_CHECKING:
     from astropy.table import QTable
 
@@ -16,72 +18,6 @@ if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
     from mauvecl.roc import Roc
     from mauvecl.snr import SnrResult
-
-#: Okabe and Ito's colours, which colour-blind readers can tell apart (jfly.uni-koeln.de/color).
-COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7", "#000000")
-NULL = "#777777"
-#: Panels side by side.
-MOST_COLUMNS = 3
-
-STYLE = {
-    "font.size": 9,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.titlesize": 9,
-    "axes.titlelocation": "left",
-    "legend.frameon": False,
-    "legend.fontsize": 8,
-    "figure.constrained_layout.use": True,
-    "savefig.dpi": 160,
-    "lines.linewidth": 1.2,
-}
-
-NAMES = {
-    "chi2": "chi2 over pixels",
-    "chi2_element": "chi2 over 10.5 nm elements",
-    "chi2_pair": "chi2 against a noisy exposure",
-    "matched": "matched filter (standard deviations)",
-    "uv_excess": "UV excess (standard deviations)",
-    "paper": "the paper's sum on smoothed spectra",
-}
-AXES = {
-    "magnitude": "magnitude",
-    "amplitude": "flare amplitude",
-    "flare_temperature": "flare temperature (K)",
-    "exposure": "exposure (s)",
-    "detector_temperature": "detector temperature (deg C)",
-    "sky": "sky brightness (V mag / arcsec²)",
-    "star": "star",
-}
-
-
-def available() -> bool:
-    """Whether matplotlib is installed."""
-    from importlib.util import find_spec
-
-    return find_spec("matplotlib") is not None
-
-
-def pyplot() -> Any:
-    """Matplotlib's pyplot, without windows unless a notebook or the user has chosen how figures are shown."""
-    import os
-
-    import matplotlib as mpl
-
-    if "MPLBACKEND" not in os.environ:
-        mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
-    return plt
-
-
-def finished(figure: Any, path: Path | None) -> Any:
-    """Save a figure under a path, in the form of its ending (.png, .pdf, .svg), or hand it out; pyplot forgets it."""
-    pyplot().close(figure)
-    if path is None:
-        return figure
-    figure.savefig(path)
-    return path
 
 
 def detection(stars: Sequence[tuple[str, Detection, Sequence[str]]], fap: float, path: Path | None = None) -> Any:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from mauvecl.console import short
-from mauvecl.flags import (
+from mauvecl.cli.console import short
+from mauvecl.cli.flags import (
     DETECTION,
     DRAWS,
     FLARE,
@@ -18,7 +18,7 @@ from mauvecl.flags import (
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-    from mauvecl.session import Session
+    from mauvecl.cli.session import Session
     from mauvecl.study import Study
 
 
@@ -39,7 +39,7 @@ def detect(
     Example: mauvecl detect --star K5V --magnitude 6 --amplitude 0.05 --amplitude 0.1 --exposure 30
     """
     from mauvecl import report
-    from mauvecl.console import show_table
+    from mauvecl.cli.console import show_table
     from mauvecl.detect_study import detect as compute
 
     with session.pool() as engine:
@@ -50,7 +50,7 @@ def detect(
     session.write(found.roc, "roc.ecsv")
     session.write(found.tails, "tails.ecsv")
     if session.draws_pictures:
-        from mauvecl.pictures import detection, spectra
+        from mauvecl.pictures.answers import detection, spectra
 
         # More would be too small to read; the tables hold all of them.
         shown = [(star.title, star.found, star.flare_names) for star in found.stars[:MOST_DRAWN]]
@@ -91,7 +91,7 @@ def detect(
 
 def _show_departures(table: QTable, fap: float) -> None:
     """Where the simulation differs from the closed form, or that it does not."""
-    from mauvecl.console import show, show_table
+    from mauvecl.cli.console import show, show_table
 
     differing = table[table["differs"]]
     if len(table) and not len(differing):
@@ -125,7 +125,7 @@ def gaussian(
     Example: mauvecl gaussian --star G2V --sweep magnitude=6,10 --sweep exposure=5,50
     """
     from mauvecl import report
-    from mauvecl.console import show_table
+    from mauvecl.cli.console import show_table
     from mauvecl.gaussian import gaussian_report
 
     with session.pool() as engine:
@@ -136,7 +136,7 @@ def gaussian(
     for name, table in tables.items():
         session.write(table, f"{name}.ecsv")
     if session.draws_pictures:
-        from mauvecl.planning_pictures import gaussian as draw
+        from mauvecl.pictures.plans import gaussian as draw
 
         session.files.append(draw(found, session.folder / "gaussian.png"))
     session.record(found.study, [star.result.expectation for star in found.signal.stars], messages)

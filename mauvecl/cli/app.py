@@ -10,13 +10,13 @@ from typing import Annotated
 import typer
 
 from mauvecl import __version__
-from mauvecl.cli_bulk import export, realise, verify
-from mauvecl.cli_detect import detect, gaussian
-from mauvecl.cli_library import app as library
-from mauvecl.cli_limits import detection_map, limit
-from mauvecl.cli_observe import exposure, simulate, snr
-from mauvecl.cli_serve import serve
-from mauvecl.flags import DeviceFlag, JsonFlag, OutputFlag, QuietFlag
+from mauvecl.cli.bulk import export, realise, verify
+from mauvecl.cli.detect import detect, gaussian
+from mauvecl.cli.flags import DeviceFlag, JsonFlag, OutputFlag, QuietFlag
+from mauvecl.cli.library import app as library
+from mauvecl.cli.limits import detection_map, limit
+from mauvecl.cli.observe import exposure, simulate, snr
+from mauvecl.cli.serve import serve
 
 app = typer.Typer(
     name="mauvecl",
@@ -45,7 +45,7 @@ def devices(
     if as_json:
         print(json.dumps(found, indent=2))
         return
-    from mauvecl.console import show_table
+    from mauvecl.cli.console import show_table
 
     cells = [
         (
@@ -76,7 +76,7 @@ def selftest(
     from dataclasses import asdict
 
     from mauvecl import report, selftest
-    from mauvecl.console import Meter, show, show_table
+    from mauvecl.cli.console import Meter, show, show_table
     from mauvecl.engine import Engine
 
     started = time.perf_counter()

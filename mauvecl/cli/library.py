@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mauvecl.flags import JsonFlag, QuietFlag
+from mauvecl.cli.flags import JsonFlag, QuietFlag
 
 if TYPE_CHECKING:
     from mauvecl.host.own_stars import OwnStar
@@ -36,7 +36,7 @@ def library(context: typer.Context, as_json: JsonFlag = False) -> None:
     if as_json:
         print(json.dumps(rows(table), indent=2))
         return
-    from mauvecl.console import show_table
+    from mauvecl.cli.console import show_table
 
     ours = table[table["kept"] == "embedded"]
     columns = ("name", "also", "type", "star", "UV at 190-210, 240-260, 290-310 nm", "licence")
@@ -101,7 +101,7 @@ def remove(names: Annotated[list[str], typer.Argument(help="Names of kept stars.
 
     Example: mauvecl library remove "HD 1234"
     """
-    from mauvecl.console import show
+    from mauvecl.cli.console import show
     from mauvecl.host.own_stars import remove
 
     for name in names:
@@ -111,7 +111,7 @@ def remove(names: Annotated[list[str], typer.Argument(help="Names of kept stars.
 
 
 def _tell(star: OwnStar, quiet: bool) -> None:
-    from mauvecl.console import show
+    from mauvecl.cli.console import show
 
     if quiet:
         return

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from astropy.table import Table
 
     from mauvecl.checkpoint import Checkpoint
-    from mauvecl.console import Meter
+    from mauvecl.cli.console import Meter
     from mauvecl.host.expectation import Expectation
     from mauvecl.pool import Pool, Workers
     from mauvecl.study import Study
@@ -104,7 +104,7 @@ class Session:
 
     def metered(self, unit: str) -> Meter:
         """Progress in a unit, to be used in a `with` block."""
-        from mauvecl.console import Meter
+        from mauvecl.cli.console import Meter
 
         return Meter(quiet=self.quiet or self.as_json, unit=unit)
 
@@ -117,7 +117,7 @@ class Session:
 
     def say(self, lines: Sequence[str]) -> None:
         """Tell the reader, unless standard output is for JSON alone."""
-        from mauvecl.console import show
+        from mauvecl.cli.console import show
 
         if not self.as_json:
             show(lines)
@@ -125,7 +125,7 @@ class Session:
     @cached_property
     def draws_pictures(self) -> bool:
         """Whether pictures are to be drawn; tells where matplotlib is missing."""
-        from mauvecl.pictures import available
+        from mauvecl.pictures.style import available
 
         if self.pictures and not available():
             if not self.quiet:

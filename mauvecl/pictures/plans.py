@@ -1,4 +1,4 @@
-"""Pictures to plan by: maps, limits, noise budgets, S/N over a sweep, exposures. Nothing is computed here."""
+"""Pictures to plan by: maps, limits, noise budgets, S/N over a sweep, exposures."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.labels import titled
-from mauvecl.pictures import AXES, COLOURS, NAMES, NULL, STYLE, finished, pyplot
+from mauvecl.pictures.style import AXES, COLOURS, NAMES, NULL, STYLE, finished, pyplot
 
 if TYPE_CHECKING:
     from mauvecl.exposures import ExposureResult

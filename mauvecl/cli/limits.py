@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mauvecl.console import short
-from mauvecl.flags import (
+from mauvecl.cli.console import short
+from mauvecl.cli.flags import (
     DETECTION,
     DRAWS,
     FLARE,
@@ -20,8 +20,8 @@ from mauvecl.flags import (
 )
 
 if TYPE_CHECKING:
+    from mauvecl.cli.session import Session
     from mauvecl.limits import Limit
-    from mauvecl.session import Session
     from mauvecl.study import Study
 
 
@@ -40,7 +40,7 @@ def limit(
     Example: mauvecl limit --star G2V --amplitude 0.24 --exposure 50
     """
     from mauvecl import report
-    from mauvecl.console import show_table
+    from mauvecl.cli.console import show_table
     from mauvecl.labels import told
     from mauvecl.limits import limiting_magnitude
 
@@ -148,7 +148,7 @@ def detection_map(
 
 def _show(found: Any, study: Study) -> None:
     """The map as tables of percentages, one per statistic."""
-    from mauvecl.console import show, show_table
+    from mauvecl.cli.console import show, show_table
 
     def text(value: float | str) -> str:
         return value if isinstance(value, str) else f"{value:.3g}"

@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mauvecl.flags import BULK, DRAWS, FLARE, SWEEP, DeviceFlag, JsonFlag, QuietFlag, takes_study
+from mauvecl.cli.flags import BULK, DRAWS, FLARE, SWEEP, DeviceFlag, JsonFlag, QuietFlag, takes_study
 
 if TYPE_CHECKING:
-    from mauvecl.session import Session
+    from mauvecl.cli.session import Session
     from mauvecl.store import Store
     from mauvecl.study import Study
 
@@ -34,9 +34,9 @@ def realise(study: Study, session: Session) -> None:
     mauvecl realise --star G2V --magnitude 7.4 --amplitude 0.24 --exposure 5 -n 1000 --output frames.fits
     """
     from mauvecl import bulk
+    from mauvecl.cli.session import told_of_interrupts, working
     from mauvecl.export import ENDINGS, Selection, export
     from mauvecl.host.errors import InputError
-    from mauvecl.session import told_of_interrupts, working
 
     place = session.output or Path("mauvecl-frames.zarr")
     one_file = place.suffix in ENDINGS
@@ -62,7 +62,7 @@ def realise(study: Study, session: Session) -> None:
 
 
 def _tell(store: Store, place: Path, session: Session) -> None:
-    from mauvecl.console import show_table
+    from mauvecl.cli.console import show_table
     from mauvecl.labels import told
 
     messages = told([scene.expectation for scene in store.scenes])
@@ -115,7 +115,7 @@ def verify(
     from dataclasses import asdict
 
     from mauvecl import bulk
-    from mauvecl.console import Meter, show, show_table
+    from mauvecl.cli.console import Meter, show, show_table
     from mauvecl.engine import Engine
 
     engine = Engine(device) if repair or redraw else None
@@ -148,7 +148,7 @@ def export(
 
     Example: mauvecl export frames.zarr some.fits --array star-1/quiescent --rows 0:1000
     """
-    from mauvecl.console import show
+    from mauvecl.cli.console import show
     from mauvecl.export import Selection
     from mauvecl.export import export as write
     from mauvecl.store import Store

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mauvecl.console import short
-from mauvecl.flags import (
+from mauvecl.cli.console import short
+from mauvecl.cli.flags import (
     DRAWS,
     FLARE,
     SIGNAL,
@@ -17,7 +17,7 @@ from mauvecl.flags import (
 )
 
 if TYPE_CHECKING:
-    from mauvecl.session import Session
+    from mauvecl.cli.session import Session
     from mauvecl.snr_study import SnrAnswer
     from mauvecl.study import Study
 
@@ -43,7 +43,7 @@ def simulate(
         for ending in (".ecsv", ".fits"):
             session.write(table, f"{stem}{ending}")
         if session.draws_pictures:
-            from mauvecl.pictures import observation
+            from mauvecl.pictures.answers import observation
 
             session.files.append(observation(title, table, session.folder / f"{stem}.png"))
         peak = int(x.signal_dn.argmax())
@@ -62,7 +62,7 @@ def simulate(
     if session.as_json:
         session.print_json({"messages": found.messages, "observations": summary})
         return
-    from mauvecl.console import show_table
+    from mauvecl.cli.console import show_table
 
     show_table(
         "One observation each (closed-form S/N)",
@@ -118,8 +118,8 @@ def snr(
 
 
 def _snr_pictures(found: SnrAnswer, folder: Path) -> list[Path]:
-    from mauvecl.pictures import signal_to_noise
-    from mauvecl.planning_pictures import noise_budgets, snr_sweep
+    from mauvecl.pictures.answers import signal_to_noise
+    from mauvecl.pictures.plans import noise_budgets, snr_sweep
 
     files = [noise_budgets(found, folder / "noise-budget.png")]
     if len(found.stars) <= 6:
@@ -131,7 +131,7 @@ def _snr_pictures(found: SnrAnswer, folder: Path) -> list[Path]:
 
 def _show_snr(found: SnrAnswer) -> None:
     """S/N and noise at some wavelengths; all of them are in the files."""
-    from mauvecl.console import show_table
+    from mauvecl.cli.console import show_table
     from mauvecl.exposures import place_of
 
     cells, budgets = [], []
@@ -170,7 +170,7 @@ def exposure(
     Example: mauvecl exposure --snr 10 --at 300 --star G2V --magnitude 7.4
     """
     from mauvecl import report
-    from mauvecl.console import show_table
+    from mauvecl.cli.console import show_table
     from mauvecl.exposures import exposure_for
 
     found, wanted = exposure_for(study), study.signal

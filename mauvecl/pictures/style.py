@@ -1,0 +1,72 @@
+"""One style for all pictures: colours, names on axes, what a figure becomes at the end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+#: Okabe and Ito's colours, which colour-blind readers can tell apart (jfly.uni-koeln.de/color).
+COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7", "#000000")
+NULL = "#777777"
+#: Panels side by side.
+MOST_COLUMNS = 3
+
+STYLE = {
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.titlesize": 9,
+    "axes.titlelocation": "left",
+    "legend.frameon": False,
+    "legend.fontsize": 8,
+    "figure.constrained_layout.use": True,
+    "savefig.dpi": 160,
+    "lines.linewidth": 1.2,
+}
+
+NAMES = {
+    "chi2": "chi2 over pixels",
+    "chi2_element": "chi2 over 10.5 nm elements",
+    "chi2_pair": "chi2 against a noisy exposure",
+    "matched": "matched filter (standard deviations)",
+    "uv_excess": "UV excess (standard deviations)",
+    "paper": "the paper's sum on smoothed spectra",
+}
+AXES = {
+    "magnitude": "magnitude",
+    "amplitude": "flare amplitude",
+    "flare_temperature": "flare temperature (K)",
+    "exposure": "exposure (s)",
+    "detector_temperature": "detector temperature (deg C)",
+    "sky": "sky brightness (V mag / arcsec²)",
+    "star": "star",
+}
+
+
+def available() -> bool:
+    """Whether matplotlib is installed."""
+    from importlib.util import find_spec
+
+    return find_spec("matplotlib") is not None
+
+
+def pyplot() -> Any:
+    """Matplotlib's pyplot, without windows unless a notebook or the user has chosen how figures are shown."""
+    import os
+
+    import matplotlib as mpl
+
+    if "MPLBACKEND" not in os.environ:
+        mpl.use("Agg")
+    import matplotlib.pyplot as plt
+
+    return plt
+
+
+def finished(figure: Any, path: Path | None) -> Any:
+    """Save a figure under a path, in the form of its ending (.png, .pdf, .svg), or hand it out; pyplot forgets it."""
+    pyplot().close(figure)
+    if path is None:
+        return figure
+    figure.savefig(path)
+    return path

@@ -1,0 +1,100 @@
+"""What every verb of the command line has in common: help by examples, completion, no colour in pipes, JSON alone."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from typer.main import get_command
+
+from mauvecl.cli.app import app
+
+VERBS: dict[str, Any] = {
+    name: verb
+    for top, found in get_command(app).commands.items()  # type: ignore[attr-defined]
+    for name, verb in {top: found, **{f"{top} {k}": v for k, v in getattr(found, "commands", {}).items()}}.items()
+}
+
+
+def started(*words: str, folder: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "mauvecl", *words],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        env=os.environ | environment,
+    )
+
+
+@pytest.mark.parametrize("name", VERBS)
+def test_help_teaches_by_an_example(name: str) -> None:
+    if not hasattr(VERBS[name], "commands"):
+        assert f"mauvecl {name}" in VERBS[name].help.split("Example", 1)[1]
+    assert all(p.help for p in VERBS[name].params if getattr(p, "opts", None) and p.param_type_name == "option")
+
+
+def test_the_same_word_means_the_same_everywhere() -> None:
+    """A flag has one help text, whatever the verb."""
+    said: dict[str, set[str]] = {}
+    for verb in VERBS.values():
+        for parameter in verb.params:
+            if parameter.param_type_name == "option" and parameter.name != "help":
+                said.setdefault(parameter.opts[0], set()).add(parameter.help)
+    several = {flag: texts for flag, texts in said.items() if len(texts) > 1}
+    assert not several
+    assert len(said) > 40
+
+
+def test_bash_completes_verbs_and_flags(tmp_path: Path) -> None:
+    for typed, wanted in (("mauvecl det", "detect"), ("mauvecl detect --magn", "--magnitude")):
+        words = {"COMP_WORDS": typed, "COMP_CWORD": str(len(typed.split()) - 1), "_MAUVECL_COMPLETE": "complete_bash"}
+        # The program's name decides the variable; the console script has it.
+        done = subprocess.run(
+            [str(Path(sys.executable).parent / "mauvecl")], capture_output=True, text=True, env=os.environ | words
+        )
+        assert wanted in done.stdout.split(), done
+
+
+def test_pipes_get_no_colour_and_errors_their_own_way(tmp_path: Path) -> None:
+    plain = started("library", folder=tmp_path, TERM="xterm-256color")
+    assert plain.returncode == 0
+    assert "\x1b" not in plain.stdout + plain.stderr
+    assert "G2V" in plain.stdout
+    wrong = started("detect", "--fap", "2", folder=tmp_path, TERM="xterm-256color")
+    assert wrong.returncode == 2
+    assert wrong.stdout == ""
+    assert "\x1b" not in wrong.stderr
+    assert len(wrong.stderr.strip().splitlines()) == 1
+    unknown = started("detetc", folder=tmp_path)
+    assert unknown.returncode == 2
+    assert "detetc" in unknown.stderr
+    assert "Traceback" not in unknown.stderr
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("library", "--json"),
+        ("detect", "--star", "G2V", "-m", "8", "-a", "0.1", "-n", "100000", "--no-pictures", "--json"),
+        ("exposure", "--snr", "10", "--at", "300", "--star", "G2V", "-m", "7.4", "--json"),
+    ],
+    ids=lambda words: words[0],
+)
+def test_json_is_alone_on_standard_output(words: tuple[str, ...], tmp_path: Path) -> None:
+    done = started(*words, folder=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)
+
+
+def test_quiet_prints_no_progress_and_no_files(tmp_path: Path) -> None:
+    words = ("detect", "--star", "G2V", "-m", "8", "-a", "0.1", "-n", "100000", "--no-pictures")
+    loud, quiet = (started(*words, *more, folder=tmp_path) for more in ((), ("--quiet",)))
+    assert "detection.ecsv" in loud.stdout + loud.stderr
+    assert "detection.ecsv" not in quiet.stdout + quiet.stderr
+    assert quiet.stderr == ""
+    assert "matched" in quiet.stdout
