@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -45,16 +46,12 @@ class Smoothing:
     @classmethod
     def of(cls, x: Expectation, used: NDArray[np.bool_]) -> Smoothing:
         """The paper's smoothing on the pixels of an expectation, those that do not count left out."""
-        from scipy.ndimage import gaussian_filter1d
-
         n = x.wavelength_nm.size
         sigma = SMOOTHING_NM / np.sqrt(8 * np.log(2)) / float(np.median(np.diff(x.wavelength_nm)))
         # An odd number of pixels has a middle.
         step = 2 * int((sigma / STEPS_PER_SIGMA + 1) / 2) - 1 if sigma > STEPS_PER_SIGMA else 1
-        starts = np.arange(0, n, step)
-        centres = (starts + np.minimum(starts + step, n) - 1) // 2
-        rows = gaussian_filter1d(np.eye(n), sigma, axis=0, mode="nearest")[centres]
-        return cls(centres, starts, sigma, rows * used)
+        starts, centres = _places(n, step)
+        return cls(centres, starts, sigma, _rows(n, sigma, step) * used)
 
     def scale(self, flare: Expectation) -> Float:
         """Factors of the squares of smoothed DN, for the paper's sum of (F - Q)^2 / F in DN/s; shape (n_centre,)."""
@@ -109,3 +106,19 @@ class Smoothing:
         for c, (low, high) in enumerate(zip(before, begun, strict=True)):
             weights[c, : high - low] = padded[low:high, c * chunk : (c + 1) * chunk]
         return weights, np.diff(done, prepend=0).astype(np.uint32)
+
+
+def _places(n: int, step: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """First pixels of steps, and the pixels in their middles."""
+    starts = np.arange(0, n, step)
+    return starts, (starts + np.minimum(starts + step, n) - 1) // 2
+
+
+@lru_cache(maxsize=4)
+def _rows(n: int, sigma: float, step: int) -> Float:
+    """Weights of the pixels in the smoothed spectrum at each step; kept, for they take a tenth of a second."""
+    from scipy.ndimage import gaussian_filter1d
+
+    rows = gaussian_filter1d(np.eye(n), sigma, axis=0, mode="nearest")[_places(n, step)[1]]
+    rows.setflags(write=False)
+    return np.asarray(rows)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -71,6 +72,10 @@ def central_counts(trials: int, probability: float, confidence: float = CONFIDEN
     return bounds[0], bounds[1]
 
 
+#: Standard deviations from the mean within which a transform is computed once for all values.
+NEAR = 40.0
+
+
 @dataclass(frozen=True, eq=False)
 class QuadraticForm:
     """sum_i weight_i (z_i + shift_i)^2 with independent standard normals z_i: a generalised chi-squared.
@@ -110,24 +115,32 @@ class QuadraticForm:
             from scipy.stats import ncx2
 
             return float(ncx2.sf(value, self.weight.size, np.sum(self.shift**2)))
-        spacing = 2.0 * np.pi / (40.0 * self.std + abs(value - self.mean))
-        total, k = 0.0, 0.5
+        reach = abs(value - self.mean) / self.std
+        u, size, phase = self._near if reach <= NEAR else self._transform(reach)
+        return float(np.clip(0.5 + np.sum(size * np.sin(phase - u * value)) / np.pi, 0.0, 1.0))
+
+    @cached_property
+    def _near(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """The transform for all values that are asked for again and again."""
+        return self._transform(NEAR)
+
+    def _transform(self, reach: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Frequencies, and the characteristic function's modulus and phase there, for values within so many std."""
+        spacing = 2.0 * np.pi / ((40.0 + reach) * self.std)
+        pull = self.shift**2 * self.weight
+        parts = []
+        k = 0.5 + np.arange(256)
         while True:
-            u = (k + np.arange(256)) * spacing
-            spread = 1.0 + (2.0 * np.outer(u, self.weight)) ** 2
-            pull = self.shift**2 * self.weight
-            log_size = -0.25 * np.log(spread).sum(axis=1) - (2.0 * np.outer(u**2, self.weight) * pull / spread).sum(
-                axis=1
-            )
-            phase = (
-                0.5 * np.arctan(2.0 * np.outer(u, self.weight)).sum(axis=1)
-                + (np.outer(u, pull) / spread).sum(axis=1)
-                - u * value
-            )
-            total += float(np.sum(np.exp(log_size) * np.sin(phase) / (k + np.arange(256))))
-            k += 256
-            if log_size[-1] < np.log(1e-15 * k):
-                return float(np.clip(0.5 + total / np.pi, 0.0, 1.0))
+            u = k * spacing
+            turn = 2.0 * np.outer(u, self.weight)
+            spread = 1.0 + turn**2
+            log_size = -0.25 * np.log(spread).sum(axis=1) - (u[:, None] * turn * pull / spread).sum(axis=1)
+            phase = 0.5 * np.arctan(turn).sum(axis=1) + (u[:, None] * pull / spread).sum(axis=1)
+            parts.append((u, np.exp(log_size) / k, phase))
+            k = k + 256
+            if log_size[-1] < np.log(1e-15 * k[0]):
+                us, sizes, phases = zip(*parts, strict=True)
+                return np.concatenate(us), np.concatenate(sizes), np.concatenate(phases)
 
     def isf(self, probability: float) -> float:
         """The value exceeded with this probability."""

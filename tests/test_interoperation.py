@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 from mauvecl import Source
 from mauvecl.cli.app import app
 from mauvecl.host.errors import InputError
+from mauvecl.host.flare import blackbody
 from mauvecl.host.flare_table import flares_of, read_flares
 from tests.scenes import star
 
@@ -36,6 +37,15 @@ def test_a_synphot_blackbody_as_stsynphot_makes_its_stars() -> None:
 
     hot, cool = (Source.from_synphot(SourceSpectrum(BlackBodyNorm1D, temperature=t)) for t in (10_000, 5_000))
     assert hot.magnitude("GALEX NUV") - hot.magnitude("V") < cool.magnitude("GALEX NUV") - cool.magnitude("V")
+
+
+def test_a_spectrum_of_stsynphot(recwarn: pytest.WarningsRecorder) -> None:
+    """Its parser, on expressions that need none of its data files."""
+    parser = pytest.importorskip("stsynphot.spparser")
+    found = Source.from_synphot(parser.parse_spec("rn(bb(9000),box(5500,100),15,abmag)"))
+    assert found.at_magnitude(8.0).magnitude("V") == pytest.approx(8.0, abs=1e-6)
+    body = Source.from_arrays(found.wavelength_nm, blackbody(found.wavelength_nm, 9000.0))
+    np.testing.assert_allclose(found.at_magnitude(8.0).flux_flam, body.at_magnitude(8.0).flux_flam, rtol=1e-3)
 
 
 def test_a_specutils_spectrum_in_and_out() -> None:
@@ -62,6 +72,16 @@ ALTAIPONY = """istart,istop,cstart,cstop,tstart,tstop,ed_rec,ed_rec_err,ampl_rec
 90,95,81,86,1330.117,1330.121,40.5,0.5,0.24,0.0035,18000
 99,102,90,93,1331.2,1331.203,1.1,0.2,0.081,0.002,18000
 """
+
+
+def test_flares_cut_out_of_a_lightkurve_light_curve() -> None:
+    lightkurve = pytest.importorskip("lightkurve")
+    flux = np.ones(200)
+    flux[[50, 120]] = 1.1, 1.02
+    curve = lightkurve.LightCurve(time=np.linspace(1325.0, 1326.0, 200), flux=flux)
+    peaks = curve[curve.flux > 1.01]
+    peaks["amplitude"] = peaks.flux - 1.0
+    np.testing.assert_allclose(flares_of(peaks)["amplitude"], [0.1, 0.02])
 
 
 def test_a_table_of_altaipony(tmp_path: Path) -> None:
