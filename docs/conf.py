@@ -13,6 +13,8 @@ extensions = [
     "numpydoc",
     "sphinx.ext.autodoc",
     "sphinx.ext.mathjax",
+    # Equations without another server.
+    "sphinx-mathjax-offline",
 ]
 myst_heading_anchors = 3
 myst_enable_extensions = ["dollarmath", "amsmath"]
@@ -22,6 +24,11 @@ nb_execution_raise_on_error = True
 nb_execution_timeout = 300
 nb_merge_streams = True
 html_theme = "pydata_sphinx_theme"
+# Every page on the left of every page.
+html_sidebars = {"**": ["globaltoc.html"]}
+html_theme_options = {"navbar_center": [], "show_toc_level": 2}
+html_static_path = ["_static"]
+html_css_files = ["wide.css"]
 smartquotes = False
 html_title = "mauvecl"
 exclude_patterns = ["_build", "_generated", "jupyter_execute", "**.ipynb_checkpoints"]

@@ -11,3 +11,8 @@ from mauvecl.engine import Engine
 def engine() -> Engine:
     """The default engine, shared because a build takes a second."""
     return Engine()
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The page first: one process then keeps its server and browser, and others take the rest of its tests."""
+    items.sort(key=lambda item: "test_page" not in item.nodeid)

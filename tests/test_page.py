@@ -199,6 +199,7 @@ def test_a_second_visitor_is_served_while_the_first_computes(browser: Browser, a
     before = summary(second)
     enter(second, "Magnitude of the star", "12")
     changed(second, before)
+    enter(second, "False-alarm probability per test", "0.05")
     second.get_by_label("Realisations").select_option("10000")
     second.get_by_role("button", name="Simulate", exact=True).click()
     summary(second, SIMULATED)
@@ -222,14 +223,19 @@ def test_alerts_are_sentences(page: Page) -> None:
     assert page.get_by_role("button", name="Simulate", exact=True).is_disabled()
 
 
-def test_limit_and_map(page: Page) -> None:
+def test_limit_and_map(page: Page, tmp_path: Path) -> None:
     summary(page)
     page.get_by_text("Limiting magnitude and map", exact=True).first.click()
     page.get_by_role("button", name="Draw the map").click()
     page.get_by_alt_text("Detection probability over magnitude and flare amplitude").wait_for()
-    table = QTable.read(io.BytesIO(download(page, "map (ecsv)")), format="ascii.ecsv")
+    content = download(page, "map (ecsv)")
+    table = QTable.read(io.BytesIO(content), format="ascii.ecsv")
     assert len(table) == 64
     assert table["closed_form"].min() < 0.5 < table["closed_form"].max()
+    (tmp_path / "map.toml").write_bytes(download(page, "map (study)"))
+    command = [sys.executable, "-m", "mauvecl", "map", "map.toml", "--no-pictures", "--quiet", "-o", "out"]
+    subprocess.run(command, cwd=tmp_path, check=True, capture_output=True)
+    assert (tmp_path / "out" / "map.ecsv").read_bytes() == content
 
 
 def test_a_phone_a_keyboard_and_a_screen_reader(browser: Browser, address: str) -> None:

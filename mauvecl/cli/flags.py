@@ -147,7 +147,13 @@ QuietFlag = Annotated[bool, typer.Option("--quiet", "-q", help="Print no progres
 PicturesFlag = Annotated[bool, typer.Option("--pictures/--no-pictures", help="Draw pictures (needs mauvecl[plot]).")]
 
 KeepAfterFlag = Annotated[
-    float, typer.Option("--keep-after", min=0.0, help="Seconds after which finished shares are kept on the disk.")
+    float | None,
+    typer.Option(
+        "--keep-after",
+        min=0.0,
+        help="Seconds after which finished shares are kept on the disk [20].",
+        show_default=False,
+    ),
 ]
 
 
@@ -263,7 +269,7 @@ WORKERS = {
     "cluster": (ClusterFlag, None),
     "resume": (ResumeFlag, False),
     "restart": (RestartFlag, False),
-    "keep_after": (KeepAfterFlag, 20.0),
+    "keep_after": (KeepAfterFlag, None),
 }
 #: Where a verb asks for fewer realisations than a detection, unless told.
 FEWER = 100_000

@@ -45,8 +45,8 @@ class Session:
         As `cluster.DaskWorkers` takes it.
     resume, restart : bool
         What is to become of an unfinished run that is there.
-    keep_after : float
-        Seconds after which finished shares are kept on the disk.
+    keep_after : float, optional
+        Seconds after which finished shares are kept on the disk; as `Checkpoint` has it by default.
     """
 
     verb: str
@@ -59,7 +59,7 @@ class Session:
     cluster: str | None = None
     resume: bool = False
     restart: bool = False
-    keep_after: float = 20.0
+    keep_after: float | None = None
     files: list[Path] = field(default_factory=list)
     started: float = field(default_factory=time.perf_counter)
     _pool: Pool | None = None
@@ -83,8 +83,10 @@ class Session:
         from mauvecl.checkpoint import Checkpoint
         from mauvecl.pool import Pool
 
-        how = {"resume": self.resume, "restart": self.restart}
-        checkpoint = Checkpoint(self.folder, self.verb, self.study, patience_s=self.keep_after, **how)
+        how: dict[str, Any] = {"resume": self.resume, "restart": self.restart}
+        if self.keep_after is not None:
+            how["patience_s"] = self.keep_after
+        checkpoint = Checkpoint(self.folder, self.verb, self.study, **how)
         self.meter = self.metered(unit)
         with ExitStack() as stack:
             stack.enter_context(told_of_interrupts(lambda: self._kept(checkpoint)))

@@ -8,12 +8,11 @@ from collections.abc import Callable
 from concurrent.futures import CancelledError, Future
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import panel as pn
 from bokeh.models.widgets import Div
-from panel.theme import fast
 
 from mauvecl.detect_study import DetectAnswer, detect
 from mauvecl.detection import Detection
@@ -27,7 +26,8 @@ from mauvecl.snr_study import SnrAnswer, snr
 from mauvecl.study import Study
 from mauvecl.web.controls import controls
 from mauvecl.web.downloads import as_file, study_file
-from mauvecl.web.question import UPLOADED, Question
+from mauvecl.web.frame import tabs
+from mauvecl.web.question import Question
 from mauvecl.web.views import Distributions, InputSpectrum, NoiseBudget, Observation, Roc, SignalToNoise, Smooth
 from mauvecl.web.work import Cancelled, Job
 
@@ -39,23 +39,6 @@ if TYPE_CHECKING:
 LOOK_MS, DRAW_MS = 250, 500
 #: The map of the page: cells along each axis, and realisations of each.
 MAP_STEPS, MAP_REALISATIONS = 8, 20_000
-NOMINAL = (
-    "Nominal throughput, pieced together from the paper, datasheets and assumptions: not a flight calibration. "
-    "Sensible uncertainty: 30 %, and 50 % below 250 nm."
-)
-ABOUT = (
-    "Would the Mauve satellite see this stellar flare, and how sure can one be? Closed forms follow every change at "
-    "once; *Simulate* refines them with noise realisations."
-)
-
-
-class Fast(fast.Fast):
-    """Panel's design with the system's letters: no visitor's browser asks another server for them.
-
-    Its name is Panel's own, by which the design's files are found.
-    """
-
-    _resources: ClassVar[Any] = {**fast.Fast._resources, "font": {}}
 
 
 class Page:
@@ -88,7 +71,7 @@ class Page:
             pn.state.on_session_destroyed(lambda context: self._left())
         self._make_buttons()
         self.controls = controls(self.question, lambda text: self._alert(text, "danger"))
-        self.tabs = self._make_tabs()
+        self.tabs = tabs(self)
         self.tabs.param.watch(self._show_tab, "active")
         self._stale: set[int] = set()
         if pn.state.location is not None:
@@ -339,95 +322,27 @@ class Page:
         """The question as it stands."""
         return self.question.study(Path(self._folder.name))
 
-    def _downloads(self, name: str, endings: tuple[str, ...]) -> Any:
-        return pn.FlexBox(*(
-            pn.widgets.FileDownload(
-                callback=partial(self._safely, partial(self._file, name, ending)),
-                filename=f"mauvecl-{name}.{ending}", label=f"{name} ({ending})", embed=False, auto=True, width=200,
-            )
-            for ending in endings
-        ))  # fmt: skip
-
-    def _file(self, name: str, ending: str) -> io.BytesIO:
+    def file(self, name: str, ending: str) -> io.BytesIO:
+        """An answer as a table or picture."""
         if self.quiet is None:
             raise InputError("there is no answer to download, expected a question that has one")
         return as_file(name, ending, self.study(), self.quiet, self.found)
 
-    def _safely(self, make: Callable[[], io.BytesIO]) -> io.BytesIO:
+    def study_of(self, name: str | None = None) -> io.BytesIO:
+        """The study of an answer that has its own, or of the question."""
+        if name is None:
+            return study_file(self.question, self.study())
+        if name not in self.found:
+            raise InputError(f"no {name} is computed yet, expected a simulation first")
+        return study_file(self.question, self.found[name].study)
+
+    def safely(self, make: Callable[[], io.BytesIO]) -> io.BytesIO:
+        """What is made, or the sentence of why not, on the page and in the file."""
         try:
             return make()
         except InputError as error:
             self._alert(str(error), "warning")
             return io.BytesIO(f"{error}\n".encode())
-
-    # Everything together
-
-    def _make_tabs(self) -> Any:
-        observation, snr, budget, distributions, roc = (view.plot for view in self.views)
-        endings = ("ecsv", "fits", "png")
-        taken = self._downloads("observation", endings)
-        return pn.Tabs(
-            ("Simulated observation", pn.Column(observation, self.spectrum.plot, taken)),
-            ("S/N", pn.Column(snr, self._downloads("snr", endings))),
-            ("Noise budget", pn.Column(budget, self._downloads("noise-budget", endings))),
-            (
-                "Flare detection",
-                pn.Column(
-                    self.table, distributions, roc, self._downloads("detection", endings),
-                    self._downloads("roc", endings),
-                ),
-            ),
-            (
-                "Limiting magnitude and map",
-                pn.Column(
-                    pn.FlexBox(self.run_limit, self.run_map), self.limit, self.map,
-                    self._downloads("limit", endings), self._downloads("map", endings),
-                ),
-            ),
-            dynamic=False,
-            sizing_mode="stretch_width",
-        )  # fmt: skip
-
-    def layout(self) -> Any:
-        """The whole page."""
-        study = pn.widgets.FileDownload(
-            callback=partial(self._safely, lambda: study_file(self.question, self.study())),
-            label="Study for the command line",
-            embed=False,
-            auto=True,
-            width=260,
-        )
-
-        def named(star: str) -> str:
-            return "study.zip" if star == UPLOADED else "study.toml"
-
-        study.filename = self.question.param.star.rx.pipe(named)
-        head = pn.Column(
-            self.alerts,
-            self.summary,
-            pn.FlexBox(self.run, self.cancel, study, sizing_mode="stretch_width"),
-            self.bar,
-            self.status,
-            sizing_mode="stretch_width",
-        )
-        # Side by side where there is room, below each other on a phone.
-        asked = pn.Column(self.controls, styles={"flex": "1 1 280px"}, max_width=420)
-        answered = pn.Column(self.tabs, styles={"flex": "4 1 340px"}, min_width=300)
-        template = pn.template.FastListTemplate(
-            title="mauvecl",
-            main=[
-                pn.Column(pn.pane.Markdown(ABOUT), head, sizing_mode="stretch_width"),
-                pn.FlexBox(asked, answered, sizing_mode="stretch_width", gap="20px"),
-                pn.pane.Markdown(f"*{NOMINAL}*"),
-            ],
-            accent_base_color="#0072B2",
-            header_background="#0072B2",
-            theme_toggle=False,
-            main_layout=None,
-            design=Fast,
-        )
-        template.font, template.font_url = "system-ui", ""
-        return template
 
 
 def _percent(value: float) -> str:

@@ -31,6 +31,7 @@ def serve(address: str, port: int, *, show: bool = False) -> Any:
     """
     import panel as pn
 
+    from mauvecl.web.frame import layout
     from mauvecl.web.page import Page
 
     pn.extension(notifications=True)
@@ -38,7 +39,7 @@ def serve(address: str, port: int, *, show: bool = False) -> Any:
     origin = [f"{address}:{port}", f"localhost:{port}"] if address != "0.0.0.0" else ["*"]
     print(f"mauvecl serves at http://{address}:{port}/; Ctrl-C ends it.", flush=True)
     return pn.serve(
-        {"/": lambda: Page().layout()},
+        {"/": lambda: layout(Page())},
         address=address,
         port=port,
         show=show,
