@@ -136,6 +136,16 @@ MUTATIONS = {
         (("mauvecl/layout.py", "REFERENCE = 64", "REFERENCE = 0"),),
         "tests/test_detection.py::test_the_null_is_its_closed_form",
     ),
+    "shifts forgotten in the closed form's phase": Mutation(
+        (
+            (
+                "mauvecl/statistics.py",
+                "phase = 0.5 * np.arctan(turn).sum(axis=1) + (u[:, None] * pull / spread).sum(axis=1)",
+                "phase = 0.5 * np.arctan(turn).sum(axis=1) + 0.0 * u",
+            ),
+        ),
+        "tests/test_statistics.py::test_equal_weights_are_a_scaled_non_central_chi_squared",
+    ),
     "one smoothed value in four dropped": Mutation(
         (
             ("kernels/comparison.cl.mako", "[k][s + 3u] = d;", "[k][s + 3u] = 0.0f;"),
