@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from mauvecl.host.source import Source
     from mauvecl.statistics import Normal, QuadraticForm
 
-HEIGHT = 380
+HEIGHT = 430
 
 
 def _figure(title: str, x: str, y: str, **how: Any) -> Any:
@@ -38,6 +38,14 @@ def _figure(title: str, x: str, y: str, **how: Any) -> Any:
     )
     plot.toolbar.logo = None
     return plot
+
+
+def _legend_below(plot: Any) -> None:
+    """The legend where it hides no line, narrow enough for a phone; a click on a name hides its own."""
+    (legend,) = plot.legend
+    plot.center.remove(legend)
+    plot.add_layout(legend, "below")
+    legend.update(orientation="horizontal", ncols=2, click_policy="hide", border_line_color=None)
 
 
 class Lines:
@@ -58,8 +66,7 @@ class Lines:
         for number, (name, source) in enumerate(self._sources.items()):
             colour = COLOURS[number % len(COLOURS)]
             self.plot.line("x", "y", source=source, color=colour, line_width=1.5, legend_label=name)
-        self.plot.legend.click_policy = "hide"
-        self.plot.legend.background_fill_alpha = 0.7
+        _legend_below(self.plot)
         self.plot.add_tools(HoverTool(tooltips=[(x, "@x{0.0}"), (y, "@y{0.000}")]))
 
     def show(self, **lines: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
@@ -206,7 +213,7 @@ class Distributions:
             self.plot.line(
                 "x", "y", source=source, color=colours[name], line_dash=dash, line_width=2, legend_label=label
             )
-        self.plot.legend.click_policy = "hide"
+        _legend_below(self.plot)
 
     def show(self, null: Smooth, flare: Smooth, cut: float, statistic: str, fap: float) -> None:
         """The closed forms and threshold; an earlier simulation goes."""
@@ -219,6 +226,9 @@ class Distributions:
             middle = (edges[1:] + edges[:-1]) / 2
             self._lines[name].data = {"x": middle, "y": density / density.max()}
         self._lines["threshold"].data = {"x": [cut, cut], "y": [0.0, 1.0]}
+        self._name(statistic, cut, fap)
+
+    def _name(self, statistic: str, cut: float, fap: float) -> None:
         self.plot.xaxis.axis_label = f"{statistic} (threshold {cut:.4g} at a false-alarm probability of {fap:g})"
 
     def add(self, star: StarDetection, statistic: str, fap: float) -> None:
@@ -229,6 +239,7 @@ class Distributions:
             self._bars[name].data = {"left": edges[:-1], "right": edges[1:], "top": height}
         cut = star.found.threshold(fap, statistic).value
         self._lines["threshold"].data = {"x": [cut, cut], "y": [0.0, 1.0]}
+        self._name(statistic, cut, fap)
 
 
 class Roc:
