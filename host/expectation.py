@@ -280,6 +280,16 @@ def expect(
     ------
     InputError
         If the exposure is not a time above 0 and up to one day, or the source does not cover the output range.
+
+    Examples
+    --------
+    >>> from mauvecl import Instrument, Sky, Source, expect
+    >>> star = Source.from_library("G2V").at_magnitude(7.4)
+    >>> quiet = expect(star, Instrument.load("mauve"), exposure=48, sky=Sky.of_brightness(22.1))
+    >>> quiet.n_frames, quiet.exposure_s
+    (10, 50.0)
+    >>> float(round(quiet.snr().max(), 2)), float(round(quiet.snr_per_element().max(), 1))
+    (8.07, 47.6)
     """
     sky = Sky.none() if sky is None else sky
     asked_s = _seconds(exposure)

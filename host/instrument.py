@@ -90,6 +90,15 @@ class Instrument(BaseModel):
     read_noise_dn, bias_dn, frame_s : float
     pixel_map : PixelMap, optional
         What differs from pixel to pixel.
+
+    Examples
+    --------
+    >>> from mauvecl import Instrument
+    >>> mauve = Instrument.load("mauve")
+    >>> round(mauve.dark_dn_per_s, 2), round(mauve.with_(temperature_c=13.0).dark_dn_per_s, 2)
+    (445.53, 257.77)
+    >>> mauve.sources["light_loss"]
+    'P: table of the payload performance'
     """
 
     model_config = ConfigDict(

@@ -35,6 +35,12 @@ class Sky:
         V mag arcsec^-2 (Vega); None is no sky at all.
     description : str
         One line for reports.
+
+    Examples
+    --------
+    >>> from mauvecl import Sky
+    >>> round(Sky.at("290.68 +11.12", "2026-09-01T12:00").surface_brightness, 2)
+    22.96
     """
 
     surface_brightness: float | None

@@ -45,6 +45,15 @@ class Source:
     ------
     InputError
         If the arrays do not hold such a spectrum.
+
+    Examples
+    --------
+    >>> from mauvecl import Source
+    >>> star = Source.from_library("G2V").at_magnitude(7.4)
+    >>> round(star.magnitude("V"), 6)
+    7.4
+    >>> star.flaring(0.24).history
+    ('scaled to V = 7.4', 'flare of 24 % in Kepler at 10000 K, added')
     """
 
     wavelength_nm: NDArray[np.float64]

@@ -68,6 +68,13 @@ def campaign(fap: float, frames: int, stack: int = 1, *, step: int | None = None
     ------
     InputError
         For numbers that cannot be.
+
+    Examples
+    --------
+    >>> from mauvecl.campaign import campaign
+    >>> day = campaign(1e-5, 17_280)
+    >>> day.tests, round(day.at_most, 4), round(day.independent, 4)
+    (17280, 0.1728, 0.1587)
     """
     step = stack if step is None else step
     tests = count_tests(frames, stack, step)

@@ -56,6 +56,21 @@ class Engine:
     ------
     DeviceError
         If there is no such device, or PoCL cannot work here.
+
+    Examples
+    --------
+    >>> from mauvecl import Engine, Instrument, Source, expect
+    >>> star, mauve = Source.from_library("G2V").at_magnitude(7.4), Instrument.load("mauve")
+    >>> quiet, flare = (expect(s, mauve, exposure=50.0) for s in (star, star.flaring(0.02)))
+    >>> engine = Engine()
+    >>> raw = engine.realise(quiet, count=3, seed=1)
+    >>> bool((engine.realise(quiet, start=2, count=1, seed=1) == raw[2:]).all())
+    True
+    >>> found = engine.detect(quiet, [flare], realisations=100_000, seed=1)
+    >>> found.statistics
+    ('chi2', 'chi2_element', 'matched')
+    >>> found.detection_probability(fap=1e-3, statistic="matched")[0].value
+    1.0
     """
 
     def __init__(

@@ -33,7 +33,17 @@ PAPER_STARS = (Star(library="K3V", magnitude=3.7), Star(library="G2V", magnitude
 
 
 class Study(Part):
-    """Everything that an answer depends on; the default is the paper's question."""
+    """Everything that an answer depends on; the default is the paper's question.
+
+    Examples
+    --------
+    >>> from mauvecl import Study
+    >>> study = Study().with_settings(["run.fap=0.01", "star.0.magnitude=6"])
+    >>> study.run.fap, study.star[0].library, study.star[0].magnitude
+    (0.01, 'K3V', 6.0)
+    >>> study == Study.build(tomllib.loads(study.toml()), "text")
+    True
+    """
 
     star: Annotated[tuple[Star, ...], Field(min_length=1)] = PAPER_STARS
     flare: Flare = Flare()
