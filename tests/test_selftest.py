@@ -63,7 +63,7 @@ def test_all_is_well_here(engine: Engine) -> None:
 
 @pytest.mark.parametrize("weakness", [unfused, rough_roots])
 def test_the_weaker_promise_is_kept_and_marked(monkeypatch: pytest.MonkeyPatch, weakness: Callable[[str], str]) -> None:
-    only(monkeypatch, "stack", "apart, tables", "priors", "priors, frames")
+    only(monkeypatch, "stack", "priors, frames")
     rendered_otherwise(monkeypatch, weakness)
     weak = Engine()
     strict = list(selftest.twins(weak))
