@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from answers import N, same, same_snr, small
 from typer.testing import CliRunner
 
 from mauvecl import bulk, shards
@@ -24,19 +25,8 @@ from mauvecl.engine import DeviceError, Engine
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.pool import Pool
-from tests.scenes import instrument, star
-from tests.test_pool import N, same, same_snr, small
 
-
-@pytest.fixture(autouse=True)
-def small_shares(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shares of 4096 realisations."""
-    monkeypatch.setattr(shards, "SHARE", 1)
-
-
-@pytest.fixture(scope="module")
-def scene() -> list[Expectation]:
-    return star(amplitudes=(0.05, 0.24), payload=instrument(part=True))
+pytestmark = pytest.mark.usefixtures("small_shares")
 
 
 @pytest.fixture(scope="module")

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import QTable, Table
+from scenes import star
 from typer.testing import CliRunner
 
 from mauvecl import Source
@@ -18,7 +19,6 @@ from mauvecl.cli.app import app
 from mauvecl.host.errors import InputError
 from mauvecl.host.flare import blackbody
 from mauvecl.host.flare_table import flares_of, read_flares
-from tests.scenes import star
 
 
 def test_a_synphot_spectrum_in_and_out() -> None:

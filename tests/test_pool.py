@@ -13,6 +13,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from answers import N, same, same_snr, small
+from scenes import instrument, star
 
 from mauvecl import shards
 from mauvecl.checkpoint import Checkpoint
@@ -27,41 +29,11 @@ from mauvecl.maps import detection_map
 from mauvecl.pool import LocalWorkers, Pool, Stopped, together
 from mauvecl.processes import Processes, Uniform
 from mauvecl.shards import Arrays, DetectRequest, Share, SnrRequest, fingerprint
-from mauvecl.snr import SnrResult
 from mauvecl.snr_study import snr
 from mauvecl.statistics import Linear
 from mauvecl.study import Study
-from tests.scenes import instrument, star
 
-N = 30_000
-
-
-@pytest.fixture(autouse=True)
-def small_shares(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shares of 4096 realisations."""
-    monkeypatch.setattr(shards, "SHARE", 1)
-
-
-@pytest.fixture(scope="module")
-def scene() -> list[Expectation]:
-    return star(amplitudes=(0.05, 0.24), payload=instrument(part=True))
-
-
-def same(ours: Detection, theirs: Detection) -> None:
-    """Every count, sum and extreme, to the bit."""
-    assert ours._found.keys() == theirs._found.keys()
-    for key, found in ours._found.items():
-        other = theirs._found[key]
-        np.testing.assert_array_equal(found.counts, other.counts)
-        assert (found.first, found.second, found.n) == (other.first, other.second, other.n)
-    for key, kept in ours._samples.items():
-        np.testing.assert_array_equal(kept.values, theirs._samples[key].values)
-        np.testing.assert_array_equal(kept.realisations, theirs._samples[key].realisations)
-
-
-def same_snr(ours: SnrResult, theirs: SnrResult) -> None:
-    for name in ("pixel", "element", "clipped", "n"):
-        np.testing.assert_array_equal(getattr(ours.counts, name), getattr(theirs.counts, name))
+pytestmark = pytest.mark.usefixtures("small_shares")
 
 
 class Shuffled(LocalWorkers):
@@ -183,17 +155,6 @@ def test_a_device_that_always_fails_is_one_sentence(engine: Engine, scene: list[
     pool = Pool(LocalWorkers([None], make=lambda device, progress: Failing(engine, set(range(99)), [])))  # type: ignore[return-value, arg-type]
     with pytest.raises(DeviceError, match=r"failed 3 times at realisations 0 to 4095 .*OUT_OF_RESOURCES.*expected"):
         pool.detect(quiet, flares, realisations=N, seed=5)
-
-
-def small(**sections: Any) -> Study:
-    changes = {"output_min_nm": 300.0, "output_max_nm": 360.0}
-    data: dict[str, Any] = {
-        "star": [{"library": "G2V", "magnitude": 7.4}, {"library": "K3V", "magnitude": 6.0}],
-        "flare": {"amplitudes": [0.05, 0.24]},
-        "observation": {"changes": changes},
-        "run": {"realisations": 10_000, "seed": 3, "fap": 0.01, "statistics": ["chi2", "matched"]},
-    }
-    return Study.build(data | sections, "test")
 
 
 AXES = {"x": {"quantity": "magnitude", "values": [6, 8, 10]}, "y": {"quantity": "amplitude", "values": [0.05, 0.2]}}
@@ -382,7 +343,7 @@ def test_clocks_may_jump(tmp_path: Path, engine: Engine, monkeypatch: pytest.Mon
 def test_a_full_disk_stops_with_a_sentence_and_loses_nothing(
     tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from tests.test_bulk import full_after
+    from test_bulk import full_after
 
     with monkeypatch.context() as patch:
         full_after(400_000, patch)

@@ -1,0 +1,42 @@
+"""Answers that must be equal to the bit, and a small study that has some, for pools and clusters."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from mauvecl.detection import Detection
+from mauvecl.snr import SnrResult
+from mauvecl.study import Study
+
+#: Realisations: several shares, the last a short one.
+N = 30_000
+
+
+def same(ours: Detection, theirs: Detection) -> None:
+    """Every count, sum and extreme, to the bit."""
+    assert ours._found.keys() == theirs._found.keys()
+    for key, found in ours._found.items():
+        other = theirs._found[key]
+        np.testing.assert_array_equal(found.counts, other.counts)
+        assert (found.first, found.second, found.n) == (other.first, other.second, other.n)
+    for key, kept in ours._samples.items():
+        np.testing.assert_array_equal(kept.values, theirs._samples[key].values)
+        np.testing.assert_array_equal(kept.realisations, theirs._samples[key].realisations)
+
+
+def same_snr(ours: SnrResult, theirs: SnrResult) -> None:
+    for name in ("pixel", "element", "clipped", "n"):
+        np.testing.assert_array_equal(getattr(ours.counts, name), getattr(theirs.counts, name))
+
+
+def small(**sections: Any) -> Study:
+    changes = {"output_min_nm": 300.0, "output_max_nm": 360.0}
+    data: dict[str, Any] = {
+        "star": [{"library": "G2V", "magnitude": 7.4}, {"library": "K3V", "magnitude": 6.0}],
+        "flare": {"amplitudes": [0.05, 0.24]},
+        "observation": {"changes": changes},
+        "run": {"realisations": 10_000, "seed": 3, "fap": 0.01, "statistics": ["chi2", "matched"]},
+    }
+    return Study.build(data | sections, "test")
