@@ -43,9 +43,9 @@ class StarDetection:
         return titled(self.label, self.at)
 
     @property
-    def flare_names(self) -> list[str]:
-        """The flares, for pictures."""
-        return [f"flare {100 * amplitude:g} %" for amplitude in self.amplitudes]
+    def shown(self) -> tuple[str, Detection, list[str]]:
+        """Title, findings and names of the flares, as pictures take them."""
+        return self.title, self.found, [f"flare {100 * amplitude:g} %" for amplitude in self.amplitudes]
 
 
 @dataclass(eq=False)
@@ -98,8 +98,7 @@ class DetectAnswer:
         """Null and flare distributions of every star and statistic; needs matplotlib."""
         from mauvecl.pictures.answers import detection
 
-        shown = [(star.title, star.found, star.flare_names) for star in self.stars]
-        return detection(shown, self.study.run.fap, None if path is None else Path(path))
+        return detection([star.shown for star in self.stars], self.study.run.fap, path)
 
     def _detections(self, star: StarDetection) -> QTable:
         table = star.found.table(self.study.run.fap)

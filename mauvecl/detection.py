@@ -318,7 +318,7 @@ class Detection:
         from mauvecl.pictures.answers import detection
 
         flares = [f"flare {k + 1}" for k in range(len(self.flares))]
-        return detection([(self.quiet.name, self, flares)], fap, None if path is None else Path(path))
+        return detection([(self.quiet.name, self, flares)], fap, path)
 
     def table(self, fap: float = 1e-3) -> QTable:
         """One row per flare and statistic: expected and simulated values, threshold and probability.

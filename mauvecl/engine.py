@@ -15,6 +15,7 @@ from mauvecl.channels import ChannelPlan, plan_channels
 from mauvecl.comparison import TEMPLATE, Comparison
 from mauvecl.detection import Detection, Tails
 from mauvecl.host.errors import InputError
+from mauvecl.layout import USUAL_STATISTICS
 from mauvecl.processes import NONE, Processes
 from mauvecl.program import DeviceError, DeviceRecord, Variant, devices
 from mauvecl.run import Run, Tile
@@ -262,7 +263,7 @@ class Engine:
         *,
         realisations: int,
         seed: int,
-        statistics: Sequence[str | Linear] = ("chi2", "chi2_element", "matched"),
+        statistics: Sequence[str | Linear] = USUAL_STATISTICS,
         mode: Mode = "auto",
         start: int = 0,
         processes: Processes = NONE,
@@ -345,7 +346,7 @@ class Engine:
         start: int = 0,
         count: int,
         seed: int,
-        statistics: Sequence[str | Linear] = ("chi2", "chi2_element", "matched"),
+        statistics: Sequence[str | Linear] = USUAL_STATISTICS,
         mode: Mode = "auto",
         processes: Processes = NONE,
         recipe: Recipe = "auto",

@@ -85,7 +85,7 @@ class ExposureResult:
         """S/N against exposure, and the answers on it; needs matplotlib."""
         from mauvecl.pictures.plans import exposures
 
-        return exposures(self, None if path is None else Path(path))
+        return exposures(self, path)
 
 
 def snr_at(x: Expectation, wavelength_nm: float, per: Per = "element") -> float:

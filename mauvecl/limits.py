@@ -164,7 +164,7 @@ class LimitResult:
         """Detection probability against the quantity: every simulated point and the limits; needs matplotlib."""
         from mauvecl.pictures.plans import limits
 
-        return limits(self, None if path is None else Path(path))
+        return limits(self, path)
 
 
 def solve(

@@ -103,7 +103,7 @@ class MapResult:
         """One panel per statistic, with contours at the study's powers; needs matplotlib."""
         from mauvecl.pictures.plans import detection_map as draw
 
-        return draw(self, None if path is None else Path(path))
+        return draw(self, path)
 
 
 def detection_map(

@@ -73,7 +73,7 @@ class Roc:
         """Detection probability against false-alarm probability; needs matplotlib."""
         from mauvecl.pictures.answers import roc
 
-        return roc([(name, self)], None if path is None else Path(path))
+        return roc([(name, self)], path)
 
     def table(self, rows: int = 200) -> QTable:
         """Some rows of the curve, both probabilities with their Clopper-Pearson intervals; the area in the meta data.

@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+from mauvecl.layout import USUAL_STATISTICS
+
 if TYPE_CHECKING:
     from mauvecl.comparison import Comparison
     from mauvecl.host.sky import Sky
@@ -168,7 +170,7 @@ class Run(Part):
 
     realisations: Annotated[int, Field(ge=1)] = 1_000_000
     seed: Annotated[int, Field(ge=0, lt=2**64)] = 1
-    statistics: Annotated[tuple[str, ...], Field(min_length=1)] = ("chi2", "chi2_element", "matched")
+    statistics: Annotated[tuple[str, ...], Field(min_length=1)] = USUAL_STATISTICS
     fap: Annotated[float, Field(gt=0, lt=1)] = 1e-3
     tails: Literal["counted", "sampled"] = "counted"
     reference: str = "template"

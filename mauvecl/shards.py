@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from mauvecl.channels import ChannelPlan, plan_channels
 from mauvecl.comparison import TEMPLATE, Comparison
 from mauvecl.detection import Detection, Tails
+from mauvecl.layout import USUAL_STATISTICS
 from mauvecl.processes import NONE, Processes
 from mauvecl.scene import BATCH, Mode, Recipe, Scene, prepare
 from mauvecl.snr import Counts, SnrResult, elements, observers
@@ -99,7 +100,7 @@ class DetectRequest:
     flares: tuple[Expectation, ...]
     realisations: int
     seed: int
-    statistics: Sequence[str | Linear] = ("chi2", "chi2_element", "matched")
+    statistics: Sequence[str | Linear] = USUAL_STATISTICS
     mode: Mode = "auto"
     start: int = 0
     processes: Processes = NONE

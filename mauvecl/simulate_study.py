@@ -29,7 +29,7 @@ class SimulateAnswer:
         from mauvecl.pictures.answers import observation
 
         title, _, table = self.observations[number]
-        return observation(title, table, None if path is None else Path(path))
+        return observation(title, table, path)
 
 
 def simulate(study: Study, *, realisation: int = 0, flaring: bool = False) -> SimulateAnswer:

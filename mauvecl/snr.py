@@ -155,7 +155,7 @@ class SnrResult:
         """S/N per pixel and element, closed form and realisations; needs matplotlib."""
         from mauvecl.pictures.answers import signal_to_noise
 
-        return signal_to_noise([(self.expectation.name, self)], None if path is None else Path(path))
+        return signal_to_noise([(self.expectation.name, self)], path)
 
     def _table(
         self,

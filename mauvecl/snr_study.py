@@ -81,7 +81,7 @@ class SnrAnswer:
         """S/N per pixel and element, closed form and realisations; needs matplotlib."""
         from mauvecl.pictures.answers import signal_to_noise
 
-        return signal_to_noise([(s.title, s.result) for s in self.stars], None if path is None else Path(path))
+        return signal_to_noise([(s.title, s.result) for s in self.stars], path)
 
     def together(self, table_of: Callable[[SnrResult], QTable]) -> QTable:
         """A table of each star and cell as one, with the star and what is swept in front."""

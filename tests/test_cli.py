@@ -2,24 +2,19 @@
 
 from __future__ import annotations
 
-import contextlib
-import io
 import json
-import os
 import signal
 import subprocess
 import sys
 import time
-from dataclasses import dataclass
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import QTable
+from commands import run, started
 
-from mauvecl.cli.app import main
 from mauvecl.detect_study import detect
 from mauvecl.engine import Engine
 from mauvecl.processes import CosmicRays, Normal, Processes, Uniform
@@ -27,42 +22,6 @@ from mauvecl.sections import Star
 from mauvecl.simulate_study import simulate
 from mauvecl.statistics import STATISTICS
 from mauvecl.study import Study
-
-COMMAND = [sys.executable, "-m", "mauvecl"]
-
-
-@dataclass(frozen=True)
-class Done:
-    stdout: str
-    stderr: str
-
-
-def run(*words: str | Path, folder: Path, code: int = 0) -> Done:
-    """In this process, which spares most tests a start of Python; `started` makes one of its own."""
-    out, told = io.StringIO(), io.StringIO()
-    ended = 0
-    with (
-        contextlib.chdir(folder),
-        contextlib.redirect_stdout(out),
-        contextlib.redirect_stderr(told),
-        mock.patch.object(sys, "argv", ["mauvecl", *map(str, words)]),
-        mock.patch.dict(os.environ, {"COLUMNS": "200"}),
-    ):
-        try:
-            main()
-        except SystemExit as end:
-            ended = end.code or 0
-    assert ended == code, out.getvalue() + told.getvalue()
-    return Done(out.getvalue(), told.getvalue())
-
-
-def started(*words: str | Path, folder: Path, code: int = 0) -> Done:
-    done = subprocess.run(
-        [*COMMAND, *map(str, words)], cwd=folder, capture_output=True, text=True, env=os.environ | {"COLUMNS": "200"}
-    )
-    assert done.returncode == code, done.stdout + done.stderr
-    assert "Traceback" not in done.stderr
-    return Done(done.stdout, done.stderr)
 
 
 @pytest.fixture(scope="module")

@@ -18,16 +18,8 @@ from mauvecl.host.instrument import Instrument
 from mauvecl.study import Study
 
 ROOT = Path(__file__).parent.parent
-#: Pages whose Python runs as it stands; others need files or a cluster, and say so.
-PAGES = (
-    "README.md",
-    "docs/tutorial.md",
-    "docs/my-star.md",
-    "docs/my-instrument.md",
-    "docs/my-statistic.md",
-    "docs/limits.md",
-    "docs/detection.md",
-)
+#: Pages whose Python needs a store or a cluster; that of all others runs as it stands.
+APART = ("bulk.md", "cluster.md")
 #: `mauvecl/roc.py`, or with a name in it: `mauvecl/roc.py: Roc`.
 NAMED = re.compile(r"`((?:host|kernels|mauvecl|tests|bench|tools|docs)/[\w./*-]+\.\w+)(?::\s*(\w+))?[^`]*`")
 #: What defines a name, by a file's ending.
@@ -37,26 +29,31 @@ DEFINITIONS = {
 }
 
 
-def blocks(page: str) -> list[str]:
-    return re.findall(r"```python\n(.*?)```", (ROOT / page).read_text(encoding="utf-8"), flags=re.DOTALL)
-
-
 def all_pages() -> list[Path]:
     return [*sorted((ROOT / "docs").glob("*.md")), ROOT / "README.md", ROOT / "CONTRIBUTING.md"]
 
 
-@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page)])
-def test_python_runs(page: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def blocks(page: Path, language: str) -> list[str]:
+    text = page.read_text(encoding="utf-8")
+    return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
+
+
+TUTORIAL = ROOT / "docs" / "tutorial.md"
+PAGES = [page for page in all_pages() if blocks(page, "python") and page.name not in APART]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_python_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a folder with a study, and after the tutorial, as a reader comes to the other pages."""
     monkeypatch.chdir(tmp_path)
     study = {"star": [{"library": "G2V", "magnitude": 9.0}], "run": {"realisations": 100_000, "statistics": ["chi2"]}}
     Path("study.toml").write_text(Study.build(study, "test").toml())
     names: dict[str, object] = {}
-    if page not in ("README.md", "docs/tutorial.md"):
-        exec(blocks("docs/tutorial.md")[0].replace("1_000_000", "100_000"), names)
+    if page not in (ROOT / "README.md", TUTORIAL):
+        exec(blocks(TUTORIAL, "python")[0].replace("1_000_000", "100_000"), names)
         names |= {"flares": [names["flare"]], "weights": np.ones(names["quiet"].wavelength_nm.size)}  # type: ignore[attr-defined]
-    for text in blocks(page):
-        exec(compile(text.replace("1_000_000", "100_000"), page, "exec"), names)
+    for text in blocks(page, "python"):
+        exec(compile(text.replace("1_000_000", "100_000"), page.name, "exec"), names)
 
 
 def test_no_page_is_left_out_of_the_contents() -> None:
@@ -87,7 +84,7 @@ def test_what_the_documentation_names_is_there() -> None:
 def test_studies_and_instruments_shown_are_valid() -> None:
     seen = 0
     for page in all_pages():
-        for text in re.findall(r"```toml\n(.*?)```", page.read_text(encoding="utf-8"), flags=re.DOTALL):
+        for text in blocks(page, "toml"):
             data = tomllib.loads(text)
             if "extends" in data:
                 values = {key: v["value"] if isinstance(v, dict) else v for key, v in data.items() if key != "extends"}

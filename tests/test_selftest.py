@@ -33,11 +33,6 @@ def rendered_otherwise(monkeypatch: pytest.MonkeyPatch, change: Callable[[str], 
     monkeypatch.setattr(program, "render", changed)
 
 
-def only(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
-    """The self-test's cases that matter to a fault; all of them take a minute."""
-    monkeypatch.setattr(selftest, "CASES", {name: selftest.CASES[name] for name in names})
-
-
 def unfused(source: str) -> str:
     """A device without fused multiply-add."""
     return source.replace("#define FMA(a, b, c) fused((a), (b), (c))", "#define FMA(a, b, c) ((a) * (b) + (c))")
@@ -63,7 +58,6 @@ def test_all_is_well_here(engine: Engine) -> None:
 
 @pytest.mark.parametrize("weakness", [unfused, rough_roots])
 def test_the_weaker_promise_is_kept_and_marked(monkeypatch: pytest.MonkeyPatch, weakness: Callable[[str], str]) -> None:
-    only(monkeypatch, "stack", "priors, frames")
     rendered_otherwise(monkeypatch, weakness)
     weak = Engine()
     strict = list(selftest.twins(weak))
@@ -77,7 +71,6 @@ def test_the_weaker_promise_is_kept_and_marked(monkeypatch: pytest.MonkeyPatch, 
 
 def test_a_wrong_kernel_keeps_no_promise(monkeypatch: pytest.MonkeyPatch) -> None:
     """Another key schedule is other draws, not rounding."""
-    only(monkeypatch, "stack", "one frame")
     rendered_otherwise(monkeypatch, another_key_schedule)
     wrong = Engine()
     assert not selftest.known_answers(wrong).passed

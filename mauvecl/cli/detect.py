@@ -53,9 +53,9 @@ def detect(
         from mauvecl.pictures.answers import detection, spectra
 
         # More would be too small to read; the tables hold all of them.
-        shown = [(star.title, star.found, star.flare_names) for star in found.stars[:MOST_DRAWN]]
+        shown = [star.shown for star in found.stars[:MOST_DRAWN]]
         session.files.append(detection(shown, study.run.fap, session.folder / "detection.png"))
-        session.files.append(spectra(found.stars[:MOST_DRAWN], session.folder / "spectra.png"))
+        session.files.append(spectra(shown, session.folder / "spectra.png"))
     inputs = [x for s in found.stars for x in (s.found.quiet, *s.found.flares)]
     session.record(study, inputs, [*found.messages, *found.paper])
     if session.as_json:

@@ -13,15 +13,17 @@ from mauvecl.pictures.style import COLOURS, MOST_COLUMNS, NAMES, NULL, STYLE, fi
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-    from mauvecl.detect_study import StarDetection
     from mauvecl.detection import Detection
     from mauvecl.host.expectation import Expectation
     from mauvecl.roc import Roc
     from mauvecl.snr import SnrResult
 
+#: A star: title, findings, and its flares' names.
+Shown = tuple[str, "Detection", Sequence[str]]
 
-def detection(stars: Sequence[tuple[str, Detection, Sequence[str]]], fap: float, path: Path | None = None) -> Any:
-    """Null and flare distributions: a row per star (title, findings, its flares' names), a column per statistic."""
+
+def detection(stars: Sequence[Shown], fap: float, path: str | Path | None = None) -> Any:
+    """Null and flare distributions: a row per star, a column per statistic."""
     plt = pyplot()
     first = stars[0][1]
     statistics = first.statistics
@@ -91,7 +93,7 @@ def _distributions(axis: Any, found: Detection, flares: Sequence[str], statistic
     axis.set_xlabel(NAMES.get(statistic, statistic))
 
 
-def roc(curves: Sequence[tuple[str, Roc]], path: Path | None = None) -> Any:
+def roc(curves: Sequence[tuple[str, Roc]], path: str | Path | None = None) -> Any:
     """Receiver operating characteristics with their areas."""
     plt = pyplot()
     with plt.rc_context(STYLE):
@@ -110,13 +112,13 @@ def roc(curves: Sequence[tuple[str, Roc]], path: Path | None = None) -> Any:
         return finished(figure, path)
 
 
-def spectra(stars: Sequence[StarDetection], path: Path | None = None) -> Any:
+def spectra(stars: Sequence[Shown], path: str | Path | None = None) -> Any:
     """Quiescent and flare spectra per second, with one standard deviation of a pixel's noise."""
     plt = pyplot()
-    groups = [(star.title, star.flare_names, star.found.quiet, star.found.flares) for star in stars]
     with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(len(groups), 1, figsize=(7.2, 2.9 * len(groups) + 0.3), squeeze=False, sharex=True)
-        for axis, (title, names, quiet, flares) in zip(axes[:, 0], groups, strict=True):
+        figure, axes = plt.subplots(len(stars), 1, figsize=(7.2, 2.9 * len(stars) + 0.3), squeeze=False, sharex=True)
+        for axis, (title, found, names) in zip(axes[:, 0], stars, strict=True):
+            quiet, flares = found.quiet, found.flares
             for k in reversed(range(len(flares))):
                 x = flares[k]
                 axis.plot(
@@ -142,7 +144,7 @@ def spectra(stars: Sequence[StarDetection], path: Path | None = None) -> Any:
         return finished(figure, path)
 
 
-def observation(title: str, table: QTable, path: Path | None = None) -> Any:
+def observation(title: str, table: QTable, path: str | Path | None = None) -> Any:
     """One raw spectrum and what it is made of, as the paper's figure of components."""
     plt = pyplot()
     panels = (
@@ -167,7 +169,7 @@ def observation(title: str, table: QTable, path: Path | None = None) -> Any:
         return finished(figure, path)
 
 
-def signal_to_noise(stars: Sequence[tuple[str, SnrResult | Expectation]], path: Path | None = None) -> Any:
+def signal_to_noise(stars: Sequence[tuple[str, SnrResult | Expectation]], path: str | Path | None = None) -> Any:
     """S/N per pixel and per resolution element: closed form, and the spread of realisations where there are some."""
     from mauvecl.snr import SnrResult
 

@@ -28,7 +28,7 @@ OPTICS = {
 }
 
 
-def magnitudes(source: Source, values: Sequence[float], band: str = "V", path: Path | None = None) -> Any:
+def magnitudes(source: Source, values: Sequence[float], band: str = "V", path: str | Path | None = None) -> Any:
     """A spectrum at several magnitudes: the paper's figure of the rescaled HD 37202."""
     plt = pyplot()
     with plt.rc_context(STYLE):
@@ -41,7 +41,7 @@ def magnitudes(source: Source, values: Sequence[float], band: str = "V", path: P
         return finished(figure, path)
 
 
-def zodiacal(source: Source, sky: Sky, instrument: Instrument, path: Path | None = None) -> Any:
+def zodiacal(source: Source, sky: Sky, instrument: Instrument, path: str | Path | None = None) -> Any:
     """A spectrum with zodiacal light, and the light alone: the paper's figure of the residual."""
     plt = pyplot()
     light = sky.spectrum(instrument.field_of_view_arcsec2)
@@ -58,7 +58,7 @@ def zodiacal(source: Source, sky: Sky, instrument: Instrument, path: Path | None
         return finished(figure, path)
 
 
-def convolved(source: Source, instrument: Instrument, path: Path | None = None) -> Any:
+def convolved(source: Source, instrument: Instrument, path: str | Path | None = None) -> Any:
     """A spectrum and the same through the line function: the paper's figure of the convolution.
 
     Light alone is shown: the line function acts on what the optics and the detector would see all of.
@@ -80,7 +80,7 @@ def convolved(source: Source, instrument: Instrument, path: Path | None = None) 
         return finished(figure, path)
 
 
-def efficiencies(instrument: Instrument, path: Path | None = None) -> Any:
+def efficiencies(instrument: Instrument, path: str | Path | None = None) -> Any:
     """Each optical element's efficiency: the paper's figure of the payload's components."""
     plt = pyplot()
     w = np.linspace(*RANGE_NM, 501)
@@ -94,7 +94,7 @@ def efficiencies(instrument: Instrument, path: Path | None = None) -> Any:
         return finished(figure, path)
 
 
-def throughput(instrument: Instrument, path: Path | None = None) -> Any:
+def throughput(instrument: Instrument, path: str | Path | None = None) -> Any:
     """Quantum efficiency, and the end-to-end throughput with it: the paper's figure of both."""
     plt = pyplot()
     w = np.linspace(*RANGE_NM, 501)
@@ -113,7 +113,7 @@ def throughput(instrument: Instrument, path: Path | None = None) -> Any:
         return finished(figure, path)
 
 
-def flares(source: Source, amplitudes: Sequence[float], path: Path | None = None) -> Any:
+def flares(source: Source, amplitudes: Sequence[float], path: str | Path | None = None) -> Any:
     """A star's spectrum at several stages of a flare: the paper's figures of the inputs."""
     plt = pyplot()
     with plt.rc_context(STYLE):

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from mauvecl.snr_study import SnrAnswer
 
 
-def detection_map(found: MapResult, path: Path | None) -> Any:
+def detection_map(found: MapResult, path: str | Path | None) -> Any:
     """Detection probability over two quantities, one panel per statistic; the figure where no path is given."""
     plt = pyplot()
     question = found.study.map
@@ -53,7 +53,7 @@ def detection_map(found: MapResult, path: Path | None) -> Any:
         return finished(figure, path)
 
 
-def limits(found: LimitResult, path: Path | None) -> Any:
+def limits(found: LimitResult, path: str | Path | None) -> Any:
     """Detection probability at every simulated value, and the limits; the figure where no path is given."""
     plt = pyplot()
     of, power = found.study.limit.of, found.study.limit.power
@@ -99,7 +99,7 @@ ORIGINS = {
 }
 
 
-def noise_budgets(found: SnrAnswer, path: Path | None = None) -> Any:
+def noise_budgets(found: SnrAnswer, path: str | Path | None = None) -> Any:
     """Noise of a pixel by origin against wavelength, one panel per star and cell, as the paper's figure has it."""
     each = len(found.study.cells())
     observed = [(star, star.result.expectation) for star in found.stars]
@@ -107,7 +107,7 @@ def noise_budgets(found: SnrAnswer, path: Path | None = None) -> Any:
     return noise_budget(named, each=each, path=path)
 
 
-def noise_budget(observed: Sequence[tuple[str, Expectation]], *, each: int = 1, path: Path | None = None) -> Any:
+def noise_budget(observed: Sequence[tuple[str, Expectation]], *, each: int = 1, path: str | Path | None = None) -> Any:
     """Noise of a pixel by origin against wavelength: titles and expectations, in so many columns."""
     plt = pyplot()
     stars = len(observed) // each
@@ -135,7 +135,7 @@ def noise_budget(observed: Sequence[tuple[str, Expectation]], *, each: int = 1, 
         return finished(figure, path)
 
 
-def snr_sweep(found: SnrAnswer, path: Path | None = None) -> Any:
+def snr_sweep(found: SnrAnswer, path: str | Path | None = None) -> Any:
     """S/N of some elements against what is swept first, a line for each value of the rest."""
     from mauvecl.exposures import place_of
 
@@ -171,7 +171,7 @@ def snr_sweep(found: SnrAnswer, path: Path | None = None) -> Any:
         return finished(figure, path)
 
 
-def gaussian(found: GaussianReport, path: Path | None) -> Any:
+def gaussian(found: GaussianReport, path: str | Path | None) -> Any:
     """How far each promise of the usual formula holds in every cell; the figure where no path is given."""
     plt = pyplot()
     cells = found.cells
@@ -201,7 +201,7 @@ def gaussian(found: GaussianReport, path: Path | None) -> Any:
         return finished(figure, path)
 
 
-def exposures(found: ExposureResult, path: Path | None) -> Any:
+def exposures(found: ExposureResult, path: str | Path | None) -> Any:
     """S/N against exposure for each star, which grows with the root of it; the figure where no path is given."""
     plt = pyplot()
     with plt.rc_context(STYLE):

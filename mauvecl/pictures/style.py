@@ -63,10 +63,10 @@ def pyplot() -> Any:
     return plt
 
 
-def finished(figure: Any, path: Path | None) -> Any:
+def finished(figure: Any, path: str | Path | None) -> Any:
     """Save a figure under a path, in the form of its ending (.png, .pdf, .svg), or hand it out; pyplot forgets it."""
     pyplot().close(figure)
     if path is None:
         return figure
     figure.savefig(path)
-    return path
+    return Path(path)

@@ -34,7 +34,7 @@ class Fast(fast.Fast):
     _resources: ClassVar[Any] = {**fast.Fast._resources, "font": {}}
 
 
-def download(label: str, file: Any, make: Callable[[], io.BytesIO], page: Page, width: int = 200) -> Any:
+def download(page: Page, label: str, file: Any, make: Callable[[], io.BytesIO], width: int = 200) -> Any:
     """A button that gives a file; `file` is its name, or something that follows the question."""
     button = pn.widgets.FileDownload(
         callback=partial(page.safely, make), label=label, embed=False, auto=True, width=width
@@ -46,11 +46,11 @@ def download(label: str, file: Any, make: Callable[[], io.BytesIO], page: Page, 
 def downloads(page: Page, name: str, *, study: bool = False) -> Any:
     """Buttons that give an answer's table and picture, and the study where it is not the question's own."""
     buttons = [
-        download(f"{name} ({ending})", f"mauvecl-{name}.{ending}", partial(page.file, name, ending), page)
+        download(page, f"{name} ({ending})", f"mauvecl-{name}.{ending}", partial(page.file, name, ending))
         for ending in ("ecsv", "fits", "png")
     ]
     if study:
-        buttons.append(download(f"{name} (study)", named(page, name), partial(page.study_of, name), page))
+        buttons.append(download(page, f"{name} (study)", named(page, name), partial(page.study_of, name)))
     return pn.FlexBox(*buttons)
 
 
@@ -87,7 +87,7 @@ def tabs(page: Page) -> Any:
 
 def layout(page: Page) -> Any:
     """The whole page."""
-    study = download("Study for the command line", named(page, "study"), page.study_of, page, width=260)
+    study = download(page, "Study for the command line", named(page, "study"), page.study_of, width=260)
     head = pn.Column(
         page.alerts,
         page.summary,

@@ -179,7 +179,9 @@ class Page:
             distributions.show(null, with_flare, self._cut, q.statistic, q.fap)
             roc.show(null, with_flare)
             if "detection" in self.found:
-                self._show_simulated(self.found["detection"])
+                (star,) = self.found["detection"].stars
+                distributions.add(star, q.statistic, q.fap)
+                roc.add(star, q.statistic)
 
     def _closed_summary(self) -> str:
         assert self.theory is not None
@@ -261,15 +263,11 @@ class Page:
             self.bar.value = min(int(100 * standing.done / standing.total), 100)
 
     def _show_refined(self, answers: tuple[DetectAnswer, SnrAnswer]) -> None:
-        self.found["detection"], self.found["snr"] = answers
-        self._show_detection(answers[0])
-        if 1 not in self._stale:
-            self.views[1].add(answers[1].element)
-
-    def _show_detection(self, answer: DetectAnswer) -> None:
+        answer, _ = self.found["detection"], self.found["snr"] = answers
+        # S/N and detection are shown anew, the simulation on top.
+        self._stale |= {1, 3}
+        self._show_tab()
         q = self.question
-        if 3 not in self._stale:
-            self._show_simulated(answer)
         frame = answer.table.to_pandas()
         columns = {
             "statistic": "statistic", "mean": "mean with flare", "threshold": "threshold",
@@ -282,12 +280,6 @@ class Page:
             f"{q.realisations:,} simulated flares are detected by {q.statistic} at a false-alarm probability of "
             f"{q.fap:g} per test; closed form {_percent(row['closed_form_probability'])}."
         )
-
-    def _show_simulated(self, answer: DetectAnswer) -> None:
-        q, (star,) = self.question, answer.stars
-        _, _, _, distributions, roc = self.views
-        distributions.add(star, q.statistic, q.fap)
-        roc.add(star, q.statistic)
 
     def _show_limit(self, found: LimitResult) -> None:
         rows = [

@@ -1,0 +1,53 @@
+"""The command line, in this process or in one of its own."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import os
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from unittest import mock
+
+from mauvecl.cli.app import main
+
+
+@dataclass(frozen=True)
+class Done:
+    stdout: str
+    stderr: str
+
+
+def run(*words: str | Path, folder: Path, code: int = 0) -> Done:
+    """In this process, which spares most tests a start of Python; `started` makes one of its own."""
+    out, told = io.StringIO(), io.StringIO()
+    ended = 0
+    with (
+        contextlib.chdir(folder),
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(told),
+        mock.patch.object(sys, "argv", ["mauvecl", *map(str, words)]),
+        mock.patch.dict(os.environ, {"COLUMNS": "200"}),
+    ):
+        try:
+            main()
+        except SystemExit as end:
+            ended = end.code or 0
+    assert ended == code, out.getvalue() + told.getvalue()
+    return Done(out.getvalue(), told.getvalue())
+
+
+def started(*words: str | Path, folder: Path, code: int = 0, **environment: str) -> Done:
+    """In a process of its own, as from a shell."""
+    done = subprocess.run(
+        [sys.executable, "-m", "mauvecl", *map(str, words)],
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        env=os.environ | {"COLUMNS": "200"} | environment,
+    )
+    assert done.returncode == code, done.stdout + done.stderr
+    assert "Traceback" not in done.stderr
+    return Done(done.stdout, done.stderr)

@@ -1,0 +1,81 @@
+"""Files from outside are read within limits."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import lzma
+import os
+from pathlib import Path
+
+import pytest
+
+from mauvecl.host.bounded import read_bytes, shortened, unpacked
+from mauvecl.host.errors import InputError
+
+PACKERS = pytest.mark.parametrize("pack", [gzip.compress, bz2.compress, lzma.compress])
+
+
+@PACKERS
+def test_what_is_packed_comes_back_also_from_several_streams(pack) -> None:
+    content = half_noise(3_000_000)
+    assert unpacked(pack(content), "f") == content
+    assert unpacked(pack(content) + pack(content), "f") == 2 * content
+
+
+@PACKERS
+def test_cut_files_end_in_a_sentence(pack) -> None:
+    packed = pack(half_noise(100_000))
+    for size in (8, len(packed) // 2, len(packed) - 1):
+        with pytest.raises(InputError, match="damaged"):
+            unpacked(packed[:size], "f")
+
+
+@PACKERS
+def test_a_bomb_is_noticed_while_it_is_small(pack, monkeypatch) -> None:
+    import tracemalloc
+
+    bomb = pack(bytes(200 << 20))
+    monkeypatch.setenv("MAUVECL_LARGEST_CONTENT_MIB", "16")
+    tracemalloc.start()
+    with pytest.raises(InputError, match="more than 16 MiB"):
+        unpacked(bomb, "f")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 40 << 20
+
+
+def test_only_regular_files_of_bounded_size(tmp_path: Path, monkeypatch) -> None:
+    fifo = tmp_path / "fifo"
+    os.mkfifo(fifo)
+    for path in ("/dev/zero", fifo, tmp_path, tmp_path / "none", "a\0b", "x" * 5000, tmp_path / ("y" * 300), "\ud800"):
+        with pytest.raises(InputError, match="spectrum file"):
+            read_bytes(Path(path), "spectrum file")
+    large = tmp_path / "large"
+    with large.open("wb") as file:
+        file.truncate((1 << 20) + 1)
+    monkeypatch.setenv("MAUVECL_LARGEST_FILE_MIB", "1")
+    with pytest.raises(InputError, match="more than 1 MiB"):
+        read_bytes(large, "study")
+    os.truncate(large, 1 << 20)
+    assert len(read_bytes(large, "study")) == 1 << 20
+
+
+@pytest.mark.parametrize("value", ["", "-1", "0", "1e3", "99999999", "٣"])
+def test_a_limit_that_is_none_is_refused(value: str, tmp_path: Path, monkeypatch) -> None:
+    (tmp_path / "f").write_bytes(b"x")
+    monkeypatch.setenv("MAUVECL_LARGEST_FILE_MIB", value)
+    with pytest.raises(InputError, match="MAUVECL_LARGEST_FILE_MIB"):
+        read_bytes(tmp_path / "f", "study")
+
+
+def test_shown_text_is_short_and_on_one_line() -> None:
+    assert len(shortened("\n" * 10_000)) < 200
+    assert "\n" not in shortened("a\nb")
+
+
+def half_noise(size: int) -> bytes:
+    """Bytes that pack badly in part."""
+    import random
+
+    return random.Random(7).randbytes(size // 2) + bytes(size - size // 2)
