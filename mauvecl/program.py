@@ -15,7 +15,7 @@ from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
-from mauvecl import __version__, layout
+from mauvecl import __version__, layout, processor
 from mauvecl.kernel_cache import kernel_cache
 
 if TYPE_CHECKING:
@@ -134,6 +134,9 @@ def _devices() -> list[Any]:
         raise DeviceError(
             "no OpenCL device found: install PoCL with `pip install 'pyopencl[pocl]'` or a driver for your device"
         )
+    for device in found:
+        if device.platform.name == POCL:
+            processor.give_name(device)
     # PoCL on the CPU first: it is the default.
     return sorted(found, key=lambda d: (d.platform.name != POCL, "cpu" not in _kind(d)))
 
@@ -277,7 +280,9 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
     if not weaknesses(device):
         options.append("-cl-fp32-correctly-rounded-divide-sqrt")
     kept = kernel_cache()
-    key = hashlib.sha256("\0".join((source, *options, device.name, device.driver_version)).encode()).hexdigest()[:32]
+    # A store shared by several machines holds what each processor can run; names such as "AMD EPYC" do not tell.
+    target = (device.name, device.version, device.driver_version, processor.level(processor.flags()))
+    key = hashlib.sha256("\0".join((source, *options, *target)).encode()).hexdigest()[:32]
     restored = kept.restore(key)
     try:
         with warnings.catch_warnings(), contextlib.nullcontext() if restored else kept.building(key):
@@ -285,6 +290,11 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
             warnings.simplefilter("ignore", cl.CompilerWarning)
             program: pyopencl.Program = cl.Program(context, source).build(options, cache_dir=False)
     except cl.Error as error:
+        if "unknown target CPU" in str(error):
+            raise DeviceError(
+                f"{device.platform.version.strip()} does not know the processor {device.name} and cannot build for it, "
+                "expected a newer PoCL or another OpenCL driver"
+            ) from error
         numbered = "\n".join(f"{i:4d}  {line}" for i, line in enumerate(source.splitlines(), 1))
         raise BuildError(f"a kernel did not compile on {device.name}\n{numbered}\n{error}") from error
     return program
