@@ -19,7 +19,9 @@ INLINE floatv expansion_draw(floatv z, float offset, float slope, float cubic)
     return nearest(FMA(z, FMA(z, curve, (floatv)slope), (floatv)offset));
 }
 
-/* Counts of two neighbours from their two words, each by its own way. */
+/* Counts of two neighbours from their two words: one each from tables, or both of both from the expansion. The scene
+   lets no pair mix the two ways (scene.py: _both_of_a_pair), for a word used twice would tie its counts together; a
+   padded neighbour alone may differ, and counts for nothing. */
 INLINE void poisson_pair(uintv first, uintv second, __global const Poisson *a, __global const Poisson *b,
                          __global const uint *tables, floatv *out)
 {

@@ -13,7 +13,7 @@ from mauvecl import layout
 from mauvecl.comparison import TEMPLATE, Comparison
 from mauvecl.cumulants import Cumulants, joint_is_exact, needs_fourth_power, polynomial
 from mauvecl.host.errors import InputError
-from mauvecl.poisson import SMALLEST_EXPANDED, AliasTable, table_of, table_set
+from mauvecl.poisson import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, table_of, table_set
 from mauvecl.processes import NONE, Processes
 
 if TYPE_CHECKING:
@@ -331,7 +331,14 @@ def _joint(scenarios: Sequence[Expectation], cumulants: Sequence[Cumulants], rec
 def _counts(out: NDArray[np.void], mean: Float, gain: Float, tables: list[AliasTable]) -> Float:
     """Fill in how Poisson counts are drawn; returns the whole numbers they are relative to, shape (n_pixel,)."""
     centre = np.rint(mean)
-    expanded = mean >= SMALLEST_EXPANDED
+    # A pair shares two words: a table takes one, the expansion both. Two of a pair never go different ways.
+    expanded = _both_of_a_pair(mean >= SMALLEST_EXPANDED)
+    if (mean[~expanded] > LARGEST_MEAN).any():
+        pixel = int(np.argmax(np.where(expanded, 0.0, mean)))
+        raise InputError(
+            f"pixel {pixel} has a Poisson mean of {mean[pixel]:.3g} in one draw beside a pixel of less than "
+            f"{SMALLEST_EXPANDED:g}, expected at most {LARGEST_MEAN:g} there: draw frame by frame"
+        )
     found, starts = table_set(mean[~expanded].tolist(), tables)
     out["table"][~expanded] = starts
     out["bits"][~expanded] = [t.bits for t in found]
@@ -342,6 +349,12 @@ def _counts(out: NDArray[np.void], mean: Float, gain: Float, tables: list[AliasT
     out["cubic"][expanded] = -1 / (72 * root)
     out["gain"] = gain
     return centre
+
+
+def _both_of_a_pair(chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Pixels 2i and 2i + 1 where both are chosen; a last one without a neighbour decides alone."""
+    pairs = np.append(chosen, chosen[-1:]) if chosen.size % 2 else chosen
+    return np.repeat(pairs.reshape(-1, 2).all(axis=1), 2)[: chosen.size]
 
 
 def _estimate(out: NDArray[np.void], template: Expectation, fraction: Float, mean_sum: Float) -> None:

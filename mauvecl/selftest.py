@@ -102,6 +102,7 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "frames at the rail": ({"frames": 3, "light": 107_000.0}, {}),
     "apart": ({}, {"recipe": "apart"}),
     "apart, tables": ({"frames": 2, "dark": 30.0, "read": 0.4, "photon_noise": "poisson"}, {"mode": "frames"}),
+    "apart, pairs of two ways": ({"frames": 1, "read": 1.0, "light": 1000.0, "photon_noise": "poisson"}, {}),
     "cosmic rays": ({}, {"processes": Processes(_RAYS)}),
     "noisy references": ({"frames": 4}, {"comparison": Comparison(3)}),
     "estimated variances": ({"frames": 2}, {"mode": "frames", "comparison": Comparison(1, estimated=True)}),

@@ -55,6 +55,12 @@ CASES = {
         "temperature_c": -9.0,
         "exposure": 5.0,
     },
+    "uneven, pairs of two ways": {
+        "pixel_map": PixelMap.made_up(2048, seed=1),
+        "read_noise_dn": 1.0,
+        "temperature_c": 9.0,
+        "exposure": 5.0,
+    },
     "cosmic rays": {"processes": Processes(cosmic_rays=RAYS)},
     "cosmic rays, frames": {"processes": Processes(cosmic_rays=RAYS), "mode": "frames", "exposure": 10.0},
     "priors": {"processes": PRIORS},

@@ -87,6 +87,10 @@ MUTATIONS = {
         (("mauvecl/scene.py", "= -1 / (72 * root)", "= 0.0"),),
         "tests/kernels/test_poisson.py::test_no_number_of_draws_would_tell_the_expansion",
     ),
+    "pairs of two ways": Mutation(
+        (("mauvecl/scene.py", "_both_of_a_pair(mean >= SMALLEST_EXPANDED)", "mean >= SMALLEST_EXPANDED"),),
+        "tests/test_correlations.py::test_no_two_draws_are_tied",
+    ),
     "skew-only expansion of the joint draw": Mutation(
         ((CUMULANTS, SHAPE, SHAPE.replace("    sd =", "    g2, g3 = 0 * g2, 0 * g3\n    sd =")),),
         "tests/kernels/test_joint.py::test_no_number_of_draws_would_tell",
