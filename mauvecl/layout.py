@@ -98,7 +98,7 @@ POISSON = np.dtype(
     ]
 )
 
-#: How a joint draw follows factors on light and dark: their means, variances, third and fourth cumulants, DN.
+#: How a joint draw follows factors on light and dark: their means, variances, third to fifth cumulants, DN.
 RESPONSE = np.dtype(
     [
         ("light", "f4"),
@@ -110,6 +110,8 @@ RESPONSE = np.dtype(
         ("dark_third", "f4"),
         ("light_fourth", "f4"),
         ("dark_fourth", "f4"),
+        ("light_fifth", "f4"),
+        ("dark_fifth", "f4"),
     ]
 )
 

@@ -212,7 +212,7 @@ def analogue(scene: Scene, drawn: Draws, i: int, pixel: int, k: int, light: Floa
     """The count above the level's base before the ADC, shape (n_realisation,)."""
     level, z = scene.levels[k, pixel], drawn.z[i]
     if scene.modulations:
-        v = _responding(scene.responses[k, pixel], level["c0"], z, light, dark)
+        v = _responding(scene.responses[k, pixel], level["c0"], z, light, dark, quartic=scene.quartic)
     elif scene.joint:
         first, *rest = ("c4", "c3", "c2", "c1", "c0") if scene.quartic else ("c3", "c2", "c1", "c0")
         v = np.full_like(z, level[first])
@@ -230,7 +230,7 @@ def analogue(scene: Scene, drawn: Draws, i: int, pixel: int, k: int, light: Floa
     return v
 
 
-def _responding(r: np.void, c0: np.float32, z: Floats, light: Floats, dark: Floats) -> Floats:
+def _responding(r: np.void, c0: np.float32, z: Floats, light: Floats, dark: Floats, *, quartic: bool) -> Floats:
     variance = fma(light, r["light_variance"], fma(dark, r["dark_variance"], r["other_variance"]))
     third = fma(light, r["light_third"], dark * r["dark_third"])
     fourth = fma(light, r["light_fourth"], dark * r["dark_fourth"])
@@ -240,9 +240,19 @@ def _responding(r: np.void, c0: np.float32, z: Floats, light: Floats, dark: Floa
         curve = curve - third * share * fma(zz, np.float32(0.055555556), np.float32(-0.1388889))
         cubic = curve / (variance * sd)
         v = fma(z, sd + cubic, fma(share, fma(zz, np.float32(0.16666667), np.float32(-0.16666667)), c0))
+        if quartic:
+            fifth = fma(light, r["light_fifth"], dark * r["dark_fifth"])
+            even = fifth * _quartic(zz, 0.008333334, -0.05, 0.025)
+            even = even - share * fourth * _quartic(zz, 0.041666668, -0.20833333, 0.083333336)
+            even = even + share * share * third * _quartic(zz, 0.037037037, -0.16358025, 0.052469134)
+            v = v + even / (variance * variance)
     one = np.float32(1.0)
     out: Floats = v + fma(light - one, r["light"], (dark - one) * r["dark"])
     return out
+
+
+def _quartic(zz: Floats, second: float, first: float, constant: float) -> Floats:
+    return fma(zz, fma(zz, np.float32(second), np.float32(first)), np.float32(constant))
 
 
 def digitise(v: Floats, edge: np.void, *, clip: bool) -> Floats:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mauvecl import layout
 from mauvecl.comparison import TEMPLATE, Comparison
-from mauvecl.cumulants import Cumulants, joint_is_exact, needs_fourth_power, polynomial
+from mauvecl.cumulants import Cumulants, joint_is_exact, needs_fourth_power, polynomial, stack_is_exact
 from mauvecl.host.errors import InputError
 from mauvecl.poisson import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, table_of, table_set
 from mauvecl.processes import NONE, Processes
@@ -52,7 +52,7 @@ class Scene:
     joint : bool
         Whether all noise of a draw comes from one normal, through its cumulants, or Poisson counts are drawn apart.
     quartic : bool
-        Whether a joint draw needs the fourth power of its normal.
+        Whether a joint draw needs the fourth power of its normal and, where factors vary, fifth cumulants.
     photons : bool
         Whether photon counts are drawn apart as well.
     clip : bool
@@ -166,7 +166,8 @@ def prepare(
     scenarios : sequence of Expectation
         On one instrument and exposure.
     mode : {"auto", "frames", "stacked"}
-        Draw each frame, or all at once; by itself frames only near a rail.
+        Draw each frame, or all at once; by itself frames only near a rail, and where a frame has so little noise that
+        its rounding is none.
     processes : Processes
     templates : sequence of int, optional
         For each scenario the quiescent one it is compared with; the first for all by default.
@@ -190,22 +191,24 @@ def prepare(
     for other in scenarios[1:]:
         _check_same_detector(quiet, other)
     compared = np.zeros(len(scenarios), np.uint32) if templates is None else np.array(templates, np.uint32)
-    frames = _draw_frames(scenarios, mode)
+    modulations = processes.modulations
+    priors = processes.factors(quiet.conditions)
+    factors = _corners(modulations, priors)
+    frames = _draw_frames(scenarios, mode, factors)
     each = 1 if frames else quiet.n_frames
     n_pixel = quiet.wavelength_nm.size
     padded = -(-n_pixel // PIXEL_BLOCK) * PIXEL_BLOCK
     cumulants = [Cumulants.of(x, each) for x in scenarios]
-    joint = _joint(scenarios, cumulants, recipe)
-    shapes = [polynomial(c) for c in cumulants] if joint and not processes.modulations else []
-    quartic = any(needs_fourth_power(c, shape[4]) for c, shape in zip(cumulants, shapes, strict=False))
+    varied = [[c.scaled(*both) for both in factors] for c in cumulants]
+    joint = _joint(scenarios, varied, recipe)
+    shapes = [polynomial(c) for c in cumulants] if joint and not modulations else []
+    quartic = joint and any(needs_fourth_power(c, varying=bool(modulations)) for row in varied for c in row)
     photons = not joint and quiet.photon_noise == "poisson"
-    modulations = processes.modulations
     if modulations and not joint:
         raise InputError(
             f"{modulations[0][0]} varies within a run, and the noise of {quiet.name} cannot be drawn jointly, expected "
-            "Gaussian noise of 1.5 DN and more in each pixel, or no such process"
+            "Gaussian noise of 1.5 Poisson counts and more in each pixel, more where counts are few, or no such process"
         )
-    priors = processes.factors(quiet.conditions)
     tables: list[AliasTable] = []
     used = ~np.any([scenarios[t].saturated for t in np.unique(compared)], axis=0)
 
@@ -309,13 +312,25 @@ def prepare(
     )
 
 
-def _joint(scenarios: Sequence[Expectation], cumulants: Sequence[Cumulants], recipe: Recipe) -> bool:
-    """Whether every pixel's noise may come from one normal."""
+def _corners(
+    modulations: tuple[tuple[str, Literal["light", "dark"]], ...], priors: NDArray[np.float32]
+) -> list[tuple[float, float]]:
+    """Factors on light and dark over all that the priors allow, neighbours at most a factor of 2 apart."""
+    ends = {"light": [1.0, 1.0], "dark": [1.0, 1.0]}
+    for (name, factor), table in zip(modulations, priors, strict=True):
+        values = 1.0 - table if name == "jitter" else table
+        ends[factor] = [ends[factor][0] * float(values.min()), ends[factor][1] * float(values.max())]
+    grids = [np.geomspace(low, high, 1 + int(np.ceil(np.log2(high / low)))) for low, high in ends.values()]
+    return [(float(light), float(dark)) for light in grids[0] for dark in grids[1]]
+
+
+def _joint(scenarios: Sequence[Expectation], varied: Sequence[Sequence[Cumulants]], recipe: Recipe) -> bool:
+    """Whether every pixel's noise may come from one normal, whatever the factors on light and dark."""
     if recipe not in ("auto", "joint", "apart"):
         raise InputError(f"recipe = {recipe!r}, expected 'auto', 'joint' or 'apart'")
     if recipe == "apart":
         return False
-    for x, c in zip(scenarios, cumulants, strict=True):
+    for x, c in ((x, c) for x, row in zip(scenarios, varied, strict=True) for c in row):
         exact = joint_is_exact(c)
         if not exact.all():
             if recipe == "joint":
@@ -373,8 +388,8 @@ def _respond(out: NDArray[np.void], c: Cumulants) -> None:
     out["light_variance"], out["dark_variance"] = c.light_variance, c.dark_variance
     # A pixel without any noise must not divide zero by zero.
     out["other_variance"] = np.maximum(c.variance - c.light_variance - c.dark_variance, NO_VARIANCE)
-    out["light_third"], out["light_fourth"] = (c.photon_cumulant(r) for r in (3, 4))
-    out["dark_third"], out["dark_fourth"] = (c.dark_cumulant(r) for r in (3, 4))
+    for order, name in ((3, "third"), (4, "fourth"), (5, "fifth")):
+        out[f"light_{name}"], out[f"dark_{name}"] = c.photon_cumulant(order), c.dark_cumulant(order)
 
 
 def _check_reach(
@@ -401,7 +416,7 @@ def _check_reach(
         )
 
 
-def _draw_frames(scenarios: Sequence[Expectation], mode: Mode) -> bool:
+def _draw_frames(scenarios: Sequence[Expectation], mode: Mode, factors: Sequence[tuple[float, float]]) -> bool:
     if mode not in ("auto", "frames", "stacked"):
         raise InputError(f"mode = {mode!r}, expected 'auto', 'frames' or 'stacked'")
     if scenarios[0].n_frames == 1 or mode == "frames":
@@ -409,14 +424,20 @@ def _draw_frames(scenarios: Sequence[Expectation], mode: Mode) -> bool:
         return mode == "frames" and scenarios[0].n_frames > 1
     for x in scenarios:
         near = near_rail(x)
-        if near.any():
-            if mode == "stacked":
-                where = float(x.wavelength_nm[near][0])
-                raise InputError(
-                    f"mode = 'stacked' cannot clip, and the pixel at {where:.1f} nm of {x.name} comes within "
-                    f"{RAIL_SIGMA:g} sigma of the ADC's range, expected mode 'frames' or 'auto'"
-                )
-            return True
+        # The less light and dark, the less the rounding is noise.
+        coarse = ~stack_is_exact(Cumulants.of(x, 1).scaled(*factors[0]), x)
+        for found, why in (
+            (near, f"cannot clip, and a frame comes within {RAIL_SIGMA:g} sigma of the ADC's range"),
+            (coarse, "takes rounding for noise, and a frame has too little noise of its own for that"),
+        ):
+            if found.any():
+                if mode == "stacked":
+                    where = float(x.wavelength_nm[found][0])
+                    raise InputError(
+                        f"mode = 'stacked' {why} in the pixel at {where:.1f} nm of {x.name}, expected mode 'frames' or "
+                        "'auto'"
+                    )
+                return True
     return False
 
 

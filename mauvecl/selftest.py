@@ -110,6 +110,7 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
         {"frames": 5},
         {"processes": Processes(_RAYS, Uniform(0.0, 0.05), Uniform(13.0, 21.0), Uniform(0.24, 0.44))},
     ),
+    "priors, fourth power": ({"frames": 1, "dark": 288.0}, {"processes": Processes(jitter=Uniform(0.0, 0.05))}),
     "priors, frames": (
         {"frames": 5, "photon_noise": "poisson"},
         {"mode": "frames", "processes": Processes(None, Uniform(0.0, 0.05), Uniform(13.0, 21.0))},

@@ -87,6 +87,14 @@ MUTATIONS = {
         (("mauvecl/scene.py", "= -1 / (72 * root)", "= 0.0"),),
         "tests/kernels/test_poisson.py::test_no_number_of_draws_would_tell_the_expansion",
     ),
+    "joint draw allowed by its skew alone": Mutation(
+        ((CUMULANTS, " & ~shows(left_out(c, fourth_power=True), c.variance))", ")"),),
+        "tests/kernels/test_joint_bound.py::test_the_worst_that_is_allowed",
+    ),
+    "fourth power left out too early": Mutation(
+        ((CUMULANTS, "345 * fourth**2", "34.5 * fourth**2"),),
+        "tests/kernels/test_joint_bound.py::test_the_worst_that_is_allowed",
+    ),
     "pairs of two ways": Mutation(
         (("mauvecl/scene.py", "_both_of_a_pair(mean >= SMALLEST_EXPANDED)", "mean >= SMALLEST_EXPANDED"),),
         "tests/test_correlations.py::test_no_two_draws_are_tied",

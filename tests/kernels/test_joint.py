@@ -63,7 +63,7 @@ def by_polynomial(x: Expectation, low: int, size: int) -> np.ndarray:
     """The same of the polynomial that the kernels evaluate, in double precision."""
     c = Cumulants.of(x, 1)
     c0, c1, c2, c3, c4 = (float(a[0]) for a in polynomial(c))
-    if not needs_fourth_power(c, polynomial(c)[4]):
+    if not needs_fourth_power(c):
         c4 = 0.0
     z = np.linspace(-9.0, 9.0, 200_001)
     draw = c.mean[0] + c0 + z * (c1 + z * (c2 + z * (c3 + z * c4)))

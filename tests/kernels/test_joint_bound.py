@@ -1,0 +1,153 @@
+"""The joint draw over the whole region that its condition allows: the worst corners, found by a search."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import exact
+import numpy as np
+import pytest
+from scipy import optimize
+
+from mauvecl import reference
+from mauvecl.cumulants import DRAWS_TO_NOTICE, Cumulants, joint_is_exact, needs_fourth_power, polynomial
+from mauvecl.host.errors import InputError
+from mauvecl.processes import Processes, Uniform
+from mauvecl.scene import prepare
+from mauvecl.selftest import toy
+
+#: By exact convolution no allowed draw is told apart sooner; the condition's own estimate is right to 4 % there.
+SOONEST = 4e13
+#: Nor is a tail between 5 and 6 sigma further from the exact one than this share of it (a longer search finds .0046).
+TAIL = 5e-3
+
+
+@dataclass(frozen=True)
+class Noise:
+    """One pixel: Gaussian noise of so many DN, Poisson counts of dark and light with their steps, and where in a DN."""
+
+    read: float
+    dark: float
+    dark_step: float
+    light: float
+    light_step: float
+    phase: float
+
+    @classmethod
+    def at(cls, point: np.ndarray) -> Noise:
+        """Of a point of the search, in decades: Gaussian over Poisson step, step, dark, light's step over it, light."""
+        over, step, dark, ratio, light = 10.0 ** point[:5]
+        return cls(over * step * max(1.0, ratio), dark, step, light if point[4] > -4 else 0.0, step * ratio, point[5])
+
+    @property
+    def cumulants(self) -> Cumulants:
+        one = np.ones(1)
+        return Cumulants(
+            mean=self.phase * one,
+            gaussian=self.read**2 * one,
+            photons=self.light * one,
+            photon_step=self.light_step * one,
+            dark_step=self.dark_step * one,
+            dark_dn=self.dark * self.dark_step * one,
+            light_dn=self.light * self.light_step * one,
+            light_variance=self.light * self.light_step**2 * one,
+        )
+
+    def both(self, *, varying: bool) -> tuple[np.ndarray, np.ndarray]:
+        """The exact probabilities of whole DN, and those of the polynomial that the kernels evaluate."""
+        c = self.cumulants
+        sd = float(np.sqrt(c.variance[0]))
+        shape = [float(a[0]) / sd for a in polynomial(c)]
+        if not needs_fourth_power(c, varying=varying):
+            shape[4] = 0.0
+            if varying:  # no third-order term at all
+                g3 = float(c.shape()[0][0])
+                shape[0], shape[2] = -g3 / 6, g3 / 6
+        half = int(9 * sd) + 6
+        poisson = [(self.dark, self.dark_step), (self.light, self.light_step)]
+        p = exact.counts(self.read**2, poisson, self.phase, -half, 2 * half)
+        return p, exact.of_polynomial(shape, sd, self.phase, -half, 2 * half)
+
+
+BOUNDS = [(np.log10(1.5), 1.5), (-0.5, 0.5), (-2.5, 3.3), (-1.0, 1.0), (-4.5, 3.3), (0.0, 1.0)]
+
+
+@pytest.mark.parametrize("varying", [False, True], ids=["steady", "factors on light and dark"])
+@pytest.mark.parametrize("what", ["Pearson", "tails"])
+def test_the_worst_that_is_allowed(what: str, varying: bool) -> None:
+    """A search for what Pearson's test sees soonest, and for the worst tail, among all that is drawn jointly."""
+    tried = 0
+
+    def merit(point: np.ndarray) -> float:
+        nonlocal tried
+        noise = Noise.at(point)
+        if not joint_is_exact(noise.cumulants)[0]:
+            return 30.0
+        tried += 1
+        p, q = noise.both(varying=varying)
+        return float(np.log10(exact.draws_to_tell(p, q)) if what == "Pearson" else -exact.worst_tail(p, q))
+
+    found = optimize.differential_evolution(merit, BOUNDS, rng=1, popsize=12, maxiter=25, polish=False)
+    assert tried > 500
+    if what == "Pearson":
+        assert SOONEST < 10**found.fun < 1.2 * DRAWS_TO_NOTICE  # and the search did find the border
+    else:
+        assert TAIL / 4 < -found.fun < TAIL
+
+
+def test_the_smallest_poisson_means() -> None:
+    """1.5 DN of Gaussian noise and .14 counts: gamma_3 is .038, yet 2e9 draws tell; the tail is off by a fifth."""
+    noise = Noise(1.5, 0.14, 1.0, 0.0, 1.0, 0.37)
+    p, q = noise.both(varying=False)
+    assert noise.cumulants.shape()[0][0] < 0.04
+    assert exact.draws_to_tell(p, q) < 5e9
+    assert exact.worst_tail(p, q) > 0.1
+    assert not joint_is_exact(noise.cumulants)[0]
+    x = toy(8, 1, dark=0.14, read=1.5, light=0.0)
+    assert not prepare([x]).joint
+    with pytest.raises(InputError, match="recipe = 'joint'"):
+        prepare([x], recipe="joint")
+    with pytest.raises(InputError, match="qe_scale varies within a run, and the noise of toy cannot be drawn jointly"):
+        prepare([x], processes=Processes(qe_scale=Uniform(0.9, 1.1)))
+
+
+def test_priors_that_lead_out_of_the_region_are_refused() -> None:
+    """Where the expectation may be drawn jointly and its dark at the prior's other end may not."""
+    x = toy(8, 1, dark=2225.0, read=2.0, light=0.0)
+    prepare([x], processes=Processes(detector_temperature=Uniform(19.0, 23.0)))
+    with pytest.raises(InputError, match="detector_temperature varies within a run"):
+        prepare([x], processes=Processes(detector_temperature=Uniform(-60.0, 23.0)))
+
+
+@pytest.mark.parametrize("quartic", [False, True])
+def test_factors_follow_the_cumulants(quartic: bool) -> None:
+    """The twin's draw under factors on light and dark is the polynomial of the cumulants at these factors."""
+    x = toy(8, 1, dark=288.0 if quartic else 2225.0, read=12.0, photon_noise="poisson")
+    processes = Processes(qe_scale=Uniform(1.4, 1.4), detector_temperature=Uniform(12.0, 12.0))
+    scene, index = prepare([x], processes=processes), np.arange(3000, dtype=np.uint64)
+    assert scene.quartic == quartic
+    factors = reference.factors(scene, index, 0, 5)
+    warm = np.exp(x.conditions["dark_slope_per_c"] * (12.0 - x.conditions["temperature_c"]))
+    c = Cumulants.of(x, 1).scaled(1.4, warm)
+    drawn = reference.draws(scene, index, 0, 1, 5)
+    for i in range(4):
+        p, z = 4 + i, drawn.z[i].astype(float)
+        shape = np.array([float(a[p]) for a in polynomial(c)])
+        if not quartic:
+            g3, sd = float(c.shape()[0][p]), float(np.sqrt(c.variance[p]))
+            shape[0], shape[2], shape[4] = -sd * g3 / 6, sd * g3 / 6, 0.0
+        ours = reference.analogue(scene, drawn, i, p, 0, *factors).astype(float) + scene.base_dn[0, p]
+        # float32 of a draw of up to a thousand DN from its base.
+        np.testing.assert_allclose(ours, c.mean[p] + np.polynomial.Polynomial(shape)(z), rtol=0, atol=3e-4)
+
+
+def test_cumulants_at_factors() -> None:
+    """`scaled` is what an expectation of other light and dark has."""
+    for noise in ("gaussian", "poisson"):
+        x = toy(8, 3, photon_noise=noise)
+        other = replace(
+            x, source_electrons=2 * x.source_electrons, sky_electrons=2 * x.sky_electrons, dark_dn=0.3 * x.dark_dn
+        )
+        ours, wanted = Cumulants.of(x, 3).scaled(2.0, 0.3), Cumulants.of(other, 3)
+        for name in Cumulants.__dataclass_fields__:
+            np.testing.assert_allclose(getattr(ours, name), getattr(wanted, name), rtol=1e-12)
