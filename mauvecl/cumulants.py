@@ -27,6 +27,8 @@ MOST_SKEW = 0.04
 #: lies at 4e13 (tests/kernels/test_joint_bound.py, tests/test_stacks.py), which the payload meets at every temperature
 #: and exposure with its cheapest draws: 11 of 72 of its settings lie below 1e14.
 DRAWS_TO_NOTICE = 4.2e13
+#: Of the sawtooth of rounding, at most; beyond them a Gaussian of .02 DN leaves nothing.
+HARMONICS = 64
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,15 +96,26 @@ class Cumulants:
         """Of everything before the draw's own rounding."""
         return self.gaussian + self.photon_cumulant(2) + self.dark_variance
 
-    def over_sd(self, order: int) -> Float:
-        """A third or higher cumulant over its power of the standard deviation; 0 where there is no noise."""
-        power = np.sqrt(self.variance) ** order
-        found = self.photon_cumulant(order) + self.dark_cumulant(order)
-        return np.asarray(np.divide(found, power, out=np.zeros_like(power), where=power > 0))
-
     def shape(self) -> tuple[Float, Float, Float]:
         """Third, fourth and fifth cumulants over their powers of the standard deviation."""
-        return self.over_sd(3), self.over_sd(4), self.over_sd(5)
+        sd = np.sqrt(self.variance)
+        third, fourth, fifth = (
+            np.divide(self.photon_cumulant(r) + self.dark_cumulant(r), sd**r, out=np.zeros_like(sd), where=sd > 0)
+            for r in (3, 4, 5)
+        )
+        return third, fourth, fifth
+
+    def over_sd(self, last: int) -> list[Float]:
+        """As `shape` up to a higher order, by products, which are cheaper than powers."""
+        sd = np.sqrt(self.variance)
+        each = np.divide(1.0, sd, out=np.zeros_like(sd), where=sd > 0)
+        light, dark = self.photon_step * each, self.dark_step * each
+        of_light, of_dark = self.photons * light**2, self.dark_dn * each * dark
+        found = []
+        for _ in range(3, last + 1):
+            of_light, of_dark = of_light * light, of_dark * dark
+            found.append(of_light + of_dark)
+        return found
 
     def scaled(self, light: float, dark: float) -> Cumulants:
         """The same draw with so many times the light and the dark."""
@@ -144,15 +157,17 @@ def left_out(c: Cumulants, *, fourth_power: bool, varying: bool = False) -> Floa
         Whether it is the kernels' one for factors on light and dark, which without the fourth power has no term of
         gamma_5, rather than `polynomial`.
     """
-    g3, g4, g5, g6, g7 = (c.over_sd(order) for order in range(3, 8))
+    g3, g4, g5, g6, g7 = c.over_sd(7)
+    g3_3 = g3 * g3 * g3
+    g3_4 = g3_3 * g3
     # Abramowitz & Stegun 26.2.49 with gamma_1 there gamma_3 here: the terms after those of `polynomial`.
-    fifth = g6 / 720 - 3 * g4**2 / 384 - 2 * g3 * g5 / 180 + 14 * g3**2 * g4 / 288 - 252 * g3**4 / 7776
-    third = -6 * g4**2 / 384 - 3 * g3 * g5 / 180 + 37 * g3**2 * g4 / 288 - 832 * g3**4 / 7776
-    first = -2 * g4**2 / 384 + 8 * g3**2 * g4 / 288 - 227 * g3**4 / 7776
+    fifth = g6 / 720 - 3 * g4**2 / 384 - 2 * g3 * g5 / 180 + 14 * g3**2 * g4 / 288 - 252 * g3_4 / 7776
+    third = -6 * g4**2 / 384 - 3 * g3 * g5 / 180 + 37 * g3**2 * g4 / 288 - 832 * g3_4 / 7776
+    first = -2 * g4**2 / 384 + 8 * g3**2 * g4 / 288 - 227 * g3_4 / 7776
     found = 720 * fifth**2 + 24 * third**2 + 2 * first**2 + g7**2 / 5040
     if not fourth_power:
-        second = 19 * g3**3 / 324 - g3 * g4 / 24
-        fourth = g5 / 120 - g3 * g4 / 24 + g3**3 / 27
+        second = 19 * g3_3 / 324 - g3 * g4 / 24
+        fourth = g5 / 120 - g3 * g4 / 24 + g3_3 / 27
         # Without gamma_5 both Hermite terms are missing; `polynomial` lacks z^4 = He_4 + 6 He_2 + 3 alone.
         found = found + (120 * fourth**2 + 6 * second**2 if varying else 345 * fourth**2)
     return np.asarray(found)
@@ -162,7 +177,7 @@ def joint_is_exact(c: Cumulants) -> NDArray[np.bool_]:
     """Pixels whose whole noise may be drawn from one normal, shape (n_pixel,)."""
     step = np.maximum(np.where(c.dark_dn > 0, c.dark_step, 0.0), np.where(c.photons > 0, c.photon_step, 0.0))
     smooth = np.sqrt(c.gaussian) >= SMOOTH_STEPS * step
-    return np.asarray(smooth & (c.over_sd(3) <= MOST_SKEW) & ~shows(left_out(c, fourth_power=True), c.variance))
+    return np.asarray(smooth & (c.over_sd(3)[0] <= MOST_SKEW) & ~shows(left_out(c, fourth_power=True), c.variance))
 
 
 def needs_fourth_power(c: Cumulants, *, varying: bool = False) -> bool:
@@ -182,22 +197,34 @@ def stack_is_exact(c: Cumulants, x: Expectation) -> NDArray[np.bool_]:
     Notes
     -----
     A stack takes each frame's rounding for noise of mean 0 and variance 1/12 that is Gaussian in the sum. The error
-    of rounding is a sawtooth, and its Fourier series over the frame's distribution has the characteristic function at
-    2 pi: with f its size there, the mean is off by up to f / pi DN, the variance by up to f (1 / pi^2 + 2 / pi times
-    the derivative of the function's logarithm) (Widrow, Kollar & Liu 1996, doi 10.1109/19.492748). Poisson counts of
-    whole DN never blur the rounding. The sum of N uniform errors has the fourth cumulant -N / 120.
+    of rounding is a sawtooth, the sum over k of sin(2 pi k x) / (pi k), so what it knows of the frame's own noise is
+    the characteristic function there (Widrow, Kollar & Liu 1996, doi 10.1109/19.492748): f_k its size and l_k the
+    slope of its logarithm at 2 pi k. Given the sum of N frames of variance v, a frame's sine is f_k exp(u_k / 2) at
+    most, u_k = l_k^2 / (N v), which moves the sum's density by Pearson's distance below. Counts of whole DN blur no
+    rounding at all. The sum of N uniform errors has the fourth cumulant -N / 120.
+
+    Poisson counts whose steps show in the sum do not help: given the counts, the rest stands alone, and a mixture is
+    never told more easily than its parts.
     """
     n = x.n_frames
-    turning = np.stack([np.sin(np.pi * c.photon_step), np.sin(np.pi * c.dark_step)])
-    counts = np.stack([c.photons, np.divide(c.dark_dn, c.dark_step, out=np.zeros_like(c.dark_dn), where=c.dark_dn > 0)])
-    size = np.exp(-2 * np.pi**2 * c.gaussian - 2 * (counts * turning**2).sum(axis=0))
-    slope = 2 * np.pi * c.gaussian
-    slope = slope + 2 * (counts * np.abs(turning) * np.stack([c.photon_step, c.dark_step])).sum(axis=0)
-    frame = c.variance + 1 / 12
-    mean = np.sqrt(n / frame) * size / np.pi
-    variance = size * (1 / np.pi**2 + 2 * slope / np.pi) / frame
-    fourth = (n - 1) / (120 * n**2 * frame**2)
-    return ~shows(mean**2 + variance**2 / 2 + fourth**2 / 24, n * frame)
+    blur = np.sqrt(n * (c.gaussian + 1 / 12))
+    dark = np.divide(c.dark_dn, c.dark_step, out=np.zeros_like(c.dark_dn), where=c.dark_dn > 0)
+    steps = np.stack([c.photon_step, c.dark_step])
+    counts = np.where(blur >= SMOOTH_STEPS * steps, np.stack([c.photons, dark]), 0.0)
+    frame = c.gaussian + (counts * steps**2).sum(axis=0) + 1 / 12
+    # Twice, here and below: for the Poisson counts' skew, and the sawtooth's square.
+    found = 2 * ((n - 1) / (120 * n**2 * frame**2)) ** 2 / 24
+    quietest = float(np.sqrt(c.gaussian.min()))
+    last = HARMONICS if HARMONICS * quietest < 1.5 else int(np.ceil(1.5 / quietest))
+    for k in range(1, last + 1):
+        turned = np.abs(np.sin(np.pi * k * steps))
+        size = 2 * np.pi**2 * k**2 * c.gaussian + 2 * (counts * turned**2).sum(axis=0)
+        slope = 2 * np.pi * k * c.gaussian + 2 * (counts * steps * turned).sum(axis=0)
+        ripple = slope**2 / (n * frame)
+        found += 2 * n / (np.pi**2 * k**2 * frame) * (1 + ripple) * np.exp(np.minimum(ripple - 2 * size, 0.0))
+    # What lies beyond is left to the Gaussian noise.
+    found += n / frame * np.exp(-4 * np.pi**2 * last**2 * c.gaussian)
+    return ~shows(found, n * frame)
 
 
 def polynomial(c: Cumulants) -> tuple[Float, Float, Float, Float, Float]:
