@@ -168,7 +168,11 @@ class Expectation:
 
     @cached_property
     def variance_dn2(self) -> Float:
-        """Variance of the exposure, DN^2, with the rounding of each frame (1/12); shape (n_pixel,)."""
+        """Variance of the exposure, DN^2, with the rounding of each frame (1/12); shape (n_pixel,).
+
+        Rounding is noise of mean 0 and variance 1/12 only where a frame's own noise is about 1 DN and more. For a
+        nearly noiseless detector this assumption, and every closed form that rests on it, fails: draws then differ.
+        """
         return self._noise_dn2 + self.n_frames / 12
 
     @cached_property

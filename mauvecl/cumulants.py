@@ -25,7 +25,7 @@ MOST_SKEW = 0.04
 #: What is drawn in another way than frame by frame and count by count would show in Pearson's test of whole DN, at five
 #: sigma, after so many draws of one pixel by the estimate here. By exact convolution the worst of all that is allowed
 #: lies at 4e13 (tests/kernels/test_joint_bound.py, tests/test_stacks.py), which the payload meets at every temperature
-#: and exposure with its cheapest draws: 11 of 72 of its settings lie below 1e14.
+#: and exposure with its cheapest draws, some at 5e13 to 1e14.
 DRAWS_TO_NOTICE = 4.2e13
 #: Of the sawtooth of rounding, at most; beyond them a Gaussian of .02 DN leaves nothing.
 HARMONICS = 64

@@ -95,6 +95,17 @@ MUTATIONS = {
         ((CUMULANTS, "345 * fourth**2", "34.5 * fourth**2"),),
         "tests/kernels/test_joint_bound.py::test_the_worst_that_is_allowed",
     ),
+    "rounding taken for noise everywhere": Mutation(
+        ((CUMULANTS, "return ~shows(found, n * frame)", "return frame > 0"),),
+        "tests/test_stacks.py::test_random_stacks_of_quiet_frames",
+    ),
+    "fifth cumulants of varying dark forgotten": Mutation(
+        (
+            ("kernels/detector.cl.mako", "factors->dark * r->dark_fifth", "factors->dark * 0.0f"),
+            (TWIN, 'dark * r["dark_fifth"]', "dark * np.float32(0)"),
+        ),
+        "tests/kernels/test_joint_bound.py::test_factors_follow_the_cumulants",
+    ),
     "pairs of two ways": Mutation(
         (("mauvecl/scene.py", "_both_of_a_pair(mean >= SMALLEST_EXPANDED)", "mean >= SMALLEST_EXPANDED"),),
         "tests/test_correlations.py::test_no_two_draws_are_tied",
