@@ -193,13 +193,13 @@ def prepare(
     compared = np.zeros(len(scenarios), np.uint32) if templates is None else np.array(templates, np.uint32)
     modulations = processes.modulations
     priors = processes.factors(quiet.conditions)
-    factors = _corners(modulations, priors)
-    frames = _draw_frames(scenarios, mode, factors)
+    corners = _corners(modulations, priors)
+    frames = _draw_frames(scenarios, mode, corners)
     each = 1 if frames else quiet.n_frames
     n_pixel = quiet.wavelength_nm.size
     padded = -(-n_pixel // PIXEL_BLOCK) * PIXEL_BLOCK
     cumulants = [Cumulants.of(x, each) for x in scenarios]
-    varied = [[c.scaled(*both) for both in factors] for c in cumulants]
+    varied = [[c.scaled(*corner) for corner in corners] for c in cumulants]
     joint = _joint(scenarios, varied, recipe)
     shapes = [polynomial(c) for c in cumulants] if joint and not modulations else []
     quartic = joint and any(needs_fourth_power(c, varying=bool(modulations)) for row in varied for c in row)
@@ -416,7 +416,7 @@ def _check_reach(
         )
 
 
-def _draw_frames(scenarios: Sequence[Expectation], mode: Mode, factors: Sequence[tuple[float, float]]) -> bool:
+def _draw_frames(scenarios: Sequence[Expectation], mode: Mode, corners: Sequence[tuple[float, float]]) -> bool:
     if mode not in ("auto", "frames", "stacked"):
         raise InputError(f"mode = {mode!r}, expected 'auto', 'frames' or 'stacked'")
     if scenarios[0].n_frames == 1 or mode == "frames":
@@ -425,7 +425,7 @@ def _draw_frames(scenarios: Sequence[Expectation], mode: Mode, factors: Sequence
     for x in scenarios:
         near = near_rail(x)
         # The less light and dark, the less the rounding is noise.
-        coarse = ~stack_is_exact(Cumulants.of(x, 1).scaled(*factors[0]), x)
+        coarse = ~stack_is_exact(Cumulants.of(x, 1).scaled(*corners[0]), x)
         for found, why in (
             (near, f"cannot clip, and a frame comes within {RAIL_SIGMA:g} sigma of the ADC's range"),
             (coarse, "takes rounding for noise, and a frame has too little noise of its own for that"),
