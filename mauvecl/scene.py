@@ -14,7 +14,7 @@ from mauvecl.comparison import TEMPLATE, Comparison
 from mauvecl.cumulants import Cumulants, joint_is_exact, needs_fourth_power, polynomial
 from mauvecl.host.errors import InputError
 from mauvecl.poisson import SMALLEST_EXPANDED, AliasTable, table_of, table_set
-from mauvecl.processes import NONE, Processes
+from mauvecl.processes import NONE, Factors, Processes
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -67,7 +67,9 @@ class Scene:
     dark_counts : ndarray of layout.POISSON, shape (n_padded,)
     tables : ndarray of uint32
         Alias tables, end to end.
-    priors : ndarray of float32, shape (n_modulation, 2**PRIOR_BITS + 1)
+    priors : ndarray of float32, shape (n_modulation, 2 * PRIOR_NODES)
+    medians : tuple of float, shape (2,)
+        Factors on light and dark of priors at their medians.
     templates : ndarray of uint32, shape (n_scenario,)
         For each scenario the one whose mean and variance it is compared with.
     fraction : ndarray, shape (n_scenario, n_padded)
@@ -98,6 +100,7 @@ class Scene:
     responses: NDArray[np.void]
     tables: NDArray[np.uint32]
     priors: NDArray[np.float32]
+    medians: tuple[float, float]
     templates: NDArray[np.uint32]
     fraction: Float
     estimates: NDArray[np.void]
@@ -189,6 +192,7 @@ def prepare(
         raise InputError(f"{quiet.wavelength_nm.size} pixels, expected at most {MOST_PIXELS}")
     for other in scenarios[1:]:
         _check_same_detector(quiet, other)
+    factors = processes.factors(quiet.conditions)
     compared = np.zeros(len(scenarios), np.uint32) if templates is None else np.array(templates, np.uint32)
     frames = _draw_frames(scenarios, mode)
     each = 1 if frames else quiet.n_frames
@@ -205,7 +209,6 @@ def prepare(
             f"{modulations[0][0]} varies within a run, and the noise of {quiet.name} cannot be drawn jointly, expected "
             "Gaussian noise of 1.5 DN and more in each pixel, or no such process"
         )
-    priors = processes.factors(quiet.conditions)
     tables: list[AliasTable] = []
     used = ~np.any([scenarios[t].saturated for t in np.unique(compared)], axis=0)
 
@@ -233,7 +236,7 @@ def prepare(
     noisier = 1.0 + comparison.share
     levels["shift"] = edges["low"] = edges["high"] = layout.MAGIC
     for k, (x, c) in enumerate(zip(scenarios, cumulants, strict=True)):
-        mean = c.mean.copy()
+        mean = c.mean + (factors.light - 1.0) * c.light_dn + (factors.dark - 1.0) * c.dark_dn
         if not joint:
             mean = each * x.bias_dn + quiet.dark_step_dn * dark_centre
             if photons:
@@ -243,8 +246,8 @@ def prepare(
         base[k] = np.clip(np.rint(mean), 0, x.adc_max_dn if each == 1 else np.inf)
         level = levels[k, :n_pixel]
         if modulations:
-            _respond(responses[k, :n_pixel], c)
-            _check_reach(x, c, priors, modulations)
+            _respond(responses[k, :n_pixel], c, factors)
+            _check_reach(x, c, factors)
         elif joint:
             for name, coefficient in zip(("c0", "c1", "c2", "c3", "c4"), shapes[k], strict=True):
                 level[name] = coefficient
@@ -299,7 +302,8 @@ def prepare(
         photon_counts=counts,
         responses=responses,
         tables=np.concatenate([np.zeros(1, np.uint32)[:0], *(t.entries for t in tables)]).astype(np.uint32),
-        priors=priors,
+        priors=factors.tables,
+        medians=(factors.light, factors.dark),
         templates=compared,
         fraction=fraction,
         estimates=estimates,
@@ -354,32 +358,25 @@ def _estimate(out: NDArray[np.void], template: Expectation, fraction: Float, mea
     out["variance"][:n_pixel] = np.maximum(template.n_frames * known, NO_VARIANCE)
 
 
-def _respond(out: NDArray[np.void], c: Cumulants) -> None:
-    """How a draw follows factors on light and dark."""
-    out["light"], out["dark"] = c.light_dn, c.dark_dn
-    out["light_variance"], out["dark_variance"] = c.light_variance, c.dark_variance
+def _respond(out: NDArray[np.void], c: Cumulants, factors: Factors) -> None:
+    """How a draw follows factors on light and dark, from what they are at the priors' medians."""
+    light, dark = factors.light, factors.dark
+    out["light"], out["dark"] = light * c.light_dn, dark * c.dark_dn
+    out["light_variance"], out["dark_variance"] = light * c.light_variance, dark * c.dark_variance
     # A pixel without any noise must not divide zero by zero.
     out["other_variance"] = np.maximum(c.variance - c.light_variance - c.dark_variance, NO_VARIANCE)
-    out["light_third"], out["light_fourth"] = (c.photon_cumulant(r) for r in (3, 4))
-    out["dark_third"], out["dark_fourth"] = (c.dark_cumulant(r) for r in (3, 4))
+    out["light_third"], out["light_fourth"] = (light * c.photon_cumulant(r) for r in (3, 4))
+    out["dark_third"], out["dark_fourth"] = (dark * c.dark_cumulant(r) for r in (3, 4))
 
 
-def _check_reach(
-    x: Expectation,
-    c: Cumulants,
-    priors: NDArray[np.float32],
-    modulations: tuple[tuple[str, Literal["light", "dark"]], ...],
-) -> None:
+def _check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
     """Refuse what the priors could carry further than the device rounds."""
-    most = {"light": 1.0, "dark": 1.0}
-    least = {"light": 1.0, "dark": 1.0}
-    for (name, factor), table in zip(modulations, priors, strict=True):
-        values = 1.0 - table if name == "jitter" else table
-        most[factor] *= float(values.max())
-        least[factor] *= float(values.min())
-    swing = {f: max(abs(most[f] - 1.0), abs(least[f] - 1.0)) for f in most}
-    reach = swing["light"] * c.light_dn + swing["dark"] * c.dark_dn
-    reach += 8.0 * np.sqrt(c.variance + swing["light"] * c.light_variance + swing["dark"] * c.dark_variance)
+    light, dark = (
+        max(most - middle, middle - least)
+        for (least, most), middle in ((factors.light_ends, factors.light), (factors.dark_ends, factors.dark))
+    )
+    variance = c.variance + factors.light_ends[1] * c.light_variance + factors.dark_ends[1] * c.dark_variance
+    reach = light * c.light_dn + dark * c.dark_dn + 8.0 * np.sqrt(variance)
     if (reach >= REACH_DN).any():
         pixel = int(np.argmax(reach))
         raise InputError(
