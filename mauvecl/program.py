@@ -21,7 +21,7 @@ from mauvecl.kernel_cache import kernel_cache
 if TYPE_CHECKING:
     import pyopencl
 
-ROOMS = ("portable", "philox", "normal", "poisson", "detector")
+ROOMS = ("portable", "philox", "normal", "poisson", "prior", "detector")
 POCL = "Portable Computing Language"
 
 
