@@ -144,10 +144,10 @@ class Scene:
 
 
 def near_rail(x: Expectation) -> NDArray[np.bool_]:
-    """Pixels whose single frame comes within `RAIL_SIGMA` of the ADC's ends, shape (n_pixel,)."""
-    reach = RAIL_SIGMA * np.sqrt(x.variance_dn2 / x.n_frames)
+    """Pixels whose single frame comes within `RAIL_SIGMA` of zero or of saturation, shape (n_pixel,)."""
+    reach = RAIL_SIGMA * np.sqrt(x.unsaturated_variance_dn2 / x.n_frames)
     low: NDArray[np.bool_] = x.mean_raw_dn - reach < 0.0
-    high: NDArray[np.bool_] = x.mean_raw_dn + reach > x.adc_max_dn
+    high: NDArray[np.bool_] = x.mean_raw_dn + reach > x.highest_dn
     return low | high
 
 
@@ -243,7 +243,7 @@ def prepare(
                 mean += x.gain_dn_per_electron * _counts(counts[k, :n_pixel], c.photons, x.gain_dn_per_electron, tables)
             else:
                 mean += x.gain_dn_per_electron * c.photons
-        base[k] = np.clip(np.rint(mean), 0, x.adc_max_dn if each == 1 else np.inf)
+        base[k] = np.clip(np.rint(mean), 0, x.highest_dn if each == 1 else np.inf)
         level = levels[k, :n_pixel]
         if modulations:
             _respond(responses[k, :n_pixel], c, factors)
@@ -255,7 +255,7 @@ def prepare(
             level["c1"] = np.sqrt(c.gaussian)
         level["c0"] += mean - base[k]
         template = scenarios[compared[k]]
-        mean_sum = template.n_frames * template.mean_raw_dn
+        mean_sum = template.recorded_dn
         whole = (quiet.n_frames // each) * base[k] - np.rint(mean_sum)
         if not comparison.exposures:
             fraction[k, :n_pixel] = np.rint(mean_sum) - mean_sum
@@ -266,7 +266,7 @@ def prepare(
         edge = edges[k, :n_pixel]
         edge["base"], edge["whole"] = base[k], whole
         edge["low"] = layout.MAGIC - base[k]
-        edge["high"] = layout.MAGIC + (x.adc_max_dn - base[k])
+        edge["high"] = layout.MAGIC + (x.highest_dn - base[k])
         if comparison.estimated:
             _estimate(estimates[k], template, fraction[k], np.rint(mean_sum))
         element_variance = np.bincount(quiet.element, variance * used)
@@ -398,7 +398,7 @@ def _draw_frames(scenarios: Sequence[Expectation], mode: Mode) -> bool:
                 where = float(x.wavelength_nm[near][0])
                 raise InputError(
                     f"mode = 'stacked' cannot clip, and the pixel at {where:.1f} nm of {x.name} comes within "
-                    f"{RAIL_SIGMA:g} sigma of the ADC's range, expected mode 'frames' or 'auto'"
+                    f"{RAIL_SIGMA:g} sigma of zero or saturation, expected mode 'frames' or 'auto'"
                 )
             return True
     return False
@@ -417,6 +417,7 @@ def _check_same_detector(quiet: Expectation, other: Expectation) -> None:
         "dark_unit",
         "photon_noise",
         "adc_max_dn",
+        "saturation_dn",
     ):
         if not np.array_equal(getattr(quiet, name), getattr(other, name)):
             raise InputError(
