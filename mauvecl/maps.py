@@ -245,4 +245,5 @@ def _fill(
             at = (s, j, i)
             found["probability"][at], found["low"][at], found["high"][at] = p.value, p.low, p.high
             limit = result.closed_form(statistic, template=k).isf(run.fap)
-            found["closed_form"][at] = result.closed_form(statistic, k).sf(limit)
+            if k not in result.blinding:
+                found["closed_form"][at] = result.closed_form(statistic, k).sf(limit)

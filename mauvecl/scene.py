@@ -143,11 +143,22 @@ class Scene:
         return replace(self, job=job, templates=templates, **per_scenario)
 
 
-def near_rail(x: Expectation) -> NDArray[np.bool_]:
-    """Pixels whose single frame comes within `RAIL_SIGMA` of zero or of saturation, shape (n_pixel,)."""
-    reach = RAIL_SIGMA * np.sqrt(x.unsaturated_variance_dn2 / x.n_frames)
-    low: NDArray[np.bool_] = x.mean_raw_dn - reach < 0.0
-    high: NDArray[np.bool_] = x.mean_raw_dn + reach > x.highest_dn
+def near_rail(x: Expectation, processes: Processes = NONE) -> NDArray[np.bool_]:
+    """Pixels whose single frame comes within `RAIL_SIGMA` of zero or of saturation, shape (n_pixel,).
+
+    With priors wherever they carry it, and with a cosmic ray's hit.
+    """
+    factors = processes.factors(x.conditions)
+    variance, light = x.unsaturated_variance_dn2 / x.n_frames, x.light_dn / x.n_frames
+    mean = x.mean_raw_dn
+    ends = []
+    for more_light, more_dark in zip(factors.light_ends, factors.dark_ends, strict=True):
+        there = mean + (more_light - 1.0) * light + (more_dark - 1.0) * x.dark_dn
+        more = (more_light - 1.0) * x.gain_dn_per_electron * light + (more_dark - 1.0) * x.dark_variance_dn2
+        ends.append((there, RAIL_SIGMA * np.sqrt(variance + np.maximum(more, 0.0))))
+    hit = 0.0 if processes.cosmic_rays is None else x.gain_dn_per_electron * processes.cosmic_rays.electrons[1]
+    low: NDArray[np.bool_] = ends[0][0] - ends[0][1] < 0.0
+    high: NDArray[np.bool_] = ends[1][0] + ends[1][1] + hit > x.highest_dn
     return low | high
 
 
@@ -194,7 +205,7 @@ def prepare(
         _check_same_detector(quiet, other)
     factors = processes.factors(quiet.conditions)
     compared = np.zeros(len(scenarios), np.uint32) if templates is None else np.array(templates, np.uint32)
-    frames = _draw_frames(scenarios, mode)
+    frames = _draw_frames(scenarios, mode, processes)
     each = 1 if frames else quiet.n_frames
     n_pixel = quiet.wavelength_nm.size
     padded = -(-n_pixel // PIXEL_BLOCK) * PIXEL_BLOCK
@@ -385,14 +396,14 @@ def _check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
         )
 
 
-def _draw_frames(scenarios: Sequence[Expectation], mode: Mode) -> bool:
+def _draw_frames(scenarios: Sequence[Expectation], mode: Mode, processes: Processes) -> bool:
     if mode not in ("auto", "frames", "stacked"):
         raise InputError(f"mode = {mode!r}, expected 'auto', 'frames' or 'stacked'")
     if scenarios[0].n_frames == 1 or mode == "frames":
         # One frame is its own stack: the same draws either way.
         return mode == "frames" and scenarios[0].n_frames > 1
     for x in scenarios:
-        near = near_rail(x)
+        near = near_rail(x, processes)
         if near.any():
             if mode == "stacked":
                 where = float(x.wavelength_nm[near][0])
