@@ -463,6 +463,8 @@ def _saturation(x: Expectation) -> tuple[str, ...]:
     safe = x.longest_safe_frame_s
     # Rounded down: a frame of the length told is safe.
     told = np.floor(safe * 1000) / 1000
+    flares = [text for text in x.provenance.get("source history", "").split("; ") if text.startswith("flare")]
+    name = f"{x.name} with a {flares[-1].removesuffix(', added')}" if flares else x.name
     advice = (
         f"the longest safe frame is {told:g} s (brightest pixel at {x.wavelength_nm[brightest]:.1f} nm, dark and bias "
         "included)"
@@ -472,11 +474,11 @@ def _saturation(x: Expectation) -> tuple[str, ...]:
         f"{100 * touched:.3g} % of exposures"
     )
     if not x.saturated.any():
-        return (f"SATURATED at times: pixels of {x.name} come near {x.ceiling_dn:.0f} DN, and {often}.",)
+        return (f"SATURATED at times: pixels of {name} come near {x.ceiling_dn:.0f} DN, and {often}.",)
     # Runs of saturated pixels, as first and last wavelength.
     steps = np.flatnonzero(np.diff(np.concatenate([[0], x.saturated.astype(np.int8), [0]])))
     runs = [f"{x.wavelength_nm[a]:.1f}-{x.wavelength_nm[b - 1]:.1f}" for a, b in steps.reshape(-1, 2)]
     return (
         f"SATURATED: {int(x.saturated.sum())} of {x.saturated.size} pixels at {', '.join(runs)} nm reach "
-        f"{x.ceiling_dn:.0f} DN in a {x.frame_s:g} s frame of {x.name}; {advice}; {often}.",
+        f"{x.ceiling_dn:.0f} DN in a {x.frame_s:g} s frame of {name}; {advice}; {often}.",
     )

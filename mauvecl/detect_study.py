@@ -179,7 +179,7 @@ def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
     stars = list(together(engine, answered, prepared))
     costs = [text for (_, cell, *_), star in zip(prepared, stars, strict=True) for text in _template_costs(cell, star)]
     answer = DetectAnswer(study, stars)
-    blinding = [text for star in stars for text in star.found.messages]
+    blinding = [f"{text[:-1]} ({star.title})." for star in stars for text in star.found.messages]
     messages = [*blinding, *told([x for *_, group in prepared for x in group])]
     if not countable(run.fap, run.realisations):
         messages.append(

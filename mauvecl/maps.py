@@ -160,10 +160,18 @@ def detection_map(
         x=x,
         y=y,
         statistics=study.run.statistics,
-        messages=told(seen),
+        messages=[*_blinded(found["probability"]), *told(seen)],
         shares=parts,
         **found,
     )
+
+
+def _blinded(probability: NDArray[np.float64]) -> list[str]:
+    """The sentence on cells without a number, if any."""
+    cells = int(np.isnan(probability[0]).sum())
+    if not cells:
+        return []
+    return [f"SATURATED: every pixel that counts saturates in {cells} of {probability[0].size} cells: no number there."]
 
 
 Arrays = dict[str, NDArray[np.float64]]

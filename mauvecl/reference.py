@@ -295,7 +295,7 @@ def observed(
 
 
 def clipped(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray[np.int64]:
-    """Frames that each pixel of scenario 0 spends below and above the ADC's range.
+    """Frames that each pixel of scenario 0 spends below zero and above saturation.
 
     Returns
     -------

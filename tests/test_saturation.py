@@ -115,8 +115,8 @@ def test_a_flare_that_saturates_every_pixel_has_no_number(engine: Engine) -> Non
         assert np.isfinite(table[name][:2]).all()
         assert np.isnan(table[name][2:]).all()
     assert found.messages == (
-        "SATURATED: blinding saturates every pixel that counts: what is recorded no longer depends on the flare, and "
-        "no number is given.",
+        f"SATURATED: flare 2 saturates every pixel of {quiet.name} that counts: what is recorded no longer depends on "
+        "the flare, and no number is given.",
     )
 
 
