@@ -177,8 +177,8 @@ class Detection:
     def messages(self) -> tuple[str, ...]:
         """What the reader must be told of these flares."""
         return tuple(
-            f"SATURATED: flare {k + 1} saturates every pixel of {self.quiet.name} that counts: what is recorded no longer "
-            "depends on the flare, and no number is given."
+            f"SATURATED: flare {k + 1} saturates every pixel of {self.quiet.name} that counts: what is recorded no "
+            "longer depends on the flare, and no number is given."
             for k in self.blinding
         )
 

@@ -71,8 +71,8 @@ LEVEL = np.dtype(
 )
 
 #: One scenario in one pixel, read where needed: whole DN of one draw's mean that the kernels leave out, zero and
-#: saturation as `nearest` sees them, whole DN from the sum of draws to the template, and, at an element's last pixel, the template's
-#: fraction of a DN and inverse variance summed over the element.
+#: saturation as `nearest` sees them, whole DN from the sum of draws to the template, and, at an element's last pixel,
+#: the template's fraction of a DN and inverse variance summed over the element.
 EDGE = np.dtype(
     [
         ("base", "i4"),

@@ -120,10 +120,11 @@ def _cut_off(star: StarSnr) -> str:
     """How many pixels saturation cut off in the simulation, and how often."""
     result = star.result
     cut = result.counts.clipped[:, 1]
-    share = 100 * cut[cut > 0].mean() / (result.counts.n * result.expectation.n_frames) if cut.any() else 0.0
+    met = cut[cut > 0]
+    if not met.size:
+        return ""
+    share = 100 * met.mean() / (result.counts.n * result.expectation.n_frames)
     return (
-        f"{star.title}: saturation cut off {np.count_nonzero(cut)} of {cut.size} pixels in the simulation, each of them "
-        f"in {share:.3g} % of its frames on average."
-        if share
-        else ""
+        f"{star.title}: saturation cut off {met.size} of {cut.size} pixels in the simulation, each of them in "
+        f"{share:.3g} % of its frames on average."
     )
