@@ -14,7 +14,7 @@ from mauvecl.comparison import TEMPLATE, Comparison
 from mauvecl.cumulants import Cumulants, joint_is_exact, needs_fourth_power, polynomial
 from mauvecl.host.errors import InputError
 from mauvecl.poisson import SMALLEST_EXPANDED, AliasTable, table_of, table_set
-from mauvecl.processes import NONE, Factors, Processes
+from mauvecl.processes import NONE, CosmicRays, Factors, Processes
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -143,12 +143,11 @@ class Scene:
         return replace(self, job=job, templates=templates, **per_scenario)
 
 
-def near_rail(x: Expectation, processes: Processes = NONE) -> NDArray[np.bool_]:
+def near_rail(x: Expectation, factors: Factors, rays: CosmicRays | None) -> NDArray[np.bool_]:
     """Pixels whose single frame comes within `RAIL_SIGMA` of zero or of saturation, shape (n_pixel,).
 
     With priors wherever they carry it, and with a cosmic ray's hit.
     """
-    factors = processes.factors(x.conditions)
     variance, light = x.unsaturated_variance_dn2 / x.n_frames, x.light_dn / x.n_frames
     mean = x.mean_raw_dn
     ends = []
@@ -156,7 +155,7 @@ def near_rail(x: Expectation, processes: Processes = NONE) -> NDArray[np.bool_]:
         there = mean + (more_light - 1.0) * light + (more_dark - 1.0) * x.dark_dn
         more = (more_light - 1.0) * x.gain_dn_per_electron * light + (more_dark - 1.0) * x.dark_variance_dn2
         ends.append((there, RAIL_SIGMA * np.sqrt(variance + np.maximum(more, 0.0))))
-    hit = 0.0 if processes.cosmic_rays is None else x.gain_dn_per_electron * processes.cosmic_rays.electrons[1]
+    hit = 0.0 if rays is None else x.gain_dn_per_electron * rays.electrons[1]
     low: NDArray[np.bool_] = ends[0][0] - ends[0][1] < 0.0
     high: NDArray[np.bool_] = ends[1][0] + ends[1][1] + hit > x.highest_dn
     return low | high
@@ -205,7 +204,7 @@ def prepare(
         _check_same_detector(quiet, other)
     factors = processes.factors(quiet.conditions)
     compared = np.zeros(len(scenarios), np.uint32) if templates is None else np.array(templates, np.uint32)
-    frames = _draw_frames(scenarios, mode, processes)
+    frames = _draw_frames(scenarios, mode, factors, processes.cosmic_rays)
     each = 1 if frames else quiet.n_frames
     n_pixel = quiet.wavelength_nm.size
     padded = -(-n_pixel // PIXEL_BLOCK) * PIXEL_BLOCK
@@ -396,14 +395,14 @@ def _check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
         )
 
 
-def _draw_frames(scenarios: Sequence[Expectation], mode: Mode, processes: Processes) -> bool:
+def _draw_frames(scenarios: Sequence[Expectation], mode: Mode, factors: Factors, rays: CosmicRays | None) -> bool:
     if mode not in ("auto", "frames", "stacked"):
         raise InputError(f"mode = {mode!r}, expected 'auto', 'frames' or 'stacked'")
     if scenarios[0].n_frames == 1 or mode == "frames":
         # One frame is its own stack: the same draws either way.
         return mode == "frames" and scenarios[0].n_frames > 1
     for x in scenarios:
-        near = near_rail(x, processes)
+        near = near_rail(x, factors, rays)
         if near.any():
             if mode == "stacked":
                 where = float(x.wavelength_nm[near][0])

@@ -130,7 +130,7 @@ MUTATIONS = {
     ),
     "priors' tables too coarse at their ends": Mutation(
         (("mauvecl/layout.py", "PRIOR_BITS = 7", "PRIOR_BITS = 4"),),
-        "tests/kernels/test_prior.py::test_tails",
+        "tests/kernels/test_prior.py::test_moments",
     ),
     "priors' finer digits dropped": Mutation(
         (
