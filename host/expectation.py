@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import astropy.units as u
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
 
 from .errors import InputError
 from .instrument import Instrument
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
+#: Pixels whose mean is further below saturation, in standard deviations of a frame, never meet it.
+CUT_SIGMA = 8.0
 #: Longest exposure, s.
 DAY_S = 86_400.0
 
@@ -147,14 +150,27 @@ class Expectation:
         return self.n_frames * self.gain_dn_per_electron * self.source_electrons
 
     @cached_property
-    def signal_dn(self) -> Float:
-        """Mean net signal of the exposure, source and sky, DN, shape (n_pixel,)."""
+    def light_dn(self) -> Float:
+        """Mean signal of the exposure before saturation, source and sky, DN, shape (n_pixel,)."""
         return self.n_frames * self.gain_dn_per_electron * (self.source_electrons + self.sky_electrons)
 
     @cached_property
+    def signal_dn(self) -> Float:
+        """Mean net signal of the exposure as recorded, source and sky, DN, shape (n_pixel,).
+
+        `light_dn` less what saturation cuts off.
+        """
+        return self.light_dn - self._cut[0]
+
+    @cached_property
     def mean_raw_dn(self) -> Float:
-        """Mean raw level of one frame: light, dark and bias, DN, before the ADC; shape (n_pixel,)."""
-        return self.signal_dn / self.n_frames + self.dark_dn + self.bias_dn
+        """Mean raw level of one frame: light, dark and bias, DN, before saturation and the ADC; shape (n_pixel,)."""
+        return self.light_dn / self.n_frames + self.dark_dn + self.bias_dn
+
+    @cached_property
+    def recorded_dn(self) -> Float:
+        """Mean of the exposure's raw values, DN, shape (n_pixel,)."""
+        return self.n_frames * self.mean_raw_dn - self._cut[0]
 
     @cached_property
     def dark_step_dn(self) -> Float:
@@ -168,17 +184,49 @@ class Expectation:
 
     @cached_property
     def variance_dn2(self) -> Float:
-        """Variance of the exposure, DN^2, with the rounding of each frame (1/12); shape (n_pixel,).
+        """Variance of the exposure as recorded, DN^2, with the rounding of each frame (1/12); shape (n_pixel,).
 
-        Rounding is noise of mean 0 and variance 1/12 only where a frame's own noise is about 1 DN and more. For a
-        nearly noiseless detector this assumption, and every closed form that rests on it, fails: draws then differ.
+        What is left of it where frames are cut off at saturation, but never below the rounding's. Rounding is noise of
+        mean 0 and variance 1/12 only where a frame's own noise is about 1 DN and more: for a nearly noiseless detector
+        this assumption, and every closed form that rests on it, fails, and draws differ.
         """
-        return self._noise_dn2 + self.n_frames / 12
+        return self._cut[1]
+
+    @cached_property
+    def unsaturated_variance_dn2(self) -> Float:
+        """The same if nothing saturated, shape (n_pixel,)."""
+        return self._noise_of(self.light_dn) + self.n_frames / 12
 
     @cached_property
     def _noise_dn2(self) -> Float:
-        photon = self.gain_dn_per_electron * self.signal_dn
+        return self._noise_of(self.signal_dn)
+
+    def _noise_of(self, signal_dn: Float) -> Float:
+        photon = self.gain_dn_per_electron * signal_dn
         return photon + self.n_frames * (self.read_noise_dn**2 + self.dark_variance_dn2)
+
+    @cached_property
+    def _cut(self) -> tuple[Float, Float]:
+        """What saturation takes of the exposure's mean, and the variance it leaves: of a normal cut at its high end."""
+        lost, variance = np.zeros_like(self.light_dn), self.unsaturated_variance_dn2.copy()
+        sd = np.sqrt(variance / self.n_frames)
+        near = self.mean_raw_dn + CUT_SIGMA * sd > self.highest_dn
+        if near.any():
+            mean, sd = self.mean_raw_dn[near], sd[near]
+            a = (self.highest_dn - mean) / sd
+            below, density = special.ndtr(a), np.exp(-(a**2) / 2) / np.sqrt(2 * np.pi)
+            # Mean and square of min(z, a) - a; of max(z - a, 0) where little is left below.
+            first = -(a * below + density)
+            second = (a**2 + 1) * below + a * density
+            lost[near] = self.n_frames * (mean - self.highest_dn - sd * first)
+            variance[near] = self.n_frames * np.maximum(sd**2 * (second - first**2), 1 / 12)
+        return lost, variance
+
+    @cached_property
+    def cut_share(self) -> Float:
+        """Probability that saturation cuts off a frame of a pixel, shape (n_pixel,)."""
+        sd = np.sqrt(self.unsaturated_variance_dn2 / self.n_frames)
+        return np.asarray(special.ndtr((self.mean_raw_dn - self.highest_dn - 0.5) / sd))
 
     def snr(self) -> Float:
         """Signal to noise per pixel, shape (n_pixel,).
@@ -208,9 +256,11 @@ class Expectation:
         from astropy.table import QTable
 
         n, gain = self.n_frames, self.gain_dn_per_electron
+        # One, but for what saturation cuts off.
+        kept = np.divide(self.signal_dn, self.light_dn, out=np.ones_like(gain), where=self.light_dn > 0)
         variances = {
-            "source_photon": n * gain**2 * self.source_electrons,
-            "zodiacal_photon": n * gain**2 * self.sky_electrons,
+            "source_photon": n * gain**2 * self.source_electrons * kept,
+            "zodiacal_photon": n * gain**2 * self.sky_electrons * kept,
             "dark": n * self.dark_variance_dn2,
             "read": n * self.read_noise_dn**2,
             "total": self._noise_dn2,
@@ -226,6 +276,11 @@ class Expectation:
     def ceiling_dn(self) -> float:
         """Raw level at which a pixel is saturated: the detector's or the ADC's, whichever is lower, DN."""
         return min(self.saturation_dn, float(self.adc_max_dn))
+
+    @property
+    def highest_dn(self) -> int:
+        """Largest value that a frame is recorded with: the last whole DN up to `ceiling_dn`."""
+        return int(np.floor(self.ceiling_dn))
 
     @cached_property
     def saturated(self) -> NDArray[np.bool_]:
@@ -396,19 +451,36 @@ def _elements(instrument: Instrument) -> tuple[NDArray[np.int32], Float]:
     return element.astype(np.int32), instrument.output_min_nm + (held + 0.5) * width
 
 
+#: Share of exposures with a frame cut off from which it is told.
+TOLD = 1e-4
+
+
 def _saturation(x: Expectation) -> tuple[str, ...]:
     """The sentence on saturation, if any."""
-    if not x.saturated.any():
+    cut = x.cut_share
+    touched = float(-np.expm1(x.n_frames * np.sum(np.log1p(-np.minimum(cut, 1 - 1e-16)))))
+    if not x.saturated.any() and touched < TOLD:
         return ()
-    # Runs of saturated pixels, as first and last wavelength.
-    steps = np.flatnonzero(np.diff(np.concatenate([[0], x.saturated.astype(np.int8), [0]])))
-    runs = [f"{x.wavelength_nm[a]:.1f}-{x.wavelength_nm[b - 1]:.1f}" for a, b in steps.reshape(-1, 2)]
     brightest = int(np.argmax(x.mean_raw_dn))
     safe = x.longest_safe_frame_s
     # Rounded down: a frame of the length told is safe.
     told = np.floor(safe * 1000) / 1000
+    flares = [text for text in x.provenance.get("source history", "").split("; ") if text.startswith("flare")]
+    name = f"{x.name} with a {flares[-1].removesuffix(', added')}" if flares else x.name
+    advice = (
+        f"the longest safe frame is {told:g} s (brightest pixel at {x.wavelength_nm[brightest]:.1f} nm, dark and bias "
+        "included)"
+    )
+    often = (
+        f"frames are cut off there: {cut.sum():.3g} pixels of a frame on average, at least one in "
+        f"{100 * touched:.3g} % of exposures"
+    )
+    if not x.saturated.any():
+        return (f"SATURATED at times: pixels of {name} come near {x.ceiling_dn:.0f} DN, and {often}.",)
+    # Runs of saturated pixels, as first and last wavelength.
+    steps = np.flatnonzero(np.diff(np.concatenate([[0], x.saturated.astype(np.int8), [0]])))
+    runs = [f"{x.wavelength_nm[a]:.1f}-{x.wavelength_nm[b - 1]:.1f}" for a, b in steps.reshape(-1, 2)]
     return (
         f"SATURATED: {int(x.saturated.sum())} of {x.saturated.size} pixels at {', '.join(runs)} nm reach "
-        f"{x.ceiling_dn:.0f} DN in a {x.frame_s:g} s frame of {x.name}; the longest safe frame is {told:g} s "
-        f"(brightest pixel at {x.wavelength_nm[brightest]:.1f} nm, dark and bias included).",
+        f"{x.ceiling_dn:.0f} DN in a {x.frame_s:g} s frame of {name}; {advice}; {often}.",
     )

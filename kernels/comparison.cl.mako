@@ -66,7 +66,7 @@ void statistics(SCENE, const uint first_low, const uint first_high,
         for (uint frame = 0; frame < job->draw_count; frame++) {
             const Address at = address(realisation, first_high, job->first_frame + frame, job->seed_low, job->seed_high);
             Factors factors = steady;
-            factors.light *= kept(SCENE_PASSED, realisation, first_high, 0u, frame);
+            factors.light = TOGETHER(factors.light, kept(SCENE_PASSED, realisation, first_high, 0u, frame));
             draw(SCENE_PASSED, &at, 0u, start, &drawn);
             for (uint k = 0; k < scenario_count; k++)
                 for (uint i = 0; i < CHUNK; i++) {
@@ -95,7 +95,7 @@ void statistics(SCENE, const uint first_low, const uint first_high,
                     for (uint frame = exposure * job->draw_count; frame < (exposure + 1u) * job->draw_count; frame++) {
                         const Address at = address(realisation, first_high, job->first_frame + frame, job->seed_low, job->seed_high);
                         Factors other = steady;
-                        other.light *= kept(SCENE_PASSED, realisation, first_high, REFERENCE, ${"frame" if frames else "exposure * job->frame_count"});
+                        other.light = TOGETHER(other.light, kept(SCENE_PASSED, realisation, first_high, REFERENCE, ${"frame" if frames else "exposure * job->frame_count"}));
                         draw(SCENE_PASSED, &at, REFERENCE, start, &drawn);
                         for (uint i = 0; i < CHUNK; i++)
                             sum[i] += digitise(analogue(SCENE_PASSED, &drawn, i, levels + quiet + i, start + i, quiet + i, &other), edges + quiet + i) - MAGIC;

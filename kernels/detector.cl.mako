@@ -25,7 +25,7 @@ typedef struct {
 % endif
 } Draws;
 
-/* Factors on light and dark of one draw. */
+/* Factors on light and dark of one draw, less one. */
 typedef struct { floatv light, dark; } Factors;
 
 /* Words first, then normals: each is a long chain of dependent operations, and only short bodies without
@@ -72,51 +72,43 @@ INLINE void draw(SCENE_GIVEN, const Address *at, uint exposure, uint start, Draw
 % endif
 }
 
-% if modulated:
-/* A prior's value at the probability that a word stands for, from its table of quantiles. */
-INLINE floatv quantile(uintv word, __global const float *table)
-{
-    uintv cell = word >> (uintv)${32 - prior_bits}u;
-    floatv part = TO_FLOAT(AS_INT(word & (uintv)${2 ** (32 - prior_bits) - 1}u)) * ${1.0 / 2 ** (32 - prior_bits)}f;
-    floatv left = AS_FLOAT(look_up((__global const uint *)table, cell));
-    floatv right = AS_FLOAT(look_up((__global const uint *)table, cell + (uintv)1u));
-    return FMA(part, right - left, left);
-}
-% endif
-
-/* Factors of the realisation, the same in all its frames and pixels. */
+/* Factors of the realisation, less one, the same in all its frames and pixels. */
 INLINE Factors factors_of(SCENE_GIVEN, uintv realisation, uint realisation_high)
 {
-    Factors f = {(floatv)1.0f, (floatv)1.0f};
+    Factors f = {(floatv)0.0f, (floatv)0.0f};
 % if modulated:
     const Address at = address(realisation, realisation_high, 0u, job->seed_low, job->seed_high);
+    Words w;
+    floatv one;
 % for number, (name, factor) in enumerate(modulations):
 % if name != "jitter":
-    f.${factor} *= quantile(words_at(&at, ${streams[name]}u, 0u).a, priors + ${number * (2 ** prior_bits + 1)}u);
+    w = words_at(&at, ${streams[name]}u, 0u);
+    one = quantile(w.a, w.b, priors + ${2 * number * prior_nodes}u);
+    f.${factor} = TOGETHER(f.${factor}, one);
 % endif
 % endfor
 % endif
     return f;
 }
 
-/* The share of light kept by one frame, or by all frames of a stack together. */
+/* The factor of the light that one frame keeps, or all frames of a stack together, less one. */
 INLINE floatv kept(SCENE_GIVEN, uintv realisation, uint realisation_high, uint exposure, uint frame)
 {
 % if jitter is not None:
-    __global const float *table = priors + ${jitter * (2 ** prior_bits + 1)}u;
-    floatv lost = 0.0f;
+    __global const float *table = priors + ${2 * jitter * prior_nodes}u;
+    floatv sum = 0.0f;
     const uint first = job->first_frame + frame, end = ${"first + 1u" if frames else "first + job->frame_count"};
     for (uint block = first / 4u; block * 4u < end; block++) {
-        /* Four frames share a block of words. */
+        /* Four frames share a block of words; the next one's last bits are a word's finer digits. */
         const Address at = address(realisation, realisation_high, block, job->seed_low, job->seed_high);
         const Words w = words_at(&at, exposure + ${streams["jitter"]}u, 0u);
-        const uintv word[4] = {w.a, w.b, w.c, w.d};
+        const uintv word[5] = {w.a, w.b, w.c, w.d, w.a};
         for (uint i = 0; i < 4u; i++)
-            if (block * 4u + i >= first && block * 4u + i < end) lost += quantile(word[i], table);
+            if (block * 4u + i >= first && block * 4u + i < end) sum += quantile(word[i], word[i + 1u], table);
     }
-    return ${"(floatv)1.0f - lost" if frames else "FMA(lost, (floatv)(-1.0f / (float)job->frame_count), (floatv)1.0f)"};
+    return ${"sum" if frames else "sum * (1.0f / (float)job->frame_count)"};
 % else:
-    return (floatv)1.0f;
+    return (floatv)0.0f;
 % endif
 }
 
@@ -126,22 +118,23 @@ INLINE floatv analogue(SCENE_GIVEN, const Draws *drawn, uint i, __global const L
     floatv z = drawn->z[i];
 % if modulated:
     __global const Response *r = responses + at;
-    floatv variance = FMA(factors->light, (floatv)r->light_variance, FMA(factors->dark, (floatv)r->dark_variance, (floatv)r->other_variance));
-    floatv third = FMA(factors->light, (floatv)r->light_third, factors->dark * r->dark_third);
-    floatv fourth = FMA(factors->light, (floatv)r->light_fourth, factors->dark * r->dark_fourth);
+    floatv light = factors->light + 1.0f, dark = factors->dark + 1.0f;
+    floatv variance = FMA(light, (floatv)r->light_variance, FMA(dark, (floatv)r->dark_variance, (floatv)r->other_variance));
+    floatv third = FMA(light, (floatv)r->light_third, dark * r->dark_third);
+    floatv fourth = FMA(light, (floatv)r->light_fourth, dark * r->dark_fourth);
     floatv sd = root(variance), share = third / variance, zz = z * z;
     /* z + k3 (z^2 - 1) / (6 s^3) + k4 (z^3 - 3 z) / (24 s^4) - k3^2 (2 z^3 - 5 z) / (36 s^6), all times s */
     floatv cubic = (fourth * FMA(zz, (floatv)0.041666668f, (floatv)-0.125f) - third * share * FMA(zz, (floatv)0.055555556f, (floatv)-0.1388889f)) / (variance * sd);
     floatv v = FMA(z, sd + cubic, FMA(share, FMA(zz, (floatv)0.16666667f, (floatv)-0.16666667f), (floatv)level->c0));
 % if quartic:
     /* k5 (z^4 - 6 z^2 + 3) / (120 s^5) - k3 k4 (z^4 - 5 z^2 + 2) / (24 s^7) + k3^3 (12 z^4 - 53 z^2 + 17) / (324 s^9) */
-    floatv fifth = FMA(factors->light, (floatv)r->light_fifth, factors->dark * r->dark_fifth);
+    floatv fifth = FMA(light, (floatv)r->light_fifth, dark * r->dark_fifth);
     floatv even = fifth * FMA(zz, FMA(zz, (floatv)0.008333334f, (floatv)-0.05f), (floatv)0.025f);
     even = even - share * fourth * FMA(zz, FMA(zz, (floatv)0.041666668f, (floatv)-0.20833333f), (floatv)0.083333336f);
     even = even + share * share * third * FMA(zz, FMA(zz, (floatv)0.037037037f, (floatv)-0.16358025f), (floatv)0.052469134f);
     v += even / (variance * variance);
 % endif
-    v += FMA(factors->light - 1.0f, (floatv)r->light, (factors->dark - 1.0f) * r->dark);
+    v += FMA(factors->light, (floatv)r->light, factors->dark * r->dark);
 % elif joint:
 % if quartic:
     floatv v = FMA(z, (floatv)level->c4, (floatv)level->c3);

@@ -32,7 +32,7 @@ void histogram(SCENE, const uint first_low, const uint first_high, const uint st
 % if not frames:
         const Address at = address(realisation, first_high, job->first_frame, job->seed_low, job->seed_high);
         Factors factors = steady;
-        factors.light *= kept(SCENE_PASSED, realisation, first_high, 0u, 0u);
+        factors.light = TOGETHER(factors.light, kept(SCENE_PASSED, realisation, first_high, 0u, 0u));
 % endif
         for (uint start = element.first & ~3u; start < element.end; start += CHUNK) {
             Draws drawn;
@@ -46,7 +46,7 @@ void histogram(SCENE, const uint first_low, const uint first_high, const uint st
             for (uint frame = 0; frame < job->draw_count; frame++) {
                 const Address at = address(realisation, first_high, job->first_frame + frame, job->seed_low, job->seed_high);
                 Factors factors = steady;
-                factors.light *= kept(SCENE_PASSED, realisation, first_high, 0u, frame);
+                factors.light = TOGETHER(factors.light, kept(SCENE_PASSED, realisation, first_high, 0u, frame));
 % endif
                 draw(SCENE_PASSED, &at, 0u, start, &drawn);
                 for (uint i = 0; i < CHUNK; i++) {

@@ -56,6 +56,14 @@ void probe_expansion(__global const uint *restrict words, const float offset, co
     STORE(expansion_draw(z[1], offset, slope, cubic), out + n + item * ${width}u);
 }
 
+__kernel ${attributes}
+void probe_prior(__global const uint *restrict words, __global const float *restrict table, __global float *restrict out)
+{
+    /* words[2][n]: chances and their finer digits -> factors[n], less one; n = WIDTH x global size */
+    const uint item = get_global_id(0), n = get_global_size(0) * ${width}u;
+    STORE(quantile(LOAD(words + item * ${width}u), LOAD(words + n + item * ${width}u), table), out + item * ${width}u);
+}
+
 __kernel void probe_layout(__global uint *restrict out)
 {
     uint i = 0;

@@ -16,7 +16,7 @@ void realise(SCENE, const uint first_low, const uint first_high, const uint star
 % if not frames:
     const Address at = address(realisation, first_high, job->first_frame, job->seed_low, job->seed_high);
     Factors factors = steady;
-    factors.light *= kept(SCENE_PASSED, realisation, first_high, 0u, 0u);
+    factors.light = TOGETHER(factors.light, kept(SCENE_PASSED, realisation, first_high, 0u, 0u));
 % endif
     for (uint start = 0; start < pixel_count; start += CHUNK) {
         Draws drawn;
@@ -26,7 +26,7 @@ void realise(SCENE, const uint first_low, const uint first_high, const uint star
         for (uint frame = 0; frame < job->draw_count; frame++) {
             const Address at = address(realisation, first_high, job->first_frame + frame, job->seed_low, job->seed_high);
             Factors factors = steady;
-            factors.light *= kept(SCENE_PASSED, realisation, first_high, 0u, frame);
+            factors.light = TOGETHER(factors.light, kept(SCENE_PASSED, realisation, first_high, 0u, frame));
 % endif
             draw(SCENE_PASSED, &at, 0u, start, &drawn);
             for (uint i = 0; i < CHUNK; i++) {

@@ -38,7 +38,7 @@ void statistics(SCENE, const uint first_low, const uint first_high,
     for (uint v = 0; v < ${vectors}u; v++) {
         at[v] = address(realisation[v], first_high, job->first_frame, job->seed_low, job->seed_high);
         factors[v] = steady[v];
-        factors[v].light *= kept(SCENE_PASSED, realisation[v], first_high, 0u, 0u);
+        factors[v].light = TOGETHER(factors[v].light, kept(SCENE_PASSED, realisation[v], first_high, 0u, 0u));
     }
 % endif
 
@@ -53,7 +53,7 @@ void statistics(SCENE, const uint first_low, const uint first_high,
             for (uint frame = 0; frame < job->draw_count; frame++) {
                 const Address at = address(realisation[v], first_high, job->first_frame + frame, job->seed_low, job->seed_high);
                 Factors factors = steady[v];
-                factors.light *= kept(SCENE_PASSED, realisation[v], first_high, 0u, frame);
+                factors.light = TOGETHER(factors.light, kept(SCENE_PASSED, realisation[v], first_high, 0u, frame));
                 draw(SCENE_PASSED, &at, 0u, start, drawn);
                 for (uint k = 0; k < scenario_count; k++)
                     for (uint i = 0; i < CHUNK; i++) {

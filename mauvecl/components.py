@@ -65,7 +65,7 @@ def components(
     raw = np.zeros(n)
     for frame in range(scene.n_draws):
         factors = reference.factors(scene, index, frame, seed)
-        light, warm = (float(f[0]) for f in factors)
+        light, warm = ((1.0 + float(f[0])) * middle for f, middle in zip(factors, scene.medians, strict=True))
         dark_dn, photon_dn, cosmic, analogue, dn = np.zeros((5, len(scene.pixels)))
         u_dark, z_split = np.zeros((2, len(scene.pixels)))
         for group in range(len(scene.pixels) // 4):

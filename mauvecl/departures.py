@@ -239,15 +239,18 @@ def _moved(found: Detection, statistic: str, template: int, shift: Float, varian
 
 
 def _digital(x: Expectation) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
-    """What the ADC does to an exposure's mean and variance, DN, with steps alone and with ends as well.
+    """What the ADC does to an exposure's mean and variance, DN, with steps alone and with its low end as well.
+
+    Saturation, the high end, is in the closed forms.
 
     Returns
     -------
     rounded, clipped : (shift, variance), each shape (n_pixel,)
     """
-    mean, sd = x.mean_raw_dn, np.sqrt(np.maximum(x.variance_dn2 / x.n_frames - 1 / 12, 0.0))
+    mean, sd = x.mean_raw_dn, np.sqrt(np.maximum(x.unsaturated_variance_dn2 / x.n_frames - 1 / 12, 0.0))
+    recorded = x.recorded_dn / x.n_frames
     found = []
-    for low, high in ((-np.inf, np.inf), (0.0, float(x.adc_max_dn))):
+    for low, high in ((-np.inf, float(x.highest_dn)), (0.0, float(x.highest_dn))):
         shift, variance = np.zeros_like(mean), np.zeros_like(mean)
         for p, (m, s) in enumerate(zip(mean, sd, strict=True)):
             # Whole numbers around the mean, the outermost taking all that lies beyond.
@@ -256,6 +259,6 @@ def _digital(x: Expectation) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
             share = np.diff(below, prepend=0.0, append=1.0)
             seen = np.clip(dn, low, high)
             centre = float(share @ seen)
-            shift[p], variance[p] = centre - m, share @ (seen - centre) ** 2
+            shift[p], variance[p] = centre - recorded[p], share @ (seen - centre) ** 2
         found.append((x.n_frames * shift, x.n_frames * variance))
     return found[0], found[1]

@@ -179,7 +179,8 @@ def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
     stars = list(together(engine, answered, prepared))
     costs = [text for (_, cell, *_), star in zip(prepared, stars, strict=True) for text in _template_costs(cell, star)]
     answer = DetectAnswer(study, stars)
-    messages = told([x for *_, group in prepared for x in group])
+    blinding = [f"{text[:-1]} ({star.title})." for star in stars for text in star.found.messages]
+    messages = [*blinding, *told([x for *_, group in prepared for x in group])]
     if not countable(run.fap, run.realisations):
         messages.append(
             f"Thresholds at a false-alarm probability of {run.fap:g} come from importance sampling, right to "

@@ -167,6 +167,21 @@ class Detection:
             if kept is not None:
                 self._samples[key] = kept
 
+    @cached_property
+    def blinding(self) -> tuple[int, ...]:
+        """Flares that saturate every pixel that counts."""
+        used = self.scene.used
+        return tuple(k for k, x in enumerate(self.flares) if x.saturated[used].all())
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """What the reader must be told of these flares."""
+        return tuple(
+            f"SATURATED: flare {k + 1} saturates every pixel of {self.quiet.name} that counts: what is recorded no "
+            "longer depends on the flare, and no number is given."
+            for k in self.blinding
+        )
+
     def distribution(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Distribution:
         """The simulated distribution of a statistic.
 
@@ -264,7 +279,7 @@ class Detection:
         return clopper_pearson(null.above(cut), null.n)
 
     def detection_probability(self, fap: float = 1e-3, statistic: str = "chi2") -> list[Interval]:
-        """For each flare, the fraction of realisations at or above the threshold.
+        """For each flare, the fraction of realisations at or above the threshold; NaN for `blinding` ones.
 
         The interval is Clopper-Pearson's and allows for the threshold's own: its low end counts from the threshold's
         high end and the other way round.
@@ -276,6 +291,9 @@ class Detection:
         """
         probabilities = []
         for flare in range(len(self.flares)):
+            if flare in self.blinding:
+                probabilities.append(Interval(np.nan, np.nan, np.nan))
+                continue
             _, (cut, cut_low, cut_high) = self._cut(fap, statistic, flare)
             found = self._found[(statistic, "flare_on_null_grid", flare)]
             value, low, high = (clopper_pearson(found.above(index), found.n) for index in (cut, cut_high, cut_low))
@@ -343,8 +361,11 @@ class Detection:
                 theory = self.closed_form(statistic, flare)
                 limit = self.closed_form(statistic, template=flare).isf(fap)
                 dof = self.dof(statistic)
-                row = (x.name, statistic, dof, theory.mean, d.mean, d.std, d.mean / dof)
-                rows.append((*row, cut.value, cut.low, cut.high, p.value, p.low, p.high, limit, theory.sf(limit)))
+                of_flare, power = (theory.mean, d.mean, d.std, d.mean / dof), theory.sf(limit)
+                if flare in self.blinding:
+                    of_flare, power = (np.nan,) * 4, np.nan
+                row = (x.name, statistic, dof, *of_flare, cut.value, cut.low, cut.high, p.value, p.low, p.high)
+                rows.append((*row, limit, power))
         table = QTable(rows=rows, names=columns)
         for name, text in DESCRIPTIONS.items():
             table[name].info.description = text

@@ -51,7 +51,7 @@ def coverage(result: SnrResult) -> NDArray[np.float64]:
         counts' histogram, 1/64 of a standard deviation or less.
     """
     seen = result.observers[: result.scene.n_pixel]
-    signal = result.expectation.signal_dn
+    signal = result.expectation.light_dn
     gain, known = seen["gain"].astype(float), seen["variance"].astype(float)
     # Ends of the observed signals whose interval reaches the true one: net -+ sqrt(gain max(net, 0) + known) = signal.
     root = np.sqrt(gain**2 / 4 + gain * signal + known)

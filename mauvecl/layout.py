@@ -70,9 +70,9 @@ LEVEL = np.dtype(
     ]
 )
 
-#: One scenario in one pixel, read where needed: whole DN of one draw's mean that the kernels leave out, the ADC's range
-#: as `nearest` sees it, whole DN from the sum of draws to the template, and, at an element's last pixel, the template's
-#: fraction of a DN and inverse variance summed over the element.
+#: One scenario in one pixel, read where needed: whole DN of one draw's mean that the kernels leave out, zero and
+#: saturation as `nearest` sees them, whole DN from the sum of draws to the template, and, at an element's last pixel,
+#: the template's fraction of a DN and inverse variance summed over the element.
 EDGE = np.dtype(
     [
         ("base", "i4"),
@@ -150,8 +150,12 @@ USUAL_STATISTICS = ("chi2", "chi2_element", "matched")
 #: Adding and subtracting this rounds a float32 below 2**22 to the nearest whole number.
 MAGIC = 12582912.0
 
-#: Quantile tables of priors hold this many cells, between which the device interpolates.
-PRIOR_BITS = 10
+#: Priors' tables of quantiles run from each end to the median in octaves of probability, 2**-PRIOR_FINEST to 1/2, of
+#: 2**PRIOR_BITS cells each, between whose nodes the device interpolates.
+PRIOR_BITS = 7
+PRIOR_FINEST = 56
+#: Nodes from one end: 1/2 comes twice.
+PRIOR_NODES = (PRIOR_FINEST - 1) * 2**PRIOR_BITS + 2
 
 #: Histograms of S/N: one per pixel and element.
 OBSERVER_BINS = 2048

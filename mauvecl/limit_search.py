@@ -118,6 +118,8 @@ class Question:
         found = self.engine.detect(
             quiet, [flare], seed=seed, **self.study.detecting | {"statistics": (self.statistic,)}
         )
+        for message in found.messages:
+            raise InputError(f"at a {self.of} of {value:g}: {message} Expected a limit where some pixel tells")
         (probability,) = found.detection_probability(self.fap, self.statistic)
         self.points.append(Point(value, probability, seed))
         return probability

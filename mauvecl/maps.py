@@ -160,10 +160,18 @@ def detection_map(
         x=x,
         y=y,
         statistics=study.run.statistics,
-        messages=told(seen),
+        messages=[*_blinded(found["probability"]), *told(seen)],
         shares=parts,
         **found,
     )
+
+
+def _blinded(probability: NDArray[np.float64]) -> list[str]:
+    """The sentence on cells without a number, if any."""
+    cells = int(np.isnan(probability[0]).sum())
+    if not cells:
+        return []
+    return [f"SATURATED: every pixel that counts saturates in {cells} of {probability[0].size} cells: no number there."]
 
 
 Arrays = dict[str, NDArray[np.float64]]
@@ -245,4 +253,5 @@ def _fill(
             at = (s, j, i)
             found["probability"][at], found["low"][at], found["high"][at] = p.value, p.low, p.high
             limit = result.closed_form(statistic, template=k).isf(run.fap)
-            found["closed_form"][at] = result.closed_form(statistic, k).sf(limit)
+            if k not in result.blinding:
+                found["closed_form"][at] = result.closed_form(statistic, k).sf(limit)

@@ -79,6 +79,13 @@ class Probes:
         items = words.size // self.width
         return self.run("probe_alias", items, np.empty(words.size, np.uint32), words, table, np.uint32(bits))
 
+    def prior(
+        self, word: NDArray[np.uint32], finer: NDArray[np.uint32], table: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """A prior's factors, less one, at the probabilities that two words each stand for."""
+        words = np.stack([word, finer])
+        return self.run("probe_prior", word.size // self.width, np.empty(word.size, np.float32), words, table)
+
     def expansion(self, radius: NDArray[np.uint32], angle: NDArray[np.uint32], mean: float) -> NDArray[np.int64]:
         """Two rows of counts relative to the whole number nearest to the mean."""
         words, root = np.stack([radius, angle]), np.sqrt(mean)

@@ -5,7 +5,7 @@ What they draw is unknown to the observer: templates and variances stay those of
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Literal
 
@@ -15,50 +15,11 @@ from scipy import special
 
 from mauvecl import layout
 from mauvecl.host.errors import InputError
+from mauvecl.priors import Normal, Prior, Uniform, table_of
+
+__all__ = ["LIMITS", "NONE", "CosmicRays", "Factors", "Normal", "Prior", "Processes", "Uniform"]
 
 Float = NDArray[np.float64]
-
-
-@dataclass(frozen=True)
-class Uniform:
-    """A prior that is flat between two values."""
-
-    low: float
-    high: float
-
-    def __post_init__(self) -> None:
-        if not (np.isfinite(self.low) and np.isfinite(self.high) and self.low <= self.high):
-            raise InputError(f"a uniform prior from {self.low:g} to {self.high:g}, expected low <= high, both finite")
-
-    def quantile(self, probability: Float) -> Float:
-        """The values that the prior stays below with these probabilities."""
-        return self.low + (self.high - self.low) * probability
-
-
-@dataclass(frozen=True)
-class Normal:
-    """A normal prior, cut at `low` and `high`."""
-
-    mean: float
-    sd: float
-    low: float
-    high: float
-
-    def __post_init__(self) -> None:
-        if not (self.sd > 0 and np.isfinite([self.mean, self.sd, self.low, self.high]).all() and self.low < self.high):
-            raise InputError(
-                f"a normal prior of mean {self.mean:g}, sd {self.sd:g}, cut at {self.low:g} and {self.high:g}, "
-                "expected sd > 0 and low < high, all finite"
-            )
-
-    def quantile(self, probability: Float) -> Float:
-        """The values that the prior stays below with these probabilities."""
-        ends = special.ndtr((np.array([self.low, self.high]) - self.mean) / self.sd)
-        inside = special.ndtri(ends[0] + (ends[1] - ends[0]) * probability)
-        return np.asarray(np.clip(self.mean + self.sd * inside, self.low, self.high))
-
-
-Prior = Uniform | Normal
 
 
 @dataclass(frozen=True)
@@ -161,38 +122,63 @@ class Processes:
             if name != "cosmic_rays" and getattr(self, name) is not None
         )
 
-    def factors(self, conditions: Mapping[str, float]) -> NDArray[np.float32]:
-        """Quantile tables of the factors, those of the jitter being the loss itself.
+    def factors(self, conditions: Mapping[str, float]) -> Factors:
+        """What is drawn of each prior: factors on light or dark, less one.
 
         Parameters
         ----------
         conditions : mapping of float
             The expectation's own values: ``temperature_c``, ``dark_slope_per_c``, ``light_loss``, ``pointing_loss``.
 
-        Returns
-        -------
-        ndarray of float32, shape (n_modulation, 2**PRIOR_BITS + 1)
-
         Raises
         ------
         InputError
             For a prior that reaches where no value can be.
         """
-        probability = np.linspace(0.0, 1.0, 2**layout.PRIOR_BITS + 1)
-        rows = []
-        for name, _ in self.modulations:
-            value = getattr(self, name).quantile(probability)
+        changes: dict[str, Callable[[Float], Float]] = {
+            "jitter": lambda lost: -lost,
+            "detector_temperature": lambda t: np.expm1(
+                conditions["dark_slope_per_c"] * (t - conditions["temperature_c"])
+            ),
+            "light_loss": lambda lost: (conditions["light_loss"] - lost) / (1.0 - conditions["light_loss"]),
+            "pointing_loss": lambda lost: (conditions["pointing_loss"] - lost) / (1.0 - conditions["pointing_loss"]),
+            "qe_scale": lambda scale: scale - 1.0,
+        }
+        tables = np.empty((len(self.modulations), 2 * layout.PRIOR_NODES), np.float32)
+        ends = {"light": (1.0, 1.0), "dark": (1.0, 1.0)}
+        centre = {"light": 1.0, "dark": 1.0}
+        for row, (name, factor) in enumerate(self.modulations):
+            prior = getattr(self, name)
+            first, last = prior.quantile(np.array([0.0, 1.0]))
             low, high = LIMITS[name]
-            if not (low <= value[0] and value[-1] <= high):
-                raise InputError(
-                    f"the prior of {name} runs from {value[0]:g} to {value[-1]:g}, expected {low:g} to {high:g}"
-                )
-            if name == "detector_temperature":
-                value = np.exp(conditions["dark_slope_per_c"] * (value - conditions["temperature_c"]))
-            elif name in ("light_loss", "pointing_loss"):
-                value = (1.0 - value) / (1.0 - conditions[name])
-            rows.append(value)
-        return np.array(rows, np.float32).reshape(len(rows), probability.size)
+            if not (low <= first and last <= high):
+                raise InputError(f"the prior of {name} runs from {first:g} to {last:g}, expected {low:g} to {high:g}")
+            tables[row], middle = table_of(prior, changes[name])
+            centre[factor] *= 1.0 + middle
+            least, most = sorted(1.0 + changes[name](np.array([first, last])))
+            ends[factor] = ends[factor][0] * float(least), ends[factor][1] * float(most)
+        return Factors(tables, centre["light"], centre["dark"], ends["light"], ends["dark"])
+
+
+@dataclass(frozen=True, eq=False)
+class Factors:
+    """What priors do to light and dark.
+
+    Attributes
+    ----------
+    tables : ndarray of float32, shape (n_modulation, 2 * layout.PRIOR_NODES)
+        See `priors.table_of`.
+    light, dark : float
+        Factors of priors at their medians, which the tables are relative to.
+    light_ends, dark_ends : tuple of float, shape (2,)
+        Smallest and largest factors of all priors together.
+    """
+
+    tables: NDArray[np.float32]
+    light: float
+    dark: float
+    light_ends: tuple[float, float]
+    dark_ends: tuple[float, float]
 
 
 #: Where each prior's values must lie.

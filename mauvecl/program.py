@@ -21,7 +21,7 @@ from mauvecl.kernel_cache import kernel_cache
 if TYPE_CHECKING:
     import pyopencl
 
-ROOMS = ("portable", "philox", "normal", "poisson", "detector")
+ROOMS = ("portable", "philox", "normal", "poisson", "prior", "detector")
 POCL = "Portable Computing Language"
 
 
@@ -228,6 +228,8 @@ def render(rooms: tuple[str, ...], variant: Variant) -> str:
         "modulated": bool(variant.modulations),
         "jitter": next((i for i, (name, _) in enumerate(variant.modulations) if name == "jitter"), None),
         "prior_bits": layout.PRIOR_BITS,
+        "prior_finest": layout.PRIOR_FINEST,
+        "prior_nodes": layout.PRIOR_NODES,
         "observer_bins": layout.OBSERVER_BINS,
         "bins": layout.BINS,
         "fine_bits": layout.FINE_BITS,

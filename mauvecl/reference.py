@@ -181,31 +181,41 @@ def draws(
     return Draws(z, dark, photon, cosmic)
 
 
-def quantile(word: NDArray[np.uint32], table: Floats) -> Floats:
-    """A prior's value at the probability that a word stands for."""
-    bits = layout.PRIOR_BITS
-    cell = word >> np.uint32(32 - bits)
-    part = (word & np.uint32(2 ** (32 - bits) - 1)).astype(np.float32) * np.float32(1.0 / 2 ** (32 - bits))
+def quantile(word: NDArray[np.uint32], finer: NDArray[np.uint32], table: Floats) -> Floats:
+    """A prior's factor, less one, at the probability that a word and its finer digits stand for."""
+    low_bits = 23 - layout.PRIOR_BITS
+    side = word.view(np.int32) >> 31
+    within = ((finer & np.uint32(0x7FFFFF)).astype(np.float32) + np.float32(0.5)) * np.float32(2.0**-23)
+    t = (word.view(np.int32) ^ side).astype(np.float32) + within
+    bits = t.view(np.uint32) - np.uint32((127 + 32 - layout.PRIOR_FINEST) << 23)
+    cell = (bits >> np.uint32(low_bits)) + (side.view(np.uint32) & np.uint32(layout.PRIOR_NODES))
+    part = (bits & np.uint32(2**low_bits - 1)).astype(np.float32) * np.float32(2.0**-low_bits)
     return fma(part, table[cell + 1] - table[cell], table[cell])
+
+
+def together(a: Floats, b: Floats) -> Floats:
+    """The product of two factors, all less one."""
+    return fma(a, b, a + b)
 
 
 def factors(
     scene: Scene, realisation: NDArray[np.uint64], frame: int, seed: int, *, exposure: int = 0
 ) -> tuple[Floats, Floats]:
-    """Factors on light and dark of one draw, each shape (n_realisation,)."""
-    found = {"light": np.ones(len(realisation), np.float32), "dark": np.ones(len(realisation), np.float32)}
-    kept = np.ones(len(realisation), np.float32)
+    """Factors on light and dark of one draw, over those at the priors' medians and less one, shape (n_realisation,)."""
+    found = {"light": np.zeros(len(realisation), np.float32), "dark": np.zeros(len(realisation), np.float32)}
+    kept = np.zeros(len(realisation), np.float32)
     first = int(scene.job["first_frame"]) + frame
     for (name, factor), table in zip(scene.modulations, scene.priors, strict=True):
         if name != "jitter":
-            found[factor] = found[factor] * quantile(words_at(realisation, 0, name, 0, seed)[0], table)
+            words = words_at(realisation, 0, name, 0, seed)
+            found[factor] = together(found[factor], quantile(words[0], words[1], table))
             continue
-        lost = np.zeros(len(realisation), np.float32)
         for f in range(first, first + (1 if scene.frames else scene.n_frames)):
-            lost = lost + quantile(words_at(realisation, f // 4, name, 0, seed, exposure)[f % 4], table)
-        one = np.float32(1.0)
-        kept = one - lost if scene.frames else fma(lost, np.float32(-1.0) / np.float32(scene.n_frames), one)
-    return found["light"] * kept, found["dark"]
+            words = words_at(realisation, f // 4, name, 0, seed, exposure)
+            kept = kept + quantile(words[f % 4], words[(f + 1) % 4], table)
+        if not scene.frames:
+            kept = kept * (np.float32(1.0) / np.float32(scene.n_frames))
+    return together(found["light"], kept), found["dark"]
 
 
 def analogue(scene: Scene, drawn: Draws, i: int, pixel: int, k: int, light: Floats, dark: Floats) -> Floats:
@@ -230,7 +240,11 @@ def analogue(scene: Scene, drawn: Draws, i: int, pixel: int, k: int, light: Floa
     return v
 
 
-def _responding(r: np.void, c0: np.float32, z: Floats, light: Floats, dark: Floats, *, quartic: bool) -> Floats:
+def _responding(
+    r: np.void, c0: np.float32, z: Floats, light_change: Floats, dark_change: Floats, *, quartic: bool
+) -> Floats:
+    one = np.float32(1.0)
+    light, dark = light_change + one, dark_change + one
     variance = fma(light, r["light_variance"], fma(dark, r["dark_variance"], r["other_variance"]))
     third = fma(light, r["light_third"], dark * r["dark_third"])
     fourth = fma(light, r["light_fourth"], dark * r["dark_fourth"])
@@ -246,8 +260,7 @@ def _responding(r: np.void, c0: np.float32, z: Floats, light: Floats, dark: Floa
             even = even - share * fourth * _quartic(zz, 0.041666668, -0.20833333, 0.083333336)
             even = even + share * share * third * _quartic(zz, 0.037037037, -0.16358025, 0.052469134)
             v = v + even / (variance * variance)
-    one = np.float32(1.0)
-    out: Floats = v + fma(light - one, r["light"], (dark - one) * r["dark"])
+    out: Floats = v + fma(light_change, r["light"], dark_change * r["dark"])
     return out
 
 
@@ -294,7 +307,7 @@ def observed(
 
 
 def clipped(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray[np.int64]:
-    """Frames that each pixel of scenario 0 spends below and above the ADC's range.
+    """Frames that each pixel of scenario 0 spends below zero and above saturation.
 
     Returns
     -------

@@ -185,7 +185,7 @@ def histograms(
     -------
     pixel_counts, element_counts : ndarray of int64, shapes (n_pixel, OBSERVER_BINS) and (n_element, OBSERVER_BINS)
     clipped : ndarray of int64, shape (n_pixel, 2)
-        Below and above the ADC's range.
+        Below zero and above saturation.
     """
     bins, half = layout.OBSERVER_BINS, layout.OBSERVER_BINS // 2
     n = observed(scene, realisation, seed, scenarios=[0])[0]

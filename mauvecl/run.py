@@ -133,7 +133,7 @@ class Run:
         Returns
         -------
         ndarray of uint32, shape (tile.wanted,)
-            Frames of any pixel that met the ADC's range.
+            Frames of any pixel cut off at zero or saturation.
         """
         flags = self._cl.mem_flags
         clipped = np.empty(tile.wanted, np.uint32)

@@ -14,7 +14,7 @@ from mauvecl.comparison import TEMPLATE, Comparison
 from mauvecl.cumulants import Cumulants, joint_is_exact, needs_fourth_power, polynomial, stack_is_exact
 from mauvecl.host.errors import InputError
 from mauvecl.poisson import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, table_of, table_set
-from mauvecl.processes import NONE, Processes
+from mauvecl.processes import NONE, CosmicRays, Factors, Processes
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -67,7 +67,9 @@ class Scene:
     dark_counts : ndarray of layout.POISSON, shape (n_padded,)
     tables : ndarray of uint32
         Alias tables, end to end.
-    priors : ndarray of float32, shape (n_modulation, 2**PRIOR_BITS + 1)
+    priors : ndarray of float32, shape (n_modulation, 2 * PRIOR_NODES)
+    medians : tuple of float, shape (2,)
+        Factors on light and dark of priors at their medians.
     templates : ndarray of uint32, shape (n_scenario,)
         For each scenario the one whose mean and variance it is compared with.
     fraction : ndarray, shape (n_scenario, n_padded)
@@ -98,6 +100,7 @@ class Scene:
     responses: NDArray[np.void]
     tables: NDArray[np.uint32]
     priors: NDArray[np.float32]
+    medians: tuple[float, float]
     templates: NDArray[np.uint32]
     fraction: Float
     estimates: NDArray[np.void]
@@ -140,11 +143,21 @@ class Scene:
         return replace(self, job=job, templates=templates, **per_scenario)
 
 
-def near_rail(x: Expectation) -> NDArray[np.bool_]:
-    """Pixels whose single frame comes within `RAIL_SIGMA` of the ADC's ends, shape (n_pixel,)."""
-    reach = RAIL_SIGMA * np.sqrt(x.variance_dn2 / x.n_frames)
-    low: NDArray[np.bool_] = x.mean_raw_dn - reach < 0.0
-    high: NDArray[np.bool_] = x.mean_raw_dn + reach > x.adc_max_dn
+def near_rail(x: Expectation, factors: Factors, rays: CosmicRays | None) -> NDArray[np.bool_]:
+    """Pixels whose single frame comes within `RAIL_SIGMA` of zero or of saturation, shape (n_pixel,).
+
+    With priors wherever they carry it, and with a cosmic ray's hit.
+    """
+    variance, light = x.unsaturated_variance_dn2 / x.n_frames, x.light_dn / x.n_frames
+    mean = x.mean_raw_dn
+    ends = []
+    for more_light, more_dark in zip(factors.light_ends, factors.dark_ends, strict=True):
+        there = mean + (more_light - 1.0) * light + (more_dark - 1.0) * x.dark_dn
+        more = (more_light - 1.0) * x.gain_dn_per_electron * light + (more_dark - 1.0) * x.dark_variance_dn2
+        ends.append((there, RAIL_SIGMA * np.sqrt(variance + np.maximum(more, 0.0))))
+    hit = 0.0 if rays is None else x.gain_dn_per_electron * rays.electrons[1]
+    low: NDArray[np.bool_] = ends[0][0] - ends[0][1] < 0.0
+    high: NDArray[np.bool_] = ends[1][0] + ends[1][1] + hit > x.highest_dn
     return low | high
 
 
@@ -190,11 +203,11 @@ def prepare(
         raise InputError(f"{quiet.wavelength_nm.size} pixels, expected at most {MOST_PIXELS}")
     for other in scenarios[1:]:
         _check_same_detector(quiet, other)
+    factors = processes.factors(quiet.conditions)
     compared = np.zeros(len(scenarios), np.uint32) if templates is None else np.array(templates, np.uint32)
     modulations = processes.modulations
-    priors = processes.factors(quiet.conditions)
-    corners = _corners(modulations, priors)
-    frames = _draw_frames(scenarios, mode, corners)
+    corners = _corners(factors)
+    frames = _draw_frames(scenarios, mode, factors, processes.cosmic_rays, corners)
     each = 1 if frames else quiet.n_frames
     n_pixel = quiet.wavelength_nm.size
     padded = -(-n_pixel // PIXEL_BLOCK) * PIXEL_BLOCK
@@ -236,18 +249,18 @@ def prepare(
     noisier = 1.0 + comparison.share
     levels["shift"] = edges["low"] = edges["high"] = layout.MAGIC
     for k, (x, c) in enumerate(zip(scenarios, cumulants, strict=True)):
-        mean = c.mean.copy()
+        mean = c.mean + (factors.light - 1.0) * c.light_dn + (factors.dark - 1.0) * c.dark_dn
         if not joint:
             mean = each * x.bias_dn + quiet.dark_step_dn * dark_centre
             if photons:
                 mean += x.gain_dn_per_electron * _counts(counts[k, :n_pixel], c.photons, x.gain_dn_per_electron, tables)
             else:
                 mean += x.gain_dn_per_electron * c.photons
-        base[k] = np.clip(np.rint(mean), 0, x.adc_max_dn if each == 1 else np.inf)
+        base[k] = np.clip(np.rint(mean), 0, x.highest_dn if each == 1 else np.inf)
         level = levels[k, :n_pixel]
         if modulations:
-            _respond(responses[k, :n_pixel], c)
-            _check_reach(x, c, priors, modulations)
+            _respond(responses[k, :n_pixel], c, factors)
+            _check_reach(x, c, factors)
         elif joint:
             for name, coefficient in zip(("c0", "c1", "c2", "c3", "c4"), shapes[k], strict=True):
                 level[name] = coefficient
@@ -255,7 +268,7 @@ def prepare(
             level["c1"] = np.sqrt(c.gaussian)
         level["c0"] += mean - base[k]
         template = scenarios[compared[k]]
-        mean_sum = template.n_frames * template.mean_raw_dn
+        mean_sum = template.recorded_dn
         whole = (quiet.n_frames // each) * base[k] - np.rint(mean_sum)
         if not comparison.exposures:
             fraction[k, :n_pixel] = np.rint(mean_sum) - mean_sum
@@ -266,7 +279,7 @@ def prepare(
         edge = edges[k, :n_pixel]
         edge["base"], edge["whole"] = base[k], whole
         edge["low"] = layout.MAGIC - base[k]
-        edge["high"] = layout.MAGIC + (x.adc_max_dn - base[k])
+        edge["high"] = layout.MAGIC + (x.highest_dn - base[k])
         if comparison.estimated:
             _estimate(estimates[k], template, fraction[k], np.rint(mean_sum))
         element_variance = np.bincount(quiet.element, variance * used)
@@ -302,7 +315,8 @@ def prepare(
         photon_counts=counts,
         responses=responses,
         tables=np.concatenate([np.zeros(1, np.uint32)[:0], *(t.entries for t in tables)]).astype(np.uint32),
-        priors=priors,
+        priors=factors.tables,
+        medians=(factors.light, factors.dark),
         templates=compared,
         fraction=fraction,
         estimates=estimates,
@@ -312,15 +326,10 @@ def prepare(
     )
 
 
-def _corners(
-    modulations: tuple[tuple[str, Literal["light", "dark"]], ...], priors: NDArray[np.float32]
-) -> list[tuple[float, float]]:
+def _corners(factors: Factors) -> list[tuple[float, float]]:
     """Factors on light and dark over all that the priors allow, neighbours at most a factor of 2 apart."""
-    ends = {"light": [1.0, 1.0], "dark": [1.0, 1.0]}
-    for (name, factor), table in zip(modulations, priors, strict=True):
-        values = 1.0 - table if name == "jitter" else table
-        ends[factor] = [ends[factor][0] * float(values.min()), ends[factor][1] * float(values.max())]
-    grids = [np.geomspace(low, high, 1 + int(np.ceil(np.log2(high / low)))) for low, high in ends.values()]
+    ends = (factors.light_ends, factors.dark_ends)
+    grids = [np.geomspace(low, high, 1 + int(np.ceil(np.log2(high / low)))) for low, high in ends]
     return [(float(light), float(dark)) for light in grids[0] for dark in grids[1]]
 
 
@@ -382,32 +391,26 @@ def _estimate(out: NDArray[np.void], template: Expectation, fraction: Float, mea
     out["variance"][:n_pixel] = np.maximum(template.n_frames * known, NO_VARIANCE)
 
 
-def _respond(out: NDArray[np.void], c: Cumulants) -> None:
-    """How a draw follows factors on light and dark."""
-    out["light"], out["dark"] = c.light_dn, c.dark_dn
-    out["light_variance"], out["dark_variance"] = c.light_variance, c.dark_variance
+def _respond(out: NDArray[np.void], c: Cumulants, factors: Factors) -> None:
+    """How a draw follows factors on light and dark, from what they are at the priors' medians."""
+    light, dark = factors.light, factors.dark
+    out["light"], out["dark"] = light * c.light_dn, dark * c.dark_dn
+    out["light_variance"], out["dark_variance"] = light * c.light_variance, dark * c.dark_variance
     # A pixel without any noise must not divide zero by zero.
     out["other_variance"] = np.maximum(c.variance - c.light_variance - c.dark_variance, NO_VARIANCE)
     for order, name in ((3, "third"), (4, "fourth"), (5, "fifth")):
-        out[f"light_{name}"], out[f"dark_{name}"] = c.photon_cumulant(order), c.dark_cumulant(order)
+        out[f"light_{name}"] = light * c.photon_cumulant(order)
+        out[f"dark_{name}"] = dark * c.dark_cumulant(order)
 
 
-def _check_reach(
-    x: Expectation,
-    c: Cumulants,
-    priors: NDArray[np.float32],
-    modulations: tuple[tuple[str, Literal["light", "dark"]], ...],
-) -> None:
+def _check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
     """Refuse what the priors could carry further than the device rounds."""
-    most = {"light": 1.0, "dark": 1.0}
-    least = {"light": 1.0, "dark": 1.0}
-    for (name, factor), table in zip(modulations, priors, strict=True):
-        values = 1.0 - table if name == "jitter" else table
-        most[factor] *= float(values.max())
-        least[factor] *= float(values.min())
-    swing = {f: max(abs(most[f] - 1.0), abs(least[f] - 1.0)) for f in most}
-    reach = swing["light"] * c.light_dn + swing["dark"] * c.dark_dn
-    reach += 8.0 * np.sqrt(c.variance + swing["light"] * c.light_variance + swing["dark"] * c.dark_variance)
+    light, dark = (
+        max(most - middle, middle - least)
+        for (least, most), middle in ((factors.light_ends, factors.light), (factors.dark_ends, factors.dark))
+    )
+    variance = c.variance + factors.light_ends[1] * c.light_variance + factors.dark_ends[1] * c.dark_variance
+    reach = light * c.light_dn + dark * c.dark_dn + 8.0 * np.sqrt(variance)
     if (reach >= REACH_DN).any():
         pixel = int(np.argmax(reach))
         raise InputError(
@@ -416,18 +419,24 @@ def _check_reach(
         )
 
 
-def _draw_frames(scenarios: Sequence[Expectation], mode: Mode, corners: Sequence[tuple[float, float]]) -> bool:
+def _draw_frames(
+    scenarios: Sequence[Expectation],
+    mode: Mode,
+    factors: Factors,
+    rays: CosmicRays | None,
+    corners: Sequence[tuple[float, float]],
+) -> bool:
     if mode not in ("auto", "frames", "stacked"):
         raise InputError(f"mode = {mode!r}, expected 'auto', 'frames' or 'stacked'")
     if scenarios[0].n_frames == 1 or mode == "frames":
         # One frame is its own stack: the same draws either way.
         return mode == "frames" and scenarios[0].n_frames > 1
     for x in scenarios:
-        near = near_rail(x)
+        near = near_rail(x, factors, rays)
         # The less light and dark, the less the rounding is noise.
         coarse = ~stack_is_exact(Cumulants.of(x, 1).scaled(*corners[0]), x)
         for found, why in (
-            (near, f"cannot clip, and a frame comes within {RAIL_SIGMA:g} sigma of the ADC's range"),
+            (near, f"cannot clip, and a frame comes within {RAIL_SIGMA:g} sigma of zero or saturation"),
             (coarse, "takes rounding for noise, and a frame has too little noise of its own for that"),
         ):
             if found.any():
@@ -454,6 +463,7 @@ def _check_same_detector(quiet: Expectation, other: Expectation) -> None:
         "dark_unit",
         "photon_noise",
         "adc_max_dn",
+        "saturation_dn",
     ):
         if not np.array_equal(getattr(quiet, name), getattr(other, name)):
             raise InputError(

@@ -72,7 +72,7 @@ class Counts:
     pixel : ndarray of int64, shape (n_pixel, OBSERVER_BINS)
     element : ndarray of int64, shape (n_element, OBSERVER_BINS)
     clipped : ndarray of int64, shape (n_pixel, 2)
-        Frames below and above the ADC's range.
+        Frames below zero and above saturation.
     n : int
         Realisations.
     """
@@ -133,7 +133,7 @@ class SnrResult:
         frames = self.counts.n * x.n_frames
         for name, column in (("clipped_low", 0), ("clipped_high", 1)):
             table[name] = self.counts.clipped[:, column] / frames
-            table[name].info.description = "share of frames that met this end of the ADC's range"
+            table[name].info.description = "share of frames cut off at this end: zero or saturation"
         return table
 
     @property

@@ -113,4 +113,18 @@ def snr(study: Study, engine: Engine | Pool) -> SnrAnswer:
     if isinstance(engine, Pool):
         engine.expect(len(prepared) * run.realisations)
     stars = list(together(engine, answered, prepared))
-    return SnrAnswer(study, stars, told([x for _, _, x in prepared]))
+    return SnrAnswer(study, stars, [*told([x for _, _, x in prepared]), *filter(None, map(_cut_off, stars))])
+
+
+def _cut_off(star: StarSnr) -> str:
+    """How many pixels saturation cut off in the simulation, and how often."""
+    result = star.result
+    cut = result.counts.clipped[:, 1]
+    met = cut[cut > 0]
+    if not met.size:
+        return ""
+    share = 100 * met.mean() / (result.counts.n * result.expectation.n_frames)
+    return (
+        f"{star.title}: saturation cut off {met.size} of {cut.size} pixels in the simulation, each of them in "
+        f"{share:.3g} % of its frames on average."
+    )

@@ -17,7 +17,7 @@ pytestmark = pytest.mark.skipif(ICD is None, reason="Oclgrind is not installed (
 KERNELS = """
 import sys
 import numpy as np
-from mauvecl import selftest
+from mauvecl import layout, selftest
 from mauvecl.engine import Engine
 from mauvecl.probes import Probes
 
@@ -30,6 +30,8 @@ assert selftest.known_answers(engine).passed
 probes.normal(words, words[::-1].copy())
 probes.expansion(words, words[::-1].copy(), 2225.0)
 probes.alias(words, np.zeros(16, np.uint32), 4)
+ends = np.repeat(np.array([0, 1, 2**31 - 1, 2**31, 2**32 - 1], np.uint32), 32)
+probes.prior(ends, ~ends, np.zeros(2 * layout.PRIOR_NODES, np.float32))
 print("kernels", len(engine._programs))
 """
 

@@ -36,6 +36,30 @@ def test_a_prior_is_what_the_light_follows(engine: Engine) -> None:
     assert stats.kstest(found, stats.truncnorm(-2, 2, 1.0, 0.3).cdf).pvalue > 1e-6
 
 
+@pytest.mark.parametrize("sd", [0.01, 0.1])
+def test_a_prior_has_its_own_moments(engine: Engine, sd: float) -> None:
+    """A normal prior with far cuts, as the light shows it: five standard errors each, by chance once in 4e5."""
+    light = total_light(engine, Processes(qe_scale=Normal(1.0, sd, 0.5, 1.5)))
+    noise = total_light(engine, NONE).var()
+    variance = light.var() - noise
+    assert abs(light.mean() - 1) < 5 * sd / np.sqrt(N)
+    assert abs(variance / sd**2 - 1) < 5 * np.sqrt(2 / N) * light.var() / variance
+    assert abs(stats.kurtosis(light)) < 5 * np.sqrt(24 / N)
+
+
+def test_jitter_shares_words_but_no_chance(engine: Engine) -> None:
+    """Frames take finer digits from each other's words: no correlation; five standard errors, by chance once in 2e5."""
+    (x,) = star(magnitude=2.0, exposure=5.0)
+    jitter = Processes(jitter=Normal(0.1, 0.02, 0.0, 0.5))
+    lost = []
+    for frame in range(4):
+        raw = engine.realise(x, count=5000, seed=12, processes=jitter, first_frame=frame)
+        lost.append((raw.astype(float) - x.mean_raw_dn).sum(axis=1))
+    for values in (np.array(lost), np.array(lost) ** 2):
+        found = np.corrcoef(values)[np.triu_indices(4, 1)]
+        assert np.abs(found).max() < 5 / np.sqrt(5000)
+
+
 def test_the_detector_temperature_moves_the_dark(engine: Engine) -> None:
     (x,) = star(magnitude=30.0, exposure=5.0)
     raw = engine.realise(x, count=N, seed=3, processes=Processes(detector_temperature=Uniform(13.0, 21.0)))

@@ -151,6 +151,31 @@ MUTATIONS = {
         (("mauvecl/layout.py", '"dark": 1', '"dark": 0'),),
         "tests/kernels/test_layout.py::test_streams_are_distinct_bytes",
     ),
+    "priors' tables too coarse at their ends": Mutation(
+        (("mauvecl/layout.py", "PRIOR_BITS = 7", "PRIOR_BITS = 4"),),
+        "tests/kernels/test_prior.py::test_moments",
+    ),
+    "priors' finer digits dropped": Mutation(
+        (
+            ("kernels/prior.cl.mako", "finer & (uintv)0x7fffffu", "finer & (uintv)0u"),
+            ("mauvecl/reference.py", "finer & np.uint32(0x7FFFFF)", "finer & np.uint32(0)"),
+        ),
+        "tests/kernels/test_prior.py::test_tails",
+    ),
+    "saturation at the ADC's end alone": Mutation(
+        (("host/expectation.py", "min(self.saturation_dn, float(self.adc_max_dn))", "float(self.adc_max_dn)"),),
+        "tests/test_saturation.py::test_closed_forms_are_those_of_what_is_drawn",
+    ),
+    "template of what is not recorded": Mutation(
+        (
+            (
+                "mauvecl/scene.py",
+                "mean_sum = template.recorded_dn",
+                "mean_sum = template.n_frames * template.mean_raw_dn",
+            ),
+        ),
+        "tests/test_saturation.py::test_closed_forms_are_those_of_what_is_drawn",
+    ),
     "noise of what is subtracted forgotten": Mutation(
         (("mauvecl/scene.py", "noisier = 1.0 + comparison.share", "noisier = 1.0"),),
         "tests/test_tails.py::test_brute_force_agrees_whatever_is_compared",

@@ -73,6 +73,8 @@ def detect(
     for row in found.table:
         amplitude, digits = f"{100 * row['amplitude']:g} %", (row["expected"], row["mean"])
         probability = f"{row['probability']:.4f}", f"[{row['low']:.4f}, {row['high']:.4f}]"
+        if row["probability"] != row["probability"]:
+            probability = "saturated", ""
         cells.append(
             (row["star"], *(short(row[name]) for name in swept), amplitude, row["statistic"],
              *(f"{value:.2f}" for value in digits), f"{row['reduced']:.3f}", f"{row['threshold']:.2f}", *probability,

@@ -187,7 +187,7 @@ class Page:
         assert self.theory is not None
         assert self.quiet is not None
         q, theory = self.question, self.theory
-        chance = theory.closed_form(q.statistic, 0).sf(self._cut)
+        chance = float("nan") if theory.blinding else theory.closed_form(q.statistic, 0).sf(self._cut)
         return (
             f"<b>{_percent(chance)}</b> of such flares are detected by {q.statistic} at a false-alarm probability of "
             f"{q.fap:g} per test: threshold {self._cut:.5g}, closed form for Gaussian noise. Best S/N "
@@ -338,7 +338,8 @@ class Page:
 
 
 def _percent(value: float) -> str:
-    return f"{100 * float(value):.2f} %"
+    # Without a number where every pixel that counts is saturated.
+    return f"{100 * float(value):.2f} %" if value == value else "(saturated)"
 
 
 def _refined(study: Study, pool: Pool) -> tuple[DetectAnswer, SnrAnswer]:

@@ -1,0 +1,169 @@
+"""Priors: the device's map from words to factors, integrated exactly, against the distribution asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from mauvecl import reference
+from mauvecl.host.errors import InputError
+from mauvecl.priors import Normal, Prior, Uniform, nodes
+from mauvecl.probes import Probes
+from mauvecl.processes import Processes
+
+CONDITIONS = {"temperature_c": 21.0, "dark_slope_per_c": 0.0684, "light_loss": 0.34, "pointing_loss": 0.02}
+#: What each prior's value makes of the light or the dark.
+FACTOR: dict[str, Callable[[np.ndarray], np.ndarray]] = {
+    "jitter": lambda x: 1 - x,
+    "detector_temperature": lambda x: np.exp(0.0684 * (x - 21.0)),
+    "light_loss": lambda x: (1 - x) / (1 - 0.34),
+    "pointing_loss": lambda x: (1 - x) / (1 - 0.02),
+    "qe_scale": lambda x: x,
+}
+PRIORS = [
+    ("qe_scale", Normal(1.0, 0.01, 0.5, 1.5)),  # cut at 50 sd
+    ("qe_scale", Normal(1.0, 1e-6, 0.5, 1.5)),  # narrower than float32 near one
+    ("qe_scale", Normal(50.0, 1e-5, 40.0, 60.0)),  # far from one
+    ("qe_scale", Normal(1.0, 0.3, 0.4, 1.6)),
+    ("qe_scale", Normal(0.5, 0.1, 0.5, 5.0)),  # half a normal
+    ("qe_scale", Normal(0.1, 0.03, 1.0, 5.0)),  # cut 30 sd away, an exponential
+    ("qe_scale", Normal(90.0, 0.001, 0.5, 1.5)),  # and 88 500 sd on the other side
+    ("qe_scale", Normal(1.0, 100.0, 0.99, 1.01)),  # flat between the cuts
+    ("qe_scale", Uniform(0.5, 1.5)),
+    ("qe_scale", Uniform(1.0, 1.0 + 1e-7)),
+    ("light_loss", Normal(0.34, 0.01, 0.1, 0.6)),
+    ("light_loss", Uniform(0.24, 0.44)),
+    ("pointing_loss", Normal(0.0, 0.02, 0.0, 0.5)),
+    ("pointing_loss", Uniform(0.0, 0.99)),
+    ("jitter", Uniform(0.0, 0.05)),
+    ("jitter", Normal(0.02, 0.001, 0.0, 0.5)),
+    ("detector_temperature", Uniform(13.0, 21.0)),
+    ("detector_temperature", Normal(21.0, 0.01, -100.0, 100.0)),
+    ("detector_temperature", Normal(13.0, 10.0, -100.0, 100.0)),
+    ("detector_temperature", Uniform(-100.0, 100.0)),
+]
+
+
+def drawn(probes: Probes, name: str, prior: Prior, tail: np.ndarray, upper: bool) -> np.ndarray:
+    """Factors on the device at probabilities from an end of the table."""
+    found = Processes(**{name: prior}).factors(CONDITIONS)
+    scaled = np.append(tail, np.full(-tail.size % 16, 0.5)) * 2**32
+    word = np.minimum(np.floor(scaled), 2**31 - 1).astype(np.uint32)
+    finer = np.minimum((scaled - word) * 2**23, 2**23 - 1).astype(np.uint32)
+    # Bits above the finer ones belong to someone else.
+    finer |= np.uint32(0xA5800000)
+    less_one = probes.prior(~word if upper else word, finer, found.tables[0]).astype(np.float64)[: tail.size]
+    centre = found.light * found.dark
+    return centre * (1 + less_one)
+
+
+def density(prior: Prior) -> tuple[np.ndarray, np.ndarray]:
+    """Values and weights of a quadrature over the prior, from its density alone."""
+    low, high = prior.low, prior.high
+    shape = np.zeros_like
+    if isinstance(prior, Normal):
+        # The part that holds all but 1e-15, from where the density is largest.
+        top = np.clip(prior.mean, low, high)
+        slope = abs(top - prior.mean) / prior.sd
+        reach = prior.sd * min(9.0, 40.0 / slope if slope > 0 else 9.0)
+        low, high = max(low, top - reach), min(high, top + reach)
+
+        def shape(x: np.ndarray) -> np.ndarray:
+            return (x - top) * (x + top - 2 * prior.mean) / (2 * prior.sd**2)
+
+    t, w = np.polynomial.legendre.leggauss(20)
+    edges = np.linspace(low, high, 201)
+    half = np.diff(edges)[:, None] / 2
+    x = (edges[:-1, None] + half * (1 + t)).ravel()
+    weight = (half * w).ravel() * np.exp(-shape(x))
+    return x, weight / weight.sum()
+
+
+def moments(x: np.ndarray, weight: np.ndarray) -> tuple[float, float, float, float]:
+    """Mean, standard deviation, skewness and kurtosis."""
+    mean = float(weight @ x)
+    sd = float(np.sqrt(weight @ (x - mean) ** 2))
+    return mean, sd, *(float(weight @ ((x - mean) / sd) ** k) for k in (3, 4))
+
+
+@pytest.mark.parametrize(("name", "prior"), PRIORS)
+def test_moments(probes: Probes, name: str, prior: Prior) -> None:
+    """Every cell of the table integrated: no draws, no chance."""
+    t, w = np.polynomial.legendre.leggauss(3)
+    edges = np.append(0.0, nodes()[:-1])
+    half = np.diff(edges)[:, None] / 2
+    tail, weight = (edges[:-1, None] + half * (1 + t)).ravel(), (half * w).ravel()
+    values = np.concatenate([drawn(probes, name, prior, tail, upper) for upper in (False, True)])
+    mean, sd, skew, kurtosis = moments(values, np.append(weight, weight))
+    wanted = moments(FACTOR[name](density(prior)[0]), density(prior)[1])
+    assert mean == pytest.approx(wanted[0], abs=1e-4 * wanted[1])
+    assert sd == pytest.approx(wanted[1], rel=1e-4)
+    assert skew == pytest.approx(wanted[2], abs=1e-3, rel=3e-4)
+    assert kurtosis == pytest.approx(wanted[3], rel=3e-4)
+
+
+@pytest.mark.parametrize("chance", [1e-9, 1e-7, 1e-5, 1e-3, 0.1])
+@pytest.mark.parametrize(("name", "prior"), PRIORS)
+def test_tails(probes: Probes, name: str, prior: Prior, chance: float) -> None:
+    """As much lies beyond the device's value as its word says, within 0.1 % and what float32 resolves of the spread."""
+    for upper in (False, True):
+        (value,) = drawn(probes, name, prior, np.array([chance]), upper)
+        found = Processes(**{name: prior}).factors(CONDITIONS)
+        ulp = 2.0**-23 * float(np.abs(found.tables[0]).max()) * found.light * found.dark + 1e-15 * value
+        beyond = [outside(prior, invert(name, v), upper) for v in (value - ulp, value, value + ulp)]
+        assert min(beyond) * (1 - 1e-3) <= chance <= max(beyond) * (1 + 1e-3)
+
+
+def invert(name: str, factor: float) -> float:
+    """The prior's value behind a factor."""
+    if name == "detector_temperature":
+        return 21.0 + np.log(factor) / 0.0684
+    if name == "qe_scale":
+        return factor
+    return 1 - factor * (1 - CONDITIONS.get(name, 0.0))
+
+
+def outside(prior: Prior, value: float, upper: bool) -> float:
+    """Probability beyond a value, by quadrature of the density between it and the end."""
+    value = min(max(value, prior.low), prior.high)
+    low, high = (value, prior.high) if upper else (prior.low, value)
+    if isinstance(prior, Uniform):
+        return (high - low) / (prior.high - prior.low)
+
+    def log_integral(a: float, b: float) -> float:
+        """Of exp(-(x - mean)^2 / 2 sd^2), from where it is largest."""
+        top = np.clip(prior.mean, a, b)
+        slope = abs(top - prior.mean) / prior.sd
+        reach = prior.sd * min(12.0, 60.0 / slope if slope > 0 else 12.0)
+        a, b = max(a, top - reach), min(b, top + reach)
+        t, w = np.polynomial.legendre.leggauss(20)
+        edges = np.linspace(a, b, 101)
+        half = np.diff(edges)[:, None] / 2
+        x = edges[:-1, None] + half * (1 + t)
+        total = np.sum(half * w * np.exp(-(x - top) * (x + top - 2 * prior.mean) / (2 * prior.sd**2)))
+        with np.errstate(divide="ignore"):
+            return float(np.log(total)) - (top - prior.mean) ** 2 / (2 * prior.sd**2)
+
+    return float(np.exp(log_integral(low, high) - log_integral(prior.low, prior.high)))
+
+
+def test_the_twin_has_the_same_bits(probes: Probes) -> None:
+    """At the ends of words, octaves and cells, and at random words."""
+    table = Processes(qe_scale=Normal(1.0, 0.01, 0.5, 1.5)).factors(CONDITIONS).tables[0]
+    ends = np.concatenate([[2**k - 1, 2**k, 2**k + 1] for k in range(1, 32)]).astype(np.uint32)
+    word, finer = (grid.ravel() for grid in np.meshgrid(np.concatenate([[0], ends, ~ends, [2**32 - 1]]), ends))
+    word, finer = word.astype(np.uint32), finer.astype(np.uint32)
+    extra = np.random.default_rng(8).integers(0, 2**32, (2, 2**15 - word.size % 16), dtype=np.uint32)
+    word, finer = np.append(word, extra[0]), np.append(finer, extra[1])
+    found = probes.prior(word, finer, table)
+    np.testing.assert_array_equal(found.view(np.uint32), reference.quantile(word, finer, table).view(np.uint32))
+    order = np.argsort(word.astype(np.float64) + (finer & np.uint32(0x7FFFFF)) / 2**23 * (word < 2**31), kind="stable")
+    low = order[word[order] < 2**31]
+    assert (np.diff(found[low]) >= 0).all()
+
+
+def test_a_cut_too_far_is_refused() -> None:
+    with pytest.raises(InputError, match=r"9\.9e\+06 sd from its mean, expected at most 100000"):
+        Normal(1.0, 1e-7, 1.99, 3.0)
