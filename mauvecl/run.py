@@ -325,7 +325,7 @@ class Run:
             return
         self._cl.enqueue_copy(self._queue, self._named["outside"], np.zeros_like(outside))
         for index in np.flatnonzero(outside):
-            found = tally.add_far(index, self.channel(tile, tally.grids[index].channel))
+            found = tally.add_far(int(index), self.channel(tile, tally.grids[index].channel))
             if found != outside[index]:
                 raise DeviceError(
                     f"{self._engine.device_name} has {outside[index]} values outside a histogram where the host has "

@@ -130,8 +130,8 @@ class Counts:
             steps = np.rint((ratio - element["centre"]) * element["bins_per_unit"])
             if not (np.abs(steps) < MOST_BINS).all():
                 raise InputError(
-                    f"the S/N of resolution element {e} is {ratio[np.abs(steps).argmax()]:g} in a realisation where "
-                    f"{element['centre']:g} was expected, expected one that bins of 1/{element['bins_per_unit']:g} reach"
+                    f"the S/N of resolution element {e} is {ratio[np.abs(steps).argmax()]:g} in a realisation, "
+                    f"expected something nearer to its closed form of {element['centre']:g}"
                 )
             self._count_far("element", e, steps.astype(np.int64))
 
@@ -195,7 +195,7 @@ class SnrResult:
         x, seen = self.expectation, self.observers[: self.scene.n_pixel]
         width = 2.0 ** seen["bin_shift"].astype(float)
 
-        def snr(which: NDArray[np.intp], place: NDArray[np.float64]) -> NDArray[np.float64]:
+        def snr(which: NDArray[np.intp], place: NDArray[np.number]) -> NDArray[np.float64]:
             # A bin holds the whole DN from its lower edge to one below the next.
             dn = width[which] * place - 0.5
             net = dn + seen["net_offset"].astype(float)[which]
@@ -220,7 +220,7 @@ class SnrResult:
             where=self.elements["bins_per_unit"] > 0,
         )
 
-        def snr(which: NDArray[np.intp], place: NDArray[np.float64]) -> NDArray[np.float64]:
+        def snr(which: NDArray[np.intp], place: NDArray[np.number]) -> NDArray[np.float64]:
             return np.asarray(self.elements["centre"][which] + step[which] * (place - 0.5))
 
         return self._table("element", x.element_wavelength_nm, x.snr_per_element(), snr)
@@ -236,7 +236,7 @@ class SnrResult:
         kind: str,
         wavelength_nm: NDArray[np.float64],
         expected: NDArray[np.float64],
-        snr: Callable[[NDArray[np.intp], NDArray[np.float64]], NDArray[np.float64]],
+        snr: Callable[[NDArray[np.intp], NDArray[np.number]], NDArray[np.float64]],
     ) -> QTable:
         """A row for each pixel or element; `snr` of those, at places between the edges of bins, which are whole."""
         import astropy.units as u
