@@ -187,9 +187,8 @@ class Detection:
         """What was counted; InputError where it has values that are no finite numbers."""
         statistic, role, flare = key
         found = self._found[key]
-        found.refuse_undefined(
-            f"statistic {statistic!r} of {(self.quiet if role == 'null' else self.flares[flare]).name}"
-        )
+        of = "without a flare" if role == "null" else f"with flare {flare + 1}"
+        found.refuse_undefined(f"statistic {statistic!r} {of}")
         return found
 
     def closed_form(self, statistic: str, flare: int | None = None, *, template: int = 0) -> QuadraticForm | Normal:

@@ -168,7 +168,7 @@ def test_order_and_pieces_change_nothing() -> None:
         parts.add_far(0, piece)
     ours, theirs = whole.far[0].found(), parts.far[0].found()
     assert ours.equals(theirs)
-    inside = np.abs(np.rint(values * np.float32(2048)) + 0.5) < 65532
+    inside = np.abs(np.rint(values.astype(float) * 2048) + 0.5) < 65532
     assert ours.first == sum(Fraction(float(x)) for x in values[~inside]) * 2**149
     assert ours.second == sum(Fraction(float(x)) ** 2 for x in values[~inside]) * 2**298
 
