@@ -1,5 +1,6 @@
 ## Histograms of each pixel's counts and each resolution element's S/N, over realisations.
 ## An observer's S/N of a pixel is a function of its count alone, so that the count's histogram holds it.
+## What lies outside is only marked, in the first and the last bin and in `outside`: the host counts it from raw spectra.
 % if width == 1:
 /* Many work-items to an element: whole-number additions, whose order changes nothing. */
 #define COUNT(pointer) atomic_inc(pointer)
@@ -10,12 +11,15 @@
 #define ADD(pointer, n) (*(pointer) += (n))
 % endif
 
+/* Whether a bin is the first or the last. */
+#define END(bin) (((bin) == 0) | ((bin) == ${observer_bins - 1}))
 #define WANTED(lane) (row + (lane) >= start_row && row + (lane) < stop_row)
 
 __kernel ${attributes}
 void histogram(SCENE, const uint first_low, const uint first_high, const uint start_row, const uint stop_row,
                __global const Observer *restrict observers, __global const Element *restrict elements,
-               __global uint *restrict pixel_counts, __global uint *restrict element_counts, __global uint *restrict clipped)
+               __global uint *restrict pixel_counts, __global uint *restrict element_counts, __global uint *restrict clipped,
+               __global uint *restrict outside)
 {
     /* pixel_counts[pixel][bin], element_counts[element][bin], clipped[pixel][low, high] */
     const uint e = get_global_id(0);
@@ -29,6 +33,7 @@ void histogram(SCENE, const uint first_low, const uint first_high, const uint st
         const bool whole = row >= start_row && row + ${width}u <= stop_row;
         const Factors steady = factors_of(SCENE_PASSED, realisation, first_high);
         floatv signal = 0.0f, variance = 0.0f;
+        intv ended = 0;
 % if not frames:
         const Address at = address(realisation, first_high, job->first_frame, job->seed_low, job->seed_high);
         Factors factors = steady;
@@ -69,6 +74,7 @@ void histogram(SCENE, const uint first_low, const uint first_high, const uint st
                 variance += FMA(most(net, (floatv)0.0f), (floatv)observers[p].gain, (floatv)observers[p].variance);
                 intv bin = (TO_INT(n[i]) >> (intv)(int)observers[p].bin_shift) + ${observer_bins // 2};
                 bin = least(most(bin, (intv)0), (intv)${observer_bins - 1});
+                ended |= END(bin);
                 int lanes[${width}];
                 STORE(bin, lanes);
                 __global uint *mine = pixel_counts + p * ${observer_bins}u;
@@ -91,10 +97,19 @@ void histogram(SCENE, const uint first_low, const uint first_high, const uint st
 % endif
             }
         }
-        floatv steps = (signal / root(variance) - element.centre) * element.bins_per_unit;
+        /* Zero where the observer knows of no noise. */
+        floatv ratio = variance > 0.0f ? signal / root(variance) : (floatv)0.0f;
+        floatv steps = (ratio - element.centre) * element.bins_per_unit;
         steps = least(most(steps, (floatv)${-(observer_bins // 2)}.0f), (floatv)${observer_bins // 2 - 1}.0f);
-        int lanes[${width}];
-        STORE(TO_INT(nearest(steps)) + ${observer_bins // 2}, lanes);
-        for (uint lane = 0; lane < ${width}u; lane++) if (WANTED(lane)) COUNT(element_counts + e * ${observer_bins}u + lanes[lane]);
+        intv bin = TO_INT(nearest(steps)) + ${observer_bins // 2};
+        ended |= END(bin);
+        int lanes[${width}], ends[${width}];
+        STORE(bin, lanes);
+        STORE(ended, ends);
+        for (uint lane = 0; lane < ${width}u; lane++) {
+            if (!WANTED(lane)) continue;
+            COUNT(element_counts + e * ${observer_bins}u + lanes[lane]);
+            if (ends[lane]) ${"atomic_or(outside + e, 1u)" if width == 1 else "outside[e] = 1u"};
+        }
     }
 }

@@ -25,6 +25,7 @@ import numpy as np
 from mauvecl import __version__
 from mauvecl.durable import alone, differing_keys, write_whole
 from mauvecl.host.errors import InputError
+from mauvecl.shards import FORM
 
 if TYPE_CHECKING:
     from mauvecl.shards import Arrays
@@ -122,6 +123,7 @@ class Checkpoint:
             if manifest["digest"] != _digest_of(manifest):
                 raise ValueError
             theirs = {"mauvecl": manifest["mauvecl"], "verb": manifest["verb"], **manifest["study"]}
+            form = manifest.get("form", 1)
         except (OSError, ValueError, KeyError, TypeError):
             # Files are named by what they answer: those of another study are never asked for.
             self.messages.append(
@@ -130,6 +132,11 @@ class Checkpoint:
             )
             self._write_manifest()
             return
+        if form != FORM:
+            raise InputError(
+                f"the unfinished run in {str(self.folder)!r} keeps its counts in form {form}, expected form {FORM} as "
+                "this version writes: --restart to forget it"
+            )
         ours = {"mauvecl": __version__, "verb": self.verb, **self._plain_study()}
         differing = differing_keys(ours, theirs)
         if differing:
@@ -198,7 +205,7 @@ class Checkpoint:
         return dict(tomllib.loads(self.study.toml()))
 
     def _write_manifest(self) -> None:
-        manifest = {"mauvecl": __version__, "verb": self.verb, "study": self._plain_study()}
+        manifest = {"mauvecl": __version__, "form": FORM, "verb": self.verb, "study": self._plain_study()}
         text = json.dumps(manifest | {"digest": _digest_of(manifest)}, indent=2)
         write_whole(self.folder / MANIFEST, text.encode())
 

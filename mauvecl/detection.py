@@ -195,8 +195,16 @@ class Detection:
         """
         self._check(statistic, flare, template)
         if flare is None:
-            return self._found[self._null_key(statistic, template)]
-        return self._found[(statistic, "flare", flare)]
+            return self._at(self._null_key(statistic, template))
+        return self._at((statistic, "flare", flare))
+
+    def _at(self, key: Key) -> Distribution:
+        """What was counted; InputError where it has values that are no finite numbers."""
+        statistic, role, flare = key
+        found = self._found[key]
+        of = "without a flare" if role == "null" else f"with flare {flare + 1}"
+        found.refuse_undefined(f"statistic {statistic!r} {of}")
+        return found
 
     def closed_form(self, statistic: str, flare: int | None = None, *, template: int = 0) -> QuadraticForm | Normal:
         """The same distribution for Gaussian noise; parameters as for `distribution`."""
@@ -244,16 +252,16 @@ class Detection:
         Returns
         -------
         Interval
-            The simulated upper quantile, rounded up to a bin's edge (1/512 of a standard deviation), and an
-            order-statistic interval; from importance sampling where tails are sampled and few lie beyond.
+            The simulated upper quantile, rounded up to a bin's edge (1/512 of a standard deviation, or 2**-13 of the
+            value beyond 32 of them), and an order-statistic interval; where tails are sampled and few lie beyond, what
+            importance sampling found.
 
         Raises
         ------
         InputError
             If fewer than 100 realisations lie beyond and tails are counted: the tail is never extrapolated.
         """
-        null, bins = self._cut(fap, statistic, template)
-        return Interval(*(float(null.edge(index)) for index in bins))
+        return self._cut(fap, statistic, template)
 
     def tail(self, fap: float, statistic: str = "chi2", *, template: int = 0) -> Tail | None:
         """The importance sampling behind a threshold, or None where realisations were counted."""
@@ -271,12 +279,10 @@ class Detection:
     def false_alarm_probability(self, threshold: float, statistic: str = "chi2", *, template: int = 0) -> Interval:
         """Fraction of null realisations at or above a threshold, with its interval; the inverse of `threshold`.
 
-        The threshold is taken at the next bin edge upwards.
+        Exact at edges of bins, as thresholds that were counted are; linear within a bin.
         """
         null = self.distribution(statistic, template=template)
-        edges = np.asarray(null.edge(np.arange(null.counts.size)))
-        cut = int(np.searchsorted(edges, threshold * (1 - 1e-12) if threshold > 0 else threshold))
-        return clopper_pearson(null.above(cut), null.n)
+        return self._share_above(null, Interval(threshold, threshold, threshold))
 
     def detection_probability(self, fap: float = 1e-3, statistic: str = "chi2") -> list[Interval]:
         """For each flare, the fraction of realisations at or above the threshold; NaN for `blinding` ones.
@@ -294,11 +300,19 @@ class Detection:
             if flare in self.blinding:
                 probabilities.append(Interval(np.nan, np.nan, np.nan))
                 continue
-            _, (cut, cut_low, cut_high) = self._cut(fap, statistic, flare)
-            found = self._found[(statistic, "flare_on_null_grid", flare)]
-            value, low, high = (clopper_pearson(found.above(index), found.n) for index in (cut, cut_high, cut_low))
-            probabilities.append(Interval(value.value, low.low, high.high))
+            cut = self._cut(fap, statistic, flare)
+            probabilities.append(self._share_above(self._at((statistic, "flare_on_null_grid", flare)), cut))
         return probabilities
+
+    @staticmethod
+    def _share_above(found: Distribution, cut: Interval) -> Interval:
+        """The share at or above a threshold; its interval is of whole counts, at the ends of the threshold's own."""
+        value, low, high = (found.above(x) for x in (cut.value, cut.high, cut.low))
+        return Interval(
+            value / found.n,
+            clopper_pearson(int(np.floor(low)), found.n).low,
+            clopper_pearson(int(np.ceil(high)), found.n).high,
+        )
 
     def quantile(
         self, probability: float, statistic: str = "chi2", flare: int | None = None, *, template: int = 0
@@ -320,6 +334,7 @@ class Detection:
 
         self._check(statistic, flare, template)
         key: Key = (statistic, "flare", flare) if flare is not None else self._null_key(statistic, template)
+        self._at(key)
         kept = self._samples[key]
         table = QTable({"realisation": kept.realisations, "value": kept.values})
         table["value"].info.description = "of the statistic, as the device computed it"
@@ -328,8 +343,8 @@ class Detection:
     def roc(self, statistic: str = "chi2", flare: int = 0) -> Roc:
         """False-alarm probability against detection probability, and the area under the curve."""
         self._check(statistic, flare)
-        null = self._found[self._null_key(statistic, flare)]
-        return Roc.of(null, self._found[(statistic, "flare_on_null_grid", flare)])
+        null = self._at(self._null_key(statistic, flare))
+        return Roc.of(null, self._at((statistic, "flare_on_null_grid", flare)))
 
     def plot(self, path: str | Path | None = None, *, fap: float = 1e-3) -> object:
         """Null and flare distributions by every statistic, with thresholds; needs matplotlib."""
@@ -383,19 +398,15 @@ class Detection:
     def _null(self, statistic: str, template: int) -> int:
         return template if statistic in SHAPED else 0
 
-    def _cut(self, fap: float, statistic: str, template: int) -> tuple[Distribution, tuple[int, int, int]]:
-        """The null, and the bins whose lower edges are the threshold and the ends of its interval."""
+    def _cut(self, fap: float, statistic: str, template: int) -> Interval:
+        """The threshold: as it was sampled, or the null's lowest edges with so many at or above them."""
         sampled = self.tail(fap, statistic, template=template)
-        null = self._found[self._null_key(statistic, template)]
         if sampled is not None:
-            edges = np.asarray(null.edge(np.arange(null.counts.size)))
-            t = sampled.threshold
-            value, low, high = (int(np.searchsorted(edges, x)) for x in (t.value, t.low, t.high))
-            return null, (value, low, high)
+            return sampled.threshold
+        null = self._at(self._null_key(statistic, template))
         n_low, n_high = central_counts(null.n, fap)
         wanted = (int(np.floor(fap * null.n * (1 + 1e-12))), n_high, max(n_low - 1, 0))
-        value, low, high = (null.first_bin_with_at_most(n) for n in wanted)
-        return null, (value, low, high)
+        return Interval(*map(null.edge_with_at_most, wanted))
 
     def _check(self, statistic: str, flare: int | None, template: int = 0) -> None:
         if statistic not in self.statistics:

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl import layout
 from mauvecl.cumulants import Cumulants
 from mauvecl.detect_study import DetectAnswer, detect
 from mauvecl.labels import described
 from mauvecl.questions import UNITS, Axis, Sweep
+from mauvecl.snr import steps_of
 from mauvecl.snr_study import SnrAnswer, snr
 from mauvecl.study import Study
 
@@ -60,10 +60,10 @@ def coverage(result: SnrResult) -> NDArray[np.float64]:
     low = np.where(low < 0, signal - np.sqrt(known), low)
     width = 2.0 ** seen["bin_shift"].astype(float)
     shares = np.empty(signal.size)
-    for p, counts in enumerate(result.counts.pixel):
-        edges = width[p] * (np.arange(layout.OBSERVER_BINS + 1) - layout.OBSERVER_BINS // 2) - 0.5
-        below = np.concatenate([[0], counts.cumsum()]) / result.counts.n
-        ends = np.interp([low[p], high[p]], edges + float(seen["net_offset"][p]), below)
+    for p in range(signal.size):
+        filled, counts = result.counts.filled("pixel", p)
+        edges = width[p] * np.column_stack([filled, filled + 1]).ravel() - 0.5
+        ends = np.interp([low[p], high[p]], edges + float(seen["net_offset"][p]), steps_of(counts) / result.counts.n)
         shares[p] = ends[1] - ends[0]
     return shares
 

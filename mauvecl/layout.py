@@ -157,15 +157,14 @@ PRIOR_FINEST = 56
 #: Nodes from one end: 1/2 comes twice.
 PRIOR_NODES = (PRIOR_FINEST - 1) * 2**PRIOR_BITS + 2
 
-#: Histograms of S/N: one per pixel and element.
+#: Histograms of S/N: one per pixel and element; the first and the last bin only mark what lies outside.
 OBSERVER_BINS = 2048
 
-#: A histogram has BINS bins of 2**FINE_BITS fine steps; a statistic's standard deviation is STEPS_PER_SIGMA steps.
+#: A histogram has BINS bins of 2**FINE_BITS fine steps; a statistic's standard deviation is STEPS_PER_SIGMA steps. What
+#: falls into the first or the last, or further out, is only marked there: `far` counts it.
 BINS = 32768
 FINE_BITS = 2
 STEPS_PER_SIGMA = 2048
-#: Values further out are held here; squares of it sum to 2**63 only after 2**27 realisations in one tile.
-STEP_LIMIT = 2**18 - 1
 
 #: Minimax fits in float32, made by tools/fit_normal.py: -2 ln(1 + f) / f for f in [sqrt(1/2) - 1, sqrt(2) - 1],
 #: sin(pi s) / s and cos(pi s) in s^2 for s in [-1/2, 1/2].

@@ -233,7 +233,6 @@ def render(rooms: tuple[str, ...], variant: Variant) -> str:
         "observer_bins": layout.OBSERVER_BINS,
         "bins": layout.BINS,
         "fine_bits": layout.FINE_BITS,
-        "limit": layout.STEP_LIMIT,
         "structs": {name: dtype.names for name, dtype in layout.STRUCTS.items()},
     }
     names = (*ROOMS, *rooms)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mauvecl import layout
 from mauvecl.reference import MAGIC, Floats, clipped, fma, nearest, observed
 from mauvecl.scene import Scene
+from mauvecl.snr import Counts
 
 if TYPE_CHECKING:
     from mauvecl.channels import ChannelPlan
@@ -178,19 +179,17 @@ def histograms(
     elements: NDArray[np.void],
     realisation: NDArray[np.uint64],
     seed: int,
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """The kernel `histogram`: each pixel's counts, each element's S/N, and frames clipped.
-
-    Returns
-    -------
-    pixel_counts, element_counts : ndarray of int64, shapes (n_pixel, OBSERVER_BINS) and (n_element, OBSERVER_BINS)
-    clipped : ndarray of int64, shape (n_pixel, 2)
-        Below zero and above saturation.
-    """
-    bins, half = layout.OBSERVER_BINS, layout.OBSERVER_BINS // 2
+) -> Counts:
+    """The kernel `histogram`: each pixel's counts, each element's S/N, and frames clipped; nothing has an end."""
+    counts, half = Counts(scene.n_pixel, len(elements)), layout.OBSERVER_BINS // 2
     n = observed(scene, realisation, seed, scenarios=[0])[0]
-    pixel_counts = np.zeros((scene.n_pixel, bins), np.int64)
-    element_counts = np.zeros((len(elements), bins), np.int64)
+
+    def count(kind: str, which: int, numbers: NDArray[np.int64]) -> None:
+        inner = np.abs(numbers + 0.5) < half - 1
+        dense = counts.pixel if kind == "pixel" else counts.element
+        dense[which] = np.bincount(numbers[inner] + half, minlength=2 * half)
+        counts.far[kind].count(which * 2**32 + 2**31 + numbers[~inner])
+
     for e, element in enumerate(elements):
         signal, variance = (np.zeros(len(realisation), np.float32) for _ in range(2))
         for p in range(int(element["first"]), int(element["end"])):
@@ -198,31 +197,47 @@ def histograms(
             net = n[p] + observer["net_offset"]
             signal = signal + net
             variance = variance + fma(np.maximum(net, np.float32(0.0)), observer["gain"], observer["variance"])
-            whole = (n[p].astype(np.int64) >> int(observer["bin_shift"])) + half
-            pixel_counts[p] = np.bincount(np.clip(whole, 0, bins - 1), minlength=bins)
-        with np.errstate(invalid="ignore"):
-            steps = (signal / np.sqrt(variance) - element["centre"]) * element["bins_per_unit"]
-        whole = nearest(np.clip(steps, np.float32(-half), np.float32(half - 1))).astype(np.int64) + half
-        element_counts[e] = np.bincount(whole, minlength=bins)
-    return pixel_counts, element_counts, clipped(scene, realisation, seed).sum(axis=0)
+            count("pixel", p, n[p].astype(np.int64) >> int(observer["bin_shift"]))
+        ratio = np.divide(signal, np.sqrt(variance), out=np.zeros_like(signal), where=variance > 0)
+        steps = (ratio - element["centre"]) * element["bins_per_unit"]
+        count("element", e, np.rint(steps).astype(np.int64))
+    counts.clipped += clipped(scene, realisation, seed).sum(axis=0)
+    counts.n = len(realisation)
+    return counts
 
 
-def tally(values: NDArray[np.float32], grids: NDArray[np.void]) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
-    """Histograms, shape (n_grid, BINS), and sums of fine steps and their squares, shape (n_grid, 2).
+def tally(
+    values: NDArray[np.float32], grids: NDArray[np.void]
+) -> tuple[NDArray[np.uint32], NDArray[np.int64], NDArray[np.uint32]]:
+    """The kernel `tally`: what each grid counts.
 
     Parameters
     ----------
     values : ndarray of float32, shape (n_channel, n)
     grids : ndarray of layout.GRID, shape (n_grid,)
+
+    Returns
+    -------
+    histogram : ndarray of uint32, shape (n_grid, BINS)
+        The first and last bins with everything outside.
+    sums : ndarray of int64, shape (n_grid, 2)
+        Of fine steps and of their squares, without those.
+    outside : ndarray of uint32, shape (n_grid,)
     """
     bins = layout.BINS
     histogram = np.zeros((len(grids), bins), np.uint32)
     sums = np.zeros((len(grids), 2), np.int64)
-    limit = np.float32(layout.STEP_LIMIT)
+    outside = np.zeros(len(grids), np.uint32)
+    end = np.float32(bins // 2 << layout.FINE_BITS)
     for g, grid in enumerate(grids):
-        steps = (values[int(grid["channel"])] - grid["centre"]) * grid["steps_per_unit"]
-        step = nearest(np.clip(steps, -limit, limit)).astype(np.int64)
-        bin_index = np.clip((step >> layout.FINE_BITS) + bins // 2, 0, bins - 1)
+        with np.errstate(over="ignore", invalid="ignore"):
+            steps = (values[int(grid["channel"])] - grid["centre"]) * grid["steps_per_unit"]
+        # What is no number lies at the lower end.
+        steps = np.where(steps > -end, np.minimum(steps, end - np.float32(1.0)), -end)
+        step = nearest(steps).astype(np.int64)
+        bin_index = (step >> layout.FINE_BITS) + bins // 2
         histogram[g] = np.bincount(bin_index, minlength=bins)
-        sums[g] = step.sum(), (step * step).sum()
-    return histogram, sums
+        inner = step[(bin_index > 0) & (bin_index < bins - 1)]
+        sums[g] = inner.sum(), (inner * inner).sum()
+        outside[g] = step.size - inner.size
+    return histogram, sums, outside

@@ -27,7 +27,7 @@ class Roc:
     Attributes
     ----------
     threshold, fap, probability : ndarray, shape (n,)
-        At bin edges of the null's histogram; those between which nothing lies are left out.
+        At edges of bins; those between which nothing lies are left out.
     realisations : int
         Of the null, and of the flare.
     area : Interval
@@ -50,24 +50,27 @@ class Roc:
         they share their draws, so that the interval errs on the wide side. Without any overlap the lower end is
         Clopper and Pearson's for as many pairs as there are realisations.
         """
-        share = [d.counts / d.n for d in (null, flare)]
-        # Whole numbers above each bin's lower edge, so that the ends of the curve are 1 and 0.
-        above = [d.counts[::-1].cumsum()[::-1] / d.n for d in (null, flare)]
-        beaten, beating = 1.0 - above[0] + 0.5 * share[0], above[1] - 0.5 * share[1]
+        # Bins of both that hold anything; those of one grid are the same.
+        lower, first = np.unique(np.concatenate([null.bins[0], flare.bins[0]]), return_index=True)
+        upper = np.concatenate([null.bins[1], flare.bins[1]])[first]
+        share, above = np.zeros((2, lower.size)), np.zeros((2, lower.size + 1))
+        for i, d in enumerate((null, flare)):
+            counts = np.zeros(lower.size, np.int64)
+            counts[np.searchsorted(lower, d.bins[0])] = d.bins[2]
+            share[i] = counts / d.n
+            # Whole numbers above each edge, so that the ends of the curve are 1 and 0.
+            above[i, :-1] = counts[::-1].cumsum()[::-1] / d.n
+        beaten, beating = 1.0 - above[0, :-1] + 0.5 * share[0], above[1, :-1] - 0.5 * share[1]
         area = float(np.clip(share[1] @ beaten, 0.0, 1.0))
         spread = [float(c @ (values - area) ** 2) for c, values in ((share[1], beaten), (share[0], beating))]
         reach = float(special.ndtri(0.5 + CONFIDENCE / 2)) * float(np.sqrt(spread[0] / flare.n + spread[1] / null.n))
         low, high = max(area - reach, 0.0), min(area + reach, 1.0)
-        filled = [np.flatnonzero(d.counts) for d in (null, flare)]
-        if filled[0][-1] < filled[1][0] or filled[1][-1] < filled[0][0]:
+        if null.bins[0][-1] < flare.bins[0][0] or flare.bins[0][-1] < null.bins[0][0]:
             area = float(round(area))
             n = min(null.n, flare.n)
             sure = clopper_pearson(round(area) * n, n)
             low, high = sure.low, sure.high
-        fap, probability = above
-        keep = np.append(True, (np.diff(fap) != 0) | (np.diff(probability) != 0))
-        edges = np.asarray(null.edge(np.flatnonzero(keep)))
-        return cls(edges, fap[keep], probability[keep], null.n, Interval(area, low, high))
+        return cls(np.append(lower[0], upper), above[0], above[1], null.n, Interval(area, low, high))
 
     def plot(self, path: str | Path | None = None, *, name: str = "") -> object:
         """Detection probability against false-alarm probability; needs matplotlib."""

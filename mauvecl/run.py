@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
@@ -20,6 +21,8 @@ if TYPE_CHECKING:
 
 #: Realisations, times frames, counted on the device before its 32-bit bins and 64-bit sums are emptied.
 MOST_COUNTED = 2**25
+#: Raw spectra looked at together on the host.
+PIECE = 4096
 #: Kernels of a detection, the first where more is compared than the template.
 COMPARED, DETECTION = ("comparison", "tally"), ("statistics", "tally")
 #: Work-items to an element or channel of a histogram, on a device of many.
@@ -47,6 +50,14 @@ class Tile:
     def rows(self) -> tuple[np.uint32, np.uint32]:
         """Which of the tile are wanted."""
         return np.uint32(self.start), np.uint32(self.stop)
+
+    def pieces(self, size: int) -> Iterator[Tile]:
+        """The same realisations in tiles of at most so many, a multiple of what a work-item follows."""
+        for begin in range(0, self.size, size):
+            length = min(size, self.size - begin)
+            start, stop = max(self.start - begin, 0), min(self.stop - begin, length)
+            if start < stop:
+                yield Tile(self.first + begin, length, start, stop)
 
 
 class Run:
@@ -169,6 +180,8 @@ class Run:
         self._pixel_counts = self.upload(np.zeros(shape, np.uint32))
         self._element_counts = self.upload(np.zeros((len(elements), layout.OBSERVER_BINS), np.uint32))
         self._clipped = self.upload(np.zeros((shape[0], 2), np.uint32))
+        self._outside = self.upload(np.zeros(len(elements), np.uint32))
+        self._observed = observers, elements
 
     def histogram(self, tile: Tile, counts: Counts) -> None:
         """Count each pixel's DN and each element's S/N of a tile on the device."""
@@ -185,11 +198,25 @@ class Run:
             self._pixel_counts,
             self._element_counts,
             self._clipped,
+            self._outside,
         )
         self._queue.finish()
         self._counted += tile.wanted
+        outside = np.empty(self._n_element, np.uint32)
+        self._cl.enqueue_copy(self._queue, outside, self._outside)
+        if outside.any():
+            self._cl.enqueue_copy(self._queue, self._outside, np.zeros_like(outside))
+            self._add_far_snr(tile, counts, np.flatnonzero(outside))
         if self._counted * self._scene.n_draws > MOST_COUNTED:
             self.flush_counts(counts)
+
+    def _add_far_snr(self, tile: Tile, counts: Counts, elements: NDArray[np.intp]) -> None:
+        """Count what lies outside the device's bins on the host, from the raw spectra of the same realisations."""
+        for piece in tile.pieces(PIECE):
+            raw = np.empty((piece.wanted, self._scene.n_pixel), np.int32)
+            self.realise(piece, raw)
+            base = self._scene.n_draws * self._scene.base_dn[0]
+            counts.add_far(np.ascontiguousarray(raw.T) - base[:, None], *self._observed, elements)
 
     def flush_counts(self, counts: Counts) -> None:
         """Move the device's histograms to the host."""
@@ -271,6 +298,7 @@ class Run:
             self._named["grids"] = self.upload(Grid.pack(tally.grids))
             self._named["histogram"] = self.upload(np.zeros((count, layout.BINS), np.uint32))
             self._named["sums"] = self.upload(np.zeros((count, shares, 2), np.int64))
+            self._named["outside"] = self.upload(np.zeros(count, np.uint32))
         named = self._named
         self._launch(
             "tally",
@@ -281,11 +309,28 @@ class Run:
             named["grids"],
             named["histogram"],
             named["sums"],
+            named["outside"],
         )
         self._queue.finish()
         self._counted += tile.wanted
+        self._add_far(tile, tally)
         if self._counted > MOST_COUNTED:
             self.flush(tally)
+
+    def _add_far(self, tile: Tile, tally: Tally) -> None:
+        """Count on the host what the device found outside its bins."""
+        outside = np.empty(len(tally.grids), np.uint32)
+        self._cl.enqueue_copy(self._queue, outside, self._named["outside"])
+        if not outside.any():
+            return
+        self._cl.enqueue_copy(self._queue, self._named["outside"], np.zeros_like(outside))
+        for index in np.flatnonzero(outside):
+            found = tally.add_far(int(index), self.channel(tile, tally.grids[index].channel))
+            if found != outside[index]:
+                raise DeviceError(
+                    f"{self._engine.device_name} has {outside[index]} values outside a histogram where the host has "
+                    f"{found}, expected the same arithmetic"
+                )
 
     def flush(self, tally: Tally) -> None:
         """Move the device's histograms and sums to the host."""

@@ -24,9 +24,9 @@ from mauvecl.probes import Probes
 from mauvecl.processes import CosmicRays, Processes, Uniform
 from mauvecl.program import SAME_BITS
 from mauvecl.scene import Scene, prepare
-from mauvecl.snr import elements, observers
+from mauvecl.snr import Counts, elements, observers
 from mauvecl.statistics import PAIRED, STATISTICS
-from mauvecl.tally import Grid
+from mauvecl.tally import Tally
 
 if TYPE_CHECKING:
     from mauvecl.program import DeviceRecord
@@ -139,8 +139,8 @@ def digests(engine: Engine, name: str) -> dict[str, str]:
         "raw": _digest(raw.astype(np.int64), clipped),
         "statistics": _digest(values.view(np.uint32)),
         "fast statistics": _digest(fast.view(np.uint32)),
-        "histograms": _digest(seen.counts.pixel, seen.counts.element, seen.counts.clipped),
-        "tally": _digest(null.counts, np.array([null.first, null.second])),
+        "histograms": _histograms(seen.counts),
+        "tally": _digest(null.counts, np.array([null.first, null.second]), null.far.keys, null.far.counts),
     }
 
 
@@ -152,15 +152,19 @@ def twin_digests(name: str) -> dict[str, str]:
     both = prepare([quiet, flare], **how)
     raw = reference.realise(scene, index, SEED)
     clipped = reference.clipped(scene, index, SEED)
-    pixels, parts, rails = reference_sums.histograms(scene, observers(quiet, scene), elements(quiet), index, SEED)
+    seen = reference_sums.histograms(scene, observers(quiet, scene), elements(quiet), index, SEED)
     values, plan = _statistics(name, both)
-    counts, sums = reference_sums.tally(values, Grid.pack(plan.grids[plan.keys.index(("chi2", "null", 0)) :][:1]))
+    tally = Tally(plan.grids[plan.keys.index(("chi2", "null", 0)) :][:1])
+    counts, sums, _ = reference_sums.tally(values, tally.packed)
+    tally.add(counts, sums, COUNT)
+    tally.add_far(0, values[tally.grids[0].channel])
+    null = tally.distribution(0)
     return {
         "raw": _digest(raw.astype(np.int64), clipped.sum(axis=(1, 2)).astype(np.uint32)),
         "statistics": _digest(values.view(np.uint32)),
         "fast statistics": _digest(_fast(values, plan).view(np.uint32)),
-        "histograms": _digest(pixels, parts, rails),
-        "tally": _digest(counts[0].astype(np.int64), sums[0]),
+        "histograms": _histograms(seen),
+        "tally": _digest(null.counts, np.array([null.first, null.second]), null.far.keys, null.far.counts),
     }
 
 
@@ -185,6 +189,11 @@ def _fast(values: NDArray[np.float32], plan: ChannelPlan) -> NDArray[np.float32]
     known = values[: plan.n_rows - len(plan.scales)].copy()
     known[[2, 5]] = 0.0
     return known
+
+
+def _histograms(counts: Counts) -> str:
+    far = (array for each in counts.far.values() for array in (each.keys, each.counts))
+    return _digest(counts.pixel, counts.element, counts.clipped, *far)
 
 
 def _digest(*arrays: NDArray[Any]) -> str:

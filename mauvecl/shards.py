@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from mauvecl.channels import ChannelPlan, plan_channels
 from mauvecl.comparison import TEMPLATE, Comparison
 from mauvecl.detection import Detection, Tails
+from mauvecl.far import FarCounts
 from mauvecl.layout import USUAL_STATISTICS
 from mauvecl.processes import NONE, Processes
 from mauvecl.scene import BATCH, Mode, Recipe, Scene, prepare
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 
 Arrays = dict[str, NDArray[Any]]
 
+#: What a share holds, and how: raised with every change, so that none of an older form is ever added.
+FORM = 2
 #: Realisations times pixels times scenarios of one share, about: some seconds of a processor's work.
 SHARE = 2**34
 #: Shares of one part of a request, about, at most: larger requests have larger shares, so that one process can add up
@@ -151,6 +154,11 @@ class DetectRequest:
         share = _sparse("counts", tally.counts)
         share["sums"] = np.array([[str(value) for value in row] for row in tally.sums])
         share["n"] = np.array(tally.n)
+        for number, far in enumerate(tally.far):
+            found = far.found()
+            if found.n or found.undefined:
+                share |= _spread(f"far-{number}", found.keys, found.counts)
+                share[f"far-{number}-sums"] = np.array([str(x) for x in (found.first, found.second, found.undefined)])
         for number, kept in enumerate(samples):
             if kept is not None:
                 share[f"values-{number}"], share[f"realisations-{number}"] = kept.values, kept.realisations
@@ -161,6 +169,10 @@ class DetectRequest:
         tally, samples = self._sums[part]
         sums = np.array([[int(value) for value in row] for row in share["sums"]], object)
         tally.add(_dense("counts", share, tally.counts.shape), sums, int(share["n"]))
+        for number, far in enumerate(tally.far):
+            if f"far-{number}" in share:
+                first, second, undefined = (int(value) for value in share[f"far-{number}-sums"])
+                far.merge(FarCounts(*_gathered(f"far-{number}", share), first, second, undefined))
         for number, kept in enumerate(samples):
             if kept is not None:
                 kept.merge(share[f"values-{number}"], share[f"realisations-{number}"])
@@ -203,6 +215,8 @@ class SnrRequest:
         counts = Counts(self.answer.scene.n_pixel, len(self.answer.elements))
         engine.count_snr(self, start, count, counts)
         share = _sparse("pixel", counts.pixel) | _sparse("element", counts.element)
+        for name, far in counts.far.items():
+            share |= _spread(f"far-{name}", far.keys, far.counts)
         return share | {"clipped": counts.clipped, "n": np.array(counts.n)}
 
     def add(self, part: int, share: Arrays) -> None:
@@ -210,6 +224,8 @@ class SnrRequest:
         counts = self.answer.counts
         pixel, element = _dense("pixel", share, counts.pixel.shape), _dense("element", share, counts.element.shape)
         counts.add(pixel, element, share["clipped"], int(share["n"]))
+        for name, far in counts.far.items():
+            far.add(*_gathered(f"far-{name}", share))
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,7 +266,20 @@ def _asked(request: Any) -> dict[str, Any]:
 def _sparse(name: str, counts: NDArray[np.int64]) -> Arrays:
     """Steps from one bin that is not empty to the next, and what these hold, in as few bytes as they need."""
     where = np.flatnonzero(counts)
-    return {f"{name}-steps": _narrow(np.diff(where, prepend=0)), name: _narrow(counts.ravel()[where])}
+    return _spread(name, where, counts.ravel()[where])
+
+
+def _spread(name: str, keys: NDArray[np.int64], counts: NDArray[np.int64]) -> Arrays:
+    """Counts of rising keys, of which only the first may be negative."""
+    steps = np.diff(keys)
+    return {f"{name}-first": keys[:1], f"{name}-steps": _narrow(steps), name: _narrow(counts)}
+
+
+def _gathered(name: str, share: Arrays) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """Keys and counts."""
+    first = share[f"{name}-first"]
+    keys = np.cumsum(np.concatenate([first, share[f"{name}-steps"].astype(np.int64)]), dtype=np.int64)
+    return keys, share[name].astype(np.int64)
 
 
 def _narrow(values: NDArray[np.int64]) -> NDArray[np.unsignedinteger]:
@@ -259,7 +288,8 @@ def _narrow(values: NDArray[np.int64]) -> NDArray[np.unsignedinteger]:
 
 def _dense(name: str, share: Arrays, shape: tuple[int, ...]) -> NDArray[np.int64]:
     counts = np.zeros(int(np.prod(shape)), np.int64)
-    counts[np.cumsum(share[f"{name}-steps"], dtype=np.int64)] = share[name]
+    keys, found = _gathered(name, share)
+    counts[keys] = found
     return counts.reshape(shape)
 
 
@@ -272,7 +302,7 @@ def fingerprint(request: Request) -> str:
 
     Realisations are left out: the same shares are counted of more of them.
     """
-    found = hashlib.sha256()
+    found = hashlib.sha256(f"form {FORM}".encode())
     _feed(found, request, leave=("realisations", "start", "tails"))
     return found.hexdigest()[:32]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl import layout
+from mauvecl.far import Sparse
+from mauvecl.host.errors import InputError
+from mauvecl.reference import Floats, fma
 from mauvecl.scene import Scene
 
 if TYPE_CHECKING:
@@ -64,6 +68,12 @@ def elements(x: Expectation) -> NDArray[np.void]:
     return table
 
 
+#: Bins that count: number 0 holds what is expected.
+FIRST_BIN, LAST_BIN = 1 - layout.OBSERVER_BINS // 2, layout.OBSERVER_BINS // 2 - 2
+#: Bins further out than this have no number.
+MOST_BINS = 2**31
+
+
 class Counts:
     """Histograms of all pixels and elements, added up tile by tile.
 
@@ -71,6 +81,9 @@ class Counts:
     ----------
     pixel : ndarray of int64, shape (n_pixel, OBSERVER_BINS)
     element : ndarray of int64, shape (n_element, OBSERVER_BINS)
+        The first and the last bin are empty.
+    far : dict of str to Sparse
+        ``pixel`` and ``element``: bins as wide beyond those, by pixel or element and number.
     clipped : ndarray of int64, shape (n_pixel, 2)
         Frames below zero and above saturation.
     n : int
@@ -80,6 +93,7 @@ class Counts:
     def __init__(self, n_pixel: int, n_element: int) -> None:
         self.pixel = np.zeros((n_pixel, layout.OBSERVER_BINS), np.int64)
         self.element = np.zeros((n_element, layout.OBSERVER_BINS), np.int64)
+        self.far = {"pixel": Sparse(), "element": Sparse()}
         self.clipped = np.zeros((n_pixel, 2), np.int64)
         self.n = 0
 
@@ -87,10 +101,70 @@ class Counts:
         self, pixel: NDArray[np.integer], element: NDArray[np.integer], clipped: NDArray[np.integer], n: int
     ) -> None:
         """Add what one or more tiles counted."""
-        self.pixel += pixel
-        self.element += element
+        inner = slice(1, layout.OBSERVER_BINS - 1)
+        self.pixel[:, inner] += pixel[:, inner]
+        self.element[:, inner] += element[:, inner]
         self.clipped += clipped
         self.n += n
+
+    def add_far(
+        self, dn: NDArray[np.integer], observers: NDArray[np.void], elements: NDArray[np.void], asked: NDArray[np.intp]
+    ) -> None:
+        """Count what lies outside the bins of some elements and their pixels.
+
+        Parameters
+        ----------
+        dn : ndarray of int, shape (n_pixel, n)
+            Raw DN less the scene's base, of some realisations.
+        observers : ndarray of layout.OBSERVER, shape (n_padded,)
+        elements : ndarray of layout.ELEMENT, shape (n_element,)
+        asked : ndarray of int
+            Which elements.
+        """
+        for e in asked:
+            element = elements[e]
+            first, end = int(element["first"]), int(element["end"])
+            for p in range(first, end):
+                self._count_far("pixel", p, dn[p].astype(np.int64) >> int(observers[p]["bin_shift"]))
+            ratio = signal_to_noise(dn[first:end], observers[first:end])
+            steps = np.rint((ratio - element["centre"]) * element["bins_per_unit"])
+            if not (np.abs(steps) < MOST_BINS).all():
+                raise InputError(
+                    f"the S/N of resolution element {e} is {ratio[np.abs(steps).argmax()]:g} in a realisation, "
+                    f"expected something nearer to its closed form of {element['centre']:g}"
+                )
+            self._count_far("element", e, steps.astype(np.int64))
+
+    def _count_far(self, kind: str, which: int, bins: NDArray[np.int64]) -> None:
+        outside = bins[(bins < FIRST_BIN) | (bins > LAST_BIN)]
+        if outside.size:
+            self.far[kind].count(which * (2 * MOST_BINS) + MOST_BINS + outside)
+
+    def spread_out(self, kind: str) -> NDArray[np.int64]:
+        """Pixels or elements that have something outside their bins."""
+        return np.unique(self.far[kind].keys // (2 * MOST_BINS))
+
+    def filled(self, kind: str, which: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Bins of one pixel or element that hold anything, rising from the expected number 0, and how much."""
+        dense = (self.pixel if kind == "pixel" else self.element)[which]
+        inner = np.flatnonzero(dense)
+        numbers, counts = inner - layout.OBSERVER_BINS // 2, dense[inner]
+        far, offset = self.far[kind], which * (2 * MOST_BINS) + MOST_BINS
+        mine = slice(*np.searchsorted(far.keys, (offset - MOST_BINS, offset + MOST_BINS)))
+        outside = far.keys[mine] - offset
+        below = int(np.count_nonzero(outside < 0))
+        return np.insert(outside, below, numbers), np.insert(far.counts[mine], below, counts)
+
+
+def signal_to_noise(dn: NDArray[np.integer], observers: NDArray[np.void]) -> Floats:
+    """An element's S/N as the device sums it, shape (n,), of its pixels' DN less the scene's base, (n_pixel, n)."""
+    signal, variance = (np.zeros(dn.shape[1], np.float32) for _ in range(2))
+    for n, observer in zip(dn, observers, strict=True):
+        net = n.astype(np.float32) + observer["net_offset"]
+        signal = signal + net
+        variance = variance + fma(np.maximum(net, np.float32(0.0)), observer["gain"], observer["variance"])
+    # Zero where the observer knows of no noise.
+    return np.divide(signal, np.sqrt(variance), out=np.zeros_like(signal), where=variance > 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,16 +194,15 @@ class SnrResult:
         """
         x, seen = self.expectation, self.observers[: self.scene.n_pixel]
         width = 2.0 ** seen["bin_shift"].astype(float)
-        steps = np.arange(layout.OBSERVER_BINS + 1) - layout.OBSERVER_BINS // 2
 
-        def snr(dn: NDArray[np.float64]) -> NDArray[np.float64]:
-            net = dn + seen["net_offset"].astype(float)[:, None]
-            noise2 = np.maximum(net, 0.0) * seen["gain"][:, None] + seen["variance"][:, None]
+        def snr(which: NDArray[np.intp], place: NDArray[np.number]) -> NDArray[np.float64]:
+            # A bin holds the whole DN from its lower edge to one below the next.
+            dn = width[which] * place - 0.5
+            net = dn + seen["net_offset"].astype(float)[which]
+            noise2 = np.maximum(net, 0.0) * seen["gain"][which] + seen["variance"][which]
             return np.asarray(np.divide(net, np.sqrt(noise2), out=np.zeros_like(net), where=noise2 > 0))
 
-        # A bin holds the whole DN from its lower edge to one below the next.
-        centres, edges = snr(width[:, None] * (steps[:-1] + 0.5) - 0.5), snr(width[:, None] * steps - 0.5)
-        table = self._table(x.wavelength_nm, x.snr(), self.counts.pixel, centres, edges)
+        table = self._table("pixel", x.wavelength_nm, x.snr(), snr)
         frames = self.counts.n * x.n_frames
         for name, column in (("clipped_low", 0), ("clipped_high", 1)):
             table[name] = self.counts.clipped[:, column] / frames
@@ -146,10 +219,11 @@ class SnrResult:
             out=np.zeros(len(self.elements)),
             where=self.elements["bins_per_unit"] > 0,
         )
-        steps = np.arange(layout.OBSERVER_BINS + 1) - layout.OBSERVER_BINS // 2
-        centres = self.elements["centre"][:, None] + step[:, None] * steps[:-1]
-        edges = self.elements["centre"][:, None] + step[:, None] * (steps - 0.5)
-        return self._table(x.element_wavelength_nm, x.snr_per_element(), self.counts.element, centres, edges)
+
+        def snr(which: NDArray[np.intp], place: NDArray[np.number]) -> NDArray[np.float64]:
+            return np.asarray(self.elements["centre"][which] + step[which] * (place - 0.5))
+
+        return self._table("element", x.element_wavelength_nm, x.snr_per_element(), snr)
 
     def plot(self, path: str | Path | None = None) -> object:
         """S/N per pixel and element, closed form and realisations; needs matplotlib."""
@@ -159,24 +233,42 @@ class SnrResult:
 
     def _table(
         self,
+        kind: str,
         wavelength_nm: NDArray[np.float64],
         expected: NDArray[np.float64],
-        counts: NDArray[np.int64],
-        centres: NDArray[np.float64],
-        edges: NDArray[np.float64],
+        snr: Callable[[NDArray[np.intp], NDArray[np.number]], NDArray[np.float64]],
     ) -> QTable:
+        """A row for each pixel or element; `snr` of those, at places between the edges of bins, which are whole."""
         import astropy.units as u
         from astropy.table import QTable
 
+        counts = self.counts.pixel if kind == "pixel" else self.counts.element
+        numbers, every = (
+            np.arange(layout.OBSERVER_BINS + 1) - layout.OBSERVER_BINS // 2,
+            np.arange(len(counts))[:, None],
+        )
+        centres, edges = snr(every, numbers[:-1] + 0.5), snr(every, numbers)
         share = counts / self.counts.n
         mean = np.sum(share * centres, axis=1)
+        std = np.sqrt(np.sum(share * (centres - mean[:, None]) ** 2, axis=1))
+        cumulative = np.concatenate([np.zeros((len(counts), 1)), np.cumsum(counts, axis=1)], axis=1) / self.counts.n
+        spread_out = self.counts.spread_out(kind)
+        quantiles = np.array([
+            np.zeros(len(PERCENTAGES)) if i in spread_out else _quantiles(c, e)
+            for i, (c, e) in enumerate(zip(cumulative, edges, strict=True))
+        ])  # fmt: skip
+        for i in spread_out:
+            filled, found = self.counts.filled(kind, i)
+            middle = snr(i, filled + 0.5)
+            mean[i] = found @ middle / self.counts.n
+            std[i] = np.sqrt(found @ (middle - mean[i]) ** 2 / self.counts.n)
+            ends = np.column_stack([snr(i, filled), snr(i, filled + 1)]).ravel()
+            quantiles[i] = np.interp(np.array(PERCENTAGES) / 100, steps_of(found) / self.counts.n, ends)
         table = QTable()
         table["wavelength"] = wavelength_nm * u.nm
         table["expected"] = expected
         table["mean"] = mean
-        table["std"] = np.sqrt(np.sum(share * (centres - mean[:, None]) ** 2, axis=1))
-        cumulative = np.concatenate([np.zeros((len(counts), 1)), np.cumsum(counts, axis=1)], axis=1) / self.counts.n
-        quantiles = np.array([_quantiles(c, e) for c, e in zip(cumulative, edges, strict=True)])
+        table["std"] = std
         for i, percentage in enumerate(PERCENTAGES):
             table[f"q{percentage:g}"] = quantiles[:, i]
         table["expected"].info.description = "closed-form S/N of the mean spectrum"
@@ -193,3 +285,9 @@ def _quantiles(cumulative: NDArray[np.float64], edges: NDArray[np.float64]) -> N
     filled = np.flatnonzero(np.diff(cumulative))
     span = slice(filled[0], filled[-1] + 2)
     return np.asarray(np.interp(np.array(PERCENTAGES) / 100, cumulative[span], edges[span]))
+
+
+def steps_of(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Realisations below the lower and the upper edge of each bin, one after the other, shape (2 m,)."""
+    above = np.cumsum(counts)
+    return np.column_stack([above - counts, above]).ravel()

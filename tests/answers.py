@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mauvecl.detection import Detection
-from mauvecl.snr import SnrResult
+from mauvecl.snr import Counts, SnrResult
 from mauvecl.study import Study
 
 #: Realisations: several shares, the last a short one.
@@ -21,14 +21,22 @@ def same(ours: Detection, theirs: Detection) -> None:
         other = theirs._found[key]
         np.testing.assert_array_equal(found.counts, other.counts)
         assert (found.first, found.second, found.n) == (other.first, other.second, other.n)
+        assert found.far.equals(other.far)
     for key, kept in ours._samples.items():
         np.testing.assert_array_equal(kept.values, theirs._samples[key].values)
         np.testing.assert_array_equal(kept.realisations, theirs._samples[key].realisations)
 
 
 def same_snr(ours: SnrResult, theirs: SnrResult) -> None:
+    same_counts(ours.counts, theirs.counts)
+
+
+def same_counts(ours: Counts, theirs: Counts) -> None:
     for name in ("pixel", "element", "clipped", "n"):
-        np.testing.assert_array_equal(getattr(ours.counts, name), getattr(theirs.counts, name))
+        np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name))
+    for kind, far in ours.far.items():
+        np.testing.assert_array_equal(far.keys, theirs.far[kind].keys)
+        np.testing.assert_array_equal(far.counts, theirs.far[kind].counts)
 
 
 def small(**sections: Any) -> Study:

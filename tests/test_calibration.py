@@ -63,7 +63,7 @@ def test_false_alarms_come_as_often_as_they_should(engine: Engine) -> None:
         for statistic in STATISTICS:
             ours, theirs = first.distribution(statistic), fresh.distribution(statistic)
             for fap in FAPS:
-                cut = ours.first_bin_with_at_most(int(fap * N))
+                cut = ours.edge_with_at_most(int(fap * N))
                 # Whole bins: the threshold's own count, which is at most fap N.
                 k = ours.above(cut)
                 expected = N * (k + 0.5) / (N + 1)

@@ -8,6 +8,7 @@ import sys
 
 import numpy as np
 import pytest
+from answers import same_counts
 from scenes import instrument, star
 from scipy import stats
 
@@ -22,7 +23,7 @@ from mauvecl.processes import CosmicRays, Normal, Processes, Uniform
 from mauvecl.scene import prepare
 from mauvecl.snr import elements, observers
 from mauvecl.statistics import STATISTICS
-from mauvecl.tally import Grid
+from mauvecl.tally import Tally
 
 RAYS = CosmicRays(rate_per_cm2_s=200.0)
 PRIORS = Processes(
@@ -121,13 +122,18 @@ def test_every_statistic_is_the_twins(any_width: Engine, name: str) -> None:
     alone = any_width.statistic_values(quiet, flares, count=INDEX.size, statistics=fast, **kind)
     same = [row for row in range(len(alone)) if row % 3 != 2 or row >= 9]
     np.testing.assert_array_equal(alone[same], values[: len(alone)][same])
-    histogram, sums = reference_sums.tally(values, Grid.pack(plan.grids))
+    tally = Tally(plan.grids)
+    histogram, sums, outside = reference_sums.tally(values, tally.packed)
+    tally.add(histogram, sums, INDEX.size)
     for i, (statistic, role, flare) in enumerate(plan.keys):
         if role == "flare_on_null_grid":
             continue
         ours = found.distribution(statistic, None if role == "null" else flare, template=flare)
-        np.testing.assert_array_equal(ours.counts, histogram[i])
-        assert (ours.first, ours.second) == tuple(sums[i])
+        assert tally.add_far(i, values[plan.grids[i].channel]) == outside[i]
+        twin = tally.distribution(i)
+        np.testing.assert_array_equal(ours.counts, twin.counts)
+        assert (ours.first, ours.second) == (twin.first, twin.second)
+        assert ours.far.equals(twin.far)
 
 
 @pytest.mark.parametrize(
@@ -157,11 +163,12 @@ def test_signal_to_noise_is_the_twins(any_width: Engine, name: str) -> None:
     (quiet, *_), how = case(name)
     scene = prepare([quiet], **how)
     found = any_width.snr(quiet, realisations=INDEX.size, start=START, seed=SEED, **how)
-    pixels, parts, clipped = reference_sums.histograms(scene, observers(quiet, scene), elements(quiet), INDEX, SEED)
-    np.testing.assert_array_equal(found.counts.pixel, pixels)
-    np.testing.assert_array_equal(found.counts.element, parts)
-    np.testing.assert_array_equal(found.counts.clipped, clipped)
-    assert found.counts.n == INDEX.size
+    twin = reference_sums.histograms(scene, observers(quiet, scene), elements(quiet), INDEX, SEED)
+    same_counts(found.counts, twin)
+    assert all(
+        each.sum() + found.counts.far[kind].counts.sum() == INDEX.size * len(each)
+        for kind, each in (("pixel", found.counts.pixel), ("element", found.counts.element))
+    )
 
 
 def test_modes_meet_the_rails(engine: Engine) -> None:
@@ -249,12 +256,14 @@ def test_tiles_change_no_bit(engine: Engine, tile: int) -> None:
     parts = Engine(tile=tile).detect(quiet, flares, realisations=3001, start=77, seed=6, statistics=tuple(STATISTICS))
     for key, distribution in whole._found.items():
         np.testing.assert_array_equal(distribution.counts, parts._found[key].counts)
+        assert distribution.far.equals(parts._found[key].far)
         assert (distribution.mean, distribution.std) == (parts._found[key].mean, parts._found[key].std)
 
 
 THREADS = """
 import hashlib, sys
 sys.path.insert(0, {tests!r})
+from answers import same_counts
 from scenes import star
 from mauvecl.engine import Engine
 quiet, *flares = star(amplitudes=(0.081, 0.24))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import pickle
 import random
 import threading
@@ -17,7 +18,7 @@ from answers import N, same, same_snr, small
 from scenes import instrument, star
 
 from mauvecl import shards
-from mauvecl.checkpoint import Checkpoint
+from mauvecl.checkpoint import Checkpoint, _digest_of
 from mauvecl.comparison import Comparison
 from mauvecl.detect_study import detect
 from mauvecl.detection import Detection
@@ -264,6 +265,24 @@ def test_what_is_unfinished_is_not_overwritten(tmp_path: Path, engine: Engine) -
         at_work(tmp_path, engine, study=other, resume=True)
     _, pool, _ = at_work(tmp_path, engine, restart=True)
     assert pool.standing.resumed == 0
+
+
+def test_counts_of_another_form_are_refused(tmp_path: Path, engine: Engine) -> None:
+    """As an older version left them; also where the manifest is lost, none of its shares is added."""
+    with pytest.raises(KeyboardInterrupt):
+        at_work(tmp_path, engine, interrupting(10_000))
+    path = tmp_path / "checkpoint" / "manifest.json"
+    manifest = json.loads(path.read_text())
+    old = {key: value for key, value in manifest.items() if key not in ("form", "digest")}
+    path.write_text(json.dumps(old | {"digest": _digest_of(old)}))
+    with pytest.raises(InputError, match="in form 1, expected form 2 as this version writes: --restart to"):
+        at_work(tmp_path, engine, resume=True)
+    quiet, *flares = small().expectations(small().star[0])
+    request = DetectRequest(quiet, tuple(flares), N, 5)
+    ours = fingerprint(request)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shards, "FORM", 1)
+        assert fingerprint(request) != ours
 
 
 def test_two_runs_in_one_folder(tmp_path: Path, engine: Engine) -> None:

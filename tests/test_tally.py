@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import math
+from fractions import Fraction
+
 import numpy as np
 import pytest
 from scipy import stats
 
 from mauvecl import layout, reference_sums
 from mauvecl.host.errors import InputError
+from mauvecl.roc import Roc
 from mauvecl.tally import Distribution, Grid, Tally
 
 
 def distribution(values: np.ndarray, grid: Grid) -> Distribution:
     tally = Tally([grid])
-    histogram, sums = reference_sums.tally(values[None].astype(np.float32), Grid.pack([grid]))
+    values = values.astype(np.float32)
+    histogram, sums, outside = reference_sums.tally(values[None], tally.packed)
     tally.add(histogram, sums, values.size)
+    assert tally.add_far(0, values) == outside[0]
     return tally.distribution(0)
 
 
@@ -64,18 +70,107 @@ def test_quantiles(values: np.ndarray, found: Distribution) -> None:
 
 
 def test_counts_beyond_an_edge_are_exact(values: np.ndarray, found: Distribution) -> None:
-    index = found.first_bin_with_at_most(200)
-    edge = found.edge(index)
-    assert found.above(index) == np.sum(values.astype(np.float32) >= edge) <= 200
-    assert found.above(index - 1) > 200
+    edge = found.edge_with_at_most(200)
+    assert found.above(edge) == np.sum(values.astype(np.float32) >= edge) <= 200
+    assert found.above(edge - BIN) > 200
+    assert (found.above(-np.inf), found.above(np.inf)) == (values.size, 0)
+    assert found.edge_with_at_most(values.size) == -np.inf
 
 
-def test_far_values_are_counted_at_the_ends() -> None:
-    values = np.array([-1e9, 0.0, 0.1, 1e9])
-    found = distribution(values, Grid(0, 0.0, 1.0))
-    assert found.beyond == 2
-    assert found.counts.sum() == 4
-    assert found.above(found.counts.size - 1) == 1
+#: What no fine grid reaches, with every sign and exponent, and what lies next to its ends.
+FLOATS = np.frombuffer(np.random.default_rng(6).bytes(80_000), np.float32)
+FAR = {
+    "every float": np.concatenate(
+        [FLOATS[np.isfinite(FLOATS)], [0.0, -0.0, 1e-45, -1e-45, 3.4028235e38, -3.4028235e38]]
+    ),
+    "around the ends": np.random.default_rng(7).uniform(-40, 40, 40_000),
+    "one side": np.random.default_rng(8).lognormal(4, 1, 20_000),
+    "near a far value": np.random.default_rng(9).normal(-1e6, 30.0, 20_000),
+    "all equal": np.full(5000, 77.7),
+}
+GRIDS = {
+    "unit": Grid(0, 0.0, 1.0),
+    "far and narrow": Grid(0, -1e6, 1.0),
+    "no float32 steps": Grid(0, 0.0, 1e50),
+    "none so small": Grid(0, 0.0, 1e-300),
+    "a far centre": Grid(0, 1e300, 1.0),
+    "tiny": Grid(0, 3.0, 1e-30),
+}
+
+
+def bin_of(value: float, grid: Grid) -> float:
+    """The widest that a bin around a value may be: 1/512 of a standard deviation, or 2**-13 of the value."""
+    return max(4 / 2048 * grid.sigma if grid.sigma < 1e30 else 0.0, abs(value) * 2.0**-13, 1e-40)
+
+
+@pytest.mark.parametrize("grid", GRIDS.values(), ids=list(GRIDS))
+@pytest.mark.parametrize("values", FAR.values(), ids=list(FAR))
+def test_nothing_has_an_end(values: np.ndarray, grid: Grid) -> None:
+    """Moments, counts, thresholds and quantiles of any float32 on any grid, against sorting and exact sums."""
+    values = values.astype(np.float32)
+    found, ordered = distribution(values, grid), np.sort(values.astype(float))
+    n = values.size
+    lower, upper, counts = found.bins
+    assert counts.sum() == n
+    assert (lower < upper).all()
+    assert (upper[:-1] <= lower[1:]).all()
+    # Rounding in float32 at the grid's far places, and a fine step.
+    scale = max(abs(grid.centre) if abs(grid.centre) < 1e30 else 0.0, grid.sigma if grid.sigma < 1e30 else 0.0)
+    slack = 1e-6 * scale + 1e-12
+    for share in (0.0004, 0.01, 0.3, 0.5, 0.9, 0.999):
+        k = int(share * n)
+        cut, exact = found.edge_with_at_most(k), ordered[n - 1 - k]
+        assert exact - slack <= cut <= exact + bin_of(exact, grid) + slack
+        assert abs(found.above(cut) - np.sum(ordered >= cut)) <= np.sum(np.abs(ordered - cut) <= slack)
+        between = found.above(exact)
+        assert np.sum(ordered > exact + bin_of(exact, grid) + slack) <= between
+        assert between <= np.sum(ordered >= exact - bin_of(exact, grid) - slack)
+        q = found.quantile(share)
+        low, high = ordered[max(int(share * n) - 1, 0)], ordered[min(int(share * n) + 1, n - 1)]
+        assert low - bin_of(low, grid) - slack <= q <= high + bin_of(high, grid) + slack
+    wide = [Fraction(float(x)) for x in values]
+    mean = sum(wide) / n
+    variance = sum(x * x for x in wide) / n - mean**2
+    fine = grid.sigma / 2048 if grid.sigma < 1e30 else 0.0
+    assert found.mean == pytest.approx(float(mean), rel=1e-7, abs=fine / 50 + slack)
+    assert found.std == pytest.approx(math.sqrt(variance), rel=1e-6, abs=fine + slack)
+    edges, heights = found.histogram(50)
+    assert heights.sum() == n
+    assert (heights >= 0).all()
+    assert len(edges) == len(heights) + 1 <= 51
+    np.testing.assert_allclose(np.diff(edges), np.diff(edges)[0], rtol=1e-6, atol=4 * slack)
+
+
+def test_what_is_no_number_is_refused() -> None:
+    """Counted, and never left out in silence."""
+    found = distribution(np.array([0.0, np.nan, np.inf, -np.inf, 1.0, 1e9]), Grid(0, 0.0, 1.0))
+    assert (found.far.undefined, found.far.n, found.counts.sum()) == (3, 1, 2)
+    for read in (
+        lambda: found.mean,
+        lambda: found.std,
+        lambda: found.above(0.5),
+        lambda: found.edge_with_at_most(1),
+        lambda: found.quantile(0.5),
+        lambda: found.quantile_interval(0.5),
+        lambda: found.histogram(),
+        lambda: Roc.of(found, found),
+    ):
+        with pytest.raises(InputError, match="infinite or no number in 3 of 6 realisations"):
+            read()
+
+
+def test_order_and_pieces_change_nothing() -> None:
+    """The same values backwards, in uneven pieces: every count and both exact sums."""
+    values, grid = FAR["every float"].astype(np.float32), GRIDS["unit"]
+    whole, parts = Tally([grid]), Tally([grid])
+    whole.add_far(0, values)
+    for piece in np.split(values[::-1], [1, 7, 5000, 5001]):
+        parts.add_far(0, piece)
+    ours, theirs = whole.far[0].found(), parts.far[0].found()
+    assert ours.equals(theirs)
+    inside = np.abs(np.rint(values.astype(float) * 2048) + 0.5) < 65532
+    assert ours.first == sum(Fraction(float(x)) for x in values[~inside]) * 2**149
+    assert ours.second == sum(Fraction(float(x)) ** 2 for x in values[~inside]) * 2**298
 
 
 def test_picture_bins_hold_every_realisation(values: np.ndarray, found: Distribution) -> None:

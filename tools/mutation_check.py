@@ -57,6 +57,14 @@ MUTATIONS = {
         ),
         "tests/test_pool.py::test_a_failed_launch_is_counted_again",
     ),
+    "far values lost": Mutation(
+        (("mauvecl/run.py", "        self._add_far(tile, tally)\n", ""),),
+        "tests/test_ends.py::test_every_number_is_that_of_sorting[0]",
+    ),
+    "far S/N lost": Mutation(
+        (("mauvecl/run.py", "            self._add_far_snr(tile, counts, np.flatnonzero(outside))\n", ""),),
+        "tests/test_ends.py::test_signal_to_noise_is_that_of_sorting[16-0]",
+    ),
     "7 rounds": Mutation(
         ((PHILOX, "range(3, 10)", "range(3, 7)"), (TWIN, "for r in range(10):", "for r in range(7):")),
         "tests/kernels/test_philox.py::test_known_answers",
