@@ -158,7 +158,7 @@ class Detection:
     @cached_property
     def smoothing(self) -> Smoothing:
         """Of the statistic `paper`."""
-        return Smoothing.of(self.quiet, self.scene.used)
+        return Smoothing.of(self.quiet, self.scene.used, self.flares)
 
     def collect(self, plan: ChannelPlan, tally: Tally, samples: Sequence[TailSamples | None]) -> None:
         """Take over the distributions and tails of one batch."""

@@ -23,7 +23,8 @@ STATISTICS = {
     "chi2_pair": "against a noisy quiescent exposure: twice the variance",
     "matched": "weighted sum with the flare's own shape as template, in standard deviations",
     "uv_excess": "net counts from 200 to 360 nm, in standard deviations",
-    "paper": "the MauveSim paper's sum of (F - Q)^2 / F on smoothed spectra in DN/s, Q a noisy exposure; F the flare's",
+    "paper": "the MauveSim paper's sum of (F - Q)^2 / F on smoothed spectra in DN/s, Q a noisy exposure, F flaring; "
+    "a few faint pixels make most of it (see `effective_terms`)",
 }
 #: Statistics that look for one flare's shape: each flare has a null of its own.
 SHAPED = ("matched", "paper")
@@ -98,6 +99,11 @@ class QuadraticForm:
     @property
     def std(self) -> float:
         return float(np.sqrt(np.sum(self.weight**2 * (2.0 + 4.0 * self.shift**2))))
+
+    @property
+    def effective_terms(self) -> float:
+        """How many equal terms would scatter as much for their sum: (sum of weights)^2 / sum of their squares."""
+        return float(self.weight.sum() ** 2 / np.sum(self.weight**2))
 
     def sf(self, value: float) -> float:
         """Probability of exceeding `value`.
