@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mauvecl.channels import ChannelPlan, Key
 from mauvecl.host.errors import InputError
+from mauvecl.intervals import detection_interval
 from mauvecl.roc import Roc
 from mauvecl.scene import Scene
 from mauvecl.smoothing import Smoothing
@@ -266,8 +267,7 @@ class Detection:
     def detection_probability(self, fap: float = 1e-3, statistic: str = "chi2") -> list[Interval]:
         """For each flare, the fraction of realisations at or above the threshold.
 
-        The interval is Clopper-Pearson's and allows for the threshold's own: its low end counts from the threshold's
-        high end and the other way round.
+        The interval holds the probability above the true threshold with 95 %: see `intervals.detection_interval`.
 
         Raises
         ------
@@ -276,10 +276,12 @@ class Detection:
         """
         probabilities = []
         for flare in range(len(self.flares)):
-            _, (cut, cut_low, cut_high) = self._cut(fap, statistic, flare)
+            null, (cut, cut_low, cut_high) = self._cut(fap, statistic, flare)
             found = self._found[(statistic, "flare_on_null_grid", flare)]
-            value, low, high = (clopper_pearson(found.above(index), found.n) for index in (cut, cut_high, cut_low))
-            probabilities.append(Interval(value.value, low.low, high.high))
+            above = [found.above(index) for index in (cut, cut_high, cut_low)]
+            # A flare adds what is not correlated with the null; tilted draws are others than the flares'.
+            shared = min(null.std / found.std, 1.0) if countable(fap, self.realisations) and found.std > 0 else 0.0
+            probabilities.append(detection_interval(above, found.n, fap, shared))
         return probabilities
 
     def quantile(
@@ -395,8 +397,8 @@ DESCRIPTIONS = {
     "threshold_low": "its 95 % interval, lower end",
     "threshold_high": "its 95 % interval, upper end",
     "probability": "detection probability at that threshold",
-    "low": "its 95 % interval, lower end, with the threshold's own",
-    "high": "its 95 % interval, upper end, with the threshold's own",
+    "low": "its 95 % interval, lower end, the threshold's error included",
+    "high": "its 95 % interval, upper end, the threshold's error included",
     "closed_form_threshold": "threshold for Gaussian noise",
     "closed_form_probability": "detection probability for Gaussian noise",
 }
