@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .bounded import shortened
 from .catalogue import band_table, find, spectrum_table
 from .errors import InputError
 
@@ -20,6 +21,9 @@ ALIASES = {
     "Gaia G": ("G", "Gaia DR2 G"),
     "GALEX NUV": ("NUV",),
 }
+#: What a magnitude may mean: what catalogues print in the band, Vega at zero in every band, or AB.
+System = Literal["catalogue", "vega", "ab"]
+SYSTEMS: tuple[System, ...] = get_args(System)
 #: A spectrum must cover this share of a band's throughput.
 COVERAGE = 0.99
 
@@ -32,7 +36,11 @@ class Band:
     ----------
     name : str
     system : {"Vega", "AB"}
-        What magnitudes in it mean.
+        What catalogues' magnitudes in it mean.
+    vega : float
+        Vega's magnitude in them; NaN for AB, where it is no zero point.
+    zero_point : str
+        Where that is from.
     origin : str
     wavelength_nm, throughput : ndarray, shape (n,)
         Response per photon, relative.
@@ -40,6 +48,8 @@ class Band:
 
     name: str
     system: Literal["Vega", "AB"]
+    vega: float
+    zero_point: str
     origin: str
     wavelength_nm: NDArray[np.float64]
     throughput: NDArray[np.float64]
@@ -73,6 +83,8 @@ def _load(name: str) -> Band:
     return Band(
         name=name,
         system=table.meta["system"],
+        vega=float(table.meta.get("vega", np.nan)),
+        zero_point=table.meta["zero_point"],
         origin=table.meta["origin"],
         wavelength_nm=np.asarray(table["wavelength"], float),
         throughput=np.asarray(table["throughput"], float),
@@ -116,7 +128,35 @@ def _observation(wavelength_nm: NDArray[np.float64], flux_flam: NDArray[np.float
     return chosen, Observation(spectrum, element, binset=grid * 10.0, force="taper")
 
 
-def magnitude(wavelength_nm: NDArray[np.float64], flux_flam: NDArray[np.float64], name: str = "V") -> float:
+def scale(name: str, system: System = "catalogue") -> str:
+    """What magnitudes in a band mean, as a sentence.
+
+    Raises
+    ------
+    InputError
+        For an unknown band or system.
+    """
+    chosen = band(name)
+    _check_system(system)
+    if system == "vega":
+        return f"Magnitudes in {chosen.name} have Vega at 0, unlike catalogues'."
+    if system == "ab":
+        return f"Magnitudes in {chosen.name} are AB."
+    meaning = "AB" if chosen.system == "AB" else f"Vega has {chosen.vega:g}"
+    return f"Magnitudes in {chosen.name} are as in catalogues: {meaning}."
+
+
+def _check_system(system: str) -> None:
+    if system not in SYSTEMS:
+        raise InputError(f"magnitude system {shortened(str(system))} is unknown, expected one of {', '.join(SYSTEMS)}")
+
+
+def magnitude(
+    wavelength_nm: NDArray[np.float64],
+    flux_flam: NDArray[np.float64],
+    name: str = "V",
+    system: System = "catalogue",
+) -> float:
     """Synthetic magnitude in a band.
 
     Parameters
@@ -125,22 +165,24 @@ def magnitude(wavelength_nm: NDArray[np.float64], flux_flam: NDArray[np.float64]
     flux_flam : ndarray, shape (n,)
         erg s-1 cm-2 A-1.
     name : str
-        Band; its record says whether the zero point is Vega's or AB.
+    system : {"catalogue", "vega", "ab"}
+        What catalogues print in the band (its record holds the zero point, with its source), Vega at zero, or AB.
 
     Raises
     ------
     InputError
-        For an unknown band, one that the spectrum does not cover, or no light in it.
+        For an unknown band or system, a band that the spectrum does not cover, or no light in it.
     """
     import astropy.units as u
     from synphot.units import VEGAMAG
 
+    _check_system(system)
     chosen, observation = _observation(wavelength_nm, flux_flam, name)
     if not float(observation.integrate().value) > 0.0:
         raise InputError(f"the spectrum has no light in the band {chosen.name}, expected a positive flux")
-    unit = VEGAMAG if chosen.system == "Vega" else u.ABmag
-    value = observation.effstim(unit, vegaspec=_vega(), wavelengths=observation.binset)
-    return float(value.value)
+    ab = system == "ab" or (system == "catalogue" and chosen.system == "AB")
+    value = observation.effstim(u.ABmag if ab else VEGAMAG, vegaspec=_vega(), wavelengths=observation.binset)
+    return float(value.value) + (chosen.vega if system == "catalogue" and not ab else 0.0)
 
 
 def photons(wavelength_nm: NDArray[np.float64], flux_flam: NDArray[np.float64], name: str) -> float:

@@ -40,6 +40,8 @@ class Source:
         What a report should say of it.
     history : tuple of str
         What was done to it.
+    scale : str
+        What the magnitude means that it was brought to; nothing where it was not.
 
     Raises
     ------
@@ -62,6 +64,7 @@ class Source:
     origin: str
     notes: tuple[str, ...] = ()
     history: tuple[str, ...] = ()
+    scale: str = ""
 
     def __post_init__(self) -> None:
         for field in ("wavelength_nm", "flux_flam"):
@@ -201,17 +204,23 @@ class Source:
         span = f"{self.wavelength_nm[0]:.0f}-{self.wavelength_nm[-1]:.0f} nm, {self.wavelength_nm.size} points"
         return f"<b>{html.escape(self.name)}</b>, {span}{notes}"
 
-    def magnitude(self, band: str = "V") -> float:
-        """Synthetic magnitude; Vega system, AB for GALEX NUV.
+    def magnitude(self, band: str = "V", system: bands.System = "catalogue") -> float:
+        """Synthetic magnitude, as catalogues print it unless another system is named.
+
+        Parameters
+        ----------
+        band : str
+        system : {"catalogue", "vega", "ab"}
+            What catalogues mean in the band, Vega at zero in every band, or AB.
 
         Raises
         ------
         InputError
-            For an unknown band or one that the spectrum does not cover.
+            For an unknown band or system, or a band that the spectrum does not cover.
         """
-        return bands.magnitude(self.wavelength_nm, self.flux_flam, band)
+        return bands.magnitude(self.wavelength_nm, self.flux_flam, band, system)
 
-    def at_magnitude(self, magnitude: float, band: str = "V") -> Self:
+    def at_magnitude(self, magnitude: float, band: str = "V", system: bands.System = "catalogue") -> Self:
         """The same star at another magnitude: F 10**(-0.4 (m - m0)) (the paper's equation 1).
 
         Raises
@@ -222,8 +231,9 @@ class Source:
         magnitude = _number("magnitude", magnitude, "mag")
         if not (np.isfinite(magnitude) and -30.0 <= magnitude <= 40.0):
             raise InputError(f"magnitude = {magnitude!r}, expected -30 to 40")
-        scale = 10.0 ** (-0.4 * (magnitude - self.magnitude(band)))
-        return self._changed(self.flux_flam * scale, f"scaled to {bands.band(band).name} = {magnitude:g}")
+        factor = 10.0 ** (-0.4 * (magnitude - self.magnitude(band, system)))
+        scaled = self._changed(self.flux_flam * factor, f"scaled to {bands.band(band).name} = {magnitude:g}")
+        return replace(scaled, scale=bands.scale(band, system))
 
     def flaring(
         self,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -18,7 +18,7 @@ from mauvecl.labels import label, put_first, stacked, titled, told
 from mauvecl.paper import PAPER_G2V, WHY, reconstruct
 from mauvecl.pool import Pool, together
 from mauvecl.sections import Star
-from mauvecl.statistics import SHAPED, Linear, matched_weights
+from mauvecl.statistics import SHAPED, Linear, QuadraticForm, matched_weights
 from mauvecl.study import PAPER_STARS, Study
 
 if TYPE_CHECKING:
@@ -187,9 +187,27 @@ def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
             f"{100 * answer.table['fap_error'].max():.1f} % of it: {run.realisations} realisations leave fewer than "
             "100 beyond them."
         )
-    answer.messages = list(dict.fromkeys([*messages, *campaign_told, *costs]))
+    answer.messages = list(dict.fromkeys([*messages, *campaign_told, *costs, *_few_terms(stars)]))
     answer.paper = _paper(study, [group for *_, group in prepared])
     return answer
+
+
+def _few_terms(stars: Sequence[StarDetection]) -> list[str]:
+    """How few pixels' worth of noise the paper's own sum holds."""
+    forms = [
+        star.found.closed_form("paper", template=flare)
+        for star in stars
+        if "paper" in star.found.statistics
+        for flare in range(len(star.amplitudes))
+    ]
+    terms = [form.effective_terms for form in forms if isinstance(form, QuadraticForm)]
+    if not terms:
+        return []
+    few, many = (f"{end:.1f}" for end in (min(terms), max(terms)))
+    return [
+        f"The paper's sum over {stars[0].found.dof('paper')} pixels scatters like one of "
+        f"{few if few == many else f'{few} to {many}'} independent squares: its faintest pixels make most of it."
+    ]
 
 
 def _own(name: str, path: Path, quiet: Expectation) -> Linear:

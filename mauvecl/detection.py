@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from mauvecl.channels import ChannelPlan, Key
 from mauvecl.host.errors import InputError
+from mauvecl.intervals import detection_interval
 from mauvecl.roc import Roc
 from mauvecl.scene import Scene
 from mauvecl.smoothing import Smoothing
@@ -158,7 +159,7 @@ class Detection:
     @cached_property
     def smoothing(self) -> Smoothing:
         """Of the statistic `paper`."""
-        return Smoothing.of(self.quiet, self.scene.used)
+        return Smoothing.of(self.quiet, self.scene.used, self.flares)
 
     def collect(self, plan: ChannelPlan, tally: Tally, samples: Sequence[TailSamples | None]) -> None:
         """Take over the distributions and tails of one batch."""
@@ -287,8 +288,7 @@ class Detection:
     def detection_probability(self, fap: float = 1e-3, statistic: str = "chi2") -> list[Interval]:
         """For each flare, the fraction of realisations at or above the threshold; NaN for `blinding` ones.
 
-        The interval is Clopper-Pearson's and allows for the threshold's own: its low end counts from the threshold's
-        high end and the other way round.
+        The interval holds the probability above the true threshold with 95 %: see `intervals.detection_interval`.
 
         Raises
         ------
@@ -301,7 +301,13 @@ class Detection:
                 probabilities.append(Interval(np.nan, np.nan, np.nan))
                 continue
             cut = self._cut(fap, statistic, flare)
-            probabilities.append(self._share_above(self._at((statistic, "flare_on_null_grid", flare)), cut))
+            found = self._at((statistic, "flare_on_null_grid", flare))
+            above = [found.above(value) for value in (cut.value, cut.high, cut.low)]
+            shared = 0.0
+            if countable(fap, self.realisations) and found.std > 0:
+                # A flare adds what is not correlated with the null; tilted draws are others than the flares'.
+                shared = min(self._at(self._null_key(statistic, flare)).std / found.std, 1.0)
+            probabilities.append(detection_interval(above, found.n, fap, shared))
         return probabilities
 
     @staticmethod
@@ -427,8 +433,8 @@ DESCRIPTIONS = {
     "threshold_low": "its 95 % interval, lower end",
     "threshold_high": "its 95 % interval, upper end",
     "probability": "detection probability at that threshold",
-    "low": "its 95 % interval, lower end, with the threshold's own",
-    "high": "its 95 % interval, upper end, with the threshold's own",
+    "low": "its 95 % interval, lower end, the threshold's error included",
+    "high": "its 95 % interval, upper end, the threshold's error included",
     "closed_form_threshold": "threshold for Gaussian noise",
     "closed_form_probability": "detection probability for Gaussian noise",
 }

@@ -71,6 +71,12 @@ def coverage(result: SnrResult) -> NDArray[np.float64]:
 def beyond(x: Expectation, sigmas: float) -> NDArray[np.float64]:
     """Probability that a pixel's exposure exceeds its mean by so many standard deviations, shape (n_pixel,).
 
+    Parameters
+    ----------
+    x : Expectation
+    sigmas : float
+        Below zero: that it falls short of it by as many.
+
     Notes
     -----
     By the saddle point (Lugannani & Rice 1980, doi 10.2307/1426607) of Gaussian and Poisson parts together; right to
@@ -95,7 +101,7 @@ def beyond(x: Expectation, sigmas: float) -> NDArray[np.float64]:
         _, first, second = cumulants(u)
         u = u - (first - goal) / second
     value, _, second = cumulants(u)
-    w, v = np.sqrt(2 * (u * goal - value)), u * np.sqrt(second)
+    w, v = np.sqrt(2 * (u * goal - value)), np.abs(u) * np.sqrt(second)
     return np.asarray(special.ndtr(-w) + np.exp(-(w**2) / 2) / np.sqrt(2 * np.pi) * (1 / v - 1 / w))
 
 
@@ -172,7 +178,8 @@ class GaussianReport:
                     "at_nm": np.nan if worst is None else float(worst["wavelength"].value),
                     "coverage_low": float(here["coverage"].min()),
                     "coverage_high": float(here["coverage"].max()),
-                    "five_sigma": float((beyond(star.result.expectation, 5.0) / special.ndtr(-5.0)).max()),
+                    "five_sigma_above": float((beyond(star.result.expectation, 5.0) / special.ndtr(-5.0)).max()),
+                    "five_sigma_below": float((beyond(star.result.expectation, -5.0) / special.ndtr(-5.0)).min()),
                     "fap_ratio": 1.0 if wrong is None else float(wrong["ratio"]),
                     "statistic": "" if wrong is None else str(wrong["statistic"]),
                     "why": "" if wrong is None else str(wrong["why"]),
@@ -189,7 +196,8 @@ class GaussianReport:
             ("at_nm", "where"),
             ("coverage_low", "smallest share of 1-sigma intervals that hold the truth, of all elements"),
             ("coverage_high", "largest"),
-            ("five_sigma", "how often a pixel exceeds its mean by 5 sigma, over the normal 2.9e-7; the worst pixel"),
+            ("five_sigma_above", "how often a pixel lies 5 sigma above its mean, over the normal 2.9e-7; the most"),
+            ("five_sigma_below", "how often a pixel lies 5 sigma below its mean, over the normal 2.9e-7; the least"),
             ("probability_off_by", "largest significant difference of a detection probability from the closed form"),
             ("fap_ratio", "most wrong false-alarm probability over the promised one; 1 if none differs"),
         ):

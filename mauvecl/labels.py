@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 def label(star: Star, x: Expectation) -> str:
     """A star's name with its magnitude, for tables and pictures."""
     name = star.library or x.name
-    return name if star.magnitude is None else f"{name} {star.band} = {star.magnitude:g}"
+    system = {"catalogue": "", "vega": " (Vega = 0)", "ab": " (AB)"}[star.magnitude_system]
+    return name if star.magnitude is None else f"{name} {star.band} = {star.magnitude:g}{system}"
 
 
 def told(expectations: list[Expectation]) -> list[str]:

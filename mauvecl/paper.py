@@ -35,7 +35,7 @@ def reconstruct(quiet: Expectation, flare: Expectation) -> Interval:
     noisy spectra are smoothed with a Gaussian of 10.5 nm FWHM, as its figure says, and compared as
     `scipy.stats.chisquare` would, with the flare's mean as the expected values.
     """
-    smoothing = Smoothing.of(quiet, np.ones(quiet.wavelength_nm.size, bool))
+    smoothing = Smoothing.of(quiet, np.ones(quiet.wavelength_nm.size, bool), (flare,))
     delta, variance = flare.signal_dn - quiet.signal_dn, flare.variance_dn2 + quiet.variance_dn2
     form = smoothing.form(smoothing.scale(flare), delta, variance)
     middle, low, high = (form.isf(p) / quiet.wavelength_nm.size for p in (0.5, 0.975, 0.025))

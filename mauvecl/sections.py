@@ -29,6 +29,7 @@ class Star(Part):
     file: Path | None = None
     magnitude: float | None = None
     band: str = "V"
+    magnitude_system: Literal["catalogue", "vega", "ab"] = "catalogue"
     ebv: float | None = None
 
     @model_validator(mode="after")
@@ -44,7 +45,7 @@ class Star(Part):
         found = Source.from_library(self.library) if self.library is not None else Source.read(self.file or "")
         if self.ebv is not None:
             found = found.reddened(self.ebv)
-        return found if self.magnitude is None else found.at_magnitude(self.magnitude, self.band)
+        return found if self.magnitude is None else found.at_magnitude(self.magnitude, self.band, self.magnitude_system)
 
 
 class Flare(Part):

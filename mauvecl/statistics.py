@@ -12,6 +12,7 @@ from scipy import special
 
 from mauvecl.comparison import TEMPLATE, Comparison
 from mauvecl.host.errors import InputError
+from mauvecl.inversion import Squares
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -23,7 +24,8 @@ STATISTICS = {
     "chi2_pair": "against a noisy quiescent exposure: twice the variance",
     "matched": "weighted sum with the flare's own shape as template, in standard deviations",
     "uv_excess": "net counts from 200 to 360 nm, in standard deviations",
-    "paper": "the MauveSim paper's sum of (F - Q)^2 / F on smoothed spectra in DN/s, Q a noisy exposure; F the flare's",
+    "paper": "the MauveSim paper's sum of (F - Q)^2 / F on smoothed spectra in DN/s, Q a noisy exposure, F flaring; "
+    "a few faint pixels make most of it (see `effective_terms`)",
 }
 #: Statistics that look for one flare's shape: each flare has a null of its own.
 SHAPED = ("matched", "paper")
@@ -72,8 +74,9 @@ def central_counts(trials: int, probability: float, confidence: float = CONFIDEN
     return bounds[0], bounds[1]
 
 
-#: Standard deviations from the mean within which a transform is computed once for all values.
-NEAR = 40.0
+#: Standard deviations from the mean within which a transform is computed once for all values, if there are as many
+#: effective terms and the probability is as large.
+NEAR, MANY, RARE = 40.0, 30.0, 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,15 +102,24 @@ class QuadraticForm:
     def std(self) -> float:
         return float(np.sqrt(np.sum(self.weight**2 * (2.0 + 4.0 * self.shift**2))))
 
+    @property
+    def effective_terms(self) -> float:
+        """How many equal terms would scatter as much for their sum: (sum of weights)^2 / sum of their squares."""
+        return float(self.weight.sum() ** 2 / np.sum(self.weight**2))
+
     def sf(self, value: float) -> float:
         """Probability of exceeding `value`.
 
         Notes
         -----
-        Davies's inversion of the characteristic function (1973, doi 10.1093/biomet/60.2.415): a trapezoidal sum whose
-        aliasing error is the probability of lying more than 2 pi / spacing away. The spacing puts that 40 standard
-        deviations out, below 1e-15 for ten terms or more; the sum stops where its terms have fallen below 1e-15.
+        Of many terms, and not far out, Davies's inversion of the characteristic function (1973, doi
+        10.1093/biomet/60.2.415), computed once for all values: a trapezoidal sum whose aliasing error is the
+        probability of lying more than 2 pi / spacing away. The spacing puts that 40 standard deviations out, below
+        1e-15 for ten terms or more; the sum stops where its terms have fallen below 1e-15. Of few terms, and far out,
+        the integral of `inversion`, which keeps its digits.
         """
+        if value <= 0.0:
+            return 1.0
         if self._is_chi_squared():
             if not self.shift.any():
                 return float(special.chdtrc(self.weight.size, value))
@@ -115,18 +127,23 @@ class QuadraticForm:
             from scipy.stats import ncx2
 
             return float(ncx2.sf(value, self.weight.size, np.sum(self.shift**2)))
-        reach = abs(value - self.mean) / self.std
-        u, size, phase = self._near if reach <= NEAR else self._transform(reach)
-        return float(np.clip(0.5 + np.sum(size * np.sin(phase - u * value)) / np.pi, 0.0, 1.0))
+        if self.effective_terms >= MANY and abs(value - self.mean) <= NEAR * self.std:
+            u, size, phase = self._near
+            found = 0.5 + float(np.sum(size * np.sin(phase - u * value))) / np.pi
+            if found >= RARE:
+                return min(found, 1.0)
+        upper = value > self.mean
+        tail = float(np.exp(self._squares.tail(value / self._squares.unit, upper=upper)[0]))
+        return tail if upper else 1.0 - tail
+
+    @cached_property
+    def _squares(self) -> Squares:
+        return Squares.of(self.weight, self.shift)
 
     @cached_property
     def _near(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """The transform for all values that are asked for again and again."""
-        return self._transform(NEAR)
-
-    def _transform(self, reach: float) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Frequencies, and the characteristic function's modulus and phase there, for values within so many std."""
-        spacing = 2.0 * np.pi / ((40.0 + reach) * self.std)
+        """Frequencies, and the characteristic function's modulus and phase there, for all values that are near."""
+        spacing = 2.0 * np.pi / ((40.0 + NEAR) * self.std)
         pull = self.shift**2 * self.weight
         parts = []
         k = 0.5 + np.arange(256)
@@ -143,13 +160,17 @@ class QuadraticForm:
                 return np.concatenate(us), np.concatenate(sizes), np.concatenate(phases)
 
     def isf(self, probability: float) -> float:
-        """The value exceeded with this probability."""
+        """The value exceeded with this probability, 0 < probability < 1."""
         if self._is_chi_squared() and not self.shift.any():
             return float(special.chdtri(self.weight.size, probability))
-        from scipy.optimize import brentq
+        if self.effective_terms >= MANY and RARE < probability < 1.0 - RARE:
+            from scipy.optimize import brentq
 
-        low, high = max(self.mean - 12 * self.std, 0.0), self.mean + 40 * self.std
-        return float(brentq(lambda x: self.sf(x) - probability, low, high, xtol=1e-9 * self.std))
+            low, high = max(self.mean - 12 * self.std, 0.0), self.mean + 40 * self.std
+            return float(brentq(lambda x: self.sf(x) - probability, low, high, xtol=1e-9 * self.std))
+        upper = probability <= 0.5
+        wanted = probability if upper else 1.0 - probability
+        return self._squares.unit * self._squares.quantile(wanted, upper=upper)
 
     def _is_chi_squared(self) -> bool:
         return bool(np.all(self.weight == 1.0))

@@ -192,7 +192,7 @@ def test_unsimulated_statistics_are_refused(engine: Engine) -> None:
 def test_saturated_pixels_are_left_out(engine: Engine) -> None:
     """Pixels saturated without a flare have no news; the rest still gives a calibrated null."""
     payload = instrument(part=True)
-    quiet, flare = star(magnitude=-0.2, amplitudes=(0.05,), exposure=10.0, payload=payload)
+    quiet, flare = star(magnitude=-0.17, amplitudes=(0.05,), exposure=10.0, payload=payload)
     assert 0 < quiet.saturated.sum() < 10
     found = engine.detect(quiet, [flare], realisations=100_000, seed=3)
     dof = int((~quiet.saturated).sum())

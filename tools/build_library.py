@@ -48,18 +48,44 @@ MUSCLES = {
 ALIASES = {"K2.5V": "K3V", "B5V": "B57V"}
 QUANTUM = "assumed per photon (optics times quantum efficiency), though pyphot tags it 'energy'"
 PHOTONS = "per photon, as pyphot tags it"
-#: Node in pyphot, magnitude system, title, and why the response is taken per photon.
+#: What magnitudes in catalogues mean: system, Vega's magnitude, source.
+ZERO_POINTS: dict[str, tuple[str, float | None, str]] = {
+    "V": (
+        "Vega",
+        0.03,
+        "Vega has V = 0.03 (Johnson et al. 1966, CoLPL 4, 99); measured 0.026 +- 0.008 (Bohlin "
+        "& Gilliland 2004, AJ 127, 3508, doi 10.1086/420715)",
+    ),
+    "Kepler": (
+        "AB",
+        None,
+        "Kp of the Kepler Input Catalog is AB (Brown et al. 2011, AJ 142, 112, doi 10.1088/0004-6256/142/4/112)",
+    ),
+    "TESS": (
+        "Vega",
+        0.0,
+        "Vega has T = 0 (Sullivan et al. 2015, ApJ 809, 77, doi 10.1088/0004-637X/809/1/77; so "
+        "the TESS Input Catalog, Stassun et al. 2019, AJ 158, 138)",
+    ),
+    "Gaia G": (
+        "Vega",
+        0.023,
+        "Gaia scales Vega to V = 0.023 (Riello et al. 2021, A&A 649, A3, doi "
+        "10.1051/0004-6361/202039587, after Bohlin 2007)",
+    ),
+    "GALEX NUV": ("AB", None, "AB (Morrissey et al. 2007, ApJS 173, 682, doi 10.1086/520512)"),
+}
+#: Node in pyphot, title, and why the response is taken per photon.
 BANDS = {
     "V": (
         "GROUND_JOHNSON_V",
-        "Vega",
         "Johnson V",
         "per photon, though pyphot tags it 'energy': only so do all Pickles classes, normalised to V = 0, agree",
     ),
-    "Kepler": ("KEPLER_Kp", "Vega", "Kepler Kp", QUANTUM),
-    "TESS": ("TESS", "Vega", "TESS", QUANTUM),
-    "Gaia G": ("GaiaDR2v2_G", "Vega", "Gaia DR2 G, revised", PHOTONS),
-    "GALEX NUV": ("GALEX_NUV", "AB", "GALEX NUV", PHOTONS),
+    "Kepler": ("KEPLER_Kp", "Kepler Kp", QUANTUM),
+    "TESS": ("TESS", "TESS", QUANTUM),
+    "Gaia G": ("GaiaDR2v2_G", "Gaia DR2 G, revised", PHOTONS),
+    "GALEX NUV": ("GALEX_NUV", "GALEX NUV", PHOTONS),
 }
 
 PICKLES_ORIGIN = {
@@ -175,7 +201,7 @@ def write_band(name: str, source: Path) -> None:
     """One band as ECSV, thinned where the published table is finer than needed."""
     import h5py
 
-    node, system, title, response = BANDS[name]
+    (node, title, response), (system, vega, zero_point) = BANDS[name], ZERO_POINTS[name]
     with h5py.File(source / "pyphot/libs/new_filters.hd5") as file:
         data = file["filters"][node]
         wavelength, throughput = np.asarray(data["WAVELENGTH"]), np.asarray(data["THROUGHPUT"])
@@ -192,6 +218,8 @@ def write_band(name: str, source: Path) -> None:
         "name": name,
         "title": title,
         "system": system,
+        **({} if vega is None else {"vega": vega}),
+        "zero_point": zero_point,
         "origin": f"{node} of the package pyphot {PACKAGES['pyphot']}",
         "licence": "MIT (pyphot)",
         "response": response,

@@ -149,12 +149,13 @@ def gaussian(
     show_table(
         f"The root-of-N formula beside {study.run.realisations:,} realisations; promised: no difference in S/N, "
         f"68.3 % of 1-sigma intervals, as many 5-sigma pixels and false alarms ({study.run.fap:g}) as normal noise has",
-        ("star", *swept, "best S/N", "S/N off by", "at nm", "1-sigma intervals", "5-sigma pixels", "false alarms",
+        ("star", *swept, "best S/N", "S/N off by", "at nm", "1-sigma intervals", "5 sigma above, below", "false alarms",
          "statistic", "why", "detection off by"),
         [
             (row["star"], *(short(row[name]) for name in swept), f"{row['best_snr']:.2f}",
              f"{row['snr_off_by']:+.3f}", "" if math.isnan(row["at_nm"]) else f"{row['at_nm']:.0f}",
-             f"{100 * row['coverage_low']:.2f}-{100 * row['coverage_high']:.2f} %", f"{row['five_sigma']:.2f}",
+             f"{100 * row['coverage_low']:.2f}-{100 * row['coverage_high']:.2f} %",
+             f"{row['five_sigma_above']:.2f}, {row['five_sigma_below']:.2f}",
              f"{row['fap_ratio']:.3f}",
              row["statistic"], row["why"], f"{row['probability_off_by']:+.4f}")
             for row in tables["gaussian"]

@@ -26,6 +26,12 @@ MagnitudeFlag = Annotated[
     typer.Option("--magnitude", "-m", help="Magnitude, one for all stars or one each.", show_default=False),
 ]
 BandFlag = Annotated[str | None, typer.Option(help="Band of the magnitude [V].", show_default=False)]
+MagnitudeSystemFlag = Annotated[
+    str | None,
+    typer.Option(
+        help="What it means: catalogue, vega (Vega is 0 in every band), or ab [catalogue].", show_default=False
+    ),
+]
 EbvFlag = Annotated[
     float | None,
     typer.Option(help="Dust before the star, E(B-V), mag (needs mauvecl[extinction]).", show_default=False),
@@ -202,6 +208,7 @@ OBSERVATION = {
     "star": Option(StarFlag),
     "magnitude": Option(MagnitudeFlag),
     "band": Option(BandFlag),
+    "magnitude_system": Option(MagnitudeSystemFlag),
     "ebv": Option(EbvFlag),
     "exposure": Option(ExposureFlag, "observation", "exposure_s"),
     "instrument": Option(InstrumentFlag, "observation", "instrument"),
@@ -380,7 +387,7 @@ def _stars(study: Study, given: dict[str, Any]) -> list[dict[str, Any]] | None:
     from mauvecl.host.errors import InputError
 
     names, magnitudes = given["star"], given["magnitude"]
-    same = {key: given[key] for key in ("band", "ebv") if given[key] is not None}
+    same = {key: given[key] for key in ("band", "magnitude_system", "ebv") if given[key] is not None}
     if not (names or magnitudes or same):
         return None
     if names:

@@ -179,7 +179,7 @@ def gaussian(found: GaussianReport, path: str | Path | None) -> Any:
     panels = (
         ("snr_off_by", "mean S/N less formula", 0.0, 0.1),
         ("coverage_low", "share of 1-sigma intervals right", 0.6827, 0.03),
-        ("five_sigma", "5-sigma pixels over normal", 1.0, 0.5),
+        ("five_sigma_above", "pixels 5 sigma above, over normal", 1.0, 0.5),
         ("fap_ratio", "false alarms over promised", 1.0, 0.2),
     )
     with plt.rc_context(STYLE):

@@ -39,12 +39,13 @@ def test_muscles_entries_admit_their_model_and_cite_their_data() -> None:
 @pytest.mark.parametrize("name", bands.ALIASES)
 def test_bands_say_where_they_are_from_and_what_they_mean(name: str) -> None:
     meta = catalogue.band_table(f"{name.lower().replace(' ', '_')}.ecsv").meta
-    assert all(meta[field] for field in ("origin", "licence", "system"))
+    assert all(meta[field] for field in ("origin", "licence", "system", "zero_point"))
+    assert ("vega" in meta) == (meta["system"] == "Vega")
     assert "per photon" in meta["response"]
 
 
 def test_the_sun_has_its_magnitude() -> None:
-    """V = -26.76 +- 0.02 (Vega system): ties Vega, the band and the absolute scale together."""
+    """V = -26.76 +- 0.02 (Willmer 2018): ties Vega, the band and the absolute scale together."""
     assert Source.from_library("Sun").magnitude("V") == pytest.approx(-26.76, abs=0.02)
 
 
