@@ -87,7 +87,8 @@ def synphot_spectrum(wavelength_nm: NDArray[np.float64], flux_flam: NDArray[np.f
 
     # synphot interpolates in photons; the difference is far below a spectrum's own sampling.
     photons = convert_flux(wavelength_nm * u.nm, flux_flam * FLAM, PHOTLAM)
-    return SourceSpectrum(Empirical1D, points=wavelength_nm * u.nm, lookup_table=photons)
+    # Negative fluxes are measured noise; without this they become zero.
+    return SourceSpectrum(Empirical1D, points=wavelength_nm * u.nm, lookup_table=photons, keep_neg=True)
 
 
 @cache

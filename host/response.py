@@ -78,6 +78,11 @@ class Line:
         """Farthest distance from a pixel's centre that sends light into it."""
         return (self.top_hat + self.pixel) / 2 + REACH_SIGMA * self.sigma
 
+    @property
+    def highest(self) -> float:
+        """The line function's highest value in a pixel, nm^-1."""
+        return float(self.landing(np.zeros(1))[0]) / self.pixel
+
     def density(self, offset_nm: ArrayLike) -> Float:
         """The line function, nm^-1, unit integral: a difference of two error functions."""
         x = np.asarray(offset_nm, np.float64)
@@ -94,9 +99,9 @@ class Line:
         # Even in the offset; on the left side of the line no digits cancel.
         x = -np.abs(offset_nm)
         half = self.pixel / 2
-        return np.asarray(self._below(x + half) - self._below(x - half))
+        return np.asarray(self.below(x + half) - self.below(x - half))
 
-    def _below(self, x: Float) -> Float:
+    def below(self, x: Float) -> Float:
         """Fraction of a line's light that lands below x."""
         if self.top_hat == 0:
             return np.asarray(ndtr(x / self.sigma))
