@@ -143,12 +143,17 @@ def columns_of(
     known = {plain(one) for one in names}
     # A word that is no column's may be a row's.
     rest = [one for one in asked if plain(one) not in known]
-    wave, flux = chosen(names, [one for one in asked if one not in rest], units)
+    try:
+        wave, flux = chosen(names, [one for one in asked if one not in rest], units)
+    except InputError as error:
+        if not rest:
+            raise
+        raise InputError(f"no column is named {shortened(rest[0])}, expected one of {listed(names)}") from error
     cells = values(wave), values(flux)
     if _is_arrays(cells[1]):
         cells = _one_row(names, values, wave, flux, cells, rest)
     elif rest:
-        raise InputError(f"no column named {shortened(rest[0])}, expected one of {listed(names)}")
+        raise InputError(f"no column is named {shortened(rest[0])}, expected one of {listed(names)}")
     missing = [None, None] if none is None else [none(wave), none(flux)]
     found = [
         numbers(cell, names[place].strip(), gap) for cell, place, gap in zip(cells, (wave, flux), missing, strict=True)
