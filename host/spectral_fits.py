@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import math
 import re
 import warnings
 from collections.abc import Sequence
@@ -17,6 +18,8 @@ from .spectral_tables import columns_of, first_fitting
 
 #: Units of the archives' tables without a word about them: CALSPEC's.
 USUAL = ("Angstrom", "erg / (s cm2 Angstrom)")
+#: Bytes of a block (FITS standard 4.0, section 3.1); cards of a header and extensions of a file that are read.
+BLOCK, MOST_CARDS, MOST_EXTENSIONS = 2880, 100_000, 1000
 #: Keywords whose words may speak of air, vacuum, the star's surface or its dust.
 _WORDS = ("AIRORVAC", "VACUUM", "WAVEMED", "WAVETYPE", "VACWAVE", "COMMENT", "HISTORY", "DESCRIP")
 #: Images that are no fluxes, by their extension's name.
@@ -33,13 +36,14 @@ def read_fits(content: bytes, name: str, origin: str, asked: Sequence[str]) -> C
     """
     from astropy.io import fits
 
+    check_sizes(content)
     try:
         # Old archive files carry headers that astropy warns of and reads all the same.
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             hdus = fits.open(io.BytesIO(content), memmap=False, lazy_load_hdus=False, disable_image_compression=True)
             with hdus:
-                return _read(hdus, len(content), name, origin, asked)
+                return _read(hdus, name, origin, asked)
     except InputError:
         raise
     except Exception as error:  # truncated and foreign files fail in many ways
@@ -47,18 +51,58 @@ def read_fits(content: bytes, name: str, origin: str, asked: Sequence[str]) -> C
         raise InputError(f"cannot be read as FITS ({shortened(reason)}), expected a whole FITS file") from error
 
 
-def _read(hdus: Any, size: int, name: str, origin: str, asked: Sequence[str]) -> Columns:
+def check_sizes(content: bytes) -> None:
+    """Refuse headers whose sizes are impossible or beyond the file, before anyone believes them.
+
+    A negative size sends astropy's reader back and around for ever.
+
+    Raises
+    ------
+    InputError
+    """
+    place = 0
+    for number in range(MOST_EXTENSIONS + 1):
+        if content[place : place + 8] not in (b"SIMPLE  ", b"XTENSION"):
+            return
+        if number == MOST_EXTENSIONS:
+            break
+        cards: dict[bytes, bytes] = {}
+        at = place
+        while content[at : at + 8] != b"END     ":
+            card = content[at : at + 80]
+            if len(card) < 80 or at - place > 80 * MOST_CARDS:
+                raise InputError(f"has a header {number} without an end, expected a whole FITS file")
+            cards.setdefault(card[:8].strip(), card[10:].split(b"/")[0].strip())
+            at += 80
+        start = place + -(-(at + 80 - place) // BLOCK) * BLOCK
+        try:
+            axes = [int(cards[b"NAXIS%d" % (k + 1)]) for k in range(min(int(cards[b"NAXIS"]), 999))]
+            bits, extra, groups = (
+                int(cards.get(k, d)) for k, d in ((b"BITPIX", b""), (b"PCOUNT", b"0"), (b"GCOUNT", b"1"))
+            )
+        except (KeyError, ValueError) as error:
+            raise InputError(f"has a header {number} whose sizes are no numbers, expected a whole FITS file") from error
+        if axes[:1] == [0] and len(axes) > 1:
+            # Random groups.
+            axes = axes[1:]
+        if min([extra, groups, *axes]) < 0 or abs(bits) > 64:
+            raise InputError(f"has a header {number} with impossible sizes, expected a whole FITS file")
+        size = abs(bits) // 8 * groups * (extra + math.prod(axes) if axes else 0)
+        if start + size > len(content):
+            raise InputError(
+                f"is cut short: its extension {number} is to hold {size} bytes, of which "
+                f"{max(0, len(content) - start)} are there, expected a whole file"
+            )
+        place = start + -(-size // BLOCK) * BLOCK
+    raise InputError(f"has more than {MOST_EXTENSIONS} extensions, expected fewer")
+
+
+def _read(hdus: Any, name: str, origin: str, asked: Sequence[str]) -> Columns:
     from astropy.io import fits
 
     primary = hdus[0].header
     tables, images = [], []
     for place, hdu in enumerate(hdus):
-        place_of = hdu.fileinfo()
-        if place_of is not None and place_of["datLoc"] + hdu.size > size:
-            raise InputError(
-                f"is cut short: its extension {place} is to hold {hdu.size} bytes, of which "
-                f"{max(0, size - place_of['datLoc'])} are there, expected a whole file"
-            )
         label = _text(hdu.header, "EXTNAME") or str(place)
         # An extension may be asked for by its name or its number.
         label = str(place) if str(place) in asked else label

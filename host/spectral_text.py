@@ -238,9 +238,14 @@ def _from_arrays(
     if "source_id" in by_name and "wavelength" not in by_name and flux.size == GAIA_POINTS:
         wavelength = GAIA_START_NM + GAIA_STEP_NM * np.arange(GAIA_POINTS, dtype=np.float64)
         return Columns(
-            wavelength, flux, f"Gaia DR3 {by_name['source_id'].strip()[:30]}",
-            f"{origin}, Gaia DR3 sampled XP spectrum", "nm", GAIA_FLUX, notes=("wavelengths 336 + 2 i nm, W m-2 nm-1: Gaia DR3's documentation",),
-        )  # fmt: skip
+            wavelength,
+            flux,
+            f"Gaia DR3 {by_name['source_id'].strip()[:30]}",
+            f"{origin}, Gaia DR3 sampled XP spectrum",
+            "nm",
+            GAIA_FLUX,
+            notes=("wavelengths 336 + 2 i nm, W m-2 nm-1: Gaia DR3's documentation",),
+        )
     wave, value = chosen(names, asked)
     step = step_among(names)
     found = row_of(

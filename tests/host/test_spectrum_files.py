@@ -108,7 +108,8 @@ def test_content_counts_and_not_the_name(
     alike(tmp_path / name)
 
 
-FROM_AIR = 10 * NM / (1 + 2.735182e-4 + 131.4182 / (10 * NM) ** 2 + 2.76249e8 / (10 * NM) ** 4)
+WAVENUMBER2 = (1000 / NM) ** 2
+FROM_AIR = 10 * NM / (1 + 8.34254e-5 + 2.406147e-2 / (130 - WAVENUMBER2) + 1.5998e-4 / (38.9 - WAVENUMBER2))
 
 
 def short_rows(values: np.ndarray) -> np.ndarray:
@@ -160,7 +161,9 @@ def test_logarithmic_images(tmp_path: Path) -> None:
     nm = 10 ** np.linspace(2.2, 3.0, 500)
     flux = 1e-13 * nm / 500
     step = 0.8 / 499
-    (tmp_path / "iraf.fits").write_bytes(image(flux, CRVAL1=3.2, CD1_1=step, DC_FLAG=1, BUNIT="FLAM", CUNIT1="Angstrom"))
+    (tmp_path / "iraf.fits").write_bytes(
+        image(flux, CRVAL1=3.2, CD1_1=step, DC_FLAG=1, BUNIT="FLAM", CUNIT1="Angstrom")
+    )
     star = Source.read(tmp_path / "iraf.fits")
     np.testing.assert_allclose(star.wavelength_nm, nm, rtol=1e-12)
     np.testing.assert_allclose(star.flux_flam, flux, rtol=1e-6)
@@ -172,11 +175,9 @@ def test_logarithmic_images(tmp_path: Path) -> None:
 
 
 def test_air_becomes_vacuum_where_the_file_says_air(tmp_path: Path) -> None:
-    """Against Morton's other formula (1991, ApJS 77, 119, equation 4: IAU), to 3e-8; and nothing said is vacuum."""
+    """Against Birch & Downs 1994, as VALD converts (Morton 2000, ApJS 130, 403), to 1e-7; and what says nothing."""
     air = FROM_AIR[NM > 205]
     flux = FLUX[NM > 205]
-    step = np.full(NM.size - air.size, 0.0)
-    assert step.size
     full = np.append(10 * NM[NM <= 205][:-1], air), np.append(FLUX[NM <= 205][:-1], flux)
     cases = {
         "a.txt": lines(*full, head="# wavelength in air (Angstrom), flux (FLAM)\n").encode(),
@@ -190,13 +191,13 @@ def test_air_becomes_vacuum_where_the_file_says_air(tmp_path: Path) -> None:
         star = Source.read(tmp_path / name)
         assert any("in air, converted to vacuum" in text for text in star.told), name
         inside = NM > 210
-        np.testing.assert_allclose(star.wavelength_nm[-inside.sum() :], NM[inside], rtol=4e-8)
+        np.testing.assert_allclose(star.wavelength_nm[-inside.sum() :], NM[inside], rtol=1e-7)
     alike_path = tmp_path / "v.fits"
     alike_path.write_bytes(table(header={"HISTORY": "All wavelengths are in vacuum."}))
     alike(alike_path)
     (tmp_path / "said.txt").write_text(lines(*full))
     said = Source.read(tmp_path / "said.txt", wavelength_unit="Angstrom air", flux_unit="flam")
-    assert said.wavelength_nm[-1] == pytest.approx(NM[-1], rel=4e-8)
+    assert said.wavelength_nm[-1] == pytest.approx(NM[-1], rel=1e-7)
     awav = image(flux, CRVAL1=2100.0, CDELT1=20.0, CTYPE1="AWAV", CUNIT1="Angstrom", BUNIT="FLAM")
     (tmp_path / "awav.fits").write_bytes(awav)
     found = read_spectrum(tmp_path / "awav.fits")
@@ -290,12 +291,12 @@ BAD_FITS = {
     "unequal": (table(columns=(short_rows(10 * NM[:-1]), short_rows(FLUX)),
                       formats=(f"{NM.size - 1}D", f"{NM.size}D")), "414 wavelengths for 415 fluxes"),
     "words": (table(columns=(10 * NM, ["x"] * NM.size), formats=("D", "3A")), "holds no plain numbers"),
-    "counts": (table(units=("ANGSTROMS", "Counts/s")), "unit 'Counts/s' is a magnitude, count or logarithm"),
-    "AB": (table(units=("ANGSTROMS", "ABmag")), "is a magnitude"),
+    "counts": (table(units=("ANGSTROMS", "Counts/s")), r"unit 'Counts/s' is no flux density \(magnitude, count"),
+    "AB": (table(units=("ANGSTROMS", "ABmag")), r"is no flux density \(magnitude"),
     "per steradian": (table(units=("nm", "W m-2 nm-1 sr-1")), "is no flux density"),
     "seconds": (table(units=("s", "FLAM")), "expected a length or a frequency"),
     "no axis": (image(FLUX), "image without CRVAL1"),
-    "giant": (WHOLE.replace(b"NAXIS2  =                  415", b"NAXIS2  =        4150000000"), "is cut short"),
+    "giant": (WHOLE.replace(b"NAXIS2  =                  415", b"NAXIS2  =" + b"4150000000".rjust(21)), "is cut short"),
     "negative rows": (WHOLE.replace(b"NAXIS2  =                  415", b"NAXIS2  =                 -415"), "FITS"),
     "bad card": (WHOLE.replace(b"TFORM1  = 'D       '", b"TFORM1  = 'Q!!     '"), "FITS"),
 }  # fmt: skip
@@ -373,7 +374,7 @@ def test_masks_and_integers_that_mark_nothing(tmp_path: Path) -> None:
 def test_the_span_is_judged_before_ends_are_cut(tmp_path: Path) -> None:
     flux = np.where(NM < 230, np.nan, FLUX)
     (tmp_path / "a.txt").write_text(lines(NM, flux, head="# nm FLAM\n"))
-    with pytest.raises(InputError, match="spans 200-998 nm once its undefined ends|flux nan at point .*, 200 nm"):
+    with pytest.raises(InputError, match=r"flux nan at point \d+, 200 nm"):
         Source.read(tmp_path / "a.txt")
 
 
