@@ -134,8 +134,18 @@ def magnitude(wavelength_nm: NDArray[np.float64], flux_flam: NDArray[np.float64]
         For an unknown band, one that the spectrum does not cover, or no light in it.
     """
     import astropy.units as u
-    from synphot.units import VEGAMAG
+    from synphot.units import FLAM, VEGAMAG
 
+    above, below = _signed(flux_flam)
+    if below is not None:
+        # synphot takes negative fluxes for none; both parts are straight between the same points, so they add up.
+        plus, minus = (
+            float(seen.effstim(FLAM, wavelengths=seen.binset).value)
+            for seen in (_observation(wavelength_nm, part, name)[1] for part in (above, below))
+        )
+        if not plus > minus:
+            raise InputError(f"the spectrum has no light in the band {band(name).name}, expected a positive flux")
+        return magnitude(wavelength_nm, above, name) - 2.5 * float(np.log10(1.0 - minus / plus))
     chosen, observation = _observation(wavelength_nm, flux_flam, name)
     if not float(observation.integrate().value) > 0.0:
         raise InputError(f"the spectrum has no light in the band {chosen.name}, expected a positive flux")
@@ -146,4 +156,12 @@ def magnitude(wavelength_nm: NDArray[np.float64], flux_flam: NDArray[np.float64]
 
 def photons(wavelength_nm: NDArray[np.float64], flux_flam: NDArray[np.float64], name: str) -> float:
     """Photons s-1 cm-2 in a band, weighted with its throughput; errors as `magnitude`."""
+    above, below = _signed(flux_flam)
+    if below is not None:
+        return photons(wavelength_nm, above, name) - photons(wavelength_nm, below, name)
     return float(_observation(wavelength_nm, flux_flam, name)[1].integrate().value)
+
+
+def _signed(flux: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    """A flux's parts above and below zero, both positive; None where nothing is below."""
+    return (np.maximum(flux, 0.0), np.maximum(-flux, 0.0)) if (flux < 0.0).any() else (flux, None)

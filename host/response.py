@@ -79,9 +79,10 @@ class Line:
         return (self.top_hat + self.pixel) / 2 + REACH_SIGMA * self.sigma
 
     @property
-    def highest(self) -> float:
-        """The line function's highest value in a pixel, nm^-1."""
-        return float(self.landing(np.zeros(1))[0]) / self.pixel
+    def mean_density(self) -> float:
+        """The line function's mean over its own light, the integral of its square, nm^-1, with the pixel's width."""
+        offset = np.linspace(-self.reach, self.reach, 4001)
+        return float(np.trapezoid((self.landing(offset) / self.pixel) ** 2, offset))
 
     def density(self, offset_nm: ArrayLike) -> Float:
         """The line function, nm^-1, unit integral: a difference of two error functions."""

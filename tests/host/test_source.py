@@ -245,7 +245,7 @@ GOOD = grid() * 1e-15
         ("200 1\n300\n400 1", "line 2: '300' has one column"),
         ("# head\n200 1\n300 abc", "line 3: '300 abc' is not numeric"),
         (rows(grid()[31:], GOOD[31:]), "spans 201-1099 nm, expected at least 200-700 nm"),
-        (rows(grid()[20:], GOOD[20:]), r"starts at 190 nm, where it is bright: \d.\d% of the brightest"),
+        (rows(grid()[25:], GOOD[25:]), r"starts at 195 nm, where it is bright: \d.\d% of the brightest"),
         (rows(grid()[:500], GOOD[:500]), "spans 170-669 nm"),
         (rows(grid()[:535], GOOD[:535]), r"ends at 704 nm, where it is bright: \d+.\d% of the brightest"),
         (rows(grid() * 10, GOOD), "these look like Angstrom"),
@@ -269,7 +269,7 @@ def test_bad_files_are_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="is not text"):
         Source.read(tmp_path / "junk.txt")
     (tmp_path / "junk.fits").write_bytes(b"SIMPLE  = nothing" * 20)
-    with pytest.raises(InputError, match="cannot be read as FITS"):
+    with pytest.raises(InputError, match="header 0 without an end, expected a whole FITS file"):
         Source.read(tmp_path / "junk.fits")
     fits.PrimaryHDU(np.zeros(5)).writeto(tmp_path / "image.fits")
     with pytest.raises(InputError, match="image without CRVAL1"):
@@ -303,14 +303,12 @@ def test_other_numbers_of_the_span() -> None:
     np.testing.assert_allclose(one.source_electrons, other.source_electrons, rtol=2e-4)
     with pytest.raises(InputError, match=r"starts at 190 nm, where it is bright: .*--extend continues it"):
         Source.from_arrays(grid()[20:], hot[20:])
-    # What was continued is not taken for measured light: not in a band, nor by an instrument that sees it.
+    # What was continued is not taken for measured light in a band.
     dark = np.where(grid() < 300, 1e-17, GOOD)
     cut = Source.from_arrays(grid()[25:], dark[25:], name="cut")
     assert cut.measured_nm == (195.0, 1099.0)
     with pytest.raises(InputError, match="covers 195-1099 nm, expected 99% of the band GALEX NUV"):
         cut.magnitude("GALEX NUV")
-    with pytest.raises(InputError, match="spans 195-1099 nm, expected at least the output range 190-700 nm"):
-        expect(cut, mauve.with_(output_min_nm=190.0), exposure=5.0)
 
 
 def test_extended_by_another_star(sun: Source) -> None:
@@ -329,7 +327,7 @@ def test_extended_by_another_star(sun: Source) -> None:
             rtol=1e-6,
         )
     with pytest.raises(InputError, match="expected light in both to scale by"):
-        Source.from_arrays(short[0], np.where(short[0] > 500, short[1], 0.0) - 1e-30, extend="G2V")
+        Source.from_arrays(short[0], np.where(short[0] > 600, short[1], 0.0) - 1e-30, extend="G2V")
     with pytest.raises(InputError, match="expected them to overlap"):
         Source.from_arrays([3000.0, 3001.0, 3002.0], [1.0, 1.0, 1.0], extend="G2V")
     whole = Source.from_arrays(sun.wavelength_nm, sun.flux_flam, extend="G2V")
@@ -368,8 +366,11 @@ def test_a_mean_below_zero_beyond_its_error_is_refused() -> None:
 
 
 def test_a_pixels_error_is_the_scatter_of_its_means() -> None:
-    """Against the scatter over 200 spectra of white noise; 200 draws tell a standard deviation to 5 %, and the bound of
-    the sum lies up to a tenth above it: 0.8 to 1.3 fails by chance less than once in 1e5 for any of ten pixels."""
+    """Against the scatter over 200 spectra of white noise.
+
+    200 draws tell a standard deviation to 5 %, and the error told, a mean over 20 of them, is right to 3 %: 0.75 to
+    1.25 is beyond four deviations and fails by chance less than once in 1e3 for any of ten pixels, of a fixed seed.
+    """
     from mauvecl.host.measured_noise import error_per_second
     from mauvecl.host.response import electrons_per_second
 
@@ -378,7 +379,6 @@ def test_a_pixels_error_is_the_scatter_of_its_means() -> None:
     rng = np.random.default_rng(5)
     draws = [1e-12 + 1e-13 * rng.standard_normal(nm.size) for _ in range(200)]
     means = np.array([electrons_per_second(mauve, nm, flux) for flux in draws])
-    told = error_per_second(Source.from_arrays(nm, draws[0]), mauve, "paper")
+    told = np.mean([error_per_second(Source.from_arrays(nm, flux), mauve, "paper") for flux in draws[:20]], axis=0)
     ratio = (told / means.std(axis=0))[100:1600:150]
-    assert (ratio > 0.8).all(), ratio
-    assert (ratio < 1.3).all(), ratio
+    assert (np.abs(ratio - 1) < 0.25).all(), ratio

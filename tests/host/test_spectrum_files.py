@@ -255,7 +255,7 @@ BAD_TEXT = {
     "counts": (lines(NM, FLUX, head="# wavelength nm, counts\n"), "speaks of 'counts'"),
     "two units": (lines(NM, FLUX, head="# nm or Angstrom\n# FLAM\n"), "names the units nm, Angstrom, expected one"),
     "two fluxes": (
-        lines(NM, FLUX, FLUX, head="wave flux_1 flux_2\n"), r"2 columns may be the flux: flux_1, flux_2.*FILE\[flux_2\]",
+        lines(NM, FLUX, FLUX, head="wave flux_1 flux_2\n"), r"2 columns may be the flux: flux_1, flux_2.*FILE\[flux_2",
     ),
     "mixed commas": (lines(NM, FLUX).replace("1.", "1,"), "mixes commas, points and blanks"),
     "commas or columns": ("\n".join(f"{n},5,1,2e-14" for n in range(200, 800)), "decimal commas or columns"),
