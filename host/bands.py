@@ -136,16 +136,15 @@ def magnitude(wavelength_nm: NDArray[np.float64], flux_flam: NDArray[np.float64]
     import astropy.units as u
     from synphot.units import FLAM, VEGAMAG
 
-    above, below = _signed(flux_flam)
-    if below is not None:
-        # synphot takes negative fluxes for none; both parts are straight between the same points, so they add up.
-        plus, minus = (
+    level = _level(flux_flam)
+    if level is not None:
+        raised, flat = (
             float(seen.effstim(FLAM, wavelengths=seen.binset).value)
-            for seen in (_observation(wavelength_nm, part, name)[1] for part in (above, below))
+            for seen in (_observation(wavelength_nm, part, name)[1] for part in (flux_flam + level, level))
         )
-        if not plus > minus:
+        if not raised > flat:
             raise InputError(f"the spectrum has no light in the band {band(name).name}, expected a positive flux")
-        return magnitude(wavelength_nm, above, name) - 2.5 * float(np.log10(1.0 - minus / plus))
+        return magnitude(wavelength_nm, level, name) - 2.5 * float(np.log10((raised - flat) / flat))
     chosen, observation = _observation(wavelength_nm, flux_flam, name)
     if not float(observation.integrate().value) > 0.0:
         raise InputError(f"the spectrum has no light in the band {chosen.name}, expected a positive flux")
@@ -156,12 +155,16 @@ def magnitude(wavelength_nm: NDArray[np.float64], flux_flam: NDArray[np.float64]
 
 def photons(wavelength_nm: NDArray[np.float64], flux_flam: NDArray[np.float64], name: str) -> float:
     """Photons s-1 cm-2 in a band, weighted with its throughput; errors as `magnitude`."""
-    above, below = _signed(flux_flam)
-    if below is not None:
-        return photons(wavelength_nm, above, name) - photons(wavelength_nm, below, name)
+    level = _level(flux_flam)
+    if level is not None:
+        return photons(wavelength_nm, flux_flam + level, name) - photons(wavelength_nm, level, name)
     return float(_observation(wavelength_nm, flux_flam, name)[1].integrate().value)
 
 
-def _signed(flux: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
-    """A flux's parts above and below zero, both positive; None where nothing is below."""
-    return (np.maximum(flux, 0.0), np.maximum(-flux, 0.0)) if (flux < 0.0).any() else (flux, None)
+def _level(flux: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """What lifts a flux above zero, the same at each point, or None: synphot takes negative fluxes for none.
+
+    Bands are linear in the flux, so what is added can be taken off again.
+    """
+    lowest = float(flux.min())
+    return np.full_like(flux, -2.0 * lowest) if lowest < 0.0 else None

@@ -278,7 +278,7 @@ def test_bad_files_are_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no unit, expected one such as nm"):
         Source.read(tmp_path / "c.ecsv")
     (tmp_path / "d.ecsv").write_text("not a table")
-    with pytest.raises(InputError, match="cannot be read as ECSV"):
+    with pytest.raises(InputError, match="holds no numbers, expected two columns"):
         Source.read(tmp_path / "d.ecsv")
 
 
