@@ -99,7 +99,8 @@ def synphot_spectrum(wavelength_nm: NDArray[np.float64], flux_flam: NDArray[np.f
 
     # synphot interpolates in photons; the difference is far below a spectrum's own sampling.
     photons = convert_flux(wavelength_nm * u.nm, flux_flam * FLAM, PHOTLAM)
-    return SourceSpectrum(Empirical1D, points=wavelength_nm * u.nm, lookup_table=photons)
+    # Negative fluxes are measured noise; without this they become zero.
+    return SourceSpectrum(Empirical1D, points=wavelength_nm * u.nm, lookup_table=photons, keep_neg=True)
 
 
 @cache
@@ -174,9 +175,18 @@ def magnitude(
         For an unknown band or system, a band that the spectrum does not cover, or no light in it.
     """
     import astropy.units as u
-    from synphot.units import VEGAMAG
+    from synphot.units import FLAM, VEGAMAG
 
     _check_system(system)
+    level = _level(flux_flam)
+    if level is not None:
+        raised, flat = (
+            float(seen.effstim(FLAM, wavelengths=seen.binset).value)
+            for seen in (_observation(wavelength_nm, part, name)[1] for part in (flux_flam + level, level))
+        )
+        if not raised > flat:
+            raise InputError(f"the spectrum has no light in the band {band(name).name}, expected a positive flux")
+        return magnitude(wavelength_nm, level, name, system) - 2.5 * float(np.log10((raised - flat) / flat))
     chosen, observation = _observation(wavelength_nm, flux_flam, name)
     if not float(observation.integrate().value) > 0.0:
         raise InputError(f"the spectrum has no light in the band {chosen.name}, expected a positive flux")
@@ -187,4 +197,16 @@ def magnitude(
 
 def photons(wavelength_nm: NDArray[np.float64], flux_flam: NDArray[np.float64], name: str) -> float:
     """Photons s-1 cm-2 in a band, weighted with its throughput; errors as `magnitude`."""
+    level = _level(flux_flam)
+    if level is not None:
+        return photons(wavelength_nm, flux_flam + level, name) - photons(wavelength_nm, level, name)
     return float(_observation(wavelength_nm, flux_flam, name)[1].integrate().value)
+
+
+def _level(flux: NDArray[np.float64]) -> NDArray[np.float64] | None:
+    """What lifts a flux above zero, the same at each point, or None: synphot takes negative fluxes for none.
+
+    Bands are linear in the flux, so what is added can be taken off again.
+    """
+    lowest = float(flux.min())
+    return np.full_like(flux, -2.0 * lowest) if lowest < 0.0 else None

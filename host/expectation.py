@@ -15,6 +15,7 @@ from scipy import special
 
 from .errors import InputError
 from .instrument import Instrument
+from .measured_noise import below_zero
 from .response import Order, electrons_per_second
 from .sky import Sky
 
@@ -355,24 +356,30 @@ def expect(
     # A hair less, so that 0.1 + 0.2 s is three frames of 0.1 s.
     n_frames = max(1, int(np.ceil(asked_s / instrument.frame_s * (1 - 1e-12))))
     low, high = instrument.output_min_nm, instrument.output_max_nm
-    if source.wavelength_nm[0] > low or source.wavelength_nm[-1] < high:
+    first, last = source.measured_nm or (float(source.wavelength_nm[0]), float(source.wavelength_nm[-1]))
+    if first > low or last < high:
         raise InputError(
-            f"the spectrum of {source.name} spans {source.wavelength_nm[0]:g}-{source.wavelength_nm[-1]:g} nm, "
+            f"the spectrum of {source.name} spans {first:g}-{last:g} nm, "
             f"expected at least the output range {low:g}-{high:g} nm of {instrument.name}"
+        )
+    if source.unscaled:
+        raise InputError(
+            f"the spectrum of {source.name} is not as bright as the star is seen: {source.unscaled}, expected a "
+            "magnitude beside it"
         )
 
     def per_frame(light: Source) -> Float:
         rate = electrons_per_second(instrument, light.wavelength_nm, light.flux_flam, order)
-        # Quadrature can leave -1e-30 where there is no light.
-        return np.maximum(rate, 0.0) * instrument.frame_s * instrument.per_pixel("response", 1.0)
+        return rate * instrument.frame_s * instrument.per_pixel("response", 1.0)
 
     zodiacal = sky.spectrum(instrument.field_of_view_arcsec2)
     n_pixel = instrument.wavelength_nm.size
     element, element_wavelength = _elements(instrument)
+    electrons = per_frame(source)
     plain = Expectation(
         wavelength_nm=instrument.wavelength_nm,
-        source_electrons=per_frame(source),
-        sky_electrons=np.zeros(n_pixel) if zodiacal is None else per_frame(zodiacal),
+        source_electrons=np.maximum(electrons, 0.0),
+        sky_electrons=np.zeros(n_pixel) if zodiacal is None else np.maximum(per_frame(zodiacal), 0.0),
         dark_dn=instrument.per_pixel("dark", instrument.dark_dn_per_s * instrument.frame_s),
         dark_unit=instrument.dark_unit,
         bias_dn=instrument.per_pixel("bias_dn", instrument.bias_dn),
@@ -396,6 +403,7 @@ def expect(
             "source origin": source.origin,
             "source notes": "; ".join(source.notes),
             "source history": "; ".join(source.history),
+            "source remarks": "; ".join(source.told),
             "source digest": source.digest,
             "sky": sky.description,
             "sky digest": "" if zodiacal is None else zodiacal.digest,
@@ -407,7 +415,8 @@ def expect(
             "exposure": f"{n_frames} x {instrument.frame_s:g} s",
         },
     )
-    messages = [*_saturation(plain)]
+    messages = [*_saturation(plain), *(f"{source.name}: {text}." for text in source.told)]
+    messages += below_zero(source, instrument, plain, electrons, order)
     if n_frames * instrument.frame_s > asked_s * (1 + 1e-9):
         messages.append(
             f"The exposure of {asked_s:g} s is rounded up to {plain.exposure_s:g} s, "

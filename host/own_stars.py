@@ -20,8 +20,9 @@ from urllib.parse import urljoin
 
 import numpy as np
 
+from .bounded import read_bytes
 from .errors import InputError
-from .formats import read_spectrum
+from .formats import without_columns
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -43,6 +44,9 @@ class OwnStar:
     notes: tuple[str, ...]
     dereddened: bool
     path: Path
+    told: tuple[str, ...] = ()
+    measured_nm: tuple[float, float] | None = None
+    unscaled: str = ""
 
 
 def folder() -> Path:
@@ -69,7 +73,12 @@ def _described(path: Path) -> OwnStar | None:
     if not {"name", "origin", "spectrum_sha256"} <= set(meta):
         return None
     notes = tuple(str(note) for note in meta.get("notes", ()))
-    return OwnStar(str(meta["name"]), str(meta["origin"]), notes, bool(meta.get("dereddened")), path)
+    told = tuple(str(text) for text in meta.get("told", ()))
+    measured = meta.get("measured_nm")
+    return OwnStar(
+        str(meta["name"]), str(meta["origin"]), notes, bool(meta.get("dereddened")), path, told,
+        None if measured is None else (float(measured[0]), float(measured[1])), str(meta.get("unscaled", "")),
+    )  # fmt: skip
 
 
 def _read(path: Path) -> Table:
@@ -106,7 +115,16 @@ def _digest(wavelength: np.ndarray, flux: np.ndarray) -> str:
     return hashlib.sha256(wavelength.tobytes() + flux.tobytes()).hexdigest()
 
 
-def add(path: str | Path, name: str | None = None, *, origin: str | None = None, replace: bool = False) -> OwnStar:
+def add(
+    path: str | Path,
+    name: str | None = None,
+    *,
+    origin: str | None = None,
+    replace: bool = False,
+    wavelength_unit: str | None = None,
+    flux_unit: str | None = None,
+    extend: str | None = None,
+) -> OwnStar:
     """Keep a spectrum from a file under a name.
 
     Parameters
@@ -119,6 +137,8 @@ def add(path: str | Path, name: str | None = None, *, origin: str | None = None,
         Where it came from.
     replace : bool
         Take the place of a kept star of that name.
+    wavelength_unit, flux_unit, extend : str, optional
+        As `Source.read` takes them.
 
     Raises
     ------
@@ -130,10 +150,11 @@ def add(path: str | Path, name: str | None = None, *, origin: str | None = None,
     from . import catalogue
     from .source import Source
 
-    path = Path(path)
-    read = read_spectrum(path)
-    source: Source = Source.read(path)
-    name = (name or read.name).strip()
+    given = path
+    path, _ = without_columns(path)
+    content = read_bytes(path, "spectrum file")
+    source: Source = Source.read(given, wavelength_unit=wavelength_unit, flux_unit=flux_unit, extend=extend)
+    name = (name or source.name).strip()
     if not re.fullmatch(r"[\w][\w .+\-*'()]{0,63}", name):
         raise InputError(f"star name {name!r}, expected up to 64 letters, digits, spaces and . + - * ' ( )")
     if catalogue.embedded(name) is not None:
@@ -147,12 +168,16 @@ def add(path: str | Path, name: str | None = None, *, origin: str | None = None,
     table.meta |= {
         "name": name,
         "origin": origin or f"file {path.name}",
-        "file_sha256": hashlib.sha256(path.read_bytes()).hexdigest(),
+        "file_sha256": hashlib.sha256(content).hexdigest(),
         "spectrum_sha256": _digest(source.wavelength_nm, source.flux_flam),
         "kept_utc": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "dereddened": dereddened,
         "notes": list(source.notes),
+        "told": list(source.told),
+        "unscaled": source.unscaled,
     }
+    if source.measured_nm is not None:
+        table.meta["measured_nm"] = list(source.measured_nm)
     place = there.path if there is not None else folder() / f"{re.sub(r'[^A-Za-z0-9.+-]', '_', name)}.ecsv"
     if there is None and place.exists():
         raise InputError(f"star name {name!r} is too much like another kept star's, expected another name")
@@ -261,7 +286,14 @@ COLLECTIONS = (
 )
 
 
-def fetch(name: str, *, base: str | None = None, replace: bool = False, show_progress: bool = True) -> OwnStar:
+def fetch(
+    name: str,
+    *,
+    base: str | None = None,
+    replace: bool = False,
+    show_progress: bool = True,
+    extend: str | None = None,
+) -> OwnStar:
     """Fetch a star of a public collection and keep it.
 
     Parameters
@@ -273,6 +305,8 @@ def fetch(name: str, *, base: str | None = None, replace: bool = False, show_pro
     replace : bool
         Take the place of a kept star of that name.
     show_progress : bool
+    extend : str, optional
+        A library spectrum that goes on where the star's file ends.
 
     Raises
     ------
@@ -297,11 +331,11 @@ def fetch(name: str, *, base: str | None = None, replace: bool = False, show_pro
         except FileNotFoundError:
             continue
         file = url.rsplit("/", 1)[1]
-        # The readers go by the file's name.
+        # Messages and notes go by the archive's name of the file.
         local = downloaded.rename(downloaded.with_name(f"{downloaded.name}-{file}"))
         try:
             title = f"{collection.title}; {collection.citation}; {url}"
-            return add(local, star, origin=title, replace=replace)
+            return add(local, star, origin=title, replace=replace, extend=extend)
         except InputError as error:
             raise InputError(
                 f"{url} came, and is no usable spectrum ({str(error).replace(local.name, file)}), expected a whole file"

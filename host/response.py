@@ -78,6 +78,12 @@ class Line:
         """Farthest distance from a pixel's centre that sends light into it."""
         return (self.top_hat + self.pixel) / 2 + REACH_SIGMA * self.sigma
 
+    @property
+    def mean_density(self) -> float:
+        """The line function's mean over its own light, the integral of its square, nm^-1, with the pixel's width."""
+        offset = np.linspace(-self.reach, self.reach, 4001)
+        return float(np.trapezoid((self.landing(offset) / self.pixel) ** 2, offset))
+
     def density(self, offset_nm: ArrayLike) -> Float:
         """The line function, nm^-1, unit integral: a difference of two error functions."""
         x = np.asarray(offset_nm, np.float64)
@@ -94,9 +100,9 @@ class Line:
         # Even in the offset; on the left side of the line no digits cancel.
         x = -np.abs(offset_nm)
         half = self.pixel / 2
-        return np.asarray(self._below(x + half) - self._below(x - half))
+        return np.asarray(self.below(x + half) - self.below(x - half))
 
-    def _below(self, x: Float) -> Float:
+    def below(self, x: Float) -> Float:
         """Fraction of a line's light that lands below x."""
         if self.top_hat == 0:
             return np.asarray(ndtr(x / self.sigma))

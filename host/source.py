@@ -16,12 +16,23 @@ from . import bands, catalogue, own_stars
 from .errors import InputError
 from .flare import Geometry, with_flare
 from .formats import read_spectrum
+from .spectral_ends import (
+    SPAN_NM,
+    check_flux,
+    check_points,
+    check_span,
+    continued,
+    extended,
+    means,
+    remarks,
+    without_undefined_ends,
+)
 
 if TYPE_CHECKING:
     import astropy.units as u
 
-#: What a spectrum must span, in nm (the paper, section "Preparing the input spectrum").
-SPAN_NM = (180.0, 750.0)
+#: V of the brightest star, Sirius (Bessell 1990: -1.46), with room, and of the Sun with room: -26.76 (Willmer 2018).
+BRIGHTEST_V, SUN_V = -2.0, (-27.3, -26.2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,9 +42,9 @@ class Source:
     Attributes
     ----------
     wavelength_nm : ndarray, shape (n,)
-        Vacuum wavelengths, strictly increasing, spanning at least 180-750 nm.
+        Vacuum wavelengths, strictly increasing, spanning at least 200-700 nm.
     flux_flam : ndarray, shape (n,)
-        erg s-1 cm-2 A-1, finite and not negative; linear between the points.
+        erg s-1 cm-2 A-1, finite; linear between the points. Negative ones are measured noise.
     name, origin : str
         Origin says where the spectrum came from, with its citation.
     notes : tuple of str
@@ -42,6 +53,12 @@ class Source:
         What was done to it.
     scale : str
         What the magnitude means that it was brought to; nothing where it was not.
+    told : tuple of str
+        What every answer must say of it: what was assumed, continued or merged.
+    measured_nm : tuple of float, optional
+        Its span without what was continued at the level of its ends; all of it by default.
+    unscaled : str
+        Why its flux is not that at the telescope, so that it needs a magnitude; empty where it is.
 
     Raises
     ------
@@ -65,6 +82,9 @@ class Source:
     notes: tuple[str, ...] = ()
     history: tuple[str, ...] = ()
     scale: str = ""
+    told: tuple[str, ...] = ()
+    measured_nm: tuple[float, float] | None = None
+    unscaled: str = ""
 
     def __post_init__(self) -> None:
         for field in ("wavelength_nm", "flux_flam"):
@@ -72,7 +92,9 @@ class Source:
             array = np.array(getattr(self, field), dtype=np.float64)
             array.setflags(write=False)
             object.__setattr__(self, field, array)
-        _check(self.name, self.wavelength_nm, self.flux_flam)
+        check_points(self.name, self.wavelength_nm, self.flux_flam)
+        check_span(self.name, self.wavelength_nm)
+        check_flux(self.name, self.wavelength_nm, self.flux_flam)
 
     @cached_property
     def digest(self) -> str:
@@ -90,7 +112,11 @@ class Source:
         """
         mine = own_stars.find(name) if catalogue.embedded(name) is None else None
         if mine is not None:
-            return cls(*own_stars.spectrum(mine), mine.name, mine.origin, mine.notes)
+            wavelength, flux = own_stars.spectrum(mine)
+            return cls(
+                wavelength, flux, mine.name, mine.origin, mine.notes,
+                told=mine.told, measured_nm=mine.measured_nm, unscaled=mine.unscaled,
+            )  # fmt: skip
         entry = catalogue.find(name)
         table = catalogue.spectrum_table(entry["file"])
         return cls(
@@ -102,19 +128,102 @@ class Source:
         )
 
     @classmethod
-    def read(cls, path: str | Path) -> Self:
-        """A user's own spectrum: two-column text (nm, erg s-1 cm-2 A-1), ECSV, or an archive's FITS table.
+    def read(
+        cls,
+        path: str | Path,
+        *,
+        wavelength_unit: str | u.UnitBase | None = None,
+        flux_unit: str | u.UnitBase | None = None,
+        extend: str | Source | None = None,
+    ) -> Self:
+        """A user's own spectrum: text, ECSV, VOTable or FITS; `told` says what was assumed or changed.
 
-        Ends beyond 180-750 nm with negative or undefined flux, as archive spectra have, are left out and noted.
+        Undefined ends beyond 200-700 nm are left out. Ends within 180-750 nm are continued at their level where they
+        are dark.
+
+        Parameters
+        ----------
+        path : str or Path
+            May end in a column, ``grid.fits[g45]``; see `formats.read_spectrum`.
+        wavelength_unit, flux_unit : str or Unit, optional
+            Stand above what the file states; a wavelength's may end in " air" or " vacuum".
+        extend : str or Source, optional
+            A library spectrum that goes on where the file ends, scaled to it at the join.
 
         Raises
         ------
         InputError
             If the file is missing, unreadable or holds no usable spectrum.
         """
-        found = read_spectrum(Path(path))
-        wavelength, flux, note = _without_bad_ends(found.wavelength_nm, found.flux_flam)
-        return cls(wavelength, flux, found.name, found.origin, (*found.notes, *note))
+        found = read_spectrum(Path(path), wavelength_unit=wavelength_unit, flux_unit=flux_unit)
+        star = cls._made(
+            found.wavelength_nm, found.flux_flam, found.name, found.origin, found.notes, found.told, extend
+        )
+        unscaled = found.unscaled or star._too_bright()
+        return replace(star, unscaled=unscaled) if unscaled else star
+
+    @classmethod
+    def _made(
+        cls,
+        wavelength: NDArray[np.float64],
+        flux: NDArray[np.float64],
+        name: str,
+        origin: str,
+        notes: tuple[str, ...] = (),
+        told: tuple[str, ...] = (),
+        extend: str | Source | None = None,
+    ) -> Self:
+        """A spectrum from outside: its span checked before its ends are cut, extended or continued."""
+        check_points(name, wavelength, flux)
+        if extend is None:
+            check_span(name, wavelength)
+        wavelength, flux, cut = without_undefined_ends(name, wavelength, flux)
+        if extend is None:
+            check_span(name, wavelength, " once its undefined ends are cut" if cut else "")
+        told = (*told, *remarks(wavelength, flux))
+        if extend is not None:
+            other = cls.from_library(extend) if isinstance(extend, str) else extend
+            wavelength, flux, added = extended(name, wavelength, flux, other.name, other.wavelength_nm, other.flux_flam)
+            told += added
+        check_flux(name, wavelength, flux)
+        measured = (float(wavelength[0]), float(wavelength[-1]))
+        wavelength, flux, added = continued(name, wavelength, flux)
+        return cls(
+            wavelength, flux, name, origin, (*notes, *cut), told=(*told, *added),
+            measured_nm=measured if added else None,
+        )  # fmt: skip
+
+    def _too_bright(self) -> str:
+        """Why the flux cannot be that of a star at the telescope, or nothing."""
+        try:
+            v = self.magnitude("V")
+        except InputError:
+            return ""
+        sunlike = SUN_V[0] < v < SUN_V[1]
+        return "" if v > BRIGHTEST_V or sunlike else f"its flux makes V = {v:.1f}, brighter than any star in the sky"
+
+    def binned(self, width_nm: u.Quantity | float) -> Self:
+        """The spectrum as means over bins, for noisy ones; bins start at its first wavelength.
+
+        Parameters
+        ----------
+        width_nm : Quantity or float
+            In nm, 0.01 to 50.
+
+        Raises
+        ------
+        InputError
+            For an impossible width.
+        """
+        width = _number("bin", width_nm, "nm")
+        if not 0.01 <= width <= 50.0:
+            raise InputError(f"bin = {width!r} nm, expected 0.01 to 50")
+        first, last = self.wavelength_nm[0], self.wavelength_nm[-1]
+        edges = np.append(np.arange(first, last - width / 2, width), last)
+        flux = means(self.wavelength_nm, self.flux_flam, edges)
+        nm = np.concatenate([[first], (edges[1:] + edges[:-1]) / 2, [last]])
+        flux = np.concatenate([flux[:1], flux, flux[-1:]])
+        return replace(self, wavelength_nm=nm, flux_flam=flux, history=(*self.history, f"binned to {width:g} nm"))
 
     @classmethod
     def from_arrays(
@@ -124,8 +233,11 @@ class Source:
         *,
         name: str = "star",
         origin: str = "arrays",
+        extend: str | Source | None = None,
     ) -> Self:
         """A spectrum from two arrays, shape (n,): Quantities, or plain numbers in nm and erg s-1 cm-2 A-1.
+
+        `extend` names a library spectrum, or is one, that goes on where the arrays end.
 
         Raises
         ------
@@ -148,7 +260,7 @@ class Source:
         if isinstance(wavelength, u.Quantity) and wavelength.unit.physical_type != "length" and axis[:1] > axis[-1:]:
             # Rising frequencies are falling wavelengths.
             axis, density = axis[::-1], density[::-1]
-        return cls(axis, density, name, origin)
+        return cls._made(np.asarray(axis, float), np.asarray(density, float), name, origin, extend=extend)
 
     @classmethod
     def from_synphot(cls, spectrum: Any, *, name: str = "synphot spectrum") -> Self:
@@ -167,7 +279,7 @@ class Source:
         alone = np.minimum(inside - nm[at - 1], nm[at] - inside) > 1e-3
         grid = np.union1d(nm, inside[alone])
         flux = spectrum(grid * u.nm, flux_unit=FLAM).value
-        return cls(grid, flux, name, f"synphot {type(spectrum).__name__}")
+        return cls._made(grid, flux, name, f"synphot {type(spectrum).__name__}")
 
     @classmethod
     def from_specutils(cls, spectrum: Any, *, name: str = "specutils spectrum") -> Self:
@@ -218,7 +330,10 @@ class Source:
         InputError
             For an unknown band or system, or a band that the spectrum does not cover.
         """
-        return bands.magnitude(self.wavelength_nm, self.flux_flam, band, system)
+        low, high = self.measured_nm or (0.0, np.inf)
+        # What was made up is nobody's magnitude.
+        inside = (self.wavelength_nm >= low) & (self.wavelength_nm <= high)
+        return bands.magnitude(self.wavelength_nm[inside], self.flux_flam[inside], band, system)
 
     def at_magnitude(self, magnitude: float, band: str = "V", system: bands.System = "catalogue") -> Self:
         """The same star at another magnitude: F 10**(-0.4 (m - m0)) (the paper's equation 1).
@@ -233,7 +348,7 @@ class Source:
             raise InputError(f"magnitude = {magnitude!r}, expected -30 to 40")
         factor = 10.0 ** (-0.4 * (magnitude - self.magnitude(band, system)))
         scaled = self._changed(self.flux_flam * factor, f"scaled to {bands.band(band).name} = {magnitude:g}")
-        return replace(scaled, scale=bands.scale(band, system))
+        return replace(scaled, scale=bands.scale(band, system), unscaled="")
 
     def flaring(
         self,
@@ -333,68 +448,5 @@ def _number(what: str, value: u.Quantity | float, unit: str = "") -> float:
         return float(value.to_value(unit)) if isinstance(value, u.Quantity) else float(value)
     except (u.UnitConversionError, TypeError, ValueError) as error:
         shown = str(value) if isinstance(value, u.Quantity) else repr(value)
-        names = {"K": "kelvin", "mag": "magnitudes", "": "a number"}
+        names = {"K": "kelvin", "mag": "magnitudes", "nm": "nm", "": "a number"}
         raise InputError(f"{what} = {shown}, expected {names[unit]}") from error
-
-
-def _without_bad_ends(
-    wavelength: NDArray[np.float64], flux: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64], tuple[str, ...]]:
-    """Leave out the ends beyond 180-750 nm from their innermost negative or undefined point on, and say so.
-
-    Archive spectra end in noise; within the span such points remain, to be refused.
-    """
-    bad = ~(np.isfinite(flux) & (flux >= 0.0))
-    low, high = (np.flatnonzero(bad & side) for side in (wavelength < SPAN_NM[0], wavelength > SPAN_NM[1]))
-    start = int(low[-1]) + 1 if low.size else 0
-    stop = int(high[0]) if high.size else wavelength.size
-    if (start, stop) == (0, wavelength.size):
-        return wavelength, flux, ()
-    kept = wavelength[start:stop]
-    note = (
-        f"cut to {kept[0]:.1f}-{kept[-1]:.1f} nm: negative or undefined flux beyond, "
-        f"outside {SPAN_NM[0]:g}-{SPAN_NM[1]:g} nm"
-        if kept.size
-        else "nothing left"
-    )
-    return kept, flux[start:stop], (note,)
-
-
-def _check(name: str, wavelength: NDArray[np.float64], flux: NDArray[np.float64]) -> None:
-    if wavelength.ndim != 1 or wavelength.shape != flux.shape or wavelength.size < 2:
-        raise InputError(
-            f"spectrum {name} has {wavelength.shape} wavelengths and {flux.shape} fluxes, expected two equal columns"
-        )
-    for what, values in (("wavelength", wavelength), ("flux", flux)):
-        bad = np.flatnonzero(~np.isfinite(values))
-        if bad.size:
-            raise InputError(
-                f"spectrum {name}: {what} {values[bad[0]]} at point {bad[0] + 1}, expected a finite number"
-            )
-    back = np.flatnonzero(np.diff(wavelength) <= 0)
-    if back.size:
-        i = int(back[0])
-        raise InputError(
-            f"spectrum {name}: wavelength {wavelength[i + 1]:g} nm at point {i + 2} follows {wavelength[i]:g} nm, "
-            "expected increasing wavelengths"
-        )
-    low, high = float(wavelength[0]), float(wavelength[-1])
-    if low > SPAN_NM[0] or high < SPAN_NM[1]:
-        guess = ""
-        for unit, factor in (("Angstrom", 0.1), ("micrometres", 1000.0)):
-            if (
-                low * factor <= SPAN_NM[0] * 1.05
-                and high * factor >= SPAN_NM[1] * 0.95
-                and (low > 300.0 or high < 100.0)
-            ):
-                guess = f" (these look like {unit})"
-        raise InputError(f"spectrum {name} spans {low:g}-{high:g} nm, expected at least 180-750 nm{guess}")
-    negative = np.flatnonzero(flux < 0.0)
-    if negative.size:
-        i = int(negative[0])
-        raise InputError(
-            f"spectrum {name}: flux {flux[i]:g} at {wavelength[i]:g} nm, the first of {negative.size} negative, "
-            "expected none: bin the spectrum more coarsely or mend it first"
-        )
-    if not flux.any():
-        raise InputError(f"spectrum {name}: every flux is zero, expected some light")

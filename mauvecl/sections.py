@@ -22,6 +22,10 @@ class Part(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
+#: What a star from a file has and one of the library has not.
+FILE_KEYS = ("file", "wavelength_unit", "flux_unit", "extend")
+
+
 class Star(Part):
     """Which spectrum, behind how much dust, how bright then."""
 
@@ -31,18 +35,32 @@ class Star(Part):
     band: str = "V"
     magnitude_system: Literal["catalogue", "vega", "ab"] = "catalogue"
     ebv: float | None = None
+    wavelength_unit: str | None = None
+    flux_unit: str | None = None
+    extend: str | None = None
+    bin_nm: float | None = None
 
     @model_validator(mode="after")
     def _one_spectrum(self) -> Self:
         if (self.library is None) == (self.file is None):
             raise ValueError("a star has neither or both of library and file, expected one of them")
+        given = [key for key in FILE_KEYS if getattr(self, key) is not None]
+        if self.file is None and given:
+            raise ValueError(f"a star of the library has {' and '.join(given)}, expected them of a file only")
         return self
 
     def source(self) -> Source:
         """The star's spectrum at its magnitude; as stored where none is given."""
         from mauvecl.host.source import Source
 
-        found = Source.from_library(self.library) if self.library is not None else Source.read(self.file or "")
+        if self.library is not None:
+            found = Source.from_library(self.library)
+        else:
+            found = Source.read(
+                self.file or "", wavelength_unit=self.wavelength_unit, flux_unit=self.flux_unit, extend=self.extend
+            )
+        if self.bin_nm is not None:
+            found = found.binned(self.bin_nm)
         if self.ebv is not None:
             found = found.reddened(self.ebv)
         return found if self.magnitude is None else found.at_magnitude(self.magnitude, self.band, self.magnitude_system)

@@ -19,7 +19,7 @@ from mauvecl.questions import (
     SignalQuestion,
     Sweep,
 )
-from mauvecl.sections import Flare, NoiseProcesses, Observation, Part, Run, SkyLight, Star, Unknowns
+from mauvecl.sections import FILE_KEYS, Flare, NoiseProcesses, Observation, Part, Run, SkyLight, Star, Unknowns
 from mauvecl.study_text import put, sentence, study_of, toml_value
 
 if TYPE_CHECKING:
@@ -181,7 +181,7 @@ class Study(Part):
         """
         change: dict[str, Any]
         if quantity in ("magnitude", "star"):
-            change = {"magnitude": value} if quantity == "magnitude" else {"library": value, "file": None}
+            change = {"magnitude": value} if quantity == "magnitude" else {"library": value, **dict.fromkeys(FILE_KEYS)}
             return self.model_copy(update={"star": tuple(star.model_copy(update=change) for star in self.star)})
         if quantity in ("amplitude", "flare_temperature"):
             change = {"amplitudes": (value,)} if quantity == "amplitude" else {"temperature_k": value}

@@ -36,6 +36,20 @@ EbvFlag = Annotated[
     float | None,
     typer.Option(help="Dust before the star, E(B-V), mag (needs mauvecl[extinction]).", show_default=False),
 ]
+WavelengthUnitFlag = Annotated[
+    str | None,
+    typer.Option(help="Of a spectrum file's wavelengths, as in Angstrom, or 'nm air'.", show_default=False),
+]
+FluxUnitFlag = Annotated[
+    str | None, typer.Option(help="Of a spectrum file's fluxes, as in 'W m-2 nm-1'.", show_default=False)
+]
+ExtendFlag = Annotated[
+    str | None,
+    typer.Option(help="Library spectrum that goes on where a spectrum file ends, scaled to it.", show_default=False),
+]
+BinFlag = Annotated[
+    float | None, typer.Option("--bin-nm", help="Bin the spectrum to this width, nm.", show_default=False)
+]
 ExposureFlag = Annotated[
     float | None, typer.Option("--exposure", "-t", help="Seconds, rounded up to 5 s frames [50].", show_default=False)
 ]
@@ -210,6 +224,10 @@ OBSERVATION = {
     "band": Option(BandFlag),
     "magnitude_system": Option(MagnitudeSystemFlag),
     "ebv": Option(EbvFlag),
+    "wavelength_unit": Option(WavelengthUnitFlag),
+    "flux_unit": Option(FluxUnitFlag),
+    "extend": Option(ExtendFlag),
+    "bin_nm": Option(BinFlag),
     "exposure": Option(ExposureFlag, "observation", "exposure_s"),
     "instrument": Option(InstrumentFlag, "observation", "instrument"),
     "temperature": Option(TemperatureFlag, "observation", "temperature_c"),
@@ -387,18 +405,13 @@ def _stars(study: Study, given: dict[str, Any]) -> list[dict[str, Any]] | None:
     from mauvecl.host.errors import InputError
 
     names, magnitudes = given["star"], given["magnitude"]
-    same = {key: given[key] for key in ("band", "magnitude_system", "ebv") if given[key] is not None}
-    if not (names or magnitudes or same):
+    same = {key: given[key] for key in ("band", "magnitude_system", "ebv", "bin_nm") if given[key] is not None}
+    of_files = {key: given[key] for key in ("wavelength_unit", "flux_unit", "extend") if given[key] is not None}
+    if not (names or magnitudes or same or of_files):
         return None
     if names:
         # A name that is a file's is a file; anything else is looked up in the library.
-        stars: list[dict[str, Any]] = [
-            {"file": name} if Path(name).suffix or Path(name).exists() else {"library": name} for name in names
-        ]
-        for entry in stars:
-            if "file" in entry and not Path(entry["file"]).exists() and Path(entry["file"]).suffix[1:].isupper():
-                # "K2.5V" looks like a file's name and is not one.
-                entry["library"] = entry.pop("file")
+        stars: list[dict[str, Any]] = [{"file": name} if _is_file(name) else {"library": name} for name in names]
     else:
         stars = [entry.model_dump(exclude_none=True) for entry in study.star]
     if magnitudes:
@@ -406,4 +419,21 @@ def _stars(study: Study, given: dict[str, Any]) -> list[dict[str, Any]] | None:
             raise InputError(f"{len(magnitudes)} magnitudes for {len(stars)} stars, expected one for all or one each")
         for entry, value in zip(stars, magnitudes * (len(stars) if len(magnitudes) == 1 else 1), strict=True):
             entry["magnitude"] = value
-    return [entry | same for entry in stars]
+    if of_files and not any("file" in entry for entry in stars):
+        flags = " and ".join("--" + key.replace("_", "-") for key in of_files)
+        raise InputError(f"{flags} without a spectrum file among the stars, expected --star FILE")
+    return [entry | same | (of_files if "file" in entry else {}) for entry in stars]
+
+
+def _is_file(name: str) -> bool:
+    from mauvecl.host.formats import without_columns
+
+    try:
+        file, _ = without_columns(name)
+        if file.exists():
+            return True
+    except (OSError, ValueError):
+        # What no file name can be is refused as one.
+        return True
+    # "K2.5V" looks like a file's name and is not one.
+    return bool(file.suffix) and not file.suffix[1:].isupper()

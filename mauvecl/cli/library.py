@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mauvecl.cli.flags import JsonFlag, QuietFlag
+from mauvecl.cli.flags import ExtendFlag, FluxUnitFlag, JsonFlag, QuietFlag, WavelengthUnitFlag
 
 if TYPE_CHECKING:
     from mauvecl.host.own_stars import OwnStar
@@ -54,9 +54,12 @@ def library(context: typer.Context, as_json: JsonFlag = False) -> None:
 
 @app.command()
 def add(
-    files: Annotated[list[Path], typer.Argument(help="Text (nm, erg s-1 cm-2 A-1), ECSV or FITS tables.")],
+    files: Annotated[list[Path], typer.Argument(help="Text, ECSV, VOTable or FITS; FILE[COLUMN] names a column.")],
     name: Annotated[str | None, typer.Option(help="For one file: another name.", show_default=False)] = None,
     replace: ReplaceFlag = False,
+    wavelength_unit: WavelengthUnitFlag = None,
+    flux_unit: FluxUnitFlag = None,
+    extend: ExtendFlag = None,
     quiet: QuietFlag = False,
 ) -> None:
     """Keep spectra of your own under a name, for --star.
@@ -69,7 +72,8 @@ def add(
     if name is not None and len(files) > 1:
         raise InputError(f"--name {name!r} for {len(files)} files, expected one file")
     for file in files:
-        _tell(add(file, name, replace=replace), quiet)
+        star = add(file, name, replace=replace, wavelength_unit=wavelength_unit, flux_unit=flux_unit, extend=extend)
+        _tell(star, quiet)
 
 
 @app.command()
@@ -81,6 +85,7 @@ def fetch(
         str | None, typer.Option("--from", help="Another address of the collection: a mirror.", show_default=False)
     ] = None,
     replace: ReplaceFlag = False,
+    extend: ExtendFlag = None,
     quiet: QuietFlag = False,
 ) -> None:
     """Fetch stars of public collections of HST spectra and keep them.
@@ -92,7 +97,8 @@ def fetch(
     from mauvecl.host.own_stars import fetch
 
     for name in names:
-        _tell(fetch(name, base=base, replace=replace, show_progress=not quiet and sys.stderr.isatty()), quiet)
+        shown = not quiet and sys.stderr.isatty()
+        _tell(fetch(name, base=base, replace=replace, show_progress=shown, extend=extend), quiet)
 
 
 @app.command()
@@ -115,7 +121,13 @@ def _tell(star: OwnStar, quiet: bool) -> None:
 
     if quiet:
         return
-    lines = [f"Kept {star.name}: --star {json.dumps(star.name) if ' ' in star.name else star.name}", *star.notes]
+    lines = [
+        f"Kept {star.name}: --star {json.dumps(star.name) if ' ' in star.name else star.name}",
+        *star.notes,
+        *star.told,
+    ]
+    if star.unscaled:
+        lines.append(f"It needs --magnitude: {star.unscaled}.")
     if star.dereddened:
         lines.append("Without its dust it is too bright in the ultraviolet: --ebv reddens it again.")
     show(lines)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +75,7 @@ class Question(param.Parameterized):
             source = Source.read(file)
         if source.wavelength_nm.size > MOST_POINTS:
             raise InputError(f"upload of {source.wavelength_nm.size} points, expected at most {MOST_POINTS}")
-        self.uploaded = Source.from_arrays(source.wavelength_nm, source.flux_flam, name=UPLOADED, origin="upload")
+        self.uploaded = replace(source, name=UPLOADED, origin="upload")
         if self.star == UPLOADED:
             self.param.trigger("star")
         else:
@@ -132,7 +133,7 @@ def write_spectrum(source: Source, folder: Path) -> Path:
 
     table = Table({"wavelength": source.wavelength_nm, "flux": source.flux_flam})
     table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
-    table.meta["name"] = UPLOADED
+    table.meta |= {"name": UPLOADED, "told": list(source.told)}
     path = folder / "star.ecsv"
     table.write(path, format="ascii.ecsv", overwrite=True)
     return path

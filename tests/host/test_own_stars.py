@@ -32,6 +32,7 @@ def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "data" / "stars"
 
 
+WHOLE = Path(__file__).parents[1] / "data" / "spectra" / "18sco_stis_004.fits"
 WAVELENGTH_NM = np.linspace(170.0, 1000.0, 500)
 FLUX = 1e-12 * np.exp(-(((WAVELENGTH_NM - 500) / 200) ** 2))
 
@@ -129,7 +130,7 @@ class Archive(http.server.BaseHTTPRequestHandler):
 @pytest.fixture
 def archive() -> Iterator[str]:
     """The archives' files on this machine; the address."""
-    calspec = archive_file(("ANGSTROMS", "FLAM"), TARGETID="18SCO")
+    calspec = WHOLE.read_bytes()
     ngsl = archive_file(("Angstrom", "erg/s/cm2/A"), TARGNAME="HD037202", DATAQUAL="good", OFFSETPX=0.1)
     names = (
         "18sco_stis_004.fits",
@@ -137,6 +138,7 @@ def archive() -> Iterator[str]:
         "18sco_stis_005.fits",
         "18sco_mod_009.fits",
         "cut_stis_001.fits",
+        "vb8_stiswfcnic_004.fits",
     )
     links = "".join(f'<a href="{name}">{name}</a>' for name in names)
     lowlib = "hlsp_lowlib_hst_stis_{}_g230lb-g430l-g750l_v1.0_spect.fits"
@@ -144,6 +146,7 @@ def archive() -> Iterator[str]:
         "calspec/": f"<html>{links}</html>".encode(),
         "calspec/18sco_stis_006.fits": calspec,
         "calspec/cut_stis_001.fits": calspec,
+        "calspec/vb8_stiswfcnic_004.fits": (WHOLE.parent / "vb8_stiswfcnic_004.fits").read_bytes(),
         "ngsl/hd037202/h_stis_ngsl_hd037202_v2.fits": ngsl,
         "ngsl/hd000001/h_stis_ngsl_hd000001_v2.fits": ngsl[: len(ngsl) // 2],
         "ngsl/hd000002/h_stis_ngsl_hd000002_v2.fits": b"<html>Sorry</html>",
@@ -162,8 +165,30 @@ def test_a_calspec_star_by_its_newest_file(archive: str) -> None:
     assert "18sco_stis_006.fits" in kept.origin
     assert "doi 10.1086/677655" in kept.origin
     star = Source.from_library("18 sco")
-    np.testing.assert_allclose(star.flux_flam, np.float32(FLUX), rtol=1e-12)
-    np.testing.assert_allclose(star.wavelength_nm, WAVELENGTH_NM, rtol=1e-12)
+    with fits.open(WHOLE) as hdus:
+        np.testing.assert_allclose(star.flux_flam, hdus[1].data["FLUX"].astype(float), rtol=1e-12)
+        np.testing.assert_allclose(star.wavelength_nm, hdus[1].data["WAVELENGTH"] / 10, rtol=1e-12)
+    assert star.magnitude("V") == pytest.approx(5.50, abs=0.06)
+
+
+def test_a_short_one_is_kept_with_what_extends_it(archive: str, tmp_path: Path) -> None:
+    base = f"{archive}/calspec/"
+    with pytest.raises(InputError, match=r"VB8 spans 290\.033-2497\.72 nm, expected at least 200-700 nm"):
+        own_stars.fetch("calspec:VB 8", base=base, show_progress=False)
+    kept = own_stars.fetch("calspec:VB 8", base=base, show_progress=False, extend="M3V")
+    assert any("continued by M3V" in text for text in kept.told)
+    star = Source.from_library("VB 8")
+    direct = Source.read(WHOLE.parent / "vb8_stiswfcnic_004.fits", extend="M3V")
+    np.testing.assert_array_equal(star.flux_flam, direct.flux_flam)
+    # What must be told of it is told wherever it is used.
+    messages = expect(star.at_magnitude(9.0), Instrument.load("mauve"), exposure=50.0).messages
+    assert any("113 of its 1349 points" in message for message in messages)
+    assert any("continued by M3V" in message for message in messages)
+    models = WHOLE.parent / "ckp00_5750.fits"
+    surface = own_stars.add(f"{models}[g45]", "model")
+    assert "at the star's surface" in surface.unscaled
+    with pytest.raises(InputError, match="at the star's surface, expected a magnitude"):
+        expect(Source.from_library("model"), Instrument.load("mauve"), exposure=5.0)
 
 
 def test_an_ngsl_star(archive: str) -> None:

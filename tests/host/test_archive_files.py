@@ -1,0 +1,156 @@
+"""Whole files of the archives, not changed by a byte: each is read right, or refused in a sentence that is true."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.io import fits
+
+from mauvecl.host.errors import InputError
+from mauvecl.host.expectation import expect
+from mauvecl.host.instrument import Instrument
+from mauvecl.host.source import Source
+
+HERE = Path(__file__).parents[1] / "data" / "spectra"
+ANGSTROM = {"wavelength_unit": "Angstrom"}
+SUN_V = -26.76  # Willmer 2018, ApJS 236, 47
+
+
+def by_hand(name: str, wavelength: str = "WAVELENGTH", flux: str = "FLUX") -> tuple[np.ndarray, np.ndarray]:
+    """A FITS table's columns, Angstrom and erg s-1 cm-2 A-1, by astropy alone."""
+    with fits.open(HERE / name) as hdus:
+        data = hdus[1].data
+        return np.array(data[wavelength], float), np.array(data[flux], float)
+
+
+def text_by_hand(name: str, skip: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    rows = [line.split()[:2] for line in (HERE / name).read_text().splitlines()[skip:]]
+    values = np.array(rows, float)
+    return values[:, 0], values[:, 1]
+
+
+#: File, options, how it is read by hand, and its V by SIMBAD or the paper named above; None where it has none.
+RIGHT: list[tuple[str, dict[str, Any], Any, float | None]] = [
+    ("18sco_stis_004.fits", {}, by_hand, 5.50),
+    ("hd60753_stis_004.fits", {}, by_hand, 6.68),
+    ("bd_75d325_stis_001.fits.gz", {}, by_hand, 9.55),
+    ("sun_reference_stis_002.fits", {}, by_hand, SUN_V),
+    ("sun_kurucz93.fits", {}, by_hand, SUN_V),
+    ("10lac_stis_001.txt", ANGSTROM, text_by_hand, 4.88),
+    ("h_stis_ngsl_hd095735_v2.txtA", ANGSTROM, text_by_hand, None),
+    ("ckp00_5750.fits[g45]", {}, lambda name: by_hand(name.split("[")[0], flux="g45"), None),
+    ("vb8_stiswfcnic_004.fits", {"extend": "M3V"}, by_hand, 16.80),
+    ("wasp-96_estimate_sed.txt", ANGSTROM | {"extend": "G8V"}, lambda name: text_by_hand(name, 1), None),
+]
+#: File, options, and the sentence.
+REFUSED = [
+    ("vb8_stiswfcnic_004.fits", {}, r"VB8 spans 290\.033-2497\.72 nm, expected at least 200-700 nm: --extend"),
+    ("lwp11854.mxlo", {}, r"lwp11854 spans 175-345\.144 nm, expected at least 200-700 nm: --extend"),
+    ("10lac_stis_001.txt", {}, r"1669-399000 nm, assumed to be in nm .*--wavelength-unit .*look like Angstrom"),
+    ("h_stis_ngsl_hd095735_v2.txtA", {}, r"1675.01-10191.7 nm, assumed to be in nm .*look like Angstrom"),
+    ("wasp-96_estimate_sed.txt", {}, r"spans 1980.05-6067.15 nm, expected at least 200-700 nm \(these look like Angst"),
+    ("wasp-96_estimate_sed.txt", ANGSTROM, r"spans 198.005-606.715 nm, expected at least 200-700 nm: --extend"),
+    ("ckp00_5750.fits", {}, r"11 columns may be the flux: g00, g05, .*g50, expected one: name it as in FILE\[g50\]"),
+    ("ckp00_5750.fits[g55]", {}, r"no column is named 'g55', expected one of WAVELENGTH, g00"),
+    ("XP_SAMPLED_RAW_dr3int6.csv", {}, r"2 spectra stand in it, one a row \(6, 4\), expected one: .* FILE\[6\]"),
+    ("XP_SAMPLED_RAW_dr3int6.csv[6]", {}, r"Gaia DR3 6 spans 336-1020 nm, expected at least 200-700 nm"),
+]
+
+
+def test_every_file_is_tried() -> None:
+    tried = {entry[0].split("[")[0] for entry in (*RIGHT, *REFUSED)}
+    assert tried == {path.name for path in HERE.iterdir() if path.suffix != ".md"}
+
+
+@pytest.mark.parametrize(("name", "options", "read", "v"), RIGHT, ids=[entry[0] for entry in RIGHT])
+def test_read_right(name: str, options: dict[str, Any], read: Any, v: float | None) -> None:
+    star = Source.read(HERE / name, **options)
+    angstrom, flux = read(name)
+    assert np.isfinite(star.flux_flam).all()
+    # Points that stand once and have a flux are there as they stand, to the rounding of the unit.
+    once = np.isfinite(flux) & np.isin(angstrom, np.unique(angstrom)[np.unique(angstrom, return_counts=True)[1] == 1])
+    inside = once & (angstrom > 2000.0) & (angstrom < 7000.0)
+    assert inside.sum() > 100
+    place = np.searchsorted(star.wavelength_nm, angstrom[inside] / 10.0 * (1 - 1e-12))
+    np.testing.assert_allclose(star.wavelength_nm[place], angstrom[inside] / 10.0, rtol=1e-12)
+    np.testing.assert_allclose(star.flux_flam[place], flux[inside], rtol=1e-12)
+    if v is not None:
+        # Zero points of V differ by 0.03 mag; the M7 dwarf varies, and catalogues with it.
+        assert star.magnitude("V") == pytest.approx(v, abs=0.15 if "extend" in options else 0.06)
+    messages = expect(star.at_magnitude(8.0), Instrument.load("mauve"), exposure=50.0).messages
+    assert all(any(text in message for message in messages) for text in star.told)
+
+
+@pytest.mark.parametrize(("name", "options", "sentence"), REFUSED, ids=[entry[0] for entry in REFUSED])
+def test_refused_in_a_sentence(name: str, options: dict[str, Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence) as caught:
+        Source.read(HERE / name, **options)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_is_told_of_them() -> None:
+    told = {name: Source.read(HERE / name, **options).told for name, options, *_ in RIGHT}
+    assert told["18sco_stis_004.fits"] == told["sun_reference_stis_002.fits"] == ()
+    assert any("ASSUMED: flux in erg" in text for text in told["10lac_stis_001.txt"])
+    assert any("merged; 11 of them differ" in text for text in told["10lac_stis_001.txt"])
+    assert any("130 of its 2242 points" in text for text in told["h_stis_ngsl_hd095735_v2.txtA"])
+    assert any("113 of its 1349 points" in text for text in told["vb8_stiswfcnic_004.fits"])
+    assert any("below 290.033 nm it is continued by M3V" in text for text in told["vb8_stiswfcnic_004.fits"])
+
+
+def test_start_and_step_in_one_row() -> None:
+    """IUE's file: 640 fluxes from 1750 A in steps of 2.662668 A, zero from 3350 A on."""
+    star = Source.read(HERE / "lwp11854.mxlo", extend="B2IV")
+    with fits.open(HERE / "lwp11854.mxlo") as hdus:
+        row = hdus[1].data[0]
+        angstrom = float(row["WAVELENGTH"]) + float(row["DELTAW"]) * np.arange(640)
+        flux = np.array(row["FLUX"], float)
+    inside = (angstrom > 2000) & (angstrom < 3300)
+    place = np.searchsorted(star.wavelength_nm, angstrom[inside] / 10 * (1 - 1e-12))
+    np.testing.assert_allclose(star.wavelength_nm[place], angstrom[inside] / 10, rtol=1e-12)
+    np.testing.assert_allclose(star.flux_flam[place], flux[inside], rtol=1e-12)
+    # Its zeros are no data, and not what the library's star is scaled to.
+    assert star.flux_flam[star.wavelength_nm > 335].min() > 0
+
+
+def test_gaias_arrays_in_a_cell() -> None:
+    """336 + 2 i nm, W m-2 nm-1: 100 erg s-1 cm-2 A-1 each."""
+    star = Source.read(f"{HERE / 'XP_SAMPLED_RAW_dr3int6.csv'}[4]", extend="K5V")
+    with (HERE / "XP_SAMPLED_RAW_dr3int6.csv").open() as file:
+        row = next(row for row in csv.DictReader(file) if row["source_id"] == "4")
+    flux = 100.0 * np.array([float(text) for text in row["flux"].strip("()").split(",")])
+    inside = (star.wavelength_nm >= 336.0) & (star.wavelength_nm <= 1020.0)
+    np.testing.assert_allclose(star.wavelength_nm[inside], 336.0 + 2.0 * np.arange(343), rtol=1e-12)
+    np.testing.assert_allclose(star.flux_flam[inside], flux, rtol=1e-12)
+
+
+def test_fluxes_at_the_surface_or_of_no_scale_need_a_magnitude() -> None:
+    mauve = Instrument.load("mauve")
+    for name, options, why in (
+        ("ckp00_5750.fits[g45]", {}, "flux at the star's surface"),
+        ("h_stis_ngsl_hd095735_v2.txtA", ANGSTROM, "brighter than any star"),
+    ):
+        star = Source.read(HERE / name, **options)
+        with pytest.raises(InputError, match=rf"{why}.*, expected a magnitude"):
+            expect(star, mauve, exposure=5.0)
+        assert expect(star.at_magnitude(7.5), mauve, exposure=5.0).signal_dn.max() > 0
+
+
+def test_starts_of_calspec_files_within_the_reach() -> None:
+    """Three start at 180.02-180.10 nm and P330E at 199.95: a whole file, cut there."""
+    star = Source.read(HERE / "18sco_stis_004.fits")
+    mauve = Instrument.load("mauve")
+    whole = expect(star, mauve, exposure=50.0)
+    for start in (180.02, 180.10, 199.95):
+        kept = star.wavelength_nm >= start
+        short = Source.from_arrays(star.wavelength_nm[kept], star.flux_flam[kept], name="short")
+        assert any(f"starts at {star.wavelength_nm[kept][0]:g} nm and is continued to 180 nm" in t for t in short.told)
+        found = expect(short, mauve, exposure=50.0)
+        # A tenth of the noise at most, and a tenth of the light.
+        error = np.abs(found.signal_dn - whole.signal_dn)
+        assert (error < 0.1 * np.sqrt(whole.variance_dn2)).all()
+        assert any("continued to 180 nm" in message for message in found.messages)
