@@ -1,31 +1,100 @@
-"""Tables of the instrument's description as files."""
+"""ECSV tables from outside: the header and the cells are looked at before astropy and YAML meet them."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from .bounded import limit_bytes, read_bytes, shortened, unpacked
 from .errors import InputError
+from .parsed import as_text, parsing
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
+#: Bytes of a header: YAML in plain Python reads a megabyte in half a minute.
+MOST_HEADER = 256 * 2**10
 
-def read_ecsv(path: str | Path, what: str) -> Table:
+
+def read_ecsv(path: str | Path, what: str, expected: str = "an ECSV table") -> Table:
     """An ECSV table, or one sentence that begins with what the file is.
 
     Raises
     ------
     InputError
-        If the file is missing or is not such a table.
+        If the file is missing, is not such a table, or is one that would unpack to more than it shows.
     """
-    # Heavy to import, and needed only where an instrument is read.
+    path = Path(path)
+    named = f"{what} {shortened(str(path))}"
+    return ecsv_table(as_text(unpacked(read_bytes(path, what), named), named), named, expected)
+
+
+def ecsv_table(text: str, what: str, expected: str = "an ECSV table") -> Table:
+    """The table in a text.
+
+    Parameters
+    ----------
+    text : str
+    what : str
+        What holds it, with its name, for messages.
+    expected : str
+
+    Raises
+    ------
+    InputError
+        As `read_ecsv`.
+    """
+    # Heavy to import, and needed only where a table is read.
     from astropy.table import Table
 
-    try:
-        return Table.read(path, format="ascii.ecsv")
-    except FileNotFoundError:
-        raise InputError(f"{what} {path} does not exist, expected an ECSV table") from None
-    except Exception as error:  # the reader raises many kinds
-        reason = str(error).splitlines()[0] if str(error) else type(error).__name__
-        raise InputError(f"{what} {path} cannot be read ({reason}), expected an ECSV table") from None
+    lines = text.splitlines()
+    check_header(lines, what)
+    check_cells([line for line in lines if not line.startswith("#")], what)
+    with parsing(what, expected):
+        # Lines, since a text of one line would be taken for a file's name.
+        return Table.read([*lines, ""], format="ascii.ecsv")
+
+
+def check_header(lines: list[str], what: str) -> None:
+    """Refuse a header that is no small plain tree: its aliases repeat their anchor, and repeat what repeats it.
+
+    Raises
+    ------
+    InputError
+        If it is longer than `MOST_HEADER` or names a YAML alias.
+    """
+    import yaml  # comes with astropy
+
+    header = [line[2:] for line in lines if line.startswith("# ")]
+    size = sum(map(len, header))
+    if size > MOST_HEADER:
+        raise InputError(f"{what} has a header of {size} characters, expected at most {MOST_HEADER}")
+    if "*" not in "".join(header):
+        return
+    with parsing(what, "an ECSV table"):
+        aliased = any(isinstance(event, yaml.AliasEvent) for event in yaml.parse("\n".join(header), yaml.SafeLoader))
+    if aliased:
+        raise InputError(f"{what} has a YAML alias (*) in its header, expected each value written out")
+
+
+def check_cells(lines: list[str], what: str) -> None:
+    """Refuse rows that would take far more room as a table than as text: each cell is as wide as the widest.
+
+    Raises
+    ------
+    InputError
+        If the widest line times the number of lines is beyond the limit of unpacked content, or a cell goes on over
+        several lines.
+    """
+    most = limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")
+    widest = max(map(len, lines), default=0)
+    if widest * len(lines) > most:
+        raise InputError(
+            f"{what} has a line of {widest} characters among {len(lines)}, expected less than {most >> 20} MiB "
+            "together if each were as long; MAUVECL_LARGEST_CONTENT_MIB sets the limit"
+        )
+    if widest > 2**17:
+        raise InputError(f"{what} has a line of {widest} characters, expected at most {2**17}")
+    odd = next((number for number, line in enumerate(lines, 1) if line.count('"') % 2), None)
+    if odd is not None:
+        raise InputError(f"{what} has a cell that goes on beyond row {odd}, expected each row on a line of its own")

@@ -348,14 +348,22 @@ def _study(
     default: Callable[[dict[str, Any]], Study] | None,
 ) -> Study:
     """A study file, or the default, with the flags on top, and ``--set`` on top of those."""
+    from mauvecl.host.errors import InputError
     from mauvecl.study import Study
 
     study = Study.read(file) if file is not None else default(given) if default else Study()
     changes: dict[str, dict[str, Any]] = {"sky": _sky(given)}
+    setting: dict[tuple[str, str], str] = {}
     for name, option in options.items():
         if option.section:
             value = given[name]
             if value is not None:
+                other = setting.setdefault((option.section, option.key), name)
+                if other != name:
+                    raise InputError(
+                        f"--{other} and --{name} are both given, expected one of them: both set "
+                        f"{option.section}.{option.key}"
+                    )
                 changes.setdefault(option.section, {})[option.key] = option.convert(value) if option.convert else value
     changed = study.with_changes(changes, _stars(study, given))
     return changed.with_settings(given["settings"]) if given["settings"] else changed
@@ -378,6 +386,7 @@ def _sky(given: dict[str, Any]) -> dict[str, Any]:
 
 def _stars(study: Study, given: dict[str, Any]) -> list[dict[str, Any]] | None:
     from mauvecl.host.errors import InputError
+    from mauvecl.host.parsed import is_file
 
     names, magnitudes = given["star"], given["magnitude"]
     same = {key: given[key] for key in ("band", "ebv") if given[key] is not None}
@@ -386,10 +395,10 @@ def _stars(study: Study, given: dict[str, Any]) -> list[dict[str, Any]] | None:
     if names:
         # A name that is a file's is a file; anything else is looked up in the library.
         stars: list[dict[str, Any]] = [
-            {"file": name} if Path(name).suffix or Path(name).exists() else {"library": name} for name in names
+            {"file": name} if Path(name).suffix or is_file(Path(name)) else {"library": name} for name in names
         ]
         for entry in stars:
-            if "file" in entry and not Path(entry["file"]).exists() and Path(entry["file"]).suffix[1:].isupper():
+            if "file" in entry and not is_file(Path(entry["file"])) and Path(entry["file"]).suffix[1:].isupper():
                 # "K2.5V" looks like a file's name and is not one.
                 entry["library"] = entry.pop("file")
     else:

@@ -14,6 +14,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mauvecl.cli.boundary import writes_to
+
 if TYPE_CHECKING:
     from astropy.table import Table
 
@@ -69,7 +71,9 @@ class Session:
         """Where everything is written."""
         from mauvecl.report import make_folder
 
-        return make_folder(self.output or Path(f"mauvecl-{self.verb}"))
+        folder = make_folder(self.output or Path(f"mauvecl-{self.verb}"))
+        writes_to(folder)
+        return folder
 
     @contextmanager
     def pool(self, *, unit: str = "realisations") -> Iterator[Pool]:
