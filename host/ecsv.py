@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,10 +27,10 @@ def read_ecsv(path: str | Path, what: str, expected: str = "an ECSV table") -> T
     """
     path = Path(path)
     named = f"{what} {shortened(str(path))}"
-    return ecsv_table(as_text(unpacked(read_bytes(path, what), named), named), named, expected)
+    return parse_ecsv(as_text(unpacked(read_bytes(path, what), named), named), named, expected)
 
 
-def ecsv_table(text: str, what: str, expected: str = "an ECSV table") -> Table:
+def parse_ecsv(text: str, what: str, expected: str = "an ECSV table") -> Table:
     """The table in a text.
 
     Parameters
@@ -50,7 +51,9 @@ def ecsv_table(text: str, what: str, expected: str = "an ECSV table") -> Table:
     lines = text.splitlines()
     check_header(lines, what)
     check_cells([line for line in lines if not line.startswith("#")], what)
-    with parsing(what, expected):
+    with parsing(what, expected), warnings.catch_warnings():
+        # What astropy reads all the same.
+        warnings.simplefilter("ignore")
         # Lines, since a text of one line would be taken for a file's name.
         return Table.read([*lines, ""], format="ascii.ecsv")
 

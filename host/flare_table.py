@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from .bounded import read_bytes, shortened, unpacked
-from .ecsv import check_cells, ecsv_table
+from .ecsv import check_cells, parse_ecsv
 from .errors import InputError
 from .parsed import LARGEST, SMALLEST, as_text, parsing, shown
 
@@ -53,14 +54,13 @@ def read_flares(path: str | Path) -> QTable:
         text = as_text(content, named)
         if len(text) > MOST_TEXT:
             raise InputError(f"{named} has {len(text)} characters, expected at most {MOST_TEXT}")
-        table = ecsv_table(text, named) if text.startswith("# %ECSV") else _text_table(text, path, named)
+        table = parse_ecsv(text, named) if text.startswith("# %ECSV") else _text_table(text, path, named)
     return flares_of(table, shortened(path.name))
 
 
 def _fits_table(content: bytes, named: str) -> Table:
     """The first table of a FITS file, which is no larger than the file is."""
     import io
-    import warnings
 
     from astropy.io import fits
     from astropy.table import Table
@@ -82,7 +82,8 @@ def _text_table(text: str, path: Path, named: str) -> Table:
 
     lines = text.splitlines()
     check_cells(lines, named)
-    with parsing(named, FORMS):
+    with parsing(named, FORMS), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
         return Table.read([*lines, ""], format="ascii.csv" if path.suffix.lower() == ".csv" else "ascii")
 
 

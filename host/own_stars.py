@@ -290,9 +290,8 @@ def fetch(name: str, *, base: str | None = None, replace: bool = False, show_pro
     for collection in chosen:
         address = base or collection.base
         try:
-            with parsing(f"address {shortened(address)}", "one such as https://host/folder/"):
-                url = urljoin(_folder(address), "")
-            url = urljoin(url, collection.file_of(star, partial(_listing, url)))
+            _check_address(address)
+            url = urljoin(_folder(address), collection.file_of(star, partial(_listing, address)))
             downloaded = Path(_download(url, show_progress))
         except FileNotFoundError:
             continue
@@ -319,15 +318,21 @@ def _folder(address: str) -> str:
     return address if address.endswith("/") else address + "/"
 
 
+def _check_address(address: str) -> None:
+    """Refuse what is no address of the network."""
+    with parsing(f"address {shortened(address)}", "one such as https://host/folder/"):
+        parts = urlsplit(address)
+        known = parts.scheme in SCHEMES and bool(parts.hostname) and parts.port != 0
+    if not (known and address.isprintable() and " " not in address):
+        raise InputError(
+            f"address {shortened(address)} is none of the network, expected one such as https://host/folder/"
+        )
+
+
 def _download(url: str, show_progress: bool) -> str:
     """A file of the network, by astropy; FileNotFoundError where the server has none."""
     from astropy.utils.data import download_file
 
-    with parsing(f"address {shortened(url)}", "one such as https://host/folder/"):
-        parts = urlsplit(url)
-        usable = parts.scheme in SCHEMES and parts.hostname and parts.port != 0 and url.isprintable() and " " not in url
-    if not usable:
-        raise InputError(f"address {shortened(url)} is none of the network, expected one such as https://host/folder/")
     try:
         return str(download_file(url, cache=False, show_progress=show_progress, timeout=TIMEOUT_S))
     except urllib.error.HTTPError as error:

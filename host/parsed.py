@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import math
+import re
 import tomllib
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -19,6 +20,8 @@ SMALLEST, LARGEST = 1e-30, 1e30
 WHOLE = (-(2**63), 2**64 - 1)
 #: Characters of a text, and levels of nesting, that a study or an instrument may have.
 LONGEST, DEEPEST = 4096, 32
+#: Dots of what may be a TOML key.
+MOST_PARTS = 512
 
 
 @contextlib.contextmanager
@@ -92,11 +95,15 @@ def toml(text: str, what: str) -> dict[str, Any]:
     InputError
         If it is none, or as `possible`.
     """
+    parts = max(part.count(".") for part in re.split(r"[=,{}\[\]\n#]", text))
+    if parts > MOST_PARTS:
+        # Python's reader takes memory with the square of it.
+        raise InputError(f"{what} has a key of {parts} parts, expected at most {MOST_PARTS}")
     with parsing(what, "TOML"):
         try:
             found = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
-            raise InputError(f"{what} is not TOML: {_plain(str(error), 160)}") from error
+            raise InputError(f"{what} is not valid TOML: {_plain(str(error), 160)}") from error
     possible(found, what)
     return found
 

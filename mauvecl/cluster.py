@@ -17,7 +17,7 @@ from urllib.parse import urlsplit
 from mauvecl import __version__
 from mauvecl.host.bounded import shortened
 from mauvecl.host.errors import InputError
-from mauvecl.host.parsed import is_file
+from mauvecl.host.parsed import is_file, json_data, read_text
 from mauvecl.program import DeviceError, DeviceRecord
 from mauvecl.shards import Arrays, Countable, Share
 
@@ -212,6 +212,10 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
         elif "://" in where and _is_address(where):
             how = {"address": where}
         elif "://" not in where and is_file(Path(where)):
+            found = json_data(read_text(Path(where), "scheduler file"), f"scheduler file {shortened(where)}")
+            address = found.get("address") if isinstance(found, dict) else None
+            if not (isinstance(address, str) and _is_address(address)):
+                raise InputError(f"scheduler file {shortened(where)} names no address, expected one that Dask wrote")
             how = {"scheduler_file": where}
         else:
             raise InputError(

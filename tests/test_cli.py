@@ -408,7 +408,7 @@ def test_bad_input_is_a_sentence_and_exit_code_2(name: str, tmp_path: Path) -> N
     [
         ("[run]\nsead = 3", "unknown key 'run.sead', did you mean 'seed'?"),
         ("[[star]]\nlibrary = 'G2V'\nmagnitud = 3", "unknown key 'star.0.magnitud', did you mean 'magnitude'?"),
-        ("[run\nseed = 3", "is not TOML"),
+        ("[run\nseed = 3", "is not valid TOML"),
         ("[run]\nfap = 2", "run.fap = 2"),
         ("[flare]\namplitudes = []", "flare.amplitudes"),
         ("[[star]]\nmagnitude = 3", "expected one of them"),

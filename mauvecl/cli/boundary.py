@@ -100,7 +100,7 @@ def _failed(error: Exception) -> int:
     # Imported late: program is not needed by verbs that draw nothing.
     program = sys.modules.get("mauvecl.program")
     if program is not None and isinstance(error, program.DeviceError):
-        return _say(str(error), BAD_INPUT, whole=True)
+        return _say(str(error), BAD_INPUT, whole=isinstance(error, program.BuildError))
     where = _write_traceback(error)
     what = f"{type(error).__name__}: {error}" if str(error) else type(error).__name__
     return _say(

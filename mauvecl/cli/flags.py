@@ -136,6 +136,9 @@ ClusterFlag = Annotated[
         show_default=False,
     ),
 ]
+InsistFlag = Annotated[
+    bool, typer.Option("--insist", help="Begin even what would take more than a year, or than the disk has room for.")
+]
 ResumeFlag = Annotated[bool, typer.Option("--resume", help="Go on with the unfinished run in the output folder.")]
 RestartFlag = Annotated[bool, typer.Option("--restart", help="Forget the unfinished run in the output folder.")]
 OutputFlag = Annotated[
@@ -270,6 +273,7 @@ WORKERS = {
     "resume": (ResumeFlag, False),
     "restart": (RestartFlag, False),
     "keep_after": (KeepAfterFlag, None),
+    "insist": (InsistFlag, False),
 }
 #: Where a verb asks for fewer realisations than a detection, unless told.
 FEWER = 100_000
@@ -315,6 +319,7 @@ def takes_study(
         _, _, *own = inspect.signature(verb).parameters.values()
 
         def command(study_file: Path | None = None, **values: Any) -> None:
+            from mauvecl.cli.foresight import question_time
             from mauvecl.cli.session import Session
 
             given = {key: values.pop(key, None) for key in options}
@@ -324,6 +329,8 @@ def takes_study(
             if "given" in kinds:
                 values["given"] = given
             study = _study(study_file, given, options, default)
+            if draws:
+                question_time(study, **{key: how[key] for key in ("device", "cluster", "insist")})
             verb(study, Session(name or verb.__name__, study, **how), **values)
 
         named = inspect.Parameter.KEYWORD_ONLY

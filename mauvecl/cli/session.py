@@ -49,6 +49,8 @@ class Session:
         What is to become of an unfinished run that is there.
     keep_after : float, optional
         Seconds after which finished shares are kept on the disk; as `Checkpoint` has it by default.
+    insist : bool
+        Begin what would never end, or not fit.
     """
 
     verb: str
@@ -62,6 +64,7 @@ class Session:
     resume: bool = False
     restart: bool = False
     keep_after: float | None = None
+    insist: bool = False
     files: list[Path] = field(default_factory=list)
     started: float = field(default_factory=time.perf_counter)
     _pool: Pool | None = None
