@@ -26,6 +26,8 @@ Float = NDArray[np.float64]
 
 #: Longest exposure, s.
 DAY_S = 86_400.0
+#: Frames of an exposure, at most: a day of 5 ms each, a thousandth of the payload's.
+MOST_FRAMES = 2**24
 
 
 @dataclass(frozen=True, eq=False)
@@ -295,6 +297,10 @@ def expect(
     asked_s = _seconds(exposure)
     # A hair less, so that 0.1 + 0.2 s is three frames of 0.1 s.
     n_frames = max(1, int(np.ceil(asked_s / instrument.frame_s * (1 - 1e-12))))
+    if n_frames > MOST_FRAMES:
+        raise InputError(
+            f"exposure = {asked_s:g} s has {n_frames} frames of {instrument.frame_s:g} s, expected at most {MOST_FRAMES}"
+        )
     low, high = instrument.output_min_nm, instrument.output_max_nm
     if source.wavelength_nm[0] > low or source.wavelength_nm[-1] < high:
         raise InputError(

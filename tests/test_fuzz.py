@@ -179,8 +179,8 @@ def test_studies(folder: Path, key: str, value: str, junk: bytes) -> None:
 
 
 INSTRUMENT_KEYS = (
-    "pixels", "adc_bits", "read_noise_dn", "temperature_c", "light_loss", "fibre_efficiency", "pixel_map", "extends", "name",
-    "conversion_uv_per_electron", "frame_s", "sources", "nonsense",
+    "pixels", "adc_bits", "read_noise_dn", "temperature_c", "light_loss", "fibre_efficiency", "pixel_map", "extends",
+    "name", "conversion_uv_per_electron", "frame_s", "sources", "nonsense",
 )  # fmt: skip
 
 

@@ -36,6 +36,8 @@ LONGEST = 1000
 #: What a disk or its limits answer where no file is named.
 DISK = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS, errno.EIO, errno.EMFILE, errno.ENFILE)
 
+#: Who writes to standard output for us.
+PRINTERS = ("click", "typer", "rich", "mauvecl.cli")
 #: Where the verb writes, once it does: the place for a traceback too.
 _folder: Path | None = None
 
@@ -115,6 +117,10 @@ def _failed_call(error: OSError) -> int:
     code = _flushed(0)
     if code:
         return code
+    if error.filename is None and _raised_by(error).startswith(PRINTERS):
+        # Click writes through a stream of its own.
+        _discard()
+        return _not_written(error)
     if error.filename is None and error.errno not in DISK:
         return _failed(error)
     name = (
@@ -162,13 +168,25 @@ def _flushed(code: int) -> int:
         _discard()
         if isinstance(error, BrokenPipeError):
             return READER_GONE
-        return _say(
-            f"standard output cannot be written ({error.strerror}), expected one with room; files are kept", OUTPUT_FULL
-        )
+        return _not_written(error)
     except ValueError:
         # Closed already.
         pass
     return code
+
+
+def _not_written(error: OSError) -> int:
+    return _say(
+        f"standard output cannot be written ({error.strerror}), expected one with room; files are kept", OUTPUT_FULL
+    )
+
+
+def _raised_by(error: BaseException) -> str:
+    """The module that raised it."""
+    step = error.__traceback__
+    while step is not None and step.tb_next is not None:
+        step = step.tb_next
+    return "" if step is None else str(step.tb_frame.f_globals.get("__name__", ""))
 
 
 def _discard() -> None:

@@ -67,7 +67,7 @@ def _read_apart(content: bytes, ending: str) -> bytes:
         "PYTHONPATH": os.pathsep.join(filter(None, (_here(), os.environ.get("PYTHONPATH")))),
     }
     # A fresh interpreter, as spawn makes one: OpenCL does not survive a fork.
-    command = [sys.executable, "-m", "mauvecl.web.limited", ending]
+    command = [sys.executable, "-m", "mauvecl.web.limited", ending, str(MEMORY_MIB), str(SECONDS)]
     with tempfile.TemporaryDirectory(prefix="mauvecl-upload-") as folder:
         try:
             done = subprocess.run(
@@ -96,13 +96,13 @@ def _here() -> str:
     return str(Path(__file__).parents[2])
 
 
-def _limit() -> None:
+def _limit(memory_mib: int, seconds: int) -> None:
     """Take memory, time and files away from this process, for good."""
     import resource
 
     for kind, value in (
-        (resource.RLIMIT_AS, MEMORY_MIB << 20),
-        (resource.RLIMIT_CPU, SECONDS),
+        (resource.RLIMIT_AS, memory_mib << 20),
+        (resource.RLIMIT_CPU, seconds),
         (resource.RLIMIT_FSIZE, 64 << 20),
         (resource.RLIMIT_CORE, 0),
         (resource.RLIMIT_NPROC, 0),
@@ -114,9 +114,10 @@ def _limit() -> None:
 
 def _main() -> int:
     """The reading process: bytes of a file come in on standard input, arrays go out, a sentence to standard error."""
-    _limit()
+    ending, memory_mib, seconds = sys.argv[1:]
+    _limit(int(memory_mib), int(seconds))
     try:
-        file = Path(f"upload{sys.argv[1]}")
+        file = Path(f"upload{ending}")
         file.write_bytes(sys.stdin.buffer.read())
         source = Source.read(file)
         out = io.BytesIO()
