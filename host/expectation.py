@@ -299,7 +299,8 @@ def expect(
     n_frames = max(1, int(np.ceil(asked_s / instrument.frame_s * (1 - 1e-12))))
     if n_frames > MOST_FRAMES:
         raise InputError(
-            f"exposure = {asked_s:g} s has {n_frames} frames of {instrument.frame_s:g} s, expected at most {MOST_FRAMES}"
+            f"exposure = {asked_s:g} s has {n_frames} frames of {instrument.frame_s:g} s, expected at most "
+            f"{MOST_FRAMES}"
         )
     low, high = instrument.output_min_nm, instrument.output_max_nm
     if source.wavelength_nm[0] > low or source.wavelength_nm[-1] < high:

@@ -66,8 +66,8 @@ def guarded(app: typer.Typer) -> int:
             code = _run(app)
         except SystemExit as end:
             code = end.code if isinstance(end.code, int) else BAD_INPUT if end.code else 0
-            if sys.stdout is not out:
-                # Click has met a broken pipe.
+            if isinstance(end.__context__, BrokenPipeError):
+                # Click and rich end so where nobody reads, each in its own way.
                 sys.stdout, code = out, READER_GONE
     return _flushed(code)
 
