@@ -16,7 +16,7 @@ from unittest import mock
 import numpy as np
 import pytest
 from commands import ended
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 pytestmark = pytest.mark.long
@@ -33,6 +33,8 @@ def many(examples: int):
         database=None,
         deadline=None,
         suppress_health_check=list(HealthCheck),
+        # The first failure will do: looking for a shorter one takes minutes.
+        phases=[Phase.generate],
     )
 
 
@@ -268,6 +270,7 @@ SPLICES = st.one_of(
             b"'",
             b"*a",
             b"&a",
+            b"word",
             b"1+2j",
             b"nan",
             b"1e308",
@@ -287,10 +290,11 @@ def spoilt(content: bytes, place: float, splice: bytes, cut: int, pack: bool) ->
 
 
 SPOILS = {
-    "place": st.floats(0.0, 1.0),
+    # Headers are longer than numbers.
+    "place": st.one_of(st.floats(0.0, 1.0), st.floats(0.7, 1.0)),
     "splice": SPLICES,
     "cut": st.sampled_from([0, 1, 5, 80, 3000]),
-    "pack": st.booleans(),
+    "pack": st.sampled_from([False, False, False, True]),
 }
 
 
@@ -302,7 +306,7 @@ def test_spectra(folder: Path, kind: int, ending: str, place: float, splice: byt
     check(folder, *ASK[:-4], "--magnitude", "7.4", "--star", str(file))
 
 
-@many(30)
+@many(40)
 @given(kind=st.integers(0, 2), ending=st.sampled_from([".csv", ".ecsv", ".fits", ".txt"]), **SPOILS)
 def test_flare_tables(folder: Path, kind: int, ending: str, place: float, splice: bytes, cut: int, pack: bool) -> None:
     file = folder / f"flares{ending}"
