@@ -390,7 +390,7 @@ BAD = {
     "magnitudes": (["detect", "-m", "1", "-m", "2", "-m", "3"], "3 magnitudes for 2 stars"),
     "flag": (["detect", "--nonsense"], "nonsense"),
     "word": (["detect", "-n", "many"], "Invalid value for '--realisations'"),
-    "study": (["detect", "no.toml"], "'no.toml' cannot be read"),
+    "study": (["detect", "no.toml"], "'no.toml' does not exist"),
     "output": (["detect", "-o", "/proc/nothing"], "cannot be written"),
 }
 
