@@ -30,6 +30,8 @@ Float = NDArray[np.float64]
 CUT_SIGMA = 8.0
 #: Longest exposure, s.
 DAY_S = 86_400.0
+#: Frames of an exposure, at most: a day of 5 ms each, a thousandth of the payload's.
+MOST_FRAMES = 2**24
 
 
 @dataclass(frozen=True, eq=False)
@@ -355,6 +357,11 @@ def expect(
     asked_s = _seconds(exposure)
     # A hair less, so that 0.1 + 0.2 s is three frames of 0.1 s.
     n_frames = max(1, int(np.ceil(asked_s / instrument.frame_s * (1 - 1e-12))))
+    if n_frames > MOST_FRAMES:
+        raise InputError(
+            f"exposure = {asked_s:g} s has {n_frames} frames of {instrument.frame_s:g} s, expected at most "
+            f"{MOST_FRAMES}"
+        )
     low, high = instrument.output_min_nm, instrument.output_max_nm
     first, last = source.measured_nm or (float(source.wavelength_nm[0]), float(source.wavelength_nm[-1]))
     if first > low or last < high:

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .bounded import read_bytes, shortened, unpacked
+from .ecsv import check_cells, parse_ecsv
 from .errors import InputError
+from .parsed import LARGEST, SMALLEST, as_text, parsing, shown
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
@@ -18,6 +22,9 @@ AMPLITUDES = ("ampl_rec", "amplitude", "ampl", "amp", "peak_amplitude", "relativ
 STARTS, STOPS = ("tstart", "start", "t_start", "time_start"), ("tstop", "stop", "t_stop", "time_stop", "end")
 #: More make a study that nobody reads.
 MOST = 500
+#: Characters of a table that is text: astropy tries a score of forms on it.
+MOST_TEXT = 4 * 2**20
+FORMS = "CSV, ECSV or FITS"
 
 
 def read_flares(path: str | Path) -> QTable:
@@ -38,19 +45,46 @@ def read_flares(path: str | Path) -> QTable:
     InputError
         If the file cannot be read, or holds no such column, none or too many flares, or an impossible amplitude.
     """
+    path = Path(path)
+    named = f"flare table {shortened(str(path))}"
+    content = unpacked(read_bytes(path, "flare table"), named)
+    if content.startswith(b"SIMPLE  ="):
+        table = _fits_table(content, named)
+    else:
+        text = as_text(content, named)
+        if len(text) > MOST_TEXT:
+            raise InputError(f"{named} has {len(text)} characters, expected at most {MOST_TEXT}")
+        table = parse_ecsv(text, named) if text.startswith("# %ECSV") else _text_table(text, path, named)
+    return flares_of(table, shortened(path.name))
+
+
+def _fits_table(content: bytes, named: str) -> Table:
+    """The first table of a FITS file, which is no larger than the file is."""
+    import io
+
+    from astropy.io import fits
     from astropy.table import Table
 
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"flare table {str(path)!r} does not exist, expected CSV, ECSV or FITS")
-    kinds = {".csv": "ascii.csv", ".ecsv": "ascii.ecsv", ".fits": "fits"}
-    try:
-        table = Table.read(path, format=kinds.get(path.suffix.lower(), "ascii"))
-    except Exception as error:  # astropy raises many kinds
-        raise InputError(
-            f"flare table {path.name} cannot be read ({str(error).splitlines()[0]}), expected CSV, ECSV or FITS"
-        ) from error
-    return flares_of(table, path.name)
+    with parsing(named, FORMS), warnings.catch_warnings(), fits.open(io.BytesIO(content), memmap=False) as hdus:
+        # Headers that astropy warns of and reads all the same.
+        warnings.simplefilter("ignore")
+        for hdu in hdus:
+            claimed = hdu.size
+            if claimed > len(content):
+                raise InputError(f"{named} says that it has {claimed} bytes of data, expected at most the file's")
+            if isinstance(hdu, fits.BinTableHDU | fits.TableHDU):
+                return Table.read(hdu)
+        raise InputError(f"{named} has no table, expected {FORMS}")
+
+
+def _text_table(text: str, path: Path, named: str) -> Table:
+    from astropy.table import Table
+
+    lines = text.splitlines()
+    check_cells(lines, named)
+    with parsing(named, FORMS), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return Table.read([*lines, ""], format="ascii.csv" if path.suffix.lower() == ".csv" else "ascii")
 
 
 def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
@@ -73,16 +107,18 @@ def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
         table = Table.from_pandas(table)
     lower = {str(column).strip().lower(): column for column in table.colnames}
 
-    def column(names: tuple[str, ...]) -> np.ndarray | None:
+    def column(names: tuple[str, ...], unit: str) -> np.ndarray | None:
         found = next((lower[one] for one in names if one in lower), None)
-        return None if found is None else np.ma.filled(np.ma.asarray(table[found], float), np.nan)
+        return None if found is None else _numbers(table[found], f"{name}: the column {found!r}", unit)
 
-    amplitudes = column(AMPLITUDES)
+    amplitudes = column(AMPLITUDES, "")
     if amplitudes is None:
-        raise InputError(f"{name} has the columns {', '.join(lower)}, expected one named {', '.join(AMPLITUDES)}")
+        raise InputError(
+            f"{name} has the columns {shown(', '.join(lower), 300)}, expected one named {', '.join(AMPLITUDES)}"
+        )
     if not 0 < amplitudes.size <= MOST:
         raise InputError(f"{name} holds {amplitudes.size} flares, expected 1 to {MOST}")
-    bad = ~(np.isfinite(amplitudes) & (amplitudes > 0))
+    bad = ~((amplitudes >= SMALLEST) & (amplitudes <= LARGEST))
     if bad.any():
         row = int(np.argmax(bad))
         raise InputError(
@@ -90,9 +126,27 @@ def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
         )
     found = QTable({"amplitude": amplitudes})
     for title, names in (("start", STARTS), ("stop", STOPS)):
-        times = column(names)
+        times = column(names, "d")
         if times is not None:
             found[title] = times
             found[title].unit = "d"
     found["amplitude"].info.description = "relative rise above the quiescent flux, in the band of the light curve"
     return found
+
+
+def _numbers(column: Any, named: str, unit: str) -> np.ndarray:
+    """A column's numbers in a unit, which is also assumed where it has none; NaN where it has no value."""
+    import astropy.units as u
+
+    kind = np.asarray(column).dtype.kind if hasattr(column, "dtype") else "O"
+    if kind not in "iuf" or np.ndim(column) != 1:
+        raise InputError(f"{named} holds no plain numbers, expected one number in each row")
+    values: np.ndarray = np.ma.filled(np.ma.asarray(getattr(column, "value", column), float), np.nan)
+    if getattr(column, "unit", None) is None:
+        return np.asarray(values, float)
+    try:
+        return np.asarray((values * u.Unit(column.unit)).to_value(unit), float)
+    except (u.UnitConversionError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{named} has the unit {str(column.unit)!r}, expected {unit or 'none, since amplitudes are relative'}"
+        ) from error

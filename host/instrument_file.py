@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import difflib
-import tomllib
 from functools import cache
 from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
+from .bounded import shortened
 from .curve import Curve
 from .errors import InputError
 from .instrument import CURVES, LABELS, Instrument
+from .parsed import is_file, read_text, toml
 from .pixel_map import PixelMap
 
 #: Where a value comes from: the paper, a datasheet, a computation, an assumption, or the user.
 TAGS = ("P", "D", "C", "A", "U")
+#: Files of a chain in which each extends the next.
+MOST_EXTENDED = 16
 
 
 def shipped() -> tuple[str, ...]:
@@ -49,13 +52,13 @@ def _find(name: str | Path, folder: Path) -> Path:
     if name in names:
         return _local(resources.files(__package__).joinpath("instruments", f"{name}.toml"))
     path = folder / name
-    if path.is_file():
+    if is_file(path):
         return path
     if path.suffix == ".toml":
-        raise InputError(f"instrument file {path} does not exist, expected a TOML file")
+        raise InputError(f"instrument file {shortened(str(path))} does not exist, expected a TOML file")
     near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.0)[0]
     raise InputError(
-        f"unknown instrument {str(name)!r}, expected {' or '.join(names)} (nearest: {near!r}) "
+        f"unknown instrument {shortened(str(name))}, expected {' or '.join(names)} (nearest: {near!r}) "
         "or the path of a TOML file"
     )
 
@@ -69,12 +72,9 @@ def _read(path: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], dict[str,
     """Values and sources of a file, over those of the file that it extends."""
     if path.resolve() in seen:
         raise InputError(f"{path.name} extends itself, expected a chain of files that ends")
-    try:
-        content = tomllib.loads(path.read_text(encoding="utf-8"))
-    except tomllib.TOMLDecodeError as error:
-        raise InputError(f"{path} is not valid TOML: {error}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise InputError(f"{path} cannot be read ({error}), expected a TOML file") from None
+    if len(seen) == MOST_EXTENDED:
+        raise InputError(f"{path.name} ends a chain of {MOST_EXTENDED} files that extend another, expected fewer")
+    content = toml(read_text(path, "instrument file"), f"instrument file {shortened(str(path))}")
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}
     if "extends" in content:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import datetime
 import hashlib
+import http.client
 import os
 import re
 import urllib.error
@@ -16,13 +17,15 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
-from urllib.parse import urljoin
+from urllib.parse import urljoin, urlsplit
 
 import numpy as np
 
-from .bounded import read_bytes
+from .bounded import read_bytes, shortened
+from .ecsv import read_ecsv
 from .errors import InputError
 from .formats import without_columns
+from .parsed import parsing
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -31,6 +34,8 @@ if TYPE_CHECKING:
 
 #: Seconds without an answer.
 TIMEOUT_S = 20.0
+#: Schemes of an address; a local file is added, not fetched.
+SCHEMES = ("http", "https", "ftp")
 #: Bytes of a listing that are looked at.
 MOST_LISTED = 20 * 2**20
 
@@ -82,15 +87,7 @@ def _described(path: Path) -> OwnStar | None:
 
 
 def _read(path: Path) -> Table:
-    from astropy.table import Table
-
-    try:
-        return Table.read(path, format="ascii.ecsv")
-    except Exception as error:  # astropy raises many kinds
-        raise InputError(
-            f"kept star {str(path)!r} cannot be read ({str(error).splitlines()[0]}), expected the file as it was kept: "
-            "`mauvecl library remove` takes it away"
-        ) from error
+    return read_ecsv(path, "kept star", "the file as it was kept: `mauvecl library remove` takes it away")
 
 
 def spectrum(star: OwnStar) -> tuple[np.ndarray, np.ndarray]:
@@ -326,6 +323,7 @@ def fetch(
     for collection in chosen:
         address = base or collection.base
         try:
+            _check_address(address)
             url = urljoin(_folder(address), collection.file_of(star, partial(_listing, address)))
             downloaded = Path(_download(url, show_progress))
         except FileNotFoundError:
@@ -353,6 +351,17 @@ def _folder(address: str) -> str:
     return address if address.endswith("/") else address + "/"
 
 
+def _check_address(address: str) -> None:
+    """Refuse what is no address of the network."""
+    with parsing(f"address {shortened(address)}", "one such as https://host/folder/"):
+        parts = urlsplit(address)
+        known = parts.scheme in SCHEMES and bool(parts.hostname) and parts.port != 0
+    if not (known and address.isprintable() and " " not in address):
+        raise InputError(
+            f"address {shortened(address)} is none of the network, expected one such as https://host/folder/"
+        )
+
+
 def _download(url: str, show_progress: bool) -> str:
     """A file of the network, by astropy; FileNotFoundError where the server has none."""
     from astropy.utils.data import download_file
@@ -366,7 +375,8 @@ def _download(url: str, show_progress: bool) -> str:
         raise InputError(f"{url} answers {error.code} {error.reason}, expected the file: try again later") from error
     except urllib.error.ContentTooShortError as error:
         raise InputError(f"{url} broke off ({error.reason}), expected the whole file: try again") from error
-    except (urllib.error.URLError, OSError) as error:
+    except (urllib.error.URLError, OSError, ValueError, http.client.HTTPException) as error:
+        # Names that no host has are ValueErrors of the IDNA codec, wrong answers HTTPExceptions.
         reason = getattr(error, "reason", error)
         raise InputError(
             f"{url} cannot be reached ({reason}), expected a network; without one bring the file: mauvecl library add "

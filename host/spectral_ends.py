@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from .errors import InputError
 from .measured_noise import point_noise
 from .spectral_columns import NEEDED_NM, looks_like
+from .spectral_values import check_values
 
 if TYPE_CHECKING:
     from .response import Line
@@ -53,6 +54,7 @@ def check_points(name: str, wavelength: Float, flux: Float) -> None:
             f"spectrum {name}: wavelength {wavelength[i + 1]:g} nm at point {i + 2} follows {wavelength[i]:g} nm, "
             "expected increasing wavelengths"
         )
+    check_values(name, wavelength, flux)
 
 
 def check_span(name: str, wavelength: Float, extra: str = "") -> None:

@@ -25,6 +25,7 @@ import numpy as np
 from mauvecl import __version__
 from mauvecl.durable import alone, differing_keys, write_whole
 from mauvecl.host.errors import InputError
+from mauvecl.host.parsed import json_data, read_text
 from mauvecl.shards import FORM
 
 if TYPE_CHECKING:
@@ -119,7 +120,7 @@ class Checkpoint:
                 "forget it"
             )
         try:
-            manifest = json.loads((self.folder / MANIFEST).read_text(encoding="utf-8"))
+            manifest = json_data(read_text(self.folder / MANIFEST, "manifest"), "manifest")
             if manifest["digest"] != _digest_of(manifest):
                 raise ValueError
             theirs = {"mauvecl": manifest["mauvecl"], "verb": manifest["verb"], **manifest["study"]}

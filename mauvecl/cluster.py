@@ -12,9 +12,12 @@ from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
 
 from mauvecl import __version__
+from mauvecl.host.bounded import shortened
 from mauvecl.host.errors import InputError
+from mauvecl.host.parsed import is_file, json_data, read_text
 from mauvecl.program import DeviceError, DeviceRecord
 from mauvecl.shards import Arrays, Countable, Share
 
@@ -190,7 +193,7 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
     with contextlib.ExitStack() as stack:
         word, _, number = where.partition(":")
         if word == "local":
-            if not number.isdecimal() or not 1 <= int(number) <= 1024:
+            if not (number.isdecimal() and len(number) <= 4 and 1 <= int(number) <= 1024):
                 raise InputError(f"--cluster {where!r}, expected local:N with N from 1 to 1024")
             threads = max((os.cpu_count() or 1) // int(number), 1)
             # Deaths are counted and shares sent out again here, so that they are told.
@@ -206,13 +209,18 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
                 env=dict.fromkeys(THREADS, str(threads)),
             )
             how = {"address": stack.enter_context(cluster)}
-        elif "://" in where:
+        elif "://" in where and _is_address(where):
             how = {"address": where}
-        elif Path(where).is_file():
+        elif "://" not in where and is_file(Path(where)):
+            found = json_data(read_text(Path(where), "scheduler file"), f"scheduler file {shortened(where)}")
+            address = found.get("address") if isinstance(found, dict) else None
+            if not (isinstance(address, str) and _is_address(address)):
+                raise InputError(f"scheduler file {shortened(where)} names no address, expected one that Dask wrote")
             how = {"scheduler_file": where}
         else:
             raise InputError(
-                f"--cluster {where!r}, expected local:N, an address such as tcp://host:8786, or a scheduler file"
+                f"--cluster {shortened(where)}, expected local:N, an address such as tcp://host:8786, or a "
+                "scheduler file"
             )
         try:
             client = stack.enter_context(distributed.Client(**how, timeout=PATIENCE_S, set_as_default=False))
@@ -221,6 +229,19 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
         yield client
 
 
+def _is_address(where: str) -> bool:
+    """Whether it names a host and a port, in one of Dask's ways to talk."""
+    try:
+        parts = urlsplit(where)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        return False
+    plain = where.isascii() and where.isprintable() and " " not in where
+    return plain and parts.scheme in SCHEMES and bool(host) and bool(port) and parts.path in ("", "/")
+
+
+#: Dask's ways to talk between machines.
+SCHEMES = ("tcp", "tls", "ucx", "ucxx", "ws", "wss")
 LOGS = ("distributed", *(f"distributed.{part}" for part in ("client", "nanny", "worker", "scheduler", "core")))
 
 # On a worker.

@@ -13,13 +13,13 @@ import numpy as np
 from mauvecl.campaign import campaign
 from mauvecl.departures import departure_table
 from mauvecl.detection import Detection, check_fap, countable
-from mauvecl.host.errors import InputError
 from mauvecl.labels import label, put_first, stacked, titled, told
 from mauvecl.paper import PAPER_G2V, WHY, reconstruct
 from mauvecl.pool import Pool, together
 from mauvecl.sections import Star
 from mauvecl.statistics import SHAPED, Linear, QuadraticForm, matched_weights
 from mauvecl.study import PAPER_STARS, Study
+from mauvecl.weights import read_weights
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -169,7 +169,7 @@ def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
     def answered(one: tuple[Mapping[str, float | str], Study, Star, list[Expectation]]) -> StarDetection:
         at, cell, star, (quiet, *flares) = one
         how = cell.detecting
-        own = [_own(name, path, quiet) for name, path in run.weights.items()]
+        own = [read_weights(name, path, quiet.wavelength_nm) for name, path in run.weights.items()]
         how["statistics"] = (*run.statistics, *own, *_other_templates(cell, star, quiet))
         found = engine.detect(quiet, flares, seed=run.seed, **how)
         return StarDetection(label(star, quiet), at, cell.flare.amplitudes, found)
@@ -208,20 +208,6 @@ def _few_terms(stars: Sequence[StarDetection]) -> list[str]:
         f"The paper's sum over {stars[0].found.dof('paper')} pixels scatters like one of "
         f"{few if few == many else f'{few} to {many}'} independent squares: its faintest pixels make most of it."
     ]
-
-
-def _own(name: str, path: Path, quiet: Expectation) -> Linear:
-    """A linear statistic from a file of wavelengths, nm, and weights per DN: straight between them, zero beyond."""
-    try:
-        columns = np.loadtxt(path, ndmin=2)
-    except (OSError, ValueError) as error:
-        raise InputError(f"weights {path.name} of {name!r} cannot be read ({error}), expected two columns") from error
-    if columns.shape[1] != 2 or not np.all(np.diff(columns[:, 0]) > 0):
-        raise InputError(
-            f"weights {path.name} of {name!r} have {columns.shape[1]} columns, expected ascending wavelengths in nm "
-            "and weights"
-        )
-    return Linear(name, np.interp(quiet.wavelength_nm, columns[:, 0], columns[:, 1], left=0.0, right=0.0))
 
 
 def _other_templates(study: Study, star: Star, quiet: Expectation) -> list[Linear]:

@@ -97,11 +97,15 @@ def load_opencl() -> Any:
     DeviceError
         If the linker ``ld`` is not on the path, pyopencl cannot be loaded, or it was loaded before a fork.
     """
-    if shutil.which("ld") is None:
+    linker = shutil.which("ld", path=os.environ.get("PATH") or os.defpath)
+    if linker is None:
         raise DeviceError(
             "no linker `ld` found on PATH, and PoCL needs it to link kernels: install binutils "
             "(Debian, Ubuntu: `apt-get install binutils`; Fedora: `dnf install binutils`)"
         )
+    if not os.environ.get("PATH"):
+        # Python looks in the usual folders then, PoCL in none, and ends the process.
+        os.environ["PATH"] = os.path.dirname(linker)
     try:
         os.environ["POCL_CACHE_DIR"] = str(kernel_cache().work)
     except OSError as error:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
@@ -19,6 +20,8 @@ QUANTITIES: dict[str, tuple[float, float]] = {
     "detector_temperature": (-100.0, 60.0),
     "sky": (10.0, 30.0),
 }
+#: Combinations of a sweep, at most: each has expectations of its own.
+MOST_CELLS = 100_000
 #: Units of these, where they have any.
 UNITS = {
     "magnitude": "mag",
@@ -158,7 +161,15 @@ class Sweep(Part):
         if self.how == "list" and len(set(lengths.values())) > 1:
             told = ", ".join(f"{n} of {name}" for name, n in lengths.items())
             raise ValueError(f"the sweep is a list of {told}, expected as many of each")
+        if self.size > MOST_CELLS:
+            raise ValueError(f"the sweep has {self.size} combinations, expected at most {MOST_CELLS}")
         return self
+
+    @property
+    def size(self) -> int:
+        """Cells."""
+        lengths = [len(axis.points()) for axis in self.axes]
+        return max(lengths, default=1) if self.how == "list" else math.prod(lengths)
 
     def cells(self) -> list[dict[str, float | str]]:
         """The values of each cell; one cell without any where nothing is swept."""

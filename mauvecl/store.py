@@ -7,9 +7,7 @@ digests tells a foreign chunk from ours. Chunks are written whole or not at all.
 
 from __future__ import annotations
 
-import json
 import tempfile
-import tomllib
 import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -24,6 +22,7 @@ from numpy.typing import NDArray
 from mauvecl import __version__
 from mauvecl.durable import UNFINISHED, differing_keys, write_whole
 from mauvecl.host.errors import InputError
+from mauvecl.host.parsed import json_data, read_text, toml
 from mauvecl.labels import label, titled
 from mauvecl.labels import told as messages_of
 from mauvecl.study import Study
@@ -161,9 +160,9 @@ class Store:
         path = Path(path)
         for place in (path / "zarr.json", *sorted(path.glob("*/*/zarr.json"))):
             try:
-                text = json.loads(place.read_text(encoding="utf-8"))["attributes"]["study"]
-                found = cls(path, Study.build(tomllib.loads(text), path.name))
-            except (OSError, ValueError, KeyError, TypeError, InputError):
+                text = json_data(read_text(place, "store"), "store")["attributes"]["study"]
+                found = cls(path, Study.build(toml(text, path.name), path.name))
+            except (OSError, ValueError, KeyError, TypeError, AttributeError):
                 continue
             found.read_digests()
             return found

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import Field, ValidationError
 
+from mauvecl.host.bounded import shortened
 from mauvecl.host.errors import InputError
+from mauvecl.host.parsed import possible, read_text, toml
 from mauvecl.questions import (
     Axis,
     BulkQuestion,
@@ -37,6 +38,7 @@ class Study(Part):
 
     Examples
     --------
+    >>> import tomllib
     >>> from mauvecl import Study
     >>> study = Study().with_settings(["run.fap=0.01", "star.0.magnitude=6"])
     >>> study.run.fap, study.star[0].library, study.star[0].magnitude
@@ -69,15 +71,8 @@ class Study(Part):
             If it is missing, not TOML (naming the line), or holds an unknown key or an impossible value.
         """
         path = Path(path)
-        try:
-            text = path.read_text(encoding="utf-8")
-            data = tomllib.loads(study_of(path) if path.suffix == ".ecsv" else text)
-        except OSError as error:
-            raise InputError(
-                f"study file {str(path)!r} cannot be read ({error.strerror}), expected a TOML file"
-            ) from error
-        except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-            raise InputError(f"study file {path.name} is not TOML: {error}") from error
+        text = study_of(path) if path.suffix == ".ecsv" else read_text(path, "study file")
+        data = toml(text, f"study file {shortened(path.name)}")
         for star in data.get("star", []) if isinstance(data.get("star"), list) else []:
             # Files are named as seen from the study.
             if isinstance(star, dict) and isinstance(star.get("file"), str):
@@ -90,6 +85,7 @@ class Study(Part):
     @classmethod
     def build(cls, data: dict[str, Any], where: str) -> Self:
         """Validate nested data, with one sentence for the first fault."""
+        possible(data, where)
         try:
             return cls.model_validate(data)
         except ValidationError as error:

@@ -9,39 +9,46 @@ from typing import Any, get_args
 
 from pydantic import BaseModel, ValidationError
 
+from mauvecl.host.bounded import shortened
+from mauvecl.host.ecsv import read_ecsv
 from mauvecl.host.errors import InputError
+from mauvecl.host.parsed import parsing, shown
 
 
 def study_of(path: Path) -> str:
     """The study in an answer's meta data."""
-    from astropy.table import Table
-
-    try:
-        study = Table.read(path, format="ascii.ecsv").meta["study"]
-    except (ValueError, KeyError) as error:
-        raise InputError(f"{path.name} holds no study, expected an answer's ECSV table") from error
-    return str(study)
+    study = read_ecsv(path, "study", "an answer's ECSV table").meta.get("study")
+    if not isinstance(study, str):
+        raise InputError(f"{path.name} holds no study, expected an answer's ECSV table")
+    return study
 
 
 def toml_value(text: str) -> Any:
     """A value as TOML has it; a bare word is text."""
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
+    with parsing(f"value {shortened(text)}", "a value as TOML has it"):
+        try:
+            found = tomllib.loads(f"value = {text}")
+        except tomllib.TOMLDecodeError:
+            return text
+    # Several lines would be several keys.
+    return found["value"] if len(found) == 1 else text
 
 
 def put(data: Any, path: list[str], value: Any, text: str) -> None:
     *parents, last = path
     for part in parents:
         if isinstance(data, list | tuple):
-            if not (part.isdigit() and int(part) < len(data)):
-                raise InputError(f"--set {text!r}: no entry {part!r}, expected 0 to {len(data) - 1}")
+            if part not in (numbers := [str(i) for i in range(len(data))]):
+                raise InputError(
+                    f"--set {shortened(text)}: no entry {shortened(part)}, expected 0 to {len(numbers) - 1}"
+                )
             data = data[int(part)]
-        else:
+        elif isinstance(data, dict):
             data = data.setdefault(part, {})
     if not isinstance(data, dict):
-        raise InputError(f"--set {text!r}: {'.'.join(parents)} holds no keys, expected one that does")
+        raise InputError(
+            f"--set {shortened(text)}: {shortened('.'.join(parents))} holds no keys, expected one that does"
+        )
     data[last] = value
 
 
@@ -54,10 +61,10 @@ def sentence(model: type[BaseModel], error: ValidationError) -> str:
         fields = list(_fields(model, path[:-1]))
         near = difflib.get_close_matches(path[-1], fields, n=1)
         expected = f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(fields)}"
-        return f"unknown key {key!r}, {expected}"
+        return f"unknown key {shortened(key)}, {expected}"
     if first["type"] == "value_error":
         return str(first["ctx"]["error"])
-    return f"{key} = {first['input']!r}: {first['msg'].lower()}"
+    return f"{key} = {shown(first['input'])}: {first['msg'].lower()}"
 
 
 def _fields(model: type[BaseModel], path: list[str]) -> Any:

@@ -22,8 +22,15 @@ class Done:
 
 def run(*words: str | Path, folder: Path, code: int = 0) -> Done:
     """In this process, which spares most tests a start of Python; `started` makes one of its own."""
+    found, out, told = ended(*words, folder=folder)
+    assert found == code, out + told
+    return Done(out, told)
+
+
+def ended(*words: str | Path, folder: Path) -> tuple[int, str, str]:
+    """In this process: exit code, standard output, standard error."""
     out, told = io.StringIO(), io.StringIO()
-    ended = 0
+    code = 0
     with (
         contextlib.chdir(folder),
         contextlib.redirect_stdout(out),
@@ -34,9 +41,8 @@ def run(*words: str | Path, folder: Path, code: int = 0) -> Done:
         try:
             main()
         except SystemExit as end:
-            ended = end.code or 0
-    assert ended == code, out.getvalue() + told.getvalue()
-    return Done(out.getvalue(), told.getvalue())
+            code = end.code or 0
+    return code, out.getvalue(), told.getvalue()
 
 
 def started(*words: str | Path, folder: Path, code: int = 0, **environment: str) -> Done:

@@ -390,7 +390,7 @@ BAD = {
     "magnitudes": (["detect", "-m", "1", "-m", "2", "-m", "3"], "3 magnitudes for 2 stars"),
     "flag": (["detect", "--nonsense"], "nonsense"),
     "word": (["detect", "-n", "many"], "Invalid value for '--realisations'"),
-    "study": (["detect", "no.toml"], "'no.toml' cannot be read"),
+    "study": (["detect", "no.toml"], "'no.toml' does not exist"),
     "output": (["detect", "-o", "/proc/nothing"], "cannot be written"),
 }
 
@@ -408,7 +408,7 @@ def test_bad_input_is_a_sentence_and_exit_code_2(name: str, tmp_path: Path) -> N
     [
         ("[run]\nsead = 3", "unknown key 'run.sead', did you mean 'seed'?"),
         ("[[star]]\nlibrary = 'G2V'\nmagnitud = 3", "unknown key 'star.0.magnitud', did you mean 'magnitude'?"),
-        ("[run\nseed = 3", "is not TOML"),
+        ("[run\nseed = 3", "is not valid TOML"),
         ("[run]\nfap = 2", "run.fap = 2"),
         ("[flare]\namplitudes = []", "flare.amplitudes"),
         ("[[star]]\nmagnitude = 3", "expected one of them"),

@@ -10,6 +10,7 @@ from typing import Annotated
 import typer
 
 from mauvecl import __version__
+from mauvecl.cli.boundary import EXIT_CODES, guarded
 from mauvecl.cli.bulk import export, realise, verify
 from mauvecl.cli.detect import detect, gaussian
 from mauvecl.cli.flags import DeviceFlag, JsonFlag, OutputFlag, QuietFlag
@@ -26,7 +27,7 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
     help="Would the Mauve satellite see this stellar flare, and how sure can one be?\n\n"
     "Start with `mauvecl detect`, which answers the question of the MauveSim paper. The throughput is nominal, not a "
-    "flight calibration. Exit codes: 0 done, 1 a check found something, 2 bad input, 130 interrupted, 143 terminated.",
+    f"flight calibration. {EXIT_CODES}",
 )
 
 
@@ -135,19 +136,5 @@ def _options(
 
 
 def main() -> None:
-    """Run the command line; bad input is one sentence and exit code 2, never a traceback."""
-    from mauvecl.host.errors import InputError
-
-    try:
-        app()
-    except InputError as error:
-        print(f"mauvecl: {error}", file=sys.stderr)
-        sys.exit(2)
-    except RuntimeError as error:
-        # Imported late: program is not needed by verbs that draw nothing.
-        from mauvecl.program import DeviceError
-
-        if not isinstance(error, DeviceError):
-            raise
-        print(f"mauvecl: {error}", file=sys.stderr)
-        sys.exit(2)
+    """Run the command line; a failure is one sentence and an exit code, never a traceback."""
+    sys.exit(guarded(app))

@@ -34,15 +34,18 @@ def realise(study: Study, session: Session) -> None:
     mauvecl realise --star G2V --magnitude 7.4 --amplitude 0.24 --exposure 5 -n 1000 --output frames.fits
     """
     from mauvecl import bulk
+    from mauvecl.cli.foresight import question_room
     from mauvecl.cli.session import told_of_interrupts, working
     from mauvecl.export import ENDINGS, Selection, export
     from mauvecl.host.errors import InputError
+    from mauvecl.store import Store
 
     place = session.output or Path("mauvecl-frames.zarr")
     one_file = place.suffix in ENDINGS
     if not one_file and place.suffix not in ("", ".zarr"):
         raise InputError(f"--output {str(place)!r}, expected a name ending in .zarr, {', '.join(ENDINGS)}")
     folder = place.with_name(f".unfinished-{place.name}.zarr") if one_file else place
+    question_room(Store(folder, study), insist=session.insist)
     if session.restart:
         bulk.forget(folder)
     with (

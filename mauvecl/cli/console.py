@@ -111,9 +111,9 @@ def show(lines: Sequence[str]) -> None:
     """Plain lines on standard output."""
     from rich.console import Console
 
-    console = Console(highlight=False, soft_wrap=True)
+    console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
     for line in lines:
-        console.print(line, markup=False)
+        console.print(line)
 
 
 def show_table(title: str, columns: Sequence[str], cells: Sequence[Sequence[Any]]) -> None:
@@ -122,12 +122,14 @@ def show_table(title: str, columns: Sequence[str], cells: Sequence[Sequence[Any]
     from rich.console import Console
     from rich.table import Table
 
-    console = Console(highlight=False)
+    # Names may hold brackets and colons, which are no markup here.
+    how: dict[str, Any] = {"highlight": False, "markup": False, "emoji": False}
+    console = Console(**how)
     if not console.is_terminal:
         # Piped: as wide as it needs to be.
-        console = Console(highlight=False, width=200)
+        console = Console(**how, width=200)
     # A table's own title would be broken at the table's width.
-    console.print(title, markup=False, soft_wrap=True)
+    console.print(title, soft_wrap=True)
     table = Table(box=box.SIMPLE_HEAD)
     for i, name in enumerate(columns):
         numeric = all(isinstance(row[i], str) and row[i][:1] in "0123456789-+.<>=" for row in cells) and bool(cells)

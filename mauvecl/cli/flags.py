@@ -156,6 +156,9 @@ ClusterFlag = Annotated[
         show_default=False,
     ),
 ]
+InsistFlag = Annotated[
+    bool, typer.Option("--insist", help="Begin even what would take more than a year, or than the disk has room for.")
+]
 ResumeFlag = Annotated[bool, typer.Option("--resume", help="Go on with the unfinished run in the output folder.")]
 RestartFlag = Annotated[bool, typer.Option("--restart", help="Forget the unfinished run in the output folder.")]
 OutputFlag = Annotated[
@@ -295,6 +298,7 @@ WORKERS = {
     "resume": (ResumeFlag, False),
     "restart": (RestartFlag, False),
     "keep_after": (KeepAfterFlag, None),
+    "insist": (InsistFlag, False),
 }
 #: Where a verb asks for fewer realisations than a detection, unless told.
 FEWER = 100_000
@@ -340,6 +344,7 @@ def takes_study(
         _, _, *own = inspect.signature(verb).parameters.values()
 
         def command(study_file: Path | None = None, **values: Any) -> None:
+            from mauvecl.cli.foresight import question_time
             from mauvecl.cli.session import Session
 
             given = {key: values.pop(key, None) for key in options}
@@ -349,6 +354,8 @@ def takes_study(
             if "given" in kinds:
                 values["given"] = given
             study = _study(study_file, given, options, default)
+            if draws:
+                question_time(study, **{key: how[key] for key in ("device", "cluster", "insist")})
             verb(study, Session(name or verb.__name__, study, **how), **values)
 
         named = inspect.Parameter.KEYWORD_ONLY
@@ -373,14 +380,22 @@ def _study(
     default: Callable[[dict[str, Any]], Study] | None,
 ) -> Study:
     """A study file, or the default, with the flags on top, and ``--set`` on top of those."""
+    from mauvecl.host.errors import InputError
     from mauvecl.study import Study
 
     study = Study.read(file) if file is not None else default(given) if default else Study()
     changes: dict[str, dict[str, Any]] = {"sky": _sky(given)}
+    setting: dict[tuple[str, str], str] = {}
     for name, option in options.items():
         if option.section:
             value = given[name]
             if value is not None:
+                other = setting.setdefault((option.section, option.key), name)
+                if other != name:
+                    raise InputError(
+                        f"--{other} and --{name} are both given, expected one of them: both set "
+                        f"{option.section}.{option.key}"
+                    )
                 changes.setdefault(option.section, {})[option.key] = option.convert(value) if option.convert else value
     changed = study.with_changes(changes, _stars(study, given))
     return changed.with_settings(given["settings"]) if given["settings"] else changed

@@ -27,7 +27,7 @@ def simulate(
     study: Study,
     session: Session,
     given: dict[str, Any],
-    realisation: Annotated[int, typer.Option(min=0, help="Which realisation to show.")] = 0,
+    realisation: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Which realisation to show.")] = 0,
 ) -> None:
     """One observation and what it is made of: star, sky, photon noise, dark, bias, read noise.
 

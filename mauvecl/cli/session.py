@@ -14,6 +14,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mauvecl.cli.boundary import writes_to
+
 if TYPE_CHECKING:
     from astropy.table import Table
 
@@ -47,6 +49,8 @@ class Session:
         What is to become of an unfinished run that is there.
     keep_after : float, optional
         Seconds after which finished shares are kept on the disk; as `Checkpoint` has it by default.
+    insist : bool
+        Begin what would never end, or not fit.
     """
 
     verb: str
@@ -60,6 +64,7 @@ class Session:
     resume: bool = False
     restart: bool = False
     keep_after: float | None = None
+    insist: bool = False
     files: list[Path] = field(default_factory=list)
     started: float = field(default_factory=time.perf_counter)
     _pool: Pool | None = None
@@ -69,7 +74,9 @@ class Session:
         """Where everything is written."""
         from mauvecl.report import make_folder
 
-        return make_folder(self.output or Path(f"mauvecl-{self.verb}"))
+        folder = make_folder(self.output or Path(f"mauvecl-{self.verb}"))
+        writes_to(folder)
+        return folder
 
     @contextmanager
     def pool(self, *, unit: str = "realisations") -> Iterator[Pool]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tempfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.source import Source
 from mauvecl.statistics import STATISTICS
 from mauvecl.study import Study
+from mauvecl.web.limited import read_limited
 
 #: Bytes of an upload, and points of its spectrum, at most.
 MOST_UPLOADED, MOST_POINTS = 4 * 2**20, 200_000
@@ -69,10 +69,7 @@ class Question(param.Parameterized):
             raise InputError(
                 f"upload of {len(content) / 2**20:.1f} MiB, expected at most {MOST_UPLOADED / 2**20:g} MiB"
             )
-        with tempfile.TemporaryDirectory() as folder:
-            file = Path(folder) / f"upload{ending}"
-            file.write_bytes(content)
-            source = Source.read(file)
+        source = read_limited(content, ending)
         if source.wavelength_nm.size > MOST_POINTS:
             raise InputError(f"upload of {source.wavelength_nm.size} points, expected at most {MOST_POINTS}")
         self.uploaded = replace(source, name=UPLOADED, origin="upload")

@@ -158,16 +158,16 @@ def test_a_users_file(tmp_path: Path, mauve: Instrument) -> None:
     [
         ('extends = "mauve"\nligth_loss = 0.2', "bad.toml: unknown key 'ligth_loss'.*nearest is 'light_loss'"),
         ("light_loss = 0.2\nname = 'x'", "bad.toml: 'notice' is missing"),
-        ("light_loss 0.2", "bad.toml is not valid TOML: .*line 1"),
+        ("light_loss 0.2", "bad.toml' is not valid TOML: .*line 1"),
         ('extends = "mauve"\nlight_loss = { tag = "P" }', "light_loss has no 'value'"),
         ('extends = "mauve"\nlight_loss = { value = 0.2, sauce = "x" }', "light_loss has the unknown key 'sauce'"),
         ('extends = "mauve"\nlight_loss = { value = 0.2, tag = "Z" }', "light_loss has the tag 'Z', expected one of P"),
-        ('extends = "mauve"\nfibre_efficiency = "none.ecsv"', "none.ecsv does not exist"),
+        ('extends = "mauve"\nfibre_efficiency = "none.ecsv"', "none.ecsv' does not exist"),
         ('extends = "mauve"\nfibre_efficiency = "short.ecsv"', "fibre_efficiency covers 250-710 nm, expected"),
         ('extends = "mauve"\nfibre_efficiency = "falling.ecsv"', "not finite and strictly increasing"),
         ('extends = "mauve"\nfibre_efficiency = "negative.ecsv"', "value at 190 nm is -0.2, expected"),
         ('extends = "mauve"\nfibre_efficiency = "unitless.ecsv"', "'wavelength' has the unit 'none', expected nm"),
-        ('extends = "mauve"\nfibre_efficiency = "text.ecsv"', "text.ecsv cannot be read"),
+        ('extends = "mauve"\nfibre_efficiency = "text.ecsv"', "text.ecsv' cannot be read"),
         ('extends = "mauve"\nfibre_efficiency = true', "fibre_efficiency = True, expected"),
         ('extends = "bad.toml"', "bad.toml extends itself"),
         ("extends = 3", "instrument 3, expected a name or the path"),
@@ -189,7 +189,7 @@ def test_bad_files(tmp_path: Path, text: str, message: str) -> None:
 def test_unknown_names() -> None:
     with pytest.raises(InputError, match=r"unknown instrument 'mauv', expected .*nearest: 'mauve'"):
         Instrument.load("mauv")
-    with pytest.raises(InputError, match=r"no-such.toml does not exist"):
+    with pytest.raises(InputError, match=r"no-such.toml' does not exist"):
         Instrument.load("no-such.toml")
 
 

@@ -1,0 +1,105 @@
+"""Questions that would never end, or never fit: told before they begin."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from mauvecl.host.errors import InputError
+
+if TYPE_CHECKING:
+    from mauvecl.store import Store
+    from mauvecl.study import Study
+
+YEAR_S = 365.25 * 86_400.0
+#: Pixel-realisations a second of one core, counted per scenario: the best of `bench/results/rates.ecsv`, 1.2e10 on two
+#: cores with 16 scenarios, so that nothing is questioned that could end.
+CORE_RATE = 6e9
+#: Assumed of a device that is named: an accelerator as fast as a hundred cores.
+DEVICE_RATE = 100 * CORE_RATE
+#: Assumed of a cluster somewhere: a thousand cores, as in the plan of the documentation.
+CLUSTER_CORES = 1000
+#: The engine's index of realisations has 63 bits: `Engine._check`.
+MOST_REALISATIONS = 2**63 - 1
+
+
+def question_time(study: Study, *, device: str | None, cluster: str | None, insist: bool) -> None:
+    """Question a study that could not end within a year.
+
+    Parameters
+    ----------
+    study : Study
+    device, cluster : str, optional
+        As the command line has them.
+    insist : bool
+        The user knows, and wants it all the same.
+
+    Raises
+    ------
+    InputError
+        If the least that it draws would take longer, with the estimate and how to insist; or if there are more
+        realisations than the index counts, which no insisting changes.
+    """
+    count = study.run.realisations
+    if count > MOST_REALISATIONS:
+        raise InputError(f"realisations = {count}, expected at most {MOST_REALISATIONS}: the index has 63 bits")
+    if insist or count < 10**9:
+        # A billion ends within hours anywhere: no need to look at the instrument.
+        return
+    scenarios = 1 + len(study.flare.amplitudes)
+    combinations = study.sweep.size
+    drawn = count * len(study.star) * combinations * scenarios * study.load_instrument().pixels
+    rate, by = _rate(device, cluster)
+    years = drawn / rate / YEAR_S
+    if years > 1.0:
+        raise InputError(
+            f"realisations = {count:.3g} of {len(study.star) * combinations} stars draw {drawn:.2g} pixels and take "
+            f"some {years:.2g} years at {rate:.2g} a second ({by}), expected less than a year; --insist begins all the "
+            "same"
+        )
+
+
+def question_room(store: Store, *, insist: bool) -> None:
+    """Question a store that its disk has no room for.
+
+    Raises
+    ------
+    InputError
+        With what it takes and what there is.
+    """
+    if insist:
+        return
+    there = next(folder for folder in (store.path, *store.path.absolute().parents) if folder.is_dir())
+    free = shutil.disk_usage(there).free + _held(store.path)
+    if store.n_bytes > free:
+        rows = free // (store.n_bytes // store.rows)
+        raise InputError(
+            f"realisations = {store.rows} take {_size(store.n_bytes)} and {str(store.path)!r} has room for "
+            f"{_size(free)}, expected at most {rows} of them, or another place; --insist begins all the same"
+        )
+
+
+def _rate(device: str | None, cluster: str | None) -> tuple[float, str]:
+    """Pixel-realisations a second at best, and whose rate it is."""
+    cores = os.cpu_count() or 1
+    if cluster is not None and not cluster.startswith("local:"):
+        return CLUSTER_CORES * CORE_RATE, f"assumed of {CLUSTER_CORES} cores"
+    if device is not None:
+        devices = device.count(",") + 1
+        return max(devices * DEVICE_RATE, cores * CORE_RATE), f"assumed of {devices} accelerators"
+    return cores * CORE_RATE, f"the best measured on {cores} cores"
+
+
+def _held(folder: Path) -> int:
+    """Bytes that an unfinished store has already."""
+    return sum(path.stat().st_size for path in folder.glob("star-*/*/c/*/*")) if folder.is_dir() else 0
+
+
+def _size(size: float) -> str:
+    for unit in ("bytes", "KiB", "MiB", "GiB", "TiB"):
+        if size < 1024:
+            return f"{size:.3g} {unit}"
+        size /= 1024
+    return f"{size:.3g} PiB"

@@ -1,0 +1,151 @@
+"""Spectra that visitors bring, read in a process of its own: whatever they do to it, the server stays as it is."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import subprocess
+import sys
+import tempfile
+import threading
+from pathlib import Path
+
+import numpy as np
+
+from mauvecl.host.errors import InputError
+from mauvecl.host.source import Source
+
+#: Memory of the reading process, MiB: Python with astropy and synphot maps some 400, a spectrum of 4 MiB as text 300.
+MEMORY_MIB = 1536
+#: Seconds that it may take, by the clock and of a processor.
+SECONDS = 20
+#: Content that a file of a visitor's may unpack to, MiB.
+CONTENT_MIB = 64
+#: Readers at the same time; other visitors wait for their turn, but no longer than `SECONDS`.
+TOGETHER = 2
+#: Exit codes of the reading process.
+_REFUSED, _NO_ROOM = 2, 3
+#: What a source tells of itself beside its numbers.
+WORDS = ("name", "origin", "notes", "told", "measured_nm", "unscaled")
+_turns = threading.BoundedSemaphore(TOGETHER)
+
+
+def read_limited(content: bytes, ending: str) -> Source:
+    """A spectrum from the bytes of a file, as `Source.read` reads it, in a process with limits of memory and time.
+
+    Blocks for about a second, most of it for the start of Python: call it from a thread.
+
+    Parameters
+    ----------
+    content : bytes
+    ending : str
+        Of the file's name, such as ``.fits``.
+
+    Raises
+    ------
+    InputError
+        If it holds no usable spectrum, or reading it takes more memory or time than allowed.
+    """
+    if not _turns.acquire(timeout=SECONDS):
+        raise InputError("too many uploads are read at the same time, expected yours again in a minute")
+    try:
+        answer = _read_apart(content, ending)
+    finally:
+        _turns.release()
+    with np.load(io.BytesIO(answer), allow_pickle=False) as found:
+        words = json.loads(str(found["words"]))
+        measured = words["measured_nm"]
+        return Source(
+            found["wavelength"],
+            found["flux"],
+            words["name"],
+            words["origin"],
+            tuple(words["notes"]),
+            told=tuple(words["told"]),
+            measured_nm=None if measured is None else (measured[0], measured[1]),
+            unscaled=words["unscaled"],
+        )
+
+
+def _read_apart(content: bytes, ending: str) -> bytes:
+    """What the reading process writes."""
+    environment = os.environ | {
+        # One thread of a numerical library needs no stacks of many.
+        **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
+        "MAUVECL_LARGEST_CONTENT_MIB": str(CONTENT_MIB),
+        "PYTHONIOENCODING": "utf-8",
+        "PYTHONPATH": os.pathsep.join(filter(None, (_here(), os.environ.get("PYTHONPATH")))),
+    }
+    # A fresh interpreter, as spawn makes one: OpenCL does not survive a fork.
+    command = [sys.executable, "-m", "mauvecl.web.limited", ending, str(MEMORY_MIB), str(SECONDS)]
+    with tempfile.TemporaryDirectory(prefix="mauvecl-upload-") as folder:
+        try:
+            done = subprocess.run(
+                command, input=content, capture_output=True, timeout=SECONDS, cwd=folder, env=environment, check=False
+            )
+        except subprocess.TimeoutExpired as error:
+            raise InputError(
+                f"the upload takes more than {SECONDS} s to read, expected a spectrum of some thousand points"
+            ) from error
+        except OSError as error:
+            raise InputError(f"the upload cannot be read now ({error.strerror}), expected it again later") from error
+    if done.returncode == 0:
+        return done.stdout
+    if done.returncode == _REFUSED:
+        raise InputError(done.stderr.decode("utf-8", "replace").strip())
+    if done.returncode == _NO_ROOM:
+        raise InputError(
+            f"the upload takes more than {MEMORY_MIB} MiB of memory to read, expected a spectrum of some thousand "
+            "points"
+        )
+    raise InputError("the upload ends its reader, expected a spectrum as text, ECSV or FITS")
+
+
+def _here() -> str:
+    """The folder that holds the package: the reading process starts elsewhere."""
+    return str(Path(__file__).parents[2])
+
+
+def _limit(memory_mib: int, seconds: int) -> None:
+    """Take memory, time and files away from this process, for good."""
+    import resource
+
+    for kind, value in (
+        (resource.RLIMIT_AS, memory_mib << 20),
+        (resource.RLIMIT_CPU, seconds),
+        (resource.RLIMIT_FSIZE, 64 << 20),
+        (resource.RLIMIT_CORE, 0),
+        (resource.RLIMIT_NPROC, 0),
+    ):
+        _, hard = resource.getrlimit(kind)
+        value = value if hard == resource.RLIM_INFINITY else min(value, hard)
+        resource.setrlimit(kind, (value, value))
+
+
+def _main() -> int:
+    """The reading process: bytes of a file come in on standard input, arrays go out, a sentence to standard error."""
+    ending, memory_mib, seconds = sys.argv[1:]
+    _limit(int(memory_mib), int(seconds))
+    try:
+        file = Path(f"upload{ending}")
+        file.write_bytes(sys.stdin.buffer.read())
+        source = Source.read(file)
+        out = io.BytesIO()
+        np.savez(
+            out,
+            wavelength=source.wavelength_nm,
+            flux=source.flux_flam,
+            words=np.array(json.dumps({key: getattr(source, key) for key in WORDS})),
+        )
+    except InputError as error:
+        print(error, file=sys.stderr)
+        return _REFUSED
+    except MemoryError:
+        return _NO_ROOM
+    sys.stdout.buffer.write(out.getvalue())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(_main())
