@@ -49,15 +49,22 @@ def alone(folder: Path, what: str) -> Iterator[None]:
     Raises
     ------
     InputError
-        If another process holds it.
+        If another process holds it, or the file system has no locks.
     """
-    handle = os.open(folder, os.O_RDONLY)
+    try:
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError as error:
+        raise InputError(f"{what} {str(folder)!r} cannot be opened ({error.strerror}), expected a folder") from error
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise InputError(
                 f"{what} {str(folder)!r} is being written by another process, expected only one"
+            ) from error
+        except OSError as error:
+            raise InputError(
+                f"{what} {str(folder)!r} cannot be locked ({error.strerror}), expected a file system with locks"
             ) from error
         yield
     finally:

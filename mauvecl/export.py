@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from mauvecl import __version__
 from mauvecl.durable import UNFINISHED
 from mauvecl.host.errors import InputError
-from mauvecl.store import CALIBRATION, COMMON_DRAWS, NOMINAL, Scene, Store
+from mauvecl.store import Scene, Store
+from mauvecl.store_description import CALIBRATION, COMMON_DRAWS, NOMINAL
 
 if TYPE_CHECKING:
     from astropy.io.fits import BinTableHDU, HDUList, ImageHDU
@@ -62,13 +63,8 @@ class Selection:
             raise InputError(
                 f"{size / 2**30:.1f} GiB of spectra, expected at most {LARGEST // 2**30} GiB in one file: choose rows"
             )
-        for chunk in store.chunks():
-            if (
-                any(chunk.scene is s for s in chosen)
-                and chunk.stop > first
-                and chunk.start < stop
-                and not store.has(chunk)
-            ):
+        for chunk in store.chunks(first, stop):
+            if any(chunk.scene is s for s in chosen) and not store.has(chunk):
                 raise InputError(f"{chunk.key} is missing, expected a whole store: `mauvecl realise --resume` draws it")
         return found
 

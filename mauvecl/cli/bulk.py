@@ -35,16 +35,14 @@ def realise(study: Study, session: Session) -> None:
     """
     from mauvecl import bulk
     from mauvecl.cli.session import told_of_interrupts, working
-    from mauvecl.export import ENDINGS, Selection, export
+    from mauvecl.export import ENDINGS
     from mauvecl.host.errors import InputError
 
     place = session.output or Path("mauvecl-frames.zarr")
     one_file = place.suffix in ENDINGS
     if not one_file and place.suffix not in ("", ".zarr"):
         raise InputError(f"--output {str(place)!r}, expected a name ending in .zarr, {', '.join(ENDINGS)}")
-    folder = place.with_name(f".unfinished-{place.name}.zarr") if one_file else place
-    if session.restart:
-        bulk.forget(folder)
+    folder = bulk.unfinished(place) if one_file else place
     with (
         told_of_interrupts(lambda: f"what was written to {str(folder)!r} is kept, and --resume draws the rest"),
         session.metered("spectra") as meter,
@@ -54,10 +52,8 @@ def realise(study: Study, session: Session) -> None:
 
         pool = Pool(workers)
         meter.standing = lambda: pool.standing
-        store = bulk.realise(study, folder, pool, resume=session.resume, progress=meter)
-    if one_file:
-        export(Selection.of(store), place)
-        bulk.forget(folder)
+        draw = bulk.realise_file if one_file else bulk.realise
+        store = draw(study, place, pool, resume=session.resume, restart=session.restart, progress=meter)
     _tell(store, place, session)
 
 
