@@ -324,7 +324,8 @@ def takes_study(
             if "given" in kinds:
                 values["given"] = given
             study = _study(study_file, given, options, default)
-            verb(study, Session(name or verb.__name__, study, **how), **values)
+            with Session(name or verb.__name__, study, **how) as session:
+                verb(study, session, **values)
 
         named = inspect.Parameter.KEYWORD_ONLY
         parameters = [
