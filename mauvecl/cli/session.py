@@ -81,7 +81,7 @@ class Session:
 
         self._held.close()
         if kind is None and self._lost:
-            others = f"; so are {len(self._lost) - 1} more files of this answer" if self._lost[1:] else ""
+            others = f"; the same holds for {len(self._lost) - 1} more files of this answer" if self._lost[1:] else ""
             raise InputError(self._lost[0] + others)
 
     @cached_property
