@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import json
-import shutil
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.durable import UNFINISHED, alone, write_whole
+from mauvecl.export import Selection, export
 from mauvecl.host.errors import InputError
 from mauvecl.pool import Pool, together
-from mauvecl.store import CRC_BYTES, DIGESTS, Chunk, Scene, Store, crc, digest
+from mauvecl.store import CRC_BYTES, Chunk, Scene, Store, crc, digest
 from mauvecl.study import Study
 
 if TYPE_CHECKING:
@@ -28,6 +27,8 @@ Progress = Callable[[int, int], None]
 
 #: Chunks drawn in one go, and threads that write while the next are drawn.
 TOGETHER, WRITERS = 4, 2
+#: `verify` names missing chunks one by one, so many at most: a study can ask for any number.
+MOST_MISSING = 100_000
 
 
 def draw(
@@ -62,7 +63,13 @@ def draw(
 
 
 def realise(
-    study: Study, path: str | Path, engine: Engine | Pool, *, resume: bool = True, progress: Progress | None = None
+    study: Study,
+    path: str | Path,
+    engine: Engine | Pool,
+    *,
+    resume: bool = True,
+    restart: bool = False,
+    progress: Progress | None = None,
 ) -> Store:
     """Draw a study's spectra into a store, or what is missing of it.
 
@@ -75,6 +82,8 @@ def realise(
     engine : Engine or Pool
     resume : bool
         Whether a store that was begun before is continued, or refused.
+    restart : bool
+        Remove the store that is there, whatever its study.
     progress : callable, optional
         Called as ``progress(done, total)`` in spectra. It may raise to stop the work; what was written is kept.
 
@@ -84,22 +93,59 @@ def realise(
         If the place holds something else or is being written by another process, or cannot be written.
     """
     store = Store(Path(path), study)
-    begun = (store.path / "zarr.json").exists()
-    with ExitStack() as stack:
-        if begun:
-            stack.enter_context(alone(store.path, "store"))
-        store.make()
-        if not begun:
-            stack.enter_context(alone(store.path, "store"))
-        todo = [chunk for chunk in store.chunks() if not store.has(chunk)]
-        if begun and not resume and todo:
-            every = sum(1 for _ in store.chunks())
-            raise InputError(
-                f"store {str(store.path)!r} holds {every - len(todo)} of {every} chunks, expected --resume to draw the "
-                "others, or another place"
-            )
-        _fill(store, todo, engine, progress)
+    store.make_folder()
+    with alone(store.path, "store"):
+        _complete(store, engine, resume, restart, progress)
     return store
+
+
+def realise_file(
+    study: Study,
+    file: str | Path,
+    engine: Engine | Pool,
+    *,
+    resume: bool = True,
+    restart: bool = False,
+    progress: Progress | None = None,
+) -> Store:
+    """As `realise`, into one FITS or HDF5 file; an unfinished store beside it is there until the file is.
+
+    Raises
+    ------
+    InputError
+        As `realise`; and if the file is there already and is not to be written anew.
+    """
+    file = Path(file)
+    if file.exists() and not restart:
+        raise InputError(f"{str(file)!r} is there already, expected another place, or --restart to write it anew")
+    store = Store(unfinished(file), study)
+    store.make_folder()
+    with alone(store.path, "store"):
+        _complete(store, engine, resume, restart, progress)
+        export(Selection.of(store), file)
+        store.clear()
+        store.path.rmdir()
+    return store
+
+
+def unfinished(file: Path) -> Path:
+    """The store beside a file that is not yet written."""
+    return file.with_name(f"{UNFINISHED}{file.name}.zarr")
+
+
+def _complete(store: Store, engine: Engine | Pool, resume: bool, restart: bool, progress: Progress | None) -> None:
+    """Draw what is missing of a store that this process holds."""
+    if restart and any(store.path.iterdir()):
+        Store.open(store.path).clear()
+    begun = (store.path / "zarr.json").exists()
+    store.make()
+    todo = [chunk for chunk in store.chunks() if not store.has(chunk)]
+    if begun and not resume and todo:
+        raise InputError(
+            f"store {str(store.path)!r} holds {store.count() - len(todo)} of {store.count()} chunks, expected --resume "
+            "to draw the others, or another place"
+        )
+    _fill(store, todo, engine, progress)
 
 
 def forget(path: str | Path) -> None:
@@ -108,12 +154,14 @@ def forget(path: str | Path) -> None:
     Raises
     ------
     InputError
-        If something else is there.
+        If something else is there, or another process is writing it: then nothing is removed.
     """
     path = Path(path)
     if path.exists():
         Store.open(path)
-        shutil.rmtree(path)
+        with alone(path, "store"):
+            Store.open(path).clear()
+            path.rmdir()
 
 
 def _fill(store: Store, todo: list[Chunk], engine: Engine | Pool, progress: Progress | None) -> None:
@@ -250,26 +298,32 @@ def verify(
     Raises
     ------
     InputError
-        If the folder is no store, is being written, or cannot be written to repair it.
+        If the folder is no store, is being written, or cannot be written to repair it; if its study contradicts
+        another copy of it, or does not draw what was written; or if more than `MOST_MISSING` chunks are missing.
     """
     if engine is None and (repair or redraw):
         raise InputError("no engine is given, expected one to repair or redraw")
-    store = Store.open(path)
-    with alone(store.path, "store"):
-        found = list(_faults_of_description(store, repair))
-        every = list(store.chunks())
+    Store.open(path)
+    with alone(Path(path), "store"):
+        store = Store.open(path)
         first, last = rows or (0, store.rows)
         if not 0 <= first < last <= store.rows:
             raise InputError(f"rows {first}:{last}, expected a range within 0:{store.rows}")
-        seen = [chunk for chunk in every if chunk.stop > first and chunk.start < last]
-        for number, chunk in enumerate(seen):
+        files = list(store.files())
+        total, there = store.count(first, last), sum(store.owns(key) for key, _ in files)
+        if total - there > MOST_MISSING:
+            raise InputError(
+                f"store {str(store.path)!r} holds {there} chunks where its study asks for {total}, expected at most "
+                f"{MOST_MISSING} missing: choose --rows, or `mauvecl realise --resume` draws them"
+            )
+        found = list(_faults_of_description(store, repair))
+        for number, chunk in enumerate(store.chunks(first, last)):
             fault = _fault(store, chunk, engine, repair, redraw)
             if fault is not None:
                 found.append(fault)
             if progress is not None:
-                progress(number + 1, len(seen))
-        expected = {chunk.key for chunk in every}
-        found += [Fault(key, "not of this store", False) for key in _strangers(store, expected)]
+                progress(number + 1, total)
+        found += [Fault(key, "not of this store", False) for key, own in files if not own]
     return found
 
 
@@ -282,6 +336,11 @@ def _fault(store: Store, chunk: Chunk, engine: Engine | Pool | None, repair: boo
     assert engine is not None
     rows = draw(store.study, chunk.scene, engine, chunk.start, chunk.stop - chunk.start)
     drawn = digest(*store.encode(chunk, rows))
+    if store.digests.get(chunk.key, drawn) != drawn and not redraw:
+        raise InputError(
+            f"{chunk.key} of {store.path.name} was written with the digest {store.digests[chunk.key]} and is now "
+            f"drawn with {drawn}, expected the same: its study or its list is wrong; --redraw --repair trusts the study"
+        )
     if seen == "good":
         if drawn == store.digests[chunk.key]:
             return None
@@ -311,16 +370,6 @@ def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
             if repair:
                 write_whole(there, content)
             yield Fault(name, seen, repair)
-
-
-def _strangers(store: Store, expected: set[str]) -> Iterator[str]:
-    """Files among the chunks that no chunk has."""
-    for scene in store.scenes:
-        for path in sorted((store.path / scene.path).rglob("*")):
-            key = str(path.relative_to(store.path))
-            own = path.name in (DIGESTS, "zarr.json") or path.name.startswith(UNFINISHED)
-            if path.is_file() and key not in expected and not own:
-                yield key
 
 
 def read(path: str | Path, scene: str = "star-1/quiescent") -> Any:

@@ -7,15 +7,17 @@ a run that is started again asks the same and finds what is there.
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 import json
-import shutil
+import os
+import re
 import threading
 import time
 import tomllib
 import zipfile
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -23,7 +25,8 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 
 from mauvecl import __version__
-from mauvecl.durable import alone, differing_keys, write_whole
+from mauvecl.durable import UNFINISHED, alone, differing_keys, write_whole
+from mauvecl.host.bounded import read_bytes
 from mauvecl.host.errors import InputError
 from mauvecl.host.parsed import json_data, read_text
 from mauvecl.shards import FORM
@@ -33,6 +36,8 @@ if TYPE_CHECKING:
     from mauvecl.study import Study
 
 FOLDER, MANIFEST = "checkpoint", "manifest.json"
+#: What shares are called: fingerprint, part, start, count.
+SHARE_NAME = re.compile(r"[0-9a-f]{32}-[0-9]+-[0-9]+-[0-9]+\.npz")
 #: Shares are held back so long before the first is written: short runs leave no files.
 PATIENCE_S = 20.0
 DIGEST_BYTES = 32
@@ -53,6 +58,8 @@ class Checkpoint:
         Forget what is there.
     patience_s : float
         See `PATIENCE_S`.
+    held : bool
+        Whether the caller holds the folder, so that no other process writes there.
 
     Attributes
     ----------
@@ -71,9 +78,10 @@ class Checkpoint:
         resume: bool = False,
         restart: bool = False,
         patience_s: float = PATIENCE_S,
+        held: bool = False,
     ) -> None:
         self.parent, self.folder, self.verb, self.study = folder, folder / FOLDER, verb, study
-        self._resume, self._restart, self._patience_s = resume, restart, patience_s
+        self._resume, self._restart, self._patience_s, self._is_held = resume, restart, patience_s, held
         self.found = self.damaged = 0
         self.messages: list[str] = []
         self._held: list[tuple[str, Arrays]] = []
@@ -89,13 +97,14 @@ class Checkpoint:
             If another process writes there; if there is a run to resume and it is not said what to do with it; or if
             it is another study's, with the keys that differ.
         """
-        self._stack.enter_context(alone(self.parent, "output folder"))
+        if not self._is_held:
+            self._stack.enter_context(alone(self.parent, "output folder"))
         try:
             self._look()
         except BaseException:
             self._stack.close()
             raise
-        self._started, self._written = time.monotonic(), self.folder.exists()
+        self._started, self._written = time.monotonic(), any(self._files())
         return self
 
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
@@ -111,8 +120,8 @@ class Checkpoint:
 
     def _look(self) -> None:
         if self._restart:
-            shutil.rmtree(self.folder, ignore_errors=True)
-        if not self.folder.exists():
+            self._remove()
+        if not any(self._files()):
             return
         if not self._resume:
             raise InputError(
@@ -195,12 +204,35 @@ class Checkpoint:
     @property
     def kept(self) -> int:
         """Files of shares that are there."""
-        return sum(1 for _ in self.folder.glob("[!.]*.npz"))
+        return sum(1 for path in self._files() if path.suffix == ".npz")
 
     def forget(self) -> None:
         """Remove it: the answer is written."""
         self._held = []
-        shutil.rmtree(self.folder, ignore_errors=True)
+        self._remove()
+
+    def _files(self) -> Iterator[Path]:
+        """The files in its folder that are a checkpoint's own, by their names.
+
+        Raises
+        ------
+        InputError
+            If there is a manifest of something else.
+        """
+        names = sorted(os.listdir(self.folder)) if self.folder.is_dir() else []
+        shares = [name for name in names if SHARE_NAME.fullmatch(name)]
+        if MANIFEST in names and not shares and not _is_ours(self.folder / MANIFEST):
+            raise InputError(f"{str(self.folder / MANIFEST)!r} is not mauvecl's, expected another output folder")
+        yield from (self.folder / name for name in names if name in shares or name == MANIFEST)
+
+    def _remove(self) -> None:
+        """Remove its own files, and its folder where nothing else is in it."""
+        for path in [*self._files(), *self.folder.glob(f"{UNFINISHED}*")]:
+            name = path.name.removeprefix(UNFINISHED)
+            if name == MANIFEST or SHARE_NAME.fullmatch(name):
+                path.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            self.folder.rmdir()
 
     def _plain_study(self) -> dict[str, object]:
         return dict(tomllib.loads(self.study.toml()))
@@ -209,6 +241,15 @@ class Checkpoint:
         manifest = {"mauvecl": __version__, "form": FORM, "verb": self.verb, "study": self._plain_study()}
         text = json.dumps(manifest | {"digest": _digest_of(manifest)}, indent=2)
         write_whole(self.folder / MANIFEST, text.encode())
+
+
+def _is_ours(manifest: Path) -> bool:
+    """Whether a manifest is whole and a checkpoint's."""
+    try:
+        content = json.loads(read_bytes(manifest, "manifest"))
+        return bool(content["digest"] == _digest_of(content))
+    except (InputError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        return False
 
 
 def _named(name: str, body: bytes) -> bytes:

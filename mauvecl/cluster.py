@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import signal
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,6 +19,7 @@ from mauvecl import __version__
 from mauvecl.host.bounded import shortened
 from mauvecl.host.errors import InputError
 from mauvecl.host.parsed import is_file, json_data, read_text
+from mauvecl.pool import Stopped
 from mauvecl.program import DeviceError, DeviceRecord
 from mauvecl.shards import Arrays, Countable, Share
 
@@ -67,7 +69,8 @@ class DaskWorkers:
         self._lock = threading.Lock()
         self._closing = False
         self._given: dict[str, DaskFuture[Any]] = {}
-        self._sent: set[DaskFuture[Any]] = set()
+        # Who waits for what was sent out.
+        self._sent: dict[DaskFuture[Any], Future[Arrays]] = {}
         self._open = contextlib.ExitStack()
         try:
             self._client: Client = self._open.enter_context(_client(where, distributed))
@@ -117,7 +120,7 @@ class DaskWorkers:
     def _send(self, found: Future[Arrays], request: Countable, key: str, share: Share, tried: int) -> None:
         with self._lock:
             if self._closing:
-                found.cancel()
+                found.set_exception(Stopped())
                 return
             try:
                 if key not in self._given:
@@ -131,23 +134,23 @@ class DaskWorkers:
                 # Dask raises either where its client has lost the scheduler.
                 found.set_exception(self._gone().with_traceback(error.__traceback__))
                 return
-            self._sent.add(sent)
+            self._sent[sent] = found
         sent.add_done_callback(partial(self._came, found, request, key, share, tried))
 
     def _came(
         self, found: Future[Arrays], request: Countable, key: str, share: Share, tried: int, sent: DaskFuture[Any]
     ) -> None:
         with self._lock:
-            self._sent.discard(sent)
+            if self._sent.pop(sent, None) is None:
+                # Nobody waits for it any longer.
+                return
         try:
             if sent.status == "finished":
                 found.set_result(sent.result())
                 return
             error = sent.exception() if sent.status == "error" else None
             known = isinstance(error, InputError | DeviceError)
-            if self._closing:
-                found.cancel()
-            elif known or tried == TRIES:
+            if known or tried == TRIES:
                 told = error if known else f"{error or 'the scheduler is gone'}"
                 found.set_exception(
                     DeviceError(f"cluster {self._where} failed at realisations {share.start} to "
@@ -167,12 +170,22 @@ class DaskWorkers:
                 found.set_exception(error)
 
     def stop(self) -> None:
-        """Take back what was sent out; a worker ends the share in its hands."""
+        """Take back what was sent out; a worker of another machine ends the share in its hands."""
         with self._lock:
             self._closing = True
-            sent = list(self._sent)
-        with contextlib.suppress(OSError, RuntimeError):
-            self._client.cancel(sent)
+            sent, self._sent = self._sent, {}
+        # Whoever waits is told here: nothing that Dask does or fails to do, and no future that is merely cancelled,
+        # would wake concurrent.futures.wait.
+        for found in sent.values():
+            found.set_exception(Stopped())
+        with contextlib.suppress(OSError, RuntimeError, TimeoutError):
+            self._client.cancel(list(sent))
+        # Those of this machine need not end the share in their hands, which takes seconds.
+        for nanny in getattr(self._client.cluster, "workers", {}).values():
+            nanny.auto_restart = False
+            if nanny.pid is not None:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(nanny.pid, signal.SIGKILL)
 
     def close(self) -> None:
         """Let the workers go; those of this machine end."""
@@ -198,17 +211,24 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
             threads = max((os.cpu_count() or 1) // int(number), 1)
             # Deaths are counted and shares sent out again here, so that they are told.
             how = {"distributed.scheduler.allowed-failures": 0, "distributed.admin.tick.limit": "1h"}
+            # Nothing to look at by HTTP, which asks nobody who they are.
+            how |= {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
             stack.enter_context(dask.config.set(how | {"logging": dict.fromkeys(LOGS, "critical")}))
             cluster = distributed.LocalCluster(
                 n_workers=int(number),
                 threads_per_worker=1,
                 processes=True,
-                dashboard_address="127.0.0.1:0",
+                host="127.0.0.1",
+                dashboard_address=None,
+                scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
+                security=_private(distributed),
+                preload=__name__,
                 memory_limit=0,
                 silence_logs=logging.CRITICAL,
                 env=dict.fromkeys(THREADS, str(threads)),
             )
-            how = {"address": stack.enter_context(cluster)}
+            stack.enter_context(cluster)
+            how = {"address": cluster, "security": cluster.security}
         elif "://" in where and _is_address(where):
             how = {"address": where}
         elif "://" not in where and is_file(Path(where)):
@@ -242,9 +262,31 @@ def _is_address(where: str) -> bool:
 
 #: Dask's ways to talk between machines.
 SCHEMES = ("tcp", "tls", "ucx", "ucxx", "ws", "wss")
+
+
+def _private(distributed: Any) -> Any:
+    """Certificates for this run alone, kept in memory: other users of the machine cannot connect.
+
+    A worker runs whatever the scheduler is sent, with the rights of whoever started it.
+    """
+    try:
+        return distributed.Security.temporary()
+    except ImportError as error:
+        raise InputError(
+            "cryptography is missing, expected it for --cluster local:N: pip install 'mauvecl[cluster]'"
+        ) from error
+
+
 LOGS = ("distributed", *(f"distributed.{part}" for part in ("client", "nanny", "worker", "scheduler", "core")))
 
 # On a worker.
+
+
+def dask_setup(worker: Any) -> None:
+    """Dask calls this on each worker of this machine: Ctrl-C reaches it too, but only the run itself acts upon it."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
 
 _engine: Engine | None = None
 _one_at_a_time = threading.Lock()

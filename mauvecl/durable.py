@@ -10,36 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from mauvecl.host.errors import InputError
+from mauvecl.host.whole import UNFINISHED, write_whole
 
-#: Files beside their place carry this in front of their name until they are whole.
-UNFINISHED = ".unfinished-"
-
-
-def write_whole(path: Path, *parts: bytes | memoryview) -> None:
-    """Write a file beside its place, bring it to the disk, and rename it.
-
-    Raises
-    ------
-    InputError
-        If it cannot be written; what was at its place is still there.
-    """
-    beside = path.with_name(f"{UNFINISHED}{path.name}")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with beside.open("wb", buffering=0) as file:
-            for part in parts:
-                left = memoryview(part).cast("B")
-                while left:
-                    left = left[file.write(left) :]
-            os.fsync(file.fileno())
-        beside.replace(path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            beside.unlink(missing_ok=True)
-        raise InputError(
-            f"{str(path)!r} cannot be written ({error.strerror}), expected a writable disk with room; what was written "
-            "before is kept"
-        ) from error
+__all__ = ["UNFINISHED", "alone", "differing_keys", "write_whole"]
 
 
 @contextlib.contextmanager
@@ -49,15 +22,22 @@ def alone(folder: Path, what: str) -> Iterator[None]:
     Raises
     ------
     InputError
-        If another process holds it.
+        If another process holds it, or the file system has no locks.
     """
-    handle = os.open(folder, os.O_RDONLY)
+    try:
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError as error:
+        raise InputError(f"{what} {str(folder)!r} cannot be opened ({error.strerror}), expected a folder") from error
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise InputError(
                 f"{what} {str(folder)!r} is being written by another process, expected only one"
+            ) from error
+        except OSError as error:
+            raise InputError(
+                f"{what} {str(folder)!r} cannot be locked ({error.strerror}), expected a file system with locks"
             ) from error
         yield
     finally:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import os
 import tempfile
 from collections.abc import Sequence
@@ -13,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl import __version__
-from mauvecl.durable import UNFINISHED
+from mauvecl.durable import UNFINISHED, write_whole
 from mauvecl.host.errors import InputError
-from mauvecl.store import CALIBRATION, COMMON_DRAWS, NOMINAL, Scene, Store
+from mauvecl.store import Scene, Store
+from mauvecl.store_description import CALIBRATION, COMMON_DRAWS, NOMINAL
 
 if TYPE_CHECKING:
     from astropy.io.fits import BinTableHDU, HDUList, ImageHDU
@@ -62,13 +64,8 @@ class Selection:
             raise InputError(
                 f"{size / 2**30:.1f} GiB of spectra, expected at most {LARGEST // 2**30} GiB in one file: choose rows"
             )
-        for chunk in store.chunks():
-            if (
-                any(chunk.scene is s for s in chosen)
-                and chunk.stop > first
-                and chunk.start < stop
-                and not store.has(chunk)
-            ):
+        for chunk in store.chunks(first, stop):
+            if any(chunk.scene is s for s in chosen) and not store.has(chunk):
                 raise InputError(f"{chunk.key} is missing, expected a whole store: `mauvecl realise --resume` draws it")
         return found
 
@@ -98,14 +95,17 @@ def export(selection: Selection, path: str | Path) -> Path:
     path = Path(path)
     if path.suffix not in ENDINGS:
         raise InputError(f"export {path.name!r}, expected a name ending in {', '.join(ENDINGS)}")
+    if path.suffix != ".fits":
+        # In memory first: on a full disk the HDF5 library ends the whole process.
+        packed = io.BytesIO()
+        _hdf5(selection, packed)
+        write_whole(path, packed.getbuffer(), shared=True)
+        return path
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryDirectory(prefix=UNFINISHED, dir=path.parent) as folder:
             beside = Path(folder) / path.name
-            if path.suffix == ".fits":
-                _fits(selection).writeto(beside, checksum=True)
-            else:
-                _hdf5(selection, beside)
+            _fits(selection).writeto(beside, checksum=True)
             with beside.open("rb") as file:
                 os.fsync(file.fileno())
             beside.replace(path)
@@ -179,14 +179,14 @@ def _calibration(scene: Scene) -> BinTableHDU:
     return fits.BinTableHDU.from_columns(columns, name=name)
 
 
-def _hdf5(selection: Selection, path: Path) -> None:
+def _hdf5(selection: Selection, place: io.BytesIO) -> None:
     try:
         import h5py
     except ImportError as error:
         raise InputError("h5py is missing, expected it for HDF5: pip install 'mauvecl[bulk]'") from error
 
     store = selection.store
-    with h5py.File(path, "w") as file:
+    with h5py.File(place, "w") as file:
         file.attrs.update({"mauvecl": __version__, "study": store.study.toml(), "seed": str(store.study.run.seed)})
         file.attrs.update({"first_row": selection.first, "draws": COMMON_DRAWS, "throughput": NOMINAL})
         for scene in selection.scenes:

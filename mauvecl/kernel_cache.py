@@ -9,11 +9,16 @@ from __future__ import annotations
 
 import atexit
 import contextlib
+import fcntl
 import hashlib
 import json
 import os
+import re
+import secrets
 import shutil
+import socket
 import tempfile
+import time
 from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
@@ -24,6 +29,12 @@ from mauvecl import __version__
 ROOM = 64 * 2**20
 #: The store's size; the programs used longest ago make room.
 MOST_STORED = 128 * 2**20
+#: Working folders, the lock in each, and folders that are becoming one.
+WORK, LOCK, MAKING = "mauvecl-work-", "lock", ".mauvecl-making-"
+#: Random for each boot, the same in every container of a host (Linux, Documentation/admin-guide/sysctl/kernel.rst).
+BOOT = Path("/proc/sys/kernel/random/boot_id")
+#: A folder of another host, whose locks may not be seen here, is left over when nothing was built in it for so long.
+ABANDONED_S = 30 * 86400.0
 
 
 class KernelCache:
@@ -42,6 +53,8 @@ class KernelCache:
     def __init__(self, base: Path | None, work: Path) -> None:
         self.work = work
         self.pid = os.getpid()
+        # Age tells other hosts whether the folder is in use.
+        self._lock = work / LOCK
         self.store = (base or work) / "store"
         self._folders: dict[str, str] = {}
         self._published: dict[str, int] = {}
@@ -76,6 +89,8 @@ class KernelCache:
     @contextlib.contextmanager
     def building(self, key: str) -> Iterator[None]:
         """Learn which of PoCL's folders belongs to the program built inside the block."""
+        with contextlib.suppress(OSError):
+            os.utime(self._lock)
         before = set(self._programs())
         yield
         new = [folder for folder in self._programs() if folder not in before]
@@ -107,7 +122,7 @@ class KernelCache:
         path = self.store / f"{key}.txt"
         with contextlib.suppress(OSError):
             self.store.mkdir(parents=True, exist_ok=True)
-            new = path.with_name(f".{key}-{os.getpid()}")
+            new = path.with_name(f".{key}-{secrets.token_hex(8)}")
             new.write_text(f"{hashlib.sha256(text.encode()).hexdigest()}\n{text}", encoding="utf-8")
             new.replace(path)
 
@@ -188,23 +203,63 @@ def _writable(folder: Path) -> bool:
 
 
 def _working_folder(parent: Path) -> Path | None:
-    """A new folder of this process under `parent`, or None where it cannot be made or would not suffice."""
+    """A new folder of this process under `parent`, or None where it cannot be made or would not suffice.
+
+    It is named by host and boot, since a home may be shared, and locked while the process lives: process numbers mean
+    nothing on another host, nor in another container of this one.
+    """
     try:
         parent.mkdir(parents=True, exist_ok=True)
         _sweep(parent)
         if shutil.disk_usage(parent).free < ROOM:
             return None
-        work = Path(tempfile.mkdtemp(prefix=f"mauvecl-work-{os.getpid()}-", dir=parent))
-        (work / "probe").write_bytes(b"\0" * 4096)
-        (work / "probe").unlink()
+        # Under another name until it is locked, so that nobody finds it without a lock.
+        making = Path(tempfile.mkdtemp(prefix=MAKING, dir=parent))
+        (making / "probe").write_bytes(b"\0" * 4096)
+        (making / "probe").unlink()
+        handle = os.open(making / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        with contextlib.suppress(OSError):
+            # A file system without locks leaves age alone to tell.
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        # The handle is never closed: the operating system lets go of the lock when the process has ended.
+        return making.rename(parent / f"{WORK}{_here()}-{secrets.token_hex(8)}")
     except OSError:
         return None
-    return work
+
+
+def _here() -> str:
+    """This host since its last boot."""
+    host = re.sub(r"[^A-Za-z0-9]", "", socket.gethostname())[:32]
+    with contextlib.suppress(OSError):
+        return f"{host}-{BOOT.read_text().strip().replace('-', '')}"
+    return f"{host}-unknown"
 
 
 def _sweep(parent: Path) -> None:
-    """Remove what processes that were killed have left."""
-    for folder in parent.glob("mauvecl-work-*"):
-        pid = folder.name.split("-")[2]
-        if pid.isdigit() and not Path("/proc", pid).exists() and Path("/proc").is_dir():
-            shutil.rmtree(folder, ignore_errors=True)
+    """Remove what processes that were killed have left: here by its lock, elsewhere by its age too."""
+    here = _here()
+    for folder in [*parent.glob(f"{WORK}*"), *parent.glob(f"{MAKING}*")]:
+        try:
+            # Containers of one host have one kernel, which knows all locks, whatever they are called.
+            same = not here.endswith("unknown") and here.rpartition("-")[2] == folder.name.split("-")[-2]
+            lock = folder / LOCK
+            age = time.time() - (lock if lock.exists() else folder).stat().st_mtime
+            if ((same and lock.exists()) or age > ABANDONED_S) and _is_free(lock):
+                shutil.rmtree(folder, ignore_errors=True)
+        except (OSError, IndexError):
+            continue
+
+
+def _is_free(lock: Path) -> bool:
+    """Whether no living process holds a lock; without a lock there is no holder."""
+    try:
+        handle = os.open(lock, os.O_RDWR | os.O_CLOEXEC)
+    except FileNotFoundError:
+        return True
+    try:
+        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    finally:
+        os.close(handle)
+    return True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import io
 import json
 import platform
 from collections.abc import Sequence
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import mauvecl
+from mauvecl.durable import write_whole
 from mauvecl.host.errors import InputError
 
 if TYPE_CHECKING:
@@ -36,7 +38,7 @@ def make_folder(path: Path) -> Path:
         path.mkdir(parents=True, exist_ok=True)
         probe = path / ".mauvecl-probe"
         probe.write_text("")
-        probe.unlink()
+        probe.unlink(missing_ok=True)
     except OSError as error:
         raise InputError(
             f"output folder {str(path)!r} cannot be written ({error.strerror}), expected a writable one"
@@ -45,21 +47,30 @@ def make_folder(path: Path) -> Path:
 
 
 def write_table(table: Table, path: Path) -> Path:
-    """A table as ECSV, or as FITS by the file's ending."""
+    """A table as ECSV, or as FITS by the file's ending; whole or not at all.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written; what was at its place is still there.
+    """
     if path.suffix == ".fits":
-        plain = table.copy()
+        plain, packed = table.copy(), io.BytesIO()
         # FITS keywords have eight letters and short values: the study goes beside it.
         plain.meta = {FITS_KEYWORDS[k]: v for k, v in plain.meta.items() if k in FITS_KEYWORDS}
-        plain.write(path, overwrite=True)
+        plain.write(packed, format="fits")
+        write_whole(path, packed.getbuffer())
     else:
-        table.write(path, format="ascii.ecsv", overwrite=True)
+        text = io.StringIO()
+        table.write(text, format="ascii.ecsv")
+        write_whole(path, text.getvalue().encode())
     return path
 
 
 def write_study(study: Study, folder: Path) -> Path:
-    """The study, to be run again as it was."""
+    """The study, to be run again as it was; errors as `write_table`."""
     path = folder / "study.toml"
-    path.write_text(study.toml(), encoding="utf-8")
+    write_whole(path, study.toml().encode())
     return path
 
 
@@ -114,8 +125,8 @@ def write_record(
 
 
 def write_json(content: Any, path: Path) -> Path:
-    """Anything plain as JSON."""
-    path.write_text(json.dumps(content, indent=2, default=str) + "\n", encoding="utf-8")
+    """Anything plain as JSON; errors as `write_table`."""
+    write_whole(path, (json.dumps(content, indent=2, default=str) + "\n").encode())
     return path
 
 

@@ -7,8 +7,9 @@ digests tells a foreign chunk from ours. Chunks are written whole or not at all.
 
 from __future__ import annotations
 
+import os
+import shutil
 import tempfile
-import warnings
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -19,12 +20,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl import __version__
 from mauvecl.durable import UNFINISHED, differing_keys, write_whole
+from mauvecl.host.bounded import read_bytes
 from mauvecl.host.errors import InputError
-from mauvecl.host.parsed import json_data, read_text, toml
+from mauvecl.host.parsed import toml
 from mauvecl.labels import label, titled
-from mauvecl.labels import told as messages_of
+from mauvecl.store_description import describe, study_in
 from mauvecl.study import Study
 
 if TYPE_CHECKING:
@@ -32,21 +33,8 @@ if TYPE_CHECKING:
 
 #: Bytes of one chunk, about.
 CHUNK_BYTES = 16 * 2**20
-#: Per pixel and frame, kept with each star, with their units.
-CALIBRATION = {
-    "wavelength_nm": "nm",
-    "bias_dn": "DN",
-    "dark_dn": "DN",
-    "read_noise_dn": "DN",
-    "gain_dn_per_electron": "DN / electron",
-}
 DIGESTS = "digests.txt"
 CRC_BYTES = 4
-COMMON_DRAWS = (
-    "row i of every array is drawn with the same random numbers, so that a flare is the only difference between two "
-    "arrays; rows of different number are independent"
-)
-NOMINAL = "the throughput is nominal, not a flight calibration"
 
 
 @dataclass(frozen=True, eq=False)
@@ -150,23 +138,35 @@ class Store:
 
     @classmethod
     def open(cls, path: str | Path) -> Store:
-        """One that was written before; from the copy of its study where the root's is damaged.
+        """One that was written before, from the copies of its study that have their digest: they must agree.
 
         Raises
         ------
         InputError
-            If it is none of mauvecl's.
+            If it is none of mauvecl's, no copy of its study is intact, or intact copies contradict each other.
         """
         path = Path(path)
+        copies: dict[str, Path] = {}
         for place in (path / "zarr.json", *sorted(path.glob("*/*/zarr.json"))):
-            try:
-                text = json_data(read_text(place, "store"), "store")["attributes"]["study"]
-                found = cls(path, Study.build(toml(text, path.name), path.name))
-            except (OSError, ValueError, KeyError, TypeError, AttributeError):
-                continue
-            found.read_digests()
-            return found
-        raise InputError(f"{str(path)!r} is no store of spectra, expected a folder that `mauvecl realise` wrote")
+            text = study_in(place)
+            if text is not None:
+                copies.setdefault(text, place.relative_to(path))
+        if not copies:
+            raise InputError(
+                f"{str(path)!r} is no store of spectra, expected a folder that `mauvecl realise` wrote, with an intact "
+                "copy of its study"
+            )
+        (text, first), *others = copies.items()
+        if others:
+            other, second = others[0]
+            keys = ", ".join(differing_keys(toml(text, path.name), toml(other, path.name)))
+            raise InputError(
+                f"store {str(path)!r} holds two studies, {str(first)!r} and {str(second)!r} differ in {keys}, "
+                "expected one study: put the right one's file back"
+            )
+        found = cls(path, Study.build(toml(text, path.name), path.name))
+        found.read_digests()
+        return found
 
     @cached_property
     def scenes(self) -> list[Scene]:
@@ -198,12 +198,20 @@ class Store:
         """Bytes of all spectra."""
         return sum(self.rows * scene.row_bytes for scene in self.scenes)
 
-    def chunks(self) -> Iterator[Chunk]:
-        """All chunks, scene by scene."""
+    def chunks(self, first: int = 0, stop: int | None = None) -> Iterator[Chunk]:
+        """All chunks, scene by scene, or those with rows `first` to `stop` - 1."""
         for scene in self.scenes:
             rows = scene.chunk_rows(self.rows)
-            for number, start in enumerate(range(0, self.rows, rows)):
-                yield Chunk(scene, number, start, min(start + rows, self.rows))
+            for number in self._numbers(scene, first, stop):
+                yield Chunk(scene, number, number * rows, min((number + 1) * rows, self.rows))
+
+    def count(self, first: int = 0, stop: int | None = None) -> int:
+        """How many chunks `chunks` goes through; known without going through them."""
+        return sum(len(self._numbers(scene, first, stop)) for scene in self.scenes)
+
+    def _numbers(self, scene: Scene, first: int = 0, stop: int | None = None) -> range:
+        rows = scene.chunk_rows(self.rows)
+        return range(first // rows, -(-(self.rows if stop is None else stop) // rows))
 
     def make(self) -> None:
         """Write what describes the arrays, nothing of them yet; or see that it is there already.
@@ -218,20 +226,36 @@ class Store:
             self._check_same()
             self.read_digests()
             return
+        self.make_folder()
         ours = {scene.group for scene in self.scenes}
-        try:
-            self.path.mkdir(parents=True, exist_ok=True)
-            other = [p.name for p in self.path.iterdir() if p.name not in ours and not p.name.startswith(UNFINISHED)]
-        except OSError as error:
-            raise InputError(
-                f"store {str(self.path)!r} cannot be made ({error.strerror}), expected a writable folder"
-            ) from error
+        other = [p.name for p in self.path.iterdir() if p.name not in ours and not p.name.startswith(UNFINISHED)]
         if other:
             raise InputError(f"{str(self.path)!r} holds {min(other)!r} and no store, expected an empty or a new folder")
         # The root comes last: where it is, everything else is.
         made = self.description()
         for name in sorted(made, key=lambda name: name == root.name):
             write_whole(self.path / name, made[name])
+
+    def make_folder(self) -> None:
+        """Its folder, which may be there.
+
+        Raises
+        ------
+        InputError
+            If it cannot be made, or its file system is smaller than the spectra.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            room = shutil.disk_usage(self.path).total
+        except OSError as error:
+            raise InputError(
+                f"store {str(self.path)!r} cannot be made ({error.strerror}), expected a writable folder"
+            ) from error
+        if self.n_bytes > room:
+            raise InputError(
+                f"spectra of {self.n_bytes / 2**30:.4g} GiB for {str(self.path)!r}, expected less than its disk's "
+                f"{room / 2**30:.4g} GiB"
+            )
 
     def description(self) -> dict[str, bytes]:
         """Every file of the store but its spectra, by its place."""
@@ -254,8 +278,8 @@ class Store:
         self.digests = {}
         for scene in self.scenes:
             try:
-                text = (self.path / scene.path / DIGESTS).read_text(encoding="utf-8", errors="replace")
-            except OSError:
+                text = read_bytes(self.path / scene.path / DIGESTS, "list of digests").decode(errors="replace")
+            except InputError:
                 continue
             for line in text.splitlines():
                 name, _, rest = line.partition(" ")
@@ -303,6 +327,48 @@ class Store:
             return False
         return chunk.key in self.digests and size == self.chunk_bytes(chunk)
 
+    def owns(self, key: str) -> bool:
+        """Whether a file at this place of the store would be a chunk's."""
+        scene = next((scene for scene in self.scenes if key.startswith(f"{scene.path}/c/")), None)
+        number = key.removeprefix(f"{scene.path}/c/").partition("/")[0] if scene else ""
+        # Twenty digits hold any number of a chunk; int() of a name without end would take its time.
+        if scene is None or not (number.isascii() and number.isdigit() and len(number) <= 20):
+            return False
+        return int(number) in self._numbers(scene) and key == Chunk(scene, int(number), 0, 0).key
+
+    def files(self) -> Iterator[tuple[str, bool]]:
+        """Every file and link in its folder, and whether it is of this store."""
+        described = self.description()
+        lists = {f"{scene.path}/{DIGESTS}" for scene in self.scenes}
+        for folder, folders, names in os.walk(self.path):
+            here = Path(folder).relative_to(self.path)
+            linked = [name for name in folders if (Path(folder) / name).is_symlink()]
+            for name in sorted([*names, *linked]):
+                whole = str(here / name.removeprefix(UNFINISHED))
+                yield str(here / name), whole in described or whole in lists or self.owns(whole)
+
+    def clear(self) -> None:
+        """Remove every file of it, its study last, so that it is a store to the end; its folder stays.
+
+        Raises
+        ------
+        InputError
+            If something else is in the folder: then nothing is removed.
+        """
+        found = list(self.files())
+        other = [key for key, own in found if not own]
+        if other:
+            raise InputError(
+                f"store {str(self.path)!r} holds {other[0]!r}, which is not of it, expected nothing else where a store "
+                "is to be removed"
+            )
+        for key, _ in sorted(found, key=lambda entry: entry[0] == "zarr.json"):
+            (self.path / key).unlink(missing_ok=True)
+        for folder, _, _ in os.walk(self.path, topdown=False):
+            if folder != str(self.path):
+                Path(folder).rmdir()
+        self.digests = {}
+
     def chunk_bytes(self, chunk: Chunk) -> int:
         """Bytes of a chunk's file: whole rows, and their CRC."""
         return chunk.scene.chunk_rows(self.rows) * chunk.scene.row_bytes + CRC_BYTES
@@ -327,56 +393,3 @@ def digest(*parts: bytes | memoryview) -> str:
 
 def _check(*words: str) -> str:
     return digest(" ".join(words).encode())[:8]
-
-
-def describe(store: Store, folder: Path) -> None:
-    """Everything of a store but its spectra: groups, arrays' descriptions, calibration."""
-    import zarr
-    from zarr.codecs import Crc32cCodec
-
-    study = store.study.toml()
-    with warnings.catch_warnings():
-        # A folder that holds nothing yet.
-        warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
-        root = zarr.open_group(folder, mode="w", zarr_format=3)
-        run: dict[str, Any] = {"study": study, "seed": store.study.run.seed, "realisations": store.rows}
-        root.attrs.update(run | {"mauvecl": __version__, "draws": COMMON_DRAWS, "throughput": NOMINAL})
-        for scene in store.scenes:
-            x, group = scene.expectation, root.require_group(scene.group)
-            if scene.name == "quiescent":
-                group.attrs.update({"star": scene.star, **scene.at})
-                group.attrs.update({"exposure_s": x.exposure_s, "frames": x.n_frames, "messages": messages_of([x])})
-                for name, unit in CALIBRATION.items():
-                    _values(group, name, np.asarray(getattr(x, name)), unit, ["pixel"])
-                if scene.frames is not None:
-                    _values(group, "frame", np.array(scene.frames), "", ["frame"])
-            if store.study.bulk.components:
-                n = x.n_frames if scene.frames is None else 1
-                gain = n * x.gain_dn_per_electron
-                for name, values in (
-                    ("source", gain * x.source_electrons),
-                    ("sky", gain * x.sky_electrons),
-                    ("noise", np.sqrt(x.variance_dn2 * n / x.n_frames)),
-                ):
-                    _values(group, f"{scene.name}-{name}", values, "DN", ["pixel"])
-            dimensions = ["realisation", *(["frame"] if scene.frames is not None else []), "pixel"]
-            array = group.create_array(
-                scene.name,
-                shape=(store.rows, *scene.row),
-                chunks=(scene.chunk_rows(store.rows), *scene.row),
-                dtype=scene.dtype,
-                compressors=[Crc32cCodec()],
-                fill_value=0,
-                dimension_names=dimensions,
-            )
-            origin: dict[str, Any] = {"star": scene.star, "provenance": dict(x.provenance), "study": study}
-            array.attrs.update(origin | {"units": "DN", "amplitude": scene.amplitude})
-
-
-def _values(group: Any, name: str, values: NDArray[Any], unit: str, dimensions: list[str]) -> None:
-    from zarr.codecs import Crc32cCodec
-
-    array = group.create_array(
-        name, data=values, chunks=values.shape, compressors=[Crc32cCodec()], dimension_names=dimensions
-    )
-    array.attrs["units"] = unit

@@ -5,12 +5,16 @@ from __future__ import annotations
 import json
 import os
 import signal
+import socket
+import ssl
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext, suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +28,7 @@ from mauvecl.cluster import DaskWorkers
 from mauvecl.engine import DeviceError, Engine
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
-from mauvecl.pool import Pool
+from mauvecl.pool import Pool, Stopped, together
 
 pytestmark = pytest.mark.usefixtures("small_shares")
 
@@ -67,6 +71,41 @@ def test_a_worker_killed_in_mid_run(workers: DaskWorkers, engine: Engine, scene:
     assert pool.standing.retries >= 1, "the share in its hands was counted again"
 
 
+def greeted(port: int, context: ssl.SSLContext | None) -> bool:
+    """Whether whoever listens sends a visitor anything, as Dask's servers greet those they talk to."""
+    try:
+        plain = socket.create_connection(("127.0.0.1", port), timeout=3)
+        with context.wrap_socket(plain) if context else plain as talk:
+            return bool(talk.recv(1))
+    except OSError:
+        return False
+
+
+def test_nobody_else_can_connect(workers: DaskWorkers) -> None:
+    """Another user of this machine sees the ports; without this run's certificate none of them answers."""
+    import psutil
+    from distributed import Security
+
+    workers._client.wait_for_workers(2, timeout=60)
+    pids = [os.getpid(), *workers._client.run(os.getpid).values()]
+    ports = {c.laddr.port for pid in pids for c in psutil.Process(pid).net_connections("tcp") if c.status == "LISTEN"}
+
+    def who_greets(context: ssl.SSLContext | None) -> int:
+        with ThreadPoolExecutor(len(ports)) as threads:
+            return sum(threads.map(partial(greeted, context=context), ports))
+
+    ours, another = (
+        s.get_connection_args("client")["ssl_context"] for s in (workers._client.security, Security.temporary())
+    )
+    without = ssl.create_default_context()
+    without.check_hostname, without.verify_mode = False, ssl.CERT_NONE
+    another.check_hostname, another.verify_mode = False, ssl.CERT_NONE
+    assert who_greets(ours) == 5, "scheduler, nannies and workers"
+    assert [who_greets(context) for context in (None, without, another)] == [0, 0, 0]
+    for pid in pids:
+        assert b"PRIVATE" not in Path(f"/proc/{pid}/cmdline").read_bytes()
+
+
 def test_raw_spectra_by_two_processes(workers: DaskWorkers, tmp_path: Path, engine: Engine) -> None:
     study = small().with_settings(["run.realisations=500"])
     bulk.realise(study, tmp_path / "s.zarr", Pool(workers))
@@ -84,6 +123,106 @@ def test_a_mistake_on_a_worker_is_a_sentence(workers: DaskWorkers, scene: list[E
     with pytest.raises(DeviceError, match=r"cluster local:2 failed at realisations 0 to 9: .*frames = -1"):
         workers.submit(Impossible(), "key", shards.Share(0, 0, 10), lambda done: None).result()
     assert workers.retries == before
+
+
+class Silent:
+    """A Dask client that answers nothing and takes nothing back; its own futures as well."""
+
+    cluster, status = None, "running"
+
+    def submit(self, *given: Any, **how: Any) -> Any:
+        return Silent()
+
+    def nthreads(self) -> dict[str, int]:
+        return {"one": 1, "two": 1}
+
+    def add_done_callback(self, call: Any) -> None:
+        pass
+
+    def cancel(self, futures: Any) -> None:
+        raise TimeoutError
+
+
+def test_whoever_waits_is_woken_at_the_end(scene: list[Expectation], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever Dask does: threads that wait for shares, for spectra, and for each other end at once."""
+    monkeypatch.setattr("mauvecl.cluster._client", lambda where, distributed: nullcontext(Silent()))
+    monkeypatch.setattr(Silent, "run", lambda *given, **how: {}, raising=False)
+    monkeypatch.setattr(Silent, "wait_for_workers", lambda *given, **how: None, raising=False)
+    workers = DaskWorkers("silent")
+    monkeypatch.setattr(DaskWorkers, "count", 2)
+    pool = Pool(workers)
+    ended: list[type[BaseException]] = []
+
+    def ask(work: Any) -> None:
+        try:
+            work()
+        except BaseException as error:
+            ended.append(type(error))
+
+    detect = partial(pool.detect, scene[0], scene[1:], realisations=N, seed=1)
+    works = [
+        detect,
+        lambda: pool.realise(scene[0], start=0, count=3, seed=1),
+        lambda: list(together(pool, lambda work: work(), [detect, detect, detect])),
+    ]
+    threads = [threading.Thread(target=ask, args=(work,), daemon=True) for work in works]
+    for thread in threads:
+        thread.start()
+    time.sleep(0.5)
+    assert ended == []
+    pool.stop()
+    for thread in threads:
+        thread.join(5)
+    assert ended == [Stopped] * 3
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_cluster_ends_in_order(stop: signal.Signals, tmp_path: Path) -> None:
+    """Ctrl-C in a terminal reaches the workers too. Two seconds where this was written; five are promised."""
+    script = "import mauvecl.shards as s; s.SHARE = 2**27; from mauvecl.cli.app import main; main()"
+    words = [
+        "detect",
+        "--star",
+        "G2V",
+        "--star",
+        "K3V",
+        "--statistic",
+        "chi2",
+        "-n",
+        "80000",
+        "--no-pictures",
+        "--fap",
+        "0.01",
+    ]
+    command = [sys.executable, "-c", script, *words, "--output", "out"]
+    run = subprocess.Popen(
+        [*command, "--cluster", "local:2", "--keep-after", "0"],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    shares = tmp_path / "out" / "checkpoint"
+    while not list(shares.glob("[!.]*.npz")):
+        time.sleep(0.01)
+        assert run.poll() is None
+    os.killpg(run.pid, stop) if stop == signal.SIGINT else run.send_signal(stop)
+    try:
+        # Twice what is promised, for machines with other work.
+        _, errors = run.communicate(timeout=10)
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(run.pid, signal.SIGKILL)
+    assert run.returncode == {signal.SIGINT: 130, signal.SIGTERM: 143}[stop]
+    assert len(errors.splitlines()) == 1, errors
+    assert "kept in 'out/checkpoint', and the same command with --resume goes on from there" in errors
+    kept = sum(int(p.stem.split("-")[-1]) for p in shares.glob("[!.]*.npz"))
+    if stop == signal.SIGTERM:
+        return
+    done = subprocess.run([*command, "--resume"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["shares"]["resumed"] == kept > 0
 
 
 @contextmanager
@@ -188,4 +327,11 @@ def test_no_cluster_is_a_sentence(
 def test_without_dask(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with pytest.raises(InputError, match=r"Dask is missing.*pip install 'mauvecl\[cluster\]'"):
+        DaskWorkers("local:2")
+
+
+def test_without_certificates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No cluster rather than an open one."""
+    monkeypatch.setitem(sys.modules, "cryptography", None)
+    with pytest.raises(InputError, match=r"cryptography is missing.*pip install 'mauvecl\[cluster\]'"):
         DaskWorkers("local:2")

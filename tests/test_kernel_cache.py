@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import fcntl
 import json
 import os
 import shutil
@@ -177,6 +178,60 @@ def test_what_a_killed_process_leaves_is_swept_up(filled: tuple[Path, str], tmp_
     child.wait()
     assert run(tmp_path)["digest"] == filled[1]
     assert not left[0].exists()
+
+
+HOLDS = "from mauvecl.kernel_cache import kernel_cache; print(kernel_cache().work, flush=True); input()"
+SWEEPS = "import sys, pathlib; from mauvecl import kernel_cache; kernel_cache._sweep(pathlib.Path(sys.argv[1]))"
+#: Commands that run another as on a machine of its own: with its own processes, and its own name.
+ELSEWHERE = {
+    "another container": ["unshare", "--pid", "--fork", "--mount-proc"],
+    "another name": ["unshare", "--uts", "sh", "-c", 'hostname elsewhere && exec "$@"', "sh"],
+    "both": ["unshare", "--pid", "--fork", "--mount-proc", "--uts", "sh", "-c", 'hostname elsewhere && "$@"', "sh"],
+}
+
+
+@pytest.mark.parametrize("place", ELSEWHERE)
+@pytest.mark.parametrize("holder", ["here", "there"])
+def test_containers_that_share_a_home_leave_each_other_alone(tmp_path: Path, place: str, holder: str) -> None:
+    """Whoever holds a working folder and whoever sweeps: while its process lives it stays, then it goes."""
+    there = ELSEWHERE[place]
+    if subprocess.run([*there, "true"], capture_output=True, check=False).returncode:
+        pytest.skip("no namespaces can be made here")
+    one, other = (there, []) if holder == "there" else ([], there)
+    environment = os.environ | {"MAUVECL_CACHE_DIR": str(tmp_path)}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    child = subprocess.Popen([*one, sys.executable, "-c", HOLDS], env=environment, text=True, **pipes)  # type: ignore[call-overload]
+    work = Path(child.stdout.readline().strip())
+    sweep = [*other, sys.executable, "-c", SWEEPS, work.parent]
+    subprocess.run(sweep, env=environment, check=True)
+    assert work.is_dir(), "swept while it was in use"
+    (left,) = [int(p.name) for p in Path("/proc").glob("[0-9]*") if _holds(p, work / "lock")]
+    os.kill(left, signal.SIGKILL)
+    child.communicate()
+    subprocess.run(sweep, env=environment, check=True)
+    assert not work.exists()
+
+
+def _holds(process: Path, file: Path) -> bool:
+    try:
+        return any(handle.readlink() == file for handle in (process / "fd").iterdir())
+    except OSError:
+        return False
+
+
+@pytest.mark.parametrize("locked", [False, True])
+@pytest.mark.parametrize("days", [0, 29, 31])
+def test_another_hosts_folder_goes_by_age_and_lock(tmp_path: Path, days: int, locked: bool) -> None:
+    """Its processes cannot be seen from here, nor perhaps its locks."""
+    folder = tmp_path / "mauvecl-work-farhost-0123456789abcdef0123456789abcdef-00"
+    folder.mkdir()
+    then = time.time() - days * 86400
+    with (folder / "lock").open("w") as lock:
+        if locked:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        os.utime(folder / "lock", (then, then))
+        kernel_cache._sweep(tmp_path)
+    assert folder.exists() == (locked or days < 30)
 
 
 def test_a_second_engine_leaves_loaded_kernels_alone(filled: tuple[Path, str]) -> None:

@@ -26,6 +26,17 @@ from scipy.interpolate import make_interp_spline
 
 LIBRARY = Path(__file__).parents[1] / "host" / "library"
 PACKAGES = {"EXOSIMS": "3.6.6", "pyphot": "2.1.0"}
+#: What the licence of each covers here, and where it is at home.
+COVERED = {
+    "EXOSIMS": (
+        "The spectra in ../spectra whose files say so, averaged over wider bins and written as ECSV, are from",
+        "https://github.com/dsavransky/EXOSIMS",
+    ),
+    "pyphot": (
+        "The band curves in ../bands, cut to where they are not zero and written as ECSV, are from",
+        "https://github.com/mfouesneau/pyphot",
+    ),
+}
 FLAM = u.erg / (u.s * u.cm**2 * u.AA)
 
 #: Bin edges in nm: half a nanometre where Mauve sees, coarser in the red that only magnitudes need.
@@ -143,7 +154,8 @@ def fetch(folder: Path, given: Path | None) -> None:
         subprocess.run([*command, "--dest", str(folder), f"{name}=={version}"], check=True)
     for wheel in folder.glob("*.whl"):
         with zipfile.ZipFile(wheel) as archive:
-            archive.extractall(folder, [m for m in archive.namelist() if "TargetList" in m or "pyphot/libs" in m])
+            wanted = ("TargetList", "pyphot/libs", "licenses/LICENSE")
+            archive.extractall(folder, [m for m in archive.namelist() if any(part in m for part in wanted)])
 
 
 def bin_means(wavelength: np.ndarray[Any, Any], flux: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
@@ -229,9 +241,19 @@ def write_band(name: str, source: Path) -> None:
     table.write(LIBRARY / "bands" / f"{name.lower().replace(' ', '_')}.ecsv", format="ascii.ecsv", overwrite=True)
 
 
+def write_licence(package: str, source: Path) -> None:
+    """A package's licence, word for word, and what of the library it covers."""
+    version, (what, home) = PACKAGES[package], COVERED[package]
+    (text,) = source.glob(f"{package.lower()}-{version}.dist-info/licenses/LICENSE")
+    head = (
+        f"{what} the package {package} {version}\n({home}).\nIts licence, as that package carries it:\n\n{'-' * 80}\n\n"
+    )
+    (LIBRARY / "licenses" / f"{package}.txt").write_text(head + text.read_text(encoding="utf-8"), encoding="utf-8")
+
+
 def main(given: Path | None = None) -> None:
     """Rebuild every file of the library, from the wheels in a folder if one is given."""
-    for folder in ("spectra", "bands"):
+    for folder in ("spectra", "bands", "licenses"):
         (LIBRARY / folder).mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as temporary:
         source = Path(temporary)
@@ -239,6 +261,8 @@ def main(given: Path | None = None) -> None:
         rows = [write_spectrum(entry, source) for entry in entries()]
         for name in BANDS:
             write_band(name, source)
+        for name in PACKAGES:
+            write_licence(name, source)
     Table(rows=rows).write(LIBRARY / "index.ecsv", format="ascii.ecsv", overwrite=True)
     size = sum(path.stat().st_size for path in LIBRARY.rglob("*.ecsv"))
     print(f"{len(rows)} spectra, {len(BANDS)} bands, {size / 1e6:.2f} MB")

@@ -88,8 +88,6 @@ def selftest(
     seconds = time.perf_counter() - started
     selftest.keep(engine, checks, seconds)
     failed = sum(not check.passed for check in checks)
-    if folder is not None:
-        report.write_json(selftest.last(engine.device), folder / "selftest.json")
     if as_json:
         print(json.dumps(selftest.last(engine.device) or [asdict(check) for check in checks], indent=2))
     else:
@@ -97,6 +95,8 @@ def selftest(
         show_table(f"Self-test of {engine.device_name}, driver {engine.driver}", ("", "check", "found"), cells)
         outcome = f"{failed} of {len(checks)} checks FAILED" if failed else f"All {len(checks)} checks passed"
         show([f"{outcome} in {seconds:.0f} s. Promise: {engine.device.promise}."])
+    if folder is not None:
+        report.write_json(selftest.last(engine.device), folder / "selftest.json")
     if failed:
         raise typer.Exit(1)
 

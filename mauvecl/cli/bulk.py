@@ -36,7 +36,7 @@ def realise(study: Study, session: Session) -> None:
     from mauvecl import bulk
     from mauvecl.cli.foresight import question_room
     from mauvecl.cli.session import told_of_interrupts, working
-    from mauvecl.export import ENDINGS, Selection, export
+    from mauvecl.export import ENDINGS
     from mauvecl.host.errors import InputError
     from mauvecl.store import Store
 
@@ -44,10 +44,8 @@ def realise(study: Study, session: Session) -> None:
     one_file = place.suffix in ENDINGS
     if not one_file and place.suffix not in ("", ".zarr"):
         raise InputError(f"--output {str(place)!r}, expected a name ending in .zarr, {', '.join(ENDINGS)}")
-    folder = place.with_name(f".unfinished-{place.name}.zarr") if one_file else place
+    folder = bulk.unfinished(place) if one_file else place
     question_room(Store(folder, study), insist=session.insist)
-    if session.restart:
-        bulk.forget(folder)
     with (
         told_of_interrupts(lambda: f"what was written to {str(folder)!r} is kept, and --resume draws the rest"),
         session.metered("spectra") as meter,
@@ -57,10 +55,8 @@ def realise(study: Study, session: Session) -> None:
 
         pool = Pool(workers)
         meter.standing = lambda: pool.standing
-        store = bulk.realise(study, folder, pool, resume=session.resume, progress=meter)
-    if one_file:
-        export(Selection.of(store), place)
-        bulk.forget(folder)
+        draw = bulk.realise_file if one_file else bulk.realise
+        store = draw(study, place, pool, resume=session.resume, restart=session.restart, progress=meter)
     _tell(store, place, session)
 
 

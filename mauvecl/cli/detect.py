@@ -54,8 +54,8 @@ def detect(
 
         # More would be too small to read; the tables hold all of them.
         shown = [star.shown for star in found.stars[:MOST_DRAWN]]
-        session.files.append(detection(shown, study.run.fap, session.folder / "detection.png"))
-        session.files.append(spectra(shown, session.folder / "spectra.png"))
+        session.leave(lambda: detection(shown, study.run.fap, session.folder / "detection.png"))
+        session.leave(lambda: spectra(shown, session.folder / "spectra.png"))
     inputs = [x for s in found.stars for x in (s.found.quiet, *s.found.flares)]
     session.record(study, inputs, [*found.messages, *found.paper])
     if session.as_json:
@@ -140,7 +140,7 @@ def gaussian(
     if session.draws_pictures:
         from mauvecl.pictures.plans import gaussian as draw
 
-        session.files.append(draw(found, session.folder / "gaussian.png"))
+        session.leave(lambda: draw(found, session.folder / "gaussian.png"))
     session.record(found.study, [star.result.expectation for star in found.signal.stars], messages)
     if session.as_json:
         session.print_json({"messages": messages, "rows": report.rows(tables["gaussian"])})

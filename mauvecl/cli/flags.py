@@ -356,7 +356,8 @@ def takes_study(
             study = _study(study_file, given, options, default)
             if draws:
                 question_time(study, **{key: how[key] for key in ("device", "cluster", "insist")})
-            verb(study, Session(name or verb.__name__, study, **how), **values)
+            with Session(name or verb.__name__, study, **how) as session:
+                verb(study, session, **values)
 
         named = inspect.Parameter.KEYWORD_ONLY
         parameters = [

@@ -50,7 +50,7 @@ def limit(
     # What is told of a star at its own magnitude need not hold at the limit.
     messages = [m for m in told(inputs) if not m.startswith("SATURATED")]
     session.say(messages)
-    session.files += found.write(session.folder)
+    session.leave(lambda: found.write(session.folder))
     moved = None
     if assumptions:
         from mauvecl.assumptions import what_matters
@@ -58,7 +58,7 @@ def limit(
         moved = what_matters(study)
         session.write(moved, "assumptions.ecsv")
     if session.draws_pictures:
-        session.files.append(_drawn(found, session.folder / "limit.png"))
+        session.leave(lambda: drawn(found, session.folder / "limit.png"))
     session.record(study, inputs, messages)
     if session.as_json:
         rows = {"messages": messages, "rows": report.rows(found.table)}
@@ -111,7 +111,8 @@ def _unknown(one: Limit, digits: str) -> tuple[str, str]:
     return f"{low:{digits}} to {high:{digits}}", ", ".join(f"{name} {100 * share:.0f} %" for name, share in first)
 
 
-def _drawn(found: Any, path: Path) -> Path:
+def drawn(found: Any, path: Path) -> Path:
+    """An answer's own picture."""
     found.plot(path)
     return path
 
@@ -134,9 +135,9 @@ def detection_map(
     with session.pool(unit="cells") as engine:
         found = compute(study, engine, progress=session.meter)
     session.say(found.messages)
-    session.files += found.write(session.folder)
+    session.leave(lambda: found.write(session.folder))
     if session.draws_pictures:
-        session.files.append(_drawn(found, session.folder / "map.png"))
+        session.leave(lambda: drawn(found, session.folder / "map.png"))
     inputs = [found.study.expect([found.study.star[0].source()])[0]]
     session.record(study, inputs, found.messages)
     if session.as_json:

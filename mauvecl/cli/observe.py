@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -45,7 +46,7 @@ def simulate(
         if session.draws_pictures:
             from mauvecl.pictures.answers import observation
 
-            session.files.append(observation(title, table, session.folder / f"{stem}.png"))
+            session.leave(partial(observation, title, table, session.folder / f"{stem}.png"))
         peak = int(x.signal_dn.argmax())
         summary.append(
             {
@@ -107,7 +108,7 @@ def snr(
     for name, table in tables.items():
         session.write(table, f"{name}.ecsv")
     if session.draws_pictures:
-        session.files += _snr_pictures(found, session.folder)
+        session.leave(lambda: _snr_pictures(found, session.folder))
     session.record(study, [star.result.expectation for star in found.stars], found.messages)
     if session.as_json:
         out = {name: report.rows(tables[name]) for name in ("snr-element", "noise-budget")}
@@ -171,13 +172,13 @@ def exposure(
     """
     from mauvecl import report
     from mauvecl.cli.console import show_table
+    from mauvecl.cli.limits import drawn
     from mauvecl.exposures import exposure_for
 
     found, wanted = exposure_for(study), study.signal
-    session.files += found.write(session.folder)
+    session.leave(lambda: found.write(session.folder))
     if session.draws_pictures:
-        found.plot(session.folder / "exposure.png")
-        session.files.append(session.folder / "exposure.png")
+        session.leave(lambda: drawn(found, session.folder / "exposure.png"))
     session.say(list(found.messages))
     if session.as_json:
         session.print_json({"messages": list(found.messages), "rows": report.rows(found.table)})

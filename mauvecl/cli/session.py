@@ -12,7 +12,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 from mauvecl.cli.boundary import writes_to
 
@@ -32,7 +32,7 @@ class Terminated(KeyboardInterrupt):
 
 @dataclass(eq=False)
 class Session:
-    """One call of a verb.
+    """One call of a verb; use it in a `with` block, in which this process alone writes into the output folder.
 
     Attributes
     ----------
@@ -68,14 +68,36 @@ class Session:
     files: list[Path] = field(default_factory=list)
     started: float = field(default_factory=time.perf_counter)
     _pool: Pool | None = None
+    _lost: list[str] = field(default_factory=list)
+    _held: ExitStack = field(default_factory=ExitStack)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Let go of the output folder.
+
+        Raises
+        ------
+        InputError
+            If a file of the answer, which is printed by now, could not be written.
+        """
+        from mauvecl.host.errors import InputError
+
+        self._held.close()
+        if kind is None and self._lost:
+            others = f"; the same holds for {len(self._lost) - 1} more files of this answer" if self._lost[1:] else ""
+            raise InputError(self._lost[0] + others)
 
     @cached_property
     def folder(self) -> Path:
-        """Where everything is written."""
+        """Where everything is written; held from now on."""
+        from mauvecl.durable import alone
         from mauvecl.report import make_folder
 
         folder = make_folder(self.output or Path(f"mauvecl-{self.verb}"))
         writes_to(folder)
+        self._held.enter_context(alone(folder, "output folder"))
         return folder
 
     @contextmanager
@@ -93,7 +115,7 @@ class Session:
         how: dict[str, Any] = {"resume": self.resume, "restart": self.restart}
         if self.keep_after is not None:
             how["patience_s"] = self.keep_after
-        checkpoint = Checkpoint(self.folder, self.verb, self.study, **how)
+        checkpoint = Checkpoint(self.folder, self.verb, self.study, held=True, **how)
         self.meter = self.metered(unit)
         with ExitStack() as stack:
             stack.enter_context(told_of_interrupts(lambda: self._kept(checkpoint)))
@@ -146,20 +168,31 @@ class Session:
         """A table into the folder, by its name's ending."""
         from mauvecl.report import write_table
 
-        self.files.append(write_table(table, self.folder / name))
+        self.leave(lambda: write_table(table, self.folder / name))
+
+    def leave(self, write: Callable[[], Path | Sequence[Path]]) -> None:
+        """Have files written; one that cannot be is told at the end, when the answer is out."""
+        from mauvecl.host.errors import InputError
+
+        try:
+            made = write()
+        except InputError as error:
+            self._lost.append(str(error))
+            return
+        self.files += [made] if isinstance(made, Path) else made
 
     def record(self, study: Study, inputs: Sequence[Expectation], messages: Sequence[str]) -> None:
         """The study and the run's record into the folder; what was kept for a resume is no longer needed."""
         from mauvecl.report import write_record, write_study
 
         if self.folder / "study.toml" not in self.files:
-            self.files.append(write_study(study, self.folder))
+            self.leave(lambda: write_study(study, self.folder))
         seconds = time.perf_counter() - self.started
         pool = self._pool
-        self.files.append(
-            write_record(self.verb, study, inputs, self.folder, pool=pool, seconds=seconds, messages=messages)
+        self.leave(
+            lambda: write_record(self.verb, study, inputs, self.folder, pool=pool, seconds=seconds, messages=messages)
         )
-        if self._pool is not None:
+        if self._pool is not None and not self._lost:
             self._checkpoint.forget()
 
     def print_json(self, content: dict[str, Any]) -> None:
@@ -168,7 +201,7 @@ class Session:
 
     def finish(self) -> None:
         """Name the files written."""
-        if not self.quiet:
+        if self.files and not self.quiet:
             names = ", ".join(path.name for path in self.files)
             self.say([f"Wrote {names} to {self.folder}/ in {time.perf_counter() - self.started:.1f} s."])
 

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import io
 from pathlib import Path
 from typing import Any
+
+from mauvecl.durable import write_whole
 
 #: Okabe and Ito's colours, which colour-blind readers can tell apart (jfly.uni-koeln.de/color).
 COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7", "#000000")
@@ -64,9 +67,17 @@ def pyplot() -> Any:
 
 
 def finished(figure: Any, path: str | Path | None) -> Any:
-    """Save a figure under a path, in the form of its ending (.png, .pdf, .svg), or hand it out; pyplot forgets it."""
+    """Save a figure under a path, in the form of its ending (.png, .pdf, .svg), or hand it out; pyplot forgets it.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written; what was at its place is still there.
+    """
     pyplot().close(figure)
     if path is None:
         return figure
-    figure.savefig(path)
-    return Path(path)
+    drawn, place = io.BytesIO(), Path(path)
+    figure.savefig(drawn, format=place.suffix[1:] or None)
+    write_whole(place, drawn.getbuffer())
+    return place

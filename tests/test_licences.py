@@ -1,0 +1,42 @@
+"""The licences of what is embedded are there, word for word, and go where the data go."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+from astropy.table import Table
+
+ROOT = Path(__file__).parent.parent
+LIBRARY = ROOT / "host" / "library"
+#: What their licences ask to be kept with every copy.
+NOTICES = {
+    "pyphot": ("Copyright (c) 2016 Morgan Fouesneau", "The above copyright notice and this permission notice shall be"),
+    "EXOSIMS": ("Copyright (c) 2015, Dmitry Savransky", "Redistributions in binary form must reproduce the above"),
+}
+
+
+@pytest.mark.parametrize("package", NOTICES)
+def test_each_package_that_data_are_from_has_its_licence_here(package: str) -> None:
+    text = (LIBRARY / "licenses" / f"{package}.txt").read_text()
+    assert all(notice in text for notice in NOTICES[package])
+
+
+def test_no_data_without_a_licence() -> None:
+    for file in LIBRARY.glob("*/*.ecsv"):
+        meta = Table.read(file, format="ascii.ecsv").meta
+        assert meta["licence"]
+        packages = [name for name in NOTICES if name in meta["origin"]]
+        assert packages, file
+        assert all((LIBRARY / "licenses" / f"{name}.txt").exists() for name in packages)
+
+
+def test_wheels_and_sdists_take_them_along() -> None:
+    """By the same patterns as setuptools: beside the data, and among the package's own licences."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    texts = set((LIBRARY / "licenses").iterdir())
+    assert len(texts) == len(NOTICES)
+    assert texts <= {p for glob in project["project"]["license-files"] for p in ROOT.glob(glob)}
+    patterns = project["tool"]["setuptools"]["package-data"]["mauvecl.host"]
+    assert texts <= {p for glob in patterns for p in (ROOT / "host").glob(glob)}
