@@ -78,7 +78,6 @@ else {{
 
 def attach(document: Any, bridge: Bridge) -> None:
     """Put the browser's part into a document."""
-    document.add_root(bridge)
     bridge.js_on_change("address", CustomJS(args={"bridge": bridge}, code=ADDRESS))
     document.js_on_event("document_ready", CustomJS(args={"bridge": bridge}, code=READY))
     document.js_on_event("connection_lost", CustomJS(args={"bridge": bridge}, code=LOST))

@@ -7,6 +7,7 @@ from urllib.parse import urlencode
 from weakref import WeakKeyDictionary
 
 import panel as pn
+from panel.io.location import Location
 from panel.theme import fast
 
 from mauvecl.web.buttons import study
@@ -75,4 +76,5 @@ def session() -> None:
     # The models are looked through once, not after each that is added.
     with document.models.freeze():
         page = PAGES[document] = Page(link)
-        layout(page).server_doc(document, title="mauvecl", location=False)
+        # The template asks for one; addresses are the bridge's.
+        layout(page).server_doc(document, title="mauvecl", location=Location())

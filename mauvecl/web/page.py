@@ -59,7 +59,7 @@ class Page:
         self._document = pn.state.curdoc
         self._folder = tempfile.TemporaryDirectory(prefix="mauvecl-page-")
         self._asked = self._uploads = 0
-        self._due = False
+        self._due = self._following = self._replaces = False
         self._told: list[tuple[str, str]] = []
         self._forget()
         self.alerts = line()
@@ -70,6 +70,8 @@ class Page:
         self.controls = Controls(self.state, self.enter, self._upload)
         self.tabs = Tabs(self)
         self.bridge = Bridge(address=self.state.link)
+        # It needs a place in the document, and the template's roots are its own.
+        self.summary.tags = [self.bridge]
         if self._document is not None:
             attach(self._document, self.bridge)
             self.bridge.on_change("came", lambda attr, old, new: self._came(new[0]))
@@ -112,16 +114,25 @@ class Page:
             # Until there is an answer to these fields there is none.
             self.quiet = None
             self._asked += 1
-            if self._document is None:
-                self.refresh()
-            elif not self._due:
-                # Several changes that wait already are answered once.
-                self._due = True
-                self._document.add_next_tick_callback(self.refresh)
+            self._due = True
+        self._replaces = replaces
+        if self._document is None:
+            self._follow()
+        elif not self._following:
+            # Several changes that wait already are answered once; models change under the document's lock alone.
+            self._following = True
+            self._document.add_next_tick_callback(self._follow)
+
+    def _follow(self) -> None:
+        """The page follows its state."""
+        self._following = False
         with pn.io.hold():
+            if self._due:
+                self.refresh()
             self.controls.show()
             self.tabs.show()
-        self._address(replaces=replaces)
+            self._address(replaces=self._replaces)
+        self._next()
 
     def _address(self, *, replaces: bool) -> None:
         self.bridge.update(replaces=replaces, address=self.state.link)
@@ -133,7 +144,6 @@ class Page:
         wanted = self.state.simulated
         self._entered(before, replaces=True)
         self._wanted = [kind for kind in wanted if kind not in self.found]
-        self._later(self._next)
 
     def _upload(self, name: str, content: bytes) -> None:
         """A file has come; it is read beside the event loop, and there is no star until then."""
@@ -172,17 +182,15 @@ class Page:
         """Everything that has a closed form."""
         self._due = False
         self._forget()
-        # One message for all changes.
-        with pn.io.hold():
-            try:
-                self._answer()
-            except InputError as error:
-                self._withdraw(str(error))
-            except Exception:
-                log.exception("no answer")
-                self._withdraw(OWN_FAULT)
-            else:
-                self.tabs.dim(False)
+        try:
+            self._answer()
+        except InputError as error:
+            self._withdraw(str(error))
+        except Exception:
+            log.exception("no answer")
+            self._withdraw(OWN_FAULT)
+        else:
+            self.tabs.dim(False)
         self._busy()
 
     def _forget(self) -> None:
@@ -250,7 +258,9 @@ class Page:
 
     def _later(self, work: Callable[[], None]) -> None:
         """Change the page from another thread, or after this change, when it is its turn."""
-        if self._document is not None:
+        if self._document is None:
+            work()
+        else:
             self._document.add_next_tick_callback(work)
 
     # Simulations
@@ -364,8 +374,9 @@ class Page:
             self.alerts.text = alerts(sentences)
 
     def _alert(self, text: str, kind: str) -> None:
+        """One more, when it is the page's turn."""
         if (text, kind) not in self._told:
-            self._tell([(text, kind), *self._told])
+            self._later(lambda: self._tell([(text, kind), *self._told]))
 
     # Downloads
 

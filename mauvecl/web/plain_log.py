@@ -45,3 +45,4 @@ def install() -> None:
     for name in ("bokeh", "panel", "tornado", "param"):
         logger = logging.getLogger(name)
         logger.handlers, logger.propagate = [], True
+        logger.setLevel(logging.WARNING)

@@ -42,10 +42,8 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
     from tornado.ioloop import PeriodicCallback
 
     from mauvecl.web.frame import session
-    from mauvecl.web.plain_log import install
 
     pn.extension()
-    install()
     server = pn.io.server.get_server(
         {"/": session},
         address=address,
@@ -120,7 +118,9 @@ def serve(address: str, port: int, *, show: bool = False, allowed: Sequence[str]
         As `make` does.
     """
     from mauvecl.web.doors import local, netloc
+    from mauvecl.web.plain_log import install
 
+    install()
     server = make(address, port, allowed)
     warm()
     if not local(address):
