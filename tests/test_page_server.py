@@ -10,6 +10,7 @@ import re
 import socket
 import subprocess
 import sys
+import tomllib
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from astropy.table import QTable
 
 pytest.importorskip("panel")
 
@@ -186,12 +188,21 @@ def test_an_uploaded_star_gives_the_same_table_on_the_command_line(tmp_path: Pat
     text = (tmp_path / "study" / "study.toml").read_text()
     assert 'file = "star.ecsv"' in text
     assert found._folder.name not in text
-    command = [sys.executable, "-m", "mauvecl", "simulate", "study.toml", "--flare", "--no-pictures", "--quiet", "-o", "out"]
+    command = [sys.executable, "-m", "mauvecl", "simulate", "study.toml", "-a", "0.24", "--no-pictures", "--quiet", "-o", "out"]
     subprocess.run(command, cwd=tmp_path / "study", check=True, capture_output=True)
-    (name,) = (p for p in (tmp_path / "study" / "out").glob("*.ecsv") if p.read_bytes()[:20] == table[:20])
-    # The command line names the file in full.
-    here = str((tmp_path / "study" / "star.ecsv").resolve()).encode()
-    assert name.read_bytes().replace(here, b"star.ecsv") == table
+    mine = told_apart(table)
+    written = [told_apart(file.read_bytes()) for file in (tmp_path / "study" / "out").glob("*.ecsv")]
+    (same,) = (one for one in written if one[1] == mine[1])
+    # The command line names the file in full, and the form of its text depends on how long that is.
+    assert mine[0]["star"][0].pop("file") == "star.ecsv"
+    assert Path(same[0]["star"][0].pop("file")) == (tmp_path / "study" / "star.ecsv").resolve()
+    assert mine[0] == same[0]
+
+
+def told_apart(table: bytes) -> tuple[dict[str, Any], list[bytes]]:
+    """A table's study, and its rows."""
+    study = tomllib.loads(QTable.read(io.BytesIO(table), format="ascii.ecsv").meta["study"])
+    return study, [line for line in table.splitlines() if not line.startswith(b"#")]
 
 
 # Who is let in
@@ -250,7 +261,7 @@ async def got(url: str, **headers: str) -> tuple[int, str]:
         answer = await AsyncHTTPClient().fetch(HTTPRequest(url, headers=headers, request_timeout=60))
     except HTTPClientError as error:
         return error.code, (error.response.body or b"").decode() if error.response else ""
-    return answer.code, answer.body.decode()
+    return answer.code, answer.body.decode(errors="replace")
 
 
 async def opened(host: str, token: str, **headers: str) -> Any:
@@ -405,28 +416,15 @@ def test_nonsense_gives_no_traceback_and_no_path(served: Any, caplog: pytest.Log
     assert all("\n" not in line and len(line) < 1500 for line in lines)
 
 
-def test_a_page_costs_at_most_a_third_of_a_second(served: Any) -> None:
-    """Of this process's time, the message of the whole document included; the first pages warm it up."""
-    import time
+def test_a_fresh_page_builds_what_is_in_front_alone(served: Any) -> None:
+    """Its cost grows with its models; `bench/crowd.py` measures the time itself."""
 
-    spent = []
+    async def work(host: str, made: Any) -> int:
+        await got(f"http://{host}/")
+        (session,) = made.get_sessions()
+        return len(list(session.document.models))
 
-    async def work(host: str, made: Any) -> None:
-        for _ in range(6):
-            start = time.process_time()
-            _, html = await got(f"http://{host}/")
-            connection = await opened(host, token_of(html))
-            for _ in range(3):
-                await connection.read_message()
-            for fragment in wire("PULL-DOC-REQ", {}):
-                await connection.write_message(fragment)
-            for _ in range(3):
-                await connection.read_message()
-            spent.append(time.process_time() - start)
-            connection.close()
-
-    served(work)
-    assert min(spent[1:]) < 0.3, spent
+    assert served(work) < 260, "half of what all tabs together need"
 
 
 def test_uploads_have_a_limit_that_a_message_can_carry() -> None:

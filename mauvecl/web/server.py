@@ -7,6 +7,7 @@ import secrets
 import sys
 import time
 from collections.abc import Sequence
+from functools import partial
 from typing import Any
 
 #: Bytes of one message: an upload in base64, and room; and of a request's body, for the page takes none.
@@ -73,7 +74,7 @@ def let_go(server: Any) -> None:
         page = PAGES.get(one.document)
         if page is not None and one.connection_count and now - page.used > IDLE_S and page.job is None:
             page.used = now
-            page.bridge.idle = True
+            one.document.add_next_tick_callback(partial(setattr, page.bridge, "idle", True))
             server.io_loop.call_later(1.0, _disconnect, one)
 
 
