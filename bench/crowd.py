@@ -3,8 +3,8 @@
 python bench/crowd.py [--visitors 50] [--changes 10] [--bombs] [--output bench/results/crowd.ecsv]
 
 Visitors are websockets on this machine's own loopback that speak as the page's browser does; each loads the page, then
-changes the magnitude once a second and waits for the answer. With ``--bombs`` one more uploads files that unpack to much,
-one after the other.
+changes the magnitude once a second and waits for the answer. With ``--bombs`` one more uploads files that unpack to
+much, one after the other.
 """
 
 from __future__ import annotations
@@ -43,7 +43,9 @@ class Visitor:
         answer = await AsyncHTTPClient(max_clients=100).fetch(f"http://{self._host}/", request_timeout=PATIENCE)
         token = re.search(r'"token":"([^"]+)"', answer.body.decode())
         assert token is not None
-        request = HTTPRequest(f"ws://{self._host}/ws", request_timeout=PATIENCE, headers={"Origin": f"http://{self._host}"})
+        request = HTTPRequest(
+            f"ws://{self._host}/ws", request_timeout=PATIENCE, headers={"Origin": f"http://{self._host}"}
+        )
         self._socket = await websocket_connect(request, subprotocols=["bokeh", token[1]], max_message_size=2**26)
         await self._message()
         await self._send("PULL-DOC-REQ", {})
@@ -51,7 +53,9 @@ class Visitor:
             pass
         text = json.dumps(content)
         ready = {"type": "event", "name": "document_ready", "values": {"type": "map", "entries": []}}
-        await self._send("PATCH-DOC", {"events": [{"kind": "MessageSent", "msg_type": "bokeh_event", "msg_data": ready}]})
+        await self._send(
+            "PATCH-DOC", {"events": [{"kind": "MessageSent", "msg_type": "bokeh_event", "msg_data": ready}]}
+        )
         self._field = self._model("TextInput", text[: text.index('"Magnitude of the star"')])
         self._file = self._model("FileInput", text)
         self._summary = self._model("Div", text[: text.index("of such flares are detected")])

@@ -43,7 +43,9 @@ HOSTILE = "![x](http://127.0.0.1:1/x.png) <img src=http://127.0.0.1:1/y.png>"
 
 
 @pytest.mark.parametrize("name", NUMBERS)
-@pytest.mark.parametrize("text", ["", " ", "7,4", "1e999", "nan", "inf", "-inf", "seven", "1_0", "0x10", "٣", "1e400000"])
+@pytest.mark.parametrize(
+    "text", ["", " ", "7,4", "1e999", "nan", "inf", "-inf", "seven", "1_0", "0x10", "٣", "1e400000"]
+)
 def test_no_number_is_guessed(name: str, text: str) -> None:
     state = State()
     state.enter({name: text})
@@ -68,7 +70,13 @@ def test_ranges_end_where_they_say(name: str) -> None:
 
 def test_stars_by_any_name_they_have() -> None:
     state = State()
-    for given, library in (("GJ 581", "M3V"), ("hd 40307", "K2.5V"), ("K3V", "K2.5V"), ("m3v", "M3V"), ("vega", "Vega")):
+    for given, library in (
+        ("GJ 581", "M3V"),
+        ("hd 40307", "K2.5V"),
+        ("K3V", "K2.5V"),
+        ("m3v", "M3V"),
+        ("vega", "Vega"),
+    ):
         state.enter({"star": given})
         assert state.question().star == library
     assert [name for name in star_names() if "HD" in name] == ["HD 40307", "HD 85512"]
@@ -81,7 +89,9 @@ def test_stars_by_any_name_they_have() -> None:
 
 def test_a_link_is_what_was_entered_right_or_wrong() -> None:
     first, second = State(), State()
-    first.enter({"magnitude": "7,4", "star": HOSTILE, "tab": "noise", "simulated": "detection,map", "target": "1 & 2=3"})
+    first.enter(
+        {"magnitude": "7,4", "star": HOSTILE, "tab": "noise", "simulated": "detection,map", "target": "1 & 2=3"}
+    )
     second.follow(first.link)
     assert (second.entered, second.faults) == (first.entered, first.faults)
     assert (second.tab, second.simulated) == ("noise", ("detection", "map"))
@@ -130,7 +140,13 @@ def answerless(found: page.Page) -> bool:
 def test_an_upload_that_fails_in_any_way_leaves_no_answer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     good = star_file(tmp_path / "star.txt")
     found = page.Page()
-    for fault in (InputError("no spectrum"), RuntimeError("odd"), MemoryError(), ValueError("unequal columns"), KeyError(1)):
+    for fault in (
+        InputError("no spectrum"),
+        RuntimeError("odd"),
+        MemoryError(),
+        ValueError("unequal columns"),
+        KeyError(1),
+    ):
         assert found.quiet is not None
 
         def fail(name: str, content: bytes, fault: Exception = fault) -> None:
@@ -146,7 +162,12 @@ def test_an_upload_that_fails_in_any_way_leaves_no_answer(monkeypatch: pytest.Mo
         found.enter({"star": "G2V"})
         assert not answerless(found)
     monkeypatch.undo()
-    for name, content in (("a.txt", b""), ("a.exe", good), ("a.txt", b"200 1\n300 2 3\n"), ("a.fits", b"SIMPLE  = " * 300)):
+    for name, content in (
+        ("a.txt", b""),
+        ("a.exe", good),
+        ("a.txt", b"200 1\n300 2 3\n"),
+        ("a.fits", b"SIMPLE  = " * 300),
+    ):
         found._upload(name, content)
         assert answerless(settled(found)), name
     found._upload("a.txt", good)
@@ -188,7 +209,19 @@ def test_an_uploaded_star_gives_the_same_table_on_the_command_line(tmp_path: Pat
     text = (tmp_path / "study" / "study.toml").read_text()
     assert 'file = "star.ecsv"' in text
     assert found._folder.name not in text
-    command = [sys.executable, "-m", "mauvecl", "simulate", "study.toml", "-a", "0.24", "--no-pictures", "--quiet", "-o", "out"]
+    command = [
+        sys.executable,
+        "-m",
+        "mauvecl",
+        "simulate",
+        "study.toml",
+        "-a",
+        "0.24",
+        "--no-pictures",
+        "--quiet",
+        "-o",
+        "out",
+    ]
     subprocess.run(command, cwd=tmp_path / "study", check=True, capture_output=True)
     mine = told_apart(table)
     written = [told_apart(file.read_bytes()) for file in (tmp_path / "study" / "out").glob("*.ecsv")]
@@ -323,7 +356,7 @@ def test_so_many_visitors_and_no_more(served: Any, monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(doors, "MOST_SESSIONS", 2)
 
     async def work(host: str, made: Any) -> None:
-        (_, first), (_, second) = [await got(f"http://{host}/") for _ in range(2)]
+        (_, first), _ = [await got(f"http://{host}/") for _ in range(2)]
         code, told = await got(f"http://{host}/")
         assert (code, told) == (503, "Too many visitors are here at the moment; please come again in some minutes.\n")
         assert (await got(f"http://{host}/favicon.ico"))[0] == 200
@@ -397,7 +430,14 @@ def test_nonsense_gives_no_traceback_and_no_path(served: Any, caplog: pytest.Log
             except TimeoutError:
                 pass
             connection.close()
-        for path in ("/..%2f..%2fetc/passwd", "/static/%00", "/?star=%ff%fe", "/nothing", "/ws", "/static/extensions/x"):
+        for path in (
+            "/..%2f..%2fetc/passwd",
+            "/static/%00",
+            "/?star=%ff%fe",
+            "/nothing",
+            "/ws",
+            "/static/extensions/x",
+        ):
             told.append((await got(f"http://{host}{path}"))[1])
         reader, writer = await asyncio.open_connection(*host.rsplit(":", 1))
         writer.write(b"GET / HTTP/9.9\r\nHost: \xff\xfe\r\nContent-Length: -1\r\n\r\n")

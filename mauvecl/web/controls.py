@@ -7,7 +7,7 @@ from typing import Any
 
 import panel as pn
 import param
-from bokeh.models import Div
+from bokeh.models.widgets import Div
 
 from mauvecl.web.fields import FIELDS, UPLOADED, Choice, star_names
 from mauvecl.web.state import State

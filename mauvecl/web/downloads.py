@@ -34,7 +34,7 @@ def study_file(study: Study) -> io.BytesIO:
 
 
 def without_folder(text: str, study: Study) -> str:
-    """A study's text with an uploaded star's file as seen from the study: where the server has it is nobody's business."""
+    """A study's text with an uploaded star's file as seen from the study: not where the server has it."""
     file = study.star[0].file
     return text if file is None else text.replace(str(file.resolve()), STAR_FILE)
 

@@ -70,7 +70,7 @@ PAGES: WeakKeyDictionary[Any, Page] = WeakKeyDictionary()
 
 def session() -> None:
     """A page for a new visitor, in their document."""
-    document = pn.state.curdoc
+    document: Any = pn.state.curdoc
     given = document.session_context.request.arguments
     link = urlencode([(name, value.decode(errors="replace")) for name, values in given.items() for value in values])
     # The models are looked through once, not after each that is added.

@@ -36,6 +36,7 @@ from mauvecl.web.work import Cancelled, Job, reading
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
     from mauvecl.host.source import Source
+    from mauvecl.pool import Pool
 
 log = logging.getLogger(__name__)
 
@@ -61,7 +62,9 @@ class Page:
         self._asked = self._uploads = 0
         self._due = self._following = self._replaces = False
         self._told: list[tuple[str, str]] = []
-        self._forget()
+        self.quiet: Expectation | None = None
+        self.flare: Expectation | None = None
+        self.theory: Detection | None = None
         self.alerts = line()
         self.summary = line(styles={"font-size": "110%"}, html_attributes={"aria-live": "polite"})
         self.status = line()
@@ -195,9 +198,7 @@ class Page:
 
     def _forget(self) -> None:
         """Answers of an earlier question go."""
-        self.quiet: Expectation | None = None
-        self.flare: Expectation | None = None
-        self.theory: Detection | None = None
+        self.quiet = self.flare = self.theory = None
         self.found = {}
 
     def _withdraw(self, why: str) -> None:
@@ -278,8 +279,12 @@ class Page:
             self._wanted.clear()
             return
         kind, asked, study = self._wanted.pop(0), self._asked, self.study()
-        ask = {"detection": detect_and_snr, "limit": limiting_magnitude, "map": map_around}[kind]
-        job = self.job = Job(partial(ask, study))
+        asks: dict[str, Callable[[Study, Pool], Any]] = {
+            "detection": detect_and_snr,
+            "limit": limiting_magnitude,
+            "map": map_around,
+        }
+        job = self.job = Job(partial(asks[kind], study))
         self._busy()
         looker = pn.state.add_periodic_callback(partial(self._look, job), LOOK_MS)
 

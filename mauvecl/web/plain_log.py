@@ -29,9 +29,7 @@ def _line(text: str) -> str:
 
 def _where(error: BaseException) -> str:
     """Modules and lines of a traceback: ours, or the last one."""
-    frames = [
-        (frame.f_globals.get("__name__", "?"), line) for frame, line in traceback.walk_tb(error.__traceback__)
-    ]
+    frames = [(frame.f_globals.get("__name__", "?"), line) for frame, line in traceback.walk_tb(error.__traceback__)]
     ours = [one for one in frames if one[0].startswith("mauvecl.")] or frames[-1:]
     return ", ".join(f"{name} line {line}" for name, line in ours)
 

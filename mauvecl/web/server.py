@@ -45,8 +45,10 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
     from mauvecl.web.frame import session
 
     pn.extension()
+    # A function may fill the document itself.
+    pages: Any = {"/": session}
     server = pn.io.server.get_server(
-        {"/": session},
+        pages,
         address=address,
         port=port,
         title="mauvecl",
