@@ -70,7 +70,9 @@ class Controls:
 
         def look() -> None:
             file = self._file
-            if file.filename is not None and (file.filename, file.value) != self._taken:
+            if file.filename is None:
+                self._taken = None, None
+            elif (file.filename, file.value) != self._taken:
                 self._taken = file.filename, file.value
                 upload(str(file.filename), file.value or b"")
 

@@ -205,7 +205,7 @@ class Page:
         """There is no answer to what is entered; pictures of an earlier one are dimmed."""
         self._forget()
         self.summary.text = f"<b>No answer.</b> {escaped(why)}"
-        self._tell([] if self.state.faults else [(why, "danger")])
+        self._tell(self._stray())
         self.tabs.dim(True)
 
     def _answer(self) -> None:
@@ -227,8 +227,9 @@ class Page:
             f"{quiet.snr().max():.3g} a pixel, {quiet.snr_per_element().max():.3g} an element; exposure "
             f"{quiet.exposure_s:g} s in {quiet.n_frames} frames."
         )
-        stray = [(self.state.stray, "warning")] if self.state.stray else []
-        self._tell([*stray, *((m, "danger" if m.startswith("SATURATED") else "info") for m in told([quiet, flare]))])
+        self._tell(
+            [*self._stray(), *((m, "danger" if m.startswith("SATURATED") else "info") for m in told([quiet, flare]))]
+        )
         self.tabs.renew()
 
     def draw_soon(self) -> None:
@@ -371,6 +372,10 @@ class Page:
         return [] if found is None else [picture(found, "Detection probability over magnitude and flare amplitude")]
 
     # Alerts
+
+    def _stray(self) -> list[tuple[str, str]]:
+        """What a link held that is no field."""
+        return [(self.state.stray, "warning")] if self.state.stray else []
 
     def _tell(self, sentences: list[tuple[str, str]]) -> None:
         """Alerts on top; the same ones stay as they are."""
