@@ -34,7 +34,11 @@ if (bridge.address !== window.location.search)
   window.history[bridge.replaces ? 'replaceState' : 'pushState']({}, '', window.location.pathname + bridge.address)
 """
 READY = f"""
-window.addEventListener('popstate', () => {{ bridge.came = [window.location.search, String(performance.now())] }})
+// The server then has no address to send back, which could come after the next step.
+window.addEventListener('popstate', () => {{
+  const search = window.location.search
+  bridge.setv({{address: search, came: [search, String(performance.now())]}})
+}})
 if (bridge.address !== window.location.search)
   window.history.replaceState({{}}, '', window.location.pathname + bridge.address)
 // 'input' leaves shadow roots and comes before the 'change' at which a file is read and sent.
