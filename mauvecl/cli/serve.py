@@ -11,12 +11,21 @@ import typer
 def serve(
     address: Annotated[str, typer.Option(help="Who may come: 127.0.0.1 is this machine alone.")] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port.")] = 5006,
+    allow_origin: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="An address that visitors' browsers show, such as https://mauve.example.org; needed where --address "
+            "lets in other machines. May be repeated.",
+            show_default=False,
+        ),
+    ] = None,
     show: Annotated[bool, typer.Option("--show", help="Open a browser.")] = False,
 ) -> None:
     """A page in your browser: controls, closed forms at once, simulations, downloads.
 
     Example: mauvecl serve --show
     """
+    from mauvecl.host.bounded import shortened
     from mauvecl.host.errors import InputError
 
     if find_spec("panel") is None:
@@ -24,8 +33,8 @@ def serve(
     from mauvecl.web.server import serve
 
     try:
-        serve(address, port, show=show)
+        serve(address, port, show=show, allowed=allow_origin or ())
     except OSError as error:
         raise InputError(
-            f"port {port} of {address} cannot be used ({error.strerror}), expected another: --port"
+            f"port {port} of {shortened(address)} cannot be used ({error.strerror}), expected another: --port"
         ) from error

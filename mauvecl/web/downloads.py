@@ -10,7 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.host.errors import InputError
-from mauvecl.web.question import UPLOADED, Question, write_spectrum
+from mauvecl.web.fields import UPLOADED
+from mauvecl.web.question import STAR_FILE
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -19,18 +20,23 @@ if TYPE_CHECKING:
     from mauvecl.study import Study
 
 
-def study_file(question: Question, study: Study) -> io.BytesIO:
+def study_file(study: Study) -> io.BytesIO:
     """The study for the command line; an uploaded star beside it, in a zip."""
-    if question.star != UPLOADED or question.uploaded is None:
+    file = study.star[0].file
+    if file is None:
         return io.BytesIO(study.toml().encode())
     out = io.BytesIO()
-    with tempfile.TemporaryDirectory() as folder, zipfile.ZipFile(out, "w") as archive:
-        file = write_spectrum(question.uploaded, Path(folder))
-        archive.write(file, file.name)
-        # Files are named as seen from the study.
-        archive.writestr("study.toml", study.toml().replace(str(study.star[0].file), file.name))
+    with zipfile.ZipFile(out, "w") as archive:
+        archive.write(file, STAR_FILE)
+        archive.writestr("study.toml", without_folder(study.toml(), study))
     out.seek(0)
     return out
+
+
+def without_folder(text: str, study: Study) -> str:
+    """A study's text with an uploaded star's file as seen from the study: not where the server has it."""
+    file = study.star[0].file
+    return text if file is None else text.replace(str(file.resolve()), STAR_FILE)
 
 
 def as_file(name: str, ending: str, study: Study, quiet: Expectation, found: Mapping[str, Any]) -> io.BytesIO:
@@ -58,7 +64,10 @@ def as_file(name: str, ending: str, study: Study, quiet: Expectation, found: Map
         if ending == "png":
             _draw(name, study, quiet, found, path)
         else:
-            write_table(_table(name, study, quiet, found), path)
+            table = _table(name, study, quiet, found).copy(copy_data=False)
+            if "study" in table.meta:
+                table.meta["study"] = without_folder(str(table.meta["study"]), study)
+            write_table(table, path)
         return io.BytesIO(path.read_bytes())
 
 

@@ -1,93 +1,88 @@
-"""The page of one visitor: controls on the left, alerts on top, a tab for each kind of answer."""
+"""The page of one visitor: one state, answers to it and to nothing else, simulations and downloads."""
 
 from __future__ import annotations
 
 import io
+import logging
 import tempfile
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
 from concurrent.futures import CancelledError, Future
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
 import panel as pn
-from bokeh.models.widgets import Div
 
-from mauvecl.detect_study import DetectAnswer, detect
 from mauvecl.detection import Detection
+from mauvecl.host.bounded import shortened
 from mauvecl.host.errors import InputError
 from mauvecl.labels import told
 from mauvecl.limits import LimitResult, limiting_magnitude
-from mauvecl.maps import MapResult, detection_map
+from mauvecl.maps import MapResult
 from mauvecl.program import DeviceError
 from mauvecl.scene import prepare
-from mauvecl.snr_study import SnrAnswer, snr
 from mauvecl.study import Study
-from mauvecl.web.controls import controls
+from mauvecl.web.asked import detect_and_snr, map_around, picture
+from mauvecl.web.bridge import Bridge, attach
+from mauvecl.web.controls import Controls
 from mauvecl.web.downloads import as_file, study_file
-from mauvecl.web.frame import tabs
-from mauvecl.web.question import Question
-from mauvecl.web.views import Distributions, InputSpectrum, NoiseBudget, Observation, Roc, SignalToNoise, Smooth
-from mauvecl.web.work import Cancelled, Job
+from mauvecl.web.state import State
+from mauvecl.web.tabs import Tabs
+from mauvecl.web.upload import read_upload, too_large
+from mauvecl.web.words import alerts, escaped, line
+from mauvecl.web.work import Cancelled, Job, reading
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
+    from mauvecl.host.source import Source
     from mauvecl.pool import Pool
+
+log = logging.getLogger(__name__)
 
 #: Milliseconds between two looks at a simulation, and from a change to a drawn spectrum.
 LOOK_MS, DRAW_MS = 250, 500
-#: The map of the page: cells along each axis, and realisations of each.
-MAP_STEPS, MAP_REALISATIONS = 8, 20_000
+#: What is told where the page itself is wrong.
+OWN_FAULT = "the page has made a mistake of its own, and there is no answer: please report what was entered"
 
 
 class Page:
-    """Controls, answers and downloads of one visitor."""
+    """State, answers and downloads of one visitor."""
 
-    def __init__(self) -> None:
-        self.question = Question()
+    def __init__(self, link: str = "") -> None:
+        self.state = State()
+        self.state.follow(link)
+        self.found: dict[str, Any] = {}
         self.job: Job | None = None
+        self.used = time.monotonic()
+        self._wanted: list[str] = []
         self._drawing: Job | None = None
+        self._document = pn.state.curdoc
+        self._folder = tempfile.TemporaryDirectory(prefix="mauvecl-page-")
+        self._asked = self._uploads = 0
+        self._due = self._following = self._replaces = False
+        self._told: list[tuple[str, str]] = []
         self.quiet: Expectation | None = None
         self.flare: Expectation | None = None
         self.theory: Detection | None = None
-        self.found: dict[str, Any] = {}
-        self._folder = tempfile.TemporaryDirectory(prefix="mauvecl-page-")
-        self._asked = 0
-        self._document = pn.state.curdoc
-        self._link_fault = ""
-        self._told: list[tuple[str, str]] = []
-        self.alerts = pn.Column(sizing_mode="stretch_width")
-        # A plain model: its text changes without a look at the whole page.
-        self.summary = Div(sizing_mode="stretch_width", styles={"font-size": "110%"})
-        self.status = pn.pane.Markdown("", sizing_mode="stretch_width")
+        self.alerts = line()
+        self.summary = line(styles={"font-size": "110%"}, html_attributes={"aria-live": "polite"})
+        self.status = line()
         self.bar = pn.indicators.Progress(name="Progress", value=0, max=100, sizing_mode="stretch_width", visible=False)
-        self.spectrum = InputSpectrum()
-        self.views = Observation(), SignalToNoise(), NoiseBudget(), Distributions(), Roc()
-        self.table = pn.pane.DataFrame(None, index=False, sizing_mode="stretch_width", escape=True)
-        self.limit = pn.Column(sizing_mode="stretch_width")
-        self.map = pn.Column(sizing_mode="stretch_width")
-        if self._document is not None:
-            pn.state.on_session_destroyed(lambda context: self._left())
         self._make_buttons()
-        self.controls = controls(self.question, lambda text: self._alert(text, "danger"))
-        self.tabs = tabs(self)
-        self.tabs.param.watch(self._show_tab, "active")
-        self._stale: set[int] = set()
-        if pn.state.location is not None:
-            pn.state.location.sync(self.question, list(self._shared()), on_error=self._bad_link)
-        self.question.param.watch(self._changed, list(self._shared()))
+        self.controls = Controls(self.state, self.enter, self._upload)
+        self.tabs = Tabs(self)
+        self.bridge = Bridge(address=self.state.link)
+        # It needs a place in the document, and the template's roots are its own.
+        self.summary.tags = [self.bridge]
+        if self._document is not None:
+            attach(self._document, self.bridge)
+            self.bridge.on_change("came", lambda attr, old, new: self._came(new[0]))
+            self.bridge.on_change("refused", lambda attr, old, new: self._refused(new[0]))
+            pn.state.on_session_destroyed(lambda context: self._left())
         self.refresh()
-
-    @staticmethod
-    def _shared() -> dict[str, str]:
-        """What a link holds."""
-        return {name: name for name in Question.param if name != "name"}
-
-    def _bad_link(self, bad: dict[str, Any]) -> None:
-        self._link_fault = (
-            f"The link holds {', '.join(sorted(map(str, bad)))} that cannot be; the usual values stand there."
-        )
+        self._wanted = [kind for kind in self.state.simulated if kind not in self.found]
+        self._later(self._next)
 
     def _left(self) -> None:
         """The visitor is gone: nothing more is computed for them."""
@@ -101,109 +96,156 @@ class Page:
         self.cancel = pn.widgets.Button(name="Cancel", disabled=True, width=120)
         self.run_limit = pn.widgets.Button(name="Find the limiting magnitude", button_type="primary")
         self.run_map = pn.widgets.Button(name="Draw the map", button_type="primary")
-        self.run.on_click(partial(self._simulate, "detection", _refined, self._show_refined))
-        self.run_limit.on_click(partial(self._simulate, "limit", limiting_magnitude, self._show_limit))
-        self.run_map.on_click(partial(self._simulate, "map", _map, self._show_map))
-        self.cancel.on_click(lambda event: self.job.cancel() if self.job is not None else None)
+        for kind, button in (("detection", self.run), ("limit", self.run_limit), ("map", self.run_map)):
+            button.on_click(partial(self._simulate, kind))
+        self.cancel.on_click(lambda event: self._stop())
+
+    # What is entered
+
+    def enter(self, given: Mapping[str, str]) -> None:
+        """A visitor has entered something: fields by name, or a tab."""
+        before = self.state.asked
+        self.state.enter(given)
+        self._entered(before)
+
+    def _entered(self, before: tuple[str, ...] | None, *, replaces: bool = False) -> None:
+        """Show the state, and answer it if another question is asked than before."""
+        self.used = time.monotonic()
+        if self.state.asked != before:
+            self.state.enter({"simulated": ""})
+            self._stop()
+            # Until there is an answer to these fields there is none.
+            self.quiet = None
+            self._asked += 1
+            self._due = True
+        self._replaces = replaces
+        if self._document is None:
+            self._follow()
+        elif not self._following:
+            # Several changes that wait already are answered once; models change under the document's lock alone.
+            self._following = True
+            self._document.add_next_tick_callback(self._follow)
+
+    def _follow(self) -> None:
+        """The page follows its state."""
+        self._following = False
+        with pn.io.hold():
+            if self._due:
+                self.refresh()
+            self.controls.show()
+            self.tabs.show()
+            self._address(replaces=self._replaces)
+        self._next()
+
+    def _address(self, *, replaces: bool) -> None:
+        self.bridge.update(replaces=replaces, address=self.state.link)
+
+    def _came(self, link: str) -> None:
+        """The visitor has gone back or forward."""
+        before = self.state.asked
+        self.state.follow(link)
+        wanted = self.state.simulated
+        self._entered(before, replaces=True)
+        self._wanted = [kind for kind in wanted if kind not in self.found]
+
+    def _upload(self, name: str, content: bytes) -> None:
+        """A file has come; it is read beside the event loop, and there is no star until then."""
+        self._uploads += 1
+        self._no_star(f"{shortened(name)} is being read")
+        future = reading(read_upload, name, content)
+        future.add_done_callback(lambda future: self._later(partial(self._uploaded, self._uploads, name, future)))
+
+    def _uploaded(self, number: int, name: str, future: Future[Source]) -> None:
+        if number != self._uploads or self.state.entered["star"]:
+            # Another star was chosen meanwhile.
+            return
+        try:
+            source = future.result()
+        except InputError as error:
+            self._no_star(str(error))
+        except Exception as error:
+            log.exception("an upload failed")
+            self._no_star(f"upload {shortened(name)} cannot be read ({type(error).__name__}), expected a spectrum")
+        else:
+            self.state.take(source)
+            self._entered(None)
+
+    def _refused(self, size: float) -> None:
+        """The browser has kept a file back."""
+        self._uploads += 1
+        self._no_star(too_large(size))
+
+    def _no_star(self, why: str) -> None:
+        self.state.lack(why)
+        self._entered(None)
 
     # Closed forms
 
-    def _changed(self, *_: Any) -> None:
-        if self.job is not None:
-            self.job.cancel()
-        self.refresh()
-
     def refresh(self) -> None:
         """Everything that has a closed form."""
-        self._asked += 1
+        self._due = False
         self._forget()
-        # One message for all changes.
-        with pn.io.hold():
-            try:
-                study = self.study()
-                self._show_closed(study)
-            except InputError as error:
-                self.quiet = None
-                self._tell([(str(error), "danger")])
-                self.summary.text = ""
-                self.run.disabled = True
-                return
-        self.run.disabled = self.job is not None
-        if self._document is not None:
-            # Not before the closed forms are shown, and not while a value is still being chosen.
-            self._document.add_timeout_callback(partial(self._draw_one, self._asked, study), DRAW_MS)
+        try:
+            self._answer()
+        except InputError as error:
+            self._withdraw(str(error))
+        except Exception:
+            log.exception("no answer")
+            self._withdraw(OWN_FAULT)
+        else:
+            self.tabs.dim(False)
+        self._busy()
 
     def _forget(self) -> None:
         """Answers of an earlier question go."""
-        if self.found:
-            self.found = {}
-            self.table.object = None
-            self.limit.clear()
-            self.map.clear()
+        self.quiet = self.flare = self.theory = None
+        self.found = {}
 
-    def _show_closed(self, study: Study) -> None:
-        q = self.question
-        source = study.star[0].source()
-        self._light = source, study.flaring(source, study.flare.amplitudes[0])
-        quiet, flare = self.quiet, self.flare = study.expect(list(self._light))
+    def _withdraw(self, why: str) -> None:
+        """There is no answer to what is entered; pictures of an earlier one are dimmed."""
+        self._forget()
+        self.summary.text = f"<b>No answer.</b> {escaped(why)}"
+        self._tell(self._stray())
+        self.tabs.dim(True)
+
+    def _answer(self) -> None:
+        q, study = self.state.question(), self.study()
+        # What is uploaded need not be read from its file at every change.
+        source = study.star[0].source() if q.uploaded is None else q.uploaded.at_magnitude(q.magnitude, q.band)
+        self.light = source, study.flaring(source, study.flare.amplitudes[0])
+        quiet, flare = study.expect(list(self.light))
         scene = prepare([quiet, flare], comparison=study.run.comparison())
         self.theory = Detection(
             quiet, (flare,), study.run.statistics, scene, study.run.realisations, seed=study.run.seed
         )
-        self._cut = self.theory.closed_form(q.statistic).isf(q.fap)
-        self.summary.text = self._closed_summary()
-        fault = [(self._link_fault, "warning")] if self._link_fault else []
-        kinds = [(m, "danger" if m.startswith("SATURATED") else "info") for m in told([quiet, flare])]
-        self._tell([*fault, *kinds])
-        self._stale = set(range(len(self.tabs)))
-        self._show_tab()
-
-    def _show_tab(self, *_: Any) -> None:
-        """Closed forms of the tab in front, once after a change; the others follow when they come to the front."""
-        if self.quiet is None or self.flare is None or self.theory is None or self.tabs.active not in self._stale:
-            return
-        self._stale.discard(self.tabs.active)
-        q, theory = self.question, self.theory
-        observation, snr, budget, distributions, roc = self.views
-        if self.tabs.active == 0:
-            observation.show(self.quiet, self.flare)
-            self.spectrum.show(*self._light)
-        elif self.tabs.active == 1:
-            snr.show(self.quiet)
-            if "snr" in self.found:
-                snr.add(self.found["snr"].element)
-        elif self.tabs.active == 2:
-            budget.show(self.quiet)
-        elif self.tabs.active == 3:
-            null, with_flare = (Smooth(theory.closed_form(q.statistic, k)) for k in (None, 0))
-            distributions.show(null, with_flare, self._cut, q.statistic, q.fap)
-            roc.show(null, with_flare)
-            if "detection" in self.found:
-                (star,) = self.found["detection"].stars
-                distributions.add(star, q.statistic, q.fap)
-                roc.add(star, q.statistic)
-
-    def _closed_summary(self) -> str:
-        assert self.theory is not None
-        assert self.quiet is not None
-        q, theory = self.question, self.theory
-        chance = float("nan") if theory.blinding else theory.closed_form(q.statistic, 0).sf(self._cut)
-        return (
+        self.cut = self.theory.closed_form(q.statistic).isf(q.fap)
+        chance = float("nan") if self.theory.blinding else self.theory.closed_form(q.statistic, 0).sf(self.cut)
+        self.quiet, self.flare = quiet, flare
+        self.summary.text = (
             f"<b>{_percent(chance)}</b> of such flares are detected by {q.statistic} at a false-alarm probability of "
-            f"{q.fap:g} per test: threshold {self._cut:.5g}, closed form for Gaussian noise. Best S/N "
-            f"{self.quiet.snr().max():.3g} a pixel, {self.quiet.snr_per_element().max():.3g} an element; exposure "
-            f"{self.quiet.exposure_s:g} s in {self.quiet.n_frames} frames."
+            f"{q.fap:g} per test: threshold {self.cut:.5g}, closed form for Gaussian noise. Best S/N "
+            f"{quiet.snr().max():.3g} a pixel, {quiet.snr_per_element().max():.3g} an element; exposure "
+            f"{quiet.exposure_s:g} s in {quiet.n_frames} frames."
         )
+        self._tell(
+            [*self._stray(), *((m, "danger" if m.startswith("SATURATED") else "info") for m in told([quiet, flare]))]
+        )
+        self.tabs.renew()
 
-    def _draw_one(self, asked: int, study: Study) -> None:
+    def draw_soon(self) -> None:
+        """One raw spectrum, not before the closed forms are shown, and not while a value is still being chosen."""
+        if self._document is not None:
+            self._document.add_timeout_callback(partial(self._draw_one, self._asked), DRAW_MS)
+
+    def _draw_one(self, asked: int) -> None:
         """One raw spectrum with the flare, drawn in the background."""
-        quiet, flare = self.quiet, self.flare
-        if asked != self._asked or quiet is None or flare is None:
+        flare = self.flare
+        if asked != self._asked or flare is None or not self.tabs.fresh("observation"):
             return
 
         def show(raw: Any) -> None:
-            if asked == self._asked and 0 not in self._stale:
-                self.views[0].add(quiet, raw)
+            if asked == self._asked:
+                self.tabs.draw(raw)
 
         def came(future: Future[Any]) -> None:
             if not future.cancelled() and future.exception() is None:
@@ -211,108 +253,151 @@ class Page:
 
         if self._drawing is not None:
             self._drawing.cancel()
+        study = self.study()
         how = study.drawing | {"seed": study.run.seed}
         self._drawing = Job(lambda pool: pool.realise(flare, count=1, **how)[0])
         self._drawing.future.add_done_callback(came)
 
     def _later(self, work: Callable[[], None]) -> None:
-        """Change the page from another thread, when it is its turn."""
-        if self._document is not None:
+        """Change the page from another thread, or after this change, when it is its turn."""
+        if self._document is None:
+            work()
+        else:
             self._document.add_next_tick_callback(work)
 
     # Simulations
 
-    def _simulate(self, kind: str, ask: Callable[[Study, Pool], Any], show: Callable[[Any], None], event: Any) -> None:
-        if self.job is not None or self.quiet is None:
+    def _simulate(self, kind: str, event: Any) -> None:
+        self.used = time.monotonic()
+        self._wanted.append(kind)
+        self._next()
+
+    def _next(self) -> None:
+        """The next simulation that is asked for, if none is on its way."""
+        if self.job is not None or not self._wanted or self._due:
             return
-        asked, study = self._asked, self.study()
-        job = self.job = Job(partial(ask, study))
-        self._busy(True)
+        if self.quiet is None:
+            self._wanted.clear()
+            return
+        kind, asked, study = self._wanted.pop(0), self._asked, self.study()
+        asks: dict[str, Callable[[Study, Pool], Any]] = {
+            "detection": detect_and_snr,
+            "limit": limiting_magnitude,
+            "map": map_around,
+        }
+        job = self.job = Job(partial(asks[kind], study))
+        self._busy()
         looker = pn.state.add_periodic_callback(partial(self._look, job), LOOK_MS)
 
         def ended() -> None:
             looker.stop()
             self.job = None
-            self._busy(False)
             try:
                 found = job.future.result()
             except (Cancelled, CancelledError):
-                self.status.object = "Cancelled."
+                self.status.text = "Cancelled."
             except (InputError, DeviceError) as error:
-                self.status.object = ""
+                self.status.text = ""
                 self._alert(str(error), "danger")
+            except Exception:
+                log.exception("a simulation failed")
+                self.status.text = ""
+                self._alert(OWN_FAULT, "danger")
             else:
-                self.status.object = f"Done: {job.told}."
+                self.status.text = f"Done: {escaped(job.told)}."
                 if asked == self._asked:
-                    self.found[kind] = found
-                    show(found)
+                    self._show_found(kind, found)
+            self._busy()
+            self._next()
 
         job.future.add_done_callback(lambda future: self._later(ended))
 
-    def _busy(self, busy: bool) -> None:
+    def _show_found(self, kind: str, found: Any) -> None:
+        if kind == "detection":
+            self.found["detection"], self.found["snr"] = found
+            self._show_refined()
+            self.tabs.renew("snr", "detection")
+        else:
+            self.found[kind] = found
+            self.tabs.renew("limit")
+        self.state.enter({"simulated": ",".join(name for name in self.found if name != "snr")})
+        self._address(replaces=True)
+
+    def _stop(self) -> None:
+        self._wanted.clear()
+        if self.job is not None:
+            self.job.cancel()
+
+    def _busy(self) -> None:
+        """What can be asked for now."""
+        busy = self.job is not None
         self.cancel.disabled = not busy
         for button in (self.run, self.run_limit, self.run_map):
-            button.disabled = busy
-        self.bar.visible = busy
-        self.bar.value = 0
+            button.disabled = busy or self.quiet is None
+        if self.bar.visible != busy:
+            self.bar.param.update(visible=busy, value=0)
 
     def _look(self, job: Job) -> None:
-        self.status.object = job.told
+        self.status.text = escaped(job.told)
         standing = job.standing
         if standing is not None and standing.total:
             self.bar.value = min(int(100 * standing.done / standing.total), 100)
 
-    def _show_refined(self, answers: tuple[DetectAnswer, SnrAnswer]) -> None:
-        answer, _ = self.found["detection"], self.found["snr"] = answers
-        # S/N and detection are shown anew, the simulation on top.
-        self._stale |= {1, 3}
-        self._show_tab()
-        q = self.question
-        frame = answer.table.to_pandas()
-        columns = {
-            "statistic": "statistic", "mean": "mean with flare", "threshold": "threshold",
-            "probability": "detected", "low": "95 % from", "high": "to", "closed_form_probability": "closed form",
-        }  # fmt: skip
-        self.table.object = frame[list(columns)].rename(columns=columns)
-        (row,) = (r for r in answer.table if r["statistic"] == q.statistic)
+    def _show_refined(self) -> None:
+        q = self.state.question()
+        (row,) = (r for r in self.found["detection"].table if r["statistic"] == q.statistic)
         self.summary.text = (
             f"<b>{_percent(row['probability'])}</b> [{_percent(row['low'])}, {_percent(row['high'])}] of "
             f"{q.realisations:,} simulated flares are detected by {q.statistic} at a false-alarm probability of "
             f"{q.fap:g} per test; closed form {_percent(row['closed_form_probability'])}."
         )
 
-    def _show_limit(self, found: LimitResult) -> None:
+    def shown_limit(self) -> list[Any]:
+        """The limiting magnitudes and their picture, if they are found."""
+        found: LimitResult | None = self.found.get("limit")
+        if found is None:
+            return []
         rows = [
-            f"- `{one.statistic}`: **{one.value.value:.3f}** [{one.value.low:.3f}, {one.value.high:.3f}], closed form "
-            f"{one.closed_form:.3f}; simulated again there: {_percent(one.check.probability.value)}"
+            f"<li>{escaped(one.statistic)}: <b>{one.value.value:.3f}</b> [{one.value.low:.3f}, {one.value.high:.3f}], "
+            f"closed form {one.closed_form:.3f}; simulated again there: {_percent(one.check.probability.value)}</li>"
             for one in found.limits
         ]
         power, fap = found.study.limit.power, found.study.run.fap
         title = f"Magnitude at which {100 * power:g} % of such flares are detected, false-alarm probability {fap:g}:"
-        self.limit.objects = [pn.pane.Markdown("\n".join([title, "", *rows])), _picture(found, "Limiting magnitude")]
+        return [line(f"{title}<ul>{''.join(rows)}</ul>"), picture(found, "Limiting magnitude")]
 
-    def _show_map(self, found: MapResult) -> None:
-        self.map.objects = [_picture(found, "Detection probability over magnitude and flare amplitude")]
+    def shown_map(self) -> list[Any]:
+        """The map, if it is found."""
+        found: MapResult | None = self.found.get("map")
+        return [] if found is None else [picture(found, "Detection probability over magnitude and flare amplitude")]
 
     # Alerts
 
-    def _tell(self, alerts: list[tuple[str, str]]) -> None:
+    def _stray(self) -> list[tuple[str, str]]:
+        """What a link held that is no field."""
+        return [(self.state.stray, "warning")] if self.state.stray else []
+
+    def _tell(self, sentences: list[tuple[str, str]]) -> None:
         """Alerts on top; the same ones stay as they are."""
-        if alerts != self._told:
-            self._told = alerts
-            self.alerts.objects = [
-                pn.pane.Alert(text.replace("<", "&lt;"), alert_type=kind, sizing_mode="stretch_width")
-                for text, kind in alerts
-            ]
+        if sentences != self._told:
+            self._told = sentences
+            self.alerts.text = alerts(sentences)
 
     def _alert(self, text: str, kind: str) -> None:
-        self._tell([(text, kind), *self._told])
+        """One more, when it is the page's turn."""
+        if (text, kind) not in self._told:
+            self._later(lambda: self._tell([(text, kind), *self._told]))
 
     # Downloads
 
+    @property
+    def uploaded(self) -> bool:
+        """Whether the star is a visitor's own."""
+        return self.state.uploaded is not None and not self.state.faults and self.state.question().uploaded is not None
+
     def study(self) -> Study:
         """The question as it stands."""
-        return self.question.study(Path(self._folder.name))
+        return self.state.question().study(Path(self._folder.name))
 
     def file(self, name: str, ending: str) -> io.BytesIO:
         """An answer as a table or picture."""
@@ -323,49 +408,25 @@ class Page:
     def study_of(self, name: str | None = None) -> io.BytesIO:
         """The study of an answer that has its own, or of the question."""
         if name is None:
-            return study_file(self.question, self.study())
+            return study_file(self.study())
         if name not in self.found:
             raise InputError(f"no {name} is computed yet, expected a simulation first")
-        return study_file(self.question, self.found[name].study)
+        return study_file(self.found[name].study)
 
     def safely(self, make: Callable[[], io.BytesIO]) -> io.BytesIO:
         """What is made, or the sentence of why not, on the page and in the file."""
+        self.used = time.monotonic()
         try:
             return make()
         except InputError as error:
-            self._alert(str(error), "warning")
-            return io.BytesIO(f"{error}\n".encode())
+            why = str(error)
+        except Exception:
+            log.exception("a download failed")
+            why = OWN_FAULT
+        self._alert(why, "warning")
+        return io.BytesIO(f"{why}\n".encode())
 
 
 def _percent(value: float) -> str:
     # Without a number where every pixel that counts is saturated.
     return f"{100 * float(value):.2f} %" if value == value else "(saturated)"
-
-
-def _refined(study: Study, pool: Pool) -> tuple[DetectAnswer, SnrAnswer]:
-    """Everything that *Simulate* refines."""
-    pool.expect(2 * study.run.realisations)
-    return detect(study, pool), snr(study, pool)
-
-
-def _map(study: Study, pool: Pool) -> MapResult:
-    """A coarse map around the question's own star."""
-    star, amplitude = study.star[0], study.flare.amplitudes[0]
-    middle = 7.0 if star.magnitude is None else star.magnitude
-    x = {"quantity": "magnitude", "start": middle - 2.5, "stop": middle + 2.5, "steps": MAP_STEPS}
-    y = {"quantity": "amplitude", "start": amplitude / 10, "stop": amplitude * 3, "steps": MAP_STEPS, "log": True}
-    # A statistic alone, and as few realisations as the false-alarm probability allows.
-    fewest = int(np.ceil(100 / study.run.fap))
-    n = min(max(MAP_REALISATIONS, fewest), study.run.realisations)
-    run = {"realisations": n, "statistics": [study.run.statistics[-1]]}
-    data = study.model_dump()
-    data["map"] |= {"x": x, "y": y}
-    data["run"] |= run
-    return detection_map(Study.build(data, "page"), pool)
-
-
-def _picture(found: LimitResult | MapResult, alternative: str) -> Any:
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "picture.png"
-        found.plot(path)
-        return pn.pane.PNG(path.read_bytes(), alt_text=alternative, sizing_mode="scale_width", max_width=900)

@@ -16,6 +16,13 @@ from mauvecl.pool import LocalWorkers, Pool, Standing
 TOGETHER = 2
 _threads = ThreadPoolExecutor(TOGETHER, thread_name_prefix="mauvecl-page")
 _own = threading.local()
+#: Uploads are read one after the other, beside the event loop.
+_reader = ThreadPoolExecutor(1, thread_name_prefix="mauvecl-upload")
+
+
+def reading(read: Callable[[str, bytes], Any], name: str, content: bytes) -> Future[Any]:
+    """Read an upload in the background."""
+    return _reader.submit(read, name, content)
 
 
 class Cancelled(Exception):  # noqa: N818

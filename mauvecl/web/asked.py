@@ -1,0 +1,52 @@
+"""What the page asks of a pool."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import panel as pn
+
+from mauvecl.detect_study import DetectAnswer, detect
+from mauvecl.maps import MapResult, detection_map
+from mauvecl.snr_study import SnrAnswer, snr
+from mauvecl.study import Study
+
+if TYPE_CHECKING:
+    from mauvecl.limits import LimitResult
+    from mauvecl.pool import Pool
+
+#: The map of the page: cells along each axis, and realisations of each.
+MAP_STEPS, MAP_REALISATIONS = 8, 20_000
+
+
+def detect_and_snr(study: Study, pool: Pool) -> tuple[DetectAnswer, SnrAnswer]:
+    """Everything that *Simulate* refines."""
+    pool.expect(2 * study.run.realisations)
+    return detect(study, pool), snr(study, pool)
+
+
+def map_around(study: Study, pool: Pool) -> MapResult:
+    """A coarse map around the question's own star."""
+    star, amplitude = study.star[0], study.flare.amplitudes[0]
+    middle = 7.0 if star.magnitude is None else star.magnitude
+    x = {"quantity": "magnitude", "start": middle - 2.5, "stop": middle + 2.5, "steps": MAP_STEPS}
+    y = {"quantity": "amplitude", "start": amplitude / 10, "stop": amplitude * 3, "steps": MAP_STEPS, "log": True}
+    # A statistic alone, and as few realisations as the false-alarm probability allows.
+    fewest = int(np.ceil(100 / study.run.fap))
+    n = min(max(MAP_REALISATIONS, fewest), study.run.realisations)
+    run = {"realisations": n, "statistics": [study.run.statistics[-1]]}
+    data = study.model_dump()
+    data["map"] |= {"x": x, "y": y}
+    data["run"] |= run
+    return detection_map(Study.build(data, "page"), pool)
+
+
+def picture(found: LimitResult | MapResult, alternative: str) -> Any:
+    """An answer's own picture."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "picture.png"
+        found.plot(path)
+        return pn.pane.PNG(path.read_bytes(), alt_text=alternative, sizing_mode="scale_width", max_width=900)

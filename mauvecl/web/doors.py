@@ -1,0 +1,190 @@
+"""Who may come to the page: hosts and origins, signed tokens, and so many visitors at a time."""
+
+from __future__ import annotations
+
+import ipaddress
+import re
+import socket
+from collections.abc import Iterable
+from typing import TYPE_CHECKING, Any
+
+from bokeh.util.token import check_token_signature, get_session_id
+from panel.io.server import WSHandler
+from tornado.routing import Matcher, Rule
+from tornado.web import RequestHandler
+
+from mauvecl.host.bounded import shortened
+from mauvecl.host.errors import InputError
+
+if TYPE_CHECKING:
+    from bokeh.protocol.message import Message
+    from bokeh.server.tornado import BokehTornado
+    from tornado.httputil import HTTPServerRequest
+
+#: Visitors at a time; each holds some megabytes (assumed to be enough for a team).
+MOST_SESSIONS = 100
+#: A host as browsers write it: name, IPv4 address or IPv6 address in brackets; and a port.
+HOST = r"(?:[a-z0-9](?:[a-z0-9.-]*[a-z0-9])?|\[[0-9a-f:.]+\])(?::\d{1,5})?"
+
+
+def local(address: str) -> bool:
+    """Whether an address lets in this machine alone.
+
+    Raises
+    ------
+    InputError
+        If it is empty, or no address or name that this machine knows.
+    """
+    if not address.strip():
+        raise InputError("--address '' is empty, expected one such as 127.0.0.1, ::1 or 0.0.0.0")
+    try:
+        found = {str(info[4][0]).split("%")[0] for info in socket.getaddrinfo(address, None, type=socket.SOCK_STREAM)}
+    except (OSError, UnicodeError) as error:
+        raise InputError(f"--address {shortened(address)} is unknown here, expected one such as 127.0.0.1") from error
+    return all(ipaddress.ip_address(one).is_loopback for one in found)
+
+
+def netloc(address: str, port: int) -> str:
+    """Host and port as an address has them: IPv6 in brackets."""
+    return f"[{address}]:{port}" if ":" in address else f"{address}:{port}"
+
+
+def plain(host: str) -> str:
+    """A host in lower case, without the ports that go without saying."""
+    return re.sub(r":(80|443)$", "", host.strip().lower())
+
+
+def origin(text: str) -> str:
+    """What `--allow-origin` names: a host with its port, from ``https://name`` or ``name:port``.
+
+    Raises
+    ------
+    InputError
+        If it names no single host.
+    """
+    host = re.sub(r"^https?://", "", text.strip().lower()).removesuffix("/")
+    if re.fullmatch(HOST, host) is None:
+        raise InputError(f"--allow-origin {shortened(text)}, expected one host such as https://mauve.example.org")
+    return plain(host)
+
+
+def hosts(address: str, port: int, allowed: Iterable[str]) -> frozenset[str]:
+    """Hosts by which the page may be asked for.
+
+    Parameters
+    ----------
+    address : str
+        Where the server listens.
+    port : int
+    allowed : iterable of str
+        What `--allow-origin` names.
+
+    Raises
+    ------
+    InputError
+        If others than this machine may come and no origin is named, or an origin or the address is none.
+    """
+    named = {origin(text) for text in allowed}
+    if not local(address) and not named:
+        raise InputError(
+            f"--address {shortened(address)} lets in other machines, expected --allow-origin with the address that "
+            "visitors' browsers will show, such as https://mauve.example.org"
+        )
+    own = {"127.0.0.1", "localhost", "::1"} | ({address} if local(address) else set())
+    return frozenset(plain(netloc(one, port)) for one in own) | named
+
+
+class Refused(RequestHandler):
+    """A sentence instead of the page."""
+
+    def initialize(self, status: int, why: str) -> None:
+        """What is answered."""
+        self._status, self._why = status, why
+
+    async def prepare(self) -> None:
+        """Answer whatever is asked."""
+        self.set_status(self._status)
+        self.set_header("Content-Type", "text/plain; charset=utf-8")
+        if self._status == 503:
+            self.set_header("Retry-After", "60")
+        await self.finish(f"{self._why}\n")
+
+
+class Door(Matcher):
+    """Matches what is not let in.
+
+    Parameters
+    ----------
+    application : BokehTornado
+    allowed : frozenset of str
+        As `hosts` gives them.
+    """
+
+    def __init__(self, application: BokehTornado, allowed: frozenset[str]) -> None:
+        self._application, self._allowed = application, allowed
+
+    def match(self, request: HTTPServerRequest) -> dict[str, Any] | None:
+        """Why a request is refused, or None."""
+        found = self._foreign(request) or self._forged(request) or self._too_many(request)
+        return None if found is None else {"target_kwargs": {"status": found[0], "why": found[1]}}
+
+    def _foreign(self, request: HTTPServerRequest) -> tuple[int, str] | None:
+        """A name that was bent to this machine, or a page of another server."""
+        if [plain(host) for host in request.headers.get_list("Host")] not in [[host] for host in self._allowed]:
+            return 403, "The page is not served under this host name; see `mauvecl serve --allow-origin`."
+        for given in request.headers.get_list("Origin"):
+            if plain(re.sub(r"^https?://", "", given.lower())) not in self._allowed:
+                return 403, "The page is not there for pages of other servers; see `mauvecl serve --allow-origin`."
+        return None
+
+    def _forged(self, request: HTTPServerRequest) -> tuple[int, str] | None:
+        """Sessions are made by the page alone."""
+        if "bokeh-token" in request.arguments or any(
+            name in request.arguments or name in request.headers for name in ("bokeh-session-id", "Bokeh-Session-Id")
+        ):
+            return 403, "The page takes no session from an address."
+        if request.path.endswith("/ws") and self._session(request) is None:
+            return 403, "Expected a connection as the page makes it."
+        return None
+
+    def _session(self, request: HTTPServerRequest) -> str | None:
+        """The session that a websocket is for, if its token is one of ours."""
+        words = [word.strip() for word in request.headers.get("Sec-WebSocket-Protocol", "").split(",")]
+        if len(words) != 2 or words[0] != "bokeh":
+            return None
+        a = self._application
+        try:
+            good = check_token_signature(words[1], secret_key=a.secret_key, signed=a.sign_sessions)
+            return str(get_session_id(words[1])) if good else None
+        except Exception:  # a token is JSON in base64, or is not
+            return None
+
+    def _too_many(self, request: HTTPServerRequest) -> tuple[int, str] | None:
+        sessions = {session.id for context in self._application.applications.values() for session in context.sessions}
+        if len(sessions) < MOST_SESSIONS or request.path.split("/")[1] in ("static", "favicon.ico"):
+            return None
+        if request.path.endswith("/ws") and self._session(request) in sessions:
+            return None
+        return 503, "Too many visitors are here at the moment; please come again in some minutes."
+
+
+class Socket(WSHandler):
+    """The page's connection; what went wrong inside the server is not told outside."""
+
+    def check_origin(self, origin: str) -> bool:
+        """The door has asked already, and more exactly: IPv6 too."""
+        return True
+
+    async def send_message(self, message: Message[Any]) -> None:
+        """Send, without a traceback."""
+        if message.msgtype == "ERROR":
+            message.content = {"text": "the message could not be handled", "traceback": None}
+        await super().send_message(message)
+
+
+def guard(application: BokehTornado, allowed: frozenset[str]) -> None:
+    """Put the door in front of everything that a server serves."""
+    for rule in application.wildcard_router.rules:
+        if isinstance(rule.target, type) and issubclass(rule.target, WSHandler):
+            rule.target = Socket
+    application.default_router.rules.insert(0, Rule(Door(application, allowed), Refused))

@@ -1,0 +1,128 @@
+"""What a visitor has entered, as text: a question where every field is right, and what is wrong where one is not.
+
+Nothing here knows how the page looks; whatever shows it enters text here, and shows `entered` and `faults`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+from urllib.parse import parse_qsl, urlencode
+
+from mauvecl.host.bounded import shortened
+from mauvecl.host.errors import InputError
+from mauvecl.web.fields import FIELDS, MOST_CHARACTERS, SEEN, UPLOADED
+from mauvecl.web.question import Question
+
+if TYPE_CHECKING:
+    from mauvecl.host.source import Source
+
+#: Bytes of a link's values that are looked at.
+MOST_LINKED = 4096
+
+
+class State:
+    """The one state of a page.
+
+    Attributes
+    ----------
+    entered : dict
+        Text of each field, right or wrong, by name: those of `FIELDS` and `SEEN`.
+    faults : dict
+        The sentence of what is wrong, by name of the field; empty where there is a question.
+    stray : str
+        What the last link held that is no field, in a sentence, or nothing.
+    uploaded : Source or None
+        The spectrum that stands for the star where "uploaded star" is entered.
+    """
+
+    def __init__(self) -> None:
+        self._fields = FIELDS | SEEN
+        self.entered = {name: field.first for name, field in self._fields.items()}
+        self._values = {name: field.read(field.first) for name, field in self._fields.items()}
+        self.faults: dict[str, str] = {}
+        self.stray = ""
+        self.uploaded: Source | None = None
+
+    def enter(self, given: Mapping[str, str]) -> None:
+        """Enter text into fields; what is wrong with it is then found in `faults`."""
+        for name, text in given.items():
+            self.entered[name] = text[:MOST_CHARACTERS]
+            self.faults.pop(name, None)
+            try:
+                if len(text) > MOST_CHARACTERS:
+                    raise InputError(f"{shortened(text)} is too long, expected at most {MOST_CHARACTERS} characters")
+                value = self._fields[name].read(text)
+                if value == UPLOADED and self.uploaded is None:
+                    raise InputError("the uploaded star is not here, expected its file again: links do not hold it")
+                self._values[name] = value
+            except InputError as error:
+                self.faults[name] = str(error)
+
+    def take(self, uploaded: Source) -> None:
+        """An upload is read: it is the star."""
+        self.uploaded = uploaded
+        self.enter({"star": UPLOADED})
+
+    def lack(self, why: str) -> None:
+        """No star is known, for an upload is not read yet or cannot be; the sentence says which."""
+        self.uploaded = None
+        self.entered["star"] = ""
+        self.faults["star"] = why
+
+    @property
+    def asked(self) -> tuple[str, ...]:
+        """The text of all fields that an answer depends on."""
+        return tuple(self.entered[name] for name in FIELDS)
+
+    @property
+    def fault(self) -> str:
+        """All faults in one text, or nothing."""
+        return "; ".join(f"{self._fields[name].label}: {why}" for name, why in self.faults.items())
+
+    def question(self) -> Question:
+        """The question.
+
+        Raises
+        ------
+        InputError
+            If some field is not right, with what each accepts.
+        """
+        if self.faults:
+            raise InputError(self.fault)
+        values = {name: self._values[name] for name in FIELDS}
+        return Question(**values, uploaded=self.uploaded if values["star"] == UPLOADED else None)
+
+    @property
+    def tab(self) -> str:
+        """The tab in front."""
+        return str(self._values["tab"])
+
+    @property
+    def simulated(self) -> tuple[str, ...]:
+        """What is simulated on the page."""
+        return tuple(self._values["simulated"])
+
+    # Links
+
+    @property
+    def link(self) -> str:
+        """Everything entered, as the query of an address."""
+        return "?" + urlencode({name: text for name, text in self.entered.items() if text})
+
+    def follow(self, link: str) -> None:
+        """Enter what a link holds, and what stands at first where it holds nothing."""
+        query = link.removeprefix("?")
+        self.stray = ""
+        if len(query) > MOST_LINKED:
+            query, self.stray = "", f"The link has more than {MOST_LINKED} characters and was left out."
+        pairs = parse_qsl(query, keep_blank_values=True, errors="replace")
+        strange = sorted({name for name, _ in pairs} - set(self._fields))
+        if strange:
+            self.stray = f"The link holds {shortened(', '.join(strange))}, which is no field here; it was left out."
+        first = {name: field.first for name, field in self._fields.items()}
+        self.enter(first | {name: text for name, text in pairs if name in self._fields})
+        for name in SEEN.keys() & self.faults.keys():
+            # No field of the page could set them right.
+            self.stray += f" The link's {name}: {self.faults[name]}; it was left out."
+            self.enter({name: SEEN[name].first})
