@@ -434,10 +434,10 @@ def expect(
             f"{source.name} was freed of its dust by its archive: brighter in the ultraviolet than it is seen, unless "
             "it is reddened again (ebv)."
         )
-    if source.scale:
-        messages.append(source.scale)
     if instrument.notice:
         messages.append(instrument.notice)
+    if source.scale:
+        messages.append(source.scale)
     return replace(plain, messages=tuple(messages))
 
 

@@ -26,6 +26,8 @@ MOST_CONTINUED = 0.01
 END_NM, JOIN_NM, ELEMENT_NM = 5.0, 10.0, 10.5
 #: A level to scale by must be so many times its error.
 JOIN_ERRORS = 5.0
+#: Fluxes beyond these are those of no star, and end in overflow; wavelengths closer than this share are one.
+FAINTEST, BRIGHTEST, SMALLEST_STEP = 1e-60, 1e30, 1e-12
 #: A gap between points is told beyond this width, nm, and this multiple of the usual spacing.
 GAP_NM, GAP_TIMES = 10.5, 10.0
 
@@ -47,7 +49,8 @@ def check_points(name: str, wavelength: Float, flux: Float) -> None:
             f"spectrum {name}: wavelength {wavelength[bad[0]]:g} at point {bad[0] + 1}, expected a finite number "
             "above 0"
         )
-    back = np.flatnonzero(np.diff(wavelength) <= 0)
+    # Steps below the rounding of a change of units are none.
+    back = np.flatnonzero(np.diff(wavelength) <= SMALLEST_STEP * wavelength[:-1])
     if back.size:
         i = int(back[0])
         raise InputError(
@@ -102,6 +105,11 @@ def check_flux(name: str, wavelength: Float, flux: Float) -> None:
         )
     inside = (wavelength >= NEEDED_NM[0]) & (wavelength <= NEEDED_NM[1])
     most, least = (float(f(flux[inside])) if inside.any() else 0.0 for f in (np.max, np.min))
+    if max(abs(most), abs(least)) > BRIGHTEST or 0.0 < most < FAINTEST:
+        raise InputError(
+            f"spectrum {name}: the highest flux in 200-700 nm is {most:.3g} and the lowest {least:.3g} erg/s/cm2/A, "
+            f"expected {FAINTEST:g} to {BRIGHTEST:g}"
+        )
     if most <= 0.0:
         what = "every flux is zero" if not flux.any() else f"no flux in 200-700 nm is above zero, the highest {most:g}"
         raise InputError(f"spectrum {name}: {what}, expected some light")

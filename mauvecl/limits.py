@@ -11,7 +11,7 @@ import numpy as np
 
 from mauvecl.detection import check_fap
 from mauvecl.host.errors import InputError
-from mauvecl.labels import described, label, stacked
+from mauvecl.labels import described, label, stacked, told
 from mauvecl.limit_search import MarginalQuestion, Point, Question, Unknown, settle
 from mauvecl.questions import UNITS
 from mauvecl.sections import Star
@@ -51,6 +51,8 @@ class Limit:
         What the study sweeps over.
     unknown : Unknown, optional
         Where the limit is averaged over what is unknown.
+    messages : tuple of str
+        What saturates at the limit, without the flare and with it.
     """
 
     star: str
@@ -66,6 +68,7 @@ class Limit:
     curve: tuple[tuple[float, float], ...]
     at: Mapping[str, float | str] = field(default_factory=dict)
     unknown: Unknown | None = None
+    messages: tuple[str, ...] = ()
 
     @property
     def agrees(self) -> bool:
@@ -194,7 +197,7 @@ def solve(
     # Another seed, far from any that a user would take for a neighbour.
     fresh = (study.run.seed + 0x9E3779B97F4A7C15) % 2**64
     check = Point(value.value, question.simulated(value.value, fresh), fresh)
-    quiet, _ = question.pair(value.value)
+    quiet, flare = question.pair(value.value)
     shown = question.study.star[0]
     named = star.model_copy(update={"magnitude": None}) if question.of == "magnitude" else shown
     return Limit(
@@ -211,6 +214,7 @@ def solve(
         curve=question.curve(value.value),
         at=at or {},
         unknown=question.unknown(theory) if isinstance(question, MarginalQuestion) else None,
+        messages=tuple(m for m in told([quiet, flare]) if m.startswith("SATURATED")),
     )
 
 

@@ -35,7 +35,8 @@ def test_detect_answers_the_papers_question(answered: tuple[Path, str]) -> None:
     folder, text = answered
     lines = text.splitlines()
     assert "not a flight calibration" in lines[0]
-    assert "false-alarm probability of 0.001 per test, 50 s (10 frames), 100,000 realisations" in lines[1]
+    assert lines[1] == "Magnitudes in V are as in catalogues: Vega has 0.03."
+    assert "false-alarm probability of 0.001 per test, 50 s (10 frames), 100,000 realisations" in lines[2]
     assert "\x1b" not in text
     table = QTable.read(folder / "mauvecl-detect" / "detection.ecsv")
     assert len(table) == 2 * 4 * 3
@@ -101,7 +102,7 @@ def test_a_table_is_read_back_into_its_study(answered: tuple[Path, str], tmp_pat
     table = folder / "mauvecl-detect" / "detection.ecsv"
     assert Study.read(table) == Study.read(folder / "mauvecl-detect" / "study.toml")
     (tmp_path / "no.ecsv").write_text("a b\n1 2\n")
-    assert "no.ecsv holds no study" in run("detect", "no.ecsv", folder=tmp_path, code=2).stderr
+    assert "study 'no.ecsv' cannot be read" in run("detect", "no.ecsv", folder=tmp_path, code=2).stderr
 
 
 def test_weights_of_ones_own_in_a_study(tmp_path: Path) -> None:

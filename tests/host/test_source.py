@@ -429,3 +429,9 @@ def test_a_pixels_error_is_the_scatter_of_its_means() -> None:
     told = np.mean([error_per_second(Source.from_arrays(nm, flux), mauve, "paper") for flux in draws[:20]], axis=0)
     ratio = (told / means.std(axis=0))[100:1600:150]
     assert (np.abs(ratio - 1) < 0.25).all(), ratio
+
+
+def test_wavelengths_a_rounding_apart_are_no_two_points() -> None:
+    nm = np.insert(grid(), 100, np.nextafter(grid()[100], 0))
+    with pytest.raises(InputError, match="expected increasing wavelengths"):
+        Source.from_arrays(nm, 1e-15 * nm)

@@ -263,6 +263,8 @@ BAD_TEXT = {
     "underscores": (lines(NM, FLUX) + "1_000 2\n", "line 416: '1_000 2' is not numeric"),
     "not rising": (lines(np.roll(NM, 5), FLUX), "expected increasing wavelengths"),
     "hole": (lines(NM, np.where(NM == 300, np.nan, FLUX)), "flux nan at point 66, 300 nm"),
+    "subnormal": (lines(NM, 0 * NM + 5e-324, head="# nm FLAM\n"), "expected 1e-60 to 1e\\+30"),
+    "too bright": (lines(NM, 0 * NM + 1e35, head="# nm FLAM\n"), "expected 1e-60 to 1e\\+30"),
     "no light": (lines(NM, -FLUX), "no flux in 200-700 nm is above zero"),
     "sign for none": (lines(NM, np.where(NM == 300, -999.0, FLUX)), "may stand for no measurement"),
     "html": ("<!DOCTYPE html><html>404</html>", "is a page or XML"),
