@@ -109,7 +109,7 @@ MUTATIONS = {
     ),
     "fifth cumulants of varying dark forgotten": Mutation(
         (
-            ("kernels/detector.cl.mako", "factors->dark * r->dark_fifth", "factors->dark * 0.0f"),
+            ("kernels/detector.cl.mako", "dark * r->dark_fifth", "factors->dark * 0.0f"),
             (TWIN, 'dark * r["dark_fifth"]', "dark * np.float32(0)"),
         ),
         "tests/kernels/test_joint_bound.py::test_factors_follow_the_cumulants",
