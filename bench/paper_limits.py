@@ -14,8 +14,8 @@ from pathlib import Path
 from astropy.table import vstack
 
 from mauvecl import Study, limiting_magnitude
-from mauvecl.assumptions import what_matters
-from mauvecl.statistics import STATISTICS
+from mauvecl.answers.assumptions import what_matters
+from mauvecl.statistics.definitions import STATISTICS
 
 KEPT = ("amplitude", "exposure", "statistic", "magnitude", "low", "high", "closed_form", "check")
 

@@ -20,8 +20,9 @@ from astropy.table import Table
 from numpy.typing import NDArray
 from scipy import special, stats
 
-from mauvecl import Engine, layout, scene
-from mauvecl.selftest import pearson, toy
+from mauvecl import Engine
+from mauvecl.device.selftest import pearson, toy
+from mauvecl.noise import layout, scene
 
 PIXELS = 1600
 SEED = 20_261_121

@@ -21,8 +21,8 @@ from astropy.table import Table
 from rates import engine_lines
 
 from mauvecl import Engine
-from mauvecl.engine import VECTORS
-from mauvecl.kernel_cache import kernel_cache
+from mauvecl.device.engine import VECTORS
+from mauvecl.device.kernel_cache import kernel_cache
 
 PEAK = """
 typedef float float16_;

@@ -24,7 +24,7 @@ CHILD = """
 import json, sys
 from dataclasses import asdict
 from mauvecl import selftest
-from mauvecl.engine import Engine, devices
+from mauvecl.device.engine import Engine, devices
 for number, record in enumerate(devices()):
     found = {}
     for width in (None, 1):
@@ -51,7 +51,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--output", type=Path, help="write the table as ECSV")
     output = parser.parse_args().output
-    from mauvecl import selftest
+    from mauvecl.device import selftest
 
     twin = {name: selftest.twin_digests(name) for name in selftest.CASES}
     with tempfile.TemporaryDirectory() as folder:

@@ -22,13 +22,13 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 
-from mauvecl.checkpoint import Checkpoint
-from mauvecl.cluster import DaskWorkers
-from mauvecl.engine import Engine
-from mauvecl.pool import LocalWorkers, Pool
-from mauvecl.sections import Run
-from mauvecl.shards import DetectRequest, fingerprint, shares
-from mauvecl.study import Study
+from mauvecl.device.engine import Engine
+from mauvecl.runs.checkpoint import Checkpoint
+from mauvecl.runs.cluster import DaskWorkers
+from mauvecl.runs.pool import LocalWorkers, Pool
+from mauvecl.runs.shards import DetectRequest, fingerprint, shares
+from mauvecl.study.sections import Run
+from mauvecl.study.study import Study
 
 #: The plan's work, pixel-realisations, and its cores.
 PLAN, CORES = 1e15, 1000

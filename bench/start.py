@@ -21,10 +21,10 @@ REPEATS = 5
 #: A first small detection in a new process; prints its own seconds, imports apart.
 DETECT = """
 import time
-from mauvecl.engine import Engine
-from mauvecl.selftest import toy
+from mauvecl.device.engine import Engine
+from mauvecl.device.selftest import toy
 quiet, flare = toy(1600), toy(1600, flare=0.1)
-import mauvecl.detection, pyopencl, scipy.special
+import mauvecl.results.detection, pyopencl, scipy.special
 start = time.perf_counter()
 Engine().detect(quiet, [flare], realisations=64, seed=1)
 print(time.perf_counter() - start)

@@ -23,14 +23,14 @@ from pathlib import Path
 import numpy as np
 from astropy.table import Table
 
-from mauvecl import bulk
-from mauvecl.engine import Engine
-from mauvecl.study import Study
+from mauvecl.device.engine import Engine
+from mauvecl.store import bulk
+from mauvecl.study.study import Study
 
 CHILD = """
 import resource, sys
 from mauvecl import bulk
-from mauvecl.engine import Engine
+from mauvecl.device.engine import Engine
 sys.path.insert(0, sys.argv[1])
 from store import study
 bulk.realise(study(int(sys.argv[3])), sys.argv[2], Engine())

@@ -14,15 +14,15 @@ from numpy.typing import NDArray
 from scipy import special
 
 from .errors import InputError
-from .instrument import Instrument
-from .measured_noise import below_zero
+from .instrument.instrument import Instrument
 from .response import Order, electrons_per_second
-from .sky import Sky
+from .sky.zodiacal import Sky
+from .spectra.measured_noise import below_zero
 
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-    from .source import Source
+    from .stars.source import Source
 
 Float = NDArray[np.float64]
 

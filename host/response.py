@@ -26,7 +26,7 @@ from scipy.sparse import csr_array
 from scipy.special import erf, ndtr
 
 from .errors import InputError
-from .instrument import Instrument
+from .instrument.instrument import Instrument
 
 Order = Literal["paper", "physical"]
 Float = NDArray[np.float64]

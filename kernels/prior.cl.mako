@@ -1,4 +1,4 @@
-## Factors from tables of quantiles; see mauvecl/priors.py.
+## Factors from tables of quantiles; see mauvecl/noise/priors.py.
 /* A prior's factor, less one, at the probability that a word stands for. Its top bit chooses an end of the table, the
    other 31 and 23 finer ones are the probability from there times 2^32, whose float has octave and cell in its bits. */
 INLINE floatv quantile(uintv word, uintv finer, __global const float *table)

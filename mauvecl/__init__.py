@@ -9,20 +9,20 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from mauvecl.comparison import Comparison
-    from mauvecl.engine import Engine
-    from mauvecl.exposures import exposure_for
-    from mauvecl.gaussian import gaussian_report
+    from mauvecl.answers.exposures import exposure_for
+    from mauvecl.answers.gaussian import gaussian_report
+    from mauvecl.answers.limits import limiting_magnitude, shortest_exposure, smallest_amplitude
+    from mauvecl.answers.maps import detection_map
+    from mauvecl.device.engine import Engine
     from mauvecl.host.errors import InputError
     from mauvecl.host.expectation import Expectation, expect
-    from mauvecl.host.instrument import Instrument
-    from mauvecl.host.sky import Sky
-    from mauvecl.host.source import Source
-    from mauvecl.limits import limiting_magnitude, shortest_exposure, smallest_amplitude
-    from mauvecl.maps import detection_map
-    from mauvecl.pool import Pool
-    from mauvecl.statistics import Linear
-    from mauvecl.study import Study
+    from mauvecl.host.instrument.instrument import Instrument
+    from mauvecl.host.sky.zodiacal import Sky
+    from mauvecl.host.stars.source import Source
+    from mauvecl.noise.comparison import Comparison
+    from mauvecl.runs.pool import Pool
+    from mauvecl.statistics.definitions import Linear
+    from mauvecl.study.study import Study
 
 __version__ = "0.1.0"
 __all__ = [
@@ -46,23 +46,23 @@ __all__ = [
 ]
 
 _HOMES = {
-    "Comparison": "comparison",
-    "Engine": "engine",
+    "Comparison": "noise.comparison",
+    "Engine": "device.engine",
     "Expectation": "host.expectation",
     "InputError": "host.errors",
-    "Instrument": "host.instrument",
-    "Linear": "statistics",
-    "Pool": "pool",
-    "Sky": "host.sky",
-    "Source": "host.source",
-    "Study": "study",
-    "detection_map": "maps",
+    "Instrument": "host.instrument.instrument",
+    "Linear": "statistics.definitions",
+    "Pool": "runs.pool",
+    "Sky": "host.sky.zodiacal",
+    "Source": "host.stars.source",
+    "Study": "study.study",
+    "detection_map": "answers.maps",
     "expect": "host.expectation",
-    "exposure_for": "exposures",
-    "gaussian_report": "gaussian",
-    "limiting_magnitude": "limits",
-    "shortest_exposure": "limits",
-    "smallest_amplitude": "limits",
+    "exposure_for": "answers.exposures",
+    "gaussian_report": "answers.gaussian",
+    "limiting_magnitude": "answers.limits",
+    "shortest_exposure": "answers.limits",
+    "smallest_amplitude": "answers.limits",
 }
 
 

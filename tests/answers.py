@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from mauvecl.detection import Detection
-from mauvecl.snr import Counts, SnrResult
-from mauvecl.study import Study
+from mauvecl.results.detection import Detection
+from mauvecl.results.snr import Counts, SnrResult
+from mauvecl.study.study import Study
 
 #: Realisations: several shares, the last a short one.
 N = 30_000

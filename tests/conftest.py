@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import subprocess
+from pathlib import Path
+from typing import Any
+
 import pytest
 from scenes import instrument, star
 
-from mauvecl import shards
-from mauvecl.engine import Engine
+from mauvecl.device.engine import Engine
 from mauvecl.host.expectation import Expectation
+from mauvecl.runs import shards
 
 
 @pytest.fixture(scope="session")
@@ -20,6 +24,20 @@ def engine() -> Engine:
 def small_shares(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shares of 4096 realisations."""
     monkeypatch.setattr(shards, "SHARE", 1)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Any:
+    """A file system of its own with 2 MB, where tests may mount one."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=2m", "tmpfs", place], capture_output=True, check=False
+    )
+    if mounted.returncode:
+        pytest.skip("file systems cannot be mounted here")
+    yield place
+    subprocess.run(["umount", "-l", place], check=True)
 
 
 @pytest.fixture(scope="session")

@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import Any
 
 from mauvecl.host.expectation import Expectation, expect
-from mauvecl.host.instrument import Instrument
-from mauvecl.host.sky import Sky
-from mauvecl.host.source import Source
+from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.host.sky.zodiacal import Sky
+from mauvecl.host.stars.source import Source
 
 
 def instrument(name: str = "mauve", *, part: bool = False, **changes: Any) -> Instrument:

@@ -14,13 +14,13 @@ import pytest
 from typer.main import get_command
 
 from mauvecl.cli.app import app
-from mauvecl.host.instrument import Instrument
-from mauvecl.study import Study
+from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.study.study import Study
 
 ROOT = Path(__file__).parent.parent
 #: Pages whose Python needs a store or a cluster; that of all others runs as it stands.
 APART = ("bulk.md", "cluster.md")
-#: `mauvecl/roc.py`, or with a name in it: `mauvecl/roc.py: Roc`.
+#: `mauvecl/results/roc.py`, or with a name in it: `mauvecl/results/roc.py: Roc`.
 NAMED = re.compile(r"`((?:host|kernels|mauvecl|tests|bench|tools|docs)/[\w./*-]+\.\w+)(?::\s*(\w+))?[^`]*`")
 #: What defines a name, by a file's ending.
 DEFINITIONS = {

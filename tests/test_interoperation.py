@@ -17,8 +17,8 @@ from typer.testing import CliRunner
 from mauvecl import Source
 from mauvecl.cli.app import app
 from mauvecl.host.errors import InputError
-from mauvecl.host.flare import blackbody
-from mauvecl.host.flare_table import flares_of, read_flares
+from mauvecl.host.stars.flare import blackbody
+from mauvecl.host.stars.flare_table import flares_of, read_flares
 
 
 def test_a_synphot_spectrum_in_and_out() -> None:

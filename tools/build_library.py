@@ -1,4 +1,4 @@
-"""Rebuild host/library from public packages, so that anyone can see where each number comes from.
+"""Rebuild host/stars/library from public packages, so that anyone can see where each number comes from.
 
     python tools/build_library.py [FOLDER]
 
@@ -24,7 +24,7 @@ from astropy.io import fits
 from astropy.table import Table
 from scipy.interpolate import make_interp_spline
 
-LIBRARY = Path(__file__).parents[1] / "host" / "library"
+LIBRARY = Path(__file__).parents[1] / "host" / "stars" / "library"
 PACKAGES = {"EXOSIMS": "3.6.6", "pyphot": "2.1.0"}
 #: What the licence of each covers here, and where it is at home.
 COVERED = {

@@ -19,7 +19,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 
 PHILOX, NORMAL, POISSON = (f"kernels/{name}.cl.mako" for name in ("philox", "normal", "poisson"))
-TWIN = "mauvecl/reference.py"
+TWIN = "mauvecl/noise/twin.py"
 
 
 @dataclass(frozen=True)
@@ -35,35 +35,35 @@ SWAPPED = (
     "w[${4 * i}] = c0[${i}]; w[${4 * i + 1}] = c1[${i}]",
     "w[${4 * i}] = c1[${i}]; w[${4 * i + 1}] = c0[${i}]",
 )
-CUMULANTS = "mauvecl/cumulants.py"
+CUMULANTS = "mauvecl/noise/cumulants.py"
 SHAPE = "    g1, g2, g3 = c.shape()\n    sd ="
 
 MUTATIONS = {
     "a share under another's name": Mutation(
-        (("mauvecl/checkpoint.py", 'name.encode() + b"\\0" + body', "body"),),
-        "tests/test_pool.py::test_a_share_in_anothers_place",
+        (("mauvecl/runs/checkpoint.py", 'name.encode() + b"\\0" + body', "body"),),
+        "tests/runs/test_pool.py::test_a_share_in_anothers_place",
     ),
     "foreign chunks unseen": Mutation(
-        (("mauvecl/bulk.py", 'return "good" if digest(data) == known else "foreign"', 'return "good"'),),
-        "tests/test_bulk.py::test_faults_are_found_and_repaired_to_the_bit",
+        (("mauvecl/store/bulk.py", 'return "good" if digest(data) == known else "foreign"', 'return "good"'),),
+        "tests/store/test_bulk.py::test_faults_are_found_and_repaired_to_the_bit",
     ),
     "half a failed share kept": Mutation(
         (
             (
-                "mauvecl/shards.py",
+                "mauvecl/runs/shards.py",
                 "        tally, samples = Tally(plan.grids), plan.tails()\n",
                 "        tally, samples = self._sums[part]\n",
             ),
         ),
-        "tests/test_pool.py::test_a_failed_launch_is_counted_again",
+        "tests/runs/test_pool.py::test_a_failed_launch_is_counted_again",
     ),
     "far values lost": Mutation(
-        (("mauvecl/run.py", "        self._add_far(tile, tally)\n", ""),),
-        "tests/test_ends.py::test_every_number_is_that_of_sorting[0]",
+        (("mauvecl/device/launches.py", "        self._add_far(tile, tally)\n", ""),),
+        "tests/results/test_ends.py::test_every_number_is_that_of_sorting[0]",
     ),
     "far S/N lost": Mutation(
-        (("mauvecl/run.py", "            self._add_far_snr(tile, counts, np.flatnonzero(outside))\n", ""),),
-        "tests/test_ends.py::test_signal_to_noise_is_that_of_sorting[16-0]",
+        (("mauvecl/device/launches.py", "            self._add_far_snr(tile, counts, np.flatnonzero(outside))\n", ""),),
+        "tests/results/test_ends.py::test_signal_to_noise_is_that_of_sorting[16-0]",
     ),
     "7 rounds": Mutation(
         ((PHILOX, "range(3, 10)", "range(3, 7)"), (TWIN, "for r in range(10):", "for r in range(7):")),
@@ -78,7 +78,7 @@ MUTATIONS = {
         "tests/kernels/test_philox.py::test_known_answers",
     ),
     "swapped words, production kernel alone": Mutation(
-        (SWAPPED,), "tests/test_extremes.py::test_extreme_words_through_the_production_kernel"
+        (SWAPPED,), "tests/noise/test_extremes.py::test_extreme_words_through_the_production_kernel"
     ),
     "rounded normal for the dark": Mutation(
         (
@@ -92,7 +92,7 @@ MUTATIONS = {
         "tests/kernels/test_joint.py::test_pearson_of_raw_counts",
     ),
     "skew-only expansion of the dark": Mutation(
-        (("mauvecl/scene.py", "= -1 / (72 * root)", "= 0.0"),),
+        (("mauvecl/noise/scene.py", "= -1 / (72 * root)", "= 0.0"),),
         "tests/kernels/test_poisson.py::test_no_number_of_draws_would_tell_the_expansion",
     ),
     "joint draw allowed by its skew alone": Mutation(
@@ -105,7 +105,7 @@ MUTATIONS = {
     ),
     "rounding taken for noise everywhere": Mutation(
         ((CUMULANTS, "return ~shows(found, n * frame)", "return frame > 0"),),
-        "tests/test_stacks.py::test_random_stacks_of_quiet_frames",
+        "tests/noise/test_stacks.py::test_random_stacks_of_quiet_frames",
     ),
     "fifth cumulants of varying dark forgotten": Mutation(
         (
@@ -115,8 +115,8 @@ MUTATIONS = {
         "tests/kernels/test_joint_bound.py::test_factors_follow_the_cumulants",
     ),
     "pairs of two ways": Mutation(
-        (("mauvecl/scene.py", "_both_of_a_pair(mean >= SMALLEST_EXPANDED)", "mean >= SMALLEST_EXPANDED"),),
-        "tests/test_correlations.py::test_no_two_draws_are_tied",
+        (("mauvecl/noise/scene.py", "_both_of_a_pair(mean >= SMALLEST_EXPANDED)", "mean >= SMALLEST_EXPANDED"),),
+        "tests/noise/test_correlations.py::test_no_two_draws_are_tied",
     ),
     "skew-only expansion of the joint draw": Mutation(
         ((CUMULANTS, SHAPE, SHAPE.replace("    sd =", "    g2, g3 = 0 * g2, 0 * g3\n    sd =")),),
@@ -130,12 +130,12 @@ MUTATIONS = {
         "tests/kernels/test_normal.py::test_a_thousand_million_draws",
     ),
     "carry of the index dropped between launches": Mutation(
-        (("mauvecl/run.py", "np.uint32(self.first >> 32)", "np.uint32(0)"),),
-        "tests/test_extremes.py::test_counter_boundaries",
+        (("mauvecl/device/launches.py", "np.uint32(self.first >> 32)", "np.uint32(0)"),),
+        "tests/noise/test_extremes.py::test_counter_boundaries",
     ),
     "carry of the index dropped within a launch": Mutation(
-        (("mauvecl/engine.py", "first = index - index % size", "first = index - index % self._step"),),
-        "tests/test_extremes.py::test_counter_boundaries",
+        (("mauvecl/device/engine.py", "first = index - index % size", "first = index - index % self._step"),),
+        "tests/noise/test_extremes.py::test_counter_boundaries",
     ),
     "carry of the product dropped in odd lanes": Mutation(
         (
@@ -148,70 +148,70 @@ MUTATIONS = {
         "tests/kernels/test_philox.py::test_known_answers",
     ),
     "alias table off by one word": Mutation(
-        (("mauvecl/poisson.py", "rich << shift | left[poor]", "rich << shift | max(left[poor] - 1, 0)"),),
+        (("mauvecl/noise/poisson.py", "rich << shift | left[poor]", "rich << shift | max(left[poor] - 1, 0)"),),
         "tests/kernels/test_poisson.py::test_realised_probabilities",
     ),
     "alias table off by one count": Mutation(
-        (("mauvecl/poisson.py", "low + int(inside[0]))", "low + int(inside[0]) + 1)"),),
+        (("mauvecl/noise/poisson.py", "low + int(inside[0]))", "low + int(inside[0]) + 1)"),),
         "tests/kernels/test_joint.py::test_pearson_of_raw_counts",
     ),
     "two streams alike": Mutation(
-        (("mauvecl/layout.py", '"dark": 1', '"dark": 0'),),
+        (("mauvecl/noise/layout.py", '"dark": 1', '"dark": 0'),),
         "tests/kernels/test_layout.py::test_streams_are_distinct_bytes",
     ),
     "priors' tables too coarse at their ends": Mutation(
-        (("mauvecl/layout.py", "PRIOR_BITS = 7", "PRIOR_BITS = 4"),),
+        (("mauvecl/noise/layout.py", "PRIOR_BITS = 7", "PRIOR_BITS = 4"),),
         "tests/kernels/test_prior.py::test_moments",
     ),
     "priors' finer digits dropped": Mutation(
         (
             ("kernels/prior.cl.mako", "finer & (uintv)0x7fffffu", "finer & (uintv)0u"),
-            ("mauvecl/reference.py", "finer & np.uint32(0x7FFFFF)", "finer & np.uint32(0)"),
+            ("mauvecl/noise/twin.py", "finer & np.uint32(0x7FFFFF)", "finer & np.uint32(0)"),
         ),
         "tests/kernels/test_prior.py::test_tails",
     ),
     "saturation at the ADC's end alone": Mutation(
         (("host/expectation.py", "min(self.saturation_dn, float(self.adc_max_dn))", "float(self.adc_max_dn)"),),
-        "tests/test_saturation.py::test_closed_forms_are_those_of_what_is_drawn",
+        "tests/noise/test_saturation.py::test_closed_forms_are_those_of_what_is_drawn",
     ),
     "template of what is not recorded": Mutation(
         (
             (
-                "mauvecl/scene.py",
+                "mauvecl/noise/scene.py",
                 "mean_sum = template.recorded_dn",
                 "mean_sum = template.n_frames * template.mean_raw_dn",
             ),
         ),
-        "tests/test_saturation.py::test_closed_forms_are_those_of_what_is_drawn",
+        "tests/noise/test_saturation.py::test_closed_forms_are_those_of_what_is_drawn",
     ),
     "noise of what is subtracted forgotten": Mutation(
-        (("mauvecl/scene.py", "noisier = 1.0 + comparison.share", "noisier = 1.0"),),
-        "tests/test_tails.py::test_brute_force_agrees_whatever_is_compared",
+        (("mauvecl/noise/scene.py", "noisier = 1.0 + comparison.share", "noisier = 1.0"),),
+        "tests/results/test_tails.py::test_brute_force_agrees_whatever_is_compared",
     ),
     "quiescent exposures with the observed draws": Mutation(
-        (("mauvecl/layout.py", "REFERENCE = 64", "REFERENCE = 0"),),
-        "tests/test_detection.py::test_the_null_is_its_closed_form",
+        (("mauvecl/noise/layout.py", "REFERENCE = 64", "REFERENCE = 0"),),
+        "tests/results/test_detection.py::test_the_null_is_its_closed_form",
     ),
     "shifts forgotten in the closed form's phase": Mutation(
         (
             (
-                "mauvecl/statistics.py",
+                "mauvecl/statistics/definitions.py",
                 "phase = 0.5 * np.arctan(turn).sum(axis=1) + (u[:, None] * pull / spread).sum(axis=1)",
                 "phase = 0.5 * np.arctan(turn).sum(axis=1) + 0.0 * u",
             ),
         ),
-        "tests/test_statistics.py::test_equal_weights_are_a_scaled_non_central_chi_squared",
+        "tests/statistics/test_statistics.py::test_equal_weights_are_a_scaled_non_central_chi_squared",
     ),
     "one smoothed value in four dropped": Mutation(
         (
             ("kernels/comparison.cl.mako", "[k][s + 3u] = d;", "[k][s + 3u] = 0.0f;"),
             (
-                "mauvecl/reference_sums.py",
+                "mauvecl/results/twin.py",
                 "for centre, row in enumerate(self.rows):",
                 "for centre, row in enumerate([]):",
             ),
         ),
-        "tests/test_detection.py::test_the_null_is_its_closed_form",
+        "tests/results/test_detection.py::test_the_null_is_its_closed_form",
     ),
 }
 

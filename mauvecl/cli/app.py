@@ -40,7 +40,7 @@ def devices(
 
     Rate: pixel-realisations per second of the chi2 statistic, two scenarios. Example: mauvecl devices
     """
-    from mauvecl.rate import measured
+    from mauvecl.device.rate import measured
 
     found = measured() if rate else measured(measure=False)
     if as_json:
@@ -76,9 +76,10 @@ def selftest(
     """
     from dataclasses import asdict
 
-    from mauvecl import report, selftest
+    from mauvecl.answers import report
     from mauvecl.cli.console import Meter, show, show_table
-    from mauvecl.engine import Engine
+    from mauvecl.device import selftest
+    from mauvecl.device.engine import Engine
 
     started = time.perf_counter()
     folder = None if output is None else report.make_folder(output)
@@ -107,7 +108,7 @@ def schema() -> None:
 
     Example: mauvecl schema > study.schema.json, and a first line #:schema study.schema.json in the study
     """
-    from mauvecl.study import Study
+    from mauvecl.study.study import Study
 
     print(json.dumps(Study.model_json_schema(), indent=2))
 

@@ -100,7 +100,7 @@ def _failed(error: Exception) -> int:
     if type(error).__name__ == "Abort":
         return _say("interrupted", INTERRUPTED)
     # Imported late: program is not needed by verbs that draw nothing.
-    program = sys.modules.get("mauvecl.program")
+    program = sys.modules.get("mauvecl.device.program")
     if program is not None and isinstance(error, program.DeviceError):
         return _say(str(error), BAD_INPUT, whole=isinstance(error, program.BuildError))
     where = _write_traceback(error)

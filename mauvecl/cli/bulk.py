@@ -13,8 +13,8 @@ from mauvecl.cli.flags import BULK, DRAWS, FLARE, SWEEP, DeviceFlag, JsonFlag, Q
 
 if TYPE_CHECKING:
     from mauvecl.cli.session import Session
-    from mauvecl.store import Store
-    from mauvecl.study import Study
+    from mauvecl.store.form import Store
+    from mauvecl.study.study import Study
 
 StoreArgument = Annotated[Path, typer.Argument(help="Store that `mauvecl realise` wrote.")]
 RowsFlag = Annotated[
@@ -33,12 +33,12 @@ def realise(study: Study, session: Session) -> None:
 
     mauvecl realise --star G2V --magnitude 7.4 --amplitude 0.24 --exposure 5 -n 1000 --output frames.fits
     """
-    from mauvecl import bulk
     from mauvecl.cli.foresight import question_room
     from mauvecl.cli.session import told_of_interrupts, working
-    from mauvecl.export import ENDINGS
     from mauvecl.host.errors import InputError
-    from mauvecl.store import Store
+    from mauvecl.store import bulk
+    from mauvecl.store.export import ENDINGS
+    from mauvecl.store.form import Store
 
     place = session.output or Path("mauvecl-frames.zarr")
     one_file = place.suffix in ENDINGS
@@ -51,7 +51,7 @@ def realise(study: Study, session: Session) -> None:
         session.metered("spectra") as meter,
         working(session.device, session.cluster) as workers,
     ):
-        from mauvecl.pool import Pool
+        from mauvecl.runs.pool import Pool
 
         pool = Pool(workers)
         meter.standing = lambda: pool.standing
@@ -62,7 +62,7 @@ def realise(study: Study, session: Session) -> None:
 
 def _tell(store: Store, place: Path, session: Session) -> None:
     from mauvecl.cli.console import show_table
-    from mauvecl.labels import told
+    from mauvecl.study.labels import told
 
     messages = told([scene.expectation for scene in store.scenes])
     session.say(messages)
@@ -113,9 +113,9 @@ def verify(
     """
     from dataclasses import asdict
 
-    from mauvecl import bulk
     from mauvecl.cli.console import Meter, show, show_table
-    from mauvecl.engine import Engine
+    from mauvecl.device.engine import Engine
+    from mauvecl.store import bulk
 
     engine = Engine(device) if repair or redraw else None
     with Meter(quiet=quiet or as_json, unit="chunks") as meter:
@@ -148,9 +148,9 @@ def export(
     Example: mauvecl export frames.zarr some.fits --array star-1/quiescent --rows 0:1000
     """
     from mauvecl.cli.console import show
-    from mauvecl.export import Selection
-    from mauvecl.export import export as write
-    from mauvecl.store import Store
+    from mauvecl.store.export import Selection
+    from mauvecl.store.export import export as write
+    from mauvecl.store.form import Store
 
     write(Selection.of(Store.open(store), array, _rows_of(rows)), file)
     if not quiet:

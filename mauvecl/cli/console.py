@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
-    from mauvecl.pool import Standing
+    from mauvecl.runs.pool import Standing
 
 #: Work shorter than this shows no progress.
 PATIENCE_S = 2.0

@@ -6,20 +6,13 @@ import math
 from typing import TYPE_CHECKING
 
 from mauvecl.cli.console import short
-from mauvecl.cli.flags import (
-    DETECTION,
-    DRAWS,
-    FLARE,
-    SWEEP,
-    TEMPLATE,
-    takes_study,
-)
+from mauvecl.cli.flags import DETECTION, DRAWS, FLARE, SWEEP, TEMPLATE, takes_study
 
 if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.cli.session import Session
-    from mauvecl.study import Study
+    from mauvecl.study.study import Study
 
 
 #: Stars, or cells of a sweep, in one picture.
@@ -38,9 +31,9 @@ def detect(
 
     Example: mauvecl detect --star K5V --magnitude 6 --amplitude 0.05 --amplitude 0.1 --exposure 30
     """
-    from mauvecl import report
+    from mauvecl.answers import report
+    from mauvecl.answers.detect import detect as compute
     from mauvecl.cli.console import show_table
-    from mauvecl.detect_study import detect as compute
 
     with session.pool() as engine:
         found = compute(study, engine)
@@ -126,9 +119,9 @@ def gaussian(
 
     Example: mauvecl gaussian --star G2V --sweep magnitude=6,10 --sweep exposure=5,50
     """
-    from mauvecl import report
+    from mauvecl.answers import report
+    from mauvecl.answers.gaussian import gaussian_report
     from mauvecl.cli.console import show_table
-    from mauvecl.gaussian import gaussian_report
 
     with session.pool() as engine:
         found = gaussian_report(study, engine)

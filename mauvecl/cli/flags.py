@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_type_hints
 import typer
 
 if TYPE_CHECKING:
-    from mauvecl.study import Study
+    from mauvecl.study.study import Study
 
 StudyFile = Annotated[
     Path | None,
@@ -215,7 +215,7 @@ def axis_of(text: str, flag: str) -> dict[str, Any]:
 
 def _amplitudes_of(path: Path) -> list[float]:
     """Those of a table of flares, each once."""
-    from mauvecl.host.flare_table import read_flares
+    from mauvecl.host.stars.flare_table import read_flares
 
     return sorted({float(value) for value in read_flares(path)["amplitude"]})
 
@@ -382,7 +382,7 @@ def _study(
 ) -> Study:
     """A study file, or the default, with the flags on top, and ``--set`` on top of those."""
     from mauvecl.host.errors import InputError
-    from mauvecl.study import Study
+    from mauvecl.study.study import Study
 
     study = Study.read(file) if file is not None else default(given) if default else Study()
     changes: dict[str, dict[str, Any]] = {"sky": _sky(given)}
@@ -442,7 +442,7 @@ def _stars(study: Study, given: dict[str, Any]) -> list[dict[str, Any]] | None:
 
 
 def _is_file(name: str) -> bool:
-    from mauvecl.host.formats import without_columns
+    from mauvecl.host.spectra.formats import without_columns
 
     try:
         file, _ = without_columns(name)

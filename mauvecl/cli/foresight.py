@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 from mauvecl.host.errors import InputError
 
 if TYPE_CHECKING:
-    from mauvecl.store import Store
-    from mauvecl.study import Study
+    from mauvecl.store.form import Store
+    from mauvecl.study.study import Study
 
 YEAR_S = 365.25 * 86_400.0
 #: Pixel-realisations a second of one core, counted per scenario: the best of `bench/results/rates.ecsv`, 1.2e10 on two

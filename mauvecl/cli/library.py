@@ -11,7 +11,7 @@ import typer
 from mauvecl.cli.flags import ExtendFlag, FluxUnitFlag, JsonFlag, QuietFlag, WavelengthUnitFlag
 
 if TYPE_CHECKING:
-    from mauvecl.host.own_stars import OwnStar
+    from mauvecl.host.stars.own_stars import OwnStar
 
 app = typer.Typer(invoke_without_command=True, rich_markup_mode=None)
 ReplaceFlag = Annotated[bool, typer.Option("--replace", help="Take the place of a kept star of that name.")]
@@ -29,8 +29,8 @@ def library(context: typer.Context, as_json: JsonFlag = False) -> None:
     """
     if context.invoked_subcommand is not None:
         return
-    from mauvecl.host.catalogue import library_table
-    from mauvecl.report import rows
+    from mauvecl.answers.report import rows
+    from mauvecl.host.stars.catalogue import library_table
 
     table = library_table()
     if as_json:
@@ -67,7 +67,7 @@ def add(
     Example: mauvecl library add my-star.txt --name "HD 1234"
     """
     from mauvecl.host.errors import InputError
-    from mauvecl.host.own_stars import add
+    from mauvecl.host.stars.own_stars import add
 
     if name is not None and len(files) > 1:
         raise InputError(f"--name {name!r} for {len(files)} files, expected one file")
@@ -94,7 +94,7 @@ def fetch(
     """
     import sys
 
-    from mauvecl.host.own_stars import fetch
+    from mauvecl.host.stars.own_stars import fetch
 
     for name in names:
         shown = not quiet and sys.stderr.isatty()
@@ -108,7 +108,7 @@ def remove(names: Annotated[list[str], typer.Argument(help="Names of kept stars.
     Example: mauvecl library remove "HD 1234"
     """
     from mauvecl.cli.console import show
-    from mauvecl.host.own_stars import remove
+    from mauvecl.host.stars.own_stars import remove
 
     for name in names:
         remove(name)

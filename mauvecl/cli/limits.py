@@ -8,21 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mauvecl.cli.console import short
-from mauvecl.cli.flags import (
-    DETECTION,
-    DRAWS,
-    FLARE,
-    LIMIT,
-    MAP,
-    SWEEP,
-    UNKNOWN,
-    takes_study,
-)
+from mauvecl.cli.flags import DETECTION, DRAWS, FLARE, LIMIT, MAP, SWEEP, UNKNOWN, takes_study
 
 if TYPE_CHECKING:
+    from mauvecl.answers.limits import Limit
     from mauvecl.cli.session import Session
-    from mauvecl.limits import Limit
-    from mauvecl.study import Study
+    from mauvecl.study.study import Study
 
 
 @takes_study(LIMIT, FLARE, DRAWS, DETECTION, UNKNOWN, SWEEP)
@@ -39,10 +30,10 @@ def limit(
 
     Example: mauvecl limit --star G2V --amplitude 0.24 --exposure 50
     """
-    from mauvecl import report
+    from mauvecl.answers import report
+    from mauvecl.answers.limits import limiting_magnitude
     from mauvecl.cli.console import show_table
-    from mauvecl.labels import told
-    from mauvecl.limits import limiting_magnitude
+    from mauvecl.study.labels import told
 
     with session.pool() as engine:
         found = limiting_magnitude(study, engine)
@@ -54,7 +45,7 @@ def limit(
     session.leave(lambda: found.write(session.folder))
     moved = None
     if assumptions:
-        from mauvecl.assumptions import what_matters
+        from mauvecl.answers.assumptions import what_matters
 
         moved = what_matters(study)
         session.write(moved, "assumptions.ecsv")
@@ -130,8 +121,8 @@ def detection_map(
 
     Example: mauvecl map --star G2V --x magnitude:4:10:16 --y amplitude:0.01:1:16:log
     """
-    from mauvecl import report
-    from mauvecl.maps import detection_map as compute
+    from mauvecl.answers import report
+    from mauvecl.answers.maps import detection_map as compute
 
     with session.pool(unit="cells") as engine:
         found = compute(study, engine, progress=session.meter)

@@ -9,18 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mauvecl.cli.console import short
-from mauvecl.cli.flags import (
-    DRAWS,
-    FLARE,
-    SIGNAL,
-    SWEEP,
-    takes_study,
-)
+from mauvecl.cli.flags import DRAWS, FLARE, SIGNAL, SWEEP, takes_study
 
 if TYPE_CHECKING:
+    from mauvecl.answers.snr import SnrAnswer
     from mauvecl.cli.session import Session
-    from mauvecl.snr_study import SnrAnswer
-    from mauvecl.study import Study
+    from mauvecl.study.study import Study
 
 
 @takes_study(FLARE, {"seed": DRAWS["seed"]}, draws=False)
@@ -34,7 +28,7 @@ def simulate(
 
     Example: mauvecl simulate --star G2V --magnitude 7.4 --exposure 50 --amplitude 0.24
     """
-    from mauvecl.simulate_study import simulate as compute
+    from mauvecl.answers.simulate import simulate as compute
 
     found = compute(study, realisation=realisation, flaring=bool(given["amplitude"]))
     session.say(found.messages)
@@ -79,7 +73,7 @@ def simulate(
 
 def _budgets_or_star(given: dict[str, Any]) -> Study:
     """The paper's noise budgets where nothing is named, else the paper's stars."""
-    from mauvecl.study import PAPER_BUDGETS, Study
+    from mauvecl.study.study import PAPER_BUDGETS, Study
 
     named = any(given[name] for name in ("star", "magnitude", "exposure", "sweep"))
     return Study() if named else PAPER_BUDGETS
@@ -98,8 +92,8 @@ def snr(
 
     mauvecl snr --star G2V --sweep magnitude=4,6,8,10 --sweep exposure=5,50,600
     """
-    from mauvecl import report
-    from mauvecl.snr_study import snr as compute
+    from mauvecl.answers import report
+    from mauvecl.answers.snr import snr as compute
 
     with session.pool() as engine:
         found = compute(study, engine)
@@ -132,8 +126,8 @@ def _snr_pictures(found: SnrAnswer, folder: Path) -> list[Path]:
 
 def _show_snr(found: SnrAnswer) -> None:
     """S/N and noise at some wavelengths; all of them are in the files."""
+    from mauvecl.answers.exposures import place_of
     from mauvecl.cli.console import show_table
-    from mauvecl.exposures import place_of
 
     cells, budgets = [], []
     for star in found.stars:
@@ -170,10 +164,10 @@ def exposure(
 
     Example: mauvecl exposure --snr 10 --at 300 --star G2V --magnitude 7.4
     """
-    from mauvecl import report
+    from mauvecl.answers import report
+    from mauvecl.answers.exposures import exposure_for
     from mauvecl.cli.console import show_table
     from mauvecl.cli.limits import drawn
-    from mauvecl.exposures import exposure_for
 
     found, wanted = exposure_for(study), study.signal
     session.leave(lambda: found.write(session.folder))

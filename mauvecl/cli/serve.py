@@ -25,8 +25,8 @@ def serve(
 
     Example: mauvecl serve --show
     """
-    from mauvecl.host.bounded import shortened
     from mauvecl.host.errors import InputError
+    from mauvecl.host.files.bounded import shortened
 
     if find_spec("panel") is None:
         raise InputError("Panel is missing, expected it for the page: pip install 'mauvecl[web]'")

@@ -19,11 +19,11 @@ from mauvecl.cli.boundary import writes_to
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from mauvecl.checkpoint import Checkpoint
     from mauvecl.cli.console import Meter
     from mauvecl.host.expectation import Expectation
-    from mauvecl.pool import Pool, Workers
-    from mauvecl.study import Study
+    from mauvecl.runs.checkpoint import Checkpoint
+    from mauvecl.runs.pool import Pool, Workers
+    from mauvecl.study.study import Study
 
 
 class Terminated(KeyboardInterrupt):
@@ -92,8 +92,8 @@ class Session:
     @cached_property
     def folder(self) -> Path:
         """Where everything is written; held from now on."""
-        from mauvecl.durable import alone
-        from mauvecl.report import make_folder
+        from mauvecl.answers.report import make_folder
+        from mauvecl.runs.durable import alone
 
         folder = make_folder(self.output or Path(f"mauvecl-{self.verb}"))
         writes_to(folder)
@@ -109,8 +109,8 @@ class Session:
         unit : str
             What progress counts: realisations, which the pool tells, or something that the caller tells `meter`.
         """
-        from mauvecl.checkpoint import Checkpoint
-        from mauvecl.pool import Pool
+        from mauvecl.runs.checkpoint import Checkpoint
+        from mauvecl.runs.pool import Pool
 
         how: dict[str, Any] = {"resume": self.resume, "restart": self.restart}
         if self.keep_after is not None:
@@ -166,7 +166,7 @@ class Session:
 
     def write(self, table: Table, name: str) -> None:
         """A table into the folder, by its name's ending."""
-        from mauvecl.report import write_table
+        from mauvecl.answers.report import write_table
 
         self.leave(lambda: write_table(table, self.folder / name))
 
@@ -183,7 +183,7 @@ class Session:
 
     def record(self, study: Study, inputs: Sequence[Expectation], messages: Sequence[str]) -> None:
         """The study and the run's record into the folder; what was kept for a resume is no longer needed."""
-        from mauvecl.report import write_record, write_study
+        from mauvecl.answers.report import write_record, write_study
 
         if self.folder / "study.toml" not in self.files:
             self.leave(lambda: write_study(study, self.folder))
@@ -209,10 +209,10 @@ class Session:
 @contextmanager
 def working(device: str | None, cluster: str | None) -> Iterator[Workers]:
     """The workers asked for; let go at the end, at once where the work ended early."""
-    from mauvecl.pool import LocalWorkers
+    from mauvecl.runs.pool import LocalWorkers
 
     if cluster is not None:
-        from mauvecl.cluster import DaskWorkers
+        from mauvecl.runs.cluster import DaskWorkers
 
         workers: Workers = DaskWorkers(cluster, device)
     else:

@@ -13,10 +13,10 @@ from mauvecl.pictures.style import COLOURS, MOST_COLUMNS, NAMES, NULL, STYLE, fi
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-    from mauvecl.detection import Detection
     from mauvecl.host.expectation import Expectation
-    from mauvecl.roc import Roc
-    from mauvecl.snr import SnrResult
+    from mauvecl.results.detection import Detection
+    from mauvecl.results.roc import Roc
+    from mauvecl.results.snr import SnrResult
 
 #: A star: title, findings, and its flares' names.
 Shown = tuple[str, "Detection", Sequence[str]]
@@ -171,7 +171,7 @@ def observation(title: str, table: QTable, path: str | Path | None = None) -> An
 
 def signal_to_noise(stars: Sequence[tuple[str, SnrResult | Expectation]], path: str | Path | None = None) -> Any:
     """S/N per pixel and per resolution element: closed form, and the spread of realisations where there are some."""
-    from mauvecl.snr import SnrResult
+    from mauvecl.results.snr import SnrResult
 
     plt = pyplot()
     with plt.rc_context(STYLE):

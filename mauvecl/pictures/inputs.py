@@ -11,9 +11,9 @@ import numpy as np
 from mauvecl.pictures.style import COLOURS, NULL, STYLE, finished, pyplot
 
 if TYPE_CHECKING:
-    from mauvecl.host.instrument import Instrument
-    from mauvecl.host.sky import Sky
-    from mauvecl.host.source import Source
+    from mauvecl.host.instrument.instrument import Instrument
+    from mauvecl.host.sky.zodiacal import Sky
+    from mauvecl.host.stars.source import Source
 
 FLUX = "flux (erg s$^{-1}$ cm$^{-2}$ Å$^{-1}$)"
 WAVELENGTH = "wavelength (nm)"

@@ -8,16 +8,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.labels import titled
 from mauvecl.pictures.style import AXES, COLOURS, NAMES, NULL, STYLE, finished, pyplot
+from mauvecl.study.labels import titled
 
 if TYPE_CHECKING:
-    from mauvecl.exposures import ExposureResult
-    from mauvecl.gaussian import GaussianReport
+    from mauvecl.answers.exposures import ExposureResult
+    from mauvecl.answers.gaussian import GaussianReport
+    from mauvecl.answers.limits import LimitResult
+    from mauvecl.answers.maps import MapResult
+    from mauvecl.answers.snr import SnrAnswer
     from mauvecl.host.expectation import Expectation
-    from mauvecl.limits import LimitResult
-    from mauvecl.maps import MapResult
-    from mauvecl.snr_study import SnrAnswer
 
 
 def detection_map(found: MapResult, path: str | Path | None) -> Any:
@@ -137,7 +137,7 @@ def noise_budget(observed: Sequence[tuple[str, Expectation]], *, each: int = 1, 
 
 def snr_sweep(found: SnrAnswer, path: str | Path | None = None) -> Any:
     """S/N of some elements against what is swept first, a line for each value of the rest."""
-    from mauvecl.exposures import place_of
+    from mauvecl.answers.exposures import place_of
 
     plt = pyplot()
     first = found.study.sweep.axes[0].quantity

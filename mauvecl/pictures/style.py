@@ -6,7 +6,7 @@ import io
 from pathlib import Path
 from typing import Any
 
-from mauvecl.durable import write_whole
+from mauvecl.runs.durable import write_whole
 
 #: Okabe and Ito's colours, which colour-blind readers can tell apart (jfly.uni-koeln.de/color).
 COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7", "#000000")

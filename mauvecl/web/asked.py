@@ -9,14 +9,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import panel as pn
 
-from mauvecl.detect_study import DetectAnswer, detect
-from mauvecl.maps import MapResult, detection_map
-from mauvecl.snr_study import SnrAnswer, snr
-from mauvecl.study import Study
+from mauvecl.answers.detect import DetectAnswer, detect
+from mauvecl.answers.maps import MapResult, detection_map
+from mauvecl.answers.snr import SnrAnswer, snr
+from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
-    from mauvecl.limits import LimitResult
-    from mauvecl.pool import Pool
+    from mauvecl.answers.limits import LimitResult
+    from mauvecl.runs.pool import Pool
 
 #: The map of the page: cells along each axis, and realisations of each.
 MAP_STEPS, MAP_REALISATIONS = 8, 20_000

@@ -13,8 +13,8 @@ from panel.io.server import WSHandler
 from tornado.routing import Matcher, Rule
 from tornado.web import RequestHandler
 
-from mauvecl.host.bounded import shortened
 from mauvecl.host.errors import InputError
+from mauvecl.host.files.bounded import shortened
 
 if TYPE_CHECKING:
     from bokeh.protocol.message import Message

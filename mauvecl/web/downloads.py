@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from astropy.table import Table
 
     from mauvecl.host.expectation import Expectation
-    from mauvecl.study import Study
+    from mauvecl.study.study import Study
 
 
 def study_file(study: Study) -> io.BytesIO:
@@ -57,7 +57,7 @@ def as_file(name: str, ending: str, study: Study, quiet: Expectation, found: Map
     InputError
         If it is not computed yet.
     """
-    from mauvecl.report import write_table
+    from mauvecl.answers.report import write_table
 
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"{name}.{ending}"
@@ -106,7 +106,7 @@ def _draw(name: str, study: Study, quiet: Expectation, found: Mapping[str, Any],
 
 def _observed(study: Study) -> Table:
     """One observation with the flare, taken apart."""
-    from mauvecl.simulate_study import simulate
+    from mauvecl.answers.simulate import simulate
 
     return simulate(study, flaring=True).observations[1][2]
 

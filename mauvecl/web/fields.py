@@ -7,11 +7,11 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
-from mauvecl.host.bands import ALIASES
-from mauvecl.host.bounded import shortened
-from mauvecl.host.catalogue import embedded, library_table
 from mauvecl.host.errors import InputError
-from mauvecl.statistics import STATISTICS
+from mauvecl.host.files.bounded import shortened
+from mauvecl.host.stars.bands import ALIASES
+from mauvecl.host.stars.catalogue import embedded, library_table
+from mauvecl.statistics.definitions import STATISTICS
 
 UPLOADED = "uploaded star"
 #: Realisations that a visitor may ask for.

@@ -14,15 +14,15 @@ from typing import TYPE_CHECKING, Any
 
 import panel as pn
 
-from mauvecl.detection import Detection
-from mauvecl.host.bounded import shortened
+from mauvecl.answers.limits import LimitResult, limiting_magnitude
+from mauvecl.answers.maps import MapResult
+from mauvecl.device.program import DeviceError
 from mauvecl.host.errors import InputError
-from mauvecl.labels import told
-from mauvecl.limits import LimitResult, limiting_magnitude
-from mauvecl.maps import MapResult
-from mauvecl.program import DeviceError
-from mauvecl.scene import prepare
-from mauvecl.study import Study
+from mauvecl.host.files.bounded import shortened
+from mauvecl.noise.scene import prepare
+from mauvecl.results.detection import Detection
+from mauvecl.study.labels import told
+from mauvecl.study.study import Study
 from mauvecl.web.asked import detect_and_snr, map_around, picture
 from mauvecl.web.bridge import Bridge, attach
 from mauvecl.web.controls import Controls
@@ -35,8 +35,8 @@ from mauvecl.web.work import Cancelled, Job, reading
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
-    from mauvecl.host.source import Source
-    from mauvecl.pool import Pool
+    from mauvecl.host.stars.source import Source
+    from mauvecl.runs.pool import Pool
 
 log = logging.getLogger(__name__)
 

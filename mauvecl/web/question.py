@@ -7,11 +7,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.host.errors import InputError
-from mauvecl.study import Study
+from mauvecl.study.study import Study
 from mauvecl.web.fields import UPLOADED
 
 if TYPE_CHECKING:
-    from mauvecl.host.source import Source
+    from mauvecl.host.stars.source import Source
 
 #: Name of an uploaded star's file beside its study.
 STAR_FILE = "star.ecsv"

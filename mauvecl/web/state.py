@@ -9,13 +9,13 @@ from collections.abc import Mapping
 from typing import TYPE_CHECKING
 from urllib.parse import parse_qsl, urlencode
 
-from mauvecl.host.bounded import shortened
 from mauvecl.host.errors import InputError
+from mauvecl.host.files.bounded import shortened
 from mauvecl.web.fields import FIELDS, MOST_CHARACTERS, SEEN, UPLOADED
 from mauvecl.web.question import Question
 
 if TYPE_CHECKING:
-    from mauvecl.host.source import Source
+    from mauvecl.host.stars.source import Source
 
 #: Bytes of a link's values that are looked at.
 MOST_LINKED = 4096

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
-from mauvecl.host.bounded import shortened
 from mauvecl.host.errors import InputError
-from mauvecl.host.source import Source
+from mauvecl.host.files.bounded import shortened
+from mauvecl.host.stars.source import Source
 from mauvecl.web.fields import UPLOADED
 from mauvecl.web.limited import read_limited
 

@@ -17,10 +17,10 @@ if TYPE_CHECKING:
     from astropy.table import QTable
     from numpy.typing import NDArray
 
-    from mauvecl.detect_study import StarDetection
+    from mauvecl.answers.detect import StarDetection
     from mauvecl.host.expectation import Expectation
-    from mauvecl.host.source import Source
-    from mauvecl.statistics import Normal, QuadraticForm
+    from mauvecl.host.stars.source import Source
+    from mauvecl.statistics.definitions import Normal, QuadraticForm
 
 HEIGHT = 430
 

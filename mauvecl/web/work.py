@@ -9,8 +9,8 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 from typing import Any
 
-from mauvecl.engine import Engine
-from mauvecl.pool import LocalWorkers, Pool, Standing
+from mauvecl.device.engine import Engine
+from mauvecl.runs.pool import LocalWorkers, Pool, Standing
 
 #: Simulations that a server computes at the same time; others wait.
 TOGETHER = 2

@@ -12,8 +12,8 @@ from astropy.io import fits
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import expect
-from mauvecl.host.instrument import Instrument
-from mauvecl.host.source import Source
+from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.host.stars.source import Source
 
 HERE = Path(__file__).parents[1] / "data" / "spectra"
 ANGSTROM = {"wavelength_unit": "Angstrom"}

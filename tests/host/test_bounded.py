@@ -10,8 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from mauvecl.host.bounded import read_bytes, shortened, unpacked
 from mauvecl.host.errors import InputError
+from mauvecl.host.files.bounded import read_bytes, shortened, unpacked
 
 PACKERS = pytest.mark.parametrize("pack", [gzip.compress, bz2.compress, lzma.compress])
 

@@ -14,9 +14,9 @@ import pytest
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation, expect
-from mauvecl.host.instrument import Instrument
-from mauvecl.host.sky import Sky
-from mauvecl.host.source import Source
+from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.host.sky.zodiacal import Sky
+from mauvecl.host.stars.source import Source
 
 
 @pytest.fixture(scope="module")
@@ -236,6 +236,6 @@ def test_order_changes_little_but_in_the_ultraviolet(sunlike: Source, mauve: Ins
 
 def test_import_is_light() -> None:
     heavy = "{'synphot', 'matplotlib', 'pyopencl', 'specutils', 'astropy.table', 'astropy.coordinates'}"
-    code = f"import sys, mauvecl.host.expectation, mauvecl.host.source; print(sorted({heavy} & set(sys.modules)))"
+    code = f"import sys, mauvecl.host.expectation, mauvecl.host.stars.source; print(sorted({heavy} & set(sys.modules)))"
     found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert found.stdout.strip() == "[]"

@@ -11,7 +11,7 @@ from astropy.io import fits
 from astropy.table import MaskedColumn, Table
 
 from mauvecl.host.errors import InputError
-from mauvecl.host.source import Source
+from mauvecl.host.stars.source import Source
 
 FLAM = u.erg / (u.s * u.cm**2 * u.AA)
 NM = np.arange(170.0, 1100.0, 1.0)

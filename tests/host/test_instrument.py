@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mauvecl.host.curve import Curve
 from mauvecl.host.errors import InputError
-from mauvecl.host.instrument import LABELS, Instrument
+from mauvecl.host.instrument.curve import Curve
+from mauvecl.host.instrument.instrument import LABELS, Instrument
 
 # Computed independently of this code: wavelength nm, total efficiency, effective area cm^2.
 PUBLISHED = [

@@ -7,8 +7,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mauvecl.host import bands, catalogue
-from mauvecl.host.source import Source
+from mauvecl.host.stars import bands, catalogue
+from mauvecl.host.stars.source import Source
 
 
 def near_ultraviolet(name: str) -> float:

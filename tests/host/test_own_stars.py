@@ -16,13 +16,13 @@ from astropy.io import fits
 from typer.testing import CliRunner
 
 from mauvecl.cli.app import app
-from mauvecl.host import own_stars
-from mauvecl.host.catalogue import library_table
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import expect
-from mauvecl.host.instrument import Instrument
-from mauvecl.host.source import Source
-from mauvecl.study import Study
+from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.host.stars import own_stars
+from mauvecl.host.stars.catalogue import library_table
+from mauvecl.host.stars.source import Source
+from mauvecl.study.study import Study
 
 
 @pytest.fixture(autouse=True)

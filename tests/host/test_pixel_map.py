@@ -9,9 +9,9 @@ import pytest
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation, expect
-from mauvecl.host.instrument import Instrument
-from mauvecl.host.pixel_map import PixelMap
-from mauvecl.host.source import Source
+from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.host.instrument.pixel_map import PixelMap
+from mauvecl.host.stars.source import Source
 
 
 def seen(payload: Instrument) -> Expectation:

@@ -12,7 +12,7 @@ from scipy.special import erf
 
 from mauvecl.host import response
 from mauvecl.host.errors import InputError
-from mauvecl.host.instrument import Instrument
+from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.response import Line, Order, electrons_per_second, response_matrix
 
 Float = NDArray[np.float64]

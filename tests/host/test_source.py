@@ -10,12 +10,12 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
-from mauvecl.host import bands, catalogue
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import expect
-from mauvecl.host.flare import blackbody
-from mauvecl.host.instrument import Instrument
-from mauvecl.host.source import Source
+from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.host.stars import bands, catalogue
+from mauvecl.host.stars.flare import blackbody
+from mauvecl.host.stars.source import Source
 
 DATA = Path(__file__).parents[1] / "data"
 LIBRARY = Path(catalogue.__file__).parent / "library"
@@ -418,8 +418,8 @@ def test_a_pixels_error_is_the_scatter_of_its_means() -> None:
     200 draws tell a standard deviation to 5 %, and the error told, a mean over 20 of them, is right to 3 %: 0.75 to
     1.25 is beyond four deviations and fails by chance less than once in 1e3 for any of ten pixels, of a fixed seed.
     """
-    from mauvecl.host.measured_noise import error_per_second
     from mauvecl.host.response import electrons_per_second
+    from mauvecl.host.spectra.measured_noise import error_per_second
 
     mauve = Instrument.load("mauve")
     nm = np.arange(170.0, 800.0, 0.5)

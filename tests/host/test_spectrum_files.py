@@ -16,8 +16,8 @@ from astropy.io import fits, votable
 from astropy.table import Column, MaskedColumn, Table
 
 from mauvecl.host.errors import InputError
-from mauvecl.host.formats import read_spectrum
-from mauvecl.host.source import Source
+from mauvecl.host.spectra.formats import read_spectrum
+from mauvecl.host.stars.source import Source
 
 FLAM = u.erg / (u.s * u.cm**2 * u.AA)
 #: Two nm apart; not straight, so that a wrong order, unit or shift shows at each point.

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from mauvecl.engine import Engine
-from mauvecl.probes import Probes
+from mauvecl.device.engine import Engine
+from mauvecl.device.probes import Probes
 
 
 @pytest.fixture(scope="session", params=["vector forms", "vectors of built-ins", "scalar"])

@@ -9,12 +9,12 @@ import pytest
 from scenes import star
 from scipy import special, stats
 
-from mauvecl import layout
-from mauvecl.cumulants import MOST_SKEW, Cumulants, joint_is_exact, needs_fourth_power, polynomial
-from mauvecl.engine import Engine
+from mauvecl.device.engine import Engine
+from mauvecl.device.selftest import pearson
 from mauvecl.host.expectation import Expectation
-from mauvecl.scene import prepare
-from mauvecl.selftest import pearson
+from mauvecl.noise import layout
+from mauvecl.noise.cumulants import MOST_SKEW, Cumulants, joint_is_exact, needs_fourth_power, polynomial
+from mauvecl.noise.scene import prepare
 
 
 def one_pixel(dark: float, photons: float, read: float, *, unit: str = "DN", noise: str = "poisson") -> Expectation:

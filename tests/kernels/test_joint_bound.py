@@ -10,12 +10,12 @@ import pytest
 from scenes import instrument, star
 from scipy import optimize
 
-from mauvecl import reference
-from mauvecl.cumulants import DRAWS_TO_NOTICE, Cumulants, joint_is_exact, left_out, needs_fourth_power, polynomial
+from mauvecl.device.selftest import toy
 from mauvecl.host.errors import InputError
-from mauvecl.processes import Processes, Uniform
-from mauvecl.scene import prepare
-from mauvecl.selftest import toy
+from mauvecl.noise import twin as reference
+from mauvecl.noise.cumulants import DRAWS_TO_NOTICE, Cumulants, joint_is_exact, left_out, needs_fourth_power, polynomial
+from mauvecl.noise.processes import Processes, Uniform
+from mauvecl.noise.scene import prepare
 
 #: By exact convolution no allowed draw is told apart sooner; the condition's own estimate is right to 4 % there.
 SOONEST = 4e13

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from mauvecl import layout
-from mauvecl.probes import Probes
+from mauvecl.device.probes import Probes
+from mauvecl.noise import layout
 
 
 def test_every_offset_on_the_device(probes: Probes) -> None:

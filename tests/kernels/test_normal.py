@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy import special, stats
 
-from mauvecl import reference
-from mauvecl.engine import Engine
-from mauvecl.probes import Probes
+from mauvecl.device.engine import Engine
+from mauvecl.device.probes import Probes
+from mauvecl.noise import twin as reference
 
 #: Words at every end of every branch: zeros, ones, signs, quadrants, the split of the logarithm.
 EDGES = np.array(

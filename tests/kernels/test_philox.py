@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import randomgen
 
-from mauvecl import reference
-from mauvecl.probes import Probes
+from mauvecl.device.probes import Probes
+from mauvecl.noise import twin as reference
 
 #: Random123's kat_vectors: counter, key, output.
 KNOWN = [

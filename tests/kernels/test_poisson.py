@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mauvecl import reference, selftest
-from mauvecl.engine import Engine
-from mauvecl.poisson import SMALLEST_EXPANDED, alias_table, table_set
-from mauvecl.probes import Probes
-from mauvecl.scene import prepare
+from mauvecl.device import selftest
+from mauvecl.device.engine import Engine
+from mauvecl.device.probes import Probes
+from mauvecl.noise import twin as reference
+from mauvecl.noise.poisson import SMALLEST_EXPANDED, alias_table, table_set
+from mauvecl.noise.scene import prepare
 
 MEANS = [0.0, 0.5, 5.0, 64.0, 2225.0, 22250.0, 222500.0]
 

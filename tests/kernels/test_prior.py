@@ -7,11 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from mauvecl import reference
+from mauvecl.device.probes import Probes
 from mauvecl.host.errors import InputError
-from mauvecl.priors import Normal, Prior, Uniform, nodes
-from mauvecl.probes import Probes
-from mauvecl.processes import Processes
+from mauvecl.noise import twin as reference
+from mauvecl.noise.priors import Normal, Prior, Uniform, nodes
+from mauvecl.noise.processes import Processes
 
 CONDITIONS = {"temperature_c": 21.0, "dark_slope_per_c": 0.0684, "light_loss": 0.34, "pointing_loss": 0.02}
 #: What each prior's value makes of the light or the dark.

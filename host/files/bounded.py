@@ -1,0 +1,135 @@
+"""Files from outside, read within limits: regular files only, and never more bytes than expected, packed or not."""
+
+from __future__ import annotations
+
+import bz2
+import lzma
+import os
+import stat
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+
+#: Largest file that is read, and largest content that one may unpack to, MiB; the environment can set others.
+LIMITS = {"MAUVECL_LARGEST_FILE_MIB": 256, "MAUVECL_LARGEST_CONTENT_MIB": 512}
+#: Bytes unpacked at a time.
+PIECE = 1 << 20
+#: Memory that unpacking xz may take beside its output; its highest preset needs 65 MiB.
+XZ_MEMORY = 128 << 20
+
+
+def limit_bytes(variable: str) -> int:
+    """A limit in bytes, from the environment or `LIMITS`.
+
+    Raises
+    ------
+    InputError
+        If the environment holds no whole number of MiB from 1 to 2**20.
+    """
+    text = os.environ.get(variable, str(LIMITS[variable]))
+    if not (text.isascii() and text.isdigit() and len(text) <= 7 and 1 <= int(text) <= 2**20):
+        raise InputError(f"{variable} = {text[:40]!r}, expected a whole number of MiB from 1 to 1048576")
+    return int(text) << 20
+
+
+def read_bytes(path: Path, what: str) -> bytes:
+    """The content of a regular file of bounded size, as it is.
+
+    Parameters
+    ----------
+    path : Path
+    what : str
+        What the file should be, for messages: "spectrum file", "study".
+
+    Raises
+    ------
+    InputError
+        If there is no such file, it is no regular file, is too large, or cannot be read.
+    """
+    shown = shortened(str(path))
+    try:
+        # Opened without waiting: a pipe that nobody writes to would never open.
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+    except FileNotFoundError as error:
+        raise InputError(f"{what} {shown} does not exist, expected a file") from error
+    except OSError as error:
+        raise InputError(f"{what} {shown} cannot be opened ({error.strerror}), expected a readable file") from error
+    except ValueError as error:
+        # Null bytes, and characters that no file name can hold.
+        raise InputError(f"{what} {shown} is no path ({error}), expected a file's name") from error
+    status = os.fstat(descriptor)
+    if not stat.S_ISREG(status.st_mode):
+        os.close(descriptor)
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "no regular file"
+        raise InputError(f"{what} {shown} is {kind}, expected a regular file")
+    with open(descriptor, "rb") as file:
+        most = limit_bytes("MAUVECL_LARGEST_FILE_MIB")
+        try:
+            # Read beyond the size told: it may grow meanwhile.
+            content = file.read(most + 1) if status.st_size <= most else None
+        except OSError as error:
+            raise InputError(f"{what} {shown} cannot be read ({error.strerror}), expected a readable file") from error
+    if content is None or len(content) > most:
+        raise InputError(
+            f"{what} {shown} has more than {most >> 20} MiB, expected less; MAUVECL_LARGEST_FILE_MIB sets the limit"
+        )
+    return content
+
+
+def unpacked(content: bytes, what: str) -> bytes:
+    """Content that gzip, bzip2 or xz packed, unpacked; any other as it is.
+
+    Parameters
+    ----------
+    content : bytes
+    what : str
+        What holds it, with its name, for messages.
+
+    Raises
+    ------
+    InputError
+        If it unpacks to more than the limit, is damaged, or is packed more than once.
+    """
+    if content[:2] == b"\x1f\x8b":
+        return _unpack(content, lambda: zlib.decompressobj(wbits=31), "gzip", what)
+    if content[:3] == b"BZh":
+        return _unpack(content, bz2.BZ2Decompressor, "bzip2", what)
+    if content[:6] == b"\xfd7zXZ\x00":
+        return _unpack(content, lambda: lzma.LZMADecompressor(memlimit=XZ_MEMORY), "xz", what)
+    return content
+
+
+def _unpack(content: bytes, start: Callable[[], Any], form: str, what: str) -> bytes:
+    """Piece by piece, so that a bomb is noticed while it is small; several streams may follow one another."""
+    most = limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")
+    pieces: list[bytes] = []
+    size = 0
+    try:
+        while content:
+            stream = start()
+            waiting = content
+            while not stream.eof:
+                piece = stream.decompress(waiting, PIECE)
+                # zlib hands back what it did not take; the others keep it.
+                waiting = getattr(stream, "unconsumed_tail", b"")
+                size += len(piece)
+                if size > most:
+                    raise InputError(
+                        f"{what} unpacks to more than {most >> 20} MiB, expected less; MAUVECL_LARGEST_CONTENT_MIB "
+                        "sets the limit"
+                    )
+                pieces.append(piece)
+                if not piece and not waiting and not stream.eof and getattr(stream, "needs_input", True):
+                    raise EOFError("it ends too early")
+            content = stream.unused_data.lstrip(b"\0")
+    except (OSError, EOFError, zlib.error, lzma.LZMAError, MemoryError) as error:
+        raise InputError(f"{what} is damaged {form} ({error}), expected a whole file") from error
+    return b"".join(pieces)
+
+
+def shortened(text: str, most: int = 80) -> str:
+    """Text from outside for a message: quoted, on one line, of bounded length."""
+    return repr(text if len(text) <= most else f"{text[: most - 23]}...{text[-20:]}")

@@ -1,0 +1,183 @@
+"""What files and flags hold, once read: text, TOML, and numbers that can be; parsers whose failures are sentences."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import re
+import tomllib
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from .bounded import read_bytes, shortened
+
+#: Sizes that a number from outside may have, beside 0: products of several stay within double precision.
+SMALLEST, LARGEST = 1e-30, 1e30
+#: Whole numbers of 64 bits, with or without a sign.
+WHOLE = (-(2**63), 2**64 - 1)
+#: Characters of a text, and levels of nesting, that a study or an instrument may have.
+LONGEST, DEEPEST = 4096, 32
+#: Dots of what may be a TOML key.
+MOST_PARTS = 512
+
+
+@contextlib.contextmanager
+def parsing(what: str, expected: str) -> Iterator[None]:
+    """Turn whatever a parser of foreign content raises into one sentence.
+
+    Parsers of TOML, YAML, FITS and tables raise dozens of kinds on damaged content: of their own, of Python
+    (RecursionError, OverflowError), of NumPy (MemoryError for sizes that a header claims).
+
+    Parameters
+    ----------
+    what : str
+        What is read, with its name.
+    expected : str
+
+    Raises
+    ------
+    InputError
+    """
+    try:
+        yield
+    except InputError:
+        raise
+    except RecursionError as error:
+        raise InputError(f"{what} is nested too deeply, expected {expected}") from error
+    except MemoryError as error:
+        raise InputError(f"{what} needs more memory than there is, expected {expected}") from error
+    except Exception as error:
+        reason = next((line.strip() for line in str(error).splitlines() if line.strip()), "") or type(error).__name__
+        raise InputError(f"{what} cannot be read ({_plain(reason, 160)}), expected {expected}") from error
+
+
+def read_text(path: Path, what: str) -> str:
+    """The text of a regular file of bounded size, in UTF-8, with or without a byte-order mark.
+
+    Raises
+    ------
+    InputError
+        As `bounded.read_bytes`, or if it is not text.
+    """
+    return as_text(read_bytes(path, what), f"{what} {shortened(str(path))}")
+
+
+def as_text(content: bytes, what: str) -> str:
+    """Bytes as text in UTF-8.
+
+    Raises
+    ------
+    InputError
+        If they are not; `what` begins the sentence.
+    """
+    try:
+        return content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{what} is not text (byte {error.start + 1} is no UTF-8), expected text in UTF-8") from error
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is something other than a folder at a path that may be none at all."""
+    try:
+        return path.exists() and not path.is_dir()
+    except (OSError, ValueError):
+        return False
+
+
+def toml(text: str, what: str) -> dict[str, Any]:
+    """A TOML document whose values can be.
+
+    Raises
+    ------
+    InputError
+        If it is none, or as `possible`.
+    """
+    parts = max(part.count(".") for part in re.split(r"[=,{}\[\]\n#]", text))
+    if parts > MOST_PARTS:
+        # Python's reader takes memory with the square of it.
+        raise InputError(f"{what} has a key of {parts} parts, expected at most {MOST_PARTS}")
+    with parsing(what, "TOML"):
+        try:
+            found = tomllib.loads(text)
+        except tomllib.TOMLDecodeError as error:
+            raise InputError(f"{what} is not valid TOML: {_plain(str(error), 160)}") from error
+    possible(found, what)
+    return found
+
+
+def json_data(text: str, what: str) -> Any:
+    """A JSON document.
+
+    Raises
+    ------
+    InputError
+        If it is none, or nested too deeply for Python.
+    """
+    with parsing(what, "JSON"):
+        return json.loads(text)
+
+
+def possible(data: Any, what: str) -> None:
+    """See that nested data hold nothing that no study or instrument could mean.
+
+    Raises
+    ------
+    InputError
+        For a number beyond `SMALLEST` to `LARGEST`, a whole one beyond 64 bits, text that is too long or holds
+        characters that no file could, or nesting that is too deep; naming its key.
+    """
+    waiting: list[tuple[str, Any, int]] = [("", data, 0)]
+    while waiting:
+        key, value, depth = waiting.pop()
+        fault = _fault(value)
+        if depth > DEEPEST:
+            fault = f"is nested more than {DEEPEST} deep, expected less"
+            key = shortened(key, 40)
+        if fault:
+            raise InputError(f"{what}: {_plain(key, 80) or 'the value'} {fault}")
+        if isinstance(value, Mapping):
+            for name, item in value.items():
+                if isinstance(name, str) and (bad := _fault(name)):
+                    raise InputError(f"{what}: a key {bad}")
+                waiting.append((f"{key}.{name}" if key else str(name), item, depth + 1))
+        elif isinstance(value, list | tuple):
+            waiting += [(f"{key}.{i}", item, depth + 1) for i, item in enumerate(value)]
+
+
+def _fault(value: Any) -> str | None:
+    """Why a single value cannot be, or None."""
+    if isinstance(value, bool):
+        return None
+    if isinstance(value, int):
+        if not WHOLE[0] <= value <= WHOLE[1]:
+            return f"is a whole number of {value.bit_length()} bits, expected at most 64"
+    elif isinstance(value, float):
+        # NaN and infinity are for those who know what the value means.
+        if math.isfinite(value) and value and not SMALLEST <= abs(value) <= LARGEST:
+            return f"= {value!r}, expected 0 or a size from {SMALLEST:g} to {LARGEST:g}"
+    elif isinstance(value, str | Path):
+        text = str(value)
+        if len(text) > LONGEST:
+            return f"is a text of {len(text)} characters, expected at most {LONGEST}"
+        if not text.isprintable() and (bad := next((c for c in text if c == "\0" or "\ud800" <= c <= "\udfff"), None)):
+            return f"= {shortened(text)} holds the character {bad!r}, expected text"
+    return None
+
+
+def shown(value: Any, most: int = 80) -> str:
+    """Any value for a message, however large or deep."""
+    try:
+        return _plain(repr(value), most)
+    except (ValueError, RecursionError):
+        # Python writes no integers beyond some thousand digits.
+        return f"a value of the type {type(value).__name__}"
+
+
+def _plain(text: str, most: int) -> str:
+    """Text on one line, of bounded length, in printable characters."""
+    if len(text) > most:
+        text = f"{text[: most - 23]}...{text[-20:]}"
+    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)

@@ -1,0 +1,1 @@
+"""Instruments: their files, curves and pixel maps."""

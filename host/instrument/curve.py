@@ -1,0 +1,100 @@
+"""A curve of an instrument: a value against wavelength, straight between its knots."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import astropy.units as u
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import InputError
+from ..files.ecsv import read_ecsv
+
+
+@dataclass(frozen=True)
+class Curve:
+    """Value against wavelength.
+
+    Attributes
+    ----------
+    wavelength_nm : tuple of float
+        Knots, strictly increasing; one knot stands for a flat curve without ends.
+    value : tuple of float
+        Value at each knot, >= 0: a fraction, or A/W for a quantum efficiency.
+    source : str
+        "tag: source" of the values.
+    """
+
+    wavelength_nm: tuple[float, ...]
+    value: tuple[float, ...]
+    source: str = "A: assumed, no source given"
+
+    def __post_init__(self) -> None:
+        wavelength = np.asarray(self.wavelength_nm, dtype=np.float64)
+        value = np.asarray(self.value, dtype=np.float64)
+        if wavelength.ndim != 1 or wavelength.size == 0 or wavelength.shape != value.shape:
+            raise InputError(
+                f"a curve has {wavelength.size} wavelengths and {value.size} values, expected as many, one or more"
+            )
+        if not (np.isfinite(wavelength).all() and (np.diff(wavelength) > 0).all()):
+            raise InputError("a curve's wavelengths are not finite and strictly increasing, expected nm in order")
+        bad = ~(np.isfinite(value) & (value >= 0))
+        if bad.any():
+            knot = int(np.argmax(bad))
+            raise InputError(f"a curve's value at {wavelength[knot]:g} nm is {value[knot]:g}, expected finite and >= 0")
+
+    @classmethod
+    def flat(cls, value: float, source: str = "A: assumed, no source given") -> Curve:
+        """The same value at every wavelength."""
+        return cls((0.0,), (value,), source)
+
+    @classmethod
+    def read(cls, path: str | Path) -> Curve:
+        """Read an ECSV table of two columns with units: wavelength, and the value (A/W or dimensionless).
+
+        The table's metadata give the values' origin: `tag` (P, D, C or A) and `source`.
+
+        Raises
+        ------
+        InputError
+            If the file is missing or is not such a table.
+        """
+        table = read_ecsv(path, "curve file")
+        if "wavelength" not in table.colnames or len(table.colnames) != 2:
+            raise InputError(
+                f"curve file {path} has the columns {', '.join(table.colnames)}, expected 'wavelength' and one value"
+            )
+        name = next(column for column in table.colnames if column != "wavelength")
+        meta = table.meta
+        try:
+            wavelength = _plain(table, "wavelength", [u.nm])
+            value = _plain(table, name, [u.A / u.W, u.dimensionless_unscaled])
+            return cls(
+                tuple(wavelength.tolist()),
+                tuple(value.tolist()),
+                f"{meta.get('tag', 'A')}: {meta.get('source', f'assumed, no source in {Path(path).name}')}",
+            )
+        except InputError as error:
+            raise InputError(f"curve file {path}: {error}") from None
+
+    def at(self, wavelength_nm: ArrayLike) -> NDArray[np.float64]:
+        """Value at wavelengths in nm, the shape of `wavelength_nm`; the end values hold beyond the knots."""
+        return np.asarray(np.interp(np.asarray(wavelength_nm, np.float64), self.wavelength_nm, self.value))
+
+    def covers(self, low_nm: float, high_nm: float) -> bool:
+        """Whether the knots reach from one wavelength to the other; a flat curve always does."""
+        return len(self.value) == 1 or (self.wavelength_nm[0] <= low_nm and self.wavelength_nm[-1] >= high_nm)
+
+
+def _plain(table: object, name: str, units: list[u.UnitBase]) -> NDArray[np.float64]:
+    """A column's numbers in the first of `units` that it converts to."""
+    column = table[name]  # type: ignore[index]
+    unit = u.dimensionless_unscaled if column.unit is None else column.unit
+    if column.dtype.kind not in "iuf" or np.ma.is_masked(column):
+        raise InputError(f"column {name!r} has missing or non-numeric values, expected numbers")
+    for wanted in units:
+        if unit.is_equivalent(wanted):
+            return np.asarray((np.asarray(column, np.float64) * unit).to_value(wanted))
+    raise InputError(f"column {name!r} has the unit {str(unit) or 'none'!r}, expected {units[0]}")

@@ -1,0 +1,371 @@
+"""The instrument: optics, spectrograph and detector as one validated, frozen record."""
+
+from __future__ import annotations
+
+import difflib
+import hashlib
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+
+from ..errors import InputError
+from .curve import Curve
+from .pixel_map import PixelMap
+
+#: Energy of a photon times its wavelength, J nm, and the charge of an electron, C (exact SI values).
+HC_J_NM = 6.62607015e-34 * 299_792_458.0 * 1e9
+ELECTRON_C = 1.602176634e-19
+
+Float = NDArray[np.float64]
+
+
+def _as_curve(value: Any) -> Any:
+    """A curve from what a file or a user gives: a curve, a path, or one number for all wavelengths."""
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        return Curve.flat(float(value))
+    return Curve.read(value) if isinstance(value, str | Path) else value
+
+
+def _as_map(value: Any) -> Any:
+    """A pixel map from a map or a path."""
+    return PixelMap.read(value) if isinstance(value, str | Path) else value
+
+
+def _fraction(curve: Curve) -> Curve:
+    if max(curve.value) > 1:
+        raise InputError(f"a value of {max(curve.value):g}, expected a fraction between 0 and 1")
+    return curve
+
+
+AnyCurve = Annotated[Curve, BeforeValidator(_as_curve)]
+Fraction = Annotated[float, Field(ge=0, le=1)]
+Loss = Annotated[float, Field(ge=0, lt=1)]
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Count = Annotated[int, Field(ge=0, le=20)]
+
+
+class Instrument(BaseModel):
+    """An instrument, frozen; units are in the names.
+
+    `Instrument.load` reads one, `with_` gives a changed copy. The values of the nominal payload, with the source
+    and tag of each, are in `instruments/mauve.toml`; none is a flight calibration.
+
+    Attributes
+    ----------
+    name : str
+    notice : str
+        What every report must say about the numbers.
+    sources : dict of str
+        "tag: source" of each value, by its name; tags P paper, D datasheet, C computed, A assumption, U the user.
+    collecting_area_cm2, field_of_view_radius_arcsec, pointing_loss : float
+    grating_efficiency, fibre_efficiency, telescope_mirror_reflectivity, spectrometer_mirror_reflectivity : Curve
+    collection_lens_efficiency, window_efficiency : Curve
+    coupling_loss, light_loss : float
+    telescope_mirrors, spectrometer_mirrors, couplings : int
+        How often light meets each.
+    pixels : int
+    pixel_zero_nm, dispersion_nm_per_pixel : float
+        Centre of pixel 0 and linear dispersion.
+    output_min_nm, output_max_nm : float
+        Pixels with centres in this closed range are read.
+    top_hat_width_nm, gaussian_fwhm_nm : float
+        Line function: a top hat of this full width convolved with a Gaussian; either may be 0 (none), not both.
+    resolution_element_nm : float
+    quantum_efficiency_a_per_w : Curve
+    conversion_uv_per_electron, adc_range_v, saturation_v : float
+    adc_bits : int
+    temperature_c : float
+        Of the detector, -40 to 60.
+    dark_scale_dn_per_s, dark_slope_per_c : float
+        Dark current is dark_scale_dn_per_s * exp(dark_slope_per_c * temperature_c).
+    dark_unit : {"DN", "electrons"}
+        The unit in which dark counts are Poisson.
+    photon_noise : {"gaussian", "poisson"}
+        How photons scatter about their mean.
+    read_noise_dn, bias_dn, frame_s : float
+    pixel_map : PixelMap, optional
+        What differs from pixel to pixel.
+
+    Examples
+    --------
+    >>> from mauvecl import Instrument
+    >>> mauve = Instrument.load("mauve")
+    >>> round(mauve.dark_dn_per_s, 2), round(mauve.with_(temperature_c=13.0).dark_dn_per_s, 2)
+    (445.53, 257.77)
+    >>> mauve.sources["light_loss"]
+    'P: table of the payload performance'
+    """
+
+    model_config = ConfigDict(
+        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True
+    )
+
+    name: str = Field(min_length=1)
+    notice: str
+    sources: dict[str, str] = Field(default_factory=dict, repr=False)
+
+    collecting_area_cm2: Positive
+    field_of_view_radius_arcsec: Positive
+    pointing_loss: Loss
+
+    grating_efficiency: AnyCurve
+    fibre_efficiency: AnyCurve
+    telescope_mirror_reflectivity: AnyCurve
+    telescope_mirrors: Count
+    spectrometer_mirror_reflectivity: AnyCurve
+    spectrometer_mirrors: Count
+    collection_lens_efficiency: AnyCurve
+    window_efficiency: AnyCurve
+    coupling_loss: Loss
+    couplings: Count
+    light_loss: Loss
+
+    pixels: int = Field(ge=1, le=65536)
+    pixel_zero_nm: float
+    dispersion_nm_per_pixel: Positive
+    output_min_nm: Positive
+    output_max_nm: Positive
+    top_hat_width_nm: float = Field(ge=0, le=500)
+    gaussian_fwhm_nm: float = Field(ge=0, le=500)
+    resolution_element_nm: Positive
+
+    quantum_efficiency_a_per_w: AnyCurve
+    conversion_uv_per_electron: Positive
+    adc_bits: int = Field(ge=1, le=24)
+    adc_range_v: Positive
+    saturation_v: Positive
+    temperature_c: float = Field(ge=-40, le=60)
+    dark_scale_dn_per_s: NotNegative
+    dark_slope_per_c: float = Field(ge=-1, le=1)
+    dark_unit: Literal["DN", "electrons"]
+    photon_noise: Literal["gaussian", "poisson"] = "gaussian"
+    read_noise_dn: NotNegative
+    bias_dn: NotNegative
+    frame_s: float = Field(gt=0, le=86_400)
+    pixel_map: Annotated[PixelMap | None, BeforeValidator(_as_map)] = None
+
+    @classmethod
+    def load(cls, name: str | Path) -> Instrument:
+        """Read an instrument: one that ships ("mauve", "mauve-electrons") or a TOML file of the user's.
+
+        Curves are paths relative to the file; `extends = "mauve"` takes every value that the file does not give.
+
+        Raises
+        ------
+        InputError
+            If there is no such instrument or file, or it holds a value that is unknown, missing or out of range.
+        """
+        # The reader imports this module.
+        from .instrument_file import read_instrument
+
+        return read_instrument(name)
+
+    @classmethod
+    def build(cls, values: dict[str, Any], where: str) -> Instrument:
+        """Validate values by name; `where` (a file, say) begins the sentence of the error."""
+        try:
+            return cls.model_validate(values)
+        except ValidationError as error:
+            raise InputError(f"{where}: {_sentence(error)}") from None
+
+    def with_(self, **changes: Any) -> Instrument:
+        """A copy with some values changed, each marked as the user's in `sources`.
+
+        Parameters
+        ----------
+        **changes
+            Values by name, in the unit of the name; a curve may be a `Curve`, a path or one number.
+
+        Raises
+        ------
+        InputError
+            If a name is unknown or a value out of range.
+        """
+        marks = {name: "U: set by the user" for name in changes if name not in LABELS}
+        changed = Instrument.build({**self._values(), **changes}, self.name)
+        given = {name: value.source for name in changes if isinstance(value := getattr(changed, name), Curve)}
+        own = {name: source for name, source in given.items() if isinstance(changes[name], str | Path)}
+        sources = {**self.sources, **changes.get("sources", {}), **marks, **own}
+        return changed.model_copy(update={"sources": sources})
+
+    def _values(self) -> dict[str, Any]:
+        return {name: getattr(self, name) for name in type(self).model_fields}
+
+    @model_validator(mode="after")
+    def _consistent(self) -> Instrument:
+        for name in OPTICS:
+            try:
+                _fraction(getattr(self, name))
+            except InputError as error:
+                raise InputError(f"{name} has {error}") from None
+        low, high = self.output_min_nm, self.output_max_nm
+        if not high > low:
+            raise InputError(f"output_max_nm = {high:g}, expected more than output_min_nm = {low:g}")
+        if self.wavelength_nm.size == 0:
+            raise InputError(f"no pixel lies in the output range {low:g}-{high:g} nm, expected at least one")
+        for name in CURVES:
+            curve: Curve = getattr(self, name)
+            if not curve.covers(low, high):
+                raise InputError(
+                    f"{name} covers {curve.wavelength_nm[0]:g}-{curve.wavelength_nm[-1]:g} nm, "
+                    f"expected at least the output range {low:g}-{high:g} nm"
+                )
+        if self.top_hat_width_nm == self.gaussian_fwhm_nm == 0:
+            raise InputError("top_hat_width_nm and gaussian_fwhm_nm are both 0, expected at least one above 0")
+        for name in ("top_hat_width_nm", "gaussian_fwhm_nm"):
+            # Much narrower than a pixel it changes nothing, and costs time and digits.
+            if 0 < getattr(self, name) < 0.1:
+                raise InputError(f"{name} = {getattr(self, name):g}, expected 0 (none) or at least 0.1")
+        if (most := float(self.quantum_efficiency(self.wavelength_nm).max())) > 1:
+            raise InputError(
+                f"quantum_efficiency_a_per_w stands for {most:.3g} electrons per photon, expected at most 1"
+            )
+        if self.resolution_element_nm < self.dispersion_nm_per_pixel:
+            raise InputError(
+                f"resolution_element_nm = {self.resolution_element_nm:g}, "
+                f"expected at least a pixel ({self.dispersion_nm_per_pixel:g})"
+            )
+        if self.bias_dn >= min(self.saturation_dn, self.adc_max_dn):
+            raise InputError(f"bias_dn = {self.bias_dn:g}, expected below saturation")
+        if self.pixel_map is not None and self.pixel_map.size != self.pixels:
+            raise InputError(f"pixel_map has {self.pixel_map.size} pixels, expected the array's {self.pixels}")
+        return self
+
+    @cached_property
+    def wavelength_nm(self) -> Float:
+        """Centres of the pixels that are read, nm, shape (n_pixel,)."""
+        chosen = self._centres_nm[self.read_pixels].copy()
+        chosen.setflags(write=False)
+        return chosen
+
+    @property
+    def _centres_nm(self) -> Float:
+        return np.asarray(self.pixel_zero_nm + self.dispersion_nm_per_pixel * np.arange(self.pixels), np.float64)
+
+    @cached_property
+    def read_pixels(self) -> slice:
+        """Which pixels of the array have their centres in the output range."""
+        inside = np.flatnonzero((self._centres_nm >= self.output_min_nm) & (self._centres_nm <= self.output_max_nm))
+        return slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)
+
+    def per_pixel(self, name: str, nominal: float) -> Float:
+        """A column of the pixel map over the pixels that are read, or `nominal` in each; shape (n_pixel,)."""
+        if self.pixel_map is None:
+            return np.full(self.wavelength_nm.size, nominal)
+        return self.pixel_map.over(name, self.read_pixels, nominal)
+
+    @property
+    def knots_nm(self) -> tuple[float, ...]:
+        """Wavelengths, nm, where the slope of any curve may jump."""
+        curves = [getattr(self, name) for name in CURVES]
+        return tuple(sorted({knot for curve in curves if len(curve.value) > 1 for knot in curve.wavelength_nm}))
+
+    @property
+    def _dn_v(self) -> float:
+        """Volts of one DN."""
+        return float(self.adc_range_v / 2**self.adc_bits)
+
+    @property
+    def gain_dn_per_electron(self) -> float:
+        """Gain, DN per electron: charge conversion over the volts of one DN (METHODS: CE / (2.2 V / 65536))."""
+        return self.conversion_uv_per_electron * 1e-6 / self._dn_v
+
+    @property
+    def adc_max_dn(self) -> int:
+        """Largest value of the ADC, DN."""
+        return int(2**self.adc_bits - 1)
+
+    @property
+    def saturation_dn(self) -> float:
+        """Raw level at which the detector saturates, DN."""
+        return self.saturation_v / self._dn_v
+
+    @property
+    def dark_dn_per_s(self) -> float:
+        """Dark current at the detector's temperature, DN/s."""
+        return float(self.dark_scale_dn_per_s * np.exp(self.dark_slope_per_c * self.temperature_c))
+
+    @property
+    def field_of_view_arcsec2(self) -> float:
+        """Solid angle of the field of view, arcsec^2."""
+        return float(np.pi * self.field_of_view_radius_arcsec**2)
+
+    def efficiency(self, wavelength_nm: ArrayLike) -> Float:
+        """Fraction of the light that the optics bring to the detector, quantum efficiency NOT included.
+
+        The paper's equation of the efficiency, times (1 - pointing_loss). Beyond the ends of a curve its end value
+        holds (an assumption). Shape of `wavelength_nm`.
+        """
+        losses = (1 - self.coupling_loss) ** self.couplings * (1 - self.light_loss) * (1 - self.pointing_loss)
+        return np.asarray(
+            losses
+            * self.grating_efficiency.at(wavelength_nm)
+            * self.fibre_efficiency.at(wavelength_nm)
+            * self.telescope_mirror_reflectivity.at(wavelength_nm) ** self.telescope_mirrors
+            * self.spectrometer_mirror_reflectivity.at(wavelength_nm) ** self.spectrometer_mirrors
+            * self.collection_lens_efficiency.at(wavelength_nm)
+            * self.window_efficiency.at(wavelength_nm)
+        )
+
+    def quantum_efficiency(self, wavelength_nm: ArrayLike) -> Float:
+        """Electrons per photon that reaches the detector: A/W times the photon's energy over the electron's charge."""
+        photon_j = HC_J_NM / np.asarray(wavelength_nm, np.float64)
+        return np.asarray(self.quantum_efficiency_a_per_w.at(wavelength_nm) * photon_j / ELECTRON_C)
+
+    def throughput(self, wavelength_nm: ArrayLike) -> Float:
+        """End-to-end fraction, electrons per photon: `efficiency` with the quantum efficiency in it."""
+        return self.efficiency(wavelength_nm) * self.quantum_efficiency(wavelength_nm)
+
+    def effective_area_cm2(self, wavelength_nm: ArrayLike) -> Float:
+        """Collecting area times throughput, cm^2 (electrons per photon per cm^2)."""
+        return self.collecting_area_cm2 * self.throughput(wavelength_nm)
+
+    def electrons_per_joule_cm2(self, wavelength_nm: ArrayLike) -> Float:
+        """Electrons per energy at the telescope's entrance, e- / (J cm^-2): area * efficiency * QE[A/W] / e."""
+        per_joule = self.efficiency(wavelength_nm) * self.quantum_efficiency_a_per_w.at(wavelength_nm) / ELECTRON_C
+        return self.collecting_area_cm2 * per_joule
+
+    @cached_property
+    def digest(self) -> str:
+        """SHA-256 of every value, without names and sources: equal digests measure alike."""
+        values = {
+            name: (value.wavelength_nm, value.value) if isinstance(value, Curve) else value
+            for name, value in self._values().items()
+            if name not in LABELS
+        }
+        return hashlib.sha256(repr(sorted(values.items())).encode()).hexdigest()
+
+    def __hash__(self) -> int:
+        return hash(self.digest)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Instrument) and self.digest == other.digest
+
+
+#: What only labels an instrument, and measures nothing.
+LABELS = ("name", "notice", "sources")
+#: The curves, and those of them that are fractions.
+CURVES = tuple(name for name, field in Instrument.model_fields.items() if field.annotation is Curve)
+OPTICS = tuple(name for name in CURVES if name != "quantum_efficiency_a_per_w")
+
+
+def _sentence(error: ValidationError) -> str:
+    """The first complaint of pydantic in one sentence of ours."""
+    first = error.errors()[0]
+    name = ".".join(str(part) for part in first["loc"])
+    kind = first["type"]
+    if kind == "extra_forbidden":
+        near = difflib.get_close_matches(name, Instrument.model_fields, n=1, cutoff=0.0)
+        return f"unknown key {name!r}, expected one of the instrument's values; the nearest is {near[0]!r}"
+    if kind == "missing":
+        return f"{name!r} is missing, expected a value"
+    given = first.get("ctx", {}).get("error")
+    if isinstance(given, InputError):
+        return f"{name}: {given}" if name else str(given)
+    expected = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
+    return f"{name} = {first['input']!r}, expected {expected}"

@@ -1,0 +1,115 @@
+"""Reading an instrument from TOML: values with their sources, curves beside the file, one file extending another."""
+
+from __future__ import annotations
+
+import difflib
+from functools import cache
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+from ..files.bounded import shortened
+from ..files.parsed import is_file, read_text, toml
+from .curve import Curve
+from .instrument import CURVES, LABELS, Instrument
+from .pixel_map import PixelMap
+
+#: Where a value comes from: the paper, a datasheet, a computation, an assumption, or the user.
+TAGS = ("P", "D", "C", "A", "U")
+#: Files of a chain in which each extends the next.
+MOST_EXTENDED = 16
+
+
+def shipped() -> tuple[str, ...]:
+    """Names of the instruments that come with the package."""
+    files = resources.files(__package__).joinpath("instruments").iterdir()
+    return tuple(sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml")))
+
+
+def read_instrument(name: str | Path) -> Instrument:
+    """Read an instrument by name or path; see `Instrument.load`."""
+    # What ships does not change while it is used; a user's own file may.
+    return _shipped(name) if name in shipped() else _built(_find(name, Path()))
+
+
+@cache
+def _shipped(name: str) -> Instrument:
+    return _built(_find(name, Path()))
+
+
+def _built(path: Path) -> Instrument:
+    values, sources = _read(path, ())
+    return Instrument.build({**values, "sources": sources}, path.name)
+
+
+def _find(name: str | Path, folder: Path) -> Path:
+    """The file of a shipped instrument or, failing that, a user's own, relative to `folder`."""
+    if not isinstance(name, str | Path):
+        raise InputError(f"instrument {name!r}, expected a name or the path of a TOML file")
+    names = shipped()
+    if name in names:
+        return _local(resources.files(__package__).joinpath("instruments", f"{name}.toml"))
+    path = folder / name
+    if is_file(path):
+        return path
+    if path.suffix == ".toml":
+        raise InputError(f"instrument file {shortened(str(path))} does not exist, expected a TOML file")
+    near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.0)[0]
+    raise InputError(
+        f"unknown instrument {shortened(str(name))}, expected {' or '.join(names)} (nearest: {near!r}) "
+        "or the path of a TOML file"
+    )
+
+
+def _local(resource: Traversable) -> Path:
+    # setuptools installs real files; a zipped package would need extracting.
+    return Path(str(resource))
+
+
+def _read(path: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], dict[str, str]]:
+    """Values and sources of a file, over those of the file that it extends."""
+    if path.resolve() in seen:
+        raise InputError(f"{path.name} extends itself, expected a chain of files that ends")
+    if len(seen) == MOST_EXTENDED:
+        raise InputError(f"{path.name} ends a chain of {MOST_EXTENDED} files that extend another, expected fewer")
+    content = toml(read_text(path, "instrument file"), f"instrument file {shortened(str(path))}")
+    values: dict[str, Any] = {}
+    sources: dict[str, str] = {}
+    if "extends" in content:
+        values, sources = _read(_find(content.pop("extends"), path.parent), (*seen, path.resolve()))
+    for name, entry in content.items():
+        if name == "sources":
+            raise InputError(
+                f"{path.name}: unknown key 'sources', expected each value's source in the value's own table"
+            )
+        value, source = _entry(name, entry, path)
+        values[name] = value
+        if name not in LABELS:
+            sources[name] = source
+    return values, sources
+
+
+def _entry(name: str, entry: Any, path: Path) -> tuple[Any, str]:
+    """One value and its source: a plain value, a table of value, tag and source, or the path of a curve."""
+    source = f"A: assumed, no source in {path.name}"
+    if isinstance(entry, dict):
+        unknown = [key for key in entry if key not in ("value", "tag", "source")]
+        if unknown or "value" not in entry:
+            what = f"the unknown key {unknown[0]!r}" if unknown else "no 'value'"
+            raise InputError(f"{path.name}: the table {name} has {what}, expected value, tag and source")
+        tag = entry.get("tag", "A")
+        if tag not in TAGS:
+            raise InputError(f"{path.name}: {name} has the tag {tag!r}, expected one of {', '.join(TAGS)}")
+        source = f"{tag}: {entry.get('source', f'no source in {path.name}')}"
+        entry = entry["value"]
+    if name in CURVES and isinstance(entry, str):
+        curve = Curve.read(path.parent / entry)
+        return curve, curve.source
+    if name in CURVES and isinstance(entry, int | float) and not isinstance(entry, bool):
+        return Curve.flat(float(entry), source), source
+    if name == "pixel_map" and isinstance(entry, str):
+        pixel_map = PixelMap.read(path.parent / entry)
+        return pixel_map, pixel_map.source
+    return entry, source

@@ -1,0 +1,1 @@
+"""The sky: zodiacal light, by place and date."""

@@ -1,0 +1,102 @@
+"""A flare as a blackbody added to a star, or taking the place of part of its photosphere (METHODS section 1)."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from .bands import photons
+
+Geometry = Literal["added", "replaces"]
+
+#: Brightness temperatures that a flare may have, in K.
+TEMPERATURE_RANGE = (1_000.0, 200_000.0)
+
+
+def blackbody(wavelength_nm: NDArray[np.float64], temperature_k: float) -> NDArray[np.float64]:
+    """Surface flux pi B_lambda of a blackbody, erg s-1 cm-2 A-1, shape (n,).
+
+    Parameters
+    ----------
+    wavelength_nm : ndarray, shape (n,)
+    temperature_k : float
+    """
+    import astropy.units as u
+    from astropy.modeling.physical_models import BlackBody
+
+    unit = u.erg / (u.s * u.cm**2 * u.AA * u.sr)
+    model = BlackBody(temperature=temperature_k * u.K, scale=1.0 * unit)
+    return np.asarray(np.pi * model(wavelength_nm * u.nm).to_value(unit))
+
+
+def with_flare(
+    wavelength_nm: NDArray[np.float64],
+    flux_flam: NDArray[np.float64],
+    *,
+    amplitude: float,
+    temperature_k: float,
+    band: str,
+    geometry: Geometry,
+    photosphere_temperature_k: float | None,
+) -> NDArray[np.float64]:
+    """The flux of a flaring star, shape (n,).
+
+    Parameters
+    ----------
+    wavelength_nm, flux_flam : ndarray, shape (n,)
+        The quiescent star, erg s-1 cm-2 A-1.
+    amplitude : float
+        Relative rise of the photons in the band: 0.24 is 24 %.
+    temperature_k : float
+        Of the flare's blackbody.
+    band : str
+        Where the amplitude is measured.
+    geometry : {"added", "replaces"}
+        ``added``: F + k B, the paper's way. ``replaces``: a patch of the filling factor f = A / (R - 1) takes the
+        place of photosphere, F (1 - f) + f R (N_F / N_B) B; N are photons in the band and R is the ratio of the two
+        surface fluxes there, from blackbodies of the two temperatures.
+    photosphere_temperature_k : float, optional
+        Only for ``replaces``.
+
+    Raises
+    ------
+    InputError
+        For an impossible value, or a band that the spectrum does not cover.
+    """
+    if not (np.isfinite(amplitude) and amplitude >= 0.0):
+        raise InputError(f"flare amplitude = {amplitude!r}, expected a finite number of at least 0")
+    _check_temperature("flare temperature", temperature_k)
+    star = photons(wavelength_nm, flux_flam, band)
+    if not star > 0.0:
+        raise InputError(f"the star has no light in the band {band}, expected some to measure the flare against")
+    body = blackbody(wavelength_nm, temperature_k)
+    hot = photons(wavelength_nm, body, band)
+    if geometry == "added":
+        return flux_flam + amplitude * star / hot * body
+    if geometry != "replaces":
+        raise InputError(f"flare geometry = {geometry!r}, expected 'added' or 'replaces'")
+    if photosphere_temperature_k is None:
+        raise InputError("flare geometry 'replaces' needs a photosphere temperature, expected one in K")
+    _check_temperature("photosphere temperature", photosphere_temperature_k)
+    ratio = hot / photons(wavelength_nm, blackbody(wavelength_nm, photosphere_temperature_k), band)
+    if ratio <= 1.0:
+        raise InputError(
+            f"flare temperature = {temperature_k:g} K is no hotter than the photosphere it replaces, "
+            f"expected more than {photosphere_temperature_k:g} K"
+        )
+    filling = amplitude / (ratio - 1.0)
+    if filling > 1.0:
+        raise InputError(
+            f"flare amplitude = {amplitude:g} needs {filling:.2f} of the star's disc at {temperature_k:g} K, "
+            f"expected at most {ratio - 1.0:.3g}"
+        )
+    return flux_flam * (1.0 - filling) + filling * ratio * star / hot * body
+
+
+def _check_temperature(what: str, value: float) -> None:
+    low, high = TEMPERATURE_RANGE
+    if not (np.isfinite(value) and low <= value <= high):
+        raise InputError(f"{what} = {value!r} K, expected {low:g} to {high:g} K")

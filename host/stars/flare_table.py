@@ -1,0 +1,152 @@
+"""Flares that were found elsewhere: tables of AltaiPony, of lightkurve users, or one's own, as a study's amplitudes."""
+
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..files.bounded import read_bytes, shortened, unpacked
+from ..files.ecsv import check_cells, parse_ecsv
+from ..files.parsed import LARGEST, SMALLEST, as_text, parsing, shown
+
+if TYPE_CHECKING:
+    from astropy.table import QTable, Table
+
+#: Columns that hold the relative rise above the quiescent flux; AltaiPony's first.
+AMPLITUDES = ("ampl_rec", "amplitude", "ampl", "amp", "peak_amplitude", "relative_amplitude")
+#: Where a flare begins and ends, days; AltaiPony's first.
+STARTS, STOPS = ("tstart", "start", "t_start", "time_start"), ("tstop", "stop", "t_stop", "time_stop", "end")
+#: More make a study that nobody reads.
+MOST = 500
+#: Characters of a table that is text: astropy tries a score of forms on it.
+MOST_TEXT = 4 * 2**20
+FORMS = "CSV, ECSV or FITS"
+
+
+def read_flares(path: str | Path) -> QTable:
+    """Amplitudes of a table of flares, with the times where it has them.
+
+    Parameters
+    ----------
+    path : str or Path
+        CSV, ECSV or FITS; a column named as in `AMPLITUDES`, in any case.
+
+    Returns
+    -------
+    QTable
+        ``amplitude``, and ``start`` and ``stop`` in days of the table's own clock.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, or holds no such column, none or too many flares, or an impossible amplitude.
+    """
+    path = Path(path)
+    named = f"flare table {shortened(str(path))}"
+    content = unpacked(read_bytes(path, "flare table"), named)
+    if content.startswith(b"SIMPLE  ="):
+        table = _fits_table(content, named)
+    else:
+        text = as_text(content, named)
+        if len(text) > MOST_TEXT:
+            raise InputError(f"{named} has {len(text)} characters, expected at most {MOST_TEXT}")
+        table = parse_ecsv(text, named) if text.startswith("# %ECSV") else _text_table(text, path, named)
+    return flares_of(table, shortened(path.name))
+
+
+def _fits_table(content: bytes, named: str) -> Table:
+    """The first table of a FITS file, which is no larger than the file is."""
+    import io
+
+    from astropy.io import fits
+    from astropy.table import Table
+
+    with parsing(named, FORMS), warnings.catch_warnings(), fits.open(io.BytesIO(content), memmap=False) as hdus:
+        # Headers that astropy warns of and reads all the same.
+        warnings.simplefilter("ignore")
+        for hdu in hdus:
+            claimed = hdu.size
+            if claimed > len(content):
+                raise InputError(f"{named} says that it has {claimed} bytes of data, expected at most the file's")
+            if isinstance(hdu, fits.BinTableHDU | fits.TableHDU):
+                return Table.read(hdu)
+        raise InputError(f"{named} has no table, expected {FORMS}")
+
+
+def _text_table(text: str, path: Path, named: str) -> Table:
+    from astropy.table import Table
+
+    lines = text.splitlines()
+    check_cells(lines, named)
+    with parsing(named, FORMS), warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return Table.read([*lines, ""], format="ascii.csv" if path.suffix.lower() == ".csv" else "ascii")
+
+
+def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
+    """The same of a table in memory: astropy's, or a DataFrame such as AltaiPony's ``flares``.
+
+    Parameters
+    ----------
+    table : Table or DataFrame
+    name : str
+        For messages.
+
+    Raises
+    ------
+    InputError
+        As `read_flares`.
+    """
+    from astropy.table import QTable, Table
+
+    if not isinstance(table, Table):
+        table = Table.from_pandas(table)
+    lower = {str(column).strip().lower(): column for column in table.colnames}
+
+    def column(names: tuple[str, ...], unit: str) -> np.ndarray | None:
+        found = next((lower[one] for one in names if one in lower), None)
+        return None if found is None else _numbers(table[found], f"{name}: the column {found!r}", unit)
+
+    amplitudes = column(AMPLITUDES, "")
+    if amplitudes is None:
+        raise InputError(
+            f"{name} has the columns {shown(', '.join(lower), 300)}, expected one named {', '.join(AMPLITUDES)}"
+        )
+    if not 0 < amplitudes.size <= MOST:
+        raise InputError(f"{name} holds {amplitudes.size} flares, expected 1 to {MOST}")
+    bad = ~((amplitudes >= SMALLEST) & (amplitudes <= LARGEST))
+    if bad.any():
+        row = int(np.argmax(bad))
+        raise InputError(
+            f"{name}: the amplitude of flare {row} is {amplitudes[row]:g}, expected a relative rise above 0"
+        )
+    found = QTable({"amplitude": amplitudes})
+    for title, names in (("start", STARTS), ("stop", STOPS)):
+        times = column(names, "d")
+        if times is not None:
+            found[title] = times
+            found[title].unit = "d"
+    found["amplitude"].info.description = "relative rise above the quiescent flux, in the band of the light curve"
+    return found
+
+
+def _numbers(column: Any, named: str, unit: str) -> np.ndarray:
+    """A column's numbers in a unit, which is also assumed where it has none; NaN where it has no value."""
+    import astropy.units as u
+
+    kind = np.asarray(column).dtype.kind if hasattr(column, "dtype") else "O"
+    if kind not in "iuf" or np.ndim(column) != 1:
+        raise InputError(f"{named} holds no plain numbers, expected one number in each row")
+    values: np.ndarray = np.ma.filled(np.ma.asarray(getattr(column, "value", column), float), np.nan)
+    if getattr(column, "unit", None) is None:
+        return np.asarray(values, float)
+    try:
+        return np.asarray((values * u.Unit(column.unit)).to_value(unit), float)
+    except (u.UnitConversionError, TypeError, ValueError) as error:
+        raise InputError(
+            f"{named} has the unit {str(column.unit)!r}, expected {unit or 'none, since amplitudes are relative'}"
+        ) from error

@@ -1,0 +1,184 @@
+"""The exposure that gives a wanted S/N at a wavelength, and the S/N that an exposure gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+
+from mauvecl.host.errors import InputError
+from mauvecl.study.labels import described, label, told
+from mauvecl.study.questions import QUANTITIES
+from mauvecl.study.sections import Star
+from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.host.expectation import Expectation
+
+Per = Literal["pixel", "element"]
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """One answer: whole frames."""
+
+    star: str
+    wavelength_nm: float
+    per: Per
+    wanted: float
+    exposure_s: float
+    frames: int
+    snr: float
+    snr_one_frame_less: float
+    saturated: bool
+
+
+@dataclass(frozen=True)
+class ExposureResult:
+    """What `exposure_for` answers, one row per star.
+
+    Attributes
+    ----------
+    study : Study
+    exposures : tuple of Exposure
+    messages : tuple of str
+    """
+
+    study: Study
+    exposures: tuple[Exposure, ...]
+    messages: tuple[str, ...]
+
+    @property
+    def table(self) -> QTable:
+        """One row per star."""
+        import astropy.units as u
+        from astropy.table import QTable
+
+        table = QTable()
+        rows = self.exposures
+        table["star"] = [r.star for r in rows]
+        table["wavelength"] = [r.wavelength_nm for r in rows] * u.nm
+        table["per"] = [r.per for r in rows]
+        table["wanted"] = [r.wanted for r in rows]
+        table["exposure"] = [r.exposure_s for r in rows] * u.s
+        table["frames"] = [r.frames for r in rows]
+        table["snr"] = [r.snr for r in rows]
+        table["snr_one_frame_less"] = [r.snr_one_frame_less for r in rows]
+        table["saturated"] = [r.saturated for r in rows]
+        table["exposure"].info.description = "the fewest frames whose closed-form S/N reaches the wanted one"
+        table["saturated"].info.description = "whether the pixel, or one of the element, saturates in a single frame"
+        table.meta["study"] = self.study.toml()
+        return described(table)
+
+    def write(self, folder: str | Path) -> list[Path]:
+        """The table as ECSV, and the study that gives it again."""
+        from mauvecl.answers.report import make_folder, write_study, write_table
+
+        place = make_folder(Path(folder))
+        return [write_table(self.table, place / "exposure.ecsv"), write_study(self.study, place)]
+
+    def plot(self, path: str | Path | None = None) -> object:
+        """S/N against exposure, and the answers on it; needs matplotlib."""
+        from mauvecl.pictures.plans import exposures
+
+        return exposures(self, path)
+
+
+def snr_at(x: Expectation, wavelength_nm: float, per: Per = "element") -> float:
+    """Closed-form S/N of the pixel or 10.5 nm element that holds a wavelength.
+
+    Raises
+    ------
+    InputError
+        If it lies outside the spectrum.
+    """
+    return float((x.snr_per_element() if per == "element" else x.snr())[place_of(x, wavelength_nm, per)])
+
+
+def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
+    """Index of the pixel or element that holds a wavelength.
+
+    Raises
+    ------
+    InputError
+        If it lies outside the spectrum.
+    """
+    if per not in ("pixel", "element"):
+        raise InputError(f"S/N per {per!r}, expected pixel or element")
+    first, last = float(x.wavelength_nm[0]), float(x.wavelength_nm[-1])
+    if not first <= wavelength_nm <= last:
+        raise InputError(f"wavelength = {wavelength_nm:g} nm, expected {first:.1f} to {last:.1f} nm")
+    pixel = int(np.argmin(np.abs(x.wavelength_nm - wavelength_nm)))
+    return int(x.element[pixel]) if per == "element" else pixel
+
+
+def exposure_for(
+    study: Study, snr: float | None = None, wavelength_nm: float | None = None, *, per: Per | None = None
+) -> ExposureResult:
+    """The fewest frames whose closed-form S/N at a wavelength reaches a wanted one.
+
+    Parameters
+    ----------
+    study : Study
+        Its exposure does not matter.
+    snr, wavelength_nm : float, optional
+        In place of those of the study's ``signal``.
+    per : {"element", "pixel"}, optional
+        A resolution element of 10.5 nm, or one pixel.
+
+    Raises
+    ------
+    InputError
+        For an S/N that no exposure up to 1e7 s reaches, or a wavelength outside the spectrum.
+    """
+    study = study.with_changes({"signal": {"snr": snr, "wavelength_nm": wavelength_nm, "per": per}}, None, "exposure")
+    snr, wavelength_nm, per = study.signal.snr, study.signal.wavelength_nm, study.signal.per
+    if snr is None or wavelength_nm is None:
+        missing = "S/N" if snr is None else "wavelength"
+        raise InputError(f"no wanted {missing}, expected --snr and --at, or snr and wavelength_nm of a study's signal")
+    found, seen = [], []
+    for star in study.star:
+        answer, x = _one(study, star, snr, wavelength_nm, per)
+        found.append(answer)
+        seen.append(x)
+    return ExposureResult(study, tuple(found), tuple(told(seen)))
+
+
+def _one(study: Study, star: Star, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposure, Expectation]:
+    source, frame_s = star.source(), study.load_instrument().frame_s
+
+    def after(frames: int) -> Expectation:
+        return study.at("exposure", frames * frame_s).expect([source])[0]
+
+    one = snr_at(after(1), wavelength_nm, per)
+    longest = QUANTITIES["exposure"][1]
+    if not one > 0 or (snr / one) ** 2 * frame_s > longest:
+        raise InputError(
+            f"{star.library or star.file} has an S/N of {one:.3g} per {per} at {wavelength_nm:g} nm in one frame, "
+            f"expected enough for {snr:g} within {longest:g} s"
+        )
+    # S/N grows with the root of the frames, to rounding: the neighbours settle it.
+    frames = max(int(np.ceil((snr / one) ** 2)), 1)
+    while frames > 1 and snr_at(after(frames - 1), wavelength_nm, per) >= snr:
+        frames -= 1
+    while snr_at(after(frames), wavelength_nm, per) < snr:
+        frames += 1
+    x = after(frames)
+    place = place_of(x, wavelength_nm, per)
+    here = x.saturated[x.element == place] if per == "element" else x.saturated[[place]]
+    answer = Exposure(
+        star=label(star, x),
+        wavelength_nm=wavelength_nm,
+        per=per,
+        wanted=snr,
+        exposure_s=x.exposure_s,
+        frames=x.n_frames,
+        snr=snr_at(x, wavelength_nm, per),
+        snr_one_frame_less=snr_at(after(frames - 1), wavelength_nm, per) if frames > 1 else 0.0,
+        saturated=bool(here.any()),
+    )
+    return answer, x

@@ -1,0 +1,269 @@
+"""The value of one quantity at which a flare is detected with a wanted probability, with its interval."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mauvecl.answers.limit_search import MarginalQuestion, Point, Question, Unknown, settle
+from mauvecl.host.errors import InputError
+from mauvecl.results.detection import check_fap
+from mauvecl.statistics.definitions import Interval
+from mauvecl.study.labels import described, label, stacked, told
+from mauvecl.study.questions import UNITS
+from mauvecl.study.sections import Star
+from mauvecl.study.study import Study
+from mauvecl.study.unknowns import draws_table
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.device.engine import Engine
+    from mauvecl.runs.pool import Pool
+
+
+@dataclass(frozen=True)
+class Limit:
+    """One limit.
+
+    Attributes
+    ----------
+    star : str
+    amplitude : float
+        Of the flare; NaN where the amplitude is asked for.
+    of, statistic : str
+    fap, power : float
+    value : Interval
+        With the simulation's own 95 % interval, that of the threshold included.
+    closed_form : float
+        The same for Gaussian noise.
+    check : Point
+        Detection probability at the value, simulated again with another seed.
+    points : tuple of Point
+        What was simulated on the way.
+    curve : tuple of (value, probability)
+        The closed form around the limit.
+    at : mapping
+        What the study sweeps over.
+    unknown : Unknown, optional
+        Where the limit is averaged over what is unknown.
+    messages : tuple of str
+        What saturates at the limit, without the flare and with it.
+    """
+
+    star: str
+    amplitude: float
+    of: str
+    statistic: str
+    fap: float
+    power: float
+    value: Interval
+    closed_form: float
+    check: Point
+    points: tuple[Point, ...]
+    curve: tuple[tuple[float, float], ...]
+    at: Mapping[str, float | str] = field(default_factory=dict)
+    unknown: Unknown | None = None
+    messages: tuple[str, ...] = ()
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the fresh simulation's interval reaches the wanted power, or passes it by less than its own width."""
+        p = self.check.probability
+        reach = p.high - p.low
+        return p.low - reach <= self.power <= p.high + reach or (self.of == "exposure" and p.high >= self.power)
+
+
+@dataclass(eq=False)
+class LimitResult:
+    """What `limiting_magnitude` and its relatives answer.
+
+    Attributes
+    ----------
+    study : Study
+    limits : list of Limit
+    """
+
+    study: Study
+    limits: list[Limit] = field(default_factory=list)
+
+    @property
+    def table(self) -> QTable:
+        """One row per star, flare and statistic."""
+        import astropy.units as u
+        from astropy.table import QTable
+
+        of = self.study.limit.of
+        unit = UNITS.get(of)
+        rows = self.limits
+        table = QTable()
+        table["star"] = [r.star for r in rows]
+        for axis in self.study.sweep.axes:
+            if axis.quantity != "amplitude":
+                swept = np.array([r.at[axis.quantity] for r in rows])
+                table[axis.quantity] = swept * u.Unit(UNITS[axis.quantity]) if axis.quantity in UNITS else swept
+        if of != "amplitude":
+            table["amplitude"] = [r.amplitude for r in rows]
+        table["statistic"] = [r.statistic for r in rows]
+        for name, values, text in (
+            (of, [r.value.value for r in rows], "where the flare is detected with the wanted probability"),
+            ("low", [r.value.low for r in rows], "its 95 % interval, lower end, with the threshold's own"),
+            ("high", [r.value.high for r in rows], "its 95 % interval, upper end, with the threshold's own"),
+            ("closed_form", [r.closed_form for r in rows], "the same for Gaussian noise"),
+        ):
+            table[name] = values if unit is None else np.array(values) * u.Unit(unit)
+            table[name].info.description = text
+        for name, value in (("check", "value"), ("check_low", "low"), ("check_high", "high")):
+            table[name] = [getattr(r.check.probability, value) for r in rows]
+            table[name].info.description = "detection probability there, with a fresh seed" + (
+                "" if name == "check" else f"; 95 % interval, {name[6:]}er end"
+            )
+        if self.study.unknowns.draws:
+            unknowns = [r.unknown for r in rows if r.unknown is not None]
+            table["unknown_low"], table["unknown_high"] = np.array([one.range for one in unknowns]).T
+            table["unknown_low"].info.description = "central 95 % of the limits over what is unknown, lower end"
+            table["unknown_high"].info.description = "central 95 % of the limits over what is unknown, upper end"
+            table["matters_most"] = [next(iter(one.shares)) for one in unknowns]
+            table["its_share"] = [next(iter(one.shares.values())) for one in unknowns]
+            table["its_share"].info.description = "share of the limits' variance that this unknown explains"
+        table.meta |= {
+            "power": self.study.limit.power,
+            "fap": self.study.run.fap,
+            "realisations": self.study.run.realisations,
+            "study": self.study.toml(),
+        }
+        return described(table)
+
+    @property
+    def draws(self) -> QTable:
+        """One row per limit and draw of the unknown: its values and the closed-form limit."""
+        parts = []
+        for one in self.limits:
+            assert one.unknown is not None
+            table = draws_table(one.unknown.draws, {self.study.limit.of: one.unknown.limits})
+            amplitude = {} if np.isnan(one.amplitude) else {"amplitude": one.amplitude}
+            swept = {k: v for k, v in one.at.items() if k != "amplitude"}
+            parts.append(({"star": one.star, **swept, **amplitude, "statistic": one.statistic}, table))
+        return stacked(parts, study=self.study.toml())
+
+    def _repr_html_(self) -> str:
+        return str(self.table._repr_html_())
+
+    def write(self, folder: str | Path) -> list[Path]:
+        """The table as ECSV, that of the unknown's draws where there are any, and the study that gives them again."""
+        from mauvecl.answers.report import make_folder, write_study, write_table
+
+        place = make_folder(Path(folder))
+        files = [write_table(self.table, place / "limit.ecsv")]
+        if self.study.unknowns.draws:
+            files.append(write_table(self.draws, place / "unknowns.ecsv"))
+        return [*files, write_study(self.study, place)]
+
+    def plot(self, path: str | Path | None = None) -> object:
+        """Detection probability against the quantity: every simulated point and the limits; needs matplotlib."""
+        from mauvecl.pictures.plans import limits
+
+        return limits(self, path)
+
+
+def solve(
+    study: Study,
+    star: Star,
+    amplitude: float | None,
+    statistic: str,
+    engine: Engine | Pool,
+    at: Mapping[str, float | str] | None = None,
+) -> Limit:
+    """One limit: the closed form's root, moved by what is simulated, and simulated again there.
+
+    Averaged over what is unknown of the instrument where the study asks for draws of it.
+
+    Raises
+    ------
+    InputError
+        If the power is not crossed in the range searched, or the false-alarm probability cannot be settled.
+    """
+    check_fap(study.run.fap, study.run.realisations, study.run.tails)
+    kind = MarginalQuestion if study.unknowns.draws else Question
+    question = kind(study, star, amplitude, statistic, engine)
+    # The nominal instrument's root is near, and quickly found.
+    theory = question.root(near=Question(study, star, amplitude, statistic).root() if study.unknowns.draws else None)
+    value = settle(question, theory)
+    simulated = tuple(question.points)
+    # Another seed, far from any that a user would take for a neighbour.
+    fresh = (study.run.seed + 0x9E3779B97F4A7C15) % 2**64
+    check = Point(value.value, question.simulated(value.value, fresh), fresh)
+    quiet, flare = question.pair(value.value)
+    shown = question.study.star[0]
+    named = star.model_copy(update={"magnitude": None}) if question.of == "magnitude" else shown
+    return Limit(
+        star=label(named, quiet),
+        amplitude=float("nan") if amplitude is None else amplitude,
+        of=question.of,
+        statistic=statistic,
+        fap=question.fap,
+        power=question.power,
+        value=value,
+        closed_form=theory,
+        check=check,
+        points=simulated,
+        curve=question.curve(value.value),
+        at=at or {},
+        unknown=question.unknown(theory) if isinstance(question, MarginalQuestion) else None,
+        messages=tuple(m for m in told([quiet, flare]) if m.startswith("SATURATED")),
+    )
+
+
+def limiting_magnitude(study: Study, engine: Engine | Pool | None = None) -> LimitResult:
+    """Limits of a study's stars and flares, by every statistic it names.
+
+    Parameters
+    ----------
+    study : Study
+        Its ``limit`` says of what (magnitude, amplitude or exposure) and at which power.
+    engine : Engine or Pool, optional
+
+    Raises
+    ------
+    InputError
+        As `solve`.
+    """
+    from mauvecl.device.engine import Engine as Default
+    from mauvecl.runs.pool import together
+
+    engine = engine or Default()
+    result = LimitResult(study)
+    if any(axis.quantity == study.limit.of for axis in study.sweep.axes):
+        raise InputError(f"the sweep runs over the {study.limit.of} that is asked for, expected other quantities")
+    asked = [
+        (cell, star, amplitude, statistic, at)
+        for at, cell in study.cells()
+        for star in cell.star
+        for amplitude in ((None,) if study.limit.of == "amplitude" else cell.flare.amplitudes)
+        for statistic in study.run.statistics
+    ]
+
+    def solved(one: tuple[Study, Star, float | None, str, Mapping[str, float | str]]) -> Limit:
+        cell, star, amplitude, statistic, at = one
+        return solve(cell, star, amplitude, statistic, engine, at)
+
+    result.limits.extend(together(engine, solved, asked))
+    return result
+
+
+def smallest_amplitude(study: Study, engine: Engine | Pool | None = None) -> LimitResult:
+    """The smallest flare that is detected; as `limiting_magnitude`."""
+    return limiting_magnitude(_asking(study, "amplitude"), engine)
+
+
+def shortest_exposure(study: Study, engine: Engine | Pool | None = None) -> LimitResult:
+    """The shortest exposure in which the flares are detected; as `limiting_magnitude`."""
+    return limiting_magnitude(_asking(study, "exposure"), engine)
+
+
+def _asking(study: Study, of: str) -> Study:
+    return study.model_copy(update={"limit": study.limit.model_copy(update={"of": of})})

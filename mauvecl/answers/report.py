@@ -1,0 +1,146 @@
+"""Write answers down: tables, the study itself, and a record of the run. Nothing is computed here."""
+
+from __future__ import annotations
+
+import datetime
+import io
+import json
+import platform
+from collections.abc import Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import mauvecl
+from mauvecl.host.errors import InputError
+from mauvecl.runs.durable import write_whole
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.runs.pool import Pool
+    from mauvecl.study.study import Study
+
+
+FITS_KEYWORDS = {"name": "OBJECT", "exposure_s": "EXPTIME", "frames": "NFRAMES", "seed": "SEED"}
+
+
+def make_folder(path: Path) -> Path:
+    """A folder to write to.
+
+    Raises
+    ------
+    InputError
+        If it cannot be made or written to.
+    """
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+        probe = path / ".mauvecl-probe"
+        probe.write_text("")
+        probe.unlink(missing_ok=True)
+    except OSError as error:
+        raise InputError(
+            f"output folder {str(path)!r} cannot be written ({error.strerror}), expected a writable one"
+        ) from error
+    return path
+
+
+def write_table(table: Table, path: Path) -> Path:
+    """A table as ECSV, or as FITS by the file's ending; whole or not at all.
+
+    Raises
+    ------
+    InputError
+        If it cannot be written; what was at its place is still there.
+    """
+    if path.suffix == ".fits":
+        plain, packed = table.copy(), io.BytesIO()
+        # FITS keywords have eight letters and short values: the study goes beside it.
+        plain.meta = {FITS_KEYWORDS[k]: v for k, v in plain.meta.items() if k in FITS_KEYWORDS}
+        plain.write(packed, format="fits")
+        write_whole(path, packed.getbuffer())
+    else:
+        text = io.StringIO()
+        table.write(text, format="ascii.ecsv")
+        write_whole(path, text.getvalue().encode())
+    return path
+
+
+def write_study(study: Study, folder: Path) -> Path:
+    """The study, to be run again as it was; errors as `write_table`."""
+    path = folder / "study.toml"
+    write_whole(path, study.toml().encode())
+    return path
+
+
+def write_record(
+    verb: str,
+    study: Study,
+    expectations: Sequence[Expectation],
+    folder: Path,
+    *,
+    pool: Pool | None,
+    seconds: float,
+    messages: Sequence[str],
+) -> Path:
+    """The run record: what made this answer.
+
+    Parameters
+    ----------
+    verb : str
+    study : Study
+    expectations : sequence of Expectation
+        Their provenance holds the digests of the inputs.
+    folder : Path
+    pool : Pool, optional
+        Who drew.
+    seconds : float
+        Wall time.
+    messages : sequence of str
+        What the reader was told.
+    """
+    record: dict[str, Any] = {
+        "mauvecl": mauvecl.__version__,
+        "verb": verb,
+        "date_utc": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
+        "wall_time_s": round(seconds, 3),
+        "seed": study.run.seed,
+        "study": study.model_dump(mode="json", exclude_none=True),
+        "inputs": [{"name": x.name} | dict(x.provenance) for x in expectations],
+        "messages": list(messages),
+        "python": platform.python_version(),
+        "packages": _versions("numpy", "scipy", "astropy", "synphot", "pyopencl"),
+    }
+    if pool is not None:
+        # What the self-test found on these devices, if the user has run it.
+        from mauvecl.device.selftest import last
+
+        record["devices"] = [asdict(device) for device in pool.devices]
+        record["kernels"] = pool.kernel_digest
+        record["shares"] = asdict(pool.standing)
+        told = "not run on this device and version: mauvecl selftest"
+        record["selftest"] = [last(device) or told for device in pool.devices]
+    return write_json(record, folder / "run.json")
+
+
+def write_json(content: Any, path: Path) -> Path:
+    """Anything plain as JSON; errors as `write_table`."""
+    write_whole(path, (json.dumps(content, indent=2, default=str) + "\n").encode())
+    return path
+
+
+def _versions(*names: str) -> dict[str, str]:
+    from importlib.metadata import version
+
+    return {name: version(name) for name in names}
+
+
+def rows(table: Table) -> list[dict[str, Any]]:
+    """A table as plain rows, for JSON; units are in the table's file."""
+    return [{name: _plain(row[name]) for name in table.colnames} for row in table]
+
+
+def _plain(value: Any) -> Any:
+    value = getattr(value, "value", value)
+    return value.item() if hasattr(value, "item") else value

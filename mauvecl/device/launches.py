@@ -1,0 +1,346 @@
+"""One scene on the device: its buffers and launches."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.device.program import DeviceError, out_of_memory
+from mauvecl.noise import layout
+from mauvecl.noise.scene import PIXEL_BLOCK, Scene
+from mauvecl.results.snr import Counts
+from mauvecl.results.tally import Grid, Tally
+
+if TYPE_CHECKING:
+    from mauvecl.device.engine import Engine
+    from mauvecl.device.program import Variant
+
+#: Realisations, times frames, counted on the device before its 32-bit bins and 64-bit sums are emptied.
+MOST_COUNTED = 2**25
+#: Raw spectra looked at together on the host.
+PIECE = 4096
+#: Kernels of a detection, the first where more is compared than the template.
+COMPARED, DETECTION = ("comparison", "tally"), ("statistics", "tally")
+#: Work-items to an element or channel of a histogram, on a device of many.
+SHARES = 1024
+
+
+@dataclass(frozen=True)
+class Tile:
+    """Realisations from `first` on, a multiple of the vector width; [start, stop) of these `size` are wanted."""
+
+    first: int
+    size: int
+    start: int
+    stop: int
+
+    @property
+    def wanted(self) -> int:
+        """How many are wanted."""
+        return self.stop - self.start
+
+    def address(self) -> tuple[np.uint32, np.uint32]:
+        """Both words of the first index."""
+        return np.uint32(self.first & 0xFFFFFFFF), np.uint32(self.first >> 32)
+
+    def rows(self) -> tuple[np.uint32, np.uint32]:
+        """Which of the tile are wanted."""
+        return np.uint32(self.start), np.uint32(self.stop)
+
+    def pieces(self, size: int) -> Iterator[Tile]:
+        """The same realisations in tiles of at most so many, a multiple of what a work-item follows."""
+        for begin in range(0, self.size, size):
+            length = min(size, self.size - begin)
+            start, stop = max(self.start - begin, 0), min(self.stop - begin, length)
+            if start < stop:
+                yield Tile(self.first + begin, length, start, stop)
+
+
+class Run:
+    """One scene on the device; its buffers are released at the end of the `with` block."""
+
+    def __init__(self, engine: Engine, scene: Scene, variant: Variant, seed: int) -> None:
+        self._engine, self._scene, self.variant = engine, scene, variant
+        self._cl, self._queue = engine.cl, engine.queue
+        self._buffers: list[Any] = []
+        self._named: dict[str, Any] = {}
+        self._kernels: dict[str, Any] = {}
+        self._counted = 0
+        job = scene.job.copy()
+        job["seed_low"], job["seed_high"] = seed & 0xFFFFFFFF, seed >> 32
+        self._arguments = [
+            self.upload(job.reshape(1)),
+            *(
+                self.upload(beyond(array))
+                for array in (
+                    scene.pixels,
+                    scene.levels,
+                    scene.edges,
+                    scene.dark_counts,
+                    scene.photon_counts,
+                    scene.responses,
+                )
+            ),
+            self.upload(scene.tables),
+            self.upload(scene.priors),
+        ]
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._queue.finish()
+        for buffer in self._buffers:
+            buffer.release()
+
+    def upload(self, array: NDArray[Any]) -> Any:
+        """A device buffer with the contents of an array; DeviceError where there is no room."""
+        flags = self._cl.mem_flags
+        data = np.ascontiguousarray(array if array.size else np.zeros(1, array.dtype))
+        try:
+            buffer = self._cl.Buffer(self._engine.context, flags.READ_WRITE | flags.COPY_HOST_PTR, hostbuf=data)
+        except self._cl.Error as error:
+            if not out_of_memory(error):
+                raise
+            raise DeviceError(
+                f"{self._engine.device_name} has too little memory for {data.nbytes} bytes of a scene: {error}"
+            ) from error
+        self._buffers.append(buffer)
+        return buffer
+
+    def _room(self, name: str, size: int) -> Any:
+        """A buffer of at least so many bytes, kept from launch to launch."""
+        found = self._named.get(name)
+        if found is None or found.size < size:
+            if found is not None:
+                self._buffers.remove(found)
+                found.release()
+            found = self._cl.Buffer(self._engine.context, self._cl.mem_flags.READ_WRITE, size)
+            self._named[name] = found
+            self._buffers.append(found)
+        return found
+
+    def _launch(self, name: str, items: tuple[int, ...], *arguments: Any) -> None:
+        if name not in self._kernels:
+            # One build for the two that are always used together.
+            detection = COMPARED if self.variant.compared else DETECTION
+            rooms = detection if name in DETECTION else (name,)
+            self._kernels[name] = self._engine.kernel(rooms, self.variant, name)
+        local = (1,) * len(items) if self.variant.width > 1 else None
+        self._kernels[name](self._queue, items, local, *arguments)
+
+    def realise(self, tile: Tile, out: NDArray[Any]) -> NDArray[np.uint32]:
+        """Raw spectra of a tile into the rows of `out`.
+
+        Parameters
+        ----------
+        tile : Tile
+        out : ndarray of uint16 or int32, shape (tile.wanted, n_pixel)
+
+        Returns
+        -------
+        ndarray of uint32, shape (tile.wanted,)
+            Frames of any pixel cut off at zero or saturation.
+        """
+        flags = self._cl.mem_flags
+        clipped = np.empty(tile.wanted, np.uint32)
+        counts = self._room("clipped", clipped.nbytes)
+        # A processor's own memory needs no copy.
+        shared = self._engine.device.kind == "cpu"
+        if shared:
+            rows = self._cl.Buffer(self._engine.context, flags.WRITE_ONLY | flags.USE_HOST_PTR, hostbuf=out)
+        else:
+            rows = self._room("rows", out.nbytes)
+        try:
+            items = (tile.size // self.variant.width,)
+            self._launch("realise", items, *self._arguments, *tile.address(), *tile.rows(), counts, rows)
+            if shared:
+                mapped, _ = self._cl.enqueue_map_buffer(
+                    self._queue, rows, self._cl.map_flags.READ, 0, out.shape, out.dtype
+                )
+                mapped.base.release(self._queue)
+            else:
+                self._cl.enqueue_copy(self._queue, out, rows)
+            self._cl.enqueue_copy(self._queue, clipped, counts)
+            self._queue.finish()
+        finally:
+            if shared:
+                rows.release()
+        return clipped
+
+    def observe(self, observers: NDArray[np.void], elements: NDArray[np.void]) -> None:
+        """Upload what the observer subtracts and assumes, and the resolution elements."""
+        self._n_element = len(elements)
+        self._observers, self._elements = self.upload(beyond(observers)), self.upload(elements)
+        shape = (self._scene.n_pixel + PIXEL_BLOCK, layout.OBSERVER_BINS)
+        self._pixel_counts = self.upload(np.zeros(shape, np.uint32))
+        self._element_counts = self.upload(np.zeros((len(elements), layout.OBSERVER_BINS), np.uint32))
+        self._clipped = self.upload(np.zeros((shape[0], 2), np.uint32))
+        self._outside = self.upload(np.zeros(len(elements), np.uint32))
+        self._observed = observers, elements
+
+    def histogram(self, tile: Tile, counts: Counts) -> None:
+        """Count each pixel's DN and each element's S/N of a tile on the device."""
+        width = self.variant.width
+        items = (self._n_element,) if width > 1 else (self._n_element, min(tile.wanted, SHARES))
+        self._launch(
+            "histogram",
+            items,
+            *self._arguments,
+            *tile.address(),
+            *tile.rows(),
+            self._observers,
+            self._elements,
+            self._pixel_counts,
+            self._element_counts,
+            self._clipped,
+            self._outside,
+        )
+        self._queue.finish()
+        self._counted += tile.wanted
+        outside = np.empty(self._n_element, np.uint32)
+        self._cl.enqueue_copy(self._queue, outside, self._outside)
+        if outside.any():
+            self._cl.enqueue_copy(self._queue, self._outside, np.zeros_like(outside))
+            self._add_far_snr(tile, counts, np.flatnonzero(outside))
+        if self._counted * self._scene.n_draws > MOST_COUNTED:
+            self.flush_counts(counts)
+
+    def _add_far_snr(self, tile: Tile, counts: Counts, elements: NDArray[np.intp]) -> None:
+        """Count what lies outside the device's bins on the host, from the raw spectra of the same realisations."""
+        for piece in tile.pieces(PIECE):
+            raw = np.empty((piece.wanted, self._scene.n_pixel), np.int32)
+            self.realise(piece, raw)
+            base = self._scene.n_draws * self._scene.base_dn[0]
+            counts.add_far(np.ascontiguousarray(raw.T) - base[:, None], *self._observed, elements)
+
+    def flush_counts(self, counts: Counts) -> None:
+        """Move the device's histograms to the host."""
+        n = self._scene.n_pixel
+        pixels, elements, clipped = (
+            self._emptied(buffer, shape)
+            for buffer, shape in (
+                (self._pixel_counts, (n, layout.OBSERVER_BINS)),
+                (self._element_counts, (self._n_element, layout.OBSERVER_BINS)),
+                (self._clipped, (n, 2)),
+            )
+        )
+        counts.add(pixels, elements, clipped, self._counted)
+        self._counted = 0
+
+    def _emptied(self, buffer: Any, shape: tuple[int, ...], dtype: type = np.uint32) -> NDArray[Any]:
+        host: NDArray[Any] = np.empty(shape, dtype)
+        self._cl.enqueue_copy(self._queue, host, buffer)
+        self._cl.enqueue_copy(self._queue, buffer, np.zeros(shape, dtype))
+        return host
+
+    def weigh(self, weights: NDArray[np.float32], linear_end: NDArray[np.uint32]) -> None:
+        """Upload the linear statistics' weights, and where each scenario's end."""
+        scene = self._scene
+        # A row of zeros behind them, for scenarios without any.
+        padded = np.concatenate([weights, np.zeros((1, len(scene.pixels)), np.float32)])
+        self._weighing = [*map(self.upload, (scene.constants(weights, linear_end), padded, linear_end))]
+        self._rows = len(layout.FIXED_STATISTICS) * len(scene.levels) + len(weights)
+
+    def compare(
+        self,
+        bands: NDArray[np.float32],
+        finished: NDArray[np.uint32],
+        scales: NDArray[np.float32],
+        scale_end: NDArray[np.uint32],
+    ) -> None:
+        """Upload what only the kernel `comparison` reads, after `weigh`.
+
+        Parameters
+        ----------
+        bands : ndarray of float32, shape (n_chunk, n_slot, chunk)
+        finished : ndarray of uint32, shape (n_chunk,)
+            See `smoothing.Smoothing.bands`.
+        scales : ndarray of float32, shape (n_smoothed, n_centre)
+        scale_end : ndarray of uint32, shape (n_scenario,)
+            One past the last smoothed statistic of each scenario.
+        """
+        scene = self._scene
+        more = map(self.upload, (beyond(scene.estimates), bands, finished, scales, scale_end))
+        self._weighing = [self.upload(scene.templates), *self._weighing, *more, np.uint32(scales.shape[1])]
+        self._rows += len(scales)
+
+    def statistics(self, tile: Tile) -> None:
+        """Compute every channel of a tile into values[channel][realisation]."""
+        values = self._room("values", 4 * self._rows * tile.size)
+        items = (tile.size // (self.variant.width * self.variant.vectors),)
+        self._launch(
+            "statistics", items, *self._arguments, *tile.address(), *self._weighing, np.uint32(tile.size), values
+        )
+
+    def values(self, tile: Tile) -> NDArray[np.float32]:
+        """The channels of the tile computed last, shape (n_channel, tile.wanted)."""
+        host = np.empty((self._rows, tile.size), np.float32)
+        self._cl.enqueue_copy(self._queue, host, self._named["values"])
+        return host[:, tile.start : tile.stop]
+
+    def channel(self, tile: Tile, number: int) -> NDArray[np.float32]:
+        """One channel of the tile computed last, shape (tile.wanted,)."""
+        host = np.empty(tile.wanted, np.float32)
+        offset = 4 * (number * tile.size + tile.start)
+        self._cl.enqueue_copy(self._queue, host, self._named["values"], src_offset=offset)
+        return host
+
+    def tally(self, tile: Tile, tally: Tally) -> None:
+        """Add a tile's channels to the histograms and integer sums on the device."""
+        count = len(tally.grids)
+        shares = 1 if self.variant.width > 1 else SHARES
+        if "grids" not in self._named:
+            self._named["grids"] = self.upload(Grid.pack(tally.grids))
+            self._named["histogram"] = self.upload(np.zeros((count, layout.BINS), np.uint32))
+            self._named["sums"] = self.upload(np.zeros((count, shares, 2), np.int64))
+            self._named["outside"] = self.upload(np.zeros(count, np.uint32))
+        named = self._named
+        self._launch(
+            "tally",
+            (count,) if shares == 1 else (count, shares),
+            *tile.rows(),
+            np.uint32(tile.size),
+            named["values"],
+            named["grids"],
+            named["histogram"],
+            named["sums"],
+            named["outside"],
+        )
+        self._queue.finish()
+        self._counted += tile.wanted
+        self._add_far(tile, tally)
+        if self._counted > MOST_COUNTED:
+            self.flush(tally)
+
+    def _add_far(self, tile: Tile, tally: Tally) -> None:
+        """Count on the host what the device found outside its bins."""
+        outside = np.empty(len(tally.grids), np.uint32)
+        self._cl.enqueue_copy(self._queue, outside, self._named["outside"])
+        if not outside.any():
+            return
+        self._cl.enqueue_copy(self._queue, self._named["outside"], np.zeros_like(outside))
+        for index in np.flatnonzero(outside):
+            found = tally.add_far(int(index), self.channel(tile, tally.grids[index].channel))
+            if found != outside[index]:
+                raise DeviceError(
+                    f"{self._engine.device_name} has {outside[index]} values outside a histogram where the host has "
+                    f"{found}, expected the same arithmetic"
+                )
+
+    def flush(self, tally: Tally) -> None:
+        """Move the device's histograms and sums to the host."""
+        count = len(tally.grids)
+        histogram = self._emptied(self._named["histogram"], (count, layout.BINS))
+        sums = self._emptied(self._named["sums"], (count, self._named["sums"].size // (16 * count), 2), np.int64)
+        tally.add(histogram, sums.sum(axis=1), self._counted)
+        self._counted = 0
+
+
+def beyond(array: NDArray[np.void]) -> NDArray[np.void]:
+    """Per-pixel structs, end to end, and a block more: a launch may look past the last pixel, never use it."""
+    return np.concatenate([array.ravel(), np.zeros(PIXEL_BLOCK, array.dtype)])

@@ -1,0 +1,95 @@
+"""Push chosen words through the production code on the device, for tests and the self-test."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.device import program
+from mauvecl.device.program import Variant
+
+if TYPE_CHECKING:
+    from mauvecl.device.engine import Engine
+
+
+class Probes:
+    """The probe kernels of an engine's device, in its own form or another.
+
+    Parameters
+    ----------
+    width : int, optional
+        Realisations in a vector.
+    vector_forms : bool, optional
+        Whether PoCL's fast forms are used, or built-ins.
+    engine : Engine
+    """
+
+    def __init__(self, *, width: int | None = None, vector_forms: bool | None = None, engine: Engine) -> None:
+        self.cl, self.context, self.queue = engine.cl, engine.context, engine.queue
+        plain = engine.variant
+        self.width = width or plain.width
+        forms = plain.vector_forms if vector_forms is None else vector_forms
+        variant = Variant(width=self.width, vector_forms=forms and self.width > 1, chunk=32 if self.width > 1 else 4)
+        self.program = program.build(self.context, program.render(("probes",), variant))
+
+    def run(
+        self,
+        name: str,
+        items: int,
+        out: NDArray[Any],
+        *inputs: Any,
+        out_first: NDArray[Any] | None = None,
+        start: NDArray[Any] | None = None,
+    ) -> NDArray[Any]:
+        """Launch a probe; arrays are uploaded, the last argument of the kernel is `out`, which may begin with `start`.
+
+        `out_first` is written before it.
+        """
+        flags = self.cl.mem_flags
+        arguments = [
+            self.cl.Buffer(self.context, flags.READ_ONLY | flags.COPY_HOST_PTR, hostbuf=np.ascontiguousarray(x))
+            if isinstance(x, np.ndarray)
+            else x
+            for x in inputs
+        ]
+        outs = [x for x in (out_first, out) if x is not None]
+        buffers = [self.cl.Buffer(self.context, flags.READ_WRITE, x.nbytes) for x in outs]
+        if start is not None:
+            self.cl.enqueue_copy(self.queue, buffers[-1], start)
+        local = (1,) if self.width > 1 and name != "probe_layout" else None
+        self.cl.Kernel(self.program, name)(self.queue, (items,), local, *arguments, *buffers)
+        for array, buffer in zip(outs, buffers, strict=True):
+            self.cl.enqueue_copy(self.queue, array, buffer)
+        return out
+
+    def philox(self, counters: NDArray[np.uint32], keys: NDArray[np.uint32]) -> NDArray[np.uint32]:
+        """Eight words per counter: the plain generator's four, then those of the loop-invariant form."""
+        out = np.empty((len(counters), 8), np.uint32)
+        return self.run("probe_philox", len(counters), out, np.uint32(len(counters)), counters, keys)
+
+    def normal(self, radius: NDArray[np.uint32], angle: NDArray[np.uint32]) -> NDArray[np.float32]:
+        """Two rows of normals from two words each; sizes are multiples of the width."""
+        words = np.stack([radius, angle])
+        return self.run("probe_normal", radius.size // self.width, np.empty(words.shape, np.float32), words)
+
+    def alias(self, words: NDArray[np.uint32], table: NDArray[np.uint32], bits: int) -> NDArray[np.uint32]:
+        """The column each word chooses."""
+        items = words.size // self.width
+        return self.run("probe_alias", items, np.empty(words.size, np.uint32), words, table, np.uint32(bits))
+
+    def prior(
+        self, word: NDArray[np.uint32], finer: NDArray[np.uint32], table: NDArray[np.float32]
+    ) -> NDArray[np.float32]:
+        """A prior's factors, less one, at the probabilities that two words each stand for."""
+        words = np.stack([word, finer])
+        return self.run("probe_prior", word.size // self.width, np.empty(word.size, np.float32), words, table)
+
+    def expansion(self, radius: NDArray[np.uint32], angle: NDArray[np.uint32], mean: float) -> NDArray[np.int64]:
+        """Two rows of counts relative to the whole number nearest to the mean."""
+        words, root = np.stack([radius, angle]), np.sqrt(mean)
+        offset, slope, cubic = mean - np.rint(mean) - 1 / 6, root - 1 / (36 * root), -1 / (72 * root)
+        coefficients = [np.float32(c) for c in (offset, slope, cubic)]
+        out = np.empty(words.shape, np.float32)
+        return self.run("probe_expansion", radius.size // self.width, out, words, *coefficients).astype(np.int64)

@@ -1,0 +1,363 @@
+"""Whether a device gives what the answers rest on: known answers, twins, chance, closed forms, in under a minute."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from mauvecl import __version__
+from mauvecl.device.engine import Engine
+from mauvecl.device.kernel_cache import kernel_cache
+from mauvecl.device.probes import Probes
+from mauvecl.device.program import SAME_BITS
+from mauvecl.host.expectation import Expectation
+from mauvecl.noise import layout
+from mauvecl.noise import twin as reference
+from mauvecl.noise.comparison import Comparison
+from mauvecl.noise.processes import CosmicRays, Processes, Uniform
+from mauvecl.noise.scene import Scene, prepare
+from mauvecl.results import twin as reference_sums
+from mauvecl.results.channels import ChannelPlan, plan_channels
+from mauvecl.results.detection import Detection
+from mauvecl.results.snr import Counts, elements, observers
+from mauvecl.results.tally import Tally
+from mauvecl.statistics.definitions import PAIRED, STATISTICS
+
+if TYPE_CHECKING:
+    from mauvecl.device.program import DeviceRecord
+
+#: A test of chance fails by chance once in so many devices.
+LUCK = 1e-6
+
+#: Random123's known answers: counter, key, output.
+KNOWN = (
+    ((0, 0, 0, 0), (0, 0), (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)),
+    ((0xFFFFFFFF,) * 4, (0xFFFFFFFF,) * 2, (0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD)),
+    (
+        (0x243F6A88, 0x85A308D3, 0x13198A2E, 0x03707344),
+        (0xA4093822, 0x299F31D0),
+        (0xD16CFE09, 0x94FDCCEB, 0x5001E420, 0x24126EA1),
+    ),
+)
+
+
+@dataclass(frozen=True)
+class Check:
+    """One line of the table."""
+
+    name: str
+    passed: bool
+    found: str
+
+
+def toy(
+    pixels: int = 64,
+    frames: int = 10,
+    *,
+    flare: float = 0.0,
+    dark: float = 2225.0,
+    read: float = 12.0,
+    light: float = 40.0,
+    unit: Any = "DN",
+    photon_noise: Any = "gaussian",
+) -> Expectation:
+    """A small exposure without a star: a smooth spectrum on a plain detector, DN and electrons per frame."""
+    shape = light * (1.0 + 0.5 * np.sin(np.arange(pixels) / 9.0))
+    ones = np.ones(pixels)
+    element = np.arange(pixels, dtype=np.int32) // 10
+    return Expectation(
+        wavelength_nm=np.arange(200.0, 200.0 + pixels),
+        source_electrons=shape * (1.0 + flare * np.linspace(1.0, 0.2, pixels)),
+        sky_electrons=0.4 * ones,
+        dark_dn=dark * ones,
+        dark_unit=unit,
+        bias_dn=600.0 * ones,
+        read_noise_dn=read * ones,
+        gain_dn_per_electron=0.6 * ones,
+        n_frames=frames,
+        frame_s=5.0,
+        element=element,
+        element_wavelength_nm=205.0 + 10.0 * np.arange(element[-1] + 1),
+        adc_max_dn=65_535,
+        saturation_dn=59_578.0,
+        name="toy",
+        instrument="toy",
+        provenance={},
+        photon_noise=photon_noise,
+        conditions={"temperature_c": 21.0, "dark_slope_per_c": 0.0684, "light_loss": 0.34, "pointing_loss": 0.0},
+    )
+
+
+_RAYS = CosmicRays(rate_per_cm2_s=300.0)
+#: Small scenes that run every branch of every kernel: what is seen, and how it is drawn.
+CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    "stack": ({}, {}),
+    "one frame": ({"frames": 1, "unit": "electrons", "photon_noise": "poisson"}, {}),
+    "fourth power": ({"frames": 1, "dark": 288.0}, {}),
+    "frames at the rail": ({"frames": 3, "light": 107_000.0}, {}),
+    "apart": ({}, {"recipe": "apart"}),
+    "apart, tables": ({"frames": 2, "dark": 30.0, "read": 0.4, "photon_noise": "poisson"}, {"mode": "frames"}),
+    "apart, pairs of two ways": ({"frames": 1, "read": 1.0, "light": 1000.0, "photon_noise": "poisson"}, {}),
+    "cosmic rays": ({}, {"processes": Processes(_RAYS)}),
+    "noisy references": ({"frames": 4}, {"comparison": Comparison(3)}),
+    "estimated variances": ({"frames": 2}, {"mode": "frames", "comparison": Comparison(1, estimated=True)}),
+    "priors": (
+        {"frames": 5},
+        {"processes": Processes(_RAYS, Uniform(0.0, 0.05), Uniform(13.0, 21.0), Uniform(0.24, 0.44))},
+    ),
+    "priors, fourth power": ({"frames": 1, "dark": 288.0}, {"processes": Processes(jitter=Uniform(0.0, 0.05))}),
+    "priors, frames": (
+        {"frames": 5, "photon_noise": "poisson"},
+        {"mode": "frames", "processes": Processes(None, Uniform(0.0, 0.05), Uniform(13.0, 21.0))},
+    ),
+}
+#: Statistics that the fast kernel knows, where nothing but the template is compared.
+FAST = tuple(name for name in STATISTICS if name not in PAIRED)
+#: Across the boundary of the counter's first word.
+START, COUNT, SEED = 2**40 - 13, 40, 2**63 + 20_261_121
+
+
+def digests(engine: Engine, name: str) -> dict[str, str]:
+    """Short digests of what a device makes of a case: raw counts, statistics, histograms."""
+    options, how = CASES[name]
+    quiet, flare = toy(**options), toy(flare=0.3, **options)
+    place: dict[str, Any] = {"start": START, "seed": SEED}
+    raw, clipped = engine.realise_and_count(quiet, count=COUNT, **place, **_drawing(how))
+    seen = engine.snr(quiet, realisations=COUNT, **place, **_drawing(how))
+    values, fast = (
+        engine.statistic_values(quiet, [flare], count=COUNT, statistics=names, **place, **how)
+        for names in (tuple(STATISTICS), FAST)
+    )
+    found = engine.detect(quiet, [flare], realisations=COUNT, statistics=FAST, **place, **how)
+    null = found.distribution("chi2")
+    return {
+        "raw": _digest(raw.astype(np.int64), clipped),
+        "statistics": _digest(values.view(np.uint32)),
+        "fast statistics": _digest(fast.view(np.uint32)),
+        "histograms": _histograms(seen.counts),
+        "tally": _digest(null.counts, np.array([null.first, null.second]), null.far.keys, null.far.counts),
+    }
+
+
+def twin_digests(name: str) -> dict[str, str]:
+    """The same by the NumPy twin."""
+    options, how = CASES[name]
+    quiet, flare = toy(**options), toy(flare=0.3, **options)
+    scene, index = prepare([quiet], **how), np.arange(START, START + COUNT, dtype=np.uint64)
+    both = prepare([quiet, flare], **how)
+    raw = reference.realise(scene, index, SEED)
+    clipped = reference.clipped(scene, index, SEED)
+    seen = reference_sums.histograms(scene, observers(quiet, scene), elements(quiet), index, SEED)
+    values, plan = _statistics(name, both)
+    tally = Tally(plan.grids[plan.keys.index(("chi2", "null", 0)) :][:1])
+    counts, sums, _ = reference_sums.tally(values, tally.packed)
+    tally.add(counts, sums, COUNT)
+    tally.add_far(0, values[tally.grids[0].channel])
+    null = tally.distribution(0)
+    return {
+        "raw": _digest(raw.astype(np.int64), clipped.sum(axis=(1, 2)).astype(np.uint32)),
+        "statistics": _digest(values.view(np.uint32)),
+        "fast statistics": _digest(_fast(values, plan).view(np.uint32)),
+        "histograms": _histograms(seen),
+        "tally": _digest(null.counts, np.array([null.first, null.second]), null.far.keys, null.far.counts),
+    }
+
+
+def _statistics(name: str, scene: Scene) -> tuple[NDArray[np.float32], ChannelPlan]:
+    """Every statistic of a case by the twin, and which is which."""
+    options, _ = CASES[name]
+    quiet, flare = toy(**options), toy(flare=0.3, **options)
+    found = Detection(quiet, (flare,), tuple(STATISTICS), scene, COUNT)
+    plan = plan_channels(found, range(1), first=True)
+    index = np.arange(START, START + COUNT, dtype=np.uint64)
+    smoothed = reference_sums.Smoothed.of(found, plan)
+    return reference_sums.statistics(scene, index, SEED, plan.weights, plan.linear_end, smoothed=smoothed), plan
+
+
+def _drawing(how: dict[str, Any]) -> dict[str, Any]:
+    """How a case is drawn, whatever it is compared with."""
+    return {key: value for key, value in how.items() if key != "comparison"}
+
+
+def _fast(values: NDArray[np.float32], plan: ChannelPlan) -> NDArray[np.float32]:
+    """The channels of the fast kernel among all, those that it does not know left at zero."""
+    known = values[: plan.n_rows - len(plan.scales)].copy()
+    known[[2, 5]] = 0.0
+    return known
+
+
+def _histograms(counts: Counts) -> str:
+    far = (array for each in counts.far.values() for array in (each.keys, each.counts))
+    return _digest(counts.pixel, counts.element, counts.clipped, *far)
+
+
+def _digest(*arrays: NDArray[Any]) -> str:
+    found = hashlib.sha256()
+    for array in arrays:
+        found.update(np.ascontiguousarray(array).tobytes())
+    return found.hexdigest()[:12]
+
+
+def known_answers(engine: Engine) -> Check:
+    """Philox against Random123's vectors, on the device."""
+    counters, keys, answers = (np.array([row[i] for row in KNOWN], np.uint32) for i in range(3))
+    out = Probes(engine=engine).philox(counters, keys)
+    right = np.array_equal(out[:, :4], answers) and np.array_equal(out[:, 4:], answers)
+    return Check("Philox4x32-10, known answers", right, f"{len(KNOWN)} vectors of Random123")
+
+
+def twins(engine: Engine) -> Iterator[Check]:
+    """Every branch of every kernel against the twin."""
+    for name in CASES:
+        ours, twin = digests(engine, name), twin_digests(name)
+        differ = [part for part in ours if ours[part] != twin[part]]
+        if not differ:
+            passed, text = True, "digests " + " ".join(ours.values())
+        elif engine.device.promise == SAME_BITS:
+            passed, text = False, f"{', '.join(differ)} differ from the twin's"
+        else:
+            passed, text = _nearly(engine, name)
+        yield Check(f"same bits as the NumPy twin: {name}", passed, text)
+
+
+def _nearly(engine: Engine, name: str) -> tuple[bool, str]:
+    """The weaker promise: hardly a count off the twin's, and by one DN; statistics within a fifth of their spread."""
+    options, how = CASES[name]
+    quiet, flare = toy(**options), toy(flare=0.3, **options)
+    index = np.arange(START, START + COUNT, dtype=np.uint64)
+    raw = engine.realise(quiet, start=START, count=COUNT, seed=SEED, **_drawing(how)).astype(np.int64)
+    off = np.abs(raw - reference.realise(prepare([quiet], **how), index, SEED))
+    share = float(np.mean(off > 0))
+    ours = engine.statistic_values(
+        quiet, [flare], start=START, count=COUNT, seed=SEED, statistics=tuple(STATISTICS), **how
+    )
+    twin = _statistics(name, prepare([quiet, flare], **how))[0]
+    apart = float(np.max(np.abs(ours - twin).max(axis=1) / np.maximum(twin.std(axis=1), 1e-3)))
+    return (
+        bool(off.max() <= 1 and share < 1e-2 and apart < 0.2),
+        f"weaker promise: {share:.2g} of counts off, by {off.max()} DN at most; statistics by {apart:.2g} sigma",
+    )
+
+
+def pearson(counts: NDArray[np.int64], probability: NDArray[np.float64]) -> float:
+    """Both tails of Pearson's statistic; rare outcomes are put together."""
+    n = counts.sum()
+    expected = n * probability
+    common = expected > 20
+    observed = np.append(counts[common], counts[~common].sum())
+    wanted = np.append(expected[common], n - expected[common].sum())
+    if wanted[-1] < 20:
+        observed, wanted = observed[:-1], wanted[:-1]
+    statistic = float(np.sum((observed - wanted) ** 2 / wanted))
+    upper = float(special.chdtrc(observed.size - 1, statistic))
+    return 2 * min(upper, 1 - upper)
+
+
+def counts_of(engine: Engine, x: Expectation, realisations: int, recipe: Any) -> tuple[NDArray[np.int64], int]:
+    """Histogram of raw counts over all pixels, which are alike, and the count of its first bin."""
+    found = engine.snr(x, realisations=realisations, seed=SEED, recipe=recipe)
+    first = int(found.scene.base_dn[0, 0]) - layout.OBSERVER_BINS // 2
+    return found.counts.pixel.sum(axis=0), first
+
+
+def exact_counts(x: Expectation, first: int) -> NDArray[np.float64]:
+    """Probabilities of the same bins: Poisson dark with Gaussian noise, rounded; Gaussian photons."""
+    mean, step = x.dark_dn[0], x.dark_step_dn[0]
+    sd = float(np.sqrt(x.read_noise_dn[0] ** 2 + x.gain_dn_per_electron[0] * x.signal_dn[0] / x.n_frames))
+    expected = mean / step
+    reach = 9.0 * np.sqrt(expected) + 20.0
+    k = np.arange(max(int(expected - reach), 0), int(expected + reach))
+    p = np.exp(special.xlogy(k, expected) - expected - special.gammaln(k + 1.0))
+    edges = first + np.arange(layout.OBSERVER_BINS + 1) - 0.5
+    offset = x.bias_dn[0] + x.signal_dn[0] / x.n_frames
+    u = (edges[:, None] - offset - step * k[None, :]) / sd
+    below, above = special.ndtr(u) @ p, special.ndtr(-u) @ p
+    return np.asarray(np.where(below[1:] < 0.5, np.diff(below), -np.diff(above)))
+
+
+def chance(engine: Engine) -> Iterator[Check]:
+    """Pearson's test of raw counts, by every recipe."""
+    for title, dark, read, recipe in (
+        ("joint draw, dark of 2225", 2225.0, 12.0, "joint"),
+        ("joint draw, dark of 30", 30.0, 12.0, "joint"),
+        ("alias table, dark of 64", 64.0, 0.8, "apart"),
+        ("expansion, dark of 2225", 2225.0, 0.8, "apart"),
+    ):
+        x = toy(512, 1, dark=dark, read=read, light=0.0)
+        counts, first = counts_of(engine, x, 100_000, recipe)
+        p = pearson(counts, exact_counts(x, first))
+        yield Check(f"Pearson, {title}", bool(p > LUCK), f"p = {p:.3g} of {counts.sum():.2g} counts")
+
+
+def closed_forms(engine: Engine) -> Iterator[Check]:
+    """S/N and statistics against their closed forms, in standard errors."""
+    n = 40_000
+    quiet, flare = toy(256), toy(256, flare=0.4)
+    table = engine.snr(quiet, realisations=n, seed=SEED).element
+    z = (table["mean"] - table["expected"]) / table["std"]
+    # The root's curvature moves the mean by about noise over eight signals of an element, 2 % here.
+    worst = float(np.abs(z).max())
+    yield Check("S/N per element, closed form", bool(worst < 0.03 + 5 / np.sqrt(n)), f"means within {worst:.3f} sigma")
+    found = engine.detect(quiet, [flare], realisations=n, seed=SEED, statistics=tuple(STATISTICS))
+    for statistic in STATISTICS:
+        for which in (None, 0):
+            ours, theory = found.distribution(statistic, which), found.closed_form(statistic, which)
+            error = (ours.mean - theory.mean) / (theory.std / np.sqrt(n))
+            name = f"{statistic}, mean {'with a flare' if which is not None else 'without'}"
+            yield Check(f"{name}, closed form", bool(abs(error) < 5), f"{error:+.1f} standard errors")
+
+
+def tiles(engine: Engine) -> Check:
+    """The same realisations in one run and in pieces."""
+    quiet = toy()
+    whole = engine.realise(quiet, start=0, count=500, seed=SEED)
+    parts = [engine.realise(quiet, start=a, count=b - a, seed=SEED) for a, b in ((0, 1), (1, 77), (77, 500))]
+    return Check("same bits in pieces", bool(np.array_equal(whole, np.concatenate(parts))), "500 realisations in 3")
+
+
+def run(engine: Engine, told: Callable[[Check], None] = lambda check: None) -> list[Check]:
+    """All checks; `told` hears of each as it ends."""
+    found: list[Check] = []
+
+    def note(check: Check) -> None:
+        found.append(check)
+        told(check)
+
+    note(known_answers(engine))
+    for group in (twins, chance, closed_forms):
+        for check in group(engine):
+            note(check)
+    note(tiles(engine))
+    return found
+
+
+def keep(engine: Engine, checks: list[Check], seconds: float) -> None:
+    """Remember the outcome for later run records on the same device, driver and version."""
+    record = {
+        "mauvecl": __version__,
+        "device": asdict(engine.device),
+        "date_utc": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+        "seconds": round(seconds, 1),
+        "passed": all(check.passed for check in checks),
+        "checks": [asdict(check) for check in checks],
+    }
+    kernel_cache().remember(_key(engine.device), json.dumps(record))
+
+
+def last(device: DeviceRecord) -> dict[str, Any] | None:
+    """The outcome kept for a device, if any."""
+    text = kernel_cache().recall(_key(device))
+    return None if text is None else dict(json.loads(text))
+
+
+def _key(device: DeviceRecord) -> str:
+    said = f"selftest {__version__} {device.label} {device.driver}"
+    return hashlib.sha256(said.encode()).hexdigest()[:32]

@@ -1,0 +1,156 @@
+"""One realisation taken apart: what the star, the photons, the dark, the read noise and the ADC put into it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from mauvecl.noise import twin as reference
+from mauvecl.noise.processes import NONE, Processes
+from mauvecl.noise.scene import Mode, Recipe, prepare
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.host.expectation import Expectation
+
+Float = NDArray[np.float64]
+
+
+def components(
+    x: Expectation,
+    *,
+    realisation: int,
+    seed: int,
+    mode: Mode = "auto",
+    processes: Processes = NONE,
+    recipe: Recipe = "auto",
+) -> QTable:
+    """The draws behind one raw spectrum, by the slow twin.
+
+    Parameters
+    ----------
+    x : Expectation
+    realisation : int
+    seed : int
+    mode : {"auto", "frames", "stacked"}
+    processes : Processes
+    recipe : {"auto", "joint", "apart"}
+
+    Returns
+    -------
+    QTable
+        One row per pixel, DN summed over the exposure: ``raw``, what the engine gives for this realisation; ``source``
+        and ``sky``, the mean signals; ``photon_noise`` and ``read_noise``; ``dark``; ``cosmic_rays``, where asked for;
+        ``bias``; ``digitisation``, what rounding and clipping changed. Those after the first add up to it.
+
+    Notes
+    -----
+    The kernels draw the noise as one sum. Its parts are drawn here from their distribution given that sum, from streams
+    of their own, so that taking a spectrum apart changes nothing in it. Given the rest the dark counts are Poisson
+    times a Gaussian; for this split, and only here, Poisson photons count as Gaussian.
+    """
+    import astropy.units as u
+    from astropy.table import QTable
+
+    scene = prepare([x], mode, processes=processes, recipe=recipe)
+    index = np.array([realisation], np.uint64)
+    n = scene.n_pixel
+    each = x.n_frames // scene.n_draws  # frames in one draw
+    gain = x.gain_dn_per_electron
+    parts = {name: np.zeros(n) for name in ("source", "sky", "photon_noise", "dark", "read_noise", "cosmic_rays")}
+    raw = np.zeros(n)
+    for frame in range(scene.n_draws):
+        factors = reference.factors(scene, index, frame, seed)
+        light, warm = ((1.0 + float(f[0])) * middle for f, middle in zip(factors, scene.medians, strict=True))
+        dark_dn, photon_dn, cosmic, analogue, dn = np.zeros((5, len(scene.pixels)))
+        u_dark, z_split = np.zeros((2, len(scene.pixels)))
+        for group in range(len(scene.pixels) // 4):
+            drawn = reference.draws(scene, index, frame, group, seed)
+            chance = reference.words_at(index, frame, "split_dark", group, seed)
+            apart = reference.four_normals(reference.words_at(index, frame, "split", group, seed))
+            for i, p in enumerate(range(4 * group, 4 * group + 4)):
+                v = reference.analogue(scene, drawn, i, p, 0, *factors)
+                analogue[p] = v[0]
+                dn[p] = reference.digitise(v, scene.edges[0, p], clip=scene.clip)[0]
+                z_split[p] = apart[i][0]
+                u_dark[p] = (float(chance[i][0]) + 0.5) / 2**32
+                if scene.cosmic:
+                    cosmic[p] = scene.pixels[p]["cosmic_gain"] * drawn.cosmic[i][0]
+                if not scene.joint:
+                    dark_dn[p] = scene.dark_counts[p]["gain"] * drawn.dark[i][0]
+                if drawn.photon is not None:
+                    pairs = reference.four_normals(drawn.photon)
+                    source = scene.photon_counts[0, p]
+                    photon_dn[p] = (
+                        source["gain"] * reference.poisson_draw(drawn.photon, i, source, scene.tables, pairs)[0]
+                    )
+        source, sky = (each * light * gain * e for e in (x.source_electrons, x.sky_electrons))
+        photon_variance = gain * (source + sky)
+        read_variance = each * x.read_noise_dn**2 + (each - 1) / 12
+        mean_dark = each * warm * x.dark_dn
+        # Everything random of this draw: photon noise + read noise + dark counts, DN.
+        total = scene.base_dn[0] + analogue[:n] - cosmic[:n] - source - sky - each * x.bias_dn
+        if scene.joint:
+            dark = _dark_given_total(total, mean_dark, x.dark_step_dn, photon_variance + read_variance, u_dark[:n])
+        else:
+            dark = x.dark_step_dn * np.rint(mean_dark / x.dark_step_dn) + dark_dn[:n]
+        rest = total - dark
+        if scene.photons:
+            photon = gain * np.rint(each * (x.source_electrons + x.sky_electrons)) + photon_dn[:n] - source - sky
+        else:
+            both = photon_variance + read_variance
+            share = np.divide(photon_variance, both, out=np.zeros(n), where=both > 0)
+            photon = rest * share + np.sqrt(read_variance * share) * z_split[:n]
+        for name, values in zip(parts, (source, sky, photon, dark, rest - photon, cosmic[:n]), strict=True):
+            parts[name] += values
+        raw += scene.base_dn[0] + dn[:n]
+    table = QTable()
+    table["wavelength"] = x.wavelength_nm * u.nm
+    parts["bias"] = np.asarray(x.n_frames * x.bias_dn)
+    if not scene.cosmic:
+        del parts["cosmic_rays"]
+    table["raw"] = raw * u.adu
+    for name, values in parts.items():
+        table[name] = values * u.adu
+    table["digitisation"] = (raw - sum(parts.values())) * u.adu
+    table["net"] = (raw - x.n_frames * (x.bias_dn + x.dark_dn)) * u.adu
+    for name in table.colnames[1:]:
+        table[name].info.description = DESCRIPTIONS[name]
+    table.meta |= {"name": x.name, "exposure_s": x.exposure_s, "frames": x.n_frames, "seed": seed}
+    return table
+
+
+def _dark_given_total(total: Float, mean: Float, step: Float, variance: Float, chance: Float) -> Float:
+    """Dark counts, DN, given their sum with a Gaussian of this variance, each by inversion at `chance`."""
+    found = np.zeros(total.size)
+    for p in np.flatnonzero(mean > 0):
+        if variance[p] == 0:
+            found[p] = total[p]
+            continue
+        expected = mean[p] / step[p]
+        # Around both the prior and what is left of the sum.
+        reach = 9.0 * np.sqrt(expected) + 9.0
+        counts = np.arange(max(int(expected - reach), 0), int(expected + reach) + 1)
+        log = special.xlogy(counts, expected) - special.gammaln(counts + 1.0)
+        log -= (total[p] - step[p] * counts) ** 2 / (2.0 * variance[p])
+        below = np.cumsum(np.exp(log - log.max()))
+        found[p] = step[p] * counts[np.searchsorted(below, chance[p] * below[-1])]
+    return found
+
+
+DESCRIPTIONS = {
+    "raw": "simulated raw spectrum, summed over the frames (DN)",
+    "source": "mean signal of the star",
+    "sky": "mean signal of the zodiacal light",
+    "photon_noise": "drawn photon noise of star and sky",
+    "dark": "drawn dark counts",
+    "bias": "bias",
+    "read_noise": "drawn read noise",
+    "cosmic_rays": "drawn charge of cosmic rays",
+    "digitisation": "what rounding and clipping changed",
+    "net": "raw less bias and mean dark",
+}

@@ -1,0 +1,192 @@
+"""Optional noise processes, each with a stream of its own, all off unless asked for.
+
+What they draw is unknown to the observer: templates and variances stay those of the expectation.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from mauvecl.host.errors import InputError
+from mauvecl.noise import layout
+from mauvecl.noise.priors import Normal, Prior, Uniform, table_of
+
+__all__ = ["LIMITS", "NONE", "CosmicRays", "Factors", "Normal", "Prior", "Processes", "Uniform"]
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class CosmicRays:
+    """Hits by charged particles; the defaults are assumptions (INSTRUMENT.md: outside the South Atlantic Anomaly).
+
+    Attributes
+    ----------
+    rate_per_cm2_s : float
+        Hits per area and time.
+    area_cm2 : float
+        Of the whole detector: 2048 pixels of 14 x 200 um.
+    pixels : int
+        Over which the area is spread; a hit stays in one pixel.
+    electrons : tuple of float, shape (2,)
+        A hit frees a number of electrons between these, all equally likely...
+    weights : tuple of float, optional
+        ... or with these relative weights, one for each whole number from the first to the last.
+    """
+
+    rate_per_cm2_s: float = 1.0
+    area_cm2: float = 0.057
+    pixels: int = 2048
+    electrons: tuple[float, float] = (500.0, 1000.0)
+    weights: tuple[float, ...] | None = None
+
+    def __post_init__(self) -> None:
+        low, high = self.electrons
+        if not (0 <= self.rate_per_cm2_s <= 1e6 and 0 < self.area_cm2 < 1e4 and self.pixels > 0):
+            raise InputError(
+                f"cosmic rays of {self.rate_per_cm2_s:g} per cm^2 s on {self.area_cm2:g} cm^2 and {self.pixels} "
+                "pixels, expected a rate of 0 to 1e6, an area and pixels above 0"
+            )
+        if not 1 <= low <= high <= 100_000:
+            raise InputError(f"cosmic rays of {low:g} to {high:g} electrons, expected 1 to 100000, ascending")
+        if self.weights is not None:
+            wanted = int(high) - int(low) + 1
+            if len(self.weights) != wanted or min(self.weights) < 0 or not 0 < sum(self.weights) < np.inf:
+                raise InputError(
+                    f"{len(self.weights)} weights of the cosmic rays' electrons, expected {wanted} of 0 and above"
+                )
+
+    def charge(self, seconds: float) -> Float:
+        """Probabilities of the electrons that one pixel collects in a time: a compound Poisson distribution.
+
+        Returns
+        -------
+        ndarray, shape (n,)
+            Of 0, 1, 2, ... electrons; what is left out has less than 2**-40.
+        """
+        low, high = (int(e) for e in self.electrons)
+        hits = self.rate_per_cm2_s * self.area_cm2 / self.pixels * seconds
+        most = 1
+        while special.pdtrc(most, hits) > 2.0**-40:
+            most += 1
+        size = 1 << (most * high + 1).bit_length()
+        if size > 2**24:
+            raise InputError(
+                f"cosmic rays free up to {most * high} electrons in a pixel and draw, expected at most {2**23}: "
+                "lower the rate, the charge or the exposure"
+            )
+        one = np.zeros(size)
+        one[low : high + 1] = 1.0 if self.weights is None else self.weights
+        # The generating function of a sum of a Poisson number of hits; distances beyond `size` would fold back.
+        spectrum = np.exp(hits * (np.fft.rfft(one / one.sum()) - 1.0))
+        return np.maximum(np.fft.irfft(spectrum, size)[: most * high + 1], 0.0)
+
+
+@dataclass(frozen=True)
+class Processes:
+    """Which optional processes act.
+
+    Attributes
+    ----------
+    cosmic_rays : CosmicRays, optional
+    jitter : Prior, optional
+        Share of the light that a frame loses by pointing jitter, on top of the expectation; drawn for every frame.
+        ``Uniform(0, 0.05)`` is the paper's expectation.
+    detector_temperature : Prior, optional
+        deg C, drawn for every realisation; the dark current follows by the instrument's law.
+    light_loss, pointing_loss : Prior, optional
+        In place of the instrument's value, drawn for every realisation.
+    qe_scale : Prior, optional
+        Factor on the quantum efficiency, drawn for every realisation.
+    """
+
+    cosmic_rays: CosmicRays | None = None
+    jitter: Prior | None = None
+    detector_temperature: Prior | None = None
+    light_loss: Prior | None = None
+    pointing_loss: Prior | None = None
+    qe_scale: Prior | None = None
+
+    @property
+    def modulations(self) -> tuple[tuple[str, Literal["light", "dark"]], ...]:
+        """Names of the priors given, and what each changes."""
+        return tuple(
+            (name, "dark" if name == "detector_temperature" else "light")
+            for name in (f.name for f in fields(self))
+            if name != "cosmic_rays" and getattr(self, name) is not None
+        )
+
+    def factors(self, conditions: Mapping[str, float]) -> Factors:
+        """What is drawn of each prior: factors on light or dark, less one.
+
+        Parameters
+        ----------
+        conditions : mapping of float
+            The expectation's own values: ``temperature_c``, ``dark_slope_per_c``, ``light_loss``, ``pointing_loss``.
+
+        Raises
+        ------
+        InputError
+            For a prior that reaches where no value can be.
+        """
+        changes: dict[str, Callable[[Float], Float]] = {
+            "jitter": lambda lost: -lost,
+            "detector_temperature": lambda t: np.expm1(
+                conditions["dark_slope_per_c"] * (t - conditions["temperature_c"])
+            ),
+            "light_loss": lambda lost: (conditions["light_loss"] - lost) / (1.0 - conditions["light_loss"]),
+            "pointing_loss": lambda lost: (conditions["pointing_loss"] - lost) / (1.0 - conditions["pointing_loss"]),
+            "qe_scale": lambda scale: scale - 1.0,
+        }
+        tables = np.empty((len(self.modulations), 2 * layout.PRIOR_NODES), np.float32)
+        ends = {"light": (1.0, 1.0), "dark": (1.0, 1.0)}
+        centre = {"light": 1.0, "dark": 1.0}
+        for row, (name, factor) in enumerate(self.modulations):
+            prior = getattr(self, name)
+            first, last = prior.quantile(np.array([0.0, 1.0]))
+            low, high = LIMITS[name]
+            if not (low <= first and last <= high):
+                raise InputError(f"the prior of {name} runs from {first:g} to {last:g}, expected {low:g} to {high:g}")
+            tables[row], middle = table_of(prior, changes[name])
+            centre[factor] *= 1.0 + middle
+            least, most = sorted(1.0 + changes[name](np.array([first, last])))
+            ends[factor] = ends[factor][0] * float(least), ends[factor][1] * float(most)
+        return Factors(tables, centre["light"], centre["dark"], ends["light"], ends["dark"])
+
+
+@dataclass(frozen=True, eq=False)
+class Factors:
+    """What priors do to light and dark.
+
+    Attributes
+    ----------
+    tables : ndarray of float32, shape (n_modulation, 2 * layout.PRIOR_NODES)
+        See `priors.table_of`.
+    light, dark : float
+        Factors of priors at their medians, which the tables are relative to.
+    light_ends, dark_ends : tuple of float, shape (2,)
+        Smallest and largest factors of all priors together.
+    """
+
+    tables: NDArray[np.float32]
+    light: float
+    dark: float
+    light_ends: tuple[float, float]
+    dark_ends: tuple[float, float]
+
+
+#: Where each prior's values must lie.
+LIMITS = {
+    "jitter": (0.0, 0.5),
+    "detector_temperature": (-100.0, 100.0),
+    "light_loss": (0.0, 0.99),
+    "pointing_loss": (0.0, 0.99),
+    "qe_scale": (0.01, 100.0),
+}
+NONE = Processes()

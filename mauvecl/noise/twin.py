@@ -1,0 +1,333 @@
+"""The slow NumPy twin of the kernels: what they draw. The same counters, the same arithmetic, the same order of sums.
+
+Integers are equal to the device's; so are floats where the device's arithmetic is strict, because every
+fused multiply-add here is rounded once, as there. Used by tests and by the self-test.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mauvecl.noise import layout
+from mauvecl.noise.scene import Scene
+
+if TYPE_CHECKING:
+    pass
+
+Words = tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.uint32], NDArray[np.uint32]]
+Floats = NDArray[np.float32]
+
+_MULTIPLIERS = (np.uint64(0xD2511F53), np.uint64(0xCD9E8D57))
+_KEY_STEPS = (0x9E3779B9, 0xBB67AE85)
+_POLYNOMIALS = {
+    name: [np.float32(float.fromhex(c)) for c in coefficients] for name, coefficients in layout.POLYNOMIALS.items()
+}
+_TWO_LN2 = np.float32(float.fromhex(layout.TWO_LN2))
+MAGIC = np.float32(layout.MAGIC)
+
+
+def philox(counter: Sequence[ArrayLike], seed: int) -> Words:
+    """Philox4x32-10 (Salmon et al. 2011, doi 10.1145/2063384.2063405).
+
+    Parameters
+    ----------
+    counter : four array_like of uint32
+        Broadcast against each other.
+    seed : int
+        The 64-bit key.
+    """
+    c0, c1, c2, c3 = np.broadcast_arrays(*(np.asarray(c, dtype=np.uint64) for c in counter))
+    half, low_half = np.uint64(32), np.uint64(0xFFFFFFFF)
+    for r in range(10):
+        k0, k1 = (
+            np.uint64((((seed >> shift) & 0xFFFFFFFF) + r * step) & 0xFFFFFFFF)
+            for shift, step in zip((0, 32), _KEY_STEPS, strict=True)
+        )
+        p0, p1 = _MULTIPLIERS[0] * c0, _MULTIPLIERS[1] * c2
+        c0, c1, c2, c3 = (p1 >> half) ^ c1 ^ k0, p1 & low_half, (p0 >> half) ^ c3 ^ k1, p0 & low_half
+    return (c0.astype(np.uint32), c1.astype(np.uint32), c2.astype(np.uint32), c3.astype(np.uint32))
+
+
+def words_at(realisation: ArrayLike, frame: int, stream: str, group: ArrayLike, seed: int, exposure: int = 0) -> Words:
+    """The four words that four neighbouring pixels of one realisation and frame share in a stream.
+
+    Parameters
+    ----------
+    realisation : array_like of int
+        64-bit indices.
+    frame : int
+    stream : str
+        A key of `layout.STREAMS`.
+    group : array_like of int
+        Pixel index over four.
+    seed : int
+    exposure : int
+        0 for the observed exposure, `layout.REFERENCE` for the other.
+    """
+    index = np.asarray(realisation, dtype=np.uint64)
+    last = np.uint64((exposure + layout.STREAMS[stream]) << 24) | np.asarray(group, dtype=np.uint64)
+    return philox((index & np.uint64(0xFFFFFFFF), index >> np.uint64(32), np.uint64(frame), last), seed)
+
+
+def fma(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> Floats:
+    """a * b + c in float32, rounded once.
+
+    The product is exact in float64. The sum is rounded to odd there (its error decides the last bit), which makes the
+    second rounding, to float32, the correct one (Boldo & Melquiond 2008, doi 10.1109/TC.2007.70819).
+    """
+    product = np.asarray(a, np.float64) * np.asarray(b, np.float64)
+    addend = np.asarray(c, np.float64)
+    total = product + addend
+    virtual = total - product
+    error = (product - (total - virtual)) + (addend - virtual)
+    even = (np.asarray(total).view(np.int64) & 1) == 0
+    odd = np.nextafter(total, np.where(error > 0, np.inf, -np.inf))
+    return np.asarray(np.where((error != 0) & even, odd, total)).astype(np.float32)
+
+
+def _horner(name: str, x: Floats) -> Floats:
+    *rest, value = _POLYNOMIALS[name]
+    result: Floats = np.full_like(x, value)
+    for coefficient in reversed(rest):
+        result = fma(result, x, coefficient)
+    return result
+
+
+def normal_pair(radius_word: NDArray[np.uint32], angle_word: NDArray[np.uint32]) -> tuple[Floats, Floats]:
+    """Two standard normals from two words, by Box and Muller (1958, doi 10.1214/aoms/1177706645)."""
+    t = radius_word.astype(np.float32) + np.float32(0.5)
+    split = np.uint32(0x3F3504F3)
+    bits = t.view(np.uint32) - split
+    halvings = (np.int32(32) - (bits.view(np.int32) >> 23)).astype(np.float32)
+    f = ((bits & np.uint32(0x007FFFFF)) + split).view(np.float32) - np.float32(1.0)
+    radius = np.sqrt(fma(halvings, _TWO_LN2, f * _horner("log", f)))
+    s = (angle_word << np.uint32(1)).view(np.int32).astype(np.float32) * np.float32(2.0**-32)
+    y = s * s
+    sine, cosine = s * _horner("sin", y), _horner("cos", y)
+    radius = (radius.view(np.uint32) ^ (angle_word & np.uint32(0x80000000))).view(np.float32)
+    return radius * cosine, radius * sine
+
+
+def alias_draw(word: NDArray[np.uint32], table: NDArray[np.uint32], bits: int) -> NDArray[np.uint32]:
+    """The alias table's column for each word; see `poisson.AliasTable`."""
+    shift = np.uint32(layout.WORD_BITS - bits)
+    column = word >> shift
+    entry = table[column]
+    mask = (np.uint32(1) << shift) - np.uint32(1)
+    return np.where((word & mask) < (entry & mask), column, entry >> shift)
+
+
+def expansion_draw(z: Floats, offset: np.float32, slope: np.float32, cubic: np.float32) -> Floats:
+    """Poisson counts of a large mean, relative to the whole number nearest to it."""
+    curve = fma(z, cubic, np.float32(0.16666667))
+    return nearest(fma(z, fma(z, curve, slope), offset))
+
+
+def nearest(x: Floats) -> Floats:
+    """Nearest whole number, ties to even, for values below 2**22."""
+    return np.asarray((x + MAGIC) - MAGIC)
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """What was drawn for four neighbouring pixels; each entry has the shape (n_realisation,)."""
+
+    z: list[Floats]
+    dark: list[Floats]
+    photon: Words | None
+    cosmic: list[Floats]
+
+
+def poisson_draw(words: Words, i: int, source: np.void, tables: NDArray[np.uint32], pairs: Sequence[Floats]) -> Floats:
+    """One pixel's count, relative to its whole number; `pairs` are the normals of the four words."""
+    if not source["bits"]:
+        return expansion_draw(pairs[i], source["offset"], source["slope"], source["cubic"])
+    column = alias_draw(words[i], tables[int(source["table"]) :], int(source["bits"]))
+    return np.asarray((column.astype(np.int32) + source["low"]).astype(np.float32))
+
+
+def four_normals(w: Words) -> list[Floats]:
+    """Normals of four neighbouring pixels."""
+    return [*normal_pair(w[0], w[1]), *normal_pair(w[2], w[3])]
+
+
+def draws(
+    scene: Scene, realisation: NDArray[np.uint64], frame: int, group: int, seed: int, *, exposure: int = 0
+) -> Draws:
+    """Everything drawn for four pixels of one draw."""
+    job = scene.job
+    address = (realisation, int(job["first_frame"]) + frame)
+    place = (int(job["first_group"]) + group, seed, exposure)
+    z = four_normals(words_at(*address, "noise", *place))
+    dark: list[Floats] = []
+    if not scene.joint:
+        w = words_at(*address, "dark", *place)
+        y = four_normals(w)
+        four = scene.dark_counts[4 * group : 4 * group + 4]
+        dark = [poisson_draw(w, i, four[i], scene.tables, y) for i in range(4)]
+    photon = words_at(*address, "photon", *place) if scene.photons else None
+    cosmic: list[Floats] = []
+    if scene.cosmic:
+        table, bits = scene.tables[int(job["cosmic_table"]) :], int(job["cosmic_bits"])
+        cosmic = [
+            (alias_draw(word, table, bits).astype(np.int32) + job["cosmic_low"]).astype(np.float32)
+            for word in words_at(*address, "cosmic", *place)
+        ]
+    return Draws(z, dark, photon, cosmic)
+
+
+def quantile(word: NDArray[np.uint32], finer: NDArray[np.uint32], table: Floats) -> Floats:
+    """A prior's factor, less one, at the probability that a word and its finer digits stand for."""
+    low_bits = 23 - layout.PRIOR_BITS
+    side = word.view(np.int32) >> 31
+    within = ((finer & np.uint32(0x7FFFFF)).astype(np.float32) + np.float32(0.5)) * np.float32(2.0**-23)
+    t = (word.view(np.int32) ^ side).astype(np.float32) + within
+    bits = t.view(np.uint32) - np.uint32((127 + 32 - layout.PRIOR_FINEST) << 23)
+    cell = (bits >> np.uint32(low_bits)) + (side.view(np.uint32) & np.uint32(layout.PRIOR_NODES))
+    part = (bits & np.uint32(2**low_bits - 1)).astype(np.float32) * np.float32(2.0**-low_bits)
+    return fma(part, table[cell + 1] - table[cell], table[cell])
+
+
+def together(a: Floats, b: Floats) -> Floats:
+    """The product of two factors, all less one."""
+    return fma(a, b, a + b)
+
+
+def factors(
+    scene: Scene, realisation: NDArray[np.uint64], frame: int, seed: int, *, exposure: int = 0
+) -> tuple[Floats, Floats]:
+    """Factors on light and dark of one draw, over those at the priors' medians and less one, shape (n_realisation,)."""
+    found = {"light": np.zeros(len(realisation), np.float32), "dark": np.zeros(len(realisation), np.float32)}
+    kept = np.zeros(len(realisation), np.float32)
+    first = int(scene.job["first_frame"]) + frame
+    for (name, factor), table in zip(scene.modulations, scene.priors, strict=True):
+        if name != "jitter":
+            words = words_at(realisation, 0, name, 0, seed)
+            found[factor] = together(found[factor], quantile(words[0], words[1], table))
+            continue
+        for f in range(first, first + (1 if scene.frames else scene.n_frames)):
+            words = words_at(realisation, f // 4, name, 0, seed, exposure)
+            kept = kept + quantile(words[f % 4], words[(f + 1) % 4], table)
+        if not scene.frames:
+            kept = kept * (np.float32(1.0) / np.float32(scene.n_frames))
+    return together(found["light"], kept), found["dark"]
+
+
+def analogue(scene: Scene, drawn: Draws, i: int, pixel: int, k: int, light: Floats, dark: Floats) -> Floats:
+    """The count above the level's base before the ADC, shape (n_realisation,)."""
+    level, z = scene.levels[k, pixel], drawn.z[i]
+    if scene.modulations:
+        v = _responding(scene.responses[k, pixel], level["c0"], z, light, dark, quartic=scene.quartic)
+    elif scene.joint:
+        first, *rest = ("c4", "c3", "c2", "c1", "c0") if scene.quartic else ("c3", "c2", "c1", "c0")
+        v = np.full_like(z, level[first])
+        for name in rest:
+            v = fma(z, v, level[name])
+    else:
+        v = fma(drawn.dark[i], scene.dark_counts[pixel]["gain"], fma(z, level["c1"], level["c0"]))
+    if drawn.photon is not None:
+        source = scene.photon_counts[k, pixel]
+        # The two of a pair use each other's words where the count comes from a normal.
+        count = poisson_draw(drawn.photon, i, source, scene.tables, four_normals(drawn.photon))
+        v = fma(count, source["gain"], v)
+    if scene.cosmic:
+        v = fma(drawn.cosmic[i], scene.pixels[pixel]["cosmic_gain"], v)
+    return v
+
+
+def _responding(
+    r: np.void, c0: np.float32, z: Floats, light_change: Floats, dark_change: Floats, *, quartic: bool
+) -> Floats:
+    one = np.float32(1.0)
+    light, dark = light_change + one, dark_change + one
+    variance = fma(light, r["light_variance"], fma(dark, r["dark_variance"], r["other_variance"]))
+    third = fma(light, r["light_third"], dark * r["dark_third"])
+    fourth = fma(light, r["light_fourth"], dark * r["dark_fourth"])
+    with np.errstate(invalid="ignore", divide="ignore"):  # padded pixels have no variance
+        sd, share, zz = np.sqrt(variance), third / variance, z * z
+        curve = fourth * fma(zz, np.float32(0.041666668), np.float32(-0.125))
+        curve = curve - third * share * fma(zz, np.float32(0.055555556), np.float32(-0.1388889))
+        cubic = curve / (variance * sd)
+        v = fma(z, sd + cubic, fma(share, fma(zz, np.float32(0.16666667), np.float32(-0.16666667)), c0))
+        if quartic:
+            fifth = fma(light, r["light_fifth"], dark * r["dark_fifth"])
+            even = fifth * _quartic(zz, 0.008333334, -0.05, 0.025)
+            even = even - share * fourth * _quartic(zz, 0.041666668, -0.20833333, 0.083333336)
+            even = even + share * share * third * _quartic(zz, 0.037037037, -0.16358025, 0.052469134)
+            v = v + even / (variance * variance)
+    out: Floats = v + fma(light_change, r["light"], dark_change * r["dark"])
+    return out
+
+
+def _quartic(zz: Floats, second: float, first: float, constant: float) -> Floats:
+    return fma(zz, fma(zz, np.float32(second), np.float32(first)), np.float32(constant))
+
+
+def digitise(v: Floats, edge: np.void, *, clip: bool) -> Floats:
+    """DN above the level's base, rounded and clipped."""
+    r = v + MAGIC
+    if clip:
+        r = np.where(r < edge["low"], edge["low"], r)
+        r = np.where(r > edge["high"], edge["high"], r)
+    return np.asarray(r - MAGIC)
+
+
+def observed(
+    scene: Scene,
+    realisation: NDArray[np.uint64],
+    seed: int,
+    *,
+    exposure: int = 0,
+    number: int = 0,
+    scenarios: Sequence[int] | None = None,
+) -> NDArray[np.float32]:
+    """DN above the base, summed over the draws, of scenarios; of exposure `number` of several.
+
+    Returns
+    -------
+    ndarray of float32, shape (n_scenario, n_padded, n_realisation)
+    """
+    chosen = range(len(scene.levels)) if scenarios is None else scenarios
+    total = np.zeros((len(chosen), len(scene.pixels), len(realisation)), np.float32)
+    for frame in range(number * scene.n_draws, (number + 1) * scene.n_draws):
+        first = frame if scene.frames else number * scene.n_frames
+        light, dark = factors(scene, realisation, first, seed, exposure=exposure)
+        for group in range(len(scene.pixels) // 4):
+            drawn = draws(scene, realisation, frame, group, seed, exposure=exposure)
+            for i, p in enumerate(range(4 * group, 4 * group + 4)):
+                for row, k in enumerate(chosen):
+                    v = analogue(scene, drawn, i, p, k, light, dark)
+                    total[row, p] += digitise(v, scene.edges[k, p], clip=scene.clip)
+    return total
+
+
+def clipped(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray[np.int64]:
+    """Frames that each pixel of scenario 0 spends below zero and above saturation.
+
+    Returns
+    -------
+    ndarray of int64, shape (n_realisation, n_pixel, 2)
+    """
+    count = np.zeros((len(realisation), len(scene.pixels), 2), np.int64)
+    if scene.clip:
+        for frame in range(scene.n_draws):
+            light, dark = factors(scene, realisation, frame, seed)
+            for group in range(-(-scene.n_pixel // 4)):
+                drawn = draws(scene, realisation, frame, group, seed)
+                for i, p in enumerate(range(4 * group, min(4 * group + 4, len(scene.pixels)))):
+                    r = analogue(scene, drawn, i, p, 0, light, dark) + MAGIC
+                    count[:, p, 0] += r < scene.edges[0, p]["low"]
+                    count[:, p, 1] += r > scene.edges[0, p]["high"]
+    return count[:, : scene.n_pixel]
+
+
+def realise(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray[np.int64]:
+    """Raw DN of scenario 0 summed over the frames, shape (n_realisation, n_pixel)."""
+    above = observed(scene, realisation, seed, scenarios=[0])[0, : scene.n_pixel]
+    raw: NDArray[np.int64] = (above.astype(np.int64) + scene.n_draws * scene.base_dn[0][:, None]).T
+    return raw

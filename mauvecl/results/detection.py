@@ -1,0 +1,440 @@
+"""Thresholds with a known false-alarm probability, and detection probabilities with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.host.errors import InputError
+from mauvecl.noise.scene import Scene
+from mauvecl.results.channels import ChannelPlan, Key
+from mauvecl.results.roc import Roc
+from mauvecl.results.tally import Distribution, TailSamples, Tally
+from mauvecl.statistics.definitions import (
+    SHAPED,
+    STATISTICS,
+    UV_NM,
+    Interval,
+    Linear,
+    Normal,
+    QuadraticForm,
+    central_counts,
+    clopper_pearson,
+    closed_form,
+    matched_weights,
+    uv_weights,
+)
+from mauvecl.statistics.detection_interval import detection_interval
+from mauvecl.statistics.smoothing import Smoothing
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.results.tails import Tail
+
+#: A threshold needs this many realisations beyond it; a rarer tail is refused, never extrapolated.
+FEWEST_IN_TAIL = 100
+
+#: Thresholds with fewer than `FEWEST_IN_TAIL` beyond them: refused, or by importance sampling.
+Tails = Literal["counted", "sampled"]
+
+
+def countable(fap: float, realisations: int) -> bool:
+    """Whether enough realisations lie beyond the threshold to count them."""
+    return fap * realisations >= FEWEST_IN_TAIL * (1 - 1e-9)
+
+
+def check_fap(fap: float, realisations: int, tails: Tails = "counted") -> None:
+    """Refuse a false-alarm probability that this many realisations cannot settle.
+
+    Raises
+    ------
+    InputError
+        If it is none, or fewer than 100 realisations would lie beyond the threshold and tails are not sampled.
+    """
+    if not 0.0 < fap < 1.0:
+        raise InputError(f"fap = {fap!r}, expected a probability between 0 and 1")
+    if tails not in ("counted", "sampled"):
+        raise InputError(f"tails = {tails!r}, expected 'counted' or 'sampled'")
+    if tails == "counted" and not countable(fap, realisations):
+        raise InputError(
+            f"fap = {fap:g} leaves {fap * realisations:.3g} of {realisations} realisations beyond the threshold, "
+            f"expected at least {FEWEST_IN_TAIL}: ask for {int(np.ceil(FEWEST_IN_TAIL / fap))} realisations, or for "
+            "sampled tails"
+        )
+
+
+@dataclass(eq=False)
+class Detection:
+    """Null and flare distributions of one study; made by `Engine.detect`.
+
+    Attributes
+    ----------
+    quiet : Expectation
+    flares : tuple of Expectation
+    asked : sequence of str or Linear
+        Statistics.
+    scene : Scene
+    realisations : int
+    tails : {"counted", "sampled"}
+        Whether a threshold beyond what was drawn is refused, or found by importance sampling.
+    seed : int
+        Of the draws.
+    statistics : tuple of str
+        Their names.
+    """
+
+    quiet: Expectation
+    flares: tuple[Expectation, ...]
+    asked: Sequence[str | Linear]
+    scene: Scene
+    realisations: int
+    tails: Tails = "counted"
+    seed: int = 0
+    statistics: tuple[str, ...] = field(init=False)
+    _tails: dict[tuple[str, int, float], Tail] = field(default_factory=dict, init=False, repr=False)
+    _forms: dict[tuple[str, int | None, int], QuadraticForm | Normal] = field(
+        default_factory=dict, init=False, repr=False
+    )
+    _own: dict[str, NDArray[np.float64]] = field(default_factory=dict, init=False, repr=False)
+    _found: dict[Key, Distribution] = field(default_factory=dict, init=False, repr=False)
+    _samples: dict[Key, TailSamples] = field(default_factory=dict, init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        names = [one.name if isinstance(one, Linear) else one for one in self.asked]
+        self.statistics = tuple(dict.fromkeys(names))
+        if not self.statistics:
+            raise InputError(f"no statistic named, expected some of {', '.join(STATISTICS)}")
+        for one in self.asked:
+            if isinstance(one, Linear):
+                self._add(one)
+            elif one not in STATISTICS:
+                raise InputError(f"statistic {one!r} is unknown, expected one of {', '.join(STATISTICS)}")
+        shaped = [name for name in self.statistics if name in SHAPED]
+        if shaped and not self.flares:
+            raise InputError(f"no flare given, expected at least one for the statistic {shaped[0]!r}")
+        if not self.scene.used.any():
+            raise InputError(f"every pixel of {self.quiet.name} is saturated, expected a fainter star")
+        if "uv_excess" in self.statistics and not uv_weights(self.quiet, self.scene.used).any():
+            raise InputError(
+                f"no pixel of {self.quiet.name} that counts lies at {UV_NM[0]:g}-{UV_NM[1]:g} nm, expected some for "
+                "the statistic 'uv_excess'"
+            )
+
+    def _add(self, own: Linear) -> None:
+        if own.name in self._own:
+            raise InputError(f"statistic {own.name!r} is given twice, expected different names")
+        if own.weights.size != self.scene.n_pixel:
+            raise InputError(
+                f"statistic {own.name!r} has {own.weights.size} weights, expected one for each of the "
+                f"{self.scene.n_pixel} pixels"
+            )
+        weights = own.weights * self.scene.used
+        if not weights.any():
+            raise InputError(f"statistic {own.name!r} weighs only saturated pixels, expected others")
+        self._own[own.name] = weights
+
+    def weights(self, statistic: str, template: int = 0) -> NDArray[np.float64] | None:
+        """Weights per DN of a linear statistic, shape (n_pixel,); None for the others.
+
+        Parameters
+        ----------
+        statistic : str
+        template : int
+            For `SHAPED` statistics: the flare whose shape is looked for.
+        """
+        if statistic == "matched":
+            return matched_weights(self.quiet, self.flares[template], self.scene.used, self.scene.comparison)
+        if statistic == "uv_excess":
+            return uv_weights(self.quiet, self.scene.used, self.scene.comparison)
+        return self._own.get(statistic)
+
+    @cached_property
+    def smoothing(self) -> Smoothing:
+        """Of the statistic `paper`."""
+        return Smoothing.of(self.quiet, self.scene.used, self.flares)
+
+    def collect(self, plan: ChannelPlan, tally: Tally, samples: Sequence[TailSamples | None]) -> None:
+        """Take over the distributions and tails of one batch."""
+        for index, (key, kept) in enumerate(zip(plan.keys, samples, strict=True)):
+            self._found[key] = tally.distribution(index)
+            if kept is not None:
+                self._samples[key] = kept
+
+    @cached_property
+    def blinding(self) -> tuple[int, ...]:
+        """Flares that saturate every pixel that counts."""
+        used = self.scene.used
+        return tuple(k for k, x in enumerate(self.flares) if x.saturated[used].all())
+
+    @property
+    def messages(self) -> tuple[str, ...]:
+        """What the reader must be told of these flares."""
+        return tuple(
+            f"SATURATED: flare {k + 1} saturates every pixel of {self.quiet.name} that counts: what is recorded no "
+            "longer depends on the flare, and no number is given."
+            for k in self.blinding
+        )
+
+    def distribution(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Distribution:
+        """The simulated distribution of a statistic.
+
+        Parameters
+        ----------
+        statistic : str
+        flare : int, optional
+            Which flare; None for the null.
+        template : int
+            For the null of `SHAPED` statistics: the flare whose shape is looked for.
+        """
+        self._check(statistic, flare, template)
+        if flare is None:
+            return self._at(self._null_key(statistic, template))
+        return self._at((statistic, "flare", flare))
+
+    def _at(self, key: Key) -> Distribution:
+        """What was counted; InputError where it has values that are no finite numbers."""
+        statistic, role, flare = key
+        found = self._found[key]
+        of = "without a flare" if role == "null" else f"with flare {flare + 1}"
+        found.refuse_undefined(f"statistic {statistic!r} {of}")
+        return found
+
+    def closed_form(self, statistic: str, flare: int | None = None, *, template: int = 0) -> QuadraticForm | Normal:
+        """The same distribution for Gaussian noise; parameters as for `distribution`."""
+        self._check(statistic, flare, template)
+        key = statistic, flare, template
+        if key not in self._forms:
+            self._forms[key] = self._closed_form(statistic, flare, template)
+        return self._forms[key]
+
+    def _closed_form(self, statistic: str, flare: int | None, template: int) -> QuadraticForm | Normal:
+        observed = self.quiet if flare is None else self.flares[flare]
+        template = template if flare is None else flare
+        if statistic == "paper":
+            scale = self.smoothing.scale(self.flares[template])
+            delta = observed.signal_dn - self.quiet.signal_dn
+            return self.smoothing.form(scale, delta, observed.variance_dn2 + self.quiet.variance_dn2)
+        weights = self.weights(statistic, template)
+        return closed_form(statistic, self.quiet, observed, self.scene.used, weights, self.scene.comparison)
+
+    def dof(self, statistic: str) -> int:
+        """Degrees of freedom without a flare: pixels, resolution elements, or one."""
+        if self.weights(statistic) is not None:
+            return 1
+        if statistic == "chi2_element":
+            return int(np.unique(self.quiet.element[self.scene.used]).size)
+        return int(self.scene.used.sum())
+
+    def histogram(
+        self, statistic: str, flare: int | None = None, *, template: int = 0, bins: int = 200
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Edges and counts for pictures; parameters as for `distribution`."""
+        return self.distribution(statistic, flare, template=template).histogram(bins)
+
+    def threshold(self, fap: float = 1e-3, statistic: str = "chi2", *, template: int = 0) -> Interval:
+        """The value exceeded with false-alarm probability `fap` in one test.
+
+        Parameters
+        ----------
+        fap : float
+            Per test.
+        statistic : str
+        template : int
+            For `SHAPED` statistics: the flare whose shape is looked for.
+
+        Returns
+        -------
+        Interval
+            The simulated upper quantile, rounded up to a bin's edge (1/512 of a standard deviation, or 2**-13 of the
+            value beyond 32 of them), and an order-statistic interval; where tails are sampled and few lie beyond, what
+            importance sampling found.
+
+        Raises
+        ------
+        InputError
+            If fewer than 100 realisations lie beyond and tails are counted: the tail is never extrapolated.
+        """
+        return self._cut(fap, statistic, template)
+
+    def tail(self, fap: float, statistic: str = "chi2", *, template: int = 0) -> Tail | None:
+        """The importance sampling behind a threshold, or None where realisations were counted."""
+        self._check(statistic, None, template)
+        check_fap(fap, self.realisations, self.tails)
+        if countable(fap, self.realisations):
+            return None
+        key = (statistic, self._null(statistic, template), fap)
+        if key not in self._tails:
+            from mauvecl.results.tails import tail
+
+            self._tails[key] = tail(self, fap, statistic, template=template, seed=self.seed)
+        return self._tails[key]
+
+    def false_alarm_probability(self, threshold: float, statistic: str = "chi2", *, template: int = 0) -> Interval:
+        """Fraction of null realisations at or above a threshold, with its interval; the inverse of `threshold`.
+
+        Exact at edges of bins, as thresholds that were counted are; linear within a bin.
+        """
+        null = self.distribution(statistic, template=template)
+        return self._share_above(null, Interval(threshold, threshold, threshold))
+
+    def detection_probability(self, fap: float = 1e-3, statistic: str = "chi2") -> list[Interval]:
+        """For each flare, the fraction of realisations at or above the threshold; NaN for `blinding` ones.
+
+        The interval holds the probability above the true threshold with 95 %: see `intervals.detection_interval`.
+
+        Raises
+        ------
+        InputError
+            As `threshold`.
+        """
+        probabilities = []
+        for flare in range(len(self.flares)):
+            if flare in self.blinding:
+                probabilities.append(Interval(np.nan, np.nan, np.nan))
+                continue
+            cut = self._cut(fap, statistic, flare)
+            found = self._at((statistic, "flare_on_null_grid", flare))
+            above = [found.above(value) for value in (cut.value, cut.high, cut.low)]
+            shared = 0.0
+            if countable(fap, self.realisations) and found.std > 0:
+                # A flare adds what is not correlated with the null; tilted draws are others than the flares'.
+                shared = min(self._at(self._null_key(statistic, flare)).std / found.std, 1.0)
+            probabilities.append(detection_interval(above, found.n, fap, shared))
+        return probabilities
+
+    @staticmethod
+    def _share_above(found: Distribution, cut: Interval) -> Interval:
+        """The share at or above a threshold; its interval is of whole counts, at the ends of the threshold's own."""
+        value, low, high = (found.above(x) for x in (cut.value, cut.high, cut.low))
+        return Interval(
+            value / found.n,
+            clopper_pearson(int(np.floor(low)), found.n).low,
+            clopper_pearson(int(np.ceil(high)), found.n).high,
+        )
+
+    def quantile(
+        self, probability: float, statistic: str = "chi2", flare: int | None = None, *, template: int = 0
+    ) -> Interval:
+        """A quantile of a simulated distribution with its order-statistic interval; others as for `distribution`."""
+        return self.distribution(statistic, flare, template=template).quantile_interval(probability)
+
+    def tail_samples(self, statistic: str = "chi2", flare: int | None = None, *, template: int = 0) -> QTable:
+        """The 1000 largest values of a null or the smallest of a flare, exactly, with their realisations.
+
+        The realisation's number brings its spectrum back: `Engine.realise` with the same seed.
+
+        Returns
+        -------
+        QTable
+            ``realisation`` and ``value``, the most extreme first.
+        """
+        from astropy.table import QTable
+
+        self._check(statistic, flare, template)
+        key: Key = (statistic, "flare", flare) if flare is not None else self._null_key(statistic, template)
+        self._at(key)
+        kept = self._samples[key]
+        table = QTable({"realisation": kept.realisations, "value": kept.values})
+        table["value"].info.description = "of the statistic, as the device computed it"
+        return table
+
+    def roc(self, statistic: str = "chi2", flare: int = 0) -> Roc:
+        """False-alarm probability against detection probability, and the area under the curve."""
+        self._check(statistic, flare)
+        null = self._at(self._null_key(statistic, flare))
+        return Roc.of(null, self._at((statistic, "flare_on_null_grid", flare)))
+
+    def plot(self, path: str | Path | None = None, *, fap: float = 1e-3) -> object:
+        """Null and flare distributions by every statistic, with thresholds; needs matplotlib."""
+        from mauvecl.pictures.answers import detection
+
+        flares = [f"flare {k + 1}" for k in range(len(self.flares))]
+        return detection([(self.quiet.name, self, flares)], fap, path)
+
+    def table(self, fap: float = 1e-3) -> QTable:
+        """One row per flare and statistic: expected and simulated values, threshold and probability.
+
+        Raises
+        ------
+        InputError
+            As `threshold`.
+        """
+        from astropy.table import QTable
+
+        columns = (
+            "name", "statistic", "dof", "expected", "mean", "std", "reduced", "threshold", "threshold_low",
+            "threshold_high", "probability", "low", "high", "closed_form_threshold", "closed_form_probability",
+        )  # fmt: skip
+        probability = {statistic: self.detection_probability(fap, statistic) for statistic in self.statistics}
+        rows = []
+        for flare, x in enumerate(self.flares):
+            for statistic in self.statistics:
+                d, p = self.distribution(statistic, flare), probability[statistic][flare]
+                cut = self.threshold(fap, statistic, template=flare)
+                theory = self.closed_form(statistic, flare)
+                limit = self.closed_form(statistic, template=flare).isf(fap)
+                dof = self.dof(statistic)
+                of_flare, power = (theory.mean, d.mean, d.std, d.mean / dof), theory.sf(limit)
+                if flare in self.blinding:
+                    of_flare, power = (np.nan,) * 4, np.nan
+                row = (x.name, statistic, dof, *of_flare, cut.value, cut.low, cut.high, p.value, p.low, p.high)
+                rows.append((*row, limit, power))
+        table = QTable(rows=rows, names=columns)
+        for name, text in DESCRIPTIONS.items():
+            table[name].info.description = text
+        tails = [self.tail(fap, s, template=flare) for flare in range(len(self.flares)) for s in self.statistics]
+        binomial = float(np.sqrt((1 - fap) / (fap * self.realisations)))
+        table["fap_error"] = [binomial if tail is None else tail.relative_error for tail in tails]
+        table["fap_error"].info.description = "relative standard error of the false-alarm probability at the threshold"
+        table.meta |= {"fap": fap, "realisations": self.realisations, "exposure_s": self.quiet.exposure_s}
+        table.meta["tails"] = "counted" if countable(fap, self.realisations) else "importance sampling"
+        return table
+
+    def _null_key(self, statistic: str, template: int) -> Key:
+        return statistic, "null", self._null(statistic, template)
+
+    def _null(self, statistic: str, template: int) -> int:
+        return template if statistic in SHAPED else 0
+
+    def _cut(self, fap: float, statistic: str, template: int) -> Interval:
+        """The threshold: as it was sampled, or the null's lowest edges with so many at or above them."""
+        sampled = self.tail(fap, statistic, template=template)
+        if sampled is not None:
+            return sampled.threshold
+        null = self._at(self._null_key(statistic, template))
+        n_low, n_high = central_counts(null.n, fap)
+        wanted = (int(np.floor(fap * null.n * (1 + 1e-12))), n_high, max(n_low - 1, 0))
+        return Interval(*map(null.edge_with_at_most, wanted))
+
+    def _check(self, statistic: str, flare: int | None, template: int = 0) -> None:
+        if statistic not in self.statistics:
+            raise InputError(f"statistic {statistic!r} was not simulated, expected one of {', '.join(self.statistics)}")
+        if flare is None and statistic in SHAPED:
+            flare = template
+        if flare is not None and not 0 <= flare < len(self.flares):
+            raise InputError(f"flare = {flare}, expected 0 to {len(self.flares) - 1}")
+
+
+DESCRIPTIONS = {
+    "dof": "degrees of freedom without a flare",
+    "expected": "closed-form mean with the flare",
+    "mean": "simulated mean with the flare",
+    "std": "simulated standard deviation with the flare",
+    "reduced": "simulated mean over degrees of freedom",
+    "threshold": "simulated threshold at the false-alarm probability, per test",
+    "threshold_low": "its 95 % interval, lower end",
+    "threshold_high": "its 95 % interval, upper end",
+    "probability": "detection probability at that threshold",
+    "low": "its 95 % interval, lower end, the threshold's error included",
+    "high": "its 95 % interval, upper end, the threshold's error included",
+    "closed_form_threshold": "threshold for Gaussian noise",
+    "closed_form_probability": "detection probability for Gaussian noise",
+}

@@ -1,0 +1,293 @@
+"""Signal-to-noise distributions: what the device is asked, and the tables made of its answer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.host.errors import InputError
+from mauvecl.noise import layout
+from mauvecl.noise.scene import Scene
+from mauvecl.noise.twin import Floats, fma
+from mauvecl.results.far import Sparse
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.host.expectation import Expectation
+
+#: Bins of an element's S/N to its standard deviation: +-8 of these.
+BINS_PER_SIGMA = 128.0
+#: Percentages of the quantiles reported: the median and one, two and three sigma.
+PERCENTAGES = (0.135, 2.5, 16.0, 50.0, 84.0, 97.5, 99.865)
+
+
+def observers(x: Expectation, scene: Scene) -> NDArray[np.void]:
+    """What an observer subtracts and assumes in each pixel, for the device.
+
+    Returns
+    -------
+    ndarray of layout.OBSERVER, shape (n_padded,)
+    """
+    table = np.zeros(len(scene.pixels), layout.OBSERVER)
+    table["variance"] = 1.0  # padding: 0 / 1
+    real = table[: scene.n_pixel]
+    real["net_offset"] = scene.n_draws * scene.base_dn[0] - x.n_frames * (x.bias_dn + x.dark_dn)
+    real["gain"] = x.gain_dn_per_electron
+    real["variance"] = x.n_frames * (x.read_noise_dn**2 + x.dark_variance_dn2)
+    # The fewest whole DN to a bin that still reach +-8 sigma: sigma / 128 to sigma / 64.
+    wanted = 16.0 * np.sqrt(x.variance_dn2) / layout.OBSERVER_BINS
+    real["bin_shift"] = np.ceil(np.log2(np.maximum(wanted, 1.0)))
+    return table
+
+
+def elements(x: Expectation) -> NDArray[np.void]:
+    """The resolution elements, each with bins around its closed-form S/N, scaled to its linearised spread.
+
+    Returns
+    -------
+    ndarray of layout.ELEMENT, shape (n_element,)
+    """
+    first = np.searchsorted(x.element, np.arange(x.element_wavelength_nm.size))
+    table = np.zeros(first.size, layout.ELEMENT)
+    table["first"], table["end"] = first, np.append(first[1:], x.element.size)
+    signal = x.per_element(x.signal_dn)
+    shot = x.per_element(x.gain_dn_per_electron * x.signal_dn)
+    noise = np.sqrt(shot + x.per_element(x.n_frames * (x.read_noise_dn**2 + x.dark_variance_dn2)))
+    gain = np.divide(shot, signal, out=np.zeros_like(signal), where=signal > 0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slope = 1.0 / noise - signal * gain / (2.0 * noise**3)
+        table["centre"] = np.nan_to_num(signal / noise)
+        # A noiseless element has no S/N to speak of; its bins do not matter.
+        table["bins_per_unit"] = np.nan_to_num(BINS_PER_SIGMA / (np.sqrt(x.per_element(x.variance_dn2)) * slope))
+    return table
+
+
+#: Bins that count: number 0 holds what is expected.
+FIRST_BIN, LAST_BIN = 1 - layout.OBSERVER_BINS // 2, layout.OBSERVER_BINS // 2 - 2
+#: Bins further out than this have no number.
+MOST_BINS = 2**31
+
+
+class Counts:
+    """Histograms of all pixels and elements, added up tile by tile.
+
+    Attributes
+    ----------
+    pixel : ndarray of int64, shape (n_pixel, OBSERVER_BINS)
+    element : ndarray of int64, shape (n_element, OBSERVER_BINS)
+        The first and the last bin are empty.
+    far : dict of str to Sparse
+        ``pixel`` and ``element``: bins as wide beyond those, by pixel or element and number.
+    clipped : ndarray of int64, shape (n_pixel, 2)
+        Frames below zero and above saturation.
+    n : int
+        Realisations.
+    """
+
+    def __init__(self, n_pixel: int, n_element: int) -> None:
+        self.pixel = np.zeros((n_pixel, layout.OBSERVER_BINS), np.int64)
+        self.element = np.zeros((n_element, layout.OBSERVER_BINS), np.int64)
+        self.far = {"pixel": Sparse(), "element": Sparse()}
+        self.clipped = np.zeros((n_pixel, 2), np.int64)
+        self.n = 0
+
+    def add(
+        self, pixel: NDArray[np.integer], element: NDArray[np.integer], clipped: NDArray[np.integer], n: int
+    ) -> None:
+        """Add what one or more tiles counted."""
+        inner = slice(1, layout.OBSERVER_BINS - 1)
+        self.pixel[:, inner] += pixel[:, inner]
+        self.element[:, inner] += element[:, inner]
+        self.clipped += clipped
+        self.n += n
+
+    def add_far(
+        self, dn: NDArray[np.integer], observers: NDArray[np.void], elements: NDArray[np.void], asked: NDArray[np.intp]
+    ) -> None:
+        """Count what lies outside the bins of some elements and their pixels.
+
+        Parameters
+        ----------
+        dn : ndarray of int, shape (n_pixel, n)
+            Raw DN less the scene's base, of some realisations.
+        observers : ndarray of layout.OBSERVER, shape (n_padded,)
+        elements : ndarray of layout.ELEMENT, shape (n_element,)
+        asked : ndarray of int
+            Which elements.
+        """
+        for e in asked:
+            element = elements[e]
+            first, end = int(element["first"]), int(element["end"])
+            for p in range(first, end):
+                self._count_far("pixel", p, dn[p].astype(np.int64) >> int(observers[p]["bin_shift"]))
+            ratio = signal_to_noise(dn[first:end], observers[first:end])
+            steps = np.rint((ratio - element["centre"]) * element["bins_per_unit"])
+            if not (np.abs(steps) < MOST_BINS).all():
+                raise InputError(
+                    f"the S/N of resolution element {e} is {ratio[np.abs(steps).argmax()]:g} in a realisation, "
+                    f"expected something nearer to its closed form of {element['centre']:g}"
+                )
+            self._count_far("element", e, steps.astype(np.int64))
+
+    def _count_far(self, kind: str, which: int, bins: NDArray[np.int64]) -> None:
+        outside = bins[(bins < FIRST_BIN) | (bins > LAST_BIN)]
+        if outside.size:
+            self.far[kind].count(which * (2 * MOST_BINS) + MOST_BINS + outside)
+
+    def spread_out(self, kind: str) -> NDArray[np.int64]:
+        """Pixels or elements that have something outside their bins."""
+        return np.unique(self.far[kind].keys // (2 * MOST_BINS))
+
+    def filled(self, kind: str, which: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Bins of one pixel or element that hold anything, rising from the expected number 0, and how much."""
+        dense = (self.pixel if kind == "pixel" else self.element)[which]
+        inner = np.flatnonzero(dense)
+        numbers, counts = inner - layout.OBSERVER_BINS // 2, dense[inner]
+        far, offset = self.far[kind], which * (2 * MOST_BINS) + MOST_BINS
+        mine = slice(*np.searchsorted(far.keys, (offset - MOST_BINS, offset + MOST_BINS)))
+        outside = far.keys[mine] - offset
+        below = int(np.count_nonzero(outside < 0))
+        return np.insert(outside, below, numbers), np.insert(far.counts[mine], below, counts)
+
+
+def signal_to_noise(dn: NDArray[np.integer], observers: NDArray[np.void]) -> Floats:
+    """An element's S/N as the device sums it, shape (n,), of its pixels' DN less the scene's base, (n_pixel, n)."""
+    signal, variance = (np.zeros(dn.shape[1], np.float32) for _ in range(2))
+    for n, observer in zip(dn, observers, strict=True):
+        net = n.astype(np.float32) + observer["net_offset"]
+        signal = signal + net
+        variance = variance + fma(np.maximum(net, np.float32(0.0)), observer["gain"], observer["variance"])
+    # Zero where the observer knows of no noise.
+    return np.divide(signal, np.sqrt(variance), out=np.zeros_like(signal), where=variance > 0)
+
+
+@dataclass(frozen=True, eq=False)
+class SnrResult:
+    """Distributions of the S/N over realisations.
+
+    Attributes
+    ----------
+    expectation : Expectation
+    scene : Scene
+    observers : ndarray of layout.OBSERVER, shape (n_padded,)
+    elements : ndarray of layout.ELEMENT, shape (n_element,)
+    counts : Counts
+    """
+
+    expectation: Expectation
+    scene: Scene
+    observers: NDArray[np.void]
+    elements: NDArray[np.void]
+    counts: Counts
+
+    @property
+    def pixel(self) -> QTable:
+        """S/N per pixel: wavelength, closed form, simulated mean, standard deviation, quantiles, clipped frames.
+
+        The histogram is of whole DN, of which the S/N is a function; its bins are 1/64 of a standard deviation or less.
+        """
+        x, seen = self.expectation, self.observers[: self.scene.n_pixel]
+        width = 2.0 ** seen["bin_shift"].astype(float)
+
+        def snr(which: NDArray[np.intp], place: NDArray[np.number]) -> NDArray[np.float64]:
+            # A bin holds the whole DN from its lower edge to one below the next.
+            dn = width[which] * place - 0.5
+            net = dn + seen["net_offset"].astype(float)[which]
+            noise2 = np.maximum(net, 0.0) * seen["gain"][which] + seen["variance"][which]
+            return np.asarray(np.divide(net, np.sqrt(noise2), out=np.zeros_like(net), where=noise2 > 0))
+
+        table = self._table("pixel", x.wavelength_nm, x.snr(), snr)
+        frames = self.counts.n * x.n_frames
+        for name, column in (("clipped_low", 0), ("clipped_high", 1)):
+            table[name] = self.counts.clipped[:, column] / frames
+            table[name].info.description = "share of frames cut off at this end: zero or saturation"
+        return table
+
+    @property
+    def element(self) -> QTable:
+        """The same per resolution element of 10.5 nm, without the clipped frames."""
+        x = self.expectation
+        step = np.divide(
+            1.0,
+            self.elements["bins_per_unit"],
+            out=np.zeros(len(self.elements)),
+            where=self.elements["bins_per_unit"] > 0,
+        )
+
+        def snr(which: NDArray[np.intp], place: NDArray[np.number]) -> NDArray[np.float64]:
+            return np.asarray(self.elements["centre"][which] + step[which] * (place - 0.5))
+
+        return self._table("element", x.element_wavelength_nm, x.snr_per_element(), snr)
+
+    def plot(self, path: str | Path | None = None) -> object:
+        """S/N per pixel and element, closed form and realisations; needs matplotlib."""
+        from mauvecl.pictures.answers import signal_to_noise
+
+        return signal_to_noise([(self.expectation.name, self)], path)
+
+    def _table(
+        self,
+        kind: str,
+        wavelength_nm: NDArray[np.float64],
+        expected: NDArray[np.float64],
+        snr: Callable[[NDArray[np.intp], NDArray[np.number]], NDArray[np.float64]],
+    ) -> QTable:
+        """A row for each pixel or element; `snr` of those, at places between the edges of bins, which are whole."""
+        import astropy.units as u
+        from astropy.table import QTable
+
+        counts = self.counts.pixel if kind == "pixel" else self.counts.element
+        numbers, every = (
+            np.arange(layout.OBSERVER_BINS + 1) - layout.OBSERVER_BINS // 2,
+            np.arange(len(counts))[:, None],
+        )
+        centres, edges = snr(every, numbers[:-1] + 0.5), snr(every, numbers)
+        share = counts / self.counts.n
+        mean = np.sum(share * centres, axis=1)
+        std = np.sqrt(np.sum(share * (centres - mean[:, None]) ** 2, axis=1))
+        cumulative = np.concatenate([np.zeros((len(counts), 1)), np.cumsum(counts, axis=1)], axis=1) / self.counts.n
+        spread_out = self.counts.spread_out(kind)
+        quantiles = np.array([
+            np.zeros(len(PERCENTAGES)) if i in spread_out else _quantiles(c, e)
+            for i, (c, e) in enumerate(zip(cumulative, edges, strict=True))
+        ])  # fmt: skip
+        for i in spread_out:
+            filled, found = self.counts.filled(kind, i)
+            middle = snr(i, filled + 0.5)
+            mean[i] = found @ middle / self.counts.n
+            std[i] = np.sqrt(found @ (middle - mean[i]) ** 2 / self.counts.n)
+            ends = np.column_stack([snr(i, filled), snr(i, filled + 1)]).ravel()
+            quantiles[i] = np.interp(np.array(PERCENTAGES) / 100, steps_of(found) / self.counts.n, ends)
+        table = QTable()
+        table["wavelength"] = wavelength_nm * u.nm
+        table["expected"] = expected
+        table["mean"] = mean
+        table["std"] = std
+        for i, percentage in enumerate(PERCENTAGES):
+            table[f"q{percentage:g}"] = quantiles[:, i]
+        table["expected"].info.description = "closed-form S/N of the mean spectrum"
+        table["mean"].info.description = "mean S/N of the realisations"
+        table["std"].info.description = "standard deviation of the S/N of the realisations"
+        table.meta["realisations"] = self.counts.n
+        table.meta["exposure_s"] = self.expectation.exposure_s
+        table.meta["name"] = self.expectation.name
+        return table
+
+
+def _quantiles(cumulative: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Quantiles of one histogram, linear within a bin."""
+    filled = np.flatnonzero(np.diff(cumulative))
+    span = slice(filled[0], filled[-1] + 2)
+    return np.asarray(np.interp(np.array(PERCENTAGES) / 100, cumulative[span], edges[span]))
+
+
+def steps_of(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Realisations below the lower and the upper edge of each bin, one after the other, shape (2 m,)."""
+    above = np.cumsum(counts)
+    return np.column_stack([above - counts, above]).ravel()

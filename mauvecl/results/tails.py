@@ -1,0 +1,282 @@
+"""Thresholds of false-alarm probabilities too small to count, by importance sampling of the engine's noise model.
+
+The normals behind each pixel are drawn from a distribution under which an alarm is common, and each realisation counts
+with the ratio of the two densities (exponential tilting; Siegmund 1976, doi 10.1214/aos/1176343541). Everything after
+the normals (skew of the dark, rounding, clipping, the statistic itself) is the engine's.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from mauvecl.host.errors import InputError
+from mauvecl.noise import layout
+from mauvecl.statistics.definitions import CONFIDENCE, PAIRED, Interval
+
+if TYPE_CHECKING:
+    from mauvecl.noise.scene import Scene
+    from mauvecl.results.detection import Detection
+
+Float = NDArray[np.float64]
+
+#: Realisations to begin with, and at most; each step doubles them.
+FEWEST, MOST = 8_000, 512_000
+#: Relative standard error of the false-alarm probability that is aimed at.
+WANTED_ERROR = 0.02
+#: Realisations drawn at once, from one run of counters.
+BLOCK = 500
+#: Second half of the generator's key: draws of tails are no draws of the engine.
+TAIL_KEY = 0x7461696C
+#: Quiescent exposures averaged at most: each is drawn on the host.
+MOST_AVERAGED = 30
+#: Smaller ones lie beyond what the polynomial of the draw was tested for.
+SMALLEST_FAP = 1e-10
+
+
+@dataclass(frozen=True)
+class Tail:
+    """A threshold from tilted draws.
+
+    Attributes
+    ----------
+    threshold : Interval
+    fap : float
+    relative_error : float
+        Standard error of the false-alarm probability at the threshold, over that probability.
+    realisations : int
+        Tilted draws.
+    """
+
+    threshold: Interval
+    fap: float
+    relative_error: float
+    realisations: int
+
+
+def tail(found: Detection, fap: float, statistic: str, *, template: int = 0, seed: int) -> Tail:
+    """The threshold that a statistic's null exceeds with a small probability.
+
+    Parameters
+    ----------
+    found : Detection
+        Of which only the scene and the quiescent star matter.
+    fap : float
+        1e-10 to 0.1.
+    statistic : str
+    template : int
+        For ``matched``: the flare whose shape is looked for.
+    seed : int
+
+    Raises
+    ------
+    InputError
+        If the noise is not drawn jointly and as stacks, processes act, more than 30 quiescent exposures are averaged,
+        or the error stays too large.
+    """
+    if not SMALLEST_FAP <= fap <= 0.1:
+        raise InputError(f"fap = {fap:g}, expected {SMALLEST_FAP:g} to 0.1 for importance sampling")
+    _check(found.scene)
+    null = found.closed_form(statistic, template=template)
+    how = _Tilt.towards(null.isf(fap), found, statistic, template)
+    values, logs = np.empty(0), np.empty(0)
+    goal = FEWEST
+    while True:
+        more = _tilted(found, statistic, template, how, seed, values.size, goal)
+        values, logs = (np.concatenate(pair) for pair in zip((values, logs), more, strict=True))
+        cut, low, high, error = _threshold(values, logs, fap)
+        if error <= WANTED_ERROR:
+            return Tail(Interval(cut, low, high), fap, error, values.size)
+        if goal >= MOST:
+            raise InputError(
+                f"the threshold of {statistic} at fap = {fap:g} has a relative error of {error:.2g} after {goal} "
+                f"tilted draws, expected {WANTED_ERROR:g}"
+            )
+        goal *= 2
+
+
+def _check(scene: Scene) -> None:
+    reasons = {
+        "noise drawn apart": not scene.joint,
+        "frames drawn one by one": scene.frames,
+        "cosmic rays": scene.cosmic,
+        "priors": bool(scene.modulations),
+        f"{scene.comparison.exposures} averaged exposures": scene.comparison.exposures > MOST_AVERAGED,
+    }
+    for reason, holds in reasons.items():
+        if holds:
+            raise InputError(
+                f"importance sampling with {reason}, expected stacks of joint draws and at most {MOST_AVERAGED} "
+                "averaged exposures: draw enough realisations"
+            )
+
+
+def _threshold(values: Float, logs: Float, fap: float) -> tuple[float, float, float, float]:
+    """The value with a weighted fraction `fap` at or above it, its interval, and that fraction's relative error."""
+    order = np.argsort(-values, kind="stable")
+    ordered, weight = values[order], np.exp(logs[order])
+    above = np.cumsum(weight) / values.size
+    # The variance of a mean of weights, over the draws that exceed each value.
+    variance = np.maximum(np.cumsum(weight**2) / values.size - above**2, 0.0) / values.size
+    error = np.sqrt(variance)
+    if above[-1] < fap:
+        return float("nan"), float("nan"), float("nan"), float("inf")
+    at = int(np.searchsorted(above, fap))
+    relative = float(error[at] / above[at])
+    # The ends are where the fraction is off by its own error at the threshold.
+    reach = float(special.ndtri(0.5 + CONFIDENCE / 2)) * relative
+    ends = np.searchsorted(above, (fap * (1.0 + reach), fap * (1.0 - reach)))
+    low, high = (float(ordered[min(int(end), values.size - 1)]) for end in ends)
+    return float(ordered[at]), low, high, relative
+
+
+@dataclass(frozen=True, eq=False)
+class _Tilt:
+    """How draws are moved towards an alarm: by `shift` along the first direction, or `stretch`ed along all of them.
+
+    Attributes
+    ----------
+    directions : ndarray or sparse array, shape (n_direction, n_pixel)
+        Orthonormal, in standard deviations of each pixel's difference.
+    stretch : ndarray, shape (n_direction,)
+    shift : float
+    """
+
+    directions: Any
+    stretch: Float
+    shift: float = 0.0
+
+    @classmethod
+    def towards(cls, goal: float, found: Detection, statistic: str, template: int) -> _Tilt:
+        """Such that the statistic comes near `goal` on average."""
+        from scipy.sparse import eye_array
+
+        scene, quiet = found.scene, found.quiet
+        sd = np.sqrt((1.0 + _share(found, statistic)) * quiet.variance_dn2) * scene.used
+        weights = found.weights(statistic, template)
+        if weights is not None:
+            # Linear: the mean moves along the statistic's own direction.
+            length = float(np.linalg.norm(weights * sd))
+            unit = 1.0 if scene.comparison.estimated else length
+            return cls((weights * sd / length)[None], np.ones(1), goal / unit)
+        # Quadratic: the spread grows, by exponential tilting of each independent square.
+        if statistic == "paper":
+            scale = found.smoothing.scale(found.flares[template])
+            square, modes = found.smoothing.modes(scale, sd**2)
+            directions = modes * sd / np.sqrt(square)[:, None]
+        elif statistic == "chi2_element":
+            member = quiet.element[None, :] == np.unique(quiet.element[scene.used])[:, None]
+            directions = member * sd
+            directions /= np.linalg.norm(directions, axis=1)[:, None]
+            square = np.ones(len(directions))
+        else:
+            directions = eye_array(scene.n_pixel, format="csr")[scene.used]
+            square = np.ones(directions.shape[0])
+        return cls(directions, _stretch(square, goal))
+
+    def moved(self, difference: Float) -> tuple[Float, Float]:
+        """What is added to differences, shape (n, n_pixel), and the logarithms of the draws' weights."""
+        along = difference @ self.directions.T
+        if self.shift:
+            there = along + self.shift
+            return self.shift * self.directions[0], self.shift**2 / 2 - self.shift * there[:, 0]
+        there = along * self.stretch
+        # The ratio of standard normal densities to those of spread `stretch`.
+        logs = np.log(self.stretch).sum() - 0.5 * there**2 @ (1.0 - 1.0 / self.stretch**2)
+        return (there - along) @ self.directions, np.asarray(logs)
+
+
+def _stretch(square: Float, goal: float) -> Float:
+    """Spreads of normals whose weighted squares then sum to `goal` on average."""
+    from scipy.optimize import brentq
+
+    most = float(square.max())
+
+    def excess(share: float) -> float:
+        return float(np.sum(square / (1.0 - share * square / most))) - goal
+
+    share = 0.0 if excess(0.0) >= 0 else float(brentq(excess, 0.0, 1.0 - 1e-12))
+    return np.asarray(1.0 / np.sqrt(1.0 - share * square / most))
+
+
+def _share(found: Detection, statistic: str) -> float:
+    return 1.0 if statistic in PAIRED else found.scene.comparison.share
+
+
+def _tilted(
+    found: Detection, statistic: str, template: int, tilt: _Tilt, seed: int, start: int, stop: int
+) -> tuple[Float, Float]:
+    """Values of tilted draws number start to stop - 1, whole blocks, and the logarithms of their weights."""
+    parts = [_block(found, statistic, template, tilt, seed, b) for b in range(start // BLOCK, stop // BLOCK)]
+    values, logs = (np.concatenate(part) for part in zip(*parts, strict=True))
+    return values, logs
+
+
+def _block(found: Detection, statistic: str, template: int, tilt: _Tilt, seed: int, block: int) -> tuple[Float, Float]:
+    scene = found.scene
+    exposures = 1 if statistic in PAIRED else scene.comparison.exposures
+    z, *others = (_normals(scene.n_pixel, seed, block, exposure) for exposure in range(1 + exposures))
+    share = _share(found, statistic)
+    # Only the difference is tilted; what it does not see stays as drawn.
+    root = np.sqrt(1.0 + share)
+    difference = (z - share * sum(others)) / root
+    move, logs = tilt.moved(difference)
+    excess = _excess(scene, z + move / root)
+    subtracted = [_excess(scene, other - share * move / root) for other in others]
+    mean = share * np.sum(subtracted, axis=0) if subtracted else np.zeros_like(excess)
+    return _value(found, statistic, template, excess, mean), logs
+
+
+def _value(found: Detection, statistic: str, template: int, excess: Float, mean: Float) -> Float:
+    """The statistic of each draw, from observed less template and subtracted less template, DN, (n, n_pixel)."""
+    scene, quiet, share = found.scene, found.quiet, _share(found, statistic)
+    x = excess - mean
+    if statistic == "paper":
+        smoothed = x @ found.smoothing.rows.T
+        return np.asarray(smoothed**2 @ found.smoothing.scale(found.flares[template]))
+    variance = np.broadcast_to((1.0 + share) * quiet.variance_dn2, x.shape)
+    if scene.comparison.estimated:
+        variance = _estimated(scene, excess) + share * _estimated(scene, mean)
+    weights = found.weights(statistic, template)
+    if weights is not None:
+        total = x @ weights
+        return np.asarray(total / np.sqrt(variance @ weights**2) if scene.comparison.estimated else total)
+    x, variance = x * scene.used, variance * scene.used
+    if statistic == "chi2_element":
+        starts = np.flatnonzero(np.append(True, np.diff(quiet.element) > 0))
+        x, variance = (np.add.reduceat(values, starts, axis=1) for values in (x, variance))
+    return np.asarray(np.sum(np.divide(x**2, variance, out=np.zeros_like(x), where=variance > 0), axis=1))
+
+
+def _estimated(scene: Scene, excess: Float) -> Float:
+    """Variances as an observer estimates them, DN^2, shape (n, n_pixel)."""
+    estimate = scene.estimates[0, : scene.n_pixel]
+    net = excess - scene.fraction[0, : scene.n_pixel] + estimate["net_offset"]
+    return np.asarray(np.maximum(net, 0.0) * estimate["gain"] + estimate["variance"])
+
+
+def _normals(n_pixel: int, seed: int, block: int, exposure: int) -> Float:
+    """Normals of a block of draws, shape (BLOCK, n_pixel), from counters of their own (Philox4x64, Box-Muller)."""
+    words = np.random.Philox(key=[seed, TAIL_KEY], counter=[0, 0, exposure, block]).random_raw(BLOCK * (n_pixel + 1))
+    uniform = ((words >> np.uint64(11)) + 0.5) * 2.0**-53
+    half = uniform.size // 2
+    radius, angle = np.sqrt(-2.0 * np.log(uniform[:half])), 2.0 * np.pi * uniform[half : 2 * half]
+    both = np.concatenate([radius * np.cos(angle), radius * np.sin(angle)])
+    return np.asarray(both[: BLOCK * n_pixel].reshape(BLOCK, n_pixel))
+
+
+def _excess(scene: Scene, z: Float) -> Float:
+    """Observed less template, DN, for the quiescent scenario."""
+    n = scene.n_pixel
+    level, edge = scene.levels[0, :n], scene.edges[0, :n]
+    drawn = level["c4"].astype(np.float64) if scene.quartic else np.zeros(n)
+    for name in ("c3", "c2", "c1", "c0"):
+        drawn = drawn * z + level[name]
+    counts = np.rint(drawn)
+    if scene.clip:
+        counts = np.clip(counts, edge["low"] - layout.MAGIC, edge["high"] - layout.MAGIC)
+    return np.asarray(counts + edge["whole"] + scene.fraction[0, :n])

@@ -1,0 +1,1 @@
+"""Work cut into shares: who counts them, and what is kept for a resume."""

@@ -1,0 +1,321 @@
+"""Dask workers as the workers of a pool: processes of this machine, or of a cluster that is there already."""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import signal
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import urlsplit
+
+from mauvecl import __version__
+from mauvecl.device.program import DeviceError, DeviceRecord
+from mauvecl.host.errors import InputError
+from mauvecl.host.files.bounded import shortened
+from mauvecl.host.files.parsed import is_file, json_data, read_text
+from mauvecl.runs.pool import Stopped
+from mauvecl.runs.shards import Arrays, Countable, Share
+
+if TYPE_CHECKING:
+    from distributed import Client
+    from distributed import Future as DaskFuture
+
+    from mauvecl.device.engine import Engine
+
+#: Seconds to find a scheduler, and then a first worker.
+PATIENCE_S, WORKER_PATIENCE_S = 30.0, 120.0
+#: A share is sent out so often before the run ends: workers die by twos and threes on a cluster that is taken back.
+TRIES = 8
+#: Seconds between two looks at how many workers there are; requests kept with the workers at a time.
+RECOUNT_S, REQUESTS = 5.0, 32
+#: What tells PoCL, old and new, how many threads it may use.
+THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
+
+
+class DaskWorkers:
+    """Workers of a Dask cluster, each with an engine of its own.
+
+    Parameters
+    ----------
+    where : str
+        ``local:N`` for N processes of this machine; the address of a scheduler, such as ``tcp://host:8786``; or a
+        scheduler file.
+    device : str, optional
+        As `Engine` takes it, on each worker.
+
+    Raises
+    ------
+    InputError
+        For another word, or where Dask is missing.
+    DeviceError
+        If no scheduler or worker answers, a worker has another version of mauvecl, or has no such device.
+    """
+
+    first: Engine | None = None
+
+    def __init__(self, where: str, device: str | None = None) -> None:
+        try:
+            import distributed
+        except ImportError as error:
+            raise InputError("Dask is missing, expected it for --cluster: pip install 'mauvecl[cluster]'") from error
+        self._where, self._device, self.retries = where, device, 0
+        self._lock = threading.Lock()
+        self._closing = False
+        self._given: dict[str, DaskFuture[Any]] = {}
+        # Who waits for what was sent out.
+        self._sent: dict[DaskFuture[Any], Future[Arrays]] = {}
+        self._open = contextlib.ExitStack()
+        try:
+            self._client: Client = self._open.enter_context(_client(where, distributed))
+            try:
+                self._client.wait_for_workers(1, timeout=WORKER_PATIENCE_S)
+            except TimeoutError as error:
+                raise DeviceError(
+                    f"cluster {where} has no worker, expected one within {WORKER_PATIENCE_S:g} s"
+                ) from error
+            found = self._client.run(_introduce, device, on_error="return")
+            for worker, answer in found.items():
+                if isinstance(answer, BaseException):
+                    raise DeviceError(
+                        f"worker {worker} cannot work ({answer}), expected mauvecl {__version__} and OpenCL there"
+                    )
+                if answer[0] != __version__:
+                    raise DeviceError(f"worker {worker} has mauvecl {answer[0]}, expected {__version__} as here")
+            self._devices = [record for _, record in found.values()]
+            self._counted = len(found), time.monotonic()
+        except BaseException:
+            self._open.close()
+            raise
+
+    @property
+    def count(self) -> int:
+        """Workers, as they were not long ago."""
+        if time.monotonic() > self._counted[1] + RECOUNT_S:
+            try:
+                self._counted = max(len(self._client.nthreads()), 1), time.monotonic()
+            except OSError as error:
+                raise self._gone() from error
+        return self._counted[0]
+
+    def _gone(self) -> DeviceError:
+        return DeviceError(f"the scheduler of cluster {self._where} is gone, expected it to stay to the end")
+
+    def describe(self) -> list[DeviceRecord]:
+        """The devices of the workers that were there at the beginning."""
+        return self._devices
+
+    def submit(self, request: Countable, key: str, share: Share, tick: Callable[[int], None]) -> Future[Arrays]:
+        """Have a share counted by whichever worker is free."""
+        found: Future[Arrays] = Future()
+        self._send(found, request, key, share, 1)
+        return found
+
+    def _send(self, found: Future[Arrays], request: Countable, key: str, share: Share, tried: int) -> None:
+        with self._lock:
+            if self._closing:
+                found.set_exception(Stopped())
+                return
+            try:
+                if key not in self._given:
+                    # A task rather than scattered data: the scheduler can make it again where a worker took it along.
+                    self._given[key] = self._client.submit(_keep, request, key=f"mauvecl-request-{key}")
+                    if len(self._given) > REQUESTS:
+                        del self._given[next(iter(self._given))]
+                name = f"mauvecl-{key}-{share.name}-{tried}"
+                sent = self._client.submit(_count, self._given[key], share, self._device, key=name, pure=False)
+            except (OSError, RuntimeError) as error:
+                # Dask raises either where its client has lost the scheduler.
+                found.set_exception(self._gone().with_traceback(error.__traceback__))
+                return
+            self._sent[sent] = found
+        sent.add_done_callback(partial(self._came, found, request, key, share, tried))
+
+    def _came(
+        self, found: Future[Arrays], request: Countable, key: str, share: Share, tried: int, sent: DaskFuture[Any]
+    ) -> None:
+        with self._lock:
+            if self._sent.pop(sent, None) is None:
+                # Nobody waits for it any longer.
+                return
+        try:
+            if sent.status == "finished":
+                found.set_result(sent.result())
+                return
+            error = sent.exception() if sent.status == "error" else None
+            known = isinstance(error, InputError | DeviceError)
+            if known or tried == TRIES:
+                told = error if known else f"{error or 'the scheduler is gone'}"
+                found.set_exception(
+                    DeviceError(f"cluster {self._where} failed at realisations {share.start} to "
+                                f"{share.start + share.count - 1}: {told}")
+                )  # fmt: skip
+            elif sent.status in ("cancelled", "lost") and self._client.status != "running":
+                found.set_exception(self._gone())
+            else:
+                with self._lock:
+                    self.retries += 1
+                    if error is None:
+                        # The request itself was lost with its worker.
+                        self._given.pop(key, None)
+                self._send(found, request, key, share, tried + 1)
+        except BaseException as error:
+            if not found.done():
+                found.set_exception(error)
+
+    def stop(self) -> None:
+        """Take back what was sent out; a worker of another machine ends the share in its hands."""
+        with self._lock:
+            self._closing = True
+            sent, self._sent = self._sent, {}
+        # Whoever waits is told here: nothing that Dask does or fails to do, and no future that is merely cancelled,
+        # would wake concurrent.futures.wait.
+        for found in sent.values():
+            found.set_exception(Stopped())
+        with contextlib.suppress(OSError, RuntimeError, TimeoutError):
+            self._client.cancel(list(sent))
+        # Those of this machine need not end the share in their hands, which takes seconds.
+        for nanny in getattr(self._client.cluster, "workers", {}).values():
+            nanny.auto_restart = False
+            if nanny.pid is not None:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(nanny.pid, signal.SIGKILL)
+
+    def close(self) -> None:
+        """Let the workers go; those of this machine end."""
+        self._closing = True
+        self._given.clear()
+        self._open.close()
+
+
+@contextlib.contextmanager
+def _client(where: str, distributed: Any) -> Iterator[Client]:
+    """A connection to the cluster, which is made first where it is this machine's."""
+    import dask
+
+    for name in LOGS:
+        # What the user must know is told in a sentence.
+        logging.getLogger(name).setLevel(logging.CRITICAL)
+    how: dict[str, Any]
+    with contextlib.ExitStack() as stack:
+        word, _, number = where.partition(":")
+        if word == "local":
+            if not (number.isdecimal() and len(number) <= 4 and 1 <= int(number) <= 1024):
+                raise InputError(f"--cluster {where!r}, expected local:N with N from 1 to 1024")
+            threads = max((os.cpu_count() or 1) // int(number), 1)
+            # Deaths are counted and shares sent out again here, so that they are told.
+            how = {"distributed.scheduler.allowed-failures": 0, "distributed.admin.tick.limit": "1h"}
+            # Nothing to look at by HTTP, which asks nobody who they are.
+            how |= {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
+            stack.enter_context(dask.config.set(how | {"logging": dict.fromkeys(LOGS, "critical")}))
+            cluster = distributed.LocalCluster(
+                n_workers=int(number),
+                threads_per_worker=1,
+                processes=True,
+                host="127.0.0.1",
+                dashboard_address=None,
+                scheduler_kwargs={"dashboard_address": "127.0.0.1:0"},
+                security=_private(distributed),
+                preload=__name__,
+                memory_limit=0,
+                silence_logs=logging.CRITICAL,
+                env=dict.fromkeys(THREADS, str(threads)),
+            )
+            stack.enter_context(cluster)
+            how = {"address": cluster, "security": cluster.security}
+        elif "://" in where and _is_address(where):
+            how = {"address": where}
+        elif "://" not in where and is_file(Path(where)):
+            found = json_data(read_text(Path(where), "scheduler file"), f"scheduler file {shortened(where)}")
+            address = found.get("address") if isinstance(found, dict) else None
+            if not (isinstance(address, str) and _is_address(address)):
+                raise InputError(f"scheduler file {shortened(where)} names no address, expected one that Dask wrote")
+            how = {"scheduler_file": where}
+        else:
+            raise InputError(
+                f"--cluster {shortened(where)}, expected local:N, an address such as tcp://host:8786, or a "
+                "scheduler file"
+            )
+        try:
+            client = stack.enter_context(distributed.Client(**how, timeout=PATIENCE_S, set_as_default=False))
+        except (OSError, ValueError, TimeoutError) as error:
+            raise DeviceError(f"no scheduler answers at {where}, expected one within {PATIENCE_S:g} s") from error
+        yield client
+
+
+def _is_address(where: str) -> bool:
+    """Whether it names a host and a port, in one of Dask's ways to talk."""
+    try:
+        parts = urlsplit(where)
+        host, port = parts.hostname, parts.port
+    except ValueError:
+        return False
+    plain = where.isascii() and where.isprintable() and " " not in where
+    return plain and parts.scheme in SCHEMES and bool(host) and bool(port) and parts.path in ("", "/")
+
+
+#: Dask's ways to talk between machines.
+SCHEMES = ("tcp", "tls", "ucx", "ucxx", "ws", "wss")
+
+
+def _private(distributed: Any) -> Any:
+    """Certificates for this run alone, kept in memory: other users of the machine cannot connect.
+
+    A worker runs whatever the scheduler is sent, with the rights of whoever started it.
+    """
+    try:
+        return distributed.Security.temporary()
+    except ImportError as error:
+        raise InputError(
+            "cryptography is missing, expected it for --cluster local:N: pip install 'mauvecl[cluster]'"
+        ) from error
+
+
+LOGS = ("distributed", *(f"distributed.{part}" for part in ("client", "nanny", "worker", "scheduler", "core")))
+
+# On a worker.
+
+
+def dask_setup(worker: Any) -> None:
+    """Dask calls this on each worker of this machine: Ctrl-C reaches it too, but only the run itself acts upon it."""
+    if threading.current_thread() is threading.main_thread():
+        signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+_engine: Engine | None = None
+_one_at_a_time = threading.Lock()
+
+
+def _keep(request: Countable) -> Countable:
+    return request
+
+
+def _engine_here(device: str | None, threads: int) -> Engine:
+    """The worker's engine, with as many of PoCL's threads as Dask gives it."""
+    from mauvecl.device.engine import Engine
+
+    global _engine
+    if _engine is None:
+        for name in THREADS:
+            os.environ.setdefault(name, str(threads))
+        _engine = Engine(device)
+    return _engine
+
+
+def _introduce(device: str | None, dask_worker: Any = None) -> tuple[str, DeviceRecord]:
+    with _one_at_a_time:
+        return __version__, _engine_here(device, dask_worker.state.nthreads).device
+
+
+def _count(request: Countable, share: Share, device: str | None) -> Arrays:
+    from distributed import get_worker
+
+    with _one_at_a_time:
+        engine = _engine_here(device, get_worker().state.nthreads)
+        return request.count(engine, share.part, share.start, share.count)

@@ -1,0 +1,60 @@
+"""Files that are whole or not there, writers that are alone, and what differs between two studies."""
+
+from __future__ import annotations
+
+import contextlib
+import fcntl
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from mauvecl.host.errors import InputError
+from mauvecl.host.files.whole import UNFINISHED, write_whole
+
+__all__ = ["UNFINISHED", "alone", "differing_keys", "write_whole"]
+
+
+@contextlib.contextmanager
+def alone(folder: Path, what: str) -> Iterator[None]:
+    """Hold a folder for this process; the operating system lets go of it whatever becomes of the process.
+
+    Raises
+    ------
+    InputError
+        If another process holds it, or the file system has no locks.
+    """
+    try:
+        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
+    except OSError as error:
+        raise InputError(f"{what} {str(folder)!r} cannot be opened ({error.strerror}), expected a folder") from error
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise InputError(
+                f"{what} {str(folder)!r} is being written by another process, expected only one"
+            ) from error
+        except OSError as error:
+            raise InputError(
+                f"{what} {str(folder)!r} cannot be locked ({error.strerror}), expected a file system with locks"
+            ) from error
+        yield
+    finally:
+        os.close(handle)
+
+
+def differing_keys(ours: Any, theirs: Any) -> list[str]:
+    """Dotted keys at which two nested data differ."""
+    mine, other = dict(_flat(ours)), dict(_flat(theirs))
+    missing = object()
+    return sorted(key for key in mine.keys() | other.keys() if mine.get(key, missing) != other.get(key, missing))
+
+
+def _flat(data: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+    items = data.items() if isinstance(data, dict) else enumerate(data) if isinstance(data, list | tuple) else None
+    if items is None:
+        yield path, data
+        return
+    for key, value in items:
+        yield from _flat(value, f"{path}.{key}" if path else str(key))

@@ -1,0 +1,345 @@
+"""Many engines as one: requests cut into shares, counted by whoever is free, kept as they come, added up exactly."""
+
+from __future__ import annotations
+
+import threading
+import uuid
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+
+from numpy.typing import NDArray
+
+from mauvecl.device.engine import DeviceError, DeviceRecord, Engine, Progress
+from mauvecl.runs.shards import (
+    Arrays,
+    Countable,
+    DetectRequest,
+    RealiseRequest,
+    Request,
+    Share,
+    SnrRequest,
+    fingerprint,
+    shares,
+)
+
+if TYPE_CHECKING:
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.results.detection import Detection
+    from mauvecl.results.snr import SnrResult
+    from mauvecl.runs.checkpoint import Checkpoint
+
+#: A share is tried so often before the run ends with what went wrong.
+TRIES = 3
+#: Shares under way for each worker: one in hand and one waiting.
+AHEAD = 2
+
+
+Item = TypeVar("Item")
+Answer = TypeVar("Answer")
+
+
+class Stopped(Exception):  # noqa: N818
+    """Raised between two tiles of a share that nobody waits for any longer."""
+
+
+class Workers(Protocol):
+    """Who counts shares."""
+
+    @property
+    def count(self) -> int:
+        """How many work at the same time."""
+
+    @property
+    def retries(self) -> int:
+        """Shares that had to be counted again so far."""
+
+    @property
+    def first(self) -> Engine | None:
+        """An engine of this process, for what is not divided."""
+
+    def describe(self) -> list[DeviceRecord]:
+        """The devices, for run records."""
+
+    def submit(self, request: Countable, key: str, share: Share, tick: Callable[[int], None]) -> Future[Arrays]:
+        """Have a share counted; `tick` may be called with realisations done of it."""
+
+    def stop(self) -> None:
+        """End what is under way as soon as may be."""
+
+    def close(self) -> None:
+        """Let go of everything."""
+
+
+class LocalWorkers:
+    """The OpenCL devices of this machine: one in the caller's thread, several in a thread each.
+
+    Parameters
+    ----------
+    devices : sequence of str or None
+        As `Engine` takes them.
+    make : callable, optional
+        Makes an engine from a device and a progress callback, for tests.
+    """
+
+    def __init__(self, devices: Sequence[str | None] = (None,), *, make: Callable[..., Engine] = Engine) -> None:
+        self._make, self._devices, self.retries = make, list(devices), 0
+        self._ticks: list[Callable[[int], None] | None] = [None] * len(devices)
+        self._stopping = False
+        self._engines: list[Engine] = [self._made(place) for place in range(len(devices))]
+        self._free = list(range(len(devices)))
+        self._threads = ThreadPoolExecutor(len(devices)) if len(devices) > 1 else None
+        self._lock = threading.Lock()
+
+    def _made(self, place: int) -> Engine:
+        return self._make(self._devices[place], progress=partial(self._tick, place))
+
+    def _tick(self, place: int, done: int, total: int) -> None:
+        if self._stopping:
+            raise Stopped
+        tick = self._ticks[place]
+        if tick is not None:
+            tick(done)
+
+    @property
+    def count(self) -> int:
+        """Devices."""
+        return len(self._engines)
+
+    @property
+    def first(self) -> Engine:
+        """The first device's engine."""
+        return self._engines[0]
+
+    def describe(self) -> list[DeviceRecord]:
+        """The devices."""
+        return [engine.device for engine in self._engines]
+
+    def submit(self, request: Countable, key: str, share: Share, tick: Callable[[int], None]) -> Future[Arrays]:
+        """Count a share: at once where there is one device."""
+        if self._threads is not None:
+            return self._threads.submit(self._count, request, share, tick)
+        found: Future[Arrays] = Future()
+        found.set_result(self._count(request, share, tick))
+        return found
+
+    def _count(self, request: Countable, share: Share, tick: Callable[[int], None]) -> Arrays:
+        with self._lock:
+            place = self._free.pop(0)
+        self._ticks[place] = tick
+        try:
+            for tried in range(1, TRIES + 1):
+                try:
+                    return request.count(self._engines[place], share.part, share.start, share.count)
+                except Exception as error:
+                    engine = self._engines[place]
+                    launch = isinstance(error, engine.cl.Error)
+                    if not launch or self._stopping:
+                        raise
+                    if tried == TRIES:
+                        raise DeviceError(
+                            f"{engine.device_name} failed {TRIES} times at realisations {share.start} to "
+                            f"{share.start + share.count - 1} ({error}), expected a device that works"
+                        ) from error
+                    with self._lock:
+                        self.retries += 1
+                    # Nothing of a failed launch is trusted: a new context, and the share from its beginning.
+                    self._engines[place] = self._made(place)
+            raise AssertionError
+        finally:
+            self._ticks[place] = None
+            with self._lock:
+                self._free.append(place)
+
+    def stop(self) -> None:
+        """End what is under way between two tiles."""
+        self._stopping = True
+
+    def close(self) -> None:
+        """Let the threads go."""
+        if self._threads is not None:
+            self._threads.shutdown(wait=True, cancel_futures=True)
+
+
+@dataclass(frozen=True)
+class Standing:
+    """How far the work is.
+
+    Attributes
+    ----------
+    done, total : int
+        Realisations, of all requests known or announced.
+    shares, of : int
+        Shares done, of all requests known.
+    retries : int
+        Shares that were counted again, because a device failed or a worker died.
+    resumed : int
+        Of the realisations done, those taken from a checkpoint.
+    """
+
+    done: int
+    total: int
+    shares: int
+    of: int
+    retries: int
+    resumed: int
+
+
+class Pool:
+    """Answers what an `Engine` answers, with all workers, and the same to the last bit.
+
+    Parameters
+    ----------
+    workers : Workers, optional
+        The default device of this machine unless told otherwise.
+    checkpoint : Checkpoint, optional
+        Where shares are kept, and looked for.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in realisations of all requests known so far; may raise to stop the work.
+    """
+
+    def __init__(
+        self,
+        workers: Workers | None = None,
+        *,
+        checkpoint: Checkpoint | None = None,
+        progress: Progress | None = None,
+    ) -> None:
+        self.workers = workers or LocalWorkers()
+        self.checkpoint, self._progress = checkpoint, progress
+        self._lock = threading.RLock()
+        self._done = self._total = self._shares = self._of = self._resumed = self._expected = 0
+        self._partly: dict[str, int] = {}
+        self._stopping = False
+
+    def expect(self, realisations: int) -> None:
+        """Announce how much will be asked for, so that the time left can be told from the beginning."""
+        self._expected = self._total + realisations
+
+    def stop(self) -> None:
+        """End everything that is under way, in other threads too."""
+        self._stopping = True
+        self.workers.stop()
+
+    @property
+    def kernel_digest(self) -> str:
+        """Short sha256 of the kernels rendered in this process; empty where others draw."""
+        first = self.workers.first
+        return "" if first is None else first.kernel_digest
+
+    @property
+    def devices(self) -> list[DeviceRecord]:
+        """Who counts."""
+        return self.workers.describe()
+
+    @property
+    def standing(self) -> Standing:
+        """How far the work is."""
+        partly = sum(self._partly.values())
+        total = max(self._total, self._expected)
+        return Standing(self._done + partly, total, self._shares, self._of, self.workers.retries, self._resumed)
+
+    def detect(self, quiet: Expectation, flares: Sequence[Expectation], **how: Any) -> Detection:
+        """As `Engine.detect`, with the same keywords."""
+        request = DetectRequest(quiet, tuple(flares), **how)
+        self._answer(request)
+        return request.answer
+
+    def snr(self, expectation: Expectation, **how: Any) -> SnrResult:
+        """As `Engine.snr`, with the same keywords."""
+        request = SnrRequest(expectation, **how)
+        self._answer(request)
+        return request.answer
+
+    def realise(
+        self, expectation: Expectation, *, count: int, out: NDArray[Any] | None = None, **how: Any
+    ) -> NDArray[Any]:
+        """As `Engine.realise`, with the same keywords, by one worker; several calls at a time keep all of them busy."""
+        # A worker of this process writes into `out` itself.
+        here = out if self.workers.first is not None else None
+        request = RealiseRequest(expectation, count, out=here, **how)
+        share = Share(0, request.start, count)
+        found = self.workers.submit(request, uuid.uuid4().hex, share, lambda done: None)
+        rows: NDArray[Any] = found.result()["rows"]
+        if out is None or here is not None:
+            return rows
+        out[:] = rows
+        return out
+
+    def _answer(self, request: Request) -> None:
+        key = fingerprint(request)
+        todo = shares(request)
+        with self._lock:
+            self._total += sum(share.count for share in todo)
+            self._of += len(todo)
+        self._told()
+        waiting: dict[Future[Arrays], Share] = {}
+        for share in todo:
+            name = f"{key}-{share.name}"
+            known = None if self.checkpoint is None else self.checkpoint.get(name)
+            if known is not None:
+                request.add(share.part, known)
+                self._finished(name, share, resumed=True)
+                continue
+            if self._stopping:
+                raise Stopped
+            while len(waiting) >= self.workers.count * AHEAD:
+                self._collect(request, key, waiting)
+            tick = partial(self._tick, name)
+            waiting[self.workers.submit(request, key, share, tick)] = share
+        while waiting:
+            self._collect(request, key, waiting)
+
+    def _collect(self, request: Request, key: str, waiting: dict[Future[Arrays], Share]) -> None:
+        finished, _ = wait(waiting, return_when=FIRST_COMPLETED)
+        for future in finished:
+            share = waiting.pop(future)
+            found = future.result()
+            request.add(share.part, found)
+            name = f"{key}-{share.name}"
+            if self.checkpoint is not None:
+                self.checkpoint.put(name, found)
+            self._finished(name, share)
+
+    def _tick(self, name: str, done: int) -> None:
+        with self._lock:
+            self._partly[name] = done
+        self._told()
+
+    def _finished(self, name: str, share: Share, *, resumed: bool = False) -> None:
+        with self._lock:
+            self._partly.pop(name, None)
+            self._done += share.count
+            self._shares += 1
+            self._resumed += share.count if resumed else 0
+        self._told()
+
+    def _told(self) -> None:
+        if self._progress is not None:
+            standing = self.standing
+            self._progress(standing.done, standing.total)
+
+
+def together(engine: Engine | Pool, work: Callable[[Item], Answer], items: Iterable[Item]) -> Iterator[Answer]:
+    """What `work` makes of each item, in their order; some at a time where several workers are to be kept busy."""
+    if not isinstance(engine, Pool) or engine.workers.count == 1:
+        yield from map(work, items)
+        return
+    ahead: deque[Future[Answer]] = deque()
+    with ThreadPoolExecutor(engine.workers.count) as threads:
+        try:
+            for item in items:
+                ahead.append(threads.submit(work, item))
+                # No more answers wait for their turn than there are workers.
+                if len(ahead) > engine.workers.count:
+                    yield ahead.popleft().result()
+            while ahead:
+                yield ahead.popleft().result()
+        except BaseException:
+            for future in ahead:
+                future.cancel()
+            engine.stop()
+            raise

@@ -1,0 +1,1 @@
+"""What is asked of draws: the detection statistics and their distributions for Gaussian noise."""

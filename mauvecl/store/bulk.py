@@ -1,0 +1,400 @@
+"""Raw spectra in bulk: what is missing of a store is drawn and written; what is damaged is found and mended."""
+
+from __future__ import annotations
+
+import json
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.host.errors import InputError
+from mauvecl.runs.durable import UNFINISHED, alone, write_whole
+from mauvecl.runs.pool import Pool, together
+from mauvecl.store.export import Selection, export
+from mauvecl.store.form import CRC_BYTES, Chunk, Scene, Store, crc, digest
+from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    from mauvecl.device.engine import Engine
+
+Progress = Callable[[int, int], None]
+
+#: Chunks drawn in one go, and threads that write while the next are drawn.
+TOGETHER, WRITERS = 4, 2
+#: `verify` names missing chunks one by one, so many at most: a study can ask for any number.
+MOST_MISSING = 100_000
+
+
+def draw(
+    study: Study, scene: Scene, engine: Engine | Pool, start: int, count: int, out: NDArray[Any] | None = None
+) -> NDArray[Any]:
+    """Rows of one array, from the engine alone.
+
+    Parameters
+    ----------
+    study : Study
+        Its seed, mode, recipe and processes.
+    scene : Scene
+    engine : Engine or Pool
+    start, count : int
+        Realisations start to start + count - 1.
+    out : ndarray, shape (count, *scene.row), optional
+        Where to write.
+
+    Returns
+    -------
+    ndarray of uint16 or int32, shape (count, n_pixel), or (count, n_frame, n_pixel) where frames are kept apart
+        Raw DN.
+    """
+    how = study.drawing | {"start": start, "count": count, "seed": study.run.seed}
+    if scene.frames is None:
+        return engine.realise(scene.expectation, out=out, **how)
+    found = np.empty((count, *scene.row), scene.dtype) if out is None else out
+    single = replace(scene.expectation, n_frames=1)
+    for place, frame in enumerate(scene.frames):
+        found[:, place] = engine.realise(single, first_frame=frame, **how)
+    return found
+
+
+def realise(
+    study: Study,
+    path: str | Path,
+    engine: Engine | Pool,
+    *,
+    resume: bool = True,
+    restart: bool = False,
+    progress: Progress | None = None,
+) -> Store:
+    """Draw a study's spectra into a store, or what is missing of it.
+
+    Parameters
+    ----------
+    study : Study
+        Its ``run.realisations`` are the rows of each array; its ``bulk`` says what is kept.
+    path : str or Path
+        A new folder, or the store of the same study that was begun before.
+    engine : Engine or Pool
+    resume : bool
+        Whether a store that was begun before is continued, or refused.
+    restart : bool
+        Remove the store that is there, whatever its study.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in spectra. It may raise to stop the work; what was written is kept.
+
+    Raises
+    ------
+    InputError
+        If the place holds something else or is being written by another process, or cannot be written.
+    """
+    store = Store(Path(path), study)
+    store.make_folder()
+    with alone(store.path, "store"):
+        _complete(store, engine, resume, restart, progress)
+    return store
+
+
+def realise_file(
+    study: Study,
+    file: str | Path,
+    engine: Engine | Pool,
+    *,
+    resume: bool = True,
+    restart: bool = False,
+    progress: Progress | None = None,
+) -> Store:
+    """As `realise`, into one FITS or HDF5 file; an unfinished store beside it is there until the file is.
+
+    Raises
+    ------
+    InputError
+        As `realise`; and if the file is there already and is not to be written anew.
+    """
+    file = Path(file)
+    if file.exists() and not restart:
+        raise InputError(f"{str(file)!r} is there already, expected another place, or --restart to write it anew")
+    store = Store(unfinished(file), study)
+    store.make_folder()
+    with alone(store.path, "store"):
+        _complete(store, engine, resume, restart, progress)
+        export(Selection.of(store), file)
+        store.clear()
+        store.path.rmdir()
+    return store
+
+
+def unfinished(file: Path) -> Path:
+    """The store beside a file that is not yet written."""
+    return file.with_name(f"{UNFINISHED}{file.name}.zarr")
+
+
+def _complete(store: Store, engine: Engine | Pool, resume: bool, restart: bool, progress: Progress | None) -> None:
+    """Draw what is missing of a store that this process holds."""
+    if restart and any(store.path.iterdir()):
+        Store.open(store.path).clear()
+    begun = (store.path / "zarr.json").exists()
+    store.make()
+    todo = [chunk for chunk in store.chunks() if not store.has(chunk)]
+    if begun and not resume and todo:
+        raise InputError(
+            f"store {str(store.path)!r} holds {store.count() - len(todo)} of {store.count()} chunks, expected --resume "
+            "to draw the others, or another place"
+        )
+    _fill(store, todo, engine, progress)
+
+
+def forget(path: str | Path) -> None:
+    """Remove a store.
+
+    Raises
+    ------
+    InputError
+        If something else is there, or another process is writing it: then nothing is removed.
+    """
+    path = Path(path)
+    if path.exists():
+        Store.open(path)
+        with alone(path, "store"):
+            Store.open(path).clear()
+            path.rmdir()
+
+
+def _fill(store: Store, todo: list[Chunk], engine: Engine | Pool, progress: Progress | None) -> None:
+    total = store.rows * len(store.scenes)
+    done = total - sum(chunk.stop - chunk.start for chunk in todo)
+    if progress is not None:
+        progress(done, total)
+    waiting: deque[tuple[Chunk, Future[str]]] = deque()
+
+    def collect(left: int) -> None:
+        nonlocal done
+        while len(waiting) > left:
+            chunk, placed = waiting.popleft()
+            store.note(chunk, placed.result())
+            done += chunk.stop - chunk.start
+            if progress is not None:
+                progress(done, total)
+
+    with ThreadPoolExecutor(WRITERS) as writers:
+        try:
+            for block, rows in _drawn(store.study, todo, engine):
+                # The block before has left its buffer when none of its chunks wait.
+                collect(0)
+                for chunk in block:
+                    part = rows[chunk.start - block[0].start : chunk.stop - block[0].start]
+                    waiting.append((chunk, writers.submit(store.place, chunk, part)))
+            collect(0)
+        except BaseException:
+            # What is being written is finished and listed; the rest is left for a resume.
+            for _, placed in waiting:
+                placed.cancel()
+            writers.shutdown()
+            for chunk, placed in waiting:
+                if not placed.cancelled() and placed.exception() is None:
+                    store.note(chunk, placed.result())
+            raise
+
+
+def _drawn(study: Study, todo: Sequence[Chunk], engine: Engine | Pool) -> Iterator[tuple[list[Chunk], NDArray[Any]]]:
+    """Blocks of neighbouring chunks and their rows, in order."""
+    if isinstance(engine, Pool) and engine.workers.count > 1:
+        # Chunk by chunk: as much as travels well.
+        def rows_of(block: list[Chunk]) -> NDArray[Any]:
+            return draw(study, block[0].scene, engine, block[0].start, block[0].stop - block[0].start)
+
+        blocks = list(_blocks(todo, 1))
+        yield from zip(blocks, together(engine, rows_of, blocks), strict=True)
+        return
+    # Two buffers in turn: one is drawn into while the other is written, so that memory stays flat.
+    buffers: list[NDArray[Any]] = [np.empty(0)] * 2
+    for number, block in enumerate(_blocks(todo, TOGETHER)):
+        scene, count = block[0].scene, block[-1].stop - block[0].start
+        there = buffers[number % 2]
+        if there.shape[1:] != scene.row or there.dtype != scene.dtype or len(there) < count:
+            there = buffers[number % 2] = np.empty((count, *scene.row), scene.dtype)
+        yield block, draw(study, scene, engine, block[0].start, count, there[:count])
+
+
+def _blocks(chunks: Sequence[Chunk], most: int) -> Iterator[list[Chunk]]:
+    """Neighbouring chunks of one scene, several at a time."""
+    block: list[Chunk] = []
+    for chunk in chunks:
+        if block and (len(block) == most or chunk.scene is not block[0].scene or chunk.start != block[-1].stop):
+            yield block
+            block = []
+        block.append(chunk)
+    if block:
+        yield block
+
+
+@dataclass(frozen=True)
+class Fault:
+    """One file of a store that is not as it should be.
+
+    Attributes
+    ----------
+    key : str
+        Its place in the store.
+    state : str
+        ``missing``; ``damaged``: its CRC or its text fails; ``foreign``: whole, but not what was written; ``unlisted``:
+        whole, but not in the list of digests; ``differs``: not what the engine draws; or ``not of this store``.
+    mended : bool
+    """
+
+    key: str
+    state: str
+    mended: bool
+
+
+def state(store: Store, chunk: Chunk) -> str:
+    """``good``, or what a chunk's bytes show to be wrong; see `Fault`."""
+    try:
+        data = (store.path / chunk.key).read_bytes()
+    except FileNotFoundError:
+        return "missing"
+    if len(data) != store.chunk_bytes(chunk) or crc(data[:-CRC_BYTES]) != data[-CRC_BYTES:]:
+        return "damaged"
+    known = store.digests.get(chunk.key)
+    if known is None:
+        return "unlisted"
+    return "good" if digest(data) == known else "foreign"
+
+
+def verify(
+    path: str | Path,
+    engine: Engine | Pool | None = None,
+    *,
+    repair: bool = False,
+    redraw: bool = False,
+    rows: tuple[int, int] | None = None,
+    progress: Progress | None = None,
+) -> list[Fault]:
+    """Look at every file of a store; draw again what is wrong, or everything.
+
+    Parameters
+    ----------
+    path : str or Path
+    engine : Engine or Pool, optional
+        Needed to repair or redraw.
+    repair : bool
+        Write what is wrong anew.
+    redraw : bool
+        Compare every spectrum with what the engine draws, not only with its digest.
+    rows : (int, int), optional
+        Look only at chunks with realisations of this half-open range.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in chunks.
+
+    Returns
+    -------
+    list of Fault
+        Empty where everything is as it was written.
+
+    Raises
+    ------
+    InputError
+        If the folder is no store, is being written, or cannot be written to repair it; if its study contradicts
+        another copy of it, or does not draw what was written; or if more than `MOST_MISSING` chunks are missing.
+    """
+    if engine is None and (repair or redraw):
+        raise InputError("no engine is given, expected one to repair or redraw")
+    Store.open(path)
+    with alone(Path(path), "store"):
+        store = Store.open(path)
+        first, last = rows or (0, store.rows)
+        if not 0 <= first < last <= store.rows:
+            raise InputError(f"rows {first}:{last}, expected a range within 0:{store.rows}")
+        files = list(store.files())
+        total, there = store.count(first, last), sum(store.owns(key) for key, _ in files)
+        if total - there > MOST_MISSING:
+            raise InputError(
+                f"store {str(store.path)!r} holds {there} chunks where its study asks for {total}, expected at most "
+                f"{MOST_MISSING} missing: choose --rows, or `mauvecl realise --resume` draws them"
+            )
+        found = list(_faults_of_description(store, repair))
+        for number, chunk in enumerate(store.chunks(first, last)):
+            fault = _fault(store, chunk, engine, repair, redraw)
+            if fault is not None:
+                found.append(fault)
+            if progress is not None:
+                progress(number + 1, total)
+        found += [Fault(key, "not of this store", False) for key, own in files if not own]
+    return found
+
+
+def _fault(store: Store, chunk: Chunk, engine: Engine | Pool | None, repair: bool, redraw: bool) -> Fault | None:
+    seen = state(store, chunk)
+    if seen == "good" and not redraw:
+        return None
+    if seen != "good" and not repair:
+        return Fault(chunk.key, seen, False)
+    assert engine is not None
+    rows = draw(store.study, chunk.scene, engine, chunk.start, chunk.stop - chunk.start)
+    drawn = digest(*store.encode(chunk, rows))
+    if store.digests.get(chunk.key, drawn) != drawn and not redraw:
+        raise InputError(
+            f"{chunk.key} of {store.path.name} was written with the digest {store.digests[chunk.key]} and is now "
+            f"drawn with {drawn}, expected the same: its study or its list is wrong; --redraw --repair trusts the study"
+        )
+    if seen == "good":
+        if drawn == store.digests[chunk.key]:
+            return None
+        seen = "differs"
+    if repair:
+        if seen != "unlisted" or digest((store.path / chunk.key).read_bytes()) != drawn:
+            store.place(chunk, rows)
+        store.note(chunk, drawn)
+    return Fault(chunk.key, seen, repair)
+
+
+def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
+    """Groups, arrays' descriptions and calibration, beside what the study makes them."""
+    for name, content in sorted(store.description().items()):
+        there = store.path / name
+        try:
+            data = there.read_bytes()
+            if name.endswith("zarr.json"):
+                same, seen = json.loads(data) == json.loads(content), "foreign"
+            else:
+                same, seen = data == content, "damaged"
+        except FileNotFoundError:
+            same, seen = False, "missing"
+        except ValueError:
+            same, seen = False, "damaged"
+        if not same:
+            if repair:
+                write_whole(there, content)
+            yield Fault(name, seen, repair)
+
+
+def read(path: str | Path, scene: str = "star-1/quiescent") -> Any:
+    """The spectra of one array, read from the disk when looked at.
+
+    Parameters
+    ----------
+    path : str or Path
+    scene : str
+        Such as ``"star-1/flare-2"``.
+
+    Returns
+    -------
+    xarray.DataArray, dimensions (realisation, pixel) or (realisation, frame, pixel)
+        Raw DN, with the wavelengths, nm, as a coordinate. NumPy's array is its ``.values``, also of a slice.
+
+    Raises
+    ------
+    InputError
+        If the folder is no store, or holds no such array.
+    """
+    import xarray
+
+    store = Store.open(path)
+    there = store.scene(scene)
+    group = xarray.open_zarr(store.path, group=there.group, chunks=None, consolidated=False)
+    found = group[there.name].assign_coords(wavelength=group["wavelength_nm"])
+    return found if there.frames is None else found.assign_coords(frame=group["frame"])

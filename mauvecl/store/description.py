@@ -1,0 +1,102 @@
+"""What a store of raw spectra says of itself: groups, arrays, calibration, and the study that made it."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import warnings
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl import __version__
+from mauvecl.host.errors import InputError
+from mauvecl.host.files.bounded import read_bytes
+from mauvecl.study.labels import told as messages_of
+
+if TYPE_CHECKING:
+    from mauvecl.store.form import Store
+
+#: Per pixel and frame, kept with each star, with their units.
+CALIBRATION = {
+    "wavelength_nm": "nm",
+    "bias_dn": "DN",
+    "dark_dn": "DN",
+    "read_noise_dn": "DN",
+    "gain_dn_per_electron": "DN / electron",
+}
+COMMON_DRAWS = (
+    "row i of every array is drawn with the same random numbers, so that a flare is the only difference between two "
+    "arrays; rows of different number are independent"
+)
+NOMINAL = "the throughput is nominal, not a flight calibration"
+
+
+def describe(store: Store, folder: Path) -> None:
+    """Everything of a store but its spectra: groups, arrays' descriptions, calibration."""
+    import zarr
+    from zarr.codecs import Crc32cCodec
+
+    study = store.study.toml()
+    with warnings.catch_warnings():
+        # A folder that holds nothing yet.
+        warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
+        root = zarr.open_group(folder, mode="w", zarr_format=3)
+        run: dict[str, Any] = signed(study) | {"seed": store.study.run.seed, "realisations": store.rows}
+        root.attrs.update(run | {"mauvecl": __version__, "draws": COMMON_DRAWS, "throughput": NOMINAL})
+        for scene in store.scenes:
+            x, group = scene.expectation, root.require_group(scene.group)
+            if scene.name == "quiescent":
+                group.attrs.update({"star": scene.star, **scene.at})
+                group.attrs.update({"exposure_s": x.exposure_s, "frames": x.n_frames, "messages": messages_of([x])})
+                for name, unit in CALIBRATION.items():
+                    _values(group, name, np.asarray(getattr(x, name)), unit, ["pixel"])
+                if scene.frames is not None:
+                    _values(group, "frame", np.array(scene.frames), "", ["frame"])
+            if store.study.bulk.components:
+                n = x.n_frames if scene.frames is None else 1
+                gain = n * x.gain_dn_per_electron
+                for name, values in (
+                    ("source", gain * x.source_electrons),
+                    ("sky", gain * x.sky_electrons),
+                    ("noise", np.sqrt(x.variance_dn2 * n / x.n_frames)),
+                ):
+                    _values(group, f"{scene.name}-{name}", values, "DN", ["pixel"])
+            dimensions = ["realisation", *(["frame"] if scene.frames is not None else []), "pixel"]
+            array = group.create_array(
+                scene.name,
+                shape=(store.rows, *scene.row),
+                chunks=(scene.chunk_rows(store.rows), *scene.row),
+                dtype=scene.dtype,
+                compressors=[Crc32cCodec()],
+                fill_value=0,
+                dimension_names=dimensions,
+            )
+            origin: dict[str, Any] = {"star": scene.star, "provenance": dict(x.provenance)} | signed(study)
+            array.attrs.update(origin | {"units": "DN", "amplitude": scene.amplitude})
+
+
+def _values(group: Any, name: str, values: NDArray[Any], unit: str, dimensions: list[str]) -> None:
+    from zarr.codecs import Crc32cCodec
+
+    array = group.create_array(
+        name, data=values, chunks=values.shape, compressors=[Crc32cCodec()], dimension_names=dimensions
+    )
+    array.attrs["units"] = unit
+
+
+def signed(study: str) -> dict[str, str]:
+    """A study's text with its digest, as a store keeps it in several places."""
+    return {"study": study, "study_sha256": hashlib.sha256(study.encode()).hexdigest()}
+
+
+def study_in(place: Path) -> str | None:
+    """The study's text in a description, where it has its digest."""
+    try:
+        kept = json.loads(read_bytes(place, "description"))["attributes"]
+        text = kept["study"]
+        return text if signed(text).items() <= kept.items() else None
+    except (InputError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        return None

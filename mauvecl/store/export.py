@@ -1,0 +1,205 @@
+"""Smaller sets of raw spectra as one FITS or HDF5 file."""
+
+from __future__ import annotations
+
+import io
+import os
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl import __version__
+from mauvecl.host.errors import InputError
+from mauvecl.runs.durable import UNFINISHED, write_whole
+from mauvecl.store.description import CALIBRATION, COMMON_DRAWS, NOMINAL
+from mauvecl.store.form import Scene, Store
+
+if TYPE_CHECKING:
+    from astropy.io.fits import BinTableHDU, HDUList, ImageHDU
+
+#: Bytes of spectra in one file, at most; more belongs into the store.
+LARGEST = 4 * 2**30
+#: What an export may be, by its ending.
+ENDINGS = (".fits", ".h5", ".hdf5")
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """Arrays and rows of a store."""
+
+    store: Store
+    scenes: Sequence[Scene]
+    first: int
+    stop: int
+
+    @classmethod
+    def of(cls, store: Store, scenes: Sequence[str] | None = None, rows: tuple[int, int] | None = None) -> Selection:
+        """All of a store unless told otherwise.
+
+        Parameters
+        ----------
+        store : Store
+        scenes : sequence of str, optional
+            Such as ``"star-1/flare-2"``.
+        rows : (int, int), optional
+            A half-open range of realisations.
+
+        Raises
+        ------
+        InputError
+            For an unknown array, an impossible range, more than `LARGEST`, or rows that are not there.
+        """
+        first, stop = rows or (0, store.rows)
+        if not 0 <= first < stop <= store.rows:
+            raise InputError(f"rows {first}:{stop}, expected a range within 0:{store.rows}")
+        chosen = [store.scene(name) for name in scenes] if scenes else store.scenes
+        found = cls(store, chosen, first, stop)
+        size = sum((stop - first) * scene.row_bytes for scene in chosen)
+        if size > LARGEST:
+            raise InputError(
+                f"{size / 2**30:.1f} GiB of spectra, expected at most {LARGEST // 2**30} GiB in one file: choose rows"
+            )
+        for chunk in store.chunks(first, stop):
+            if any(chunk.scene is s for s in chosen) and not store.has(chunk):
+                raise InputError(f"{chunk.key} is missing, expected a whole store: `mauvecl realise --resume` draws it")
+        return found
+
+    def rows(self, scene: Scene) -> NDArray[Any]:
+        """The spectra of one array."""
+        import zarr
+
+        array = zarr.open_array(self.store.path / scene.path, mode="r")
+        return np.asarray(array[self.first : self.stop])
+
+
+def export(selection: Selection, path: str | Path) -> Path:
+    """Write spectra, calibration and origin into one file, whole or not at all.
+
+    Parameters
+    ----------
+    selection : Selection
+    path : str or Path
+        Ending in .fits, .h5 or .hdf5. In FITS an image per array, its wavelengths as a spectral axis looked up in a
+        table (the -TAB form of the FITS standard, section 8.3), and a table of the calibration per star.
+
+    Raises
+    ------
+    InputError
+        For another ending, or if the file cannot be written.
+    """
+    path = Path(path)
+    if path.suffix not in ENDINGS:
+        raise InputError(f"export {path.name!r}, expected a name ending in {', '.join(ENDINGS)}")
+    if path.suffix != ".fits":
+        # In memory first: on a full disk the HDF5 library ends the whole process.
+        packed = io.BytesIO()
+        _hdf5(selection, packed)
+        write_whole(path, packed.getbuffer(), shared=True)
+        return path
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(prefix=UNFINISHED, dir=path.parent) as folder:
+            beside = Path(folder) / path.name
+            _fits(selection).writeto(beside, checksum=True)
+            with beside.open("rb") as file:
+                os.fsync(file.fileno())
+            beside.replace(path)
+    except OSError as error:
+        raise InputError(
+            f"export {str(path)!r} cannot be written ({error.strerror or error}), expected a writable place with room"
+        ) from error
+    return path
+
+
+def _fits(selection: Selection) -> HDUList:
+    from astropy.io import fits
+
+    store = selection.store
+    primary = fits.PrimaryHDU()
+    primary.header["ORIGIN"] = (f"mauvecl {__version__}", "simulated, not observed")
+    primary.header["SEED"] = (str(store.study.run.seed), "of the random numbers")
+    primary.header["FIRSTROW"] = (selection.first, "realisation of the first row of each image")
+    for line in (COMMON_DRAWS, NOMINAL):
+        primary.header["COMMENT"] = f"{line[0].upper()}{line[1:]}."
+    primary.header["HISTORY"] = "Study that gives these spectra again:"
+    for line in store.study.toml().splitlines():
+        primary.header["HISTORY"] = line.expandtabs(4) or " "
+    parts: list[ImageHDU | BinTableHDU] = []
+    for group in dict.fromkeys(scene.group for scene in selection.scenes):
+        here = [scene for scene in selection.scenes if scene.group == group]
+        table = _calibration(here[0])
+        parts += [*(_image(selection, scene, table.name) for scene in here), table]
+    return fits.HDUList([primary, *parts])
+
+
+def _image(selection: Selection, scene: Scene, table: str) -> ImageHDU:
+    from astropy.io import fits
+
+    x = scene.expectation
+    hdu = fits.ImageHDU(selection.rows(scene), name=scene.path.upper().replace("/", "_"))
+    header = hdu.header
+    header["BUNIT"] = "adu"
+    header["OBJECT"] = scene.star
+    header["AMPLITUD"] = (scene.amplitude, "flare amplitude, 0 without a flare")
+    header["EXPTIME"] = (x.frame_s if scene.frames is not None else x.exposure_s, "[s] of one row")
+    header["NFRAMES"] = (1 if scene.frames is not None else x.n_frames, "frames summed in one row")
+    # Axis 1: vacuum wavelength, looked up by pixel in the calibration's table.
+    header["CTYPE1"], header["CUNIT1"] = "WAVE-TAB", "nm"
+    header["CRPIX1"], header["CRVAL1"], header["CDELT1"] = 1.0, 1.0, 1.0
+    header["PS1_0"] = (table, "extension of the coordinates")
+    header["PS1_1"] = ("COORDS", "column of the coordinates")
+    header["PV1_1"], header["PV1_2"], header["PV1_3"] = 1, 1, 1
+    names = ["realisation"] if scene.frames is None else ["frame", "realisation"]
+    firsts = [selection.first] if scene.frames is None else [0, selection.first]
+    for number, (name, first) in enumerate(zip(names, firsts, strict=True), 2):
+        header[f"CTYPE{number}"], header[f"CNAME{number}"] = "LINEAR", name
+        header[f"CRPIX{number}"], header[f"CRVAL{number}"], header[f"CDELT{number}"] = 1.0, float(first), 1.0
+    if scene.frames is not None:
+        header["FRAMES"] = (",".join(map(str, scene.frames)), "numbers of the frames along axis 2")
+    return hdu
+
+
+def _calibration(scene: Scene) -> BinTableHDU:
+    """Calibration of the pixels, a row each, and all wavelengths in one cell, as the -TAB axis wants them."""
+    from astropy.io import fits
+
+    x = scene.expectation
+    name = f"{scene.group}-calibration".upper().replace("-", "_")
+    # A cell of (1, n_pixel) coordinates: one row, so that the pixels' own columns are vectors too.
+    n = x.wavelength_nm.size
+    columns = [fits.Column("COORDS", f"{n}D", unit="nm", dim=f"(1,{n})", array=x.wavelength_nm.reshape(1, n, 1))]
+    units = {"nm": "nm", "DN": "adu", "DN / electron": "adu/electron"}
+    for key, unit in CALIBRATION.items():
+        columns.append(fits.Column(key.upper(), f"{n}D", unit=units[unit], array=getattr(x, key).reshape(1, n)))
+    return fits.BinTableHDU.from_columns(columns, name=name)
+
+
+def _hdf5(selection: Selection, place: io.BytesIO) -> None:
+    try:
+        import h5py
+    except ImportError as error:
+        raise InputError("h5py is missing, expected it for HDF5: pip install 'mauvecl[bulk]'") from error
+
+    store = selection.store
+    with h5py.File(place, "w") as file:
+        file.attrs.update({"mauvecl": __version__, "study": store.study.toml(), "seed": str(store.study.run.seed)})
+        file.attrs.update({"first_row": selection.first, "draws": COMMON_DRAWS, "throughput": NOMINAL})
+        for scene in selection.scenes:
+            group = file.require_group(scene.group)
+            if "wavelength_nm" not in group:
+                group.attrs["star"] = scene.star
+                for name, unit in CALIBRATION.items():
+                    group[name] = getattr(scene.expectation, name)
+                    group[name].attrs["units"] = unit
+                group["wavelength_nm"].make_scale("wavelength")
+            data = group.create_dataset(scene.name, data=selection.rows(scene), fletcher32=True, chunks=True)
+            data.attrs.update({"units": "DN", "amplitude": scene.amplitude})
+            names = ["realisation", *(["frame"] if scene.frames is not None else []), "pixel"]
+            for dimension, name in zip(data.dims, names, strict=True):
+                dimension.label = name
+            data.dims[len(names) - 1].attach_scale(group["wavelength_nm"])

@@ -1,0 +1,395 @@
+"""The form of a store of raw spectra: a Zarr v3 hierarchy, its chunks and their digests.
+
+A group per star holds an array per scene (``quiescent``, ``flare-1``, ...), one row per realisation, and its pixels'
+calibration. Each chunk ends in its own CRC, which any Zarr reader checks; beside each array a list of its chunks'
+digests tells a foreign chunk from ours. Chunks are written whole or not at all.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.host.errors import InputError
+from mauvecl.host.files.bounded import read_bytes
+from mauvecl.host.files.parsed import toml
+from mauvecl.runs.durable import UNFINISHED, differing_keys, write_whole
+from mauvecl.store.description import describe, study_in
+from mauvecl.study.labels import label, titled
+from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    from mauvecl.host.expectation import Expectation
+
+#: Bytes of one chunk, about.
+CHUNK_BYTES = 16 * 2**20
+DIGESTS = "digests.txt"
+CRC_BYTES = 4
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """One array of a store: a star without a flare, or with one."""
+
+    group: str
+    name: str
+    star: str
+    amplitude: float
+    expectation: Expectation
+    frames: tuple[int, ...] | None
+    at: Mapping[str, float | str]
+
+    @property
+    def path(self) -> str:
+        """Its place in the store."""
+        return f"{self.group}/{self.name}"
+
+    @property
+    def row(self) -> tuple[int, ...]:
+        """Shape of one realisation: pixels, or frames and pixels."""
+        n_pixel = self.expectation.wavelength_nm.size
+        return (n_pixel,) if self.frames is None else (len(self.frames), n_pixel)
+
+    @property
+    def dtype(self) -> np.dtype[Any]:
+        """16 bits for single frames of a 16-bit ADC, 32 for sums of several."""
+        x = self.expectation
+        single = self.frames is not None or x.n_frames == 1
+        return np.dtype("<u2" if single and x.adc_max_dn < 2**16 else "<i4")
+
+    @property
+    def row_bytes(self) -> int:
+        """Bytes of one realisation."""
+        return int(np.prod(self.row)) * self.dtype.itemsize
+
+    def chunk_rows(self, realisations: int) -> int:
+        """Realisations in one chunk."""
+        return max(min(CHUNK_BYTES // self.row_bytes, realisations), 1)
+
+
+def scenes(study: Study) -> list[Scene]:
+    """What a study's store holds: every star in every cell of the sweep, without and with each of its flares."""
+    found = []
+    number = 0
+    for at, cell in study.cells():
+        for star in cell.star:
+            number += 1
+            quiet, *flares = cell.expectations(star)
+            chosen = cell.bulk.chosen(quiet.n_frames)
+            # A flare's amplitude stands with its own array.
+            swept = {name: value for name, value in at.items() if name != "amplitude"}
+            name = titled(label(star, quiet), swept)
+            found.append(Scene(f"star-{number}", "quiescent", name, 0.0, quiet, chosen, swept))
+            for k, (amplitude, x) in enumerate(zip(cell.flare.amplitudes, flares, strict=True), 1):
+                found.append(Scene(f"star-{number}", f"flare-{k}", name, amplitude, x, chosen, swept))
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Chunk:
+    """One chunk of one scene: rows `start` to `stop` - 1 of its array."""
+
+    scene: Scene
+    number: int
+    start: int
+    stop: int
+
+    @property
+    def name(self) -> str:
+        """Its file under the array's folder."""
+        return "/".join(["c", str(self.number), *["0"] * len(self.scene.row)])
+
+    @property
+    def key(self) -> str:
+        """Its file in the store."""
+        return f"{self.scene.path}/{self.name}"
+
+
+@dataclass(eq=False)
+class Store:
+    """A store and the study that made it, whose ``run.realisations`` are the rows of each array.
+
+    Attributes
+    ----------
+    path : Path
+    study : Study
+    digests : dict of str
+        By chunk, of what was written.
+    """
+
+    path: Path
+    study: Study
+    digests: dict[str, str] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        missing = [name for name in ("zarr", "xxhash", "google_crc32c") if find_spec(name) is None]
+        if missing:
+            raise InputError(f"{missing[0]} is missing, expected it for stores: pip install 'mauvecl[bulk]'")
+
+    @classmethod
+    def open(cls, path: str | Path) -> Store:
+        """One that was written before, from the copies of its study that have their digest: they must agree.
+
+        Raises
+        ------
+        InputError
+            If it is none of mauvecl's, no copy of its study is intact, or intact copies contradict each other.
+        """
+        path = Path(path)
+        copies: dict[str, Path] = {}
+        for place in (path / "zarr.json", *sorted(path.glob("*/*/zarr.json"))):
+            text = study_in(place)
+            if text is not None:
+                copies.setdefault(text, place.relative_to(path))
+        if not copies:
+            raise InputError(
+                f"{str(path)!r} is no store of spectra, expected a folder that `mauvecl realise` wrote, with an intact "
+                "copy of its study"
+            )
+        (text, first), *others = copies.items()
+        if others:
+            other, second = others[0]
+            keys = ", ".join(differing_keys(toml(text, path.name), toml(other, path.name)))
+            raise InputError(
+                f"store {str(path)!r} holds two studies, {str(first)!r} and {str(second)!r} differ in {keys}, "
+                "expected one study: put the right one's file back"
+            )
+        found = cls(path, Study.build(toml(text, path.name), path.name))
+        found.read_digests()
+        return found
+
+    @cached_property
+    def scenes(self) -> list[Scene]:
+        """Its arrays of spectra."""
+        return scenes(self.study)
+
+    def scene(self, path: str) -> Scene:
+        """One of them, such as ``star-1/flare-2``.
+
+        Raises
+        ------
+        InputError
+            If there is none.
+        """
+        found = next((scene for scene in self.scenes if scene.path == path), None)
+        if found is None:
+            raise InputError(
+                f"no array {path!r} in {self.path.name}, expected one of {', '.join(s.path for s in self.scenes)}"
+            )
+        return found
+
+    @property
+    def rows(self) -> int:
+        """Realisations of each array."""
+        return self.study.run.realisations
+
+    @property
+    def n_bytes(self) -> int:
+        """Bytes of all spectra."""
+        return sum(self.rows * scene.row_bytes for scene in self.scenes)
+
+    def chunks(self, first: int = 0, stop: int | None = None) -> Iterator[Chunk]:
+        """All chunks, scene by scene, or those with rows `first` to `stop` - 1."""
+        for scene in self.scenes:
+            rows = scene.chunk_rows(self.rows)
+            for number in self._numbers(scene, first, stop):
+                yield Chunk(scene, number, number * rows, min((number + 1) * rows, self.rows))
+
+    def count(self, first: int = 0, stop: int | None = None) -> int:
+        """How many chunks `chunks` goes through; known without going through them."""
+        return sum(len(self._numbers(scene, first, stop)) for scene in self.scenes)
+
+    def _numbers(self, scene: Scene, first: int = 0, stop: int | None = None) -> range:
+        rows = scene.chunk_rows(self.rows)
+        return range(first // rows, -(-(self.rows if stop is None else stop) // rows))
+
+    def make(self) -> None:
+        """Write what describes the arrays, nothing of them yet; or see that it is there already.
+
+        Raises
+        ------
+        InputError
+            If another study's store is there, with the keys that differ; or the folder cannot be written.
+        """
+        root = self.path / "zarr.json"
+        if root.exists():
+            self._check_same()
+            self.read_digests()
+            return
+        self.make_folder()
+        ours = {scene.group for scene in self.scenes}
+        other = [p.name for p in self.path.iterdir() if p.name not in ours and not p.name.startswith(UNFINISHED)]
+        if other:
+            raise InputError(f"{str(self.path)!r} holds {min(other)!r} and no store, expected an empty or a new folder")
+        # The root comes last: where it is, everything else is.
+        made = self.description()
+        for name in sorted(made, key=lambda name: name == root.name):
+            write_whole(self.path / name, made[name])
+
+    def make_folder(self) -> None:
+        """Its folder, which may be there.
+
+        Raises
+        ------
+        InputError
+            If it cannot be made, or its file system is smaller than the spectra.
+        """
+        try:
+            self.path.mkdir(parents=True, exist_ok=True)
+            room = shutil.disk_usage(self.path).total
+        except OSError as error:
+            raise InputError(
+                f"store {str(self.path)!r} cannot be made ({error.strerror}), expected a writable folder"
+            ) from error
+        if self.n_bytes > room:
+            raise InputError(
+                f"spectra of {self.n_bytes / 2**30:.4g} GiB for {str(self.path)!r}, expected less than its disk's "
+                f"{room / 2**30:.4g} GiB"
+            )
+
+    def description(self) -> dict[str, bytes]:
+        """Every file of the store but its spectra, by its place."""
+        with tempfile.TemporaryDirectory() as folder:
+            describe(self, Path(folder))
+            files = [p for p in Path(folder).rglob("*") if p.is_file()]
+            return {str(p.relative_to(folder)): p.read_bytes() for p in files}
+
+    def _check_same(self) -> None:
+        there = Store.open(self.path).study
+        differing = differing_keys(self.study.model_dump(mode="json"), there.model_dump(mode="json"))
+        if differing:
+            raise InputError(
+                f"store {str(self.path)!r} was begun by another study, which differs in {', '.join(differing)}, "
+                "expected the same study or another place"
+            )
+
+    def read_digests(self) -> None:
+        """Look up what was written; lines that are not whole say nothing."""
+        self.digests = {}
+        for scene in self.scenes:
+            try:
+                text = read_bytes(self.path / scene.path / DIGESTS, "list of digests").decode(errors="replace")
+            except InputError:
+                continue
+            for line in text.splitlines():
+                name, _, rest = line.partition(" ")
+                found, _, check = rest.partition(" ")
+                if check == _check(name, found):
+                    self.digests[f"{scene.path}/{name}"] = found
+
+    def note(self, chunk: Chunk, found: str) -> None:
+        """Add a chunk's digest to its array's list."""
+        self.digests[chunk.key] = found
+        line = f"{chunk.name} {found} {_check(chunk.name, found)}\n"
+        try:
+            # One short write at the end of the file; a line cut short by a full disk is closed by the next.
+            with (self.path / chunk.scene.path / DIGESTS).open("a+b", buffering=0) as file:
+                file.seek(0, 2)
+                if file.tell():
+                    file.seek(-1, 2)
+                    line = line if file.read(1) == b"\n" else "\n" + line
+                file.write(line.encode())
+        except OSError as error:
+            raise InputError(
+                f"{chunk.scene.path}/{DIGESTS} of {self.path.name} cannot be written ({error.strerror}), expected a "
+                "writable disk with room; what was written before is kept"
+            ) from error
+
+    def encode(self, chunk: Chunk, rows: NDArray[Any]) -> tuple[memoryview, bytes]:
+        """A chunk as Zarr's codecs `bytes` and `crc32c` have it: whole, the last one filled with zeros."""
+        full = chunk.scene.chunk_rows(self.rows)
+        if len(rows) < full:
+            rows = np.concatenate([rows, np.zeros((full - len(rows), *chunk.scene.row), rows.dtype)])
+        whole = np.ascontiguousarray(rows, chunk.scene.dtype)
+        return memoryview(whole.data).cast("B"), crc(whole)
+
+    def place(self, chunk: Chunk, rows: NDArray[Any]) -> str:
+        """Write a chunk, whole or not at all; returns its digest."""
+        data, check = self.encode(chunk, rows)
+        write_whole(self.path / chunk.key, data, check)
+        return digest(data, check)
+
+    def has(self, chunk: Chunk) -> bool:
+        """Whether a chunk was written, by the list of digests and its size; `verify.state` looks into it."""
+        try:
+            size = (self.path / chunk.key).stat().st_size
+        except OSError:
+            return False
+        return chunk.key in self.digests and size == self.chunk_bytes(chunk)
+
+    def owns(self, key: str) -> bool:
+        """Whether a file at this place of the store would be a chunk's."""
+        scene = next((scene for scene in self.scenes if key.startswith(f"{scene.path}/c/")), None)
+        number = key.removeprefix(f"{scene.path}/c/").partition("/")[0] if scene else ""
+        # Twenty digits hold any number of a chunk; int() of a name without end would take its time.
+        if scene is None or not (number.isascii() and number.isdigit() and len(number) <= 20):
+            return False
+        return int(number) in self._numbers(scene) and key == Chunk(scene, int(number), 0, 0).key
+
+    def files(self) -> Iterator[tuple[str, bool]]:
+        """Every file and link in its folder, and whether it is of this store."""
+        described = self.description()
+        lists = {f"{scene.path}/{DIGESTS}" for scene in self.scenes}
+        for folder, folders, names in os.walk(self.path):
+            here = Path(folder).relative_to(self.path)
+            linked = [name for name in folders if (Path(folder) / name).is_symlink()]
+            for name in sorted([*names, *linked]):
+                whole = str(here / name.removeprefix(UNFINISHED))
+                yield str(here / name), whole in described or whole in lists or self.owns(whole)
+
+    def clear(self) -> None:
+        """Remove every file of it, its study last, so that it is a store to the end; its folder stays.
+
+        Raises
+        ------
+        InputError
+            If something else is in the folder: then nothing is removed.
+        """
+        found = list(self.files())
+        other = [key for key, own in found if not own]
+        if other:
+            raise InputError(
+                f"store {str(self.path)!r} holds {other[0]!r}, which is not of it, expected nothing else where a store "
+                "is to be removed"
+            )
+        for key, _ in sorted(found, key=lambda entry: entry[0] == "zarr.json"):
+            (self.path / key).unlink(missing_ok=True)
+        for folder, _, _ in os.walk(self.path, topdown=False):
+            if folder != str(self.path):
+                Path(folder).rmdir()
+        self.digests = {}
+
+    def chunk_bytes(self, chunk: Chunk) -> int:
+        """Bytes of a chunk's file: whole rows, and their CRC."""
+        return chunk.scene.chunk_rows(self.rows) * chunk.scene.row_bytes + CRC_BYTES
+
+
+def crc(data: bytes | NDArray[Any]) -> bytes:
+    """CRC-32C as Zarr's codec of that name writes it."""
+    import google_crc32c
+
+    return int(google_crc32c.value(data)).to_bytes(CRC_BYTES, "little")
+
+
+def digest(*parts: bytes | memoryview) -> str:
+    """XXH3, 128 bits, of some parts together."""
+    import xxhash
+
+    found = xxhash.xxh3_128()
+    for part in parts:
+        found.update(part)
+    return found.hexdigest()
+
+
+def _check(*words: str) -> str:
+    return digest(" ".join(words).encode())[:8]

@@ -1,0 +1,1 @@
+"""A question as data: read from TOML, changed by flags, turned into expectations."""

@@ -1,0 +1,126 @@
+"""What rows of answers are called, and what their readers must be told."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mauvecl.study.questions import UNITS
+from mauvecl.study.sections import Star
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.host.expectation import Expectation
+
+
+def label(star: Star, x: Expectation) -> str:
+    """A star's name with its magnitude, for tables and pictures."""
+    name = star.library or x.name
+    system = {"catalogue": "", "vega": " (Vega = 0)", "ab": " (AB)"}[star.magnitude_system]
+    return name if star.magnitude is None else f"{name} {star.band} = {star.magnitude:g}{system}"
+
+
+def told(expectations: list[Expectation]) -> list[str]:
+    """Their messages, each once, saturation first."""
+    messages = list(dict.fromkeys(message for x in expectations for message in x.messages))
+    return sorted(messages, key=lambda m: not m.startswith("SATURATED"))
+
+
+def put_first(table: QTable, values: Mapping[str, float | str]) -> None:
+    """Columns of one value each in front of a table, with their units."""
+    import astropy.units as u
+
+    for place, (name, value) in enumerate(values.items()):
+        column = np.full(len(table), value)
+        table.add_column(column * u.Unit(UNITS[name]) if name in UNITS else column, name=name, index=place)
+
+
+def stacked(parts: Iterable[tuple[Mapping[str, float | str], QTable]], **meta: object) -> QTable:
+    """One table of many, each with columns of its own values in front; of their meta data what all agree on.
+
+    Parameters
+    ----------
+    parts : iterable of (mapping, QTable)
+    **meta
+        Meta data of the whole.
+    """
+    from astropy.table import vstack
+
+    tables = []
+    for values, table in parts:
+        put_first(table, values)
+        tables.append(table)
+    shared = {k: v for k, v in tables[0].meta.items() if all(k in t.meta and t.meta[k] == v for t in tables)}
+    for table in tables:
+        table.meta = {}
+    found = vstack(tables)
+    found.meta |= shared | meta
+    return described(found)
+
+
+def titled(name: str, at: Mapping[str, float | str]) -> str:
+    """A star with the values of its cell, for pictures; its magnitude and name are there already."""
+    units = {"flare_temperature": " K", "exposure": " s", "detector_temperature": " deg C", "sky": " mag/arcsec2"}
+    parts = [
+        f"{quantity.replace('_', ' ')} {value:g}{units.get(quantity, '')}"
+        for quantity, value in at.items()
+        if quantity not in ("magnitude", "star") and not isinstance(value, str)
+    ]
+    return ", ".join([name, *parts])
+
+
+#: What columns hold that many tables have.
+COLUMNS = {
+    "star": "library name or file, with its magnitude",
+    "statistic": "detection statistic",
+    "amplitude": "flare amplitude: relative rise of the photons in the flare's band",
+    "template": "amplitude of the flare that the statistic looks for",
+    "magnitude": "magnitude of the star in its band",
+    "flare_temperature": "blackbody temperature of the flare",
+    "exposure": "length of the exposure",
+    "detector_temperature": "temperature of the detector",
+    "sky": "zodiacal surface brightness in V",
+    "wavelength": "vacuum wavelength, the middle of the pixel or element",
+    "threshold": "value at and above which a detection is claimed",
+    "fap_low": "95 % interval of the false-alarm probability, lower end",
+    "fap_high": "95 % interval of the false-alarm probability, upper end",
+    "probability_low": "95 % interval of the detection probability, lower end",
+    "probability_high": "95 % interval of the detection probability, upper end",
+    "area_low": "95 % interval of the area, lower end",
+    "area_high": "95 % interval of the area, upper end",
+    "realisation": "number of the realisation, by which it can be drawn again",
+    "source_photon": "photon noise of the star, rms",
+    "zodiacal_photon": "photon noise of the zodiacal light, rms",
+    "dark": "noise of the dark current, rms",
+    "read": "read noise, rms",
+    "total": "all of them in quadrature, without the ADC's rounding",
+    "why": "main cause of a difference from the closed form",
+    "per": "pixel, or resolution element of 10.5 nm",
+    "wanted": "wanted S/N",
+    "frames": "frames of the exposure",
+    "snr": "closed-form S/N reached",
+    "snr_one_frame_less": "closed-form S/N of one frame less",
+    "matters_most": "unknown that explains most of the limits' variance",
+    "assumption": "what is assumed of the instrument",
+    "low_end": "lower end of its sensible range",
+    "high_end": "upper end of its sensible range",
+    "at_low_end": "closed-form limit with the assumption at its lower end",
+    "at_high_end": "closed-form limit with the assumption at its upper end",
+    "temperature_c": "detector temperature of the draw, deg C",
+    "light_loss": "light loss of the draw",
+    "pointing_loss": "pointing loss of the draw",
+    "qe_scale": "factor on the quantum efficiency of the draw",
+    "conversion_uv_per_electron": "charge conversion of the draw, uV per electron",
+    "read_noise_dn": "read noise of the draw, DN",
+} | {f"q{p}": f"{p} % quantile of the realisations" for p in ("0.135", "2.5", "16", "50", "84", "97.5", "99.865")}
+
+
+def described(table: QTable) -> QTable:
+    """The table, its common columns described where they are not yet."""
+    for name in table.colnames:
+        if not table[name].info.description:
+            table[name].info.description = COLUMNS.get(name)
+    return table

@@ -1,0 +1,178 @@
+"""What a study may ask beyond detection: quantities and their axes, limits, maps, sweeps, campaigns, bulk frames."""
+
+from __future__ import annotations
+
+import itertools
+import math
+from typing import Annotated, Literal, Self
+
+from pydantic import Field, model_validator
+
+from mauvecl.host.errors import InputError
+from mauvecl.study.sections import Part
+
+#: What a limit is asked for, or an axis of a map runs over, and where it may lie.
+QUANTITIES: dict[str, tuple[float, float]] = {
+    "magnitude": (-2.0, 25.0),
+    "amplitude": (1e-6, 1e4),
+    "flare_temperature": (1_000.0, 100_000.0),
+    "exposure": (1e-3, 1e7),
+    "detector_temperature": (-100.0, 60.0),
+    "sky": (10.0, 30.0),
+}
+#: Combinations of a sweep, at most: each has expectations of its own.
+MOST_CELLS = 100_000
+#: Units of these, where they have any.
+UNITS = {
+    "magnitude": "mag",
+    "flare_temperature": "K",
+    "exposure": "s",
+    "detector_temperature": "deg_C",
+    "sky": "mag / arcsec2",
+}
+
+
+class CampaignQuestion(Part):
+    """How many tests a search makes: frames in all, and from one stack to the next."""
+
+    frames: Annotated[int, Field(ge=1)] | None = None
+    step: Annotated[int, Field(ge=1)] | None = None
+
+
+class SignalQuestion(Part):
+    """The S/N that an exposure is wanted for."""
+
+    snr: Annotated[float, Field(gt=0)] | None = None
+    wavelength_nm: float | None = None
+    per: Literal["element", "pixel"] = "element"
+
+
+class BulkQuestion(Part):
+    """What is kept of each realisation: the exposure's sum, or its frames; and the mean components beside it."""
+
+    frames: Literal["stack", "all"] | Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] = "stack"
+    components: bool = False
+
+    @model_validator(mode="after")
+    def _ascending(self) -> Self:
+        if not isinstance(self.frames, str) and list(self.frames) != sorted(set(self.frames)):
+            raise ValueError(f"bulk.frames = {list(self.frames)}, expected ascending numbers")
+        return self
+
+    def chosen(self, n_frames: int) -> tuple[int, ...] | None:
+        """Frames kept apart, of so many; None where they are summed.
+
+        Raises
+        ------
+        InputError
+            If one of them is not there.
+        """
+        if self.frames == "stack":
+            return None
+        if isinstance(self.frames, str):
+            return tuple(range(n_frames))
+        if self.frames[-1] >= n_frames:
+            raise InputError(f"bulk.frames names frame {self.frames[-1]}, expected 0 to {n_frames - 1}")
+        return self.frames
+
+
+class LimitQuestion(Part):
+    """The value of one quantity at which a flare is detected with a wanted probability."""
+
+    of: Literal["magnitude", "amplitude", "exposure"] = "magnitude"
+    power: Annotated[float, Field(gt=0, lt=1)] = 0.9
+
+
+class Axis(Part):
+    """One axis of a map: values, or so many steps from start to stop."""
+
+    quantity: Literal["magnitude", "amplitude", "flare_temperature", "exposure", "detector_temperature", "sky", "star"]
+    values: tuple[float | str, ...] | None = None
+    start: float | None = None
+    stop: float | None = None
+    steps: Annotated[int, Field(ge=2, le=1000)] | None = None
+    log: bool = False
+
+    @model_validator(mode="after")
+    def _one_way(self) -> Self:
+        spaced = (self.start, self.stop, self.steps)
+        if (self.values is None) == (None in spaced) or (self.values is not None and spaced != (None, None, None)):
+            raise ValueError(
+                f"the axis {self.quantity!r} has neither or both of values and start, stop, steps, expected one of them"
+            )
+        if self.values is not None and len(self.values) == 0:
+            raise ValueError(f"the axis {self.quantity!r} has no values, expected some")
+        for value in self.points():
+            if (self.quantity == "star") != isinstance(value, str):
+                raise ValueError(f"the axis {self.quantity!r} has the value {value!r}, expected {self._expected()}")
+            if not isinstance(value, str):
+                low, high = QUANTITIES[self.quantity]
+                if not low <= value <= high:
+                    raise ValueError(f"the axis {self.quantity!r} reaches {value:g}, expected {low:g} to {high:g}")
+        return self
+
+    def _expected(self) -> str:
+        return "names of the library" if self.quantity == "star" else "numbers"
+
+    def points(self) -> tuple[float | str, ...]:
+        """Its values."""
+        if self.values is not None:
+            return self.values
+        assert self.start is not None
+        assert self.stop is not None
+        assert self.steps is not None
+        if self.log and min(self.start, self.stop) <= 0:
+            raise ValueError(
+                f"the axis {self.quantity!r} is logarithmic from {self.start:g} to {self.stop:g}, expected > 0"
+            )
+        share = [i / (self.steps - 1) for i in range(self.steps)]
+        if self.log:
+            return tuple(self.start * (self.stop / self.start) ** s for s in share)
+        return tuple(self.start + (self.stop - self.start) * s for s in share)
+
+
+class MapQuestion(Part):
+    """Detection probability over two quantities."""
+
+    x: Axis = Axis(quantity="magnitude", start=4.0, stop=10.0, steps=16)
+    y: Axis = Axis(quantity="amplitude", start=0.01, stop=1.0, steps=16, log=True)
+    contours: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = (0.1, 0.5, 0.9)
+
+    @model_validator(mode="after")
+    def _two(self) -> Self:
+        if self.x.quantity == self.y.quantity:
+            raise ValueError(f"both axes of the map are {self.x.quantity!r}, expected two quantities")
+        return self
+
+
+class Sweep(Part):
+    """Quantities that take several values: in every combination, or side by side as a list."""
+
+    how: Literal["product", "list"] = "product"
+    axes: tuple[Axis, ...] = ()
+
+    @model_validator(mode="after")
+    def _fits(self) -> Self:
+        names = [axis.quantity for axis in self.axes]
+        twice = next((name for name in names if names.count(name) > 1), None)
+        if twice is not None:
+            raise ValueError(f"the sweep has the quantity {twice!r} twice, expected different ones")
+        lengths = {axis.quantity: len(axis.points()) for axis in self.axes}
+        if self.how == "list" and len(set(lengths.values())) > 1:
+            told = ", ".join(f"{n} of {name}" for name, n in lengths.items())
+            raise ValueError(f"the sweep is a list of {told}, expected as many of each")
+        if self.size > MOST_CELLS:
+            raise ValueError(f"the sweep has {self.size} combinations, expected at most {MOST_CELLS}")
+        return self
+
+    @property
+    def size(self) -> int:
+        """Cells."""
+        lengths = [len(axis.points()) for axis in self.axes]
+        return max(lengths, default=1) if self.how == "list" else math.prod(lengths)
+
+    def cells(self) -> list[dict[str, float | str]]:
+        """The values of each cell; one cell without any where nothing is swept."""
+        values = [axis.points() for axis in self.axes]
+        together = zip(*values, strict=True) if self.how == "list" and values else itertools.product(*values)
+        return [{a.quantity: v for a, v in zip(self.axes, cell, strict=True)} for cell in together]

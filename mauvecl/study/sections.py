@@ -1,0 +1,251 @@
+"""The sections of a study: star, flare, observation, sky, noise processes, run, and what is unknown."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from mauvecl.noise.layout import USUAL_STATISTICS
+
+if TYPE_CHECKING:
+    from mauvecl.host.sky.zodiacal import Sky
+    from mauvecl.host.stars.source import Source
+    from mauvecl.noise.comparison import Comparison
+    from mauvecl.noise.processes import Prior, Processes
+
+
+class Part(BaseModel):
+    """A section: frozen, and strict about its keys."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+#: What a star from a file has and one of the library has not.
+FILE_KEYS = ("file", "wavelength_unit", "flux_unit", "extend")
+
+
+class Star(Part):
+    """Which spectrum, behind how much dust, how bright then."""
+
+    library: str | None = None
+    file: Path | None = None
+    magnitude: float | None = None
+    band: str = "V"
+    magnitude_system: Literal["catalogue", "vega", "ab"] = "catalogue"
+    ebv: float | None = None
+    wavelength_unit: str | None = None
+    flux_unit: str | None = None
+    extend: str | None = None
+    bin_nm: float | None = None
+
+    @model_validator(mode="after")
+    def _one_spectrum(self) -> Self:
+        if (self.library is None) == (self.file is None):
+            raise ValueError("a star has neither or both of library and file, expected one of them")
+        given = [key for key in FILE_KEYS if getattr(self, key) is not None]
+        if self.file is None and given:
+            raise ValueError(f"a star of the library has {' and '.join(given)}, expected them of a file only")
+        return self
+
+    def source(self) -> Source:
+        """The star's spectrum at its magnitude; as stored where none is given."""
+        from mauvecl.host.stars.source import Source
+
+        if self.library is not None:
+            found = Source.from_library(self.library)
+        else:
+            found = Source.read(
+                self.file or "", wavelength_unit=self.wavelength_unit, flux_unit=self.flux_unit, extend=self.extend
+            )
+        if self.bin_nm is not None:
+            found = found.binned(self.bin_nm)
+        if self.ebv is not None:
+            found = found.reddened(self.ebv)
+        return found if self.magnitude is None else found.at_magnitude(self.magnitude, self.band, self.magnitude_system)
+
+
+class Flare(Part):
+    """Which flares."""
+
+    amplitudes: Annotated[tuple[float, ...], Field(min_length=1)] = (0.0076, 0.02, 0.081, 0.24)
+    temperature_k: float = 10_000.0
+    band: str = "Kepler"
+    geometry: Literal["added", "replaces"] = "added"
+    photosphere_temperature_k: float | None = None
+
+
+class Observation(Part):
+    """How it is observed."""
+
+    exposure_s: float = 50.0
+    instrument: str = "mauve"
+    temperature_c: float | None = None
+    order: Literal["paper", "physical"] = "paper"
+    mode: Literal["auto", "frames", "stacked"] = "auto"
+    recipe: Literal["auto", "joint", "apart"] = "auto"
+    changes: dict[str, float | int | str] = Field(default_factory=dict)
+
+
+#: V mag arcsec-2 where a study says nothing of the sky: the ecliptic opposite the Sun.
+DEFAULT_SKY = 22.1
+
+
+class SkyLight(Part):
+    """What is behind the star: a surface brightness, a target and a time, or nothing."""
+
+    surface_brightness: float | None = None
+    target: str | None = None
+    time: str | None = None
+    none: bool = False
+
+    @model_validator(mode="before")
+    @classmethod
+    def _something(cls, given: Any) -> Any:
+        return given or {"surface_brightness": DEFAULT_SKY}
+
+    @model_validator(mode="after")
+    def _one_sky(self) -> Self:
+        if (self.target is None) != (self.time is None):
+            raise ValueError("the sky has only one of target and time, expected both or neither")
+        if (self.surface_brightness is not None) + (self.target is not None) + self.none > 1:
+            raise ValueError("the sky is given twice, expected one of surface_brightness, target with time, and none")
+        return self
+
+    def sky(self) -> Sky:
+        """What the host needs of it."""
+        from mauvecl.host.sky.zodiacal import Sky
+
+        if self.none:
+            return Sky.none()
+        if self.target is not None and self.time is not None:
+            return Sky.at(self.target, self.time)
+        return Sky.none() if self.surface_brightness is None else Sky.of_brightness(self.surface_brightness)
+
+
+class PriorText(Part):
+    """What is known of a value that differs from realisation to realisation: flat, or normal and cut."""
+
+    uniform: tuple[float, float] | None = None
+    normal: tuple[float, float] | None = None
+    between: tuple[float, float] | None = None
+
+    @model_validator(mode="after")
+    def _one_shape(self) -> Self:
+        if (self.uniform is None) == (self.normal is None) or (self.normal is None) != (self.between is None):
+            raise ValueError(
+                "a prior is neither { uniform = [low, high] } nor { normal = [mean, sd], between = [low, high] }, "
+                "expected one of them"
+            )
+        self.prior()
+        return self
+
+    def prior(self) -> Prior:
+        """As the engine takes it."""
+        from mauvecl.noise.processes import Normal, Uniform
+
+        if self.normal is not None and self.between is not None:
+            return Normal(*self.normal, *self.between)
+        return Uniform(*(self.uniform or (0.0, 0.0)))  # one of the two is there
+
+
+class Rays(Part):
+    """Cosmic-ray hits; see `processes.CosmicRays`."""
+
+    rate_per_cm2_s: float = 1.0
+    area_cm2: float = 0.057
+    electrons: tuple[float, float] = (500.0, 1000.0)
+    weights: tuple[float, ...] | None = None
+
+
+class NoiseProcesses(Part):
+    """Optional noise processes, all off unless named; see `processes.Processes`."""
+
+    cosmic_rays: Rays | None = None
+    jitter: PriorText | None = None
+    detector_temperature: PriorText | None = None
+    light_loss: PriorText | None = None
+    pointing_loss: PriorText | None = None
+    qe_scale: PriorText | None = None
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        self.processes()
+        return self
+
+    def processes(self) -> Processes:
+        """As the engine takes them."""
+        from mauvecl.noise.processes import CosmicRays, Processes
+
+        rays = None if self.cosmic_rays is None else CosmicRays(**self.cosmic_rays.model_dump())
+        names = [name for name in type(self).model_fields if name != "cosmic_rays"]
+        given = {name: getattr(self, name) for name in names}
+        return Processes(rays, **{name: None if text is None else text.prior() for name, text in given.items()})
+
+
+class Run(Part):
+    """How much is drawn, and what is asked of it."""
+
+    realisations: Annotated[int, Field(ge=1)] = 1_000_000
+    seed: Annotated[int, Field(ge=0, lt=2**64)] = 1
+    statistics: Annotated[tuple[str, ...], Field(min_length=1)] = USUAL_STATISTICS
+    fap: Annotated[float, Field(gt=0, lt=1)] = 1e-3
+    tails: Literal["counted", "sampled"] = "counted"
+    reference: str = "template"
+    variances: Literal["model", "estimated"] = "model"
+    template_temperatures_k: tuple[float, ...] = ()
+    weights: dict[str, Path] = Field(default_factory=dict)
+
+    @field_validator("statistics")
+    @classmethod
+    def _all(cls, given: tuple[str, ...]) -> tuple[str, ...]:
+        from mauvecl.statistics.definitions import STATISTICS
+
+        return tuple(STATISTICS) if "all" in given else given
+
+    @model_validator(mode="after")
+    def _comparable(self) -> Self:
+        self.comparison()
+        return self
+
+    def comparison(self) -> Comparison:
+        """What an observed spectrum is compared with, as the engine takes it."""
+        from mauvecl.noise.comparison import Comparison
+
+        return Comparison.of(self.reference, self.variances)
+
+
+class Unknowns(Part):
+    """What is unknown of the instrument and the same in every exposure; nothing unless draws are asked for.
+
+    The priors are those of the documentation's page on what is nominal.
+    """
+
+    draws: Annotated[int, Field(ge=0, le=4096)] = 0
+    temperature_c: PriorText | None = PriorText(uniform=(13.0, 21.0))
+    light_loss: PriorText | None = PriorText(normal=(0.34, 0.10), between=(0.04, 0.64))
+    pointing_loss: PriorText | None = PriorText(uniform=(0.0, 0.05))
+    qe_scale: PriorText | None = PriorText(normal=(1.0, 0.3), between=(0.3, 1.7))
+    conversion_uv_per_electron: PriorText | None = PriorText(uniform=(20.0, 25.0))
+    read_noise_dn: PriorText | None = PriorText(normal=(12.0, 1.0), between=(9.0, 15.0))
+    known: tuple[str, ...] = ()
+
+    @model_validator(mode="after")
+    def _enough(self) -> Self:
+        if self.draws == 1:
+            raise ValueError("unknowns.draws = 1, expected 0 or at least 2")
+        other = next((name for name in self.known if name not in self._names()), None)
+        if other is not None:
+            raise ValueError(f"unknowns.known names {other!r}, expected some of {', '.join(self._names())}")
+        self.priors()
+        return self
+
+    @classmethod
+    def _names(cls) -> list[str]:
+        return [name for name in cls.model_fields if name not in ("draws", "known")]
+
+    def priors(self) -> dict[str, Prior]:
+        """The priors of what is not known, by the instrument's names, and `qe_scale`."""
+        given = {name: getattr(self, name) for name in self._names() if name not in self.known}
+        return {name: text.prior() for name, text in given.items() if text is not None}

@@ -1,0 +1,257 @@
+"""A question as data: read from TOML, changed by flags, turned into expectations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Self
+
+from pydantic import Field, ValidationError
+
+from mauvecl.host.errors import InputError
+from mauvecl.host.files.bounded import shortened
+from mauvecl.host.files.parsed import possible, read_text, toml
+from mauvecl.study.questions import (
+    Axis,
+    BulkQuestion,
+    CampaignQuestion,
+    LimitQuestion,
+    MapQuestion,
+    SignalQuestion,
+    Sweep,
+)
+from mauvecl.study.sections import FILE_KEYS, Flare, NoiseProcesses, Observation, Part, Run, SkyLight, Star, Unknowns
+from mauvecl.study.study_text import put, sentence, study_of, toml_value
+
+if TYPE_CHECKING:
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.instrument.instrument import Instrument
+    from mauvecl.host.stars.source import Source
+    from mauvecl.noise.processes import Prior
+
+#: The paper's two stars.
+PAPER_STARS = (Star(library="K3V", magnitude=3.7), Star(library="G2V", magnitude=7.4))
+
+
+class Study(Part):
+    """Everything that an answer depends on; the default is the paper's question.
+
+    Examples
+    --------
+    >>> import tomllib
+    >>> from mauvecl import Study
+    >>> study = Study().with_settings(["run.fap=0.01", "star.0.magnitude=6"])
+    >>> study.run.fap, study.star[0].library, study.star[0].magnitude
+    (0.01, 'K3V', 6.0)
+    >>> study == Study.build(tomllib.loads(study.toml()), "text")
+    True
+    """
+
+    star: Annotated[tuple[Star, ...], Field(min_length=1)] = PAPER_STARS
+    flare: Flare = Flare()
+    observation: Observation = Observation()
+    sky: SkyLight = SkyLight()
+    processes: NoiseProcesses = NoiseProcesses()
+    run: Run = Run()
+    campaign: CampaignQuestion = CampaignQuestion()
+    signal: SignalQuestion = SignalQuestion()
+    limit: LimitQuestion = LimitQuestion()
+    map: MapQuestion = MapQuestion()
+    bulk: BulkQuestion = BulkQuestion()
+    sweep: Sweep = Sweep()
+    unknowns: Unknowns = Unknowns()
+
+    @classmethod
+    def read(cls, path: str | Path) -> Self:
+        """A study file, or the study that an answer's ECSV table was made by.
+
+        Raises
+        ------
+        InputError
+            If it is missing, not TOML (naming the line), or holds an unknown key or an impossible value.
+        """
+        path = Path(path)
+        text = study_of(path) if path.suffix == ".ecsv" else read_text(path, "study file")
+        data = toml(text, f"study file {shortened(path.name)}")
+        for star in data.get("star", []) if isinstance(data.get("star"), list) else []:
+            # Files are named as seen from the study.
+            if isinstance(star, dict) and isinstance(star.get("file"), str):
+                star["file"] = str(path.parent / star["file"])
+        run = data.get("run")
+        if isinstance(run, dict) and isinstance(run.get("weights"), dict):
+            run["weights"] = {k: str(path.parent / v) if isinstance(v, str) else v for k, v in run["weights"].items()}
+        return cls.build(data, path.name)
+
+    @classmethod
+    def build(cls, data: dict[str, Any], where: str) -> Self:
+        """Validate nested data, with one sentence for the first fault."""
+        possible(data, where)
+        try:
+            return cls.model_validate(data)
+        except ValidationError as error:
+            raise InputError(f"{where}: {sentence(cls, error)}") from error
+
+    def with_changes(
+        self, changes: dict[str, dict[str, Any]], stars: list[dict[str, Any]] | None, where: str = "command line"
+    ) -> Self:
+        """The study with a section's values replaced where they are not None, and with other stars."""
+        data = self.model_dump()
+        for section, values in changes.items():
+            given = {key: value for key, value in values.items() if value is not None}
+            if section == "sky" and given:
+                # A new sky takes the place of the old one whole.
+                data[section] = {}
+            data[section].update(given)
+        if stars is not None:
+            data["star"] = stars
+        return self.build(data, where)
+
+    def with_settings(self, settings: Sequence[str]) -> Self:
+        """The study with keys set as text, such as ``run.fap=0.01`` or ``star.0.magnitude=6``.
+
+        Raises
+        ------
+        InputError
+            For text without "=", or a key or value that cannot be.
+        """
+        data = self.model_dump(exclude_none=True)
+        for text in settings:
+            path, equals, value = (part.strip() for part in text.partition("="))
+            if not (path and equals):
+                raise InputError(f"--set {text!r}, expected key=value, such as run.fap=0.01")
+            put(data, path.split("."), toml_value(value), text)
+        return self.build(data, "--set")
+
+    def toml(self) -> str:
+        """The study as TOML that `read` reads back."""
+        import tomli_w
+
+        data = self.model_dump(mode="json", exclude_none=True)
+        if not self.sky.none:
+            del data["sky"]["none"]
+        if not data["observation"]["changes"]:
+            del data["observation"]["changes"]
+        if not self.sweep.axes:
+            del data["sweep"]
+        if not self.unknowns.draws:
+            del data["unknowns"]
+        if self.signal.snr is None:
+            del data["signal"]
+        if self.bulk == BulkQuestion():
+            del data["bulk"]
+        for section in ("processes", "campaign"):
+            if not data[section]:
+                del data[section]
+        data["run"]["weights"] = {name: str(Path(file).resolve()) for name, file in data["run"]["weights"].items()}
+        if not data["run"]["weights"]:
+            del data["run"]["weights"]
+        for star in data["star"]:
+            if "file" in star:
+                star["file"] = str(Path(star["file"]).resolve())
+        return tomli_w.dumps(data)
+
+    def load_instrument(self) -> Instrument:
+        """The instrument with what the study changes of it: its ``changes``, and the detector's temperature."""
+        from mauvecl.host.instrument.instrument import Instrument
+
+        found, o = Instrument.load(self.observation.instrument), self.observation
+        changes = o.changes | ({} if o.temperature_c is None else {"temperature_c": o.temperature_c})
+        return found.with_(**changes) if changes else found
+
+    def with_instrument(self, changes: Mapping[str, Any]) -> Self:
+        """The study with some values of the instrument changed; see `Instrument.with_`."""
+        o = self.observation
+        update: dict[str, Any] = {"changes": o.changes | dict(changes)}
+        if "temperature_c" in changes:
+            update["temperature_c"] = None
+        return self.model_copy(update={"observation": o.model_copy(update=update)})
+
+    def at(self, quantity: str, value: float | str) -> Self:
+        """The study with one quantity at another value, for all its stars.
+
+        Parameters
+        ----------
+        quantity : str
+            A key of `QUANTITIES`, or "star" with a library name.
+        value : float or str
+        """
+        change: dict[str, Any]
+        if quantity in ("magnitude", "star"):
+            change = {"magnitude": value} if quantity == "magnitude" else {"library": value, **dict.fromkeys(FILE_KEYS)}
+            return self.model_copy(update={"star": tuple(star.model_copy(update=change) for star in self.star)})
+        if quantity in ("amplitude", "flare_temperature"):
+            change = {"amplitudes": (value,)} if quantity == "amplitude" else {"temperature_k": value}
+            return self.model_copy(update={"flare": self.flare.model_copy(update=change)})
+        if quantity == "sky":
+            return self.model_copy(update={"sky": SkyLight(surface_brightness=float(value))})
+        change = {{"exposure": "exposure_s", "detector_temperature": "temperature_c"}[quantity]: value}
+        return self.model_copy(update={"observation": self.observation.model_copy(update=change)})
+
+    def unknown_priors(self) -> dict[str, Prior]:
+        """Priors of what is unknown of the instrument; what the study states of it is known.
+
+        Raises
+        ------
+        InputError
+            If nothing is left unknown, and draws are asked for.
+        """
+        stated = {*self.observation.changes, *(() if self.observation.temperature_c is None else ("temperature_c",))}
+        found = {name: prior for name, prior in self.unknowns.priors().items() if name not in stated}
+        if self.unknowns.draws and not found:
+            raise InputError("everything is known of the instrument, expected a prior, or unknowns.draws = 0")
+        return found
+
+    def cells(self) -> list[tuple[dict[str, float | str], Self]]:
+        """The values that the study sweeps over, and the study at each; itself where it sweeps over nothing."""
+        found = []
+        for values in self.sweep.cells():
+            study = self.model_copy(update={"sweep": Sweep()})
+            for quantity, value in values.items():
+                study = study.at(quantity, value)
+            found.append((values, study))
+        return found
+
+    @property
+    def drawing(self) -> dict[str, Any]:
+        """How the engine is to draw: mode, recipe, processes."""
+        o = self.observation
+        return {"mode": o.mode, "recipe": o.recipe, "processes": self.processes.processes()}
+
+    @property
+    def detecting(self) -> dict[str, Any]:
+        """How the engine is to draw and compare: everything that `Engine.detect` takes but stars and seed."""
+        run = self.run
+        how = {"realisations": run.realisations, "statistics": run.statistics, "tails": run.tails}
+        return self.drawing | how | {"comparison": run.comparison()}
+
+    def expectations(self, star: Star) -> list[Expectation]:
+        """A star without a flare, then with each of the flares."""
+        source = star.source()
+        flares = [self.flaring(source, amplitude) for amplitude in self.flare.amplitudes]
+        return self.expect([source, *flares])
+
+    def flaring(self, source: Source, amplitude: float) -> Source:
+        """The star with one of the study's flares."""
+        f = self.flare
+        return source.flaring(
+            amplitude,
+            f.temperature_k,
+            band=f.band,
+            geometry=f.geometry,
+            photosphere_temperature=f.photosphere_temperature_k,
+        )
+
+    def expect(self, sources: list[Source]) -> list[Expectation]:
+        """Expectations of sources on the study's instrument, sky and exposure."""
+        from mauvecl.host.expectation import expect
+
+        instrument, sky, o = self.load_instrument(), self.sky.sky(), self.observation
+        return [expect(s, instrument, exposure=o.exposure_s, sky=sky, order=o.order) for s in sources]
+
+
+#: The paper's noise budgets (its section "Noise"): the Be star HD 37202 and both flare stars, 50 s and 600 s.
+PAPER_BUDGETS = Study(
+    star=(Star(library="B2IV", magnitude=3.03), *PAPER_STARS),
+    run=Run(realisations=100_000),
+    sweep=Sweep(axes=(Axis(quantity="exposure", values=(50.0, 600.0)),)),
+)

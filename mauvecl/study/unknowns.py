@@ -1,0 +1,124 @@
+"""What is unknown of the instrument, and the same with a flare and without: drawn from priors, and averaged over.
+
+An observer's template and threshold come from the instrument as it is; only the one who writes a proposal does not know
+it. So each draw of the unknown values has its own template and threshold, and a detection probability is the average.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from mauvecl.host.errors import InputError
+from mauvecl.results.detection import FEWEST_IN_TAIL
+from mauvecl.statistics.definitions import CONFIDENCE, Interval
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.study.study import Study
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Draws:
+    """Values of the unknown, one row a draw.
+
+    Attributes
+    ----------
+    names : tuple of str
+    values : ndarray, shape (n_draw, n_name)
+    studies : tuple of Study
+        The study on each draw's instrument, nothing unknown any more, with its share of the realisations.
+    """
+
+    names: tuple[str, ...]
+    values: Float
+    studies: tuple[Study, ...]
+
+
+def drawn(study: Study) -> Draws:
+    """Draws from the study's priors, even in each of them (a Latin hypercube, seeded with the study's seed).
+
+    Raises
+    ------
+    InputError
+        If a prior reaches where the instrument cannot be, or everything is known.
+    """
+    from scipy.stats import qmc
+
+    asked, priors = study.unknowns, study.unknown_priors()
+    sequence = qmc.LatinHypercube(len(priors), rng=np.random.default_rng(study.run.seed))
+    even = sequence.random(asked.draws)
+    values = np.column_stack([prior.quantile(even[:, k]) for k, prior in enumerate(priors.values())])
+    area = study.load_instrument().collecting_area_cm2
+    run = study.run.model_copy(update={"realisations": share_of_realisations(study)})
+    certain = study.model_copy(update={"unknowns": type(asked)(), "run": run})
+    studies = []
+    for row in values:
+        changes = dict(zip(priors, (float(v) for v in row), strict=True))
+        if "qe_scale" in changes:
+            # It scales all light alike, as the area does.
+            changes["collecting_area_cm2"] = changes.pop("qe_scale") * area
+        changed = certain.with_instrument(changes)
+        try:
+            changed.load_instrument()
+        except InputError as error:
+            raise InputError(f"the priors of what is unknown reach too far: {error}") from error
+        studies.append(changed)
+    return Draws(tuple(priors), values, tuple(studies))
+
+
+def share_of_realisations(study: Study) -> int:
+    """Realisations for each draw: as many in all as asked for, but enough to count each draw's threshold."""
+    run = study.run
+    fewest = int(np.ceil(FEWEST_IN_TAIL / run.fap)) if run.tails == "counted" else 1000
+    return max(run.realisations // study.unknowns.draws, fewest)
+
+
+def average(found: Sequence[Interval]) -> Interval:
+    """The mean of probabilities over draws of the unknown, with 95 % for their own errors and the number of draws.
+
+    Draws are even, so that the interval, made for independent ones, errs on the wide side.
+    """
+    values = np.array([p.value for p in found])
+    own = np.array([p.high - p.low for p in found]) / 2
+    reach = float(special.ndtri(0.5 + CONFIDENCE / 2))
+    spread = values.std(ddof=1) / np.sqrt(values.size) if values.size > 1 else 0.0
+    half = float(np.hypot(reach * spread, np.sqrt(np.sum(own**2)) / values.size))
+    mean = float(values.mean())
+    return Interval(mean, max(mean - half, 0.0), min(mean + half, 1.0))
+
+
+def shares(draws: Draws, outcome: Float) -> dict[str, float]:
+    """Share of an outcome's variance that each unknown explains, the largest first, by a linear fit.
+
+    Parameters
+    ----------
+    draws : Draws
+    outcome : ndarray, shape (n_draw,)
+    """
+    kept = np.isfinite(outcome)
+    x, y = draws.values[kept], outcome[kept]
+    if len(y) <= x.shape[1] + 1 or y.std() == 0.0:
+        return dict.fromkeys(draws.names, float("nan"))
+    scaled = (x - x.mean(axis=0)) / x.std(axis=0)
+    slopes, *_ = np.linalg.lstsq(np.column_stack([scaled, np.ones(len(y))]), y, rcond=None)
+    explained = slopes[:-1] ** 2 / y.var()
+    return {draws.names[k]: float(explained[k]) for k in np.argsort(-explained)}
+
+
+def draws_table(draws: Draws, outcomes: dict[str, Float]) -> QTable:
+    """One row per draw: the unknown values, and what came of them."""
+    from astropy.table import QTable
+
+    table = QTable({name: draws.values[:, k] for k, name in enumerate(draws.names)})
+    for name, values in outcomes.items():
+        table[name] = values
+    return table

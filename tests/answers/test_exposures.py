@@ -1,0 +1,76 @@
+"""Exposures for a wanted S/N: there and back, against the engine, and refusals."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mauvecl.answers.exposures import exposure_for, snr_at
+from mauvecl.device.engine import Engine
+from mauvecl.host.errors import InputError
+from mauvecl.study.study import Study
+
+
+def study(magnitude: float = 7.4, **observation: float) -> Study:
+    return Study.build({"star": [{"library": "G2V", "magnitude": magnitude}], "observation": observation}, "test")
+
+
+@pytest.mark.parametrize("per", ["pixel", "element"])
+@pytest.mark.parametrize("frames", [1, 2, 7, 120])
+@pytest.mark.parametrize("wavelength", [280.0, 450.0])
+def test_there_and_back(per: str, frames: int, wavelength: float) -> None:
+    """The S/N of an exposure asks for that exposure, and a little more for a frame more."""
+    asked = study(exposure_s=5.0 * frames)
+    (x,) = asked.expect([asked.star[0].source()])
+    snr = snr_at(x, wavelength, per)
+    (same,) = exposure_for(asked, snr * (1 - 1e-9), wavelength, per=per).exposures
+    assert (same.frames, same.exposure_s) == (frames, 5.0 * frames)
+    assert same.snr_one_frame_less < snr <= same.snr * (1 + 1e-9)
+    (more,) = exposure_for(asked, snr * (1 + 1e-9), wavelength, per=per).exposures
+    assert more.frames == frames + 1
+
+
+def test_the_engine_finds_the_wanted_snr(engine: Engine) -> None:
+    """Mean S/N of realisations at the answer: 5 standard errors, and 1 % for the clipped root's curvature."""
+    (found,) = exposure_for(study(), 20.0, 300.0).exposures
+    asked = study(exposure_s=found.exposure_s)
+    (x,) = asked.expect([asked.star[0].source()])
+    table = engine.snr(x, realisations=20_000, seed=4).element
+    row = table[int(np.argmin(np.abs(table["wavelength"].value - 300.0)))]
+    assert row["mean"] == pytest.approx(found.snr, abs=5 * row["std"] / np.sqrt(20_000) + 0.01 * found.snr)
+
+
+def test_fainter_is_longer_and_saturation_is_told() -> None:
+    bright, faint = (exposure_for(study(m), 10.0, 400.0).exposures[0] for m in (6.0, 8.0))
+    assert faint.frames > bright.frames
+    blinding = exposure_for(study(-2.0), 10.0, 450.0)
+    assert blinding.exposures[0].saturated
+    assert any("SATURATED" in message for message in blinding.messages)
+    assert not bright.saturated
+
+
+@pytest.mark.parametrize(
+    ("snr", "wavelength", "per", "sentence"),
+    [
+        (-1.0, 300.0, "element", "signal.snr = -1"),
+        (10.0, 900.0, "element", "wavelength = 900 nm"),
+        (10.0, 300.0, "line", "signal.per = 'line'"),
+        (1e9, 300.0, "element", "expected enough for 1e"),
+    ],
+)
+def test_impossible_wishes_are_a_sentence(snr: float, wavelength: float, per: str, sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        exposure_for(study(), snr, wavelength, per=per)
+
+
+def test_the_answer_is_written_and_drawn(tmp_path: Path) -> None:
+    found = exposure_for(study(), 10.0, 300.0)
+    assert [path.name for path in found.write(tmp_path)] == ["exposure.ecsv", "study.toml"]
+    again = exposure_for(Study.read(tmp_path / "exposure.ecsv"))
+    assert (again.study, again.exposures) == (found.study, found.exposures)
+    with pytest.raises(InputError, match="no wanted wavelength"):
+        exposure_for(study(), 10.0)
+    found.plot(tmp_path / "exposure.png")
+    assert (tmp_path / "exposure.png").read_bytes()[:4] == b"\x89PNG"

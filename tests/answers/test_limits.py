@@ -1,0 +1,139 @@
+"""Limits: the power asked for is found there again, by theory and by simulation; harder is never easier."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from astropy.table import QTable
+
+from mauvecl.answers.assumptions import what_matters
+from mauvecl.answers.limit_search import Question
+from mauvecl.answers.limits import limiting_magnitude, shortest_exposure, smallest_amplitude
+from mauvecl.device.engine import Engine
+from mauvecl.host.errors import InputError
+from mauvecl.study.study import Study
+
+STATISTICS = ("chi2", "chi2_element", "matched", "uv_excess")
+
+
+def study(**changes: Any) -> Study:
+    """The paper's G2V star with a 24 % flare, 1e5 realisations at 1e-2."""
+    data: dict[str, Any] = {
+        "star": [{"library": "G2V", "magnitude": 7.4}],
+        "flare": {"amplitudes": [0.24]},
+        "run": {"realisations": 100_000, "fap": 1e-2, "statistics": STATISTICS, "seed": 5},
+    }
+    for section, values in changes.items():
+        data[section] = (data.get(section, {}) | values) if isinstance(values, dict) else values
+    return Study.build(data, "test")
+
+
+FEW = {"statistics": ("matched",), "realisations": 20_000}
+
+
+@pytest.mark.parametrize("power", [0.5, 0.9])
+def test_the_limiting_magnitude_has_the_power_asked_for(engine: Engine, power: float) -> None:
+    """By a fresh simulation, within three half-widths of its 95 % interval: four statistics, 1e-4 by chance."""
+    asked = study(limit={"power": power})
+    result = limiting_magnitude(asked, engine)
+    assert [limit.statistic for limit in result.limits] == list(STATISTICS)
+    for limit in result.limits:
+        assert limit.value.low <= limit.value.value <= limit.value.high
+        p = limit.check.probability
+        assert p.low - (p.high - p.low) < power < p.high + (p.high - p.low)
+        assert limit.agrees
+        assert limit.check.seed != asked.run.seed
+        # Far from the rails the closed form is right to the skew of the dark.
+        assert abs(limit.value.value - limit.closed_form) < 0.03
+        # The curve of the closed form, nearest to the limit, is the power.
+        values, theory = np.array(sorted(limit.curve)).T
+        assert np.interp(limit.closed_form, values, theory) == pytest.approx(power, abs=0.01)
+    found = {limit.statistic: limit.value.value for limit in result.limits}
+    assert max(found.values()) == found["matched"]
+    assert found["chi2"] < found["chi2_element"]
+
+
+def test_there_and_back(engine: Engine) -> None:
+    """At the limiting magnitude of an amplitude the smallest amplitude is that one, and the exposure the shortest."""
+    only = {"statistics": ("matched",)}
+    (limit,) = limiting_magnitude(study(run=only), engine).limits
+    there = study(run=only, star=[{"library": "G2V", "magnitude": limit.value.value}])
+    (back,) = smallest_amplitude(there, engine).limits
+    assert back.value.value == pytest.approx(0.24, rel=0.03)
+    (shortest,) = shortest_exposure(there, engine).limits
+    assert shortest.value.value % 5 == 0
+    assert abs(shortest.value.value - 50) <= 5
+    assert shortest.value.low <= shortest.value.value <= shortest.value.high
+
+
+@pytest.mark.parametrize(
+    "harder",
+    [
+        {"observation": {"exposure_s": 25.0}},
+        {"observation": {"temperature_c": 25.0}},
+        {"flare": {"amplitudes": [0.12]}},
+        {"sky": {"surface_brightness": 14.0}},
+    ],
+)
+def test_harder_is_never_fainter(engine: Engine, harder: dict[str, Any]) -> None:
+    (plain,), (worse,) = (limiting_magnitude(study(run=FEW, **c), engine).limits for c in ({}, harder))
+    assert worse.value.value < plain.value.value
+
+
+def test_a_cooler_detector_gains_what_theory_says(engine: Engine) -> None:
+    """13 C has 0.58 of the dark of 21 C: the limit moves as the closed form's."""
+    few = {"statistics": ("matched",)}
+    (warm,), (cool,) = (
+        limiting_magnitude(study(run=few, observation={"temperature_c": t}), engine).limits for t in (21.0, 13.0)
+    )
+    gain = cool.value.value - warm.value.value
+    assert gain == pytest.approx(cool.closed_form - warm.closed_form, abs=0.02)
+    # Dark alone: 1.25 log10 of its ratio; the read noise and the star leave less.
+    assert 0.15 < gain < 1.25 * 0.0684 * 8 / np.log(10)
+
+
+def test_the_table_and_the_files(engine: Engine, tmp_path: Path) -> None:
+    result = limiting_magnitude(study(run=FEW), engine)
+    files = result.write(tmp_path)
+    table = QTable.read(tmp_path / "limit.ecsv")
+    assert table["magnitude"].unit == "mag"
+    assert table["magnitude"].value[0] == result.limits[0].value.value
+    assert {path.name for path in files} == {"limit.ecsv", "study.toml"}
+    again = limiting_magnitude(Study.read(tmp_path / "study.toml"), engine)
+    assert again.limits == result.limits
+    result.plot(tmp_path / "limit.png")
+    assert (tmp_path / "limit.png").stat().st_size > 10_000
+
+
+def test_what_cannot_be_reached_is_a_sentence(engine: Engine) -> None:
+    with pytest.raises(InputError, match=r"does not reach 0\.9 at magnitude"):
+        limiting_magnitude(study(run=FEW, flare={"amplitudes": [1e-6]}), engine)
+    with pytest.raises(InputError, match="leaves 20 of 20000"):
+        limiting_magnitude(study(run=FEW | {"fap": 1e-3}), engine)
+
+
+def test_one_frame_is_the_shortest(engine: Engine) -> None:
+    (limit,) = shortest_exposure(study(run=FEW, star=[{"library": "G2V", "magnitude": 5.0}]), engine).limits
+    assert limit.value.value == 5.0
+    assert limit.agrees
+
+
+def test_what_is_assumed_moves_the_limit_as_physics_says() -> None:
+    """More light or less noise is fainter; each end is the limit of an instrument changed so."""
+    asked = study(run=FEW)
+    table = what_matters(asked)
+    assert (np.diff(table["span"]) <= 0).all()
+    rows = {row["assumption"]: row for row in table}
+    for name in ("detector temperature (C)", "light loss", "pointing loss", "read noise (DN)"):
+        assert rows[name]["at_low_end"] > rows[name]["at_high_end"]
+    assert rows["quantum efficiency, scale"]["at_low_end"] < rows["quantum efficiency, scale"]["at_high_end"]
+    # Poisson in electrons has 0.77 of the dark noise.
+    assert rows["dark counts are Poisson in"]["at_high_end"] > rows["dark counts are Poisson in"]["at_low_end"]
+    lossy = asked.with_instrument({"light_loss": 0.44})
+    assert lossy.load_instrument().light_loss == 0.44
+    root = Question(lossy, lossy.star[0], 0.24, "matched").root()
+    assert rows["light loss"]["at_high_end"] == pytest.approx(root, abs=1e-3)
+    assert Study.build(lossy.model_dump(), "again") == lossy

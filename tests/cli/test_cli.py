@@ -1,0 +1,489 @@
+"""The command line as a user meets it: answers, files, reruns, refusals, interruption."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import QTable
+from commands import run, started
+
+from mauvecl.answers.detect import detect
+from mauvecl.answers.simulate import simulate
+from mauvecl.device.engine import Engine
+from mauvecl.noise.processes import CosmicRays, Normal, Processes, Uniform
+from mauvecl.statistics.definitions import STATISTICS
+from mauvecl.study.sections import Star
+from mauvecl.study.study import Study
+
+
+@pytest.fixture(scope="module")
+def answered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """The default question with fewer realisations."""
+    folder = tmp_path_factory.mktemp("detect")
+    return folder, started("detect", "-n", "100000", folder=folder).stdout
+
+
+def test_detect_answers_the_papers_question(answered: tuple[Path, str]) -> None:
+    folder, text = answered
+    lines = text.splitlines()
+    assert "not a flight calibration" in lines[0]
+    assert lines[1] == "Magnitudes in V are as in catalogues: Vega has 0.03."
+    assert "false-alarm probability of 0.001 per test, 50 s (10 frames), 100,000 realisations" in lines[2]
+    assert "\x1b" not in text
+    table = QTable.read(folder / "mauvecl-detect" / "detection.ecsv")
+    assert len(table) == 2 * 4 * 3
+    assert set(table["star"]) == {"K3V V = 3.7", "G2V V = 7.4"}
+    assert set(table["amplitude"]) == {0.0076, 0.02, 0.081, 0.24}
+    assert set(table["statistic"]) == {"chi2", "chi2_element", "matched"}
+    assert np.all((table["low"] <= table["probability"]) & (table["probability"] <= table["high"]))
+    np.testing.assert_allclose(table["mean"], table["expected"], rtol=0.01)
+    # The calibrated answer: the 24 % flare is certain on both, the smallest is lost in the pixels' noise of the G2V.
+    row = {(r["star"][:3], r["amplitude"], r["statistic"]): r["probability"] for r in table}
+    assert row["G2V", 0.24, "chi2"] == row["K3V", 0.0076, "chi2"] == 1.0
+    assert row["G2V", 0.0076, "chi2"] < 0.01 < 0.4 < row["G2V", 0.0076, "matched"]
+
+
+def test_the_papers_pair_is_compared(answered: tuple[Path, str]) -> None:
+    """Both of the paper's values are reconstructed within 30 %, and the text says why a calibrated answer differs."""
+    _, text = answered
+    for amplitude, reduced in (("8.1 %", 0.66), ("24 %", 3.75)):
+        line = next(x for x in text.splitlines() if x.startswith(f"G2V, {amplitude} flare"))
+        assert f"reduced {reduced:g}" in line
+        ours = float(line.split("reconstructed here ")[1].split()[0])
+        assert ours == pytest.approx(reduced, rel=0.3)
+    assert "no calibrated chi-squared" in text
+
+
+def test_files_and_record(answered: tuple[Path, str]) -> None:
+    folder, text = answered
+    out = folder / "mauvecl-detect"
+    tables = {"detection.ecsv", "departures.ecsv", "roc.ecsv", "tails.ecsv"}
+    names = tables | {"detection.png", "spectra.png", "study.toml", "run.json"}
+    assert {path.name for path in out.iterdir()} == names
+    assert all(name in text.splitlines()[-1] for name in names)
+    record = json.loads((out / "run.json").read_text())
+    assert record["seed"] == 1
+    assert record["study"]["run"]["realisations"] == 100_000
+    assert len(record["inputs"]) == 10
+    assert all(len(entry["source digest"]) == 64 for entry in record["inputs"])
+    assert {"devices", "kernels", "wall_time_s", "mauvecl", "messages"} <= set(record)
+    for picture in ("detection.png", "spectra.png"):
+        assert (out / picture).read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
+
+
+def test_everything_side_by_side(tmp_path: Path) -> None:
+    """Six statistics against noisy exposures and by estimated variances, and the study that says so."""
+    words = ("detect", "--star", "G2V", "-m", "7.4", "-a", "0.1", "-n", "20000", "--fap", "0.01", "--no-pictures")
+    shown = run(*words, "--statistic", "all", "--reference", "stack:3", "--variances", "estimated", folder=tmp_path)
+    for statistic in STATISTICS:
+        assert f" {statistic} " in shown.stdout
+    asked = Study.read(tmp_path / "mauvecl-detect" / "study.toml").run
+    assert (asked.reference, asked.variances, asked.statistics) == ("stack:3", "estimated", tuple(STATISTICS))
+
+
+def test_the_study_gives_the_same_bits_again(answered: tuple[Path, str], tmp_path: Path) -> None:
+    folder, _ = answered
+    first = folder / "mauvecl-detect"
+    run("detect", first / "study.toml", "--no-pictures", "-o", "again", folder=tmp_path)
+    assert (tmp_path / "again" / "detection.ecsv").read_text() == (first / "detection.ecsv").read_text()
+    assert (tmp_path / "again" / "study.toml").read_text() == (first / "study.toml").read_text()
+
+
+def test_a_table_is_read_back_into_its_study(answered: tuple[Path, str], tmp_path: Path) -> None:
+    folder, _ = answered
+    table = folder / "mauvecl-detect" / "detection.ecsv"
+    assert Study.read(table) == Study.read(folder / "mauvecl-detect" / "study.toml")
+    (tmp_path / "no.ecsv").write_text("a b\n1 2\n")
+    assert "study 'no.ecsv' cannot be read" in run("detect", "no.ecsv", folder=tmp_path, code=2).stderr
+
+
+def test_weights_of_ones_own_in_a_study(tmp_path: Path) -> None:
+    """A band around 280 nm: its closed form and its simulation agree, and bad files are a sentence."""
+    (tmp_path / "band.txt").write_text("# nm, per DN\n270 1\n290 1\n")
+    words = ("detect", "study.toml", "-n", "20000", "--fap", "0.01", "--no-pictures")
+    study = (
+        "[[star]]\nlibrary = 'G2V'\nmagnitude = 7.4\n[flare]\namplitudes = [0.03]\n[run.weights]\nband = 'band.txt'\n"
+    )
+    (tmp_path / "study.toml").write_text(study)
+    run(*words, folder=tmp_path)
+    table = QTable.read(tmp_path / "mauvecl-detect" / "detection.ecsv")
+    (row,) = table[table["statistic"] == "band"]
+    assert row["mean"] == pytest.approx(row["expected"], rel=0.02)
+    assert abs(row["probability"] - row["closed_form_probability"]) < 0.03
+    for text, sentence in (
+        ("270\n290\n", "have 1 columns"),
+        ("a b\n", "cannot be read"),
+        ("290 1\n270 1\n", "ascending"),
+    ):
+        (tmp_path / "band.txt").write_text(text)
+        assert sentence in run(*words, folder=tmp_path, code=2).stderr
+
+
+def test_a_study_file_and_flags(tmp_path: Path) -> None:
+    """A user's own spectrum named in a study, with flags on top; JSON alone on standard output."""
+    wavelength = np.arange(170.0, 1100.0, 2.0)
+    np.savetxt(tmp_path / "mine.txt", np.column_stack([wavelength, 1e-11 * np.ones_like(wavelength)]))
+    (tmp_path / "study.toml").write_text(
+        '[[star]]\nfile = "mine.txt"\nmagnitude = 6\n[flare]\namplitudes = [0.1]\n'
+        '[observation]\nexposure_s = 12\n[sky]\ntarget = "290.68 +11.12"\ntime = "2026-09-01T12:00"\n'
+        '[run]\nrealisations = 2000\nfap = 0.05\nstatistics = ["matched"]\n'
+    )
+    elsewhere = tmp_path / "elsewhere"
+    elsewhere.mkdir()
+    done = run("detect", "../study.toml", "--seed", "7", "--sky", "none", "--json", folder=elsewhere)
+    answer = json.loads(done.stdout)
+    assert len(answer["rows"]) == 1
+    assert answer["rows"][0]["star"] == "mine V = 6"
+    assert any("15 s" in message for message in answer["messages"])
+    text = (elsewhere / "mauvecl-detect" / "study.toml").read_text()
+    assert "none = true" in text
+    assert "target" not in text
+    assert "seed = 7" in text
+
+
+def test_a_study_may_redden_its_star() -> None:
+    plain, behind = (Star(library="G2V", magnitude=7.4, ebv=e).source() for e in (None, 0.3))
+    assert behind.magnitude("V") == pytest.approx(plain.magnitude("V"), abs=1e-9)
+    assert behind.magnitude("GALEX NUV") > plain.magnitude("GALEX NUV") + 1
+
+
+PROCESSES = """
+[[star]]
+library = "G2V"
+magnitude = 6
+[flare]
+amplitudes = [0.1]
+[observation]
+exposure_s = 10
+recipe = "joint"
+[processes]
+jitter = { uniform = [0.0, 0.05] }
+detector_temperature = { normal = [21, 2], between = [13, 25] }
+[processes.cosmic_rays]
+rate_per_cm2_s = 500
+[run]
+realisations = 2000
+fap = 0.1
+"""
+
+
+def test_a_study_may_ask_for_processes(tmp_path: Path, engine: Engine) -> None:
+    """As the engine given them in Python, and written back as they were read."""
+    (tmp_path / "study.toml").write_text(PROCESSES)
+    study = Study.read(tmp_path / "study.toml")
+    processes = Processes(
+        CosmicRays(rate_per_cm2_s=500), jitter=Uniform(0.0, 0.05), detector_temperature=Normal(21, 2, 13, 25)
+    )
+    assert study.drawing == {"mode": "auto", "recipe": "joint", "processes": processes}
+    (tmp_path / "again.toml").write_text(study.toml())
+    assert Study.read(tmp_path / "again.toml") == study
+    found = detect(study, engine).stars[0].found
+    quiet, *flares = study.expectations(study.star[0])
+    wanted = engine.detect(quiet, flares, realisations=2000, seed=1, processes=processes)
+    np.testing.assert_array_equal(found.distribution("chi2", 0).counts, wanted.distribution("chi2", 0).counts)
+    plain = engine.detect(quiet, flares, realisations=2000, seed=1)
+    assert (found.distribution("chi2", 0).counts != plain.distribution("chi2", 0).counts).any()
+    assert "cosmic_rays" in simulate(study).observations[0][2].colnames
+
+
+def test_simulate(tmp_path: Path) -> None:
+    run("simulate", "--star", "G2V", "-m", "7.4", "-a", "0.24", "-t", "10", "-o", "out", folder=tmp_path)
+    table = QTable.read(tmp_path / "out" / "observation-2.ecsv")
+    parts = ("source", "sky", "photon_noise", "dark", "bias", "read_noise", "digitisation")
+    np.testing.assert_allclose(sum(table[name] for name in parts).value, table["raw"].value, rtol=1e-12)
+    assert np.abs(table["digitisation"].value).max() <= 0.51
+    assert table["raw"].unit == "adu"
+    with fits.open(tmp_path / "out" / "observation-2.fits") as hdus:
+        hdus.verify("exception")
+        assert hdus[1].header["EXPTIME"] == 10.0
+        np.testing.assert_array_equal(hdus[1].data["raw"], table["raw"].value)
+    assert (tmp_path / "out" / "observation-2.png").exists()
+
+
+def test_a_simulation_is_the_engines_realisation() -> None:
+    from scenes import instrument, star
+
+    from mauvecl.device.engine import Engine
+    from mauvecl.noise.components import components
+
+    for options in ({"exposure": 50.0}, {"exposure": 10.0, "magnitude": -0.3}):
+        (x,) = star(payload=instrument(part=True), **options)
+        table = components(x, realisation=123, seed=4)
+        np.testing.assert_array_equal(table["raw"].value, Engine().realise(x, start=123, count=1, seed=4)[0])
+
+
+def test_the_parts_of_a_simulation_have_their_variances() -> None:
+    """Photon and read noise apart: 197 pixels x 30 realisations, each sum of squares within 5 standard errors."""
+    from scenes import instrument, star
+
+    from mauvecl.noise.components import components
+
+    (x,) = star(magnitude=4.0, payload=instrument(part=True))
+    tables = [components(x, realisation=i, seed=4) for i in range(30)]
+    gain, n = x.gain_dn_per_electron, 30 * x.wavelength_nm.size
+    photon = np.array([t["photon_noise"].value for t in tables]) / np.sqrt(gain * x.signal_dn)
+    read = np.array([t["read_noise"].value for t in tables]) / np.sqrt(x.n_frames * 144 + (x.n_frames - 1) / 12)
+    for z in (photon, read):
+        assert abs((z**2).sum() - n) < 5 * np.sqrt(2 * n)
+    assert abs((photon * read).sum()) < 5 * np.sqrt(n)
+
+
+def test_snr(tmp_path: Path) -> None:
+    done = run("snr", "--star", "B2IV", "-m", "3.03", "-t", "5", "-n", "5000", "-o", "out", folder=tmp_path)
+    assert "S/N per 10.5 nm element" in done.stdout
+    table = QTable.read(tmp_path / "out" / "snr-element.ecsv")
+    np.testing.assert_allclose(table["mean"], table["expected"], rtol=1e-3)
+    assert np.all(table["q2.5"] < table["q97.5"])
+    names = {"snr-pixel.ecsv", "noise-budget.ecsv", "noise-budget.png", "snr.png"}
+    assert names <= {p.name for p in (tmp_path / "out").iterdir()}
+
+
+def test_snr_of_the_papers_budgets_and_a_sweep(tmp_path: Path) -> None:
+    """Without arguments the paper's three stars at 50 s and 600 s; with a sweep every combination, or a list."""
+    shown = run("snr", "-n", "500", folder=tmp_path).stdout
+    for name in ("B2IV V = 3.03", "K3V V = 3.7", "G2V V = 7.4"):
+        assert len([line for line in shown.splitlines() if name in line and " 600 " in line]) == 8
+    assert {"noise-budget.png", "snr-sweep.png"} <= {p.name for p in (tmp_path / "mauvecl-snr").iterdir()}
+    words = ("snr", "--star", "G2V", "--sweep", "magnitude=5,7", "--sweep", "exposure=5,50", "--as-list", "-n", "500")
+    run(*words, "--no-pictures", "-o", "swept", folder=tmp_path)
+    table = QTable.read(tmp_path / "swept" / "snr-element.ecsv")
+    assert {(m.value, t.value) for m, t in zip(table["magnitude"], table["exposure"], strict=True)} == {(5, 5), (7, 50)}
+    # Read back from a table, the study gives it again.
+    run("snr", tmp_path / "swept" / "snr-element.ecsv", "--no-pictures", "-o", "again", folder=tmp_path)
+    for name in ("snr-element.ecsv", "snr-pixel.ecsv"):
+        assert (tmp_path / "again" / name).read_text() == (tmp_path / "swept" / name).read_text()
+    assert "--sweep 'magnitude=a'" in run("snr", "--sweep", "magnitude=a", folder=tmp_path, code=2).stderr
+
+
+def test_gaussian(tmp_path: Path) -> None:
+    words = ("--star", "G2V", "-n", "10000", "--fap", "0.01", "--sweep", "magnitude=6,9", "--statistic", "matched")
+    shown = run("gaussian", *words, folder=tmp_path).stdout
+    assert "The root-of-N formula beside 10,000 realisations" in shown
+    names = {"gaussian.ecsv", "elements.ecsv", "thresholds.ecsv", "gaussian.png", "study.toml", "run.json"}
+    assert {p.name for p in (tmp_path / "mauvecl-gaussian").iterdir()} == names
+
+
+def test_a_wrong_template_costs(tmp_path: Path) -> None:
+    """Looked for as 5000 K a flare of 10000 K is seen less often, and the text says how much S/N is kept."""
+    words = ("--star", "G2V", "-m", "7.4", "-a", "0.01", "-n", "50000", "--fap", "0.01", "--statistic", "matched")
+    shown = run("detect", *words, "--no-pictures", "--template", "5000", "--template", "10000", folder=tmp_path).stdout
+    kept = [float(line.split(" keeps ")[1].split()[0]) for line in shown.splitlines() if " keeps " in line]
+    assert 50 < kept[0] < 95
+    assert kept[1] == 100.0
+    table = QTable.read(tmp_path / "mauvecl-detect" / "detection.ecsv")
+    p = dict(zip(table["statistic"], table["probability"], strict=True))
+    assert p["matched 5000 K"] < p["matched"] == p["matched 10000 K"]
+
+
+def test_limit(tmp_path: Path) -> None:
+    """The table, its files, and the study that gives the same bits again."""
+    words = ("--star", "G2V", "-a", "0.24", "-n", "20000", "--fap", "0.01", "--statistic", "matched")
+    shown = run("limit", *words, folder=tmp_path).stdout
+    assert "Limit of magnitude" in shown
+    assert "agrees" in shown
+    assert "not a flight calibration" in shown
+    first = tmp_path / "mauvecl-limit"
+    assert {p.name for p in first.iterdir()} == {"limit.ecsv", "limit.png", "study.toml", "run.json"}
+    run("limit", first / "study.toml", "-o", "again", "--no-pictures", folder=tmp_path)
+    assert (tmp_path / "again" / "limit.ecsv").read_text() == (first / "limit.ecsv").read_text()
+    answer = json.loads(run("limit", *words, "--of", "exposure", "-m", "9", "--json", folder=tmp_path).stdout)
+    assert answer["rows"][0]["exposure"] % 5 == 0
+    assert "expected" in run("limit", "--of", "colour", folder=tmp_path, code=2).stderr.replace(
+        "input should be", "expected"
+    )
+
+
+def test_exposure(tmp_path: Path) -> None:
+    words = ("exposure", "--snr", "10", "--at", "300", "--star", "G2V", "-m", "7.4")
+    assert "S/N of 10 per element at 300 nm" in run(*words, folder=tmp_path).stdout
+    row = json.loads(run(*words, "--json", folder=tmp_path).stdout)["rows"][0]
+    assert row["snr_one_frame_less"] < 10 <= row["snr"]
+    assert "wavelength = 900 nm" in run(*words[:4], "900", folder=tmp_path, code=2).stderr
+
+
+def test_map(tmp_path: Path) -> None:
+    words = ("--star", "G2V", "--x", "magnitude:6:9:3", "--y", "amplitude=0.05,0.2", "-n", "20000", "--fap", "0.01")
+    shown = run("map", *words, "--statistic", "matched", folder=tmp_path).stdout
+    assert "detection probability in percent, matched" in shown
+    first = tmp_path / "mauvecl-map"
+    assert {p.name for p in first.iterdir()} == {"map.ecsv", "map.fits", "map.png", "study.toml", "run.json"}
+    run("map", first / "study.toml", "-o", "again", "--no-pictures", folder=tmp_path)
+    averaged = run(
+        "map", *words, "--statistic", "matched", "--unknown", "2", "-o", "u", "--no-pictures", folder=tmp_path
+    )
+    assert "averaged over 2 draws of what is unknown" in averaged.stdout
+    assert (tmp_path / "again" / "map.ecsv").read_text() == (first / "map.ecsv").read_text()
+    for axis in ("magnitude:6:9", "magnitude:a:b:3", "magnitude=a", "magnitude:6:9:3:cubic"):
+        assert f"--x '{axis}'" in run("map", "--x", axis, folder=tmp_path, code=2).stderr
+
+
+def test_any_key_can_be_set(tmp_path: Path) -> None:
+    words = ("snr", "--star", "G2V", "-m", "6", "-n", "1000", "--no-pictures", "--quiet")
+    settings = (
+        "--set",
+        "star.0.magnitude=5",
+        "--set",
+        "observation.exposure_s = 10",
+        "--set",
+        "sky.surface_brightness=21",
+    )
+    run(*words, *settings, folder=tmp_path)
+    study = Study.read(tmp_path / "mauvecl-snr" / "study.toml")
+    assert (study.star[0].magnitude, study.observation.exposure_s, study.sky.surface_brightness) == (5, 10, 21)
+    for text, sentence in (
+        ("run.fap", "expected key=value"),
+        ("run.fop=1", "unknown key 'run.fop', did you mean 'fap'?"),
+        ("star.7.magnitude=1", "no entry '7', expected 0 to 0"),
+        ("run.fap=many", "run.fap = 'many'"),
+        ("run.seed.x=1", "holds no keys"),
+    ):
+        assert sentence in run(*words, "--set", text, folder=tmp_path, code=2).stderr
+
+
+def test_the_schema_describes_every_key(tmp_path: Path) -> None:
+    schema = json.loads(run("schema", folder=tmp_path).stdout)
+    assert set(schema["properties"]) == set(Study.model_fields)
+
+
+def test_library_and_devices(tmp_path: Path) -> None:
+    assert "HD 40307" in run("library", folder=tmp_path).stdout
+    assert len(json.loads(run("library", "--json", folder=tmp_path).stdout)) >= 25
+    assert "Portable Computing Language" in run("devices", folder=tmp_path).stdout
+    assert json.loads(run("devices", "--json", folder=tmp_path).stdout)[0]["default"]
+    assert "mauvecl 0" in run("--version", folder=tmp_path).stdout
+
+
+def test_saturation_comes_first(tmp_path: Path) -> None:
+    done = run("simulate", "--star", "B2IV", "-m", "0.5", "-t", "5", "--no-pictures", folder=tmp_path)
+    first = done.stdout.splitlines()[0]
+    assert first.startswith("SATURATED: ")
+    assert " nm reach " in first
+    assert "the longest safe frame is " in first
+
+
+BAD = {
+    "unknown star": (["detect", "--star", "G3V"], "'G3V' is unknown"),
+    "missing file": (["detect", "--star", "no.txt"], "'no.txt' does not exist"),
+    "exposure": (["detect", "--exposure", "-5"], "exposure"),
+    "amplitude": (["detect", "-a", "-0.1"], "amplitude = -0.1"),
+    "flare temperature": (["detect", "--flare-temperature", "5"], "flare temperature = 5.0 K"),
+    "detector temperature": (["detect", "--temperature", "900"], "temperature"),
+    "coordinates": (["detect", "--target", "here", "--time", "2026-09-01"], "here"),
+    "time": (["detect", "--target", "290 11", "--time", "yesterday"], "yesterday"),
+    "only a target": (["detect", "--target", "290 11"], "only one of target and time"),
+    "the Sun": (["detect", "--target", "340 -8", "--time", "2026-03-01"], "Sun"),
+    "sky": (["detect", "--sky", "dark"], "'dark'"),
+    "instrument": (["detect", "--instrument", "hubble"], "hubble"),
+    "device": (["detect", "--device", "abacus"], "'abacus' is not here, expected one of"),
+    "statistic": (["detect", "--statistic", "chi3"], "'chi3' is unknown"),
+    "reference": (["detect", "--reference", "stack"], "reference = 'stack', expected 'template', 'exposure' or"),
+    "variances": (["detect", "--variances", "guessed"], "run.variances = 'guessed'"),
+    "rare fap": (["detect", "--fap", "1e-6", "-n", "1000", "--star", "G2V"], "ask for 100000000 realisations"),
+    "realisations": (["detect", "-n", "0"], "run.realisations = 0"),
+    "magnitudes": (["detect", "-m", "1", "-m", "2", "-m", "3"], "3 magnitudes for 2 stars"),
+    "flag": (["detect", "--nonsense"], "nonsense"),
+    "word": (["detect", "-n", "many"], "Invalid value for '--realisations'"),
+    "study": (["detect", "no.toml"], "'no.toml' does not exist"),
+    "output": (["detect", "-o", "/proc/nothing"], "cannot be written"),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_bad_input_is_a_sentence_and_exit_code_2(name: str, tmp_path: Path) -> None:
+    words, sentence = BAD[name]
+    done = run(*words, folder=tmp_path, code=2)
+    assert sentence in done.stderr
+    assert done.stdout == ""
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("[run]\nsead = 3", "unknown key 'run.sead', did you mean 'seed'?"),
+        ("[[star]]\nlibrary = 'G2V'\nmagnitud = 3", "unknown key 'star.0.magnitud', did you mean 'magnitude'?"),
+        ("[run\nseed = 3", "is not valid TOML"),
+        ("[run]\nfap = 2", "run.fap = 2"),
+        ("[flare]\namplitudes = []", "flare.amplitudes"),
+        ("[[star]]\nmagnitude = 3", "expected one of them"),
+        ("[observation]\nexposure_s = 'long'", "observation.exposure_s = 'long'"),
+        ("[processes]\njitter = { unform = [0, 1] }", "unknown key 'processes.jitter.unform', did you mean 'uniform'?"),
+        ("[processes]\njitter = { normal = [0, 1] }", "a prior is neither"),
+        ("[processes]\njitter = { uniform = [0.05, 0] }", "a uniform prior from 0.05 to 0"),
+        ("[processes]\njitter = { uniform = [0, 0.9] }", "the prior of jitter runs from 0 to 0.9, expected 0 to 0.5"),
+        ("[processes.cosmic_rays]\nrate_per_cm2_s = -1", "cosmic rays of -1 per cm^2 s"),
+    ],
+)
+def test_bad_studies_are_a_sentence(text: str, sentence: str, tmp_path: Path) -> None:
+    (tmp_path / "study.toml").write_text(text)
+    done = run("detect", "study.toml", folder=tmp_path, code=2)
+    assert sentence in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+
+
+#: The command line with small shares, so that a run of a second has several; shares change no answer.
+SMALL_SHARES = [
+    sys.executable,
+    "-c",
+    "import mauvecl.runs.shards as s; s.SHARE = 2**29; from mauvecl.cli.app import main; main()",
+]
+LONG = (
+    "detect",
+    "--star",
+    "G2V",
+    "-m",
+    "7.4",
+    "--statistic",
+    "chi2",
+    "-n",
+    "400000",
+    "--no-pictures",
+    "--output",
+    "out",
+)
+
+
+@pytest.fixture(scope="module")
+def never_stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The answer of a run that nobody stopped."""
+    folder = tmp_path_factory.mktemp("long")
+    run(*LONG, folder=folder)
+    return folder / "out"
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
+def test_stopped_and_resumed_as_if_never_stopped(stop: signal.Signals, tmp_path: Path, never_stopped: Path) -> None:
+    """Ctrl-C, the end of a batch job, kill -9: a second run goes on, and writes the same tables."""
+    command = [*SMALL_SHARES, *LONG, "--keep-after", "0"]
+    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    shares = tmp_path / "out" / "checkpoint"
+    while not list(shares.glob("[!.]*.npz")):
+        time.sleep(0.005)
+        assert process.poll() is None
+    process.send_signal(stop)
+    _, errors = process.communicate(timeout=60)
+    assert process.returncode == {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -9}[stop]
+    assert "Traceback" not in errors
+    if stop != signal.SIGKILL:
+        assert "kept in 'out/checkpoint', and the same command with --resume goes on from there" in errors
+    kept = sum(int(p.stem.split("-")[-1]) for p in shares.glob("[!.]*.npz"))
+    done = subprocess.run([*SMALL_SHARES, *LONG, "--resume"], cwd=tmp_path, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["shares"]["resumed"] == kept > 0
+    assert not shares.exists()
+    for name in ("detection.ecsv", "tails.ecsv", "roc.ecsv", "departures.ecsv"):
+        assert (tmp_path / "out" / name).read_bytes() == (never_stopped / name).read_bytes()
+
+
+def test_nothing_heavy_is_loaded_early() -> None:
+    """Importing the package, or asking for help, loads neither OpenCL nor synphot nor astropy."""
+    heavy = "('pyopencl', 'synphot', 'astropy', 'scipy')"
+    code = f"import sys, mauvecl, mauvecl.cli.app; print([m for m in {heavy} if m in sys.modules])"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout == "[]\n"

@@ -1,0 +1,52 @@
+"""Spectrum files on the command line and in studies: what was assumed stands in the answer's first lines."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from mauvecl.cli.app import app
+from mauvecl.host.errors import InputError
+from mauvecl.study.study import Study
+
+FILES = Path(__file__).parents[1] / "data" / "spectra"
+
+
+def simulated(folder: Path, *flags: str) -> str:
+    flags = ("simulate", *flags, "--exposure", "5", "--no-pictures", "-o", str(folder / "out"))
+    done = CliRunner().invoke(app, flags)
+    assert done.exit_code == 0, done.output
+    return " ".join(done.output.split())
+
+
+def test_what_is_assumed_of_a_star_stands_in_the_first_lines(tmp_path: Path) -> None:
+    told = simulated(tmp_path, "--star", str(FILES / "10lac_stis_001.txt"), "--wavelength-unit", "Angstrom", "-m", "8")
+    assert told.index("ASSUMED: flux in erg") < told.index("10lac_stis_001 V = 8")
+    record = json.loads(next((tmp_path / "out").glob("*.json")).read_text())
+    assert "ASSUMED: flux in erg" in json.dumps(record)
+    # The study that was written reads the same star again.
+    again = Study.read(tmp_path / "out" / "study.toml")
+    assert (again.star[0].wavelength_unit, again.star[0].magnitude) == ("Angstrom", 8.0)
+
+
+def test_a_star_is_extended_and_binned(tmp_path: Path) -> None:
+    flags = ("--star", str(FILES / "vb8_stiswfcnic_004.fits"), "--extend", "M3V", "--bin-nm", "2", "-m", "9")
+    told = simulated(tmp_path, *flags)
+    assert "continued by M3V" in told
+    assert "113 of its 1349 points" in told
+    told = simulated(tmp_path, "--star", f"{FILES / 'ckp00_5750.fits'}[g45]", "-m", "8")
+    assert "ckp00_5750" in told
+
+
+def test_keys_of_files_belong_to_stars_of_files(tmp_path: Path) -> None:
+    done = CliRunner().invoke(app, ["simulate", "--star", "G2V", "--extend", "K5V", "-o", str(tmp_path)])
+    assert isinstance(done.exception, InputError)
+    assert "--extend without a spectrum file among the stars" in str(done.exception)
+    with pytest.raises(InputError, match="a star of the library has extend, expected them of a file only"):
+        Study.build({"star": [{"library": "G2V", "extend": "K5V"}]}, "test")
+    study = Study.build({"star": [{"file": "x.txt", "extend": "K5V", "flux_unit": "Jy"}]}, "test")
+    star = study.at("star", "G2V").star[0]
+    assert (star.library, star.file, star.extend, star.flux_unit) == ("G2V", None, None, None)

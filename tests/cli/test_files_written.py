@@ -1,0 +1,197 @@
+"""What a verb leaves on the disk is whole or not there, whatever the disk does; the answer is told all the same."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from pathlib import Path
+from typing import Any
+
+import pytest
+from answers import small
+
+from mauvecl.cli.app import app
+from mauvecl.host.errors import InputError
+from mauvecl.host.files.whole import write_whole
+from mauvecl.runs.checkpoint import Checkpoint
+from mauvecl.runs.durable import alone
+from mauvecl.store.export import Selection, export
+
+FEW = ("--star", "G2V", "-m", "7.4", "--exposure", "5", "--seed", "1")
+DRAWN = (*FEW, "-n", "10000", "--statistic", "chi2")
+VERBS = {
+    "exposure": ("exposure", "--star", "G2V", "-m", "7.4", "--snr", "5", "--at", "300"),
+    "simulate": ("simulate", *FEW),
+    "snr": ("snr", *FEW, "-n", "2000"),
+    "detect": ("detect", *DRAWN, "--fap", "0.01"),
+    "limit": ("limit", *DRAWN, "--amplitude", "0.5", "--fap", "0.01", "--no-pictures"),
+    "map": ("map", *DRAWN, "--fap", "0.01", "--x", "magnitude=6,7", "--y", "amplitude=0.1,0.5", "--no-pictures"),
+}
+
+
+def full_from(step: int, monkeypatch: pytest.MonkeyPatch) -> list[str]:
+    """A disk that is full from the so-many-th file on; the files that were tried."""
+    tried: list[str] = []
+    real = os.fsync
+
+    def fsync(handle: int) -> None:
+        tried.append(Path(f"/proc/self/fd/{handle}").readlink().name)
+        if len(tried) > step:
+            raise OSError(28, "No space left on device")
+        real(handle)
+
+    monkeypatch.setattr("mauvecl.host.files.whole.os.fsync", fsync)
+    return tried
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_the_answer_is_told_though_the_disk_is_full(
+    verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Nothing is written, nothing half written, and a table that was there is still there."""
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / f"{verb}.ecsv").write_text("of an earlier run")
+    tried = full_from(0, monkeypatch)
+    with pytest.raises(InputError, match=r"\(No space left on device\), .*; the same holds for \d+ more"):
+        app([*VERBS[verb], "--output", str(out), "--json"], standalone_mode=False)
+    assert len(tried) > 1
+    assert json.loads(capsys.readouterr().out)
+    assert [(p.name, p.read_text()) for p in out.iterdir()] == [(f"{verb}.ecsv", "of an earlier run")]
+
+
+def test_a_disk_that_fills_at_every_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Those before it are as ever, those after it as they were."""
+    words = [*VERBS["simulate"], "--no-pictures", "--output"]
+    app([*words, str(tmp_path / "whole")], standalone_mode=False)
+    plain = capsys.readouterr().out
+    whole = {p.name: p.read_bytes() for p in (tmp_path / "whole").iterdir()}
+    assert len(whole) >= 4
+    for step in range(len(whole)):
+        out = tmp_path / str(step)
+        with monkeypatch.context() as patch:
+            tried = full_from(step, patch)
+            with pytest.raises(InputError, match="No space left on device"):
+                app([*words, str(out)], standalone_mode=False)
+        there = {p.name: p.read_bytes() for p in out.iterdir()}
+        assert len(tried) == len(whole)
+        assert len(there) == step
+        # The run record holds the time.
+        assert all(there[name] == whole[name] for name in there if name.endswith((".ecsv", ".toml")))
+        assert capsys.readouterr().out.partition("Wrote")[0] == plain.partition("Wrote")[0]
+
+
+def test_a_disk_that_is_really_full(small_disk: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = small_disk / "out"
+    words = [*VERBS["simulate"], "--no-pictures", "--output", str(out)]
+    app(words, standalone_mode=False)
+    before = {p.name: p.read_bytes() for p in out.iterdir()}
+    capsys.readouterr()
+    (small_disk / "filler").write_bytes(bytes(os.statvfs(small_disk).f_bavail * os.statvfs(small_disk).f_bsize))
+    with pytest.raises(InputError, match=r"observation-1\.ecsv' cannot be written \(No space left on device\)"):
+        app([*words, "--exposure", "10"], standalone_mode=False)
+    assert "One observation each" in capsys.readouterr().out
+    assert {p.name: p.read_bytes() for p in out.iterdir()} == before
+
+
+@pytest.mark.parametrize("name", ["f.fits", "f.h5"])
+def test_an_export_onto_a_full_disk(name: str, small_disk: Path, tmp_path: Path) -> None:
+    from stores import Painter, study
+
+    from mauvecl.store import bulk
+
+    painter: Any = Painter()
+    store = bulk.realise(study(4000), tmp_path / "s.zarr", painter)
+    (small_disk / name).write_text("of an earlier run")
+    with pytest.raises(InputError, match="cannot be written"):
+        export(Selection.of(store), small_disk / name)
+    assert [(p.name, p.read_text()) for p in small_disk.iterdir()] == [(name, "of an earlier run")]
+
+
+def test_one_process_writes_a_folder_from_beginning_to_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Tables too, and of verbs that draw nothing."""
+    out = tmp_path / "out"
+    out.mkdir()
+    with alone(out, "output folder"), pytest.raises(InputError, match="is being written by another process"):
+        app([*VERBS["exposure"], "--output", str(out)], standalone_mode=False)
+    assert list(out.iterdir()) == []
+    held: list[bool] = []
+
+    def noted(path: Path, *parts: Any) -> None:
+        try:
+            with alone(out, "output folder"):
+                held.append(False)
+        except InputError:
+            held.append(True)
+        write_whole(path, *parts)
+
+    monkeypatch.setattr("mauvecl.answers.report.write_whole", noted)
+    app([*VERBS["detect"], "--no-pictures", "--output", str(out)], standalone_mode=False)
+    assert held == [True] * 6
+    with alone(out, "output folder"):
+        pass
+
+
+SHARE = f"{hashlib.md5(b'').hexdigest()}-0-0-4096.npz"
+
+
+@pytest.mark.parametrize("how", [{"restart": True}, {"resume": True}, {}])
+def test_a_folder_called_checkpoint_is_not_ours_by_its_name(tmp_path: Path, how: dict[str, bool]) -> None:
+    """Only files that a checkpoint writes are removed, at a restart and at the end."""
+    theirs = tmp_path / "checkpoint"
+    (theirs / "deep").mkdir(parents=True)
+    for name in ("epoch-1.pt", "mine.npz", "deep/keep", ".unfinished-mine"):
+        (theirs / name).write_text("keep me")
+    with Checkpoint(tmp_path, "detect", small(), patience_s=0.0, **how) as checkpoint:
+        checkpoint.put(SHARE.removesuffix(".npz"), {})
+        assert checkpoint.kept == 1
+    with pytest.raises(InputError, match="holds an unfinished run"), Checkpoint(tmp_path, "detect", small()):
+        pass
+    (theirs / f".unfinished-{SHARE}").write_text("killed while it was written")
+    with Checkpoint(tmp_path, "detect", small(), resume=True) as checkpoint:
+        checkpoint.forget()
+    assert sorted(str(p.relative_to(theirs)) for p in theirs.rglob("*") if p.is_file()) == [
+        ".unfinished-mine",
+        "deep/keep",
+        "epoch-1.pt",
+        "mine.npz",
+    ]
+
+
+@pytest.mark.parametrize("how", [{"restart": True}, {"resume": True}, {}])
+def test_another_programs_manifest_is_kept(tmp_path: Path, how: dict[str, bool]) -> None:
+    manifest = tmp_path / "checkpoint" / "manifest.json"
+    manifest.parent.mkdir()
+    manifest.write_text('{"model": "mine"}')
+    with (
+        pytest.raises(InputError, match=r"manifest\.json' is not mauvecl's, expected another output folder"),
+        Checkpoint(tmp_path, "detect", small(), **how),
+    ):
+        pass
+    assert manifest.read_text() == '{"model": "mine"}'
+
+
+def test_a_restart_waits_for_no_one(tmp_path: Path) -> None:
+    """What another process holds is not looked at, let alone removed."""
+    with Checkpoint(tmp_path, "detect", small(), patience_s=0.0) as checkpoint:
+        checkpoint.put(SHARE.removesuffix(".npz"), {})
+        for how in ({"restart": True}, {"resume": True}):
+            with (
+                pytest.raises(InputError, match="is being written by another process"),
+                Checkpoint(tmp_path, "detect", small(), **how),
+            ):
+                pass
+        assert checkpoint.kept == 1
+
+
+def test_what_cannot_be_put_in_place_leaves_nothing(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    with pytest.raises(InputError, match="cannot be written"):
+        write_whole(tmp_path / "a", b"content")
+    assert [p.name for p in tmp_path.iterdir()] == ["a"]
+    write_whole(tmp_path / "b", b"con", memoryview(b"tent"), shared=True)
+    assert (tmp_path / "b").read_bytes() == b"content"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "b"]

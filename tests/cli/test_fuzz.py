@@ -1,0 +1,351 @@
+"""Generated inputs of every kind: each ends in an answer, or in one sentence and exit code 2; none in a traceback."""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+import io
+import os
+import resource
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from unittest import mock
+
+import numpy as np
+import pytest
+from commands import ended
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+pytestmark = pytest.mark.long
+
+#: Memory that a question may take beyond what the process has, and seconds.
+ROOM, SECONDS = 1 << 30, 30.0
+
+
+def many(examples: int):
+    """The same examples in every run, wherever it runs."""
+    return settings(
+        max_examples=examples,
+        derandomize=True,
+        database=None,
+        deadline=None,
+        suppress_health_check=list(HealthCheck),
+        # The first failure will do: looking for a shorter one takes minutes.
+        phases=[Phase.generate],
+    )
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return tmp_path_factory.mktemp("fuzz")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def bounded_memory() -> Iterator[None]:
+    """Whoever asks for more memory is told that there is none, and the sentence of that is a failure here."""
+    here = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+    before = resource.getrlimit(resource.RLIMIT_AS)
+    # PoCL maps some gigabytes of its own, in tests that draw.
+    resource.setrlimit(resource.RLIMIT_AS, (here + ROOM + (4 << 30), before[1]))
+    yield
+    resource.setrlimit(resource.RLIMIT_AS, before)
+
+
+def check(folder: Path, *words: str, **environment: str) -> None:
+    """The command ends as it should."""
+    started, before = time.monotonic(), resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with mock.patch.dict(os.environ, {"MAUVECL_DATA_DIR": str(folder / "data")} | environment):
+        code, out, told = ended(*words, folder=folder)
+    grown = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before
+    sentences = [line for line in told.splitlines() if not line.startswith("mauvecl: note: ")]
+    assert code in (0, 2), (words, code, told)
+    assert "Traceback" not in out + told
+    if code == 2:
+        assert len(sentences) == 1, told
+        assert sentences[0].startswith("mauvecl: ")
+        assert len(sentences[0]) < 1200
+        assert "memory" not in sentences[0]
+    else:
+        assert not sentences
+    assert grown * 1024 < ROOM
+    assert time.monotonic() - started < SECONDS
+
+
+# What can be wrong with a value.
+
+NUMBERS = st.one_of(
+    st.sampled_from(
+        [
+            "0",
+            "-1",
+            "1e-308",
+            "5e-324",
+            "1e308",
+            "-1e308",
+            "nan",
+            "inf",
+            "-inf",
+            "1e-31",
+            "1e31",
+            "18446744073709551616",
+        ]
+    ),
+    st.sampled_from(["9223372036854775807", "9" * 5000, "0x" + "f" * 2000, "1_0", "1e999", "0.1", "5", "1e17"]),
+    st.floats(allow_nan=False).map(repr),
+    st.integers().map(str),
+)
+TEXTS = st.one_of(
+    st.text(max_size=30),
+    st.sampled_from(
+        [
+            "",
+            ".",
+            "..",
+            "/",
+            "[/red]",
+            "[bold]x",
+            "a\0b",
+            "\udcff",
+            "x" * 5000,
+            "y" * 300 + ".toml",
+            "\n",
+            "'",
+            '"',
+            "²",
+            "~",
+        ]
+    ),
+    st.sampled_from(
+        ["G2V", "mauve", "stack:5", "V", "chi2", "all", "none", "zero.txt", "fifo.txt", "/dev/zero", "good.txt"]
+    ),
+)
+QUOTED = TEXTS.map(lambda text: '"' + "".join(f"\\u{ord(c):04x}" if ord(c) < 0xD800 else "?" for c in text) + '"')
+VALUES = st.recursive(
+    st.one_of(NUMBERS, QUOTED, st.sampled_from(["true", "false", "1979-05-27", "[]", "{}"])),
+    lambda inner: st.one_of(
+        st.lists(inner, max_size=4).map(lambda items: f"[{', '.join(items)}]"),
+        inner.map(lambda value: f"{{ uniform = [{value}, {value}] }}"),
+        inner.map(lambda value: f"{{ value = {value}, tag = 'A' }}"),
+        st.integers(1, 3000).map(lambda depth: "[" * depth + "]" * depth),
+    ),
+    max_leaves=5,
+)
+
+
+def keys() -> list[str]:
+    """Every key that a study has, but those that ask for work."""
+    from pydantic import BaseModel
+
+    from mauvecl.study.study import Study
+
+    found = []
+    for section, field in Study.model_fields.items():
+        inner = field.annotation
+        if isinstance(inner, type) and issubclass(inner, BaseModel):
+            found += [f"{section}.{key}" for key in inner.model_fields]
+        found.append(section)
+    return [
+        *found,
+        "star.0.magnitude",
+        "star.0.file",
+        "star.0.library",
+        "star.0.band",
+        "star.0.ebv",
+        "star.-1",
+        "star.²",
+    ]
+
+
+#: A verb that reads everything and draws nothing.
+ASK = ("exposure", "--snr", "10", "--at", "300", "--no-pictures", "--quiet", "--star", "G2V", "--magnitude", "7.4")
+KEYS = st.one_of(
+    st.sampled_from(keys()), st.sampled_from(["observation.changes.temperature_c", "run.weights.x", ""]), TEXTS
+)
+
+
+@many(70)
+@given(key=KEYS, value=st.one_of(VALUES, TEXTS))
+def test_settings(folder: Path, key: str, value: str) -> None:
+    check(folder, *ASK, "--set", f"{key}={value}")
+
+
+@many(50)
+@given(key=st.sampled_from(keys()), value=VALUES, junk=st.one_of(st.just(b""), st.binary(max_size=20)))
+def test_studies(folder: Path, key: str, value: str, junk: bytes) -> None:
+    study = folder / "study.toml"
+    study.write_bytes(f"{key.replace('star.0', 'star')} = {value}\n".encode() + junk)
+    check(folder, "exposure", "study.toml", "--snr", "10", "--at", "300", "--no-pictures", "--quiet")
+
+
+INSTRUMENT_KEYS = (
+    "pixels", "adc_bits", "read_noise_dn", "temperature_c", "light_loss", "fibre_efficiency", "pixel_map", "extends",
+    "name", "conversion_uv_per_electron", "frame_s", "sources", "nonsense",
+)  # fmt: skip
+
+
+@many(40)
+@given(key=st.sampled_from(INSTRUMENT_KEYS), value=VALUES)
+def test_instruments(folder: Path, key: str, value: str) -> None:
+    (folder / "mine.toml").write_text(f"extends = 'mauve'\n{key} = {value}\n")
+    check(folder, *ASK, "--instrument", "mine.toml")
+
+
+FLAGS = st.sampled_from(
+    ["--star", "--magnitude", "--band", "--exposure", "--instrument", "--temperature", "--sky", "--target", "--time",
+     "--snr", "--at", "--per", "--output", "--realisations", "--nonsense", "--set", "--json", "study_file"]
+)  # fmt: skip
+
+
+@many(60)
+@given(flag=FLAGS, value=st.one_of(NUMBERS, TEXTS))
+def test_flags(folder: Path, flag: str, value: str) -> None:
+    if flag == "--output":
+        # Not outside the folder: what is written there would stay.
+        value = value.replace("/", "?").replace("..", "?")
+    # The operating system passes no null bytes.
+    value = value.replace("\0", "?")
+    words = (value,) if flag == "study_file" else (f"{flag}={value}",)
+    check(folder, "exposure", "--no-pictures", "--quiet", "--snr=10", "--at=300", *words)
+
+
+@many(25)
+@given(verb=st.sampled_from(["verify", "export", "realise", "library", "serve", "map", "limit", "detect"]), value=TEXTS)
+def test_verbs(folder: Path, verb: str, value: str) -> None:
+    words = {
+        "verify": ("verify", value),
+        "export": ("export", value, f"{value}.fits", "--rows", value),
+        "realise": ("realise", "--star", value, "--frames", value, "-n", "1"),
+        "library": ("library", "add", value),
+        "serve": ("serve", "--port", value or "0"),
+        "map": ("map", "--x", value),
+        "limit": ("limit", "--of", value or "x"),
+        "detect": ("detect", "--fap", value or "x", "-o", value),
+    }[verb]
+    check(folder, *words)
+
+
+def _spectra() -> tuple[bytes, ...]:
+    from astropy.io import fits
+
+    wavelength = np.linspace(170.0, 800.0, 200)
+    flux = np.full(200, 1e-12)
+    text = "".join(f"{w:.3f} {f:.3e}\n" for w, f in zip(wavelength, flux, strict=True)).encode()
+    header = (
+        "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: wavelength, unit: nm, datatype: float64}\n"
+        "# - {name: flux, unit: erg / (s cm2 Angstrom), datatype: float64}\n"
+    )
+    columns = [fits.Column("WAVELENGTH", "D", array=wavelength * 10), fits.Column("FLUX", "D", array=flux)]
+    content = io.BytesIO()
+    fits.HDUList([fits.PrimaryHDU(), fits.BinTableHDU.from_columns(columns)]).writeto(content)
+    return text, header.encode() + b"wavelength flux\n" + text, content.getvalue()
+
+
+def _flares() -> tuple[bytes, ...]:
+    from astropy.table import Table
+
+    table = Table({"amplitude": [0.1, 0.2], "tstart": [1.0, 2.0]})
+    found = []
+    for form in ("ascii.csv", "ascii.ecsv"):
+        content = io.StringIO()
+        table.write(content, format=form)
+        found.append(content.getvalue().encode())
+    packed = io.BytesIO()
+    table.write(packed, format="fits")
+    return *found, packed.getvalue()
+
+
+SPLICES = st.one_of(
+    st.binary(max_size=12),
+    NUMBERS.map(str.encode),
+    st.sampled_from(
+        [
+            b"\n",
+            b" ",
+            b"#",
+            b",",
+            b'"',
+            b"'",
+            b"*a",
+            b"&a",
+            b"word",
+            b"1+2j",
+            b"nan",
+            b"1e308",
+            b"\0" * 100,
+            b"\xff\xfe",
+            b"\x1f\x8b",
+        ]
+    ),
+)
+
+
+def spoilt(content: bytes, place: float, splice: bytes, cut: int, pack: bool) -> bytes:
+    """Some bytes of a good file taken out, others put in."""
+    at = int(place * len(content))
+    found = content[:at] + splice + content[at + cut :]
+    return gzip.compress(found)[: -1 if cut == 1 else None] if pack else found
+
+
+SPOILS = {
+    # Headers are longer than numbers.
+    "place": st.one_of(st.floats(0.0, 1.0), st.floats(0.7, 1.0)),
+    "splice": SPLICES,
+    "cut": st.sampled_from([0, 1, 5, 80, 3000]),
+    "pack": st.sampled_from([False, False, False, True]),
+}
+
+
+@many(50)
+@given(kind=st.integers(0, 2), ending=st.sampled_from([".txt", ".ecsv", ".fits", ".csv", ".gz", ""]), **SPOILS)
+def test_spectra(folder: Path, kind: int, ending: str, place: float, splice: bytes, cut: int, pack: bool) -> None:
+    file = folder / f"star{ending}"
+    file.write_bytes(spoilt(_spectra()[kind], place, splice, cut, pack))
+    check(folder, *ASK[:-4], "--magnitude", "7.4", "--star", str(file))
+
+
+@many(40)
+@given(kind=st.integers(0, 2), ending=st.sampled_from([".csv", ".ecsv", ".fits", ".txt"]), **SPOILS)
+def test_flare_tables(folder: Path, kind: int, ending: str, place: float, splice: bytes, cut: int, pack: bool) -> None:
+    file = folder / f"flares{ending}"
+    file.write_bytes(spoilt(_flares()[kind], place, splice, cut, pack))
+    # Fewer realisations than the threshold needs: everything is read, and then refused.
+    check(folder, "detect", "--star", "G2V", "-m", "8", "-n", "100", "--flares", str(file))
+
+
+@many(25)
+@given(lines=st.lists(st.tuples(NUMBERS, NUMBERS).map(" ".join), max_size=4), junk=st.binary(max_size=8))
+def test_weights(folder: Path, lines: list[str], junk: bytes) -> None:
+    from mauvecl.host.errors import InputError
+    from mauvecl.study.weights import read_weights
+
+    file = folder / "weights.txt"
+    file.write_bytes("\n".join(["190 0.5", *lines, "700 1"]).encode() + junk)
+    with contextlib.suppress(InputError):
+        found = read_weights("mine", file, np.linspace(190.0, 710.0, 50)).weights
+        # Their squares, times any count, are numbers.
+        assert np.isfinite(found**2 * 1e60).all()
+
+
+@many(20)
+@given(
+    name=st.sampled_from(
+        ["MAUVECL_DATA_DIR", "MAUVECL_CACHE_DIR", "MAUVECL_LARGEST_FILE_MIB", "MAUVECL_LARGEST_CONTENT_MIB", "COLUMNS",
+         "TERM", "NO_COLOR", "PYTHONIOENCODING", "LANG", "TMPDIR"]
+    ),
+    value=TEXTS.filter(lambda text: "\0" not in text),
+)  # fmt: skip
+def test_environments(folder: Path, name: str, value: str) -> None:
+    check(folder, "library", **{name: value})
+
+
+def test_the_check_would_notice(folder: Path) -> None:
+    """A verb that fails in a way that nobody foresaw fails here."""
+    with (
+        mock.patch("mauvecl.host.stars.catalogue.library_table", side_effect=KeyError("x")),
+        pytest.raises(AssertionError),
+    ):
+        check(folder, "library")
+    assert sys.stdout is not None

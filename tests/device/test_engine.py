@@ -1,0 +1,365 @@
+"""The engine against its NumPy twin, its own splits, and the closed-form moments."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from answers import same_counts
+from scenes import instrument, star
+from scipy import stats
+
+from mauvecl.device.engine import Engine
+from mauvecl.host.errors import InputError
+from mauvecl.host.instrument.pixel_map import PixelMap
+from mauvecl.noise import twin as reference
+from mauvecl.noise.comparison import Comparison
+from mauvecl.noise.processes import CosmicRays, Normal, Processes, Uniform
+from mauvecl.noise.scene import prepare
+from mauvecl.results import twin as reference_sums
+from mauvecl.results.channels import ChannelPlan, plan_channels
+from mauvecl.results.detection import Detection
+from mauvecl.results.snr import elements, observers
+from mauvecl.results.tally import Tally
+from mauvecl.statistics.definitions import STATISTICS
+
+RAYS = CosmicRays(rate_per_cm2_s=200.0)
+PRIORS = Processes(
+    jitter=Uniform(0.0, 0.05),
+    detector_temperature=Uniform(13.0, 21.0),
+    light_loss=Normal(0.34, 0.1, 0.1, 0.6),
+    pointing_loss=Uniform(0.0, 0.05),
+    qe_scale=Normal(1.0, 0.3, 0.4, 1.6),
+)
+#: What the noise model can be asked for: paper and physical counts, one frame and stacks, a rail, every recipe (joint
+#: with and without the fourth power, apart by tables, expansion, or some of each), every process, uneven pixels.
+CASES = {
+    "stack": {},
+    "one frame": {"exposure": 5.0},
+    "electrons": {"name": "mauve-electrons"},
+    "cold": {"temperature_c": -30.0, "exposure": 5.0},
+    "cold electrons": {"name": "mauve-electrons", "temperature_c": -20.0, "exposure": 10.0},
+    "frames": {"exposure": 15.0, "mode": "frames"},
+    "at the rail": {"exposure": 10.0, "magnitude": -0.7},
+    "apart": {"recipe": "apart"},
+    "apart, cold": {"recipe": "apart", "temperature_c": -30.0, "exposure": 5.0},
+    "apart, quiet readout": {"read_noise_dn": 0.5, "name": "mauve-electrons", "exposure": 5.0, "magnitude": 14.0},
+    "apart, electrons, frames": {"recipe": "apart", "name": "mauve-electrons", "exposure": 10.0, "mode": "frames"},
+    "apart, some of each": {"recipe": "apart", "name": "mauve-electrons", "exposure": 5.0, "magnitude": 3.0},
+    "noiseless": {"read_noise_dn": 0.0, "dark_scale_dn_per_s": 0.0, "magnitude": 30.0, "exposure": 5.0},
+    "uneven": {"pixel_map": PixelMap.made_up(2048, seed=5, hot_share=0.05)},
+    "uneven, apart": {
+        "pixel_map": PixelMap.made_up(2048, seed=5),
+        "recipe": "apart",
+        "temperature_c": -9.0,
+        "exposure": 5.0,
+    },
+    "uneven, pairs of two ways": {
+        "pixel_map": PixelMap.made_up(2048, seed=1),
+        "read_noise_dn": 1.0,
+        "temperature_c": 9.0,
+        "exposure": 5.0,
+    },
+    "cosmic rays": {"processes": Processes(cosmic_rays=RAYS)},
+    "cosmic rays, frames": {"processes": Processes(cosmic_rays=RAYS), "mode": "frames", "exposure": 10.0},
+    "priors": {"processes": PRIORS},
+    "priors, electrons, frames": {"processes": PRIORS, "name": "mauve-electrons", "mode": "frames", "exposure": 25.0},
+    "jitter, cold": {"processes": Processes(jitter=Uniform(0.0, 0.05)), "temperature_c": -30.0, "exposure": 5.0},
+    "jitter, one frame, rays": {"processes": Processes(RAYS, jitter=Uniform(0.0, 0.05)), "exposure": 5.0},
+}
+
+
+def case(name: str) -> tuple[list, dict]:
+    """Expectations, and how to draw them."""
+    options = dict(CASES[name])
+    how = {key: options.pop(key) for key in ("mode", "recipe", "processes") if key in options}
+    exposure, magnitude = options.pop("exposure", 50.0), options.pop("magnitude", 7.4)
+    payload = instrument(options.pop("name", "mauve"), part=True, **options)
+    return star(magnitude=magnitude, amplitudes=(0.081, 0.24), exposure=exposure, payload=payload), how
+
+
+@pytest.fixture(scope="module", params=["vectors", "scalar"])
+def any_width(request: pytest.FixtureRequest, engine: Engine) -> Engine:
+    """The engine as processors run it, and one realisation to a work-item, as a GPU does."""
+    return engine if request.param == "vectors" else Engine(width=1)
+
+
+#: Around the boundary of the counter's first word.
+START = 2**32 - 24
+INDEX = np.arange(START, START + 40, dtype=np.uint64)
+SEED = 2**63 + 12345
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_raw_spectra_are_the_twins(any_width: Engine, name: str) -> None:
+    (quiet, *_), how = case(name)
+    raw, clipped = any_width.realise_and_count(quiet, start=START, count=INDEX.size, seed=SEED, **how)
+    scene = prepare([quiet], **how)
+    np.testing.assert_array_equal(raw, reference.realise(scene, INDEX, SEED))
+    np.testing.assert_array_equal(clipped, reference.clipped(scene, INDEX, SEED).sum(axis=(1, 2)))
+    assert (raw.dtype == np.uint16) == (quiet.n_frames == 1)
+
+
+def _twin(found: Detection, plan: ChannelPlan) -> np.ndarray:
+    """Every channel of a detection by the twin."""
+    smoothed = reference_sums.Smoothed.of(found, plan)
+    return reference_sums.statistics(found.scene, INDEX, SEED, plan.weights, plan.linear_end, smoothed=smoothed)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_statistic_is_the_twins(any_width: Engine, name: str) -> None:
+    """Those of the fast kernel alone, and all of them, with their histograms."""
+    (quiet, *flares), how = case(name)
+    if name == "noiseless":
+        pytest.skip("without noise there is no statistic")
+    kind = {"start": START, "seed": SEED, **how}
+    found = any_width.detect(quiet, flares, realisations=INDEX.size, statistics=tuple(STATISTICS), **kind)
+    plan = plan_channels(found, range(len(flares)), first=True)
+    values = _twin(found, plan)
+    fast = ("chi2", "chi2_element", "matched", "uv_excess")
+    alone = any_width.statistic_values(quiet, flares, count=INDEX.size, statistics=fast, **kind)
+    same = [row for row in range(len(alone)) if row % 3 != 2 or row >= 9]
+    np.testing.assert_array_equal(alone[same], values[: len(alone)][same])
+    tally = Tally(plan.grids)
+    histogram, sums, outside = reference_sums.tally(values, tally.packed)
+    tally.add(histogram, sums, INDEX.size)
+    for i, (statistic, role, flare) in enumerate(plan.keys):
+        if role == "flare_on_null_grid":
+            continue
+        ours = found.distribution(statistic, None if role == "null" else flare, template=flare)
+        assert tally.add_far(i, values[plan.grids[i].channel]) == outside[i]
+        twin = tally.distribution(i)
+        np.testing.assert_array_equal(ours.counts, twin.counts)
+        assert (ours.first, ours.second) == (twin.first, twin.second)
+        assert ours.far.equals(twin.far)
+
+
+@pytest.mark.parametrize(
+    ("name", "comparison"),
+    [
+        ("stack", Comparison(1)),
+        ("stack", Comparison(0, True)),
+        ("stack", Comparison(3)),
+        *((name, Comparison(2, True)) for name in ("at the rail", "apart, electrons, frames", "uneven", "priors")),
+    ],
+)
+def test_whatever_is_compared_is_the_twins(any_width: Engine, name: str, comparison: Comparison) -> None:
+    """Noisy quiescent exposures, one or several, and variances from the counts."""
+    (quiet, *flares), how = case(name)
+    kind = {"statistics": tuple(STATISTICS), "start": START, "seed": SEED, "comparison": comparison, **how}
+    found = any_width.detect(quiet, flares, realisations=INDEX.size, **kind)
+    values = any_width.statistic_values(quiet, flares, count=INDEX.size, **kind)
+    twin = _twin(found, plan_channels(found, range(len(flares)), first=True))
+    np.testing.assert_array_equal(values, twin)
+    if comparison == Comparison(1):
+        # Against one exposure chi2 is chi2_pair, but for the order in which it is summed.
+        np.testing.assert_allclose(values[0], values[2], rtol=1e-5)
+
+
+@pytest.mark.parametrize("name", ["stack", "at the rail", "apart, electrons, frames", "priors", "cosmic rays"])
+def test_signal_to_noise_is_the_twins(any_width: Engine, name: str) -> None:
+    (quiet, *_), how = case(name)
+    scene = prepare([quiet], **how)
+    found = any_width.snr(quiet, realisations=INDEX.size, start=START, seed=SEED, **how)
+    twin = reference_sums.histograms(scene, observers(quiet, scene), elements(quiet), INDEX, SEED)
+    same_counts(found.counts, twin)
+    assert all(
+        each.sum() + found.counts.far[kind].counts.sum() == INDEX.size * len(each)
+        for kind, each in (("pixel", found.counts.pixel), ("element", found.counts.element))
+    )
+
+
+def test_modes_meet_the_rails(engine: Engine) -> None:
+    """A star that saturates is drawn frame by frame, cut off at saturation, unasked."""
+    (bright, *_), _ = case("at the rail")
+    assert prepare([bright]).frames
+    raw = engine.realise(bright, count=200, seed=1)
+    assert raw.max() == 2 * bright.highest_dn == 2 * 59_578
+    with pytest.raises(InputError, match="stacked"):
+        prepare([bright], "stacked")
+    (faint, *_), _ = case("stack")
+    assert not prepare([faint]).frames
+
+
+@pytest.mark.parametrize("payload", ["mauve", "mauve-electrons"])
+def test_moments_of_raw_spectra(engine: Engine, payload: str) -> None:
+    """Mean and variance of each pixel follow the model: |z| < 6 in 1643 pixels fails once in 3e5 seeds."""
+    (quiet,) = star(payload=instrument(payload))
+    n = 20_000
+    raw = engine.realise(quiet, count=n, seed=4).astype(float)
+    mean, variance = quiet.n_frames * quiet.mean_raw_dn, quiet.variance_dn2
+    z = (raw.mean(axis=0) - mean) / np.sqrt(variance / n)
+    assert np.abs(z).max() < 6
+    assert abs(z.sum()) < 5 * np.sqrt(z.size)
+    ratio = raw.var(axis=0) / variance
+    assert np.abs(ratio - 1).max() < 6 * np.sqrt(2 / n)
+    assert abs(ratio.mean() - 1) < 5 * np.sqrt(2 / n / z.size)
+
+
+def test_frames_and_stacks_agree(engine: Engine) -> None:
+    """Two ways to draw the same exposure, far from the rails: means and variances, 5 standard errors."""
+    (quiet, *_), _ = case("frames")
+    n = 20_000
+    frames, stacked = (engine.realise(quiet, count=n, seed=s, mode=m) for s, m in ((1, "frames"), (2, "stacked")))
+    difference = frames.mean(axis=0) - stacked.mean(axis=0)
+    assert np.abs(difference / np.sqrt(2 * quiet.variance_dn2 / n)).max() < 5.5
+    total = frames.var(axis=0).sum() / stacked.var(axis=0).sum()
+    assert abs(total - 1) < 5 * np.sqrt(4 / n / quiet.wavelength_nm.size)
+
+
+def test_pixels_and_realisations_are_uncorrelated(engine: Engine) -> None:
+    """Neighbours in pixel, realisation and seed: |z| < 5 for sums of 3e7 products."""
+    (quiet,) = star()
+    raw = engine.realise(quiet, count=20_000, seed=9)
+    z = (raw - quiet.n_frames * quiet.mean_raw_dn) / np.sqrt(quiet.variance_dn2)
+    other = engine.realise(quiet, count=20_000, seed=10)
+    y = (other - quiet.n_frames * quiet.mean_raw_dn) / np.sqrt(quiet.variance_dn2)
+    for a, b in ((z[:, 1:], z[:, :-1]), (z[:, 2:], z[:, :-2]), (z[1:], z[:-1]), (z[16:], z[:-16]), (z, y)):
+        products = a * b
+        assert abs(products.sum()) < 5 * np.sqrt(products.size)
+
+
+def test_frames_are_uncorrelated(engine: Engine) -> None:
+    """Single frames 0, 1 and 2**32 - 1 of the same realisations: |z| < 5 for sums of 3e7 products."""
+    (x,) = star(exposure=5.0)
+    z = []
+    for frame in (0, 1, 2**32 - 1):
+        scene, out = prepare([x], first_frame=frame), np.empty((20_000, x.wavelength_nm.size), np.int32)
+        with engine._scene(scene, 9) as run:
+            engine._over(
+                0, 20_000, 4 * scene.n_pixel, lambda t, n, run=run, out=out: run.realise(t, out[n : n + t.wanted])
+            )
+        z.append((out - x.mean_raw_dn) / np.sqrt(x.variance_dn2))
+    for a, b in ((z[0], z[1]), (z[0], z[2]), (z[1], z[2])):
+        products = a * b
+        assert abs(products.sum()) < 5 * np.sqrt(products.size)
+
+
+def test_any_realisation_by_its_index_alone(engine: Engine) -> None:
+    (quiet, *_), _ = case("stack")
+    far = 734_221_008
+    run = engine.realise(quiet, start=far - 100, count=300, seed=5)
+    for offset in (0, 99, 100, 299):
+        alone = engine.realise(quiet, start=far - 100 + offset, count=1, seed=5)
+        np.testing.assert_array_equal(alone[0], run[offset])
+    huge = engine.realise(quiet, start=2**62 + 3, count=2, seed=5)
+    twin = reference.realise(prepare([quiet]), np.array([2**62 + 3, 2**62 + 4], np.uint64), 5)
+    np.testing.assert_array_equal(huge, twin)
+
+
+@pytest.mark.parametrize("tile", [16, 64, 4096])
+def test_tiles_change_no_bit(engine: Engine, tile: int) -> None:
+    (quiet, *flares), _ = case("stack")
+    whole = engine.detect(quiet, flares, realisations=3001, start=77, seed=6, statistics=tuple(STATISTICS))
+    parts = Engine(tile=tile).detect(quiet, flares, realisations=3001, start=77, seed=6, statistics=tuple(STATISTICS))
+    for key, distribution in whole._found.items():
+        np.testing.assert_array_equal(distribution.counts, parts._found[key].counts)
+        assert distribution.far.equals(parts._found[key].far)
+        assert (distribution.mean, distribution.std) == (parts._found[key].mean, parts._found[key].std)
+
+
+THREADS = """
+import hashlib, sys
+sys.path.insert(0, {tests!r})
+from answers import same_counts
+from scenes import star
+from mauvecl.device.engine import Engine
+quiet, *flares = star(amplitudes=(0.081, 0.24))
+found = Engine().detect(quiet, flares, realisations=20_000, seed=3)
+table = found.table(fap=1e-2)
+print(hashlib.sha256(repr([tuple(row) for row in table]).encode()).hexdigest())
+"""
+
+
+def test_threads_change_no_bit() -> None:
+    """The same table from one thread and from two, to the last digit."""
+    code = THREADS.format(tests=os.path.dirname(os.path.dirname(__file__)))
+    digests = {
+        subprocess.run(
+            [sys.executable, "-c", code],
+            env=os.environ | {"POCL_MAX_PTHREAD_COUNT": threads},
+            capture_output=True,
+            text=True,
+            check=True,
+        ).stdout
+        for threads in ("1", "2")
+    }
+    assert len(digests) == 1
+
+
+def test_many_flares_are_done_in_batches(engine: Engine) -> None:
+    """More scenarios than one launch holds give each flare what it gets alone."""
+    amplitudes = tuple(np.linspace(0.01, 0.3, 18))
+    payload = instrument(part=True)
+    quiet, *flares = star(amplitudes=amplitudes, payload=payload)
+    together = engine.detect(quiet, flares, realisations=2000, seed=8)
+    for k in (0, 14, 15, 17):
+        alone = engine.detect(quiet, [flares[k]], realisations=2000, seed=8)
+        for statistic in ("chi2", "chi2_element", "matched"):
+            for flare in (None, 0):
+                wanted = alone.distribution(statistic, flare)
+                ours = together.distribution(statistic, None if flare is None else k, template=k)
+                np.testing.assert_array_equal(ours.counts, wanted.counts)
+
+
+def test_snr_follows_the_closed_form(engine: Engine) -> None:
+    """Mean S/N against the closed form: the clipped root's bias is below 2 % of the spread for a star this bright."""
+    (quiet,) = star(magnitude=5.0)
+    found = engine.snr(quiet, realisations=20_000, seed=2)
+    for table in (found.pixel, found.element):
+        bright = table["expected"] > 5
+        z = (table["mean"] - table["expected"])[bright] / table["std"][bright]
+        assert np.abs(z).max() < 0.02 + 5 / np.sqrt(20_000)
+        for column, p in (("q16", 0.16), ("q50", 0.5), ("q97.5", 0.975)):
+            normal = table["mean"] + table["std"] * stats.norm.ppf(p)
+            assert np.abs((table[column] - normal)[bright] / table["std"][bright]).max() < 0.08
+
+
+def test_progress_is_reported_and_may_stop(engine: Engine) -> None:
+    (quiet, *flares), _ = case("stack")
+    seen: list[tuple[int, int]] = []
+    Engine(tile=1024, progress=lambda done, total: seen.append((done, total))).detect(
+        quiet, flares, realisations=5000, seed=1
+    )
+    assert (seen[0], seen[-1]) == ((0, 5000), (5000, 5000))
+    assert len(seen) == 6
+
+    def stop(done: int, total: int) -> None:
+        raise KeyboardInterrupt
+
+    stopping = Engine(tile=1024, progress=stop)
+    with pytest.raises(KeyboardInterrupt):
+        stopping.realise(quiet, count=5000, seed=1)
+    # The engine works on.
+    stopping._progress = None
+    assert stopping.realise(quiet, count=3, seed=1).shape[0] == 3
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"count": 0, "seed": 1}, "realisations = 0"),
+        ({"count": 1, "seed": -1}, "seed = -1"),
+        ({"count": 1, "seed": 2**64}, "seed = 18446744073709551616"),
+        ({"count": 1, "seed": 1, "start": -1}, "start = -1"),
+        ({"count": 1, "seed": 1, "mode": "fast"}, "mode = 'fast'"),
+    ],
+)
+def test_impossible_requests_are_refused(engine: Engine, options: dict, sentence: str) -> None:
+    (quiet, *_), _ = case("stack")
+    with pytest.raises(InputError, match=sentence):
+        engine.realise(quiet, **options)
+
+
+def test_statistics_and_scenarios_are_checked(engine: Engine) -> None:
+    (quiet, *flares), _ = case("stack")
+    with pytest.raises(InputError, match="'chi3' is unknown"):
+        engine.detect(quiet, flares, realisations=10, seed=1, statistics=("chi3",))
+    with pytest.raises(InputError, match="no flare"):
+        engine.detect(quiet, [], realisations=10, seed=1, statistics=("matched",))
+    (other, *_), _ = case("one frame")
+    with pytest.raises(InputError, match="n_frames of"):
+        engine.detect(quiet, [other], realisations=10, seed=1)

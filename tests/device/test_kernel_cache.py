@@ -1,0 +1,264 @@
+"""Compiled kernels kept from run to run: whatever is done to them costs a build, never a run or a bit."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from mauvecl.device import kernel_cache
+from mauvecl.device.kernel_cache import KernelCache
+
+#: Two kernels on the toy scene; tells whether they came from the store.
+RUN = """
+import hashlib, sys
+from mauvecl import kernel_cache, selftest
+def digest(engine):
+    x = selftest.toy(frames=1)
+    raw, seen = engine.realise(x, count=64, seed=1), engine.snr(x, realisations=64, seed=1)
+    return hashlib.sha256(raw.tobytes() + seen.counts.pixel.tobytes()).hexdigest()
+{before}
+from mauvecl.device.engine import DeviceError, Engine
+restore, restored = kernel_cache.KernelCache.restore, []
+kernel_cache.KernelCache.restore = lambda cache, key: restored.append(restore(cache, key)) or restored[-1]
+try:
+    print("digest", digest(Engine()))
+    print("restored", sum(restored), "of", len(restored))
+    print("work", kernel_cache.kernel_cache().work)
+except DeviceError as error:
+    print("sentence", error)
+"""
+
+
+def run(cache: Path | str, before: str = "") -> dict[str, str]:
+    """What a process of its own prints; PoCL ends processes, so each is watched from outside."""
+    child = subprocess.run(
+        [sys.executable, "-c", RUN.format(before=before)],
+        env=os.environ | {"MAUVECL_CACHE_DIR": str(cache)},
+        capture_output=True,
+        text=True,
+    )
+    assert child.returncode == 0, child.stderr
+    assert child.stderr == ""
+    return dict(line.split(" ", 1) for line in child.stdout.splitlines())
+
+
+@pytest.fixture(scope="module")
+def filled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A cache that one process has filled, and the digest it printed."""
+    cache = tmp_path_factory.mktemp("filled")
+    first = run(cache)
+    assert first["restored"].startswith("0 of")
+    return cache, first["digest"]
+
+
+def files_of(cache: Path) -> list[Path]:
+    return sorted(path for path in cache.rglob("*") if path.is_file())
+
+
+def test_the_second_process_builds_nothing(filled: tuple[Path, str]) -> None:
+    cache, digest = filled
+    again = run(cache)
+    restored, _, wanted = again["restored"].partition(" of ")
+    assert again["digest"] == digest
+    assert restored == wanted != "0"
+    # Each process leaves only the store behind.
+    assert not Path(again["work"]).exists()
+
+
+def flip(path: Path) -> None:
+    content = bytearray(path.read_bytes())
+    content[len(content) // 2] ^= 0x10
+    path.write_bytes(bytes(content))
+
+
+DAMAGE = {
+    "a flipped bit": flip,
+    "cut short": lambda path: path.write_bytes(path.read_bytes()[: path.stat().st_size // 2]),
+    "emptied": lambda path: path.write_bytes(b""),
+    "garbage": lambda path: path.write_bytes(b"\xff\x00 nothing of the kind"),
+    "gone": lambda path: path.unlink(),
+}
+
+
+@pytest.mark.parametrize(
+    ("kind", "ending"),
+    [
+        *((kind, ".so") for kind in DAMAGE),
+        ("a flipped bit", ".bc"),
+        ("emptied", ".bc"),
+        ("a flipped bit", ".json"),
+        ("garbage", ".json"),
+        ("a flipped bit", ".txt"),
+    ],
+)
+def test_a_damaged_store_is_built_again(filled: tuple[Path, str], tmp_path: Path, kind: str, ending: str) -> None:
+    source, digest = filled
+    cache = tmp_path / "cache"
+    shutil.copytree(source, cache)
+    damaged = [path for path in files_of(cache) if path.suffix == ending]
+    assert damaged
+    for path in damaged:
+        DAMAGE[kind](path)
+    after = run(cache)
+    assert after["digest"] == digest
+    if ending != ".txt":
+        # A text is a rendered source: made anew, it is the same, and its program is found.
+        assert after["restored"].startswith("0 of")
+    healed = run(cache)
+    restored, _, wanted = healed["restored"].partition(" of ")
+    assert (healed["digest"], restored) == (digest, wanted)
+
+
+MANIFESTS = ("", "[]", "3", '{"files": {}}', '{"files": 1}', '{"folder": "x"}', '{"folder": 3, "files": {"a": "b"}}')
+
+
+@pytest.mark.parametrize("text", MANIFESTS)
+def test_any_manifest_is_read_without_trust(tmp_path: Path, text: str) -> None:
+    cache = KernelCache(tmp_path, tmp_path / "work")
+    entry = cache.store / "key"
+    entry.mkdir(parents=True)
+    (entry / "a").write_text("contents")
+    (entry / "manifest.json").write_text(text)
+    assert not cache.restore("key")
+    assert not (cache.work / "a").exists()
+
+
+def test_a_full_store_is_no_obstacle(filled: tuple[Path, str], tmp_path: Path) -> None:
+    """The disk fills while the store is written to: the run is as ever, and nothing half-written is ever read."""
+    before = f"""
+from pathlib import Path
+write_bytes, write_text = Path.write_bytes, Path.write_text
+def full(path, *rest, **more):
+    if "store" in path.parts:
+        raise OSError({errno.ENOSPC}, "No space left on device")
+    return (write_bytes if isinstance(rest[0], bytes) else write_text)(path, *rest, **more)
+Path.write_bytes = Path.write_text = full
+"""
+    assert run(tmp_path, before)["digest"] == filled[1]
+    assert files_of(tmp_path) == []
+
+
+def test_without_any_room_one_sentence_says_what_to_do(tmp_path: Path) -> None:
+    said = run(tmp_path, "kernel_cache.ROOM = 2**60")["sentence"]
+    assert "no folder for compiled kernels" in said
+    assert "MAUVECL_CACHE_DIR" in said
+    assert "\n" not in said
+
+
+@pytest.mark.parametrize("folder", ["/proc/mauvecl", "/dev/null/mauvecl"])
+def test_a_folder_that_cannot_be_made_is_replaced(filled: tuple[Path, str], folder: str) -> None:
+    found = run(folder)
+    assert found["digest"] == filled[1]
+    assert not found["work"].startswith(folder)
+
+
+def test_what_a_killed_process_leaves_is_swept_up(filled: tuple[Path, str], tmp_path: Path) -> None:
+    code = "import time; from mauvecl.device.engine import Engine; Engine(); print('up', flush=True); time.sleep(60)"
+    child = subprocess.Popen(
+        [sys.executable, "-c", code],
+        env=os.environ | {"MAUVECL_CACHE_DIR": str(tmp_path)},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert child.stdout is not None
+    assert child.stdout.readline() == "up\n"
+    left = list(tmp_path.glob("*/mauvecl-work-*"))
+    assert len(left) == 1
+    child.send_signal(signal.SIGKILL)
+    child.wait()
+    assert run(tmp_path)["digest"] == filled[1]
+    assert not left[0].exists()
+
+
+HOLDS = "from mauvecl.device.kernel_cache import kernel_cache; print(kernel_cache().work, flush=True); input()"
+SWEEPS = "import sys, pathlib; from mauvecl import kernel_cache; kernel_cache._sweep(pathlib.Path(sys.argv[1]))"
+#: Commands that run another as on a machine of its own: with its own processes, and its own name.
+ELSEWHERE = {
+    "another container": ["unshare", "--pid", "--fork", "--mount-proc"],
+    "another name": ["unshare", "--uts", "sh", "-c", 'hostname elsewhere && exec "$@"', "sh"],
+    "both": ["unshare", "--pid", "--fork", "--mount-proc", "--uts", "sh", "-c", 'hostname elsewhere && "$@"', "sh"],
+}
+
+
+@pytest.mark.parametrize("place", ELSEWHERE)
+@pytest.mark.parametrize("holder", ["here", "there"])
+def test_containers_that_share_a_home_leave_each_other_alone(tmp_path: Path, place: str, holder: str) -> None:
+    """Whoever holds a working folder and whoever sweeps: while its process lives it stays, then it goes."""
+    there = ELSEWHERE[place]
+    if subprocess.run([*there, "true"], capture_output=True, check=False).returncode:
+        pytest.skip("no namespaces can be made here")
+    one, other = (there, []) if holder == "there" else ([], there)
+    environment = os.environ | {"MAUVECL_CACHE_DIR": str(tmp_path)}
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    child = subprocess.Popen([*one, sys.executable, "-c", HOLDS], env=environment, text=True, **pipes)  # type: ignore[call-overload]
+    work = Path(child.stdout.readline().strip())
+    sweep = [*other, sys.executable, "-c", SWEEPS, work.parent]
+    subprocess.run(sweep, env=environment, check=True)
+    assert work.is_dir(), "swept while it was in use"
+    (left,) = [int(p.name) for p in Path("/proc").glob("[0-9]*") if _holds(p, work / "lock")]
+    os.kill(left, signal.SIGKILL)
+    child.communicate()
+    subprocess.run(sweep, env=environment, check=True)
+    assert not work.exists()
+
+
+def _holds(process: Path, file: Path) -> bool:
+    try:
+        return any(handle.readlink() == file for handle in (process / "fd").iterdir())
+    except OSError:
+        return False
+
+
+@pytest.mark.parametrize("locked", [False, True])
+@pytest.mark.parametrize("days", [0, 29, 31])
+def test_another_hosts_folder_goes_by_age_and_lock(tmp_path: Path, days: int, locked: bool) -> None:
+    """Its processes cannot be seen from here, nor perhaps its locks."""
+    folder = tmp_path / "mauvecl-work-farhost-0123456789abcdef0123456789abcdef-00"
+    folder.mkdir()
+    then = time.time() - days * 86400
+    with (folder / "lock").open("w") as lock:
+        if locked:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+        os.utime(folder / "lock", (then, then))
+        kernel_cache._sweep(tmp_path)
+    assert folder.exists() == (locked or days < 30)
+
+
+def test_a_second_engine_leaves_loaded_kernels_alone(filled: tuple[Path, str]) -> None:
+    """A loaded kernel whose file is written anew ends the process at its next use."""
+    before = """
+from mauvecl.device.engine import Engine as E
+one = E()
+first = digest(one)
+two = E()
+assert first == digest(two) == digest(one)
+"""
+    assert run(filled[0], before)["digest"] == filled[1]
+
+
+def test_the_store_keeps_to_its_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The programs used longest ago make room."""
+    monkeypatch.setattr(kernel_cache, "MOST_STORED", 25_000)
+    for number in range(4):
+        cache = KernelCache(tmp_path, tmp_path / f"work{number}")
+        with cache.building(f"key{number}"):
+            folder = cache.work / "AA" / f"program{number}"
+            folder.mkdir(parents=True)
+            (folder / "program.bc").write_bytes(bytes(10_000))
+        cache.publish()
+        then = time.time() - 100 + number
+        os.utime(cache.store / f"key{number}", (then, then))
+    cache.publish()
+    assert sorted(path.name for path in cache.store.iterdir()) == ["key2", "key3"]
+    manifest = json.loads((cache.store / "key3" / "manifest.json").read_text())
+    assert manifest["folder"] == "AA/program3"

@@ -1,0 +1,75 @@
+"""Every kernel under Oclgrind, which simulates a device and watches each access for races and for going astray."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ICD = next(
+    (path for root in ("/usr/lib", "/usr/local/lib") for path in Path(root).rglob("liboclgrind-rt-icd.so")), None
+)
+pytestmark = pytest.mark.skipif(ICD is None, reason="Oclgrind is not installed (Debian: apt-get install oclgrind)")
+
+KERNELS = """
+import sys
+import numpy as np
+from mauvecl import layout, selftest
+from mauvecl.device.engine import Engine
+from mauvecl.device.probes import Probes
+
+engine = Engine("Oclgrind", width=int(sys.argv[1]))
+for name in selftest.CASES:
+    assert selftest.digests(engine, name) == selftest.twin_digests(name), name
+probes = Probes(engine=engine)
+words = np.arange(160, dtype=np.uint32) * np.uint32(0x9E3779B9)
+assert selftest.known_answers(engine).passed
+probes.normal(words, words[::-1].copy())
+probes.expansion(words, words[::-1].copy(), 2225.0)
+probes.alias(words, np.zeros(16, np.uint32), 4)
+ends = np.repeat(np.array([0, 1, 2**31 - 1, 2**31, 2**32 - 1], np.uint32), 32)
+probes.prior(ends, ~ends, np.zeros(2 * layout.PRIOR_NODES, np.float32))
+print("kernels", len(engine._programs))
+"""
+
+RACE = """
+import numpy as np
+import pyopencl as cl
+platform = next(p for p in cl.get_platforms() if p.name == "Oclgrind")
+context = cl.Context(platform.get_devices())
+queue = cl.CommandQueue(context)
+source = "__kernel void race(__global int *a) { a[0] += get_global_id(0); }"
+buffer = cl.Buffer(context, cl.mem_flags.READ_WRITE, 4)
+cl.Program(context, source).build().race(queue, (64,), None, buffer)
+queue.finish()
+"""
+
+
+def under_oclgrind(code: str, folder: Path, *arguments: str) -> tuple[subprocess.CompletedProcess, str]:
+    """Run Python with Oclgrind as an OpenCL device; its exit code stays 0 whatever it finds, so the log is read."""
+    (folder / "oclgrind.icd").write_text(f"{ICD}\n")
+    log = folder / "log"
+    environment = os.environ | {
+        "OCL_ICD_VENDORS": str(folder),
+        "OCLGRIND_DATA_RACES": "1",
+        "OCLGRIND_LOG": str(log),
+    }
+    run = subprocess.run([sys.executable, "-c", code, *arguments], env=environment, capture_output=True, text=True)
+    return run, log.read_text() if log.exists() else ""
+
+
+@pytest.mark.parametrize("width", ["16", "1"])
+def test_no_kernel_races_or_strays_and_all_bits_are_the_twins(tmp_path: Path, width: str) -> None:
+    run, log = under_oclgrind(KERNELS, tmp_path, width)
+    assert run.returncode == 0, run.stderr
+    assert int(run.stdout.split()[-1]) >= 20
+    assert log == ""
+
+
+def test_a_race_would_be_seen(tmp_path: Path) -> None:
+    run, log = under_oclgrind(RACE, tmp_path)
+    assert run.returncode == 0, run.stderr
+    assert "data race" in log.lower()

@@ -1,0 +1,152 @@
+"""What must end in a sentence or in the same bits: missing devices and tools, little memory, absurd numbers."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from mauvecl.device.engine import DeviceError, Engine, devices
+from mauvecl.device.kernel_cache import kernel_cache
+from mauvecl.device.selftest import toy
+from mauvecl.host.errors import InputError
+
+
+def test_devices_and_absent_ones() -> None:
+    present = devices()
+    assert present[0].default
+    assert "Portable" in present[0].platform
+    with pytest.raises(DeviceError, match="not here, expected one of: 0 = "):
+        Engine(device="no such device")
+    assert Engine(device="portable").device == present[0]
+    assert Engine(device="0").device == present[0]
+
+
+def test_a_missing_linker_is_named(tmp_path) -> None:
+    """PoCL would abort Python; here one sentence says what to install."""
+    code = "from mauvecl.device.engine import Engine, DeviceError\ntry: Engine()\nexcept DeviceError as e: print(e)"
+    run = subprocess.run(
+        [sys.executable, "-c", code],
+        env=os.environ | {"PATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert "no linker `ld`" in run.stdout
+    assert "binutils" in run.stdout
+
+
+def test_no_device_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    from mauvecl.device import program
+
+    opencl = program.load_opencl()
+
+    def nothing() -> list:
+        raise opencl.LogicError("clGetPlatformIDs failed: PLATFORM_NOT_FOUND_KHR")
+
+    for empty in (nothing, list):
+        monkeypatch.setattr(opencl, "get_platforms", empty)
+        with pytest.raises(DeviceError, match="no OpenCL device found"):
+            Engine()
+
+
+@pytest.mark.parametrize("new", [False, True])
+def test_after_a_fork_there_is_a_sentence_and_no_hang(engine: Engine, new: bool) -> None:
+    """PoCL would wait for ever for threads that did not survive, for an old engine as for a new one."""
+    queue = multiprocessing.get_context("fork").Queue()
+
+    def child() -> None:
+        try:
+            (Engine() if new else engine).realise(toy(), count=1, seed=1)
+        except DeviceError as error:
+            queue.put(str(error))
+
+    process = multiprocessing.get_context("fork").Process(target=child)
+    process.start()
+    assert "before a fork" in queue.get(timeout=20)
+    process.join(timeout=20)
+
+
+def test_a_forked_child_leaves_the_kernels_to_its_parent(engine: Engine) -> None:
+    work = kernel_cache().work
+    process = multiprocessing.get_context("fork").Process(target=lambda: kernel_cache().close())
+    process.start()
+    process.join(timeout=20)
+    assert process.exitcode == 0
+    assert work.is_dir()
+
+
+def test_a_failing_build_shows_the_numbered_source(engine: Engine) -> None:
+    from mauvecl.device.program import BuildError, build
+
+    with pytest.raises(BuildError, match=r"   2  nonsense here"):
+        build(engine.context, "// a comment\nnonsense here\n")
+
+
+def refuse_beyond(monkeypatch: pytest.MonkeyPatch, limit: int, *, scenes: bool = False) -> list[int]:
+    """Let the device refuse buffers of more than so many bytes, or what a scene is kept in; the sizes refused."""
+    refused: list[int] = []
+
+    def buffer(context: cl.Context, flags: int, size: int = 0, hostbuf: np.ndarray | None = None) -> cl.Buffer:
+        if size > limit or (scenes and hostbuf is not None):
+            refused.append(size)
+            hostbuf, flags, size = None, cl.mem_flags.READ_WRITE, 2**60  # which no device has
+        return real(context, flags, size, hostbuf)
+
+    real = cl.Buffer
+    monkeypatch.setattr(cl, "Buffer", buffer)
+    return refused
+
+
+def test_little_memory_means_smaller_tiles_and_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    quiet, flare = toy(), toy(flare=0.3)
+
+    def work() -> list[np.ndarray]:
+        engine = Engine()
+        found = engine.detect(quiet, [flare], realisations=20_000, seed=1)
+        raw, clipped = engine.realise_and_count(quiet, count=20_000, seed=1)
+        return [raw, clipped, *(found.distribution(s, k).counts for s in found.statistics for k in (None, 0))]
+
+    plain = work()
+    # Statistics of 64 realisations take 64 * 4 * 8 bytes; a tile of 20 000 much more.
+    refused = refuse_beyond(monkeypatch, 5_000)
+    for ours, wanted in zip(work(), plain, strict=True):
+        np.testing.assert_array_equal(ours, wanted)
+    assert len(refused) > 5
+
+
+def test_too_little_memory_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    refuse_beyond(monkeypatch, 100)
+    with pytest.raises(DeviceError, match="too little memory for 64 realisations"):
+        Engine().detect(toy(), [toy(flare=0.3)], realisations=20_000, seed=1)
+    refuse_beyond(monkeypatch, 100, scenes=True)
+    with pytest.raises(DeviceError, match=r"too little memory for .* bytes of a scene"):
+        Engine().realise(toy(), count=1, seed=1)
+
+
+def test_other_failures_of_a_device_are_not_taken_for_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    engine, real = Engine(), cl.Buffer
+    both = cl.mem_flags.READ_ONLY | cl.mem_flags.WRITE_ONLY
+    monkeypatch.setattr(cl, "Buffer", lambda context, flags, *rest, **more: real(context, both, 64))
+    with pytest.raises(cl.LogicError, match="INVALID_VALUE"):
+        engine.realise(toy(), count=10, seed=1)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, -1.0, 1e13])
+@pytest.mark.parametrize(
+    "name",
+    ["source_electrons", "sky_electrons", "dark_dn", "bias_dn", "read_noise_dn", "gain_dn_per_electron"],
+)
+def test_absurd_means_and_noise_are_refused_by_pixel(name: str, value: float) -> None:
+    x = toy()
+    wrong = getattr(x, name).copy()
+    wrong[17] = value
+    with pytest.raises(InputError, match=rf"{name} of pixel 17 .*expected") as caught:
+        replace(x, **{name: wrong})
+    assert "\n" not in str(caught.value)

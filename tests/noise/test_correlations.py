@@ -1,0 +1,100 @@
+"""Whether draws that should know nothing of each other do: by recipe, and by every mixture of recipes in a group."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import instrument, star
+
+from mauvecl.device.engine import Engine
+from mauvecl.device.selftest import toy
+from mauvecl.host.errors import InputError
+from mauvecl.host.expectation import Expectation
+from mauvecl.host.instrument.pixel_map import PixelMap
+from mauvecl.noise.poisson import SMALLEST_EXPANDED, alias_table
+from mauvecl.noise.processes import CosmicRays, Normal, Processes
+from mauvecl.noise.scene import prepare
+
+#: Sixteen groups of four; pixel i of group g has a mean for the expansion where bit i of g is set, else for a table.
+MIXED = np.array([1500.0 + 7 * g if g >> i & 1 else 300.0 + 11 * g for g in range(16) for i in range(4)])
+
+
+def detector(dark: np.ndarray | float, electrons: np.ndarray | float, read: float = 0.7, **changes) -> Expectation:
+    """One frame of 64 pixels with these means."""
+    x = toy(64, 1, read=read, **changes)
+    ones = np.ones(64)
+    return replace(x, dark_dn=dark * ones, source_electrons=electrons * ones, sky_electrons=0 * ones)
+
+
+SCENES = {
+    "joint": (detector(2225.0, 40.0, read=12.0), {}),
+    "joint, fourth power": (detector(40.0, 40.0, read=12.0), {}),
+    "priors": (detector(2225.0, 0.0, read=12.0), {"processes": Processes(qe_scale=Normal(1.0, 0.1, 0.5, 1.5))}),
+    "tables": (detector(30.0 + np.arange(64), 60.0, photon_noise="poisson"), {}),
+    "expansion": (detector(1500.0 + np.arange(64), 2000.0, photon_noise="poisson"), {}),
+    "dark by every mixture": (detector(MIXED, 0.0), {}),
+    "photons by every mixture": (detector(0.0, MIXED, photon_noise="poisson"), {}),
+    "both by every mixture": (detector(MIXED, MIXED[::-1], photon_noise="poisson"), {"recipe": "apart"}),
+    "cosmic rays": (detector(MIXED, 0.0), {"processes": Processes(CosmicRays(3000.0, electrons=(20.0, 40.0)))}),
+}
+ROWS = 50_000
+
+
+@pytest.mark.parametrize("name", SCENES)
+def test_no_two_draws_are_tied(engine: Engine, name: str) -> None:
+    """Values, squares and neighbours' products of 64 pixels in two frames, each with each: |z| < 6.5 for 73 000
+    correlations, which fails once in 1e5 seeds for each scene (half as often again for the squares' long tails)."""
+    x, how = SCENES[name]
+    values = []
+    for frame in (0, 1):
+        scene, rows = prepare([x], first_frame=frame, **how), np.empty((ROWS, x.wavelength_nm.size), np.int32)
+        with engine._scene(scene, 17) as run:
+            engine._over(0, ROWS, 256, lambda t, n, run=run, rows=rows: run.realise(t, rows[n : n + t.wanted]))
+        values.append((rows - rows.mean(axis=0)) / rows.std(axis=0))
+    z = np.hstack(values)
+    pixel = np.arange(z.shape[1])
+    features = np.hstack([z, z**2, z[:, :-1] * z[:, 1:]])
+    features = (features - features.mean(axis=0)) / features.std(axis=0)
+    first, last = np.hstack([pixel, pixel, pixel[:-1]]), np.hstack([pixel, pixel, pixel[1:]])
+    apart = (last[:, None] < first[None, :]) | (first[:, None] > last[None, :])
+    found = (features.T @ features / np.sqrt(ROWS))[apart]
+    assert found.size > 70_000
+    assert np.abs(found).max() < 6.5
+
+
+def test_pairs_go_one_way() -> None:
+    """No pair mixes tables with the expansion, and pairs of one kind are drawn as they would be alone."""
+    scene = prepare([detector(MIXED, MIXED[::-1], photon_noise="poisson")], recipe="apart")
+    for counts, mean in ((scene.dark_counts[:64], MIXED), (scene.photon_counts[0, :64], MIXED[::-1])):
+        pairs = (counts["bits"] == 0).reshape(-1, 2)
+        assert (pairs[:, 0] == pairs[:, 1]).all()
+        np.testing.assert_array_equal(pairs[:, 0], (mean >= SMALLEST_EXPANDED).reshape(-1, 2).all(axis=1))
+        # A table in place of the expansion is the same one that the mean has anywhere.
+        p = int(np.flatnonzero((counts["bits"] > 0) & (mean >= SMALLEST_EXPANDED))[0])
+        table = alias_table(mean[p])
+        start = int(counts["table"][p])
+        np.testing.assert_array_equal(scene.tables[start : start + table.entries.size], table.entries)
+    # The last of an odd number has no neighbour.
+    odd = replace(toy(65, 1, read=0.7, light=0.0), dark_dn=np.append(MIXED, 1500.0), bias_dn=np.full(65, 600.0))
+    assert prepare([odd]).dark_counts["bits"][64] == 0
+
+
+def test_a_pair_that_no_table_can_hold_is_refused() -> None:
+    x = detector(0.0, 0.0)
+    x = replace(x, dark_dn=np.where(np.arange(64) == 7, 2e8, 5.0), adc_max_dn=2**31, saturation_dn=2.0**31)
+    with pytest.raises(InputError, match="pixel 7 has a Poisson mean of 2e\\+08 in one draw beside a pixel of less"):
+        prepare([x])
+
+
+def test_an_uneven_detector_keeps_its_chi_squared(engine: Engine) -> None:
+    """The null's mean of an instrument whose dark scatters about a mean of 1000 counts, where pairs mix: it was 44.45
+    instead of 48 degrees of freedom. Five standard errors fail once in 2e6 seeds."""
+    payload = instrument(read_noise_dn=1.0, temperature_c=9.0, pixel_map=PixelMap.made_up(2048, seed=1))
+    (quiet,) = star(payload=payload, exposure=5.0)
+    n = 20_000
+    found = engine.detect(quiet, [], realisations=n, seed=3, statistics=("chi2_element",))
+    null = found.distribution("chi2_element")
+    freedom = quiet.element_wavelength_nm.size
+    assert abs(null.mean - freedom) < 5 * np.sqrt(2 * freedom / n)

@@ -1,0 +1,138 @@
+"""Words and counters at their ends, through the production kernels."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import instrument, star
+
+from mauvecl.device.engine import Engine
+from mauvecl.device.launches import Tile
+from mauvecl.host.errors import InputError
+from mauvecl.host.expectation import Expectation
+from mauvecl.noise import layout
+from mauvecl.noise import twin as reference
+from mauvecl.noise.processes import CosmicRays, Processes
+from mauvecl.noise.scene import Scene, prepare
+
+INVERSE = [pow(m, -1, 2**32) for m in (0xD2511F53, 0xCD9E8D57)]
+
+
+def unwind(words: tuple[int, int, int, int], seed: int) -> tuple[int, int, int, int]:
+    """The counter whose Philox words these are: each round is a bijection."""
+    k0, k1 = seed & 0xFFFFFFFF, seed >> 32
+    c = words
+    for r in reversed(range(10)):
+        a, b = (k0 + r * 0x9E3779B9) & 0xFFFFFFFF, (k1 + r * 0xBB67AE85) & 0xFFFFFFFF
+        # out = (high1 ^ c1 ^ a, low1, high0 ^ c3 ^ b, low0)
+        c2, c0 = c[1] * INVERSE[1] & 0xFFFFFFFF, c[3] * INVERSE[0] & 0xFFFFFFFF
+        high0, high1 = c0 * 0xD2511F53 >> 32, c2 * 0xCD9E8D57 >> 32
+        c = (c0, c[0] ^ high1 ^ a, c2, c[2] ^ high0 ^ b)
+    return c
+
+
+def place_of(words: tuple[int, int, int, int], stream: str) -> tuple[int, int, int, int]:
+    """A seed, realisation, frame and group whose words in a stream are these."""
+    for seed in range(100_000):
+        c = unwind(words, seed)
+        if c[3] >> 24 == layout.STREAMS[stream] and c[1] < 2**31:
+            return seed, c[1] << 32 | c[0], c[2], c[3] & 0xFFFFFF
+    raise AssertionError("no such place")
+
+
+def draw_one(engine: Engine, scene: Scene, index: int, seed: int) -> np.ndarray:
+    """One realisation of a scene by the production kernel."""
+    out = np.empty((1, scene.n_pixel), np.int32)
+    tile = engine._tile_at(index, 1, 4096)
+    assert isinstance(tile, Tile)
+    with engine._scene(scene, seed) as run:
+        run.realise(tile, out)
+    return out
+
+
+ENDS = [
+    (0, 0, 0, 0),
+    (2**32 - 1,) * 4,
+    (0, 2**32 - 1, 0, 2**32 - 1),
+    (2**32 - 1, 0, 1, 2**31),
+    (1, 2**31 - 1, 2**32 - 2, 2**30),
+]
+
+
+@pytest.mark.parametrize("words", ENDS)
+@pytest.mark.parametrize(
+    ("stream", "options", "how"),
+    [
+        ("noise", {}, {}),
+        ("noise", {"temperature_c": -30.0}, {}),
+        ("dark", {}, {"recipe": "apart"}),
+        ("dark", {"temperature_c": -30.0}, {"recipe": "apart"}),
+        ("photon", {"name": "mauve-electrons"}, {"recipe": "apart"}),
+        ("cosmic", {}, {"processes": Processes(cosmic_rays=CosmicRays(rate_per_cm2_s=500.0))}),
+    ],
+)
+def test_extreme_words_through_the_production_kernel(
+    engine: Engine, words: tuple[int, int, int, int], stream: str, options: dict, how: dict
+) -> None:
+    seed, index, frame, group = place_of(words, stream)
+    np.testing.assert_array_equal([int(w[0]) for w in reference.words_at([index], frame, stream, group, seed)], words)
+    options = dict(options)
+    payload = instrument(options.pop("name", "mauve"), part=True, output_max_nm=310.0, **options)
+    (x,) = star(payload=payload, exposure=5.0)
+    scene = prepare([x], first_frame=frame, first_group=group, **how)
+    raw = draw_one(engine, scene, index, seed)
+    np.testing.assert_array_equal(raw, reference.realise(scene, np.array([index], np.uint64), seed))
+    # No word gives more than 6.77 sigma of its own noise, or half the tables' 2**-33.
+    z = (raw[0, :4] - x.mean_raw_dn[:4]) / np.sqrt(x.variance_dn2[:4])
+    if stream != "cosmic":
+        assert np.abs(z).max() < 15
+    if stream == "noise" and words == (0, 0, 0, 0):
+        assert z[0] > 6.5
+
+
+@pytest.mark.parametrize("index", [2**32 - 1, 2**32, 2**40 - 1, 2**40, 2**62])
+def test_counter_boundaries(engine: Engine, index: int) -> None:
+    (x,) = star(payload=instrument(part=True, output_max_nm=320.0))
+    raw = engine.realise(x, start=index - 20, count=41, seed=2**64 - 1)
+    numbers = np.arange(index - 20, index + 21, dtype=np.uint64)
+    np.testing.assert_array_equal(raw, reference.realise(prepare([x]), numbers, 2**64 - 1))
+    assert len(np.unique(raw, axis=0)) == 41
+
+
+def wide(pixels: int) -> Expectation:
+    (x,) = star(exposure=5.0)
+    tiled = {
+        name: np.resize(getattr(x, name), pixels)
+        for name in ("source_electrons", "sky_electrons", "dark_dn", "bias_dn", "read_noise_dn", "gain_dn_per_electron")
+    }
+    element = np.arange(pixels) // 35
+    return replace(
+        x,
+        wavelength_nm=200.0 + 0.01 * np.arange(pixels),
+        element=element,
+        element_wavelength_nm=200.0 + np.arange(element[-1] + 1),
+        **tiled,
+    )
+
+
+def test_as_many_pixels_as_the_counter_holds(engine: Engine) -> None:
+    """65 536 pixels: the last ones are the twin's, no two groups are alike, statistics still fit."""
+    x = wide(65_536)
+    raw = engine.realise(x, start=2**40, count=2, seed=3)
+    scene = prepare([x])
+    index = np.array([2**40, 2**40 + 1], np.uint64)
+    for group in (0, 1, 8191, 8192, 16_382, 16_383):
+        drawn = reference.draws(scene, index, 0, group, 3)
+        one = np.ones(2, np.float32)
+        for i, p in enumerate(range(4 * group, 4 * group + 4)):
+            v = reference.analogue(scene, drawn, i, p, 0, one, one)
+            twin = reference.digitise(v, scene.edges[0, p], clip=scene.clip) + scene.base_dn[0, p]
+            np.testing.assert_array_equal(raw[:, p], twin)
+    z = (raw - x.mean_raw_dn) / np.sqrt(x.variance_dn2)
+    assert len(np.unique(z[0].reshape(-1, 4), axis=0)) == 16_384
+    found = engine.detect(x, [], realisations=4000, seed=3, statistics=("chi2",)).distribution("chi2")
+    assert abs(found.mean - 65_536) < 5 * np.sqrt(2 * 65_536 / 4000)
+    with pytest.raises(InputError, match="65540 pixels, expected at most 65536"):
+        prepare([wide(65_540)])

@@ -1,0 +1,249 @@
+"""Optional processes: each draws what it says, from a stream of its own, and moves nothing else."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scenes import instrument, star
+from scipy import stats
+
+from mauvecl.device.engine import Engine
+from mauvecl.host.errors import InputError
+from mauvecl.noise import layout
+from mauvecl.noise import twin as reference
+from mauvecl.noise.components import components
+from mauvecl.noise.processes import NONE, CosmicRays, Normal, Processes, Uniform
+from mauvecl.noise.scene import prepare
+
+N = 20_000
+
+
+def total_light(engine: Engine, processes: Processes, *, exposure: float = 5.0, mode: str = "auto") -> np.ndarray:
+    """Net DN of each realisation over its expectation, and the expectation itself."""
+    (x,) = star(magnitude=4.0, exposure=exposure)
+    raw = engine.realise(x, count=N, seed=12, processes=processes, mode=mode)
+    net = raw.sum(axis=1) - np.sum(x.n_frames * (x.bias_dn + x.dark_dn))
+    return net / x.signal_dn.sum()
+
+
+def test_a_prior_is_what_the_light_follows(engine: Engine) -> None:
+    """Summed over all pixels the light shows the factor itself: KS on 20 000, fails by chance once in 1e6."""
+    noise = total_light(engine, NONE).std()
+    found = total_light(engine, Processes(light_loss=Uniform(0.24, 0.44)))
+    low, high = (1 - 0.44) / (1 - 0.34), (1 - 0.24) / (1 - 0.34)
+    assert noise < 0.002 < (high - low) / 50
+    assert stats.kstest(found, stats.uniform(low, high - low).cdf).pvalue > 1e-6
+    found = total_light(engine, Processes(qe_scale=Normal(1.0, 0.3, 0.4, 1.6)))
+    assert stats.kstest(found, stats.truncnorm(-2, 2, 1.0, 0.3).cdf).pvalue > 1e-6
+
+
+@pytest.mark.parametrize("sd", [0.01, 0.1])
+def test_a_prior_has_its_own_moments(engine: Engine, sd: float) -> None:
+    """A normal prior with far cuts, as the light shows it: five standard errors each, by chance once in 4e5."""
+    light = total_light(engine, Processes(qe_scale=Normal(1.0, sd, 0.5, 1.5)))
+    noise = total_light(engine, NONE).var()
+    variance = light.var() - noise
+    assert abs(light.mean() - 1) < 5 * sd / np.sqrt(N)
+    assert abs(variance / sd**2 - 1) < 5 * np.sqrt(2 / N) * light.var() / variance
+    assert abs(stats.kurtosis(light)) < 5 * np.sqrt(24 / N)
+
+
+def test_jitter_shares_words_but_no_chance(engine: Engine) -> None:
+    """Frames take finer digits from each other's words: no correlation; five standard errors, by chance once in 2e5."""
+    (x,) = star(magnitude=2.0, exposure=5.0)
+    jitter = Processes(jitter=Normal(0.1, 0.02, 0.0, 0.5))
+    lost = []
+    for frame in range(4):
+        raw = engine.realise(x, count=5000, seed=12, processes=jitter, first_frame=frame)
+        lost.append((raw.astype(float) - x.mean_raw_dn).sum(axis=1))
+    for values in (np.array(lost), np.array(lost) ** 2):
+        found = np.corrcoef(values)[np.triu_indices(4, 1)]
+        assert np.abs(found).max() < 5 / np.sqrt(5000)
+
+
+def test_the_detector_temperature_moves_the_dark(engine: Engine) -> None:
+    (x,) = star(magnitude=30.0, exposure=5.0)
+    raw = engine.realise(x, count=N, seed=3, processes=Processes(detector_temperature=Uniform(13.0, 21.0)))
+    dark = (raw.sum(axis=1) - x.bias_dn.sum()) / x.dark_dn.sum()
+    temperature = 21.0 + np.log(dark) / 0.0684
+    # The dark's own noise scatters the temperature by 0.01 C.
+    assert stats.kstest(temperature, stats.uniform(13.0, 8.0).cdf).statistic < 0.005 + 2.6 / np.sqrt(N)
+    # Its variance follows: where it is coldest, it is that of the colder dark.
+    cold = raw[temperature < 13.4].astype(float)
+    share = np.exp(0.0684 * (13.2 - 21.0))
+    wanted = x.dark_dn * share + x.read_noise_dn**2 + 1 / 12
+    between = np.var(np.exp(0.0684 * (temperature[temperature < 13.4] - 21.0))) * x.dark_dn**2
+    ratio = np.mean(cold.var(axis=0) / (wanted + between))
+    assert abs(ratio - 1) < 0.01 + 5 * np.sqrt(2 / cold.size)
+
+
+def test_jitter_is_drawn_for_every_frame(engine: Engine) -> None:
+    """One frame loses a uniform share; ten lose the mean of ten, stacked or frame by frame: six standard errors."""
+    most = Processes(jitter=Uniform(0.0, 0.05))
+    one = total_light(engine, most)
+    assert stats.kstest(one, stats.uniform(0.95, 0.05).cdf).statistic < 0.02 + 2.6 / np.sqrt(N)
+    for mode in ("stacked", "frames"):
+        ten, quiet = (total_light(engine, p, exposure=50.0, mode=mode) for p in (most, NONE))
+        assert abs(ten.mean() - 0.975) < 6 * ten.std() / np.sqrt(N)
+        own = ten.var() - quiet.var()
+        assert abs(own / (0.05**2 / 12 / 10) - 1) < 6 * np.sqrt(2 / N) * ten.var() / own
+
+
+def test_cosmic_rays(engine: Engine) -> None:
+    """Counts of hit pixels and their charge, against the compound distribution they are drawn from."""
+    rays = CosmicRays(rate_per_cm2_s=40.0)
+    (x,) = star(exposure=5.0)
+    clean, hit = (engine.realise(x, count=2000, seed=9, processes=p) for p in (NONE, Processes(cosmic_rays=rays)))
+    extra = hit.astype(int) - clean.astype(int)
+    rate = 40.0 * 0.057 / 2048 * 5.0
+    hits = np.count_nonzero(extra)
+    expected = extra.size * -np.expm1(-rate)
+    assert abs(hits - expected) < 5 * np.sqrt(expected)
+    electrons = extra[extra > 0] / x.gain_dn_per_electron[0]
+    assert extra.min() == 0
+    # Single hits, 500 to 1000; the second of a pair lies beyond. Rounding to DN is one electron.
+    single = electrons[electrons < 1003]
+    assert stats.kstest(single, stats.uniform(499, 1002).cdf).statistic > 0.1
+    assert stats.kstest(single, stats.uniform(499.5, 501).cdf).pvalue > 1e-6
+    assert abs(electrons.size - single.size - expected * rate / 2) < 6 * np.sqrt(expected * rate / 2)
+
+
+def test_the_charge_of_a_stack() -> None:
+    """Mean and variance of a compound Poisson sum: rate times the first two moments of one hit."""
+    rays = CosmicRays(rate_per_cm2_s=3000.0)
+    for seconds in (5.0, 50.0, 600.0):
+        p = rays.charge(seconds)
+        e = np.arange(p.size)
+        rate = 3000.0 * 0.057 / 2048 * seconds
+        one = np.arange(500, 1001)
+        assert abs(p.sum() - 1) < 1e-11
+        np.testing.assert_allclose(p @ e, rate * one.mean(), rtol=1e-9)
+        np.testing.assert_allclose(p @ e**2 - (p @ e) ** 2, rate * np.mean(one**2), rtol=1e-8)
+        # The Fourier transform's own rounding.
+        np.testing.assert_allclose(p[0], np.exp(-rate), rtol=1e-9, atol=1e-15)
+    weighted = CosmicRays(electrons=(2, 4), weights=(1.0, 0.0, 3.0), rate_per_cm2_s=100.0).charge(5.0)
+    assert weighted[3] < 1e-15 < weighted[2] < weighted[4]
+
+
+def test_one_process_moves_no_other(engine: Engine) -> None:
+    """Without its own effect on a pixel, a process changes no bit of what the others drew."""
+    (x,) = star(exposure=5.0)
+    clean = engine.realise(x, count=200, seed=4)
+    # Hits only: pixels without one are as they were.
+    hit = engine.realise(x, count=200, seed=4, processes=Processes(cosmic_rays=CosmicRays()))
+    assert np.mean(hit != clean) < 1e-3
+    # A prior of one value is no prior, but for the rounding of its arithmetic.
+    same = Processes(light_loss=Uniform(0.34, 0.34), detector_temperature=Uniform(21.0, 21.0))
+    still = engine.realise(x, count=200, seed=4, processes=same)
+    assert np.mean(still != clean) < 1e-3
+    assert np.abs(still.astype(int) - clean).max() <= 1
+
+
+@pytest.mark.parametrize(
+    ("make", "sentence"),
+    [
+        (lambda: Uniform(2.0, 1.0), "from 2 to 1, expected low <= high"),
+        (lambda: Normal(0.0, -1.0, 0.0, 1.0), "expected sd > 0"),
+        (lambda: CosmicRays(rate_per_cm2_s=-1.0), "cosmic rays of -1 per cm"),
+        (lambda: CosmicRays(electrons=(900.0, 100.0)), "900 to 100 electrons"),
+        (lambda: CosmicRays(electrons=(1, 3), weights=(1.0,)), "1 weights .* expected 3"),
+        (lambda: prepare(star(), processes=Processes(jitter=Uniform(0.0, 0.9))), "prior of jitter runs from 0 to 0.9"),
+        (lambda: prepare(star(), processes=Processes(light_loss=Uniform(-0.1, 0.5))), "prior of light_loss"),
+        (
+            lambda: prepare(
+                star(payload=instrument(read_noise_dn=0.1), exposure=5.0), processes=Processes(jitter=Uniform(0, 0.05))
+            ),
+            "jitter varies within a run, and the noise of G2V cannot be drawn jointly",
+        ),
+        (
+            lambda: prepare(
+                star(magnitude=3.0, exposure=80_000.0), "stacked", processes=Processes(qe_scale=Uniform(0.5, 1.5))
+            ),
+            r"the priors carry pixel \d+ of G2V",
+        ),
+    ],
+)
+def test_what_cannot_be_is_refused(make, sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        make()
+
+
+@pytest.mark.parametrize("recipe", ["joint", "apart"])
+@pytest.mark.parametrize("name", ["mauve", "mauve-electrons"])
+def test_components_add_up_and_scatter_as_they_should(engine: Engine, name: str, recipe: str) -> None:
+    """A spectrum taken apart: its parts sum to the engine's count, and each has its own moments."""
+    (x,) = star(payload=instrument(name), exposure=50.0)
+    processes = Processes(cosmic_rays=CosmicRays()) if recipe == "joint" else NONE
+    table = components(x, realisation=7, seed=5, recipe=recipe, processes=processes)
+    raw = engine.realise(x, start=7, count=1, seed=5, recipe=recipe, processes=processes)[0]
+    np.testing.assert_array_equal(table["raw"].value, raw)
+    names = [c for c in table.colnames if c not in ("wavelength", "raw", "net")]
+    np.testing.assert_allclose(sum(table[c].value for c in names), raw, rtol=0, atol=1e-6)
+    # Rounding of a stack changes at most half a DN, beyond the float32 arithmetic of the draw.
+    assert np.abs(table["digitisation"].value).max() < 0.502
+    n, size = x.n_frames, x.wavelength_nm.size
+    variances = {
+        "photon_noise": x.gain_dn_per_electron * x.signal_dn,
+        "dark": n * x.dark_variance_dn2,
+        "read_noise": n * x.read_noise_dn**2 + (n - 1) / 12,
+    }
+    for part, variance in variances.items():
+        mean = n * x.dark_dn if part == "dark" else 0.0
+        z = (table[part].value - mean) / np.sqrt(variance)
+        assert abs(z.mean()) < 5 / np.sqrt(size)
+        assert abs(z.var() - 1) < 5 * np.sqrt(2 / size)
+    # Independent of each other, as they were before they were added.
+    z = [table[p].value - (n * x.dark_dn if p == "dark" else 0.0) for p in variances]
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        assert abs(np.corrcoef(z[a], z[b])[0, 1]) < 5 / np.sqrt(size)
+    steps = table["dark"].value / x.dark_step_dn
+    np.testing.assert_allclose(steps, np.rint(steps), atol=1e-6)
+
+
+def test_no_two_draws_share_a_counter(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every counter that a run with all processes visits, listed: none twice, in any realisation, frame or exposure."""
+    seen: list[np.ndarray] = []
+    philox = reference.philox
+
+    def recording(counter, seed: int):
+        c = np.broadcast_arrays(*(np.asarray(word, np.uint64) for word in counter))
+        seen.append(np.stack(c, axis=-1).reshape(-1, 4))
+        return philox(counter, seed)
+
+    monkeypatch.setattr(reference, "philox", recording)
+    everything = Processes(
+        cosmic_rays=CosmicRays(),
+        jitter=Uniform(0.0, 0.05),
+        detector_temperature=Uniform(13.0, 21.0),
+        light_loss=Uniform(0.3, 0.4),
+        pointing_loss=Uniform(0.0, 0.05),
+        qe_scale=Uniform(0.7, 1.3),
+    )
+    payload = instrument(part=True, output_max_nm=310.0)
+    index = np.array([0, 1, 2**32 - 1, 2**32, 2**40], np.uint64)
+    cases = [
+        ({"exposure": 20.0, "payload": payload}, {"mode": "frames", "processes": everything}),
+        ({"exposure": 20.0, "payload": payload}, {"recipe": "apart"}),
+        ({"exposure": 10.0, "payload": instrument("mauve-electrons", output_max_nm=205.0)}, {"recipe": "apart"}),
+    ]
+    for observation, how in cases:
+        scene = prepare(star(**observation), **how)
+        seen.clear()
+        for frame in range(scene.n_draws):
+            for exposure in (0, layout.REFERENCE):
+                for group in range(len(scene.pixels) // 4):
+                    reference.draws(scene, index, frame, group, 1, exposure=exposure)
+        for name, _ in scene.modulations:
+            if name != "jitter":
+                reference.words_at(index, 0, name, 0, 1)
+        if "processes" in how:
+            for exposure in (0, layout.REFERENCE):
+                for block in range(scene.n_frames // 4):
+                    reference.words_at(index, block, "jitter", 0, 1, exposure)
+        counters = np.concatenate(seen)
+        assert len(np.unique(counters, axis=0)) == len(counters)
+    # Streams of both exposures are distinct bytes, and the groups of the largest detector fit below them.
+    streams = [s + e for s in layout.STREAMS.values() for e in (0, layout.REFERENCE)]
+    assert len(set(streams)) == len(streams)
+    assert max(streams) < 256
+    assert 65_536 // 4 <= 2**24

@@ -1,0 +1,133 @@
+"""Near and beyond saturation: what is drawn, and the closed forms of it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scenes import instrument, star
+
+from mauvecl.device.engine import Engine
+from mauvecl.host.expectation import Expectation
+from mauvecl.noise import twin as reference
+from mauvecl.noise.processes import Normal, Processes
+from mauvecl.noise.scene import prepare
+
+N = 4000
+STATISTICS = ("chi2", "chi2_element", "matched", "uv_excess")
+
+
+def bright(seed: int) -> tuple[Expectation, Expectation]:
+    """A star whose brightest pixel lies around saturation, and a flare that carries more of them there."""
+    some = np.random.default_rng(seed)
+    frames = int(some.choice([1, 1, 2, 5]))
+    frame_s = float(some.uniform(3.0, 7.0))
+    payload = instrument(part=True, output_min_nm=290.0, output_max_nm=350.0, frame_s=frame_s)
+    name = str(some.choice(["G2V", "K3V", "B2IV"]))
+    quiet, flare = star(name, 5.0, amplitudes=(float(10 ** some.uniform(-3, -0.3)),), exposure=frames * frame_s,
+                        payload=payload)  # fmt: skip
+    # The quiescent star's own brightest pixel just below saturation, or well below.
+    room = quiet.ceiling_dn - quiet.bias_dn - quiet.dark_dn
+    sd = np.sqrt(quiet.gain_dn_per_electron * room)
+    scale = float(np.min((room + some.choice([-8.0, -1.0, 0.5]) * sd) / (quiet.light_dn / frames)))
+    found = [replace(x, source_electrons=scale * x.source_electrons, messages=()) for x in (quiet, flare)]
+    return found[0], found[1]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_closed_forms_are_those_of_what_is_drawn(engine: Engine, seed: int) -> None:
+    """Means, variances and statistics of random bright stars and flares, in single frames and sums of some.
+
+    Five standard errors for 8 statistics, six for 198 pixels: by chance once in 1e5 seeds.
+    """
+    quiet, flare = bright(seed)
+    assert flare.cut_share.max() > 0
+    for x in (quiet, flare):
+        raw = engine.realise(x, count=N, seed=4).astype(np.float64)
+        assert raw.max() <= x.n_frames * x.highest_dn == x.n_frames * 59_578
+        sd = np.sqrt(x.variance_dn2)
+        # A third of a DN for values too rare to have a standard error.
+        assert np.all(np.abs(raw.mean(axis=0) - x.recorded_dn) < 6 * sd / np.sqrt(N) + 1 / 3)
+        square = (raw - x.recorded_dn) ** 2
+        some = x.cut_share < 0.9  # rarer values than these have a variance too few realisations know
+        error = square.std(axis=0)[some] / np.sqrt(N)
+        assert np.all(np.abs(square.mean(axis=0) - x.variance_dn2)[some] < 6 * error)
+        np.testing.assert_allclose(x.signal_dn, x.recorded_dn - x.n_frames * (x.bias_dn + x.dark_dn), rtol=1e-9)
+    found = engine.detect(quiet, [flare], realisations=N, seed=4, statistics=STATISTICS[:3])
+    for statistic in found.statistics:
+        for k in (None, 0):
+            seen, form = found.distribution(statistic, k), found.closed_form(statistic, k)
+            # A value is known to a step of its grid, 1/2048 of the null's standard deviation, and to float32's sums.
+            known = 1e-3 * found.closed_form(statistic).std + 1e-6 * abs(form.mean)
+            assert abs(seen.mean - form.mean) < 5 * seen.std / np.sqrt(N) + known
+
+
+def test_the_twin_cuts_off_alike(engine: Engine) -> None:
+    """Counts of frames cut off, and rows, equal to the twin's; as often as the closed form says, to 5 sigma."""
+    quiet, flare = bright(1)
+    index = np.arange(64, dtype=np.uint64)
+    for x in (quiet, flare):
+        raw, cut = engine.realise_and_count(x, count=64, seed=9, mode="frames")
+        scene = prepare([x], "frames")
+        np.testing.assert_array_equal(raw, reference.realise(scene, index, 9))
+        np.testing.assert_array_equal(cut, reference.clipped(scene, index, 9).sum(axis=(1, 2)))
+        counts = engine.snr(x, realisations=N, seed=9, mode="frames").counts.clipped[:, 1]
+        trials = N * x.n_frames
+        spread = np.sqrt(trials * x.cut_share * (1 - x.cut_share)) + 1
+        assert np.abs(counts - trials * x.cut_share).max() < 5 * spread.max()
+
+
+def test_priors_that_carry_light_to_saturation_are_drawn_frame_by_frame(engine: Engine) -> None:
+    """A stack cannot be cut off: what the prior may reach decides, not the mean."""
+    quiet, _ = bright(1)
+    stack = replace(quiet, n_frames=4, source_electrons=0.5 * quiet.source_electrons)
+    assert not prepare([stack]).frames
+    brighter = Processes(qe_scale=Normal(1.5, 0.5, 0.5, 4.0))
+    assert prepare([stack], processes=brighter).frames
+    assert engine.realise(stack, count=2000, seed=2, processes=brighter).max() == 4 * 59_578
+
+
+def test_signal_to_noise_is_that_of_what_is_recorded(engine: Engine) -> None:
+    """The formula's S/N of pixels deep in saturation is the simulated one; five standard errors and the root's bend."""
+    quiet, flare = bright(1)
+    for x in (quiet, flare):
+        found = engine.snr(x, realisations=N, seed=3).pixel
+        gap = np.abs(found["mean"] - found["expected"])
+        assert np.all(gap < 5 * found["std"] / np.sqrt(N) + 0.02 * np.maximum(found["std"], 0.05))
+        budget = x.noise_budget()
+        np.testing.assert_allclose(x.signal_dn / budget["total"].value, x.snr(), rtol=1e-12)
+
+
+def test_a_flare_that_saturates_every_pixel_has_no_number(engine: Engine) -> None:
+    """Its values are those of saturation alone: NaN and a sentence, beside another flare's numbers."""
+    quiet, flare = bright(1)
+    blinding = replace(flare, source_electrons=flare.source_electrons + 2e5, name="blinding")
+    found = engine.detect(quiet, [flare, blinding], realisations=N, seed=4, statistics=("chi2", "matched"))
+    assert found.blinding == (1,)
+    for statistic in found.statistics:
+        seen, nothing = found.detection_probability(0.03, statistic)
+        assert 0 <= seen.value <= 1
+        assert np.isnan([nothing.value, nothing.low, nothing.high]).all()
+    table = found.table(0.03)
+    of_flare = ("expected", "mean", "std", "reduced", "probability", "low", "high", "closed_form_probability")
+    for name in of_flare:
+        assert np.isfinite(table[name][:2]).all()
+        assert np.isnan(table[name][2:]).all()
+    assert found.messages == (
+        f"SATURATED: flare 2 saturates every pixel of {quiet.name} that counts: what is recorded no longer depends on "
+        "the flare, and no number is given.",
+    )
+
+
+def test_what_saturates_is_told() -> None:
+    """How many pixels, and in what share of exposures; at times where no mean is saturated."""
+    from mauvecl.host.expectation import _saturation
+
+    quiet, flare = bright(1)
+    (often,) = _saturation(flare)
+    assert often.startswith("SATURATED: 8 of 197 pixels at ")
+    assert "at least one in 100 % of exposures" in often
+    (rarely,) = _saturation(quiet)
+    assert rarely.startswith("SATURATED at times: pixels of ")
+    assert _saturation(replace(quiet, source_electrons=0.9 * quiet.source_electrons)) == ()

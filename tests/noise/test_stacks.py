@@ -1,0 +1,133 @@
+"""Stacks against their frames: where rounding is not noise, frames are drawn one by one."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import exact
+import numpy as np
+import pytest
+from scenes import instrument, star
+from scipy import optimize
+
+from mauvecl.device.engine import Engine
+from mauvecl.device.selftest import toy
+from mauvecl.host.errors import InputError
+from mauvecl.host.expectation import Expectation
+from mauvecl.noise.cumulants import Cumulants, stack_is_exact
+from mauvecl.noise.processes import Processes, Uniform
+from mauvecl.noise.scene import prepare
+
+#: By exact convolution no stack that is allowed is told from its frames sooner, in draws of one pixel.
+SOONEST = 4e13
+
+
+def quiet(read: float, frames: int, *, dark: float = 0.0, light: float = 0.0, gain: float = 0.6, **kind) -> Expectation:
+    """Eight pixels whose bias lies at different places in a DN."""
+    x = toy(8, frames, read=read, dark=dark, light=light, **kind)
+    full = np.ones(8)
+    return replace(
+        x,
+        bias_dn=600.0 + np.arange(8) / 8,
+        source_electrons=light * full,
+        sky_electrons=0 * full,
+        gain_dn_per_electron=gain * full,
+    )
+
+
+def both(x: Expectation, pixel: int) -> tuple[np.ndarray, np.ndarray, int]:
+    """Exact probabilities of the exposure's whole DN, frame by frame and as a stack, and the DN they start from."""
+    one, n = Cumulants.of(x, 1), x.n_frames
+    read, dark, light = one.gaussian[pixel], x.dark_dn[pixel] / x.dark_step_dn[pixel], x.source_electrons[pixel]
+    poisson = [(dark, float(x.dark_step_dn[pixel]))]
+    if x.photon_noise == "poisson":
+        poisson.append((light, float(x.gain_dn_per_electron[pixel])))
+    half = int(9 * np.sqrt(x.variance_dn2[pixel])) + 6
+    mean = float(x.mean_raw_dn[pixel])
+    low = int(n * mean) - half
+    frames = exact.counts(read, poisson, mean, low, 2 * half, n)
+    together = [(n * count, step) for count, step in poisson]
+    return frames, exact.counts(n * read + (n - 1) / 12, together, n * mean, low, 2 * half), low
+
+
+def test_the_worst_stack_that_is_allowed() -> None:
+    """A search over read noise, counts, gain, frames and phase for what tells a stack from its frames soonest."""
+    tried = 0
+
+    def merit(point: np.ndarray) -> float:
+        nonlocal tried
+        read, dark, light, gain, frames = 10.0 ** point[:5]
+        kind = {
+            "unit": "electrons" if point[5] > 0.5 else "DN",
+            "photon_noise": "poisson" if point[6] > 0.5 else "gaussian",
+        }
+        x = quiet(read, round(frames), dark=dark, light=light if point[2] > -2 else 0.0, gain=gain, **kind)
+        x = replace(x, bias_dn=600.0 + point[7] * np.ones(8))
+        if not stack_is_exact(Cumulants.of(x, 1), x)[0]:
+            return 30.0
+        tried += 1
+        p, q, _ = both(x, 0)
+        return float(np.log10(exact.draws_to_tell(p, q)))
+
+    bounds = [(-0.8, 0.8), (-3.0, 1.5), (-2.2, 2.0), (-1.5, 0.5), (np.log10(2), 2.0), (0, 1), (0, 1), (0, 1)]
+    found = optimize.differential_evolution(merit, bounds, rng=1, popsize=10, maxiter=25, polish=False)
+    assert tried > 300
+    assert SOONEST < 10**found.fun < 3 * SOONEST
+
+
+def test_random_stacks_of_quiet_frames() -> None:
+    """Where `auto` stacks, mean, variance and shape are those of the frames; where they are not, it draws frames."""
+    generator = np.random.default_rng(14)
+    stacked = wrong = 0
+    for _ in range(150):
+        kind = {
+            "unit": generator.choice(["DN", "electrons"]),
+            "photon_noise": generator.choice(["gaussian", "poisson"]),
+            "dark": float(generator.choice([0.0, 0.1, 3.0, 100.0])),
+            "light": float(generator.choice([0.0, 0.2, 20.0])),
+            "gain": float(generator.choice([0.05, 0.6, 1.0])),
+        }
+        x = quiet(float(10 ** generator.uniform(-1.0, 1.2)), int(generator.integers(2, 60)), **kind)
+        told = [exact.draws_to_tell(*both(x, p)[:2]) for p in range(8)]
+        frames = prepare([x]).frames
+        stacked += not frames
+        wrong += min(told) < 1e12
+        assert frames or min(told) > SOONEST
+        if frames:
+            with pytest.raises(InputError, match="mode = 'stacked' takes rounding for noise"):
+                prepare([x], "stacked")
+    assert stacked > 20
+    assert wrong > 20
+
+
+def test_a_nearly_noiseless_detector(engine: Engine) -> None:
+    """Read noise .15 DN, no dark, 20 frames: the stack's means were off by .38 standard deviations, its variance 118
+    times too large. Pearson's five sigma of each pixel's mean and variance: fails once in 1e5 seeds."""
+    x = quiet(0.15, 20)
+    rows = 40_000
+    assert prepare([x]).frames
+    raw = engine.realise(x, count=rows, seed=5).astype(float)
+    for pixel in range(8):
+        p, _, low = both(x, pixel)
+        dn = low + np.arange(p.size)
+        mean = p @ dn
+        variance, fourth = (p @ (dn - mean) ** k for k in (2, 4))
+        assert abs(raw[:, pixel].mean() - mean) < 5 * np.sqrt(variance / rows) + 1e-9
+        spread = np.sqrt(max(fourth - variance**2, 0.0) / rows)
+        assert abs(((raw[:, pixel] - mean) ** 2).mean() - variance) < 5 * spread + 1e-9
+
+
+def test_priors_may_take_the_noise_away() -> None:
+    """Gaussian photons blur the rounding; the least light that a prior leaves decides."""
+    x = quiet(0.1, 100, light=60.0)
+    assert not prepare([x]).frames
+    assert prepare([x], processes=Processes(qe_scale=Uniform(0.01, 1.0))).frames
+
+
+def test_the_payload_is_stacked() -> None:
+    """As it is, its read noise of 12 DN makes noise of all rounding."""
+    for name in ("mauve", "mauve-electrons"):
+        for temperature in (-40.0, 21.0):
+            for exposure in (10.0, 500.0):
+                payload = instrument(name, part=True, temperature_c=temperature)
+                assert not prepare(star(payload=payload, exposure=exposure)).frames

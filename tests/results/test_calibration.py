@@ -1,0 +1,84 @@
+"""What a sceptic would run: in random scenes, false alarms come as often as the threshold says."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from mauvecl.device.engine import Engine
+from mauvecl.host.expectation import expect
+from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.host.sky.zodiacal import Sky
+from mauvecl.host.stars.source import Source
+from mauvecl.statistics.definitions import STATISTICS
+
+SCENES = 200
+#: Of the thresholds, and again of the false alarms counted with other draws.
+N = 300_000
+FAPS = (1e-2, 1e-3, 1e-4)
+STARS = ("B2IV", "A0V", "F5V", "G2V", "K3V", "K5V", "M0V")
+
+
+def scene(number: int) -> tuple:
+    """A star, magnitude, exposure, temperature, sky, instrument and 12 nm of spectrum, all at random."""
+    generator = np.random.default_rng([2026, number])
+    first = generator.uniform(200.0, 330.0)
+    payload = Instrument.load(str(generator.choice(["mauve", "mauve-electrons"]))).with_(
+        temperature_c=float(generator.uniform(-10.0, 25.0)),
+        output_min_nm=float(first),
+        output_max_nm=float(first + 12.0),
+    )
+    source = Source.from_library(str(generator.choice(STARS))).at_magnitude(float(generator.uniform(3.0, 10.0)))
+    sky = Sky.of_brightness(float(generator.uniform(18.0, 23.0)))
+    exposure = 5.0 * int(generator.integers(1, 60))
+    return tuple(
+        expect(s, payload, exposure=exposure, sky=sky)
+        for s in (source, source.flaring(float(generator.uniform(0.01, 1.0))))
+    )
+
+
+def test_false_alarms_come_as_often_as_they_should(engine: Engine) -> None:
+    """Eighteen sums over 200 scenes, and their scatter; both together fail by chance once in 1e6 runs.
+
+    A threshold is an order statistic of N null draws, so that the number of N fresh ones beyond it is beta-binomial.
+    """
+    z = {(s, fap): [] for s in STATISTICS for fap in FAPS}
+    drawn_frames = 0
+    for number in range(SCENES):
+        quiet, flare = scene(number)
+        first, fresh = (
+            engine.detect(
+                quiet,
+                [flare],
+                realisations=N,
+                seed=seed,
+                statistics=tuple(STATISTICS),
+                # A few frames are drawn one by one, rounded and clipped each.
+                mode="frames" if quiet.n_frames <= 5 else "auto",
+            )
+            for seed in (2 * number, 2 * number + 1)
+        )
+        drawn_frames += first.scene.frames
+        for statistic in STATISTICS:
+            ours, theirs = first.distribution(statistic), fresh.distribution(statistic)
+            for fap in FAPS:
+                cut = ours.edge_with_at_most(int(fap * N))
+                # Whole bins: the threshold's own count, which is at most fap N.
+                k = ours.above(cut)
+                expected = N * (k + 0.5) / (N + 1)
+                z[(statistic, fap)].append((theirs.above(cut) - expected) / np.sqrt(2 * expected))
+    # Both ways of drawing are among the scenes.
+    assert 0 < drawn_frames < SCENES
+    tests = 2 * len(z)
+    for values in z.values():
+        total = np.sum(values) / np.sqrt(SCENES)
+        assert 2 * stats.norm.sf(abs(total)) > 1e-6 / tests
+        scatter = stats.chi2.cdf(np.sum(np.square(values)), SCENES)
+        assert 2 * min(scatter, 1 - scatter) > 1e-6 / tests
+
+
+@pytest.mark.parametrize("number", [0, 1])
+def test_the_scenes_differ(number: int) -> None:
+    a, b = scene(number)[0], scene(number + 1)[0]
+    assert a.exposure_s != b.exposure_s or a.wavelength_nm[0] != b.wavelength_nm[0]

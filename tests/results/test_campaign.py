@@ -1,0 +1,78 @@
+"""Campaigns: bounds, independence, overlap, and what a detection says of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from mauvecl.answers.detect import detect
+from mauvecl.device.engine import Engine
+from mauvecl.host.errors import InputError
+from mauvecl.results.campaign import campaign
+from mauvecl.study.study import Study
+
+
+def test_a_day_of_single_frames() -> None:
+    found = campaign(1e-5, 17_280)
+    assert found.tests == 17_280
+    assert found.independent == pytest.approx(1 - (1 - 1e-5) ** 17_280)
+    assert found.at_most == pytest.approx(0.1728)
+    assert found.overlapping is None
+
+
+@pytest.mark.parametrize(("stack", "step"), [(2, 1), (10, 1), (10, 5)])
+def test_overlap_lies_between_the_bounds(stack: int, step: int) -> None:
+    """Overlapping stacks alarm together: less often than independent ones, more often than stacks end to end."""
+    found, apart = campaign(1e-3, 600, stack, step=step), campaign(1e-3, 600, stack)
+    assert found.overlapping is not None
+    assert found.tests == (600 - stack) // step + 1
+    assert found.overlapping.low < found.independent < found.at_most
+    assert found.overlapping.high > apart.independent
+
+
+def test_two_overlapping_stacks_exactly() -> None:
+    """Two stacks of two frames that share one: the bivariate normal with correlation one half."""
+    found = campaign(0.05, 3, 2, step=1)
+    cut = stats.norm.isf(0.05)
+    both = stats.multivariate_normal([0, 0], [[1, 0.5], [0.5, 1]]).cdf([cut, cut])
+    assert found.tests == 2
+    assert found.overlapping is not None
+    # A 95 % interval, widened to four standard errors.
+    assert abs(found.overlapping.value - (1 - both)) < 4 * np.sqrt(both * (1 - both) / 20_000)
+
+
+def test_long_campaigns_are_joined_from_stretches() -> None:
+    """Ten times the frames: the chance of no alarm to the tenth power, to four standard errors."""
+    one, ten = campaign(1e-5, 40_005, 10, step=1), campaign(1e-5, 400_050, 10, step=1, seed=2)
+    assert one.overlapping is not None
+    assert ten.overlapping is not None
+    rate = [-np.log1p(-o.value) / n for o, n in ((one.overlapping, one.tests), (ten.overlapping, ten.tests))]
+    # Some 4096 x 20 000 x 1e-5 / clustering alarms are drawn.
+    assert abs(rate[0] / rate[1] - 1) < 4 * np.sqrt(2 / (20_000 * 4096 * rate[0]))
+
+
+@pytest.mark.parametrize(
+    ("fap", "frames", "stack", "step"), [(0.0, 10, 1, 1), (0.1, 10, 20, 1), (0.1, 10, 2, 3), (0.1, 10, 2, 0)]
+)
+def test_impossible_campaigns_are_refused(fap: float, frames: int, stack: int, step: int) -> None:
+    with pytest.raises(InputError, match="expected"):
+        campaign(fap, frames, stack, step=step)
+
+
+def test_a_detection_tells_both(engine: Engine) -> None:
+    study = Study.build(
+        {
+            "star": [{"library": "G2V", "magnitude": 7.4}],
+            "flare": {"amplitudes": [0.1]},
+            "run": {"realisations": 20_000, "fap": 0.01, "statistics": ["matched"]},
+            "campaign": {"frames": 17_280, "step": 1},
+        },
+        "test",
+    )
+    said = [m for m in detect(study, engine).messages if "campaign" in m]
+    assert len(said) == 1
+    assert "17271 tests" in said[0]
+    assert "at 0.01 per test" in said[0]
+    assert "with the overlap of its stacks" in said[0]
+    assert Study.build(study.model_dump(), "again") == study

@@ -1,0 +1,290 @@
+"""Detection: calibrated nulls, probabilities against closed forms, inversions, and honest refusals."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scenes import instrument, star
+from scipy import stats
+
+from mauvecl.device.engine import Engine
+from mauvecl.host.errors import InputError
+from mauvecl.host.expectation import expect
+from mauvecl.host.sky.zodiacal import Sky
+from mauvecl.host.stars.source import Source
+from mauvecl.results import twin as reference_sums
+from mauvecl.results.detection import Detection
+from mauvecl.results.roc import Roc
+from mauvecl.results.tally import Distribution, Grid, Tally
+from mauvecl.statistics.definitions import STATISTICS, Linear, matched_weights
+
+N = 1_000_000
+#: The paper's G2V star, with flares around the edge of detection for one statistic or another.
+AMPLITUDES = (0.03, 0.081, 0.15, 0.24)
+
+
+@pytest.fixture(scope="module")
+def found(engine: Engine) -> Detection:
+    quiet, *flares = star(amplitudes=AMPLITUDES)
+    return engine.detect(quiet, flares, realisations=N, seed=20, statistics=tuple(STATISTICS))
+
+
+def ks_probability(d: Distribution, sf: object) -> float:
+    """Kolmogorov-Smirnov at edges of the filled bins, 32 to a standard deviation."""
+    filled = np.flatnonzero(d.counts)
+    # The last edge, too: all values in one bin are no distribution.
+    edges = np.asarray(d.edge(np.unique(np.append(np.arange(filled[0], filled[-1] + 2, 16), filled[-1] + 1))))
+    ours = np.array([d.above(x) / d.n for x in edges])
+    theirs = np.array([sf(float(x)) for x in edges])
+    return float(stats.kstwo.sf(np.abs(ours - theirs).max(), d.n))
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+def test_the_null_is_its_closed_form(found: Detection, statistic: str) -> None:
+    """At 1e6 realisations of a star where Gaussian limits hold; fails by chance once in 1e6 seeds."""
+    d = found.distribution(statistic)
+    # The smoothed sum is a generalised chi-squared, which test_smoothing.py looks at.
+    exact = stats.norm() if statistic in ("matched", "uv_excess") else stats.chi2(found.dof(statistic))
+    exact = found.closed_form(statistic) if statistic == "paper" else exact
+    assert ks_probability(d, exact.sf) > 1e-6
+    assert d.far.n == 0
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+@pytest.mark.parametrize("flare", range(len(AMPLITUDES)))
+def test_a_flare_follows_its_closed_form(found: Detection, statistic: str, flare: int) -> None:
+    """The whole distribution under a flare, binned on its own grid: the same test."""
+    assert ks_probability(found.distribution(statistic, flare), found.closed_form(statistic, flare).sf) > 1e-6
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+@pytest.mark.parametrize("fap", [1e-2, 1e-3])
+def test_detection_probabilities_agree_with_the_closed_form(found: Detection, statistic: str, fap: float) -> None:
+    """Within 4 standard errors, binomial and of the threshold: 48 values, one chance failure in 500 seeds at most."""
+    for flare, p in enumerate(found.detection_probability(fap, statistic)):
+        theory = found.closed_form(statistic, flare)
+        null = found.closed_form(statistic, template=flare)
+        cut = null.isf(fap)
+        exact = theory.sf(cut)
+        # How the probability moves when the simulated threshold errs by its own standard error.
+        shifted = theory.sf(null.isf(fap + np.sqrt(fap * (1 - fap) / N)))
+        error = np.hypot(np.sqrt(exact * (1 - exact) / N), shifted - exact)
+        # A bin is 1/512 of a standard deviation, and the threshold its upper edge.
+        grain = exact - theory.sf(cut + null.std / 512)
+        assert abs(p.value - exact) < 4 * error + grain + 3 / N
+        assert p.low <= p.value <= p.high
+
+
+def test_the_paper_flares_have_an_order(found: Detection) -> None:
+    """More flare is never harder to see, and the right template is never beaten (Neyman & Pearson)."""
+    probability = {s: [p.value for p in found.detection_probability(1e-3, s)] for s in STATISTICS}
+    for values in probability.values():
+        assert all(a <= b + 1e-3 for a, b in pairwise(values))
+    for statistic in set(STATISTICS) - {"matched"}:
+        assert all(m >= p - 1e-3 for m, p in zip(probability["matched"], probability[statistic], strict=True))
+    # Fewer numbers, less noise in their sum: elements see the smallest flare better than pixels do.
+    assert probability["chi2_element"][0] > 2 * probability["chi2"][0]
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+def test_thresholds_invert(found: Detection, statistic: str) -> None:
+    for fap in (0.5, 0.1, 1e-2, 1e-3, 1e-4):
+        cut = found.threshold(fap, statistic)
+        assert cut.low <= cut.value <= cut.high
+        back = found.false_alarm_probability(cut.value, statistic)
+        # A bin holds at most 1/512 of a standard deviation's worth.
+        assert fap * 0.96 - 2 / N < back.value <= fap
+        exact = found.closed_form(statistic).isf(fap)
+        assert cut.low - 1e-9 <= exact <= cut.high or abs(cut.value - exact) < 4 * (cut.high - cut.low) / 3.92
+
+
+def test_roc(found: Detection) -> None:
+    curve = found.roc("matched", 1)
+    fap, probability = curve.fap, curve.probability
+    assert (fap[0], probability[0]) == (1.0, 1.0)
+    assert np.all(np.diff(fap) <= 0)
+    assert np.all(np.diff(probability) <= 0)
+    assert np.all(probability >= fap - 1e-3)
+    at = int(np.searchsorted(-fap, -1e-3))
+    assert probability[at] == pytest.approx(found.detection_probability(1e-3, "matched")[1].value, rel=0.01)
+    table = curve.table()
+    assert np.all((table["fap_low"] <= table["fap"]) & (table["fap"] <= table["fap_high"]))
+    assert np.all((table["probability_low"] <= table["probability"]) & (table["probability"] >= 0))
+    assert len(table) <= 201
+
+
+@pytest.mark.parametrize("flare", range(len(AMPLITUDES)))
+def test_the_area_under_a_roc_is_its_closed_form(found: Detection, flare: int) -> None:
+    """Of two unit normals a distance d apart it is Phi(d / sqrt(2)): 4 half-widths of DeLong's, 6e-15 by chance."""
+    null, with_flare = (found.closed_form("matched", f, template=flare) for f in (None, flare))
+    exact = stats.norm.cdf((with_flare.mean - null.mean) / np.hypot(null.std, with_flare.std))
+    area = found.roc("matched", flare).area
+    assert abs(area.value - exact) <= 2 * max(area.high - area.low, 1e-6)
+    assert area.low <= area.value <= area.high
+
+
+def test_delongs_interval_is_that_of_draws_made_apart() -> None:
+    """200 pairs of samples: at least 178 intervals hold the exact area, fewer once in 1e4 runs of new seeds."""
+    rng, grid, held = np.random.default_rng(8), Grid(0, 0.0, 1.0), 0
+    exact = stats.norm.cdf(1.0 / np.sqrt(2.0))
+    for _ in range(200):
+        parts = []
+        for centre in (0.0, 1.0):
+            tally = Tally([grid])
+            values = rng.normal(centre, 1.0, (1, 400)).astype(np.float32)
+            tally.add(*reference_sums.tally(values, Grid.pack([grid]))[:2], 400)
+            parts.append(tally.distribution(0))
+        area = Roc.of(*parts).area
+        held += area.low <= exact <= area.high
+    assert held >= 178
+    assert stats.binom.cdf(177, 200, 0.95) < 3e-4
+
+
+def test_tail_samples_are_the_extremes_and_can_be_drawn_again(engine: Engine) -> None:
+    quiet, flare = star(amplitudes=(0.081,))
+    kind = {"seed": 3, "start": 70, "statistics": ("chi2", "matched")}
+    found = engine.detect(quiet, [flare], realisations=3000, **kind)
+    values = engine.statistic_values(quiet, [flare], count=3000, **kind)
+    for statistic, null, with_flare in (("chi2", 0, 3), ("matched", 6, 7)):
+        largest, smallest = found.tail_samples(statistic), found.tail_samples(statistic, 0)
+        np.testing.assert_array_equal(largest["value"], np.sort(values[null])[::-1][:1000])
+        np.testing.assert_array_equal(smallest["value"], np.sort(values[with_flare])[:1000])
+        np.testing.assert_array_equal(values[null][largest["realisation"] - 70], largest["value"])
+    # In other tiles the same: the largest is addressed by its realisation alone.
+    small = Engine(tile=256).detect(quiet, [flare], realisations=3000, **kind)
+    for statistic in ("chi2", "matched"):
+        for flare_or_none in (None, 0):
+            ours, theirs = (d.tail_samples(statistic, flare_or_none) for d in (found, small))
+            np.testing.assert_array_equal(ours["realisation"], theirs["realisation"])
+
+
+def test_rare_tails_are_refused_not_extrapolated(found: Detection) -> None:
+    with pytest.raises(InputError, match="ask for 10000000 realisations"):
+        found.threshold(1e-5)
+    found.threshold(1e-4)
+    for fap in (0.0, 1.0, -1.0, np.nan):
+        with pytest.raises(InputError, match="fap = "):
+            found.threshold(fap)
+
+
+def test_table(found: Detection) -> None:
+    table = found.table(fap=1e-3)
+    assert len(table) == len(AMPLITUDES) * len(STATISTICS)
+    chi2 = table[table["statistic"] == "chi2"]
+    assert list(chi2["dof"]) == [found.quiet.wavelength_nm.size] * len(AMPLITUDES)
+    np.testing.assert_allclose(chi2["reduced"], chi2["mean"] / chi2["dof"])
+    np.testing.assert_allclose(chi2["mean"], chi2["expected"], rtol=5e-4)
+    assert table.meta["realisations"] == N
+    assert all(table[name].info.description for name in ("probability", "threshold", "expected"))
+
+
+def test_unsimulated_statistics_are_refused(engine: Engine) -> None:
+    quiet, flare = star(amplitudes=(0.24,), payload=instrument(part=True))
+    found = engine.detect(quiet, [flare], realisations=1000, seed=1, statistics=("matched",))
+    with pytest.raises(InputError, match="'chi2' was not simulated"):
+        found.threshold(0.5, "chi2")
+    with pytest.raises(InputError, match="flare = 1"):
+        found.distribution("matched", 1)
+
+
+def test_saturated_pixels_are_left_out(engine: Engine) -> None:
+    """Pixels saturated without a flare have no news; the rest still gives a calibrated null."""
+    payload = instrument(part=True)
+    quiet, flare = star(magnitude=-0.17, amplitudes=(0.05,), exposure=10.0, payload=payload)
+    assert 0 < quiet.saturated.sum() < 10
+    found = engine.detect(quiet, [flare], realisations=100_000, seed=3)
+    dof = int((~quiet.saturated).sum())
+    assert found.dof("chi2") == dof
+    assert found.scene.frames
+    mean = found.distribution("chi2").mean
+    assert abs(mean - dof) < 5 * np.sqrt(2 * dof / 100_000)
+    bright, _ = star(magnitude=-3.0, amplitudes=(0.05,), payload=payload)
+    with pytest.raises(InputError, match="every pixel of G2V is saturated"):
+        engine.detect(bright, [bright], realisations=10, seed=1)
+
+
+def test_wider_wings_than_the_grid_are_counted(engine: Engine) -> None:
+    """On the null's grid a strong flare lies beyond its end, and is still above every threshold."""
+    quiet, flare = star(magnitude=3.0, amplitudes=(0.24,), payload=instrument(part=True))
+    found = engine.detect(quiet, [flare], realisations=2000, seed=1)
+    assert [p.value for p in found.detection_probability(0.05, "chi2")] == [1.0]
+    own = found.distribution("chi2", 0)
+    assert own.mean == pytest.approx(found.closed_form("chi2", 0).mean, rel=0.02)
+    assert own.far.n == 0
+
+
+def test_a_statistic_of_ones_own(engine: Engine) -> None:
+    """The matched filter given as weights is the matched filter; any other follows its normal."""
+    quiet, *flares = star(amplitudes=AMPLITUDES)
+    used = np.ones(quiet.wavelength_nm.size, bool)
+    twin = Linear("twin", matched_weights(quiet, flares[1], used))
+    slope = Linear("slope", np.linspace(-1.0, 2.0, used.size))
+    found = engine.detect(
+        quiet, flares, realisations=N, seed=3, statistics=("matched", twin, "uv_excess", slope, "chi2")
+    )
+    assert found.statistics == ("matched", "twin", "uv_excess", "slope", "chi2")
+    for flare in (None, 1):
+        ours, wanted = found.distribution("twin", flare), found.distribution("matched", flare, template=1)
+        np.testing.assert_array_equal(ours.counts, wanted.counts)
+        for name in ("slope", "uv_excess"):
+            d = found.distribution(name, flare)
+            assert ks_probability(d, found.closed_form(name, flare).sf) > 1e-6
+    theory = found.closed_form("slope", 3)
+    delta = flares[3].signal_dn - quiet.signal_dn
+    assert theory.mean == pytest.approx(float(slope.weights @ delta))
+    assert found.dof("slope") == 1
+
+
+@pytest.mark.parametrize(
+    ("weights", "name", "sentence"),
+    [
+        (np.ones(5), "mine", r"has 5 weights, expected one for each of the \d+ pixels"),
+        (np.zeros(198), "mine", "not all zero"),
+        (np.full(198, np.nan), "mine", "198 of them no numbers"),
+        (np.ones((2, 99)), "mine", r"the shape \(2, 99\)"),
+        (np.ones(198), "chi2", "one of mauvecl's own"),
+    ],
+)
+def test_impossible_weights_are_refused(engine: Engine, weights: np.ndarray, name: str, sentence: str) -> None:
+    quiet, flare = star(amplitudes=(0.1,), payload=instrument(part=True))
+    with pytest.raises(InputError, match=sentence):
+        engine.detect(quiet, [flare], realisations=10, seed=1, statistics=(Linear(name, weights),))
+
+
+def test_uv_excess_needs_uv(engine: Engine) -> None:
+    quiet, flare = star(amplitudes=(0.1,), payload=instrument(output_min_nm=400.0, output_max_nm=500.0))
+    with pytest.raises(InputError, match="200-360 nm"):
+        engine.detect(quiet, [flare], realisations=10, seed=1, statistics=("uv_excess",))
+
+
+@pytest.mark.parametrize("number", range(5))
+def test_random_scenes_agree_with_theory(engine: Engine, number: int) -> None:
+    """Detection probabilities of random scenes at 1e6, within 4 standard errors: 30 values, 2e-3 by chance.
+
+    A star, magnitude, exposure, temperature and sky at random, and a flare near the edge of detection.
+    """
+    rng = np.random.default_rng([7, number])
+    payload = instrument(temperature_c=float(rng.uniform(5.0, 25.0)), output_min_nm=280.0, output_max_nm=340.0)
+    source = Source.from_library(str(rng.choice(["A0V", "F5V", "G2V", "K3V"]))).at_magnitude(float(rng.uniform(5, 9)))
+    sky, exposure = Sky.of_brightness(float(rng.uniform(19, 23))), 5.0 * int(rng.integers(1, 40))
+
+    def at(amplitude: float) -> list:
+        sources = (source, source.flaring(amplitude))
+        return [expect(s, payload, exposure=exposure, sky=sky) for s in sources]
+
+    # Amplitudes scale the flare: one with an S/N of 6 for the matched filter.
+    quiet, flare = at(1.0)
+    delta = flare.signal_dn - quiet.signal_dn
+    amplitude = float(6.0 / np.sqrt(np.sum(delta**2 / quiet.variance_dn2)))
+    quiet, flare = at(amplitude)
+    found = engine.detect(quiet, [flare], realisations=N, seed=number, statistics=tuple(STATISTICS), mode="stacked")
+    for statistic in STATISTICS:
+        null, theory = found.closed_form(statistic), found.closed_form(statistic, 0)
+        (p,) = found.detection_probability(1e-2, statistic)
+        cut = null.isf(1e-2)
+        exact = theory.sf(cut)
+        shifted = theory.sf(null.isf(1e-2 + np.sqrt(0.01 * 0.99 / N)))
+        grain = exact - theory.sf(cut + null.std / 512)
+        assert abs(p.value - exact) < 4 * np.hypot(np.sqrt(exact * (1 - exact) / N), shifted - exact) + grain + 3 / N

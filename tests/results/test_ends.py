@@ -1,0 +1,224 @@
+"""No distribution has an end: every number of an answer against sorting the values of the same realisations.
+
+Studies at random, most with something that carries statistics far from where Gaussian noise alone would leave them:
+priors, cosmic rays, noisy references, estimated variances, own weights, near-saturated stars. Nothing here is left to
+chance: both sides see the same draws.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scenes import instrument, star
+
+from mauvecl.device.engine import Engine
+from mauvecl.host.errors import InputError
+from mauvecl.host.expectation import Expectation
+from mauvecl.noise.comparison import Comparison
+from mauvecl.noise.processes import CosmicRays, Normal, Processes, Uniform
+from mauvecl.results.channels import plan_channels
+from mauvecl.results.detection import Detection
+from mauvecl.results.snr import PERCENTAGES
+from mauvecl.results.tally import Distribution
+from mauvecl.statistics.definitions import STATISTICS, Linear, central_counts
+
+N, FAP = 4000, 0.05
+STUDIES = 12
+SEED = 14
+
+
+def study(number: int) -> tuple[list[Expectation], dict]:
+    """A star with two flares, and how it is drawn and compared."""
+    rng = np.random.default_rng([14, number])
+    low = float(rng.uniform(205.0, 600.0))
+    payload = instrument(
+        str(rng.choice(["mauve", "mauve-electrons"])),
+        temperature_c=float(rng.uniform(0.0, 22.0)),
+        output_min_nm=low,
+        output_max_nm=low + 25.0,
+    )
+    bright = number % 6 == 5
+    scenario = star(
+        str(rng.choice(["A0V", "G2V", "K3V", "M0V"])),
+        1.5 if bright else float(rng.uniform(3.0, 10.0)),
+        amplitudes=(float(rng.uniform(0.01, 0.1)), float(rng.uniform(0.2, 2.0))),
+        exposure=5.0 * int(rng.integers(1, 20)),
+        payload=payload,
+    )
+    warm = float(payload.temperature_c)
+    priors = {
+        "detector_temperature": Uniform(warm - float(rng.uniform(0.05, 1.0)), warm + float(rng.uniform(0.05, 1.0))),
+        "light_loss": Normal(0.34, float(rng.uniform(0.002, 0.05)), 0.1, 0.6),
+        "qe_scale": Uniform(1.0 - float(rng.uniform(0.0, 0.2)), 1.0 + float(rng.uniform(0.0, 0.2))),
+        "jitter": Uniform(0.0, 0.05),
+    }
+    names = [str(x) for x in rng.permutation(list(priors))[: int(rng.integers(0, 3))]]
+    rays = CosmicRays(rate_per_cm2_s=300.0) if rng.random() < 0.4 else None
+    n = scenario[0].wavelength_nm.size
+    own = Linear("own", rng.normal(size=n) * 10.0 ** rng.uniform(-6, 6))
+    used = ("chi2", "chi2_element", "chi2_pair", "matched", "paper", own)
+    how = {
+        "statistics": (*used, "uv_excess") if low < 330.0 else used,
+        "processes": Processes(rays, **{name: priors[name] for name in names}),
+        "comparison": Comparison(int(rng.choice([0, 0, 1, 3])), bool(rng.random() < 0.3)),
+    }
+    return scenario, how
+
+
+class Sorted:
+    """The values that a distribution was made of, and how wide its bins may be there."""
+
+    def __init__(self, values: np.ndarray, sigma: float, centre: float) -> None:
+        self.values = np.sort(values.astype(float))
+        # Steps are taken in float32.
+        self.sigma, self.slack = sigma, 1e-6 * (abs(centre) + sigma)
+
+    def bin(self, value: float) -> float:
+        return max(self.sigma / 512, abs(value) * 2.0**-13) + self.slack
+
+    def at_or_above(self, value: float) -> int:
+        return int(self.values.size - np.searchsorted(self.values, value))
+
+    def close(self, value: float) -> int:
+        """Values so near that float32 may put them on either side."""
+        return int(np.sum(np.abs(self.values - value) <= self.slack))
+
+
+def check_distribution(d: Distribution, exact: Sorted) -> None:
+    n, values = exact.values.size, exact.values
+    widest = max(exact.bin(values[0]), exact.bin(values[-1]))
+    assert d.mean == pytest.approx(values.mean(), rel=1e-7, abs=exact.sigma / 2048 + exact.slack)
+    assert d.std == pytest.approx(values.std(), rel=1e-5, abs=exact.sigma / 2048 + exact.slack)
+    assert d.bins[0][0] - exact.slack <= values[0]
+    assert values[-1] <= d.bins[1][-1] + exact.slack
+    for p in (0.01, 0.16, 0.5, 0.84, 0.99):
+        found = d.quantile_interval(p)
+        assert values[int(p * n) - 1] - widest <= found.value <= values[int(p * n)] + widest
+        low, high = central_counts(n, p)
+        assert values[low - 1] - exact.bin(values[low - 1]) <= found.low <= values[low - 1] + exact.slack
+        assert values[high] - exact.slack <= found.high <= values[high] + exact.bin(values[high])
+    edges, counts = d.histogram(40)
+    assert counts.sum() == n
+    direct = np.histogram(values, edges)[0]
+    # A picture's edge may cut a bin.
+    near = [np.sum(np.abs(values - edge) <= exact.bin(edge)) for edge in edges]
+    assert (np.abs(np.cumsum(direct) - np.cumsum(counts)) <= np.array(near[1:]) + 1).all()
+
+
+@pytest.mark.parametrize("number", range(STUDIES))
+def test_every_number_is_that_of_sorting(engine: Engine, number: int) -> None:
+    (quiet, *flares), how = study(number)
+    found = engine.detect(quiet, flares, realisations=N, seed=SEED, **how)
+    values = engine.statistic_values(quiet, flares, count=N, seed=SEED, **how)
+    plan = plan_channels(found, range(len(flares)), first=True)
+    rows = {key: grid.channel for key, grid in zip(plan.keys, plan.grids, strict=True)}
+    for statistic in found.statistics:
+        for k in range(len(flares)):
+            shaped = ("null", k) if (statistic, "null", k) in rows else ("null", 0)
+            null, flare = found.closed_form(statistic, template=k), found.closed_form(statistic, k)
+            quiet_values = Sorted(values[rows[(statistic, *shaped)]], null.std, null.mean)
+            own = Sorted(values[rows[(statistic, "flare", k)]], flare.std, flare.mean)
+            on_null = Sorted(values[rows[(statistic, "flare", k)]], null.std, null.mean)
+            check_distribution(found.distribution(statistic, template=k), quiet_values)
+            check_distribution(found.distribution(statistic, k), own)
+            check_answers(found, statistic, k, quiet_values, on_null)
+
+
+def check_answers(found: Detection, statistic: str, k: int, null: Sorted, flare: Sorted) -> None:
+    wanted = int(FAP * N)
+    cut = found.threshold(FAP, statistic, template=k)
+    low, high = central_counts(N, FAP)
+    for edge, above in ((cut.value, wanted), (cut.low, high), (cut.high, low - 1)):
+        exact = null.values[N - 1 - above]
+        assert exact - null.slack <= edge <= exact + null.bin(exact)
+    back = found.false_alarm_probability(cut.value, statistic, template=k)
+    assert abs(round(back.value * N) - null.at_or_above(cut.value)) <= null.close(cut.value)
+    p = found.detection_probability(FAP, statistic)[k]
+    assert abs(round(p.value * N) - flare.at_or_above(cut.value)) <= flare.close(cut.value)
+    assert p.low <= p.value <= p.high
+    curve = found.roc(statistic, k)
+    assert (curve.fap[0], curve.probability[0], curve.fap[-1], curve.probability[-1]) == (1.0, 1.0, 0.0, 0.0)
+    for i in np.linspace(0, curve.fap.size - 1, 30).astype(int):
+        x = curve.threshold[i]
+        assert abs(round(curve.fap[i] * N) - null.at_or_above(x)) <= null.close(x)
+        assert abs(round(curve.probability[i] * N) - flare.at_or_above(x)) <= flare.close(x)
+    # Of all pairs, those that the flare wins; a bin cannot tell its own apart, and counts them half.
+    beaten = np.searchsorted(null.values, flare.values, side="left") + np.searchsorted(
+        null.values, flare.values, "right"
+    )
+    reach = np.array([null.bin(x) for x in flare.values])
+    unsure = np.searchsorted(null.values, flare.values + reach) - np.searchsorted(null.values, flare.values - reach)
+    assert abs(curve.area.value - beaten.sum() / (2 * N**2)) <= unsure.sum() / (2 * N**2) + 1e-12
+
+
+@pytest.mark.parametrize("number", [*range(3), 5])
+@pytest.mark.parametrize("width", [1, 16])
+def test_signal_to_noise_is_that_of_sorting(width: int, number: int) -> None:
+    """Means, spreads and quantiles per pixel and element, against the S/N of the raw spectra themselves."""
+    (quiet, *_), how = study(number)
+    n = 1000
+    processes = how["processes"]
+    if number < 3:
+        processes = (Processes(CosmicRays(rate_per_cm2_s=300.0)), PRIOR, Processes(light_loss=Uniform(0.2, 0.5)))[
+            number
+        ]
+    engine = Engine(width=width)
+    found = engine.snr(quiet, realisations=n, seed=3, processes=processes)
+    raw = engine.realise(quiet, count=n, seed=3, processes=processes).astype(float)
+    net = raw - quiet.n_frames * (quiet.bias_dn + quiet.dark_dn)
+    known = quiet.n_frames * (quiet.read_noise_dn**2 + quiet.dark_variance_dn2)
+    noise2 = np.maximum(net, 0.0) * quiet.gain_dn_per_electron + known
+    per_pixel = net / np.sqrt(noise2)
+    per_element = np.array(
+        [quiet.per_element(x) / np.sqrt(quiet.per_element(y)) for x, y in zip(net, noise2, strict=True)]
+    )
+    assert number == 5 or any(found.counts.far[kind].keys.size for kind in ("pixel", "element"))
+    for table, exact, sd in (
+        (found.pixel, per_pixel, np.sqrt(quiet.variance_dn2 / noise2.mean(axis=0))),
+        (found.element, per_element, np.ones(per_element.shape[1])),
+    ):
+        # A bin is 1/64 of a standard deviation or less; its own changes with the S/N's slope, at most twofold.
+        width_ = 2 * sd / 64
+        np.testing.assert_allclose(table["mean"], exact.mean(axis=0), rtol=1e-4, atol=width_.max())
+        np.testing.assert_allclose(table["std"], exact.std(axis=0), rtol=1e-3, atol=width_.max())
+        ordered = np.sort(exact, axis=0)
+        for percentage in PERCENTAGES:
+            place = percentage / 100 * n
+            low, high = ordered[max(int(place) - 1, 0)], ordered[min(int(place) + 1, n - 1)]
+            q = table[f"q{percentage:g}"]
+            assert ((q >= low - width_ - 1e-4 * abs(low)) & (q <= high + width_ + 1e-4 * abs(high))).all()
+
+
+PRIOR = Processes(detector_temperature=Uniform(15.0, 24.0))
+
+
+def test_values_that_are_no_numbers_are_refused(engine: Engine) -> None:
+    """Weights so large that float32 overflows in the flare: the null is answered, what reads the flare is not."""
+    quiet, flare = star(magnitude=5.0, amplitudes=(2.0,), payload=instrument(part=True))
+    delta = (flare.signal_dn - quiet.signal_dn).sum()
+    own = Linear("own", np.full(quiet.wavelength_nm.size, 1e38 / delta * 5))
+    found = engine.detect(quiet, [flare], realisations=1000, seed=1, statistics=("matched", own))
+    assert np.isfinite(found.threshold(0.2, "own").value)
+    for read in (
+        lambda: found.detection_probability(0.2, "own"),
+        lambda: found.distribution("own", 0),
+        lambda: found.roc("own"),
+        lambda: found.table(0.2),
+        lambda: found.tail_samples("own", 0),
+    ):
+        with pytest.raises(
+            InputError, match="'own' with flare 1 is infinite or no number in 1000 of 1000 realisations"
+        ):
+            read()
+    assert found.detection_probability(0.2, "matched")[0].value == 1.0
+
+
+def test_all_statistics_are_looked_at() -> None:
+    """Every statistic, reference, kind of variance, prior and cosmic rays are among the studies."""
+    hows = [study(number)[1] for number in range(STUDIES)]
+    assert {name for how in hows for name in how["statistics"] if isinstance(name, str)} == set(STATISTICS)
+    assert {how["comparison"].exposures for how in hows} == {0, 1, 3}
+    assert {how["comparison"].estimated for how in hows} == {False, True}
+    processes = [how["processes"] for how in hows]
+    for name in ("cosmic_rays", "detector_temperature", "light_loss", "qe_scale", "jitter"):
+        assert any(getattr(each, name) is not None for each in processes)

@@ -1,0 +1,146 @@
+"""Rare false alarms by importance sampling: against brute force, the closed form, and themselves."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scenes import instrument, star
+from scipy import special
+
+from mauvecl.device.engine import Engine
+from mauvecl.host.errors import InputError
+from mauvecl.noise.comparison import Comparison
+from mauvecl.noise.processes import Processes, Uniform
+from mauvecl.results.detection import Detection
+from mauvecl.results.tails import tail
+from mauvecl.statistics.definitions import STATISTICS
+
+#: A sixth of the pixels: brute force can then afford 3e7 draws, 30 of them beyond a threshold at 1e-6.
+PART = {"output_min_nm": 330.0, "output_max_nm": 360.0}
+N = 30_000_000
+
+
+@pytest.fixture(scope="module")
+def found(engine: Engine) -> Detection:
+    quiet, flare = star(amplitudes=(0.1,), payload=instrument(**PART))
+    return engine.detect(quiet, [flare], realisations=N, seed=11, statistics=tuple(STATISTICS), tails="sampled")
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+@pytest.mark.parametrize("fap", [1e-2, 1e-4, 1e-6])
+def test_brute_force_agrees(found: Detection, statistic: str, fap: float) -> None:
+    """Realisations beyond the sampled threshold: |z| < 4.5 with both errors, 18 values, 1e-4 by chance."""
+    sampled = tail(found, fap, statistic, seed=3)
+    null = found.distribution(statistic)
+    beyond, expected = null.above(sampled.threshold.value), fap * N
+    error = np.hypot(np.sqrt(expected), sampled.relative_error * expected)
+    assert abs(beyond - expected) < 4.5 * error
+    assert sampled.relative_error <= 0.02
+    assert sampled.threshold.low < sampled.threshold.value < sampled.threshold.high
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+@pytest.mark.parametrize("fap", [1e-3, 1e-6, 1e-9])
+def test_the_closed_form_where_it_is_exact(engine: Engine, statistic: str, fap: float) -> None:
+    """Without dark, and 60 DN of noise, statistics are exactly normal and chi-squared: 4 standard errors."""
+    payload = instrument(dark_scale_dn_per_s=0.0, read_noise_dn=60.0, **PART)
+    quiet, flare = star(amplitudes=(0.1,), payload=payload)
+    plain = engine.detect(quiet, [flare], realisations=100, seed=1, statistics=tuple(STATISTICS), tails="sampled")
+    sampled = tail(plain, fap, statistic, seed=5)
+    exact = plain.closed_form(statistic).sf(sampled.threshold.value)
+    assert abs(exact / fap - 1) < 4 * sampled.relative_error
+
+
+@pytest.mark.parametrize("statistic", ["chi2", "matched"])
+def test_no_bin_moves_a_sampled_threshold(engine: Engine, statistic: str) -> None:
+    """What a detection reports is what was sampled, and flares are counted there, not at the next edge of a bin."""
+    quiet, *flares = star(amplitudes=(0.05, 0.1), payload=instrument(**PART))
+    found = engine.detect(quiet, flares, realisations=20_000, seed=2, statistics=("chi2", "matched"), tails="sampled")
+    for fap in (1e-4, 1e-7):
+        for k, p in enumerate(found.detection_probability(fap, statistic)):
+            sampled = found.tail(fap, statistic, template=k)
+            assert sampled is not None
+            cut = found.threshold(fap, statistic, template=k)
+            assert cut == sampled.threshold
+            d = found.distribution(statistic, k)
+            # Of another grid: half of one bin's realisations, at most.
+            width = d.std / 512
+            assert (
+                abs(p.value - d.above(cut.value) / d.n)
+                <= (d.above(cut.value - width) - d.above(cut.value + width)) / d.n
+            )
+            assert p.low <= p.value <= p.high
+
+
+def test_intervals_cover(engine: Engine) -> None:
+    """Of 60 intervals of 95 %, at least 50 hold the closed form: fewer once in 2000 runs of new seeds."""
+    payload = instrument(dark_scale_dn_per_s=0.0, read_noise_dn=60.0, output_min_nm=350.0, output_max_nm=360.0)
+    quiet, flare = star(amplitudes=(0.1,), payload=payload)
+    plain = engine.detect(quiet, [flare], realisations=100, seed=1, statistics=("chi2", "matched"), tails="sampled")
+    held = 0
+    for seed in range(30):
+        for statistic in ("chi2", "matched"):
+            t = tail(plain, 1e-7, statistic, seed=seed).threshold
+            held += t.low <= plain.closed_form(statistic).isf(1e-7) <= t.high
+    assert held >= 50
+    assert special.bdtr(49, 60, 0.95) < 5e-4
+
+
+def test_a_detection_uses_it_and_says_so(engine: Engine) -> None:
+    quiet, *flares = star(amplitudes=(0.05, 0.24), payload=instrument(**PART))
+    kind = {"realisations": 100_000, "seed": 2, "statistics": ("chi2", "matched")}
+    sampled = engine.detect(quiet, flares, tails="sampled", **kind)
+    table = sampled.table(fap=1e-9)
+    assert table.meta["tails"] == "importance sampling"
+    assert (table["fap_error"] <= 0.02).all()
+    for row in table:
+        assert row["low"] <= row["probability"] <= row["high"]
+        assert abs(row["probability"] - row["closed_form_probability"]) < 0.05
+    # Where enough realisations lie beyond, they are counted.
+    counted = engine.detect(quiet, flares, **kind)
+    assert sampled.table(1e-2).meta["tails"] == "counted"
+    assert sampled.threshold(1e-2) == counted.threshold(1e-2)
+    with pytest.raises(InputError, match="or for sampled tails"):
+        counted.table(fap=1e-9)
+    assert sampled.threshold(1e-9) == engine.detect(quiet, flares, tails="sampled", **kind).threshold(1e-9)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"recipe": "apart"}, "noise drawn apart"),
+        ({"mode": "frames"}, "frames drawn one by one"),
+        ({"processes": Processes(jitter=Uniform(0.0, 0.05))}, "with priors"),
+    ],
+)
+def test_what_cannot_be_tilted_is_refused(engine: Engine, options: dict, sentence: str) -> None:
+    quiet, flare = star(amplitudes=(0.1,), payload=instrument(**PART))
+    found = engine.detect(quiet, [flare], realisations=100, seed=1, statistics=("chi2",), tails="sampled", **options)
+    with pytest.raises(InputError, match=sentence):
+        found.threshold(1e-6)
+    plain = engine.detect(quiet, [flare], realisations=100, seed=1, statistics=("chi2",), tails="sampled")
+    with pytest.raises(InputError, match="fap = 1e-12"):
+        plain.threshold(1e-12)
+
+
+@pytest.mark.parametrize("statistic", STATISTICS)
+@pytest.mark.parametrize("comparison", [Comparison(4), Comparison(1, True)], ids=["stack", "estimated"])
+def test_brute_force_agrees_whatever_is_compared(engine: Engine, statistic: str, comparison: Comparison) -> None:
+    """At 1e-4 of 1e6 realisations: |z| < 4.5 with both errors, 12 values, 1e-4 by chance."""
+    n, fap = 1_000_000, 1e-4
+    quiet, flare = star(amplitudes=(0.1,), payload=instrument(output_min_nm=345.0, output_max_nm=360.0))
+    found = engine.detect(
+        quiet, [flare], realisations=n, seed=12, statistics=(statistic,), comparison=comparison, tails="sampled"
+    )
+    sampled = tail(found, fap, statistic, seed=4)
+    beyond = found.false_alarm_probability(sampled.threshold.value, statistic).value * n
+    error = np.hypot(np.sqrt(fap * n), sampled.relative_error * fap * n)
+    assert abs(beyond - fap * n) < 4.5 * error
+
+
+def test_too_many_exposures_are_refused(engine: Engine) -> None:
+    quiet, flare = star(amplitudes=(0.1,), payload=instrument(**PART))
+    kind = {"realisations": 100, "seed": 1, "statistics": ("chi2",), "tails": "sampled"}
+    found = engine.detect(quiet, [flare], comparison=Comparison(40), **kind)
+    with pytest.raises(InputError, match="40 averaged exposures"):
+        found.threshold(1e-6)

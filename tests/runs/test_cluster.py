@@ -1,0 +1,338 @@
+"""Dask workers in processes of their own: the same bits, whoever dies."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import ssl
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager, nullcontext, suppress
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import pytest
+from answers import N, same, same_snr, small
+from typer.testing import CliRunner
+
+from mauvecl.cli.app import app
+from mauvecl.device.engine import DeviceError, Engine
+from mauvecl.host.errors import InputError
+from mauvecl.host.expectation import Expectation
+from mauvecl.runs import shards
+from mauvecl.runs.cluster import DaskWorkers
+from mauvecl.runs.pool import Pool, Stopped, together
+from mauvecl.store import bulk
+
+pytestmark = pytest.mark.usefixtures("small_shares")
+
+
+@pytest.fixture(scope="module")
+def workers() -> Iterator[DaskWorkers]:
+    """Two processes; tests that kill some find new ones there afterwards."""
+    found = DaskWorkers("local:2")
+    yield found
+    found.close()
+
+
+def test_two_processes_give_one_answer(workers: DaskWorkers, engine: Engine, scene: list[Expectation]) -> None:
+    quiet, *flares = scene
+    pool = Pool(workers)
+    assert workers.count == 2
+    same(pool.detect(quiet, flares, realisations=N, seed=5), engine.detect(quiet, flares, realisations=N, seed=5))
+    same_snr(pool.snr(quiet, realisations=N, seed=5), engine.snr(quiet, realisations=N, seed=5))
+    assert pool.standing.shares == 16
+    assert [device.name for device in pool.devices] == [engine.device.name] * 2
+
+
+def test_a_worker_killed_in_mid_run(workers: DaskWorkers, engine: Engine, scene: list[Expectation]) -> None:
+    """SIGKILL to a process that is counting: its share is counted by another, and the answer keeps its bits."""
+    quiet, *flares = scene
+    n, pids = 150_000, list(workers._client.run(os.getpid).values())
+    pool = Pool(workers)
+
+    def kill() -> None:
+        while pool.standing.shares < 10:
+            time.sleep(0.005)
+        os.kill(pids[0], signal.SIGKILL)
+
+    killer = threading.Thread(target=kill)
+    killer.start()
+    found = pool.detect(quiet, flares, realisations=n, seed=6)
+    killer.join()
+    same(found, engine.detect(quiet, flares, realisations=n, seed=6))
+    assert pids[0] not in workers._client.run(os.getpid).values()
+    assert pool.standing.retries >= 1, "the share in its hands was counted again"
+
+
+def greeted(port: int, context: ssl.SSLContext | None) -> bool:
+    """Whether whoever listens sends a visitor anything, as Dask's servers greet those they talk to."""
+    try:
+        plain = socket.create_connection(("127.0.0.1", port), timeout=3)
+        with context.wrap_socket(plain) if context else plain as talk:
+            return bool(talk.recv(1))
+    except OSError:
+        return False
+
+
+def test_nobody_else_can_connect(workers: DaskWorkers) -> None:
+    """Another user of this machine sees the ports; without this run's certificate none of them answers."""
+    import psutil
+    from distributed import Security
+
+    workers._client.wait_for_workers(2, timeout=60)
+    pids = [os.getpid(), *workers._client.run(os.getpid).values()]
+    ports = {c.laddr.port for pid in pids for c in psutil.Process(pid).net_connections("tcp") if c.status == "LISTEN"}
+
+    def who_greets(context: ssl.SSLContext | None) -> int:
+        with ThreadPoolExecutor(len(ports)) as threads:
+            return sum(threads.map(partial(greeted, context=context), ports))
+
+    ours, another = (
+        s.get_connection_args("client")["ssl_context"] for s in (workers._client.security, Security.temporary())
+    )
+    without = ssl.create_default_context()
+    without.check_hostname, without.verify_mode = False, ssl.CERT_NONE
+    another.check_hostname, another.verify_mode = False, ssl.CERT_NONE
+    assert who_greets(ours) == 5, "scheduler, nannies and workers"
+    assert [who_greets(context) for context in (None, without, another)] == [0, 0, 0]
+    for pid in pids:
+        assert b"PRIVATE" not in Path(f"/proc/{pid}/cmdline").read_bytes()
+
+
+def test_raw_spectra_by_two_processes(workers: DaskWorkers, tmp_path: Path, engine: Engine) -> None:
+    study = small().with_settings(["run.realisations=500"])
+    bulk.realise(study, tmp_path / "s.zarr", Pool(workers))
+    assert bulk.verify(tmp_path / "s.zarr", engine, redraw=True) == []
+
+
+def test_a_mistake_on_a_worker_is_a_sentence(workers: DaskWorkers, scene: list[Expectation]) -> None:
+    """An error that another try would not mend is not tried again."""
+    before = workers.retries
+
+    class Impossible:
+        def count(self, *given: Any) -> Any:
+            raise InputError("frames = -1, expected at least 1")
+
+    with pytest.raises(DeviceError, match=r"cluster local:2 failed at realisations 0 to 9: .*frames = -1"):
+        workers.submit(Impossible(), "key", shards.Share(0, 0, 10), lambda done: None).result()
+    assert workers.retries == before
+
+
+class Silent:
+    """A Dask client that answers nothing and takes nothing back; its own futures as well."""
+
+    cluster, status = None, "running"
+
+    def submit(self, *given: Any, **how: Any) -> Any:
+        return Silent()
+
+    def nthreads(self) -> dict[str, int]:
+        return {"one": 1, "two": 1}
+
+    def add_done_callback(self, call: Any) -> None:
+        pass
+
+    def cancel(self, futures: Any) -> None:
+        raise TimeoutError
+
+
+def test_whoever_waits_is_woken_at_the_end(scene: list[Expectation], monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever Dask does: threads that wait for shares, for spectra, and for each other end at once."""
+    monkeypatch.setattr("mauvecl.runs.cluster._client", lambda where, distributed: nullcontext(Silent()))
+    monkeypatch.setattr(Silent, "run", lambda *given, **how: {}, raising=False)
+    monkeypatch.setattr(Silent, "wait_for_workers", lambda *given, **how: None, raising=False)
+    workers = DaskWorkers("silent")
+    monkeypatch.setattr(DaskWorkers, "count", 2)
+    pool = Pool(workers)
+    ended: list[type[BaseException]] = []
+
+    def ask(work: Any) -> None:
+        try:
+            work()
+        except BaseException as error:
+            ended.append(type(error))
+
+    detect = partial(pool.detect, scene[0], scene[1:], realisations=N, seed=1)
+    works = [
+        detect,
+        lambda: pool.realise(scene[0], start=0, count=3, seed=1),
+        lambda: list(together(pool, lambda work: work(), [detect, detect, detect])),
+    ]
+    threads = [threading.Thread(target=ask, args=(work,), daemon=True) for work in works]
+    for thread in threads:
+        thread.start()
+    time.sleep(0.5)
+    assert ended == []
+    pool.stop()
+    for thread in threads:
+        thread.join(5)
+    assert ended == [Stopped] * 3
+
+
+@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM])
+def test_an_interrupted_cluster_ends_in_order(stop: signal.Signals, tmp_path: Path) -> None:
+    """Ctrl-C in a terminal reaches the workers too. Two seconds where this was written; five are promised."""
+    script = "import mauvecl.runs.shards as s; s.SHARE = 2**27; from mauvecl.cli.app import main; main()"
+    words = [
+        "detect",
+        "--star",
+        "G2V",
+        "--star",
+        "K3V",
+        "--statistic",
+        "chi2",
+        "-n",
+        "80000",
+        "--no-pictures",
+        "--fap",
+        "0.01",
+    ]
+    command = [sys.executable, "-c", script, *words, "--output", "out"]
+    run = subprocess.Popen(
+        [*command, "--cluster", "local:2", "--keep-after", "0"],
+        cwd=tmp_path,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        start_new_session=True,
+    )
+    shares = tmp_path / "out" / "checkpoint"
+    while not list(shares.glob("[!.]*.npz")):
+        time.sleep(0.01)
+        assert run.poll() is None
+    os.killpg(run.pid, stop) if stop == signal.SIGINT else run.send_signal(stop)
+    try:
+        # Twice what is promised, for machines with other work.
+        _, errors = run.communicate(timeout=10)
+    finally:
+        with suppress(ProcessLookupError):
+            os.killpg(run.pid, signal.SIGKILL)
+    assert run.returncode == {signal.SIGINT: 130, signal.SIGTERM: 143}[stop]
+    assert len(errors.splitlines()) == 1, errors
+    assert "kept in 'out/checkpoint', and the same command with --resume goes on from there" in errors
+    kept = sum(int(p.stem.split("-")[-1]) for p in shares.glob("[!.]*.npz"))
+    if stop == signal.SIGTERM:
+        return
+    done = subprocess.run([*command, "--resume"], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["shares"]["resumed"] == kept > 0
+
+
+@contextmanager
+def by_hand(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], Path]]:
+    """A scheduler and a worker started by hand, as on a cluster; the scheduler and its file."""
+    file, dask = folder / "scheduler.json", Path(sys.executable).with_name("dask")
+
+    def start(*words: str | Path) -> subprocess.Popen[bytes]:
+        command = [dask, *words, "--scheduler-file", file, "--no-dashboard"]
+        return subprocess.Popen(command, cwd=folder, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+    scheduler = start("scheduler", "--port", "0", "--host", "127.0.0.1")
+    while not file.exists() or not file.read_text().strip():
+        time.sleep(0.05)
+    worker = start("worker", "--nthreads", "1")
+    try:
+        yield scheduler, file
+    finally:
+        for process in (worker, scheduler):
+            process.terminate()
+            process.wait(20)
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:
+    """What the documentation's example for batch systems starts; its address and its file."""
+    pytest.importorskip("dask_jobqueue")
+    folder = tmp_path_factory.mktemp("cluster")
+    example, file = Path(__file__).parents[2] / "docs" / "examples" / "batch_cluster.py", folder / "scheduler.json"
+    words = ["local", "--jobs", "1", "--cores", "1", "--memory", "2GB"]
+    script = subprocess.Popen([sys.executable, example, *words], cwd=folder, stdout=subprocess.DEVNULL)
+    while not file.exists():
+        time.sleep(0.05)
+        assert script.poll() is None
+    yield json.loads(file.read_text())["address"], file
+    script.terminate()
+    script.wait(20)
+    assert not file.exists()
+
+
+@pytest.mark.parametrize(("system", "line"), [("slurm", "#SBATCH -p astro"), ("pbs", "#PBS -q astro")])
+def test_the_example_for_batch_systems(system: str, line: str) -> None:
+    pytest.importorskip("dask_jobqueue")
+    example = Path(__file__).parents[2] / "docs" / "examples" / "batch_cluster.py"
+    command = [sys.executable, example, system, "--queue", "astro", "--cores", "4", "--show"]
+    told = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert line in told
+    assert "--nthreads 1" in told
+    assert "--nworkers 4" in told
+
+
+@pytest.mark.parametrize("by", ["address", "file"])
+def test_a_cluster_that_is_there(
+    cluster: tuple[str, Path], by: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By address and by scheduler file, from the command line; the tables are those of one machine."""
+    monkeypatch.chdir(tmp_path)
+    Path("study.toml").write_text(small().toml())
+    flags = ["detect", "study.toml", "--no-pictures", "--quiet"]
+    where = cluster[0] if by == "address" else str(cluster[1])
+    for folder, more in (("one", []), ("many", ["--cluster", where])):
+        done = CliRunner().invoke(app, [*flags, "--output", folder, *more])
+        assert done.exit_code == 0, done.output
+    for name in ("detection.ecsv", "tails.ecsv", "roc.ecsv", "departures.ecsv"):
+        assert Path("many", name).read_bytes() == Path("one", name).read_bytes()
+    assert '"retries": 0' in Path("many/run.json").read_text()
+
+
+def test_a_scheduler_that_dies(tmp_path: Path, scene: list[Expectation]) -> None:
+    with by_hand(tmp_path) as (scheduler, file):
+        workers = DaskWorkers(str(file))
+        pool = Pool(workers)
+
+        def kill() -> None:
+            while pool.standing.shares < 5:
+                time.sleep(0.005)
+            scheduler.kill()
+
+        threading.Thread(target=kill).start()
+        with pytest.raises(DeviceError, match=r"the scheduler of cluster .* is gone, expected it to stay"):
+            pool.detect(scene[0], scene[1:], realisations=1_000_000, seed=1)
+        workers.stop()
+        workers.close()
+
+
+@pytest.mark.parametrize(
+    ("where", "kind", "sentence"),
+    [
+        ("local:0", InputError, "--cluster 'local:0', expected local:N with N from 1"),
+        ("nowhere.json", InputError, "expected local:N, an address such as tcp://host:8786, or a scheduler file"),
+        ("tcp://127.0.0.1:1", DeviceError, "no scheduler answers at tcp://127.0.0.1:1, expected one within"),
+    ],
+)
+def test_no_cluster_is_a_sentence(
+    where: str, kind: type[Exception], sentence: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("mauvecl.runs.cluster.PATIENCE_S", 1.0)
+    with pytest.raises(kind, match=sentence.replace("(", r"\(")):
+        DaskWorkers(where)
+
+
+def test_without_dask(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(InputError, match=r"Dask is missing.*pip install 'mauvecl\[cluster\]'"):
+        DaskWorkers("local:2")
+
+
+def test_without_certificates(monkeypatch: pytest.MonkeyPatch) -> None:
+    """No cluster rather than an open one."""
+    monkeypatch.setitem(sys.modules, "cryptography", None)
+    with pytest.raises(InputError, match=r"cryptography is missing.*pip install 'mauvecl\[cluster\]'"):
+        DaskWorkers("local:2")

@@ -1,0 +1,410 @@
+"""Shares of a request: whoever counts them, in whatever order, however often, they add up to the engine's answer."""
+
+from __future__ import annotations
+
+import json
+import pickle
+import random
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from answers import N, same, same_snr, small
+from scenes import instrument, star
+
+from mauvecl.answers.detect import detect
+from mauvecl.answers.limits import limiting_magnitude
+from mauvecl.answers.maps import detection_map
+from mauvecl.answers.snr import snr
+from mauvecl.device.engine import DeviceError, Engine
+from mauvecl.host.errors import InputError
+from mauvecl.host.expectation import Expectation
+from mauvecl.noise.comparison import Comparison
+from mauvecl.noise.processes import Processes, Uniform
+from mauvecl.results.detection import Detection
+from mauvecl.runs import shards
+from mauvecl.runs.checkpoint import Checkpoint, _digest_of
+from mauvecl.runs.pool import LocalWorkers, Pool, Stopped, together
+from mauvecl.runs.shards import Arrays, DetectRequest, Share, SnrRequest, fingerprint
+from mauvecl.statistics.definitions import Linear
+from mauvecl.study.study import Study
+
+pytestmark = pytest.mark.usefixtures("small_shares")
+
+
+class Shuffled(LocalWorkers):
+    """Answers shares late, in another order, and through the form they travel in."""
+
+    def __init__(self, engine: Engine, seed: int) -> None:
+        super().__init__([None], make=lambda device, progress: engine)
+        self._random, self._late = random.Random(seed), ThreadPoolExecutor(8)
+        self._alone = threading.Lock()
+
+    @property
+    def count(self) -> int:
+        return 4
+
+    def submit(self, request: Any, key: str, share: Share, tick: Callable[[int], None]) -> Future[Arrays]:
+        sent = pickle.loads(pickle.dumps(request))
+        wait = self._random.uniform(0.0, 0.05)
+
+        def work() -> Arrays:
+            time.sleep(wait)
+            with self._alone:
+                found = sent.count(self.first, share.part, share.start, share.count)
+            time.sleep(wait)
+            return dict(pickle.loads(pickle.dumps(found)))
+
+        return self._late.submit(work)
+
+
+@pytest.mark.parametrize("start", [0, 2**32 - 5000])
+def test_any_order_gives_the_engines_answer(engine: Engine, scene: list[Expectation], start: int) -> None:
+    quiet, *flares = scene
+    own = Linear("own", np.linspace(0.0, 1.0, quiet.wavelength_nm.size))
+    how: dict[str, Any] = {"realisations": N, "seed": 5, "start": start, "statistics": ("chi2", "matched", own)}
+    pool = Pool(Shuffled(engine, 3))
+    same(pool.detect(quiet, flares, **how), engine.detect(quiet, flares, **how))
+    assert (
+        pool.standing.shares
+        == pool.standing.of
+        == len(shards.shares(DetectRequest(quiet, tuple(flares), N, 5, ("chi2",), start=start)))
+    )
+    same_snr(
+        pool.snr(quiet, realisations=N, seed=5, start=start),
+        engine.snr(quiet, realisations=N, seed=5, start=start),
+    )
+
+
+def test_many_flares_noisy_references_and_processes(engine: Engine) -> None:
+    """Several launches to a request, and everything that a request can carry."""
+    quiet, *flares = star(amplitudes=tuple(np.linspace(0.01, 0.3, 17)), payload=instrument(part=True))
+    how: dict[str, Any] = {
+        "realisations": 9000,
+        "seed": 1,
+        "statistics": ("chi2_pair", "matched"),
+        "comparison": Comparison.of("stack:3", "estimated"),
+        "processes": Processes(jitter=Uniform(0.0, 0.05)),
+    }
+    pool = Pool(Shuffled(engine, 4))
+    same(pool.detect(quiet, flares, **how), engine.detect(quiet, flares, **how))
+    assert pool.standing.of == 2 * 3
+
+
+def test_several_devices_of_different_form(scene: list[Expectation], engine: Engine) -> None:
+    """Two engines, one with 16 realisations to a work-item and one with 1, share the work and the answer's bits."""
+    quiet, *flares = scene
+    widths = iter((16, 1))
+
+    def make(device: str | None, progress: Any) -> Engine:
+        return Engine(device, progress=progress, width=next(widths))
+
+    workers = LocalWorkers([None, "0"], make=make)
+    counted: list[Engine] = []
+    real = Engine.count_detection
+
+    def noted(self: Engine, *given: Any, **more: Any) -> None:
+        counted.append(self)
+        real(self, *given, **more)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Engine, "count_detection", noted)
+        found = Pool(workers).detect(quiet, flares, realisations=N, seed=2)
+    workers.close()
+    assert len(set(map(id, counted))) == 2, "both worked"
+    same(found, engine.detect(quiet, flares, realisations=N, seed=2))
+
+
+class Failing:
+    """An engine whose launches fail at chosen calls."""
+
+    def __init__(self, engine: Engine, fails: set[int], calls: list[int]) -> None:
+        self._engine, self._fails, self._calls = engine, fails, calls
+        self.cl, self.device, self.device_name = engine.cl, engine.device, engine.device_name
+
+    def count_detection(self, *given: Any) -> None:
+        self._calls.append(len(self._calls))
+        if self._calls[-1] in self._fails:
+            # Half of the share is counted already when it fails.
+            self._engine.count_detection(given[0], given[1], given[2], given[3] // 2, *given[4:])
+            raise self.cl.RuntimeError("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES", -5, "")
+        self._engine.count_detection(*given)
+
+
+def test_a_failed_launch_is_counted_again(engine: Engine, scene: list[Expectation]) -> None:
+    quiet, *flares = scene
+    calls: list[int] = []
+    made: list[int] = []
+
+    def make(device: str | None, progress: Any) -> Any:
+        made.append(1)
+        return Failing(engine, {2, 5, 6}, calls)
+
+    pool = Pool(LocalWorkers([None], make=make))
+    same(pool.detect(quiet, flares, realisations=N, seed=5), engine.detect(quiet, flares, realisations=N, seed=5))
+    assert pool.standing.retries == 3
+    assert len(made) == 4, "each time with a new context"
+
+
+def test_a_device_that_always_fails_is_one_sentence(engine: Engine, scene: list[Expectation]) -> None:
+    quiet, *flares = scene
+    pool = Pool(LocalWorkers([None], make=lambda device, progress: Failing(engine, set(range(99)), [])))  # type: ignore[return-value, arg-type]
+    with pytest.raises(DeviceError, match=r"failed 3 times at realisations 0 to 4095 .*OUT_OF_RESOURCES.*expected"):
+        pool.detect(quiet, flares, realisations=N, seed=5)
+
+
+AXES = {"x": {"quantity": "magnitude", "values": [6, 8, 10]}, "y": {"quantity": "amplitude", "values": [0.05, 0.2]}}
+
+
+@pytest.mark.parametrize(
+    ("ask", "sections"),
+    [
+        (lambda s, e: detect(s, e).table, {}),
+        (lambda s, e: snr(s, e).element, {"sweep": {"axes": [{"quantity": "exposure", "values": [5, 50]}]}}),
+        (lambda s, e: limiting_magnitude(s, e).table, {}),
+        (lambda s, e: detection_map(s, e).table, {"map": AXES}),
+        (lambda s, e: detection_map(s, e).table, {"map": AXES, "unknowns": {"draws": 3}}),
+    ],
+    ids=["detect", "snr", "limit", "map", "unknowns"],
+)
+def test_every_study_gives_the_same_table(
+    engine: Engine, ask: Callable[[Study, Any], Any], sections: dict[str, Any]
+) -> None:
+    ours, theirs = ask(small(**sections), engine), ask(small(**sections), Pool(Shuffled(engine, 9)))
+    assert ours.colnames == theirs.colnames
+    for name in ours.colnames:
+        np.testing.assert_array_equal(np.asarray(ours[name]), np.asarray(theirs[name]), err_msg=name)
+
+
+def test_fingerprints_tell_requests_apart(scene: list[Expectation]) -> None:
+    """Everything that changes an answer changes the name of its shares, and nothing else does."""
+    from dataclasses import replace
+
+    quiet, *flares = scene
+    base = DetectRequest(quiet, tuple(flares), N, 5, ("chi2", "matched"))
+    brighter = replace(flares[1], source_electrons=np.nextafter(flares[1].source_electrons, np.inf))
+    others = [
+        replace(base, seed=6),
+        replace(base, statistics=("chi2",)),
+        replace(base, statistics=("chi2", Linear("own", np.ones(quiet.wavelength_nm.size)))),
+        replace(base, statistics=("chi2", Linear("own", np.full(quiet.wavelength_nm.size, 2.0)))),
+        replace(base, flares=tuple(flares[::-1])),
+        replace(base, flares=(flares[0], brighter)),
+        replace(base, comparison=Comparison.of("exposure")),
+        replace(base, processes=Processes(jitter=Uniform(0.0, 0.01))),
+        replace(base, mode="frames"),
+        SnrRequest(quiet, N, 5),
+    ]
+    names = [fingerprint(one) for one in (base, *others)]
+    assert len(set(names)) == len(names)
+    told = replace(quiet, provenance={"from": "elsewhere"}, messages=())
+    for same_one in (replace(base, realisations=7), replace(base, quiet=told), pickle.loads(pickle.dumps(base))):
+        assert fingerprint(same_one) == names[0]
+
+
+def test_shares_do_not_depend_on_the_number_of_realisations(scene: list[Expectation]) -> None:
+    """All but the last: so a longer run finds the shares of a shorter one."""
+    quiet, *flares = scene
+    short, long = (shards.shares(DetectRequest(quiet, tuple(flares), n, 5, ("chi2",))) for n in (N, 10 * N))
+    assert short[:-1] == long[: len(short) - 1]
+    for request_shares, n in ((short, N), (long, 10 * N)):
+        assert sum(share.count for share in request_shares) == n
+
+
+def test_large_requests_have_larger_shares(scene: list[Expectation], monkeypatch: pytest.MonkeyPatch) -> None:
+    """So that there are never more than one process can add up."""
+    monkeypatch.setattr(shards, "SHARE", 2**34)
+    for n in (10**6, 10**9, 10**12, 10**15):
+        found = shards.shares(DetectRequest(scene[0], tuple(scene[1:]), n, 5, ("chi2",)))
+        assert len(found) <= 2 * shards.MOST + 1
+        assert sum(share.count for share in found) == n
+        assert all(share.count & (share.count - 1) == 0 for share in found[:-1])
+
+
+def interrupting(after: int) -> Callable[[int, int], None]:
+    def progress(done: int, total: int) -> None:
+        if done >= after:
+            raise KeyboardInterrupt
+
+    return progress
+
+
+def at_work(
+    folder: Path, engine: Engine, progress: Any = None, study: Study | None = None, **how: Any
+) -> tuple[Detection, Pool, Checkpoint]:
+    study = study or small()
+    quiet, *flares = study.expectations(study.star[0])
+    with Checkpoint(folder, "detect", study, patience_s=0.0, **how) as checkpoint:
+        pool = Pool(LocalWorkers([None], make=lambda d, progress: engine), checkpoint=checkpoint, progress=progress)
+        return pool.detect(quiet, flares, realisations=N, seed=5), pool, checkpoint
+
+
+def test_an_interrupted_run_goes_on(tmp_path: Path, engine: Engine) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        at_work(tmp_path, engine, interrupting(20_000))
+    found, pool, checkpoint = at_work(tmp_path, engine, resume=True)
+    assert 16_000 < pool.standing.resumed < N
+    quiet, *flares = small().expectations(small().star[0])
+    same(found, engine.detect(quiet, flares, realisations=N, seed=5))
+    checkpoint.forget()
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_is_unfinished_is_not_overwritten(tmp_path: Path, engine: Engine) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        at_work(tmp_path, engine, interrupting(10_000))
+    with pytest.raises(InputError, match="holds an unfinished run, expected --resume to go on with it or --restart"):
+        at_work(tmp_path, engine)
+    other = small().with_settings(["run.seed=4", "flare.amplitudes=[0.1]"])
+    with pytest.raises(InputError, match=r"differs in flare\.amplitudes\.0, flare\.amplitudes\.1, run\.seed, expected"):
+        at_work(tmp_path, engine, study=other, resume=True)
+    _, pool, _ = at_work(tmp_path, engine, restart=True)
+    assert pool.standing.resumed == 0
+
+
+def test_counts_of_another_form_are_refused(tmp_path: Path, engine: Engine) -> None:
+    """As an older version left them; also where the manifest is lost, none of its shares is added."""
+    with pytest.raises(KeyboardInterrupt):
+        at_work(tmp_path, engine, interrupting(10_000))
+    path = tmp_path / "checkpoint" / "manifest.json"
+    manifest = json.loads(path.read_text())
+    old = {key: value for key, value in manifest.items() if key not in ("form", "digest")}
+    path.write_text(json.dumps(old | {"digest": _digest_of(old)}))
+    with pytest.raises(InputError, match="in form 1, expected form 2 as this version writes: --restart to"):
+        at_work(tmp_path, engine, resume=True)
+    quiet, *flares = small().expectations(small().star[0])
+    request = DetectRequest(quiet, tuple(flares), N, 5)
+    ours = fingerprint(request)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(shards, "FORM", 1)
+        assert fingerprint(request) != ours
+
+
+def test_two_runs_in_one_folder(tmp_path: Path, engine: Engine) -> None:
+    with (
+        Checkpoint(tmp_path, "detect", small()),
+        pytest.raises(InputError, match="is being written by another process"),
+    ):
+        at_work(tmp_path, engine)
+
+
+@pytest.mark.parametrize("place", [0, 20, -1])
+def test_a_flipped_byte_in_a_share(tmp_path: Path, engine: Engine, place: int) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        at_work(tmp_path, engine, interrupting(20_000))
+    first, *_ = sorted((tmp_path / "checkpoint").glob("*.npz"))
+    data = bytearray(first.read_bytes())
+    data[place] ^= 4
+    first.write_bytes(data)
+    found, pool, checkpoint = at_work(tmp_path, engine, resume=True)
+    assert checkpoint.damaged == 1
+    assert pool.standing.resumed >= 8192
+    quiet, *flares = small().expectations(small().star[0])
+    same(found, engine.detect(quiet, flares, realisations=N, seed=5))
+
+
+def test_a_share_in_anothers_place(tmp_path: Path, engine: Engine) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        at_work(tmp_path, engine, interrupting(20_000))
+    first, second, *_ = sorted((tmp_path / "checkpoint").glob("*.npz"))
+    first.write_bytes(second.read_bytes())
+    found, _, checkpoint = at_work(tmp_path, engine, resume=True)
+    assert checkpoint.damaged == 1
+    quiet, *flares = small().expectations(small().star[0])
+    same(found, engine.detect(quiet, flares, realisations=N, seed=5))
+
+
+@pytest.mark.parametrize("spoil", ["flip", "empty", "gone"])
+def test_a_damaged_manifest(tmp_path: Path, engine: Engine, spoil: str) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        at_work(tmp_path, engine, interrupting(20_000))
+    manifest = tmp_path / "checkpoint" / "manifest.json"
+    text = manifest.read_text()
+    manifest.unlink() if spoil == "gone" else manifest.write_text(text.replace("7.4", "7.5") if spoil == "flip" else "")
+    found, pool, checkpoint = at_work(tmp_path, engine, resume=True)
+    assert "was damaged or missing and is written anew" in checkpoint.messages[0]
+    assert pool.standing.resumed > 16_000
+    assert manifest.read_text() == text
+    quiet, *flares = small().expectations(small().star[0])
+    same(found, engine.detect(quiet, flares, realisations=N, seed=5))
+
+
+def test_short_runs_leave_no_files(tmp_path: Path, engine: Engine) -> None:
+    study = small()
+    quiet, *flares = study.expectations(study.star[0])
+    with Checkpoint(tmp_path, "detect", study) as checkpoint:
+        pool = Pool(LocalWorkers([None], make=lambda d, progress: engine), checkpoint=checkpoint)
+        pool.detect(quiet, flares, realisations=N, seed=5)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_clocks_may_jump(tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Wall time runs backwards and leaps; neither shares nor progress care."""
+    from mauvecl.cli.console import Meter
+
+    leaps = iter(np.resize([1e9, -1e9, 0.0, 5e9], 100_000))
+    real = time.time
+    monkeypatch.setattr(time, "time", lambda: real() + next(leaps))
+    with pytest.raises(KeyboardInterrupt):
+        at_work(tmp_path, engine, interrupting(20_000))
+    with Meter(quiet=True) as meter:
+        found, pool, _ = at_work(tmp_path, engine, meter, resume=True)
+    assert pool.standing.resumed > 16_000
+    quiet, *flares = small().expectations(small().star[0])
+    same(found, engine.detect(quiet, flares, realisations=N, seed=5))
+
+
+def test_a_full_disk_stops_with_a_sentence_and_loses_nothing(
+    tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from stores import full_after
+
+    with monkeypatch.context() as patch:
+        full_after(400_000, patch)
+        with pytest.raises(InputError, match=r"cannot be written \(No space left on device\).*before is kept"):
+            at_work(tmp_path, engine)
+    kept = len(list((tmp_path / "checkpoint").glob("*.npz")))
+    assert kept >= 1
+    found, pool, _ = at_work(tmp_path, engine, resume=True)
+    assert pool.standing.resumed == kept * 4096
+    quiet, *flares = small().expectations(small().star[0])
+    same(found, engine.detect(quiet, flares, realisations=N, seed=5))
+
+
+def test_progress_tells_shares_and_what_was_resumed(tmp_path: Path, engine: Engine) -> None:
+    with pytest.raises(KeyboardInterrupt):
+        at_work(tmp_path, engine, interrupting(20_000))
+    told: list[tuple[int, int]] = []
+    _, pool, _ = at_work(tmp_path, engine, lambda done, total: told.append((done, total)), resume=True)
+    assert told[0] == (0, N)
+    assert told[-1] == (N, N)
+    assert [done for done, _ in told] == sorted(done for done, _ in told)
+    s = pool.standing
+    assert (s.shares, s.of, s.retries) == (8, 8, 0)
+
+
+def test_answers_keep_their_order_and_errors_end_the_rest(engine: Engine) -> None:
+    pool = Pool(Shuffled(engine, 1))
+    pauses: Sequence[float] = [0.05, 0.0, 0.03, 0.01, 0.02, 0.0]
+
+    def slow(number: int) -> int:
+        time.sleep(pauses[number])
+        return number
+
+    assert list(together(pool, slow, range(6))) == list(range(6))
+
+    def bad(number: int) -> int:
+        if number == 2:
+            raise InputError("number = 2, expected another")
+        return number
+
+    with pytest.raises(InputError, match="number = 2"):
+        list(together(pool, bad, range(6)))
+    quiet, *flares = small().expectations(small().star[0])
+    with pytest.raises(Stopped):
+        pool.detect(quiet, flares, realisations=N, seed=5)

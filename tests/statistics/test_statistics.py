@@ -1,0 +1,138 @@
+"""Closed forms against scipy's exact distributions and plain simulation; intervals against their definition."""
+
+from __future__ import annotations
+
+import itertools
+import time
+
+import numpy as np
+import pytest
+from scipy import integrate, stats
+
+from mauvecl.statistics.definitions import MANY, Normal, QuadraticForm, clopper_pearson
+
+
+@pytest.mark.parametrize("n", [10, 48, 1643])
+@pytest.mark.parametrize("scale", [1.0, 2.5])
+def test_equal_weights_are_a_scaled_non_central_chi_squared(n: int, scale: float) -> None:
+    """scipy's ncx2 is another method (Boost); weights of 1 + 1e-12 keep ours from handing over to it."""
+    shift = np.linspace(-0.5, 0.7, n)
+    form = QuadraticForm(np.full(n, scale * (1 + 1e-12)), shift)
+    exact = stats.ncx2(n, np.sum(shift**2), scale=scale)
+    assert form.mean == pytest.approx(exact.mean())
+    assert form.std == pytest.approx(exact.std())
+    for p in (0.999999, 0.99, 0.5, 1e-2, 1e-4, 1e-6, 1e-9):
+        assert form.sf(float(exact.isf(p))) == pytest.approx(p, rel=1e-4, abs=1e-13)
+
+
+def test_unit_weights_are_handed_to_scipy() -> None:
+    assert QuadraticForm(np.ones(30), np.zeros(30)).isf(1e-3) == stats.chi2.isf(1e-3, 30)
+    form = QuadraticForm(np.ones(30), np.full(30, 0.3))
+    assert form.sf(40.0) == pytest.approx(stats.ncx2.sf(40.0, 30, 30 * 0.09), rel=1e-12)
+
+
+def test_two_weights_with_a_closed_form() -> None:
+    """Pairs of equal weights make exponentials: a hypoexponential tail, exact."""
+    a, b = 1.0, 3.0
+    form = QuadraticForm(np.array([a, a, b, b]), np.zeros(4))
+    for x in (0.5, 5.0, 20.0, 60.0):
+        exact = (b * np.exp(-x / (2 * b)) - a * np.exp(-x / (2 * a))) / (b - a)
+        assert form.sf(x) == pytest.approx(exact, rel=1e-6)
+
+
+def of_two(form: QuadraticForm, x: float, *, upper: bool) -> float:
+    """Above or below x, for two terms: over all normals of the first term, whether the second reaches there."""
+    (a, b), (first, second) = form.weight, form.shift
+    most = np.sqrt(x / a)
+
+    def rest(z: float) -> float:
+        root = np.sqrt(max(x - a * (z + first) ** 2, 0.0) / b)
+        ends = stats.norm.cdf([root - second, -root - second])
+        return float(stats.norm.sf(root - second) + ends[1] if upper else ends[0] - ends[1])
+
+    edges = np.linspace(-most, most, 21) - first
+    inside = sum(
+        integrate.quad(lambda z: stats.norm.pdf(z) * rest(z), *pair, epsabs=0.0, epsrel=1e-10)[0]
+        for pair in itertools.pairwise(edges)
+    )
+    return float(inside + upper * (stats.norm.sf(edges[-1]) + stats.norm.cdf(edges[0])))
+
+
+@pytest.mark.filterwarnings("ignore::scipy.integrate.IntegrationWarning")
+def test_two_terms_of_any_kind_against_quadrature() -> None:
+    """Weights up to 1e4 apart, shifts up to 8: every tail to 1e-10, its quantile in half a second."""
+    generator = np.random.default_rng(8)
+    for _ in range(3):
+        form = QuadraticForm(10 ** generator.uniform(-4, 0, 2), generator.normal(0, 1, 2) * generator.choice([0, 1, 4]))
+        for p in (1e-10, 1e-3, 0.3, 0.9, 1 - 1e-4):
+            began = time.process_time()
+            x = form.isf(p)
+            assert time.process_time() - began < 0.5
+            upper = p <= 0.5
+            assert of_two(form, x, upper=upper) == pytest.approx(p if upper else 1 - p, rel=1e-7)
+            assert form.sf(x) == pytest.approx(p, rel=1e-9)
+
+
+@pytest.mark.parametrize("n", [1, 2, 5, 29, 400])
+@pytest.mark.parametrize("push", [0.0, 0.5, 1e4])
+def test_few_terms_and_far_tails_are_scipys(n: int, push: float) -> None:
+    """Equal weights, whatever their number: 1e-100 too; below 1e-10 scipy's own digits end."""
+    form = QuadraticForm(np.full(n, 2.5), np.sqrt(np.append(push, np.zeros(n - 1))))
+    exact = stats.ncx2(n, push, scale=2.5) if push else stats.chi2(n, scale=2.5)
+    for p in (1e-10, 1e-5, 0.2):
+        assert exact.sf(form.isf(p)) == pytest.approx(p, rel=1e-6)
+        assert exact.cdf(form.isf(1 - p)) == pytest.approx(p, rel=1e-5)
+    if not push:
+        assert exact.sf(form.isf(1e-100)) == pytest.approx(1e-100, rel=1e-9)
+
+
+def test_several_weights_with_a_closed_form() -> None:
+    """Pairs of equal weights make exponentials; five different ones, from 1 to 1e-3, in a tail of 1e-12 too."""
+    weight = np.array([1.0, 0.4, 0.05, 0.01, 1e-3])
+    form = QuadraticForm(np.repeat(weight, 2), np.zeros(10))
+    share = np.array([np.prod(w / (w - np.delete(weight, k))) for k, w in enumerate(weight)])
+    for p in (0.9, 0.1, 1e-3, 1e-12):
+        x = form.isf(p)
+        assert share @ np.exp(-x / (2 * weight)) == pytest.approx(p, rel=1e-8)
+
+
+@pytest.mark.parametrize("spread", [0.01, 0.5, 3.0])
+def test_both_integrals_say_the_same(spread: float) -> None:
+    """Of many terms: the characteristic function's, and the one along the bent path."""
+    generator = np.random.default_rng(9)
+    form = QuadraticForm(10 ** generator.uniform(-spread, 0, 300), generator.normal(0, 0.3, 300))
+    assert form.effective_terms > MANY
+    for sigmas in (-3.0, -1.0, 0.5, 3.0, 5.0):
+        value = form.mean + sigmas * form.std
+        bent = np.exp(form._squares.tail(value / form._squares.unit, upper=sigmas > 0)[0])
+        assert form.sf(value) == pytest.approx(bent if sigmas > 0 else 1 - bent, rel=1e-6, abs=1e-14)
+
+
+def test_effective_terms() -> None:
+    assert QuadraticForm(np.full(7, 2.5), np.ones(7)).effective_terms == pytest.approx(7.0)
+    assert QuadraticForm(np.array([3.0, 1.0]), np.zeros(2)).effective_terms == pytest.approx(1.6)
+
+
+def test_unequal_weights_against_simulation() -> None:
+    """A fixed seed; 5 standard errors at 4e5, so one chance failure in 3e5 seeds for the five values."""
+    generator = np.random.default_rng(77)
+    weight, shift = generator.uniform(0.8, 1.4, 60), generator.normal(0, 0.5, 60)
+    form = QuadraticForm(weight, shift)
+    draws = ((generator.standard_normal((400_000, 60)) + shift) ** 2) @ weight
+    for p in (0.9, 0.5, 0.1, 1e-2, 1e-3):
+        x = form.isf(p)
+        assert abs(np.mean(draws > x) - p) < 5 * np.sqrt(p * (1 - p) / draws.size)
+
+
+def test_quantiles_invert_probabilities() -> None:
+    form = QuadraticForm(np.linspace(0.5, 2.0, 100), np.linspace(0.0, 1.0, 100))
+    for distribution in (form, Normal(2.0, 3.0)):
+        for p in (0.9, 0.1, 1e-3, 1e-6):
+            assert distribution.sf(distribution.isf(p)) == pytest.approx(p, rel=1e-5)
+
+
+@pytest.mark.parametrize(("k", "n"), [(0, 10), (10, 10), (3, 10), (1000, 1_000_000)])
+def test_clopper_pearson_is_scipys_exact_interval(k: int, n: int) -> None:
+    ours, theirs = clopper_pearson(k, n), stats.binomtest(k, n).proportion_ci(method="exact")
+    assert ours.value == k / n
+    assert (ours.low, ours.high) == pytest.approx((theirs.low, theirs.high), rel=1e-9)

@@ -1,0 +1,13 @@
+"""Fixtures of the tests of stores."""
+
+from __future__ import annotations
+
+import pytest
+
+from mauvecl.store import form as store
+
+
+@pytest.fixture(autouse=True)
+def small_chunks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Chunks of some 64 rows, so that a small store has several."""
+    monkeypatch.setattr(store, "CHUNK_BYTES", 64 * 197 * 2)

@@ -1,0 +1,400 @@
+"""Stores of raw spectra: what is in them, what is found wrong with them, and what they survive."""
+
+from __future__ import annotations
+
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import time
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zarr
+from stores import CHUNK, LAST, Painter, flip, forked, full_after, killed, study, tree
+from typer.testing import CliRunner
+
+from mauvecl.cli.app import app
+from mauvecl.device.engine import Engine
+from mauvecl.host.errors import InputError
+from mauvecl.runs import durable
+from mauvecl.runs.durable import alone
+from mauvecl.store import bulk
+from mauvecl.store import form as store
+from mauvecl.store.export import Selection, export
+from mauvecl.store.form import Store
+from mauvecl.study.study import Study
+
+
+def test_rows_are_the_engines(tmp_path: Path, engine: Engine) -> None:
+    asked = study()
+    made = bulk.realise(asked, tmp_path / "frames.zarr", engine)
+    assert len(list(made.chunks())) > 4
+    quiet, flare = asked.expectations(asked.star[0])
+    for name, x in (("star-1/quiescent", quiet), ("star-1/flare-1", flare)):
+        found = bulk.read(tmp_path / "frames.zarr", name)
+        assert found.dims == ("realisation", "pixel")
+        assert found.dtype == np.uint16
+        assert found.attrs["units"] == "DN"
+        np.testing.assert_array_equal(found.values, engine.realise(x, count=300, seed=11))
+        np.testing.assert_array_equal(found[17:20].values, engine.realise(x, start=17, count=3, seed=11))
+        np.testing.assert_array_equal(found.wavelength, x.wavelength_nm)
+    root = zarr.open_group(tmp_path / "frames.zarr", mode="r")
+    np.testing.assert_array_equal(root["star-1/gain_dn_per_electron"][:], quiet.gain_dn_per_electron)
+    assert Study.build(tomllib.loads(root.attrs["study"]), "store") == asked
+    assert "not a flight calibration" in root.attrs["throughput"]
+
+
+def test_sums_of_frames_have_32_bits_and_components_are_kept(tmp_path: Path, engine: Engine) -> None:
+    asked = study(40, observation={"exposure_s": 50.0}, bulk={"components": True})
+    bulk.realise(asked, tmp_path / "s.zarr", engine)
+    quiet, flare = asked.expectations(asked.star[0])
+    found = bulk.read(tmp_path / "s.zarr", "star-1/flare-1")
+    assert found.dtype == np.int32
+    np.testing.assert_array_equal(found.values, engine.realise(flare, count=40, seed=11))
+    group = zarr.open_group(tmp_path / "s.zarr", mode="r")["star-1"]
+    mean = group["flare-1-source"][:] + group["flare-1-sky"][:] + 10 * (group["bias_dn"][:] + group["dark_dn"][:])
+    np.testing.assert_allclose(mean, 10 * flare.mean_raw_dn, rtol=1e-12)
+    np.testing.assert_allclose(group["quiescent-noise"][:], np.sqrt(quiet.variance_dn2), rtol=1e-12)
+
+
+@pytest.mark.parametrize("processes", [{}, {"jitter": {"uniform": (0.0, 0.05)}}])
+def test_frames_kept_apart_add_up_to_the_exposure(tmp_path: Path, engine: Engine, processes: dict[str, Any]) -> None:
+    how = {"observation": {"exposure_s": 50.0, "mode": "frames"}, "processes": processes}
+    whole = bulk.realise(study(30, **how), tmp_path / "whole.zarr", engine)
+    bulk.realise(study(30, **how, bulk={"frames": "all"}), tmp_path / "all.zarr", engine)
+    bulk.realise(study(30, **how, bulk={"frames": [0, 7]}), tmp_path / "two.zarr", engine)
+    for scene in whole.scenes:
+        every = bulk.read(tmp_path / "all.zarr", scene.path)
+        assert every.dims == ("realisation", "frame", "pixel")
+        assert every.dtype == np.uint16
+        np.testing.assert_array_equal(every.values.sum(axis=1), bulk.read(tmp_path / "whole.zarr", scene.path).values)
+        two = bulk.read(tmp_path / "two.zarr", scene.path)
+        np.testing.assert_array_equal(two.frame, [0, 7])
+        np.testing.assert_array_equal(two.values, every.values[:, [0, 7]])
+
+
+def test_every_star_of_every_cell_is_there(tmp_path: Path, engine: Engine) -> None:
+    asked = study(20, sweep={"axes": [{"quantity": "magnitude", "values": [6.0, 8.0]}]})
+    made = bulk.realise(asked, tmp_path / "sweep.zarr", engine)
+    assert [scene.path for scene in made.scenes] == [f"star-{k}/{n}" for k in (1, 2) for n in ("quiescent", "flare-1")]
+    second = asked.cells()[1][1].expectations(asked.cells()[1][1].star[0])[0]
+    np.testing.assert_array_equal(
+        bulk.read(tmp_path / "sweep.zarr", "star-2/quiescent").values, engine.realise(second, count=20, seed=11)
+    )
+
+
+def swap(a: Path, b: Path) -> None:
+    a_bytes, b_bytes = a.read_bytes(), b.read_bytes()
+    a.write_bytes(b_bytes)
+    b.write_bytes(a_bytes)
+
+
+FAULTS: list[tuple[str, Callable[[Path], object], dict[str, str]]] = [
+    ("flipped byte", lambda p: flip(p / CHUNK), {CHUNK: "damaged"}),
+    ("flipped CRC", lambda p: flip(p / LAST, -1), {LAST: "damaged"}),
+    ("cut short", lambda p: (p / CHUNK).write_bytes((p / CHUNK).read_bytes()[:-10]), {CHUNK: "damaged"}),
+    ("missing", lambda p: (p / CHUNK).unlink(), {CHUNK: "missing"}),
+    (
+        "swapped",
+        lambda p: swap(p / CHUNK, p / "star-1/quiescent/c/2/0"),
+        {CHUNK: "foreign", "star-1/quiescent/c/2/0": "foreign"},
+    ),
+    (
+        "flipped byte in the list",
+        lambda p: flip(p / "star-1/quiescent/digests.txt", 5),
+        {"star-1/quiescent/c/0/0": "unlisted"},
+    ),
+    ("flipped byte in the study", lambda p: flip(p / "zarr.json", 40), {"zarr.json": "?"}),
+    (
+        "a missing description",
+        lambda p: (p / "star-1/flare-1/zarr.json").unlink(),
+        {"star-1/flare-1/zarr.json": "missing"},
+    ),
+    ("flipped calibration", lambda p: flip(p / "star-1/bias_dn/c/0"), {"star-1/bias_dn/c/0": "damaged"}),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("break_it", "expected"), [f[1:] for f in FAULTS], ids=[f[0] for f in FAULTS])
+def test_faults_are_found_and_repaired_to_the_bit(
+    tmp_path: Path, engine: Engine, break_it: Callable[[Path], object], expected: dict[str, str]
+) -> None:
+    path = tmp_path / "frames.zarr"
+    bulk.realise(study(), path, engine)
+    assert bulk.verify(path) == []
+    before = tree(path)
+    break_it(path)
+    found = {fault.key: fault.state for fault in bulk.verify(path)}
+    assert found.keys() == expected.keys()
+    assert all(state in (found[key], "?") for key, state in expected.items())
+    assert all(fault.mended for fault in bulk.verify(path, engine, repair=True))
+    # A list of digests keeps the line that could not be read.
+    after = tree(path)
+    assert {k: v for k, v in after.items() if "digests" not in k} == {
+        k: v for k, v in before.items() if "digests" not in k
+    }
+    assert bulk.verify(path, engine, redraw=True) == []
+
+
+def test_redrawing_finds_what_digests_cannot(tmp_path: Path, engine: Engine) -> None:
+    """Chunk and digest of another seed's store are consistent, and not this study's."""
+    path, other = tmp_path / "frames.zarr", tmp_path / "other.zarr"
+    bulk.realise(study(), path, engine)
+    bulk.realise(study(run={"seed": 12}), other, engine)
+    for name in (CHUNK, "star-1/quiescent/digests.txt"):
+        shutil.copy(other / name, path / name)
+    states = {fault.state for fault in bulk.verify(path)}
+    assert states == {"foreign"}, "the other chunks do not have the copied digests"
+    (path / "star-1/quiescent/c").rename(tmp_path / "c")
+    shutil.copytree(other / "star-1/quiescent/c", path / "star-1/quiescent/c")
+    assert bulk.verify(path) == []
+    assert {f.state for f in bulk.verify(path, engine, redraw=True, rows=(60, 70))} == {"differs"}
+    bulk.verify(path, engine, redraw=True, repair=True)
+    assert bulk.verify(path, engine, redraw=True) == []
+
+
+def test_strangers_are_named_and_left(tmp_path: Path, engine: Engine) -> None:
+    path = tmp_path / "frames.zarr"
+    bulk.realise(study(), path, engine)
+    (path / "star-1/quiescent/c/99").mkdir()
+    (path / "star-1/quiescent/c/99/0").write_bytes(b"?")
+    (fault,) = bulk.verify(path, engine, repair=True)
+    assert (fault.key, fault.state, fault.mended) == ("star-1/quiescent/c/99/0", "not of this store", False)
+
+
+def test_another_study_is_refused_with_what_differs(tmp_path: Path, engine: Engine) -> None:
+    path = tmp_path / "frames.zarr"
+    bulk.realise(study(), path, engine)
+    with pytest.raises(InputError, match=r"differs in run\.seed, star\.0\.magnitude, expected the same"):
+        bulk.realise(study(run={"seed": 3}).at("magnitude", 7.0), path, engine)
+    assert bulk.verify(path) == []
+
+
+def test_places_that_cannot_be(tmp_path: Path, engine: Engine) -> None:
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "mine.txt").write_text("keep me")
+    with pytest.raises(InputError, match=r"holds 'mine\.txt' and no store"):
+        bulk.realise(study(), tmp_path / "notes", engine)
+    with pytest.raises(InputError, match="is no store of spectra"):
+        bulk.forget(tmp_path / "notes")
+    assert (tmp_path / "notes" / "mine.txt").read_text() == "keep me"
+    with pytest.raises(InputError, match="cannot be made"):
+        bulk.realise(study(), tmp_path / "notes" / "mine.txt" / "store", engine)
+    with pytest.raises(InputError, match="is no store of spectra"):
+        bulk.read(tmp_path / "nowhere")
+    bulk.realise(study(20), tmp_path / "s.zarr", engine)
+    with pytest.raises(InputError, match="no array 'star-9/quiescent'"):
+        bulk.read(tmp_path / "s.zarr", "star-9/quiescent")
+    with pytest.raises(InputError, match=r"frame 7, expected 0 to 0"):
+        bulk.realise(study(20, bulk={"frames": [7]}), tmp_path / "t.zarr", engine)
+
+
+def test_two_writers_on_one_store(tmp_path: Path, engine: Engine) -> None:
+    path = tmp_path / "frames.zarr"
+    bulk.realise(study(), path, engine)
+    with alone(path, "store"):
+        with pytest.raises(InputError, match="being written by another process"):
+            bulk.realise(study(), path, engine)
+        with pytest.raises(InputError, match="being written by another process"):
+            bulk.verify(path)
+    assert bulk.verify(path) == []
+
+
+@pytest.fixture(scope="module")
+def painted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The store of a run that nobody killed."""
+    path = tmp_path_factory.mktemp("painted") / "frames.zarr"
+    before, store.CHUNK_BYTES = store.CHUNK_BYTES, 64 * 197 * 2
+    bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
+    store.CHUNK_BYTES = before
+    return tree(path)
+
+
+def test_fifty_kills_at_random(tmp_path: Path, painted: dict[str, bytes]) -> None:
+    """Killed at any moment and resumed: the same files, to the bit."""
+    path, kills, stores = tmp_path / "frames.zarr", 0, 0
+    moments = random.Random(5)
+    while kills < 50:
+        child = forked(lambda: bulk.realise(study(1000), path, Painter()))  # type: ignore[arg-type]
+        time.sleep(moments.uniform(0.0, 0.4))
+        os.kill(child, signal.SIGKILL)
+        if killed(child):
+            kills += 1
+        else:
+            # It had ended before: a store resumed after many kills, and the next one begins.
+            assert tree(path) == painted
+            shutil.rmtree(path)
+            stores += 1
+    bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
+    assert tree(path) == painted
+    assert bulk.verify(path) == []
+
+
+def test_a_kill_at_every_step_of_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before each fsync, each rename and each line of digests, one by one."""
+    described, seen, step = Store(tmp_path, study(200)).description(), store.scenes(study(200)), 0
+    monkeypatch.setattr(Store, "description", lambda self: described)
+    monkeypatch.setattr(store, "scenes", lambda asked: seen)
+    while True:
+        path, counted = tmp_path / f"{step}.zarr", iter(range(step + 1))
+
+        def mortal(work: Callable[..., Any], counted: Any = counted, last: int = step) -> Callable[..., Any]:
+            def wrapped(*given: Any) -> Any:
+                if next(counted, last) == last:
+                    os.kill(os.getpid(), signal.SIGKILL)
+                return work(*given)
+
+            return wrapped
+
+        def run(path: Path = path, mortal: Any = mortal) -> None:
+            durable.os.fsync = mortal(os.fsync)  # type: ignore[attr-defined]
+            Path.replace = mortal(Path.replace)  # type: ignore[method-assign]
+            Store.note = mortal(Store.note)  # type: ignore[method-assign]
+            bulk.realise(study(200), path, Painter())  # type: ignore[arg-type]
+
+        ended = not killed(forked(run))
+        bulk.realise(study(200), path, Painter())  # type: ignore[arg-type]
+        if step == 0:
+            first = tree(path)
+        assert tree(path) == first
+        shutil.rmtree(path)
+        if ended:
+            break
+        step += 1
+    assert step > 30
+
+
+def test_a_full_disk_is_one_sentence_and_a_resume(
+    tmp_path: Path, painted: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "frames.zarr"
+    with monkeypatch.context() as patch:
+        full_after(300_000, patch)
+        with pytest.raises(InputError, match=r"cannot be written \(No space left on device\), expected"):
+            bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
+    there = [chunk for chunk in Store.open(path).chunks() if Store.open(path).has(chunk)]
+    assert len(there) > 5, "what was written before is kept"
+    bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
+    assert tree(path) == painted
+
+
+def test_a_disk_that_is_really_full_or_read_only(small_disk: Path, painted: dict[str, bytes]) -> None:
+    path = small_disk / "frames.zarr"
+    filler = small_disk / "filler"
+    filler.write_bytes(bytes(1_400_000))
+    with pytest.raises(InputError, match="No space left on device"):
+        bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
+    filler.unlink()
+    subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
+    with pytest.raises(InputError, match="Read-only file system"):
+        bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
+    with pytest.raises(InputError, match="Read-only file system"):
+        bulk.realise(study(1000), small_disk / "other.zarr", Painter())  # type: ignore[arg-type]
+    subprocess.run(["mount", "-o", "remount,rw", small_disk], check=True)
+    bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
+    assert tree(path) == painted
+
+
+def test_stopped_by_progress_nothing_is_lost(tmp_path: Path, painted: dict[str, bytes]) -> None:
+    path = tmp_path / "frames.zarr"
+
+    def stop(done: int, total: int) -> None:
+        if done > total // 2:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        bulk.realise(study(1000), path, Painter(), progress=stop)  # type: ignore[arg-type]
+    seen: list[int] = []
+    bulk.realise(study(1000), path, Painter(), progress=lambda done, total: seen.append(done))  # type: ignore[arg-type]
+    assert seen[0] > 1000, "it went on from where it was"
+    assert seen[-1] == 2000
+    assert tree(path) == painted
+
+
+def test_the_fits_export(tmp_path: Path, engine: Engine) -> None:
+    from astropy.io import fits
+    from astropy.wcs import WCS
+
+    made = bulk.realise(study(50), tmp_path / "s.zarr", engine)
+    path = export(Selection.of(made, rows=(10, 30)), tmp_path / "s.fits")
+    with fits.open(path, checksum=True) as hdus:
+        for hdu, scene in zip(hdus[1:3], made.scenes, strict=True):
+            np.testing.assert_array_equal(hdu.data, engine.realise(scene.expectation, start=10, count=20, seed=11))
+            wcs = WCS(hdu.header, hdus)
+            pixels = np.arange(hdu.data.shape[1])
+            wavelength, row = wcs.pixel_to_world_values(pixels, 3 + 0 * pixels)
+            np.testing.assert_allclose(wavelength, scene.expectation.wavelength_nm, rtol=1e-12)
+            np.testing.assert_array_equal(row, 13)
+        np.testing.assert_array_equal(hdus[3].data["DARK_DN"][0], made.scenes[0].expectation.dark_dn)
+        history = "\n".join(hdus[0].header["HISTORY"])
+        assert Study.build(tomllib.loads(history.partition("again:\n")[2]), "fits") == made.study
+    if shutil.which("fitsverify"):
+        told = subprocess.run(["fitsverify", path], capture_output=True, text=True, check=True).stdout
+        assert "0 warning(s) and 0 error(s)" in told, told
+
+
+def test_the_hdf5_export_of_frames(tmp_path: Path, engine: Engine) -> None:
+    import h5py
+
+    made = bulk.realise(
+        study(50, observation={"exposure_s": 10.0}, bulk={"frames": "all"}), tmp_path / "s.zarr", engine
+    )
+    path = export(Selection.of(made, ["star-1/flare-1"], rows=(5, 9)), tmp_path / "s.h5")
+    with h5py.File(path) as file:
+        data = file["star-1/flare-1"]
+        assert [d.label for d in data.dims] == ["realisation", "frame", "pixel"]
+        np.testing.assert_array_equal(data[:], bulk.read(tmp_path / "s.zarr", "star-1/flare-1")[5:9].values)
+        assert file.attrs["first_row"] == 5
+        assert data.attrs["units"] == "DN"
+        assert "star-1/quiescent" not in file
+
+
+def test_exports_that_cannot_be(tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    made = bulk.realise(study(50), tmp_path / "s.zarr", engine)
+    with pytest.raises(InputError, match=r"rows 10:60, expected a range within 0:50"):
+        Selection.of(made, rows=(10, 60))
+    with pytest.raises(InputError, match=r"expected a name ending in \.fits, \.h5, \.hdf5"):
+        export(Selection.of(made), tmp_path / "s.txt")
+    (tmp_path / "s.zarr" / "star-1/quiescent/c/0/0").unlink()
+    with pytest.raises(InputError, match=r"star-1/quiescent/c/0/0 is missing"):
+        Selection.of(made)
+    monkeypatch.setattr("mauvecl.store.export.LARGEST", 1000)
+    with pytest.raises(InputError, match="GiB in one file: choose rows"):
+        Selection.of(made)
+
+
+def test_the_verbs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("study.toml").write_text(study(100).toml())
+    run = CliRunner().invoke
+    made = run(app, ["realise", "study.toml", "--output", "f.zarr"])
+    assert made.exit_code == 0, made.output
+    assert "100 x 197" in made.output
+    assert "not a flight calibration" in made.output
+    again = run(app, ["realise", "study.toml", "--output", "f.zarr", "--json"])
+    assert json.loads(again.stdout)["arrays"][1]["amplitude"] == 0.24
+    good = run(app, ["verify", "f.zarr"])
+    assert (good.exit_code, "Everything agrees" in good.output) == (0, True)
+    flip(Path("f.zarr/star-1/quiescent/c/0/0"))
+    bad = run(app, ["verify", "f.zarr"])
+    assert bad.exit_code == 1
+    assert "damaged" in bad.output
+    assert run(app, ["verify", "f.zarr", "--repair"]).exit_code == 0
+    assert run(app, ["verify", "f.zarr", "--redraw", "--rows", "0:10"]).exit_code == 0
+    assert run(app, ["export", "f.zarr", "f.h5", "--rows", "0:10"]).exit_code == 0
+    direct = run(app, ["realise", "study.toml", "--output", "f.fits", "--quiet"])
+    assert direct.exit_code == 0, direct.output
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["f.fits", "f.h5", "f.zarr", "study.toml"]
+    Path("f.zarr/star-1/quiescent/c/0/0").unlink()
+    with pytest.raises(InputError, match=r"holds 3 of 4 chunks, expected --resume"):
+        app(["realise", "study.toml", "--output", "f.zarr"], standalone_mode=False)
+    app(["realise", "study.toml", "--output", "f.zarr", "--resume"], standalone_mode=False)
+    assert run(app, ["verify", "f.zarr"]).exit_code == 0
+    with pytest.raises(InputError, match=r"expected a name ending in \.zarr"):
+        app(["realise", "study.toml", "--output", "f.txt"], standalone_mode=False)

@@ -1,0 +1,226 @@
+"""Stores under attack: wrong studies, other people's files, two processes, absurd sizes."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from stores import CHUNK, Painter, flip, forked, killed, study, tree
+from typer.testing import CliRunner
+
+from mauvecl.cli.app import app
+from mauvecl.host.errors import InputError
+from mauvecl.runs.durable import alone
+from mauvecl.store import bulk
+from mauvecl.store.description import signed
+from mauvecl.store.export import Selection
+from mauvecl.store.form import Store
+
+__all__ = ["small_chunks"]
+
+
+class Seeded(Painter):
+    """Rows that tell their seed too."""
+
+    def realise(
+        self, x: Any, *, start: int, count: int, seed: int, out: NDArray[Any] | None = None, **how: Any
+    ) -> NDArray[Any]:
+        rows = super().realise(x, start=start, count=count, seed=seed) ^ np.uint16(seed)
+        if out is None:
+            return rows
+        out[:] = rows
+        return out
+
+
+PAINTER: Any = Seeded()
+
+
+@pytest.fixture
+def made(tmp_path: Path) -> Path:
+    """A small store, whole."""
+    path = tmp_path / "frames.zarr"
+    bulk.realise(study(), path, PAINTER)
+    return path
+
+
+def relabelled(place: Path, change: Callable[[str], str], **more: str) -> None:
+    """Change the study's text in a description."""
+    content = json.loads(place.read_text())
+    content["attributes"] |= {"study": change(content["attributes"]["study"])} | more
+    place.write_text(json.dumps(content, indent=2))
+
+
+COPIES = ["zarr.json", "star-1/quiescent/zarr.json", "star-1/flare-1/zarr.json"]
+
+
+@pytest.mark.parametrize("copy", COPIES)
+def test_a_byte_of_a_study_changes_no_label(made: Path, copy: str) -> None:
+    """Wherever it is changed: the store keeps its study, and repair mends the one file."""
+    before, right = tree(made), Store.open(made).study
+    text = study().toml()
+    # A sample of the bytes, and the seed's.
+    for place in [*range(3, len(text), len(text) // 12), text.index("seed = 11") + 7]:
+        other = "3" if text[place] != "3" else "4"
+        relabelled(made / copy, lambda text, place=place, other=other: text[:place] + other + text[place + 1 :])
+        assert Store.open(made).study == right
+        (made / copy).write_bytes(before[copy])
+    relabelled(made / copy, lambda text: text.replace("seed = 11", "seed = 31"))
+    assert [(f.key, f.mended) for f in bulk.verify(made, PAINTER, repair=True)] == [(copy, True)]
+    assert tree(made) == before
+
+
+@pytest.mark.parametrize("copy", COPIES)
+def test_contradicting_studies_are_refused(made: Path, copy: str) -> None:
+    """Each with its digest: nobody here can know which one was drawn, so nothing is read and nothing written."""
+    other = study().toml().replace("seed = 11", "seed = 31")
+    relabelled(made / copy, lambda text: other, **signed(other))
+    before = tree(made)
+    for ask in (
+        lambda: bulk.verify(made),
+        lambda: bulk.verify(made, PAINTER, repair=True, redraw=True),
+        lambda: bulk.read(made),
+        lambda: bulk.realise(study(), made, PAINTER),
+        lambda: bulk.realise(study(), made, PAINTER, restart=True),
+        lambda: bulk.forget(made),
+    ):
+        with pytest.raises(InputError, match=r"holds two studies, 'zarr\.json' and .* differ in run\.seed, "):
+            ask()
+    assert tree(made) == before
+
+
+def test_no_intact_study_is_no_store(made: Path) -> None:
+    for copy in COPIES:
+        relabelled(made / copy, lambda text: text.replace("seed = 11", "seed = 31"))
+    before = tree(made)
+    with pytest.raises(InputError, match="with an intact copy of its study"):
+        bulk.verify(made, PAINTER, repair=True)
+    assert tree(made) == before
+
+
+def test_repair_does_not_mix_what_two_studies_draw(made: Path) -> None:
+    """Every copy replaced alike: the digests of what was written still tell."""
+    other = study().toml().replace("seed = 11", "seed = 31")
+    for copy in COPIES:
+        relabelled(made / copy, lambda text: other, **signed(other))
+    flip(made / CHUNK)
+    before = tree(made)
+    with pytest.raises(InputError, match=rf"{CHUNK} of frames\.zarr was written with the digest .* expected the same"):
+        bulk.verify(made, PAINTER, repair=True)
+    assert {k: v for k, v in tree(made).items() if not k.endswith("zarr.json")} == {
+        k: v for k, v in before.items() if not k.endswith("zarr.json")
+    }
+
+
+@pytest.mark.parametrize("how", ["python", "command", "forget"])
+def test_a_store_that_is_being_written_is_not_removed(made: Path, how: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(made.parent)
+    Path("study.toml").write_text(study().toml())
+    before = tree(made)
+    words = ["realise", "study.toml", "--restart", "--output", str(made)]
+    restart = {
+        "python": lambda: bulk.realise(study(), made, PAINTER, restart=True),
+        "forget": lambda: bulk.forget(made),
+        "command": lambda: app(words, standalone_mode=False),
+    }[how]
+    with alone(made, "store"), pytest.raises(InputError, match="is being written by another process"):
+        restart()
+    assert tree(made) == before
+
+
+@pytest.mark.parametrize("place", ["mine.txt", "star-1/mine.txt", "star-1/quiescent/c/mine", "star-1/quiescent/c/99/0"])
+@pytest.mark.parametrize("kind", ["file", "link"])
+def test_other_peoples_files_are_not_removed(made: Path, place: str, kind: str) -> None:
+    elsewhere = made.parent / "elsewhere"
+    elsewhere.mkdir()
+    (elsewhere / "keep").write_text("me")
+    (made / place).parent.mkdir(exist_ok=True)
+    (made / place).write_text("keep me") if kind == "file" else (made / place).symlink_to(elsewhere)
+    before = tree(made)
+    for remove in (
+        lambda: bulk.realise(study(), made, PAINTER, restart=True),
+        lambda: bulk.forget(made),
+    ):
+        with pytest.raises(InputError, match=f"holds '{place}', which is not of it"):
+            remove()
+    assert tree(made) == before
+    assert (elsewhere / "keep").read_text() == "me"
+
+
+def test_a_restart_draws_another_study(made: Path, tmp_path: Path) -> None:
+    other = study(run={"seed": 3})
+    bulk.realise(other, made, PAINTER, restart=True)
+    bulk.realise(other, tmp_path / "fresh.zarr", PAINTER)
+    assert tree(made) == tree(tmp_path / "fresh.zarr")
+    bulk.forget(made)
+    assert not made.exists()
+
+
+def test_a_kill_while_a_store_is_removed(made: Path, tmp_path: Path) -> None:
+    """At any file: what is left is a store, and a second restart ends as the first would have."""
+    other = study(run={"seed": 3})
+    bulk.realise(other, tmp_path / "fresh.zarr", PAINTER)
+    for step in (0, 3, 9, 14):
+        path, counted = tmp_path / f"{step}.zarr", iter(range(step))
+        shutil.copytree(made, path)
+
+        def run(path: Path = path, counted: Any = counted) -> None:
+            unlink = Path.unlink
+
+            def mortal(self: Path, missing_ok: bool = False) -> None:
+                if next(counted, None) is None:
+                    os.kill(os.getpid(), signal.SIGKILL)
+                unlink(self, missing_ok)
+
+            Path.unlink = mortal  # type: ignore[method-assign]
+            bulk.realise(other, path, PAINTER, restart=True)
+
+        assert killed(forked(run))
+        assert Store.open(path).study == study()
+        bulk.realise(other, path, PAINTER, restart=True)
+        assert tree(path) == tree(tmp_path / "fresh.zarr")
+
+
+def test_a_study_that_asks_for_more_than_any_disk_holds(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """6e15 rows and one chunk of them: each question is answered by what is there, in a second or so."""
+    path, asked = tmp_path / "vast.zarr", study(6 * 10**15)
+    with pytest.raises(InputError, match=r"GiB for .*, expected less than its disk's"):
+        bulk.realise(asked, path, PAINTER)
+    # Written by hand, as an attacker would.
+    vast = Store(path, asked)
+    for name, content in vast.description().items():
+        (path / name).parent.mkdir(parents=True, exist_ok=True)
+        (path / name).write_bytes(content)
+    first = next(vast.chunks())
+    vast.note(first, vast.place(first, bulk.draw(asked, first.scene, PAINTER, 0, first.stop)))
+    for repair in (False, True):
+        with pytest.raises(InputError, match=r"holds 1 chunks where its study asks for \d+, expected at most 100000"):
+            bulk.verify(path, PAINTER, repair=repair)
+    assert [f.key for f in bulk.verify(path, rows=(0, first.stop))] == ["star-1/flare-1/c/0/0"]
+    assert Selection.of(Store.open(path), ["star-1/quiescent"], (3, 5)).stop == 5
+    with pytest.raises(InputError, match="expected less than its disk's"):
+        bulk.realise(asked, path, PAINTER)
+    bulk.forget(path)
+    assert not path.exists()
+
+
+@pytest.mark.parametrize("name", ["f.fits", "f.h5"])
+def test_one_file_is_not_overwritten(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("study.toml").write_text(study(20).toml())
+    Path(name).write_text("mine")
+    for more in ([], ["--resume"]):
+        with pytest.raises(InputError, match=f"'{name}' is there already, expected another place, or --restart"):
+            app(["realise", "study.toml", "--output", name, *more], standalone_mode=False)
+    assert Path(name).read_text() == "mine"
+    done = CliRunner().invoke(app, ["realise", "study.toml", "--output", name, "--restart"])
+    assert done.exit_code == 0, done.output
+    assert Path(name).stat().st_size > 2 * 2 * 20 * 197
+    assert sorted(p.name for p in tmp_path.iterdir()) == [name, "study.toml"]

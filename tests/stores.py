@@ -1,0 +1,88 @@
+"""Small stores of raw spectra for tests, and the ways in which a disk or a process fails them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mauvecl.runs import durable
+from mauvecl.study.study import Study
+
+CHUNK, LAST = "star-1/quiescent/c/1/0", "star-1/flare-1/c/4/0"
+
+
+def study(realisations: int = 300, **sections: Any) -> Study:
+    """One star with one flare on 197 pixels, one frame each unless told otherwise."""
+    data = {
+        "star": [{"library": "G2V", "magnitude": 7.4}],
+        "flare": {"amplitudes": [0.24]},
+        "observation": {"exposure_s": 5.0, "changes": {"output_min_nm": 300.0, "output_max_nm": 360.0}},
+        "run": {"realisations": realisations, "seed": 11},
+    }
+    for name, values in sections.items():
+        data[name] = {**data.get(name, {}), **values}  # type: ignore[dict-item]
+    return Study.build(data, "test")
+
+
+def tree(path: Path) -> dict[str, bytes]:
+    """Every file of a store; lists of digests sorted, since their order tells only what was written first."""
+    found = {str(p.relative_to(path)): p.read_bytes() for p in path.rglob("*") if p.is_file()}
+    lists = {name: b"".join(sorted(set(text.splitlines()))) for name, text in found.items() if "digests" in name}
+    return {name: text for name, text in found.items() if not Path(name).name.startswith(".")} | lists
+
+
+def flip(path: Path, place: int = 100) -> None:
+    data = bytearray(path.read_bytes())
+    data[place] ^= 1
+    path.write_bytes(data)
+
+
+class Painter:
+    """Draws nothing by chance and needs no OpenCL: rows that tell their number, for tests that fork."""
+
+    def realise(
+        self, x: Any, *, start: int, count: int, seed: int, out: NDArray[Any] | None = None, **how: Any
+    ) -> NDArray[Any]:
+        number = np.arange(start, start + count, dtype=np.uint64)[:, None] * np.uint64(6364136223846793005)
+        rows = ((number >> np.uint64(40)) + np.arange(x.wavelength_nm.size, dtype=np.uint64)) % np.uint64(60000)
+        if out is None:
+            return rows.astype(np.uint16)
+        out[:] = rows
+        return out
+
+
+def forked(work: Callable[[], object]) -> int:
+    """Do work in a child process; its number."""
+    child = os.fork()
+    if child == 0:
+        try:
+            work()
+        finally:
+            os._exit(0)
+    return child
+
+
+def killed(child: int) -> bool:
+    """Whether it ended by SIGKILL."""
+    _, status = os.waitpid(child, 0)
+    return os.WIFSIGNALED(status)
+
+
+def full_after(n_bytes: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A disk with room for so many bytes."""
+    left, real = n_bytes, os.fsync
+
+    def fsync(handle: int) -> None:
+        nonlocal left
+        left -= os.fstat(handle).st_size
+        if left < 0:
+            raise OSError(28, "No space left on device")
+        real(handle)
+
+    monkeypatch.setattr(durable.os, "fsync", fsync)

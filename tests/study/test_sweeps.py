@@ -1,0 +1,200 @@
+"""Studies that sweep: every combination or a list, in detections, limits and S/N; and the usual formula beside them."""
+
+from __future__ import annotations
+
+import tomllib
+from typing import Any
+
+import numpy as np
+import pytest
+from scenes import instrument, star
+from scipy import stats
+
+from mauvecl.answers.assumptions import what_matters
+from mauvecl.answers.detect import detect
+from mauvecl.answers.exposures import exposure_for
+from mauvecl.answers.gaussian import ONE_SIGMA, beyond, coverage, gaussian_report
+from mauvecl.answers.limits import limiting_magnitude
+from mauvecl.answers.maps import detection_map
+from mauvecl.answers.simulate import simulate
+from mauvecl.answers.snr import snr
+from mauvecl.device.engine import Engine
+from mauvecl.host.errors import InputError
+from mauvecl.study.study import PAPER_BUDGETS, Study
+
+
+def study(axes: list[dict[str, Any]], how: str = "product", **changes: Any) -> Study:
+    """The paper's G2V star."""
+    data: dict[str, Any] = {
+        "star": [{"library": "G2V", "magnitude": 7.4}],
+        "flare": {"amplitudes": [0.1]},
+        "run": {"realisations": 20_000, "fap": 1e-2, "statistics": ["matched"], "seed": 5},
+        "sweep": {"how": how, "axes": axes},
+    }
+    return Study.build(data | changes, "test")
+
+
+MAGNITUDES = {"quantity": "magnitude", "values": [6.0, 9.0]}
+EXPOSURES = {"quantity": "exposure", "values": [5.0, 50.0]}
+
+
+def test_cells() -> None:
+    both = study([MAGNITUDES, EXPOSURES]).cells()
+    assert [tuple(at.values()) for at, _ in both] == [(6, 5), (6, 50), (9, 5), (9, 50)]
+    assert all(
+        cell.star[0].magnitude == at["magnitude"] and cell.observation.exposure_s == at["exposure"] for at, cell in both
+    )
+    assert all(not cell.sweep.axes for _, cell in both)
+    listed = study([MAGNITUDES, EXPOSURES], "list").cells()
+    assert [tuple(at.values()) for at, _ in listed] == [(6, 5), (9, 50)]
+    assert study([]).cells() == [({}, study([]))]
+
+
+@pytest.mark.parametrize(
+    ("axes", "how", "sentence"),
+    [
+        ([MAGNITUDES, MAGNITUDES], "product", "the sweep has the quantity 'magnitude' twice"),
+        ([MAGNITUDES, {"quantity": "exposure", "values": [5.0]}], "list", "a list of 2 of magnitude, 1 of exposure"),
+        ([{"quantity": "colour", "values": [1.0]}], "product", "sweep.axes.0.quantity"),
+    ],
+)
+def test_impossible_sweeps(axes: list[dict[str, Any]], how: str, sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        study(axes, how)
+
+
+def test_a_study_with_a_sweep_is_read_back(tmp_path: Any) -> None:
+    asked = study([MAGNITUDES, EXPOSURES], "list", unknowns={"draws": 4, "known": ["qe_scale"]})
+    path = tmp_path / "study.toml"
+    path.write_text(asked.toml())
+    assert Study.read(path) == asked
+
+
+def test_a_detection_of_each_cell_is_its_own(engine: Engine) -> None:
+    """Swept, or asked for alone: the same bits, with columns that say where."""
+    asked = study([MAGNITUDES, EXPOSURES])
+    found = detect(asked, engine)
+    assert list(found.table["magnitude"].value) == [6, 6, 9, 9]
+    assert list(found.table["exposure"].value) == [5, 50, 5, 50]
+    for k, (_, cell) in enumerate(asked.cells()):
+        (alone,) = detect(cell, engine).table
+        assert alone["probability"] == found.table["probability"][k]
+        assert alone["threshold"] == found.table["threshold"][k]
+    assert found.table["probability"][0] > found.table["probability"][2]
+    amplitudes = detect(study([{"quantity": "amplitude", "values": [0.01, 0.1]}]), engine).table
+    assert list(amplitudes["amplitude"]) == [0.01, 0.1]
+
+
+def test_limits_over_a_sweep(engine: Engine) -> None:
+    """A colder detector and a longer exposure reach further."""
+    axes = [{"quantity": "detector_temperature", "values": [13.0, 21.0]}, EXPOSURES]
+    result = limiting_magnitude(study(axes), engine)
+    table = result.table
+    assert list(table["detector_temperature"].value) == [13, 13, 21, 21]
+    value = table["magnitude"].value
+    assert value[0] > value[2]
+    assert value[1] > value[3]
+    assert value[1] > value[0]
+    with pytest.raises(InputError, match="the sweep runs over the magnitude that is asked for"):
+        limiting_magnitude(study([MAGNITUDES]), engine)
+
+
+def test_the_papers_noise_budgets(engine: Engine) -> None:
+    """Three stars, 50 s and 600 s: the parts add up, photons rule the Be star, and the dark the G2V star."""
+    found = snr(PAPER_BUDGETS.with_settings(["run.realisations=1000"]), engine)
+    assert [s.result.expectation.exposure_s for s in found.stars] == [50.0] * 3 + [600.0] * 3
+    table = found.noise_budget
+    parts = [table[name].value for name in ("source_photon", "zodiacal_photon", "dark", "read")]
+    np.testing.assert_allclose(np.sqrt(np.sum(np.square(parts), axis=0)), table["total"].value, rtol=1e-9)
+    blue = np.abs(table["wavelength"].value - 250) < 5
+    for name, largest in (("B2IV V = 3.03", "source_photon"), ("G2V V = 7.4", "dark")):
+        rows = table[blue & (table["star"] == name)]
+        assert all(rows[largest].mean() >= rows[other].mean() for other in ("source_photon", "dark", "read"))
+    # Twelve times the frames, the root of twelve times the noise.
+    short, long = (table[(table["exposure"].value == t) & (table["star"] == "G2V V = 7.4")] for t in (50, 600))
+    np.testing.assert_allclose(long["total"] / short["total"], np.sqrt(12), rtol=1e-6)
+
+
+def test_snr_grows_as_it_should(engine: Engine) -> None:
+    table = snr(study([MAGNITUDES, EXPOSURES]), engine).element
+    by_cell = {
+        (m, t): table[(table["magnitude"].value == m) & (table["exposure"].value == t)]["expected"]
+        for m in (6, 9)
+        for t in (5, 50)
+    }
+    np.testing.assert_allclose(by_cell[6, 50] / by_cell[6, 5], np.sqrt(10), rtol=1e-6)
+    assert np.all(by_cell[6, 5] > by_cell[9, 5])
+
+
+def test_coverage_is_exact(engine: Engine) -> None:
+    """From the histograms as from the counts themselves; and as promised where the noise is normal."""
+    (quiet,) = star(exposure=5.0, payload=instrument(part=True))
+    n = 20_000
+    result = engine.snr(quiet, realisations=n, seed=4)
+    raw = engine.realise(quiet, count=n, seed=4)
+    net = raw - quiet.n_frames * (quiet.bias_dn + quiet.dark_dn)
+    known = quiet.n_frames * (quiet.read_noise_dn**2 + quiet.dark_variance_dn2)
+    sigma = np.sqrt(quiet.gain_dn_per_electron * np.maximum(net, 0) + known)
+    direct = np.mean(np.abs(net - quiet.signal_dn) <= sigma, axis=0)
+    np.testing.assert_allclose(coverage(result), direct, atol=0.01)
+    assert coverage(result).mean() == pytest.approx(direct.mean(), abs=5e-4)
+    # 198 pixels: the mean of so many is right to 2.4e-4, and a DN is 1/49 of sigma.
+    assert direct.mean() == pytest.approx(ONE_SIGMA, abs=5e-3)
+
+
+def test_the_formula_holds_for_the_payload_and_fails_at_the_rail(engine: Engine) -> None:
+    """No false alarm or S/N is off for the nominal payload; a bias near zero clips, and everything is."""
+    asked = study([MAGNITUDES, EXPOSURES])
+    cells = gaussian_report(asked, engine).cells
+    assert len(cells) == 4
+    assert np.all(np.abs(cells["fap_ratio"] - 1) < 1e-9)
+    assert np.all((cells["coverage_low"] > 0.66) & (cells["coverage_high"] < 0.71))
+    clipped = gaussian_report(asked.with_instrument({"bias_dn": 5.0, "dark_scale_dn_per_s": 0.01}), engine).cells
+    (faint,) = clipped[(clipped["magnitude"].value == 9) & (clipped["exposure"].value == 5)]
+    assert abs(faint["snr_off_by"]) > 0.1
+    assert faint["why"] == "clipping"
+    assert faint["fap_ratio"] != 1.0
+
+
+@pytest.mark.parametrize("name", ["mauve", "mauve-electrons"])
+@pytest.mark.parametrize("temperature", [21.0, -30.0])
+@pytest.mark.parametrize("sigmas", [3.0, 5.0])
+def test_pixels_beyond_five_sigma(name: str, temperature: float, sigmas: float) -> None:
+    """The saddle point against the exact sum over dark counts, to 0.3 %: more above than a normal has, fewer below."""
+    (quiet,) = star(exposure=5.0, payload=instrument(name, part=True, temperature_c=temperature))
+    p, step = 90, float(quiet.dark_step_dn[90])
+    poisson = quiet.photon_noise == "poisson"
+    # Photons and dark are then Poisson in electrons alike.
+    mean = quiet.dark_dn[p] / step + (quiet.source_electrons + quiet.sky_electrons)[p] * poisson
+    goal = sigmas * np.sqrt(quiet.variance_dn2[p] - 1 / 12)
+    sd = np.sqrt(quiet.read_noise_dn[p] ** 2 + quiet.gain_dn_per_electron[p] * quiet.signal_dn[p] * (not poisson))
+    counts = np.arange(int(mean + 14 * np.sqrt(mean) + 30))
+    for side in (1, -1):
+        exact = stats.poisson.pmf(counts, mean) @ stats.norm.sf((goal - side * (counts - mean) * step) / sd)
+        found = beyond(quiet, side * sigmas)[p]
+        assert found == pytest.approx(exact, rel=3e-3)
+        assert (found > stats.norm.sf(sigmas)) == (side > 0)
+
+
+def test_every_column_is_described_and_every_answer_knows_its_study(engine: Engine) -> None:
+    """Tables of every kind of answer: a description for each column, and the study that is read back from each."""
+    asked = study([{"quantity": "sky", "values": [21.0, 22.0]}])
+    plain = study([]).with_settings(
+        ["map.x={quantity='magnitude',values=[7.0]}", "map.y={quantity='amplitude',values=[0.1]}"]
+    )
+    unknown = asked.model_copy(update={"unknowns": type(asked.unknowns)(draws=2)})
+    detected, seen, usual = detect(asked, engine), snr(asked, engine), gaussian_report(asked, engine)
+    limits, exposures = limiting_magnitude(unknown, engine), exposure_for(plain, 5.0, 300.0)
+    tables = [
+        (asked, [detected.table, detected.departures, detected.roc, detected.tails]),
+        (asked, [seen.pixel, seen.element, seen.noise_budget, usual.cells, usual.elements, usual.thresholds]),
+        (unknown, [limits.table, limits.draws]),
+        (exposures.study, [exposures.table]),
+        (plain, [what_matters(plain), simulate(plain).observations[0][2]]),
+    ]
+    found = detection_map(plain, engine)
+    tables.append((found.study, [found.table]))
+    for made_by, group in tables:
+        for table in group:
+            assert [name for name in table.colnames if not table[name].info.description] == []
+            assert Study.build(tomllib.loads(table.meta["study"]), "table") == made_by
