@@ -24,8 +24,6 @@ from mauvecl.store.description import signed
 from mauvecl.store.export import Selection
 from mauvecl.store.form import Store
 
-__all__ = ["small_chunks"]
-
 
 class Seeded(Painter):
     """Rows that tell their seed too."""
