@@ -17,7 +17,7 @@ import numpy as np
 from astropy.table import Table
 from playwright.sync_api import Page, sync_playwright
 
-from mauvecl.statistics.definitions import STATISTICS
+from mauvecl.statistics.registry import STATISTICS
 
 CHANGES = 11
 #: What is changed, and what from and to; each change is another value between.

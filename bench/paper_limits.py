@@ -15,7 +15,7 @@ from astropy.table import vstack
 
 from mauvecl import Study, limiting_magnitude
 from mauvecl.answers.assumptions import what_matters
-from mauvecl.statistics.definitions import STATISTICS
+from mauvecl.statistics.registry import STATISTICS
 
 KEPT = ("amplitude", "exposure", "statistic", "magnitude", "low", "high", "closed_form", "check")
 

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
     from mauvecl.noise.comparison import Comparison
     from mauvecl.runs.pool import Pool
-    from mauvecl.statistics.definitions import Linear
+    from mauvecl.statistics.linear import Linear
     from mauvecl.study.study import Study
 
 __version__ = "0.1.0"
@@ -51,7 +51,7 @@ _HOMES = {
     "Expectation": "host.expectation",
     "InputError": "host.errors",
     "Instrument": "host.instrument.instrument",
-    "Linear": "statistics.definitions",
+    "Linear": "statistics.linear",
     "Pool": "runs.pool",
     "Sky": "host.sky.zodiacal",
     "Source": "host.stars.source",

@@ -15,7 +15,9 @@ from mauvecl.results.departures import departure_table
 from mauvecl.results.detection import Detection, check_fap, countable
 from mauvecl.results.paper import PAPER_G2V, WHY, reconstruct
 from mauvecl.runs.pool import Pool, together
-from mauvecl.statistics.definitions import SHAPED, Linear, QuadraticForm, matched_weights
+from mauvecl.statistics.distributions import QuadraticForm
+from mauvecl.statistics.linear import Linear, Matched
+from mauvecl.statistics.statistic import Setting
 from mauvecl.study.labels import label, put_first, stacked, titled, told
 from mauvecl.study.sections import Star
 from mauvecl.study.study import PAPER_STARS, Study
@@ -142,7 +144,7 @@ def _tails(star: StarDetection) -> QTable:
     for statistic in star.found.statistics:
         for flare, amplitude in enumerate(star.amplitudes):
             kept = [(amplitude, star.found.tail_samples(statistic, flare))]
-            if statistic in SHAPED or flare == 0:
+            if star.found.statistic(statistic).shaped or flare == 0:
                 kept.append((0.0, star.found.tail_samples(statistic, template=flare)))
             for name, table in kept:
                 put_first(table, {"statistic": statistic, "amplitude": name, "template": amplitude})
@@ -217,8 +219,8 @@ def _other_templates(study: Study, star: Star, quiet: Expectation) -> list[Linea
         source = star.source()
         other = study.at("flare_temperature", temperature)
         (shape,) = other.expect([other.flaring(source, study.flare.amplitudes[0])])
-        weights = matched_weights(quiet, shape, ~quiet.saturated, study.run.comparison())
-        found.append(Linear(f"matched {temperature:g} K", weights))
+        setting = Setting(quiet, ~quiet.saturated, study.run.comparison())
+        found.append(Linear(f"matched {temperature:g} K", Matched().weights_per_dn(setting, shape)))
     return found
 
 

@@ -14,7 +14,7 @@ from scipy import special
 from mauvecl.host.errors import InputError
 from mauvecl.noise.scene import prepare
 from mauvecl.results.detection import Detection
-from mauvecl.statistics.definitions import Interval
+from mauvecl.statistics.intervals import Interval
 from mauvecl.study.questions import QUANTITIES
 from mauvecl.study.sections import Star
 from mauvecl.study.study import Study

@@ -12,7 +12,7 @@ import numpy as np
 from mauvecl.answers.limit_search import MarginalQuestion, Point, Question, Unknown, settle
 from mauvecl.host.errors import InputError
 from mauvecl.results.detection import check_fap
-from mauvecl.statistics.definitions import Interval
+from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, stacked, told
 from mauvecl.study.questions import UNITS
 from mauvecl.study.sections import Star

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.results.detection import check_fap
-from mauvecl.statistics.definitions import Interval
+from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, told
 from mauvecl.study.questions import UNITS
 from mauvecl.study.study import Study

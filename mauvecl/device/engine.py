@@ -15,7 +15,6 @@ from mauvecl.device.launches import Run, Tile
 from mauvecl.device.program import DeviceError, DeviceRecord, Variant, devices
 from mauvecl.host.errors import InputError
 from mauvecl.noise.comparison import TEMPLATE, Comparison
-from mauvecl.noise.layout import USUAL_STATISTICS
 from mauvecl.noise.processes import NONE, Processes
 from mauvecl.noise.scene import BATCH, PIXEL_BLOCK, Mode, Recipe, Scene, prepare
 from mauvecl.results.channels import ChannelPlan, plan_channels
@@ -23,7 +22,9 @@ from mauvecl.results.detection import Detection, Tails
 from mauvecl.results.snr import Counts, SnrResult
 from mauvecl.results.tally import TailSamples, Tally
 from mauvecl.runs.shards import DetectRequest, SnrRequest
-from mauvecl.statistics.definitions import Linear
+from mauvecl.statistics.linear import Linear
+from mauvecl.statistics.paper import Paper
+from mauvecl.statistics.registry import USUAL_STATISTICS
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -392,12 +393,13 @@ class Engine:
     def _statistics(self, scene: Scene, seed: int, plan: ChannelPlan, asked: Detection) -> Run:
         bands, finished = np.zeros((1, 0, 1), np.float32), np.zeros(1, np.uint32)
         if len(plan.scales):
-            bands, finished = asked.smoothing.bands(len(scene.pixels), self.variant.chunk)
+            bands, finished = Paper().smoothing(asked.setting).bands(len(scene.pixels), self.variant.chunk)
+        sums = {asked.statistic(name).kernel_sum for name in asked.statistics}
         run = self._scene(
             scene,
             seed,
-            pair="chi2_pair" in asked.statistics,
-            elements="chi2_element" in asked.statistics,
+            pair="chi2_pair" in sums,
+            elements="chi2_element" in sums,
             linears=len(plan.weights),
             smooths=len(plan.scales),
             slots=bands.shape[1],

@@ -29,7 +29,7 @@ from mauvecl.results.channels import ChannelPlan, plan_channels
 from mauvecl.results.detection import Detection
 from mauvecl.results.snr import Counts, elements, observers
 from mauvecl.results.tally import Tally
-from mauvecl.statistics.definitions import PAIRED, STATISTICS
+from mauvecl.statistics.registry import STATISTICS
 
 if TYPE_CHECKING:
     from mauvecl.device.program import DeviceRecord
@@ -120,7 +120,7 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     ),
 }
 #: Statistics that the fast kernel knows, where nothing but the template is compared.
-FAST = tuple(name for name in STATISTICS if name not in PAIRED)
+FAST = tuple(name for name, one in STATISTICS.items() if not one.paired)
 #: Across the boundary of the counter's first word.
 START, COUNT, SEED = 2**40 - 13, 40, 2**63 + 20_261_121
 

@@ -144,8 +144,6 @@ STRUCTS = {
 
 #: Statistics with a channel in every scenario, in the kernel's order; linear statistics follow them.
 FIXED_STATISTICS = ("chi2", "chi2_element", "chi2_pair")
-#: Computed where nobody names any.
-USUAL_STATISTICS = ("chi2", "chi2_element", "matched")
 
 #: Adding and subtracting this rounds a float32 below 2**22 to the nearest whole number.
 MAGIC = 12582912.0

@@ -8,7 +8,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.pictures.style import COLOURS, MOST_COLUMNS, NAMES, NULL, STYLE, finished, pyplot
+from mauvecl.pictures.style import COLOURS, MOST_COLUMNS, NULL, STYLE, finished, pyplot
+from mauvecl.statistics.registry import label
+from mauvecl.statistics.statistic import LinearStatistic
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -53,7 +55,8 @@ def detection(stars: Sequence[Shown], fap: float, path: str | Path | None = None
 
 
 def _distributions(axis: Any, found: Detection, flares: Sequence[str], statistic: str, fap: float) -> None:
-    linear = found.weights(statistic) is not None
+    one = found.statistic(statistic)
+    linear = isinstance(one, LinearStatistic)
     shapes: list[tuple[int | None, str, str]] = [(None, NULL, "no flare")]
     shapes += [(k, COLOURS[k % len(COLOURS)], name) for k, name in enumerate(flares)]
     for flare, colour, name in shapes:
@@ -62,7 +65,7 @@ def _distributions(axis: Any, found: Detection, flares: Sequence[str], statistic
         axis.fill_between(middle, height, step="mid", color=colour, alpha=0.3, linewidth=0)
         axis.step(middle, height, where="mid", color=colour, label=name)
     # Where a statistic is scaled by the flare, each has a threshold of its own.
-    own = range(len(flares)) if statistic == "paper" else range(1)
+    own = range(len(flares)) if one.shaped and not linear else range(1)
     for k in own:
         cut = found.threshold(fap, statistic, template=k).value
         colour = COLOURS[k % len(COLOURS)] if len(own) > 1 else "black"
@@ -90,7 +93,7 @@ def _distributions(axis: Any, found: Detection, flares: Sequence[str], statistic
         axis.set_xticks(ticks, [f"{t:g}" if t < 1e5 else f"$10^{{{np.log10(t):.0f}}}$" for t in ticks])
         axis.tick_params(axis="x", which="minor", labelbottom=False)
     axis.set_ylim(bottom=0)
-    axis.set_xlabel(NAMES.get(statistic, statistic))
+    axis.set_xlabel(label(statistic))
 
 
 def roc(curves: Sequence[tuple[str, Roc]], path: str | Path | None = None) -> Any:

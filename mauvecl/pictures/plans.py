@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.pictures.style import AXES, COLOURS, NAMES, NULL, STYLE, finished, pyplot
+from mauvecl.pictures.style import AXES, COLOURS, NULL, STYLE, finished, pyplot
+from mauvecl.statistics.registry import label
 from mauvecl.study.labels import titled
 
 if TYPE_CHECKING:
@@ -44,7 +45,7 @@ def detection_map(found: MapResult, path: str | Path | None) -> Any:
                 elif described.log:
                     getattr(axis, f"set_{which}scale")("log")
             axis.set_xlabel(AXES[question.x.quantity])
-            axis.set_title(NAMES.get(statistic, statistic))
+            axis.set_title(label(statistic))
         axes[0][0].set_ylabel(AXES[question.y.quantity])
         figure.colorbar(mesh, ax=list(axes[0]), label="detection probability")
         figure.suptitle(

@@ -27,14 +27,6 @@ STYLE = {
     "lines.linewidth": 1.2,
 }
 
-NAMES = {
-    "chi2": "chi2 over pixels",
-    "chi2_element": "chi2 over 10.5 nm elements",
-    "chi2_pair": "chi2 against a noisy exposure",
-    "matched": "matched filter (standard deviations)",
-    "uv_excess": "UV excess (standard deviations)",
-    "paper": "the paper's sum on smoothed spectra",
-}
 AXES = {
     "magnitude": "magnitude",
     "amplitude": "flare amplitude",

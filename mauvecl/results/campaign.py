@@ -8,7 +8,7 @@ import numpy as np
 from scipy import special
 
 from mauvecl.host.errors import InputError
-from mauvecl.statistics.definitions import Interval, clopper_pearson
+from mauvecl.statistics.intervals import Interval, clopper_pearson
 
 #: Campaigns drawn where stacks overlap.
 DRAWN = 20_000

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -11,7 +11,9 @@ from numpy.typing import NDArray
 
 from mauvecl.noise.layout import FIXED_STATISTICS
 from mauvecl.results.tally import Grid, TailSamples
-from mauvecl.statistics.definitions import SHAPED, Normal, QuadraticForm
+from mauvecl.statistics.distributions import Normal, QuadraticForm
+from mauvecl.statistics.paper import Paper
+from mauvecl.statistics.statistic import LinearStatistic, Statistic
 
 if TYPE_CHECKING:
     from mauvecl.results.detection import Detection
@@ -56,6 +58,24 @@ class ChannelPlan:
         return len(FIXED_STATISTICS) * len(self.linear_end) + len(self.weights) + len(self.scales)
 
 
+@dataclass(eq=False)
+class _Rows:
+    """Rows of weights of one kind, scenario by scenario."""
+
+    rows: list[NDArray[np.float64]] = field(default_factory=list)
+    ends: list[int] = field(default_factory=list)
+    #: Where a statistic of a scenario is found; `shaped` ones by the flare looked for.
+    places: dict[tuple[str, int, int], int] = field(default_factory=dict)
+
+    def add(self, statistic: str, scenario: int, flare: int, row: NDArray[np.float64]) -> None:
+        self.places[statistic, scenario, flare] = len(self.rows)
+        self.rows.append(row)
+
+    def end(self) -> None:
+        """End a scenario."""
+        self.ends.append(len(self.rows))
+
+
 def plan_channels(result: Detection, batch: Sequence[int], *, first: bool) -> ChannelPlan:
     """Lay out the channels of a batch of flares; scenario 0 is always the quiescent one.
 
@@ -67,52 +87,50 @@ def plan_channels(result: Detection, batch: Sequence[int], *, first: bool) -> Ch
     first : bool
         Whether nulls shared by all batches are counted in this one.
     """
-    n_scenario, width = 1 + len(batch), len(result.scene.pixels)
-    shared = [name for name in result.statistics if name not in (*FIXED_STATISTICS, *SHAPED)]
-    rows: list[NDArray[np.float64]] = []
-    scales: list[NDArray[np.float64]] = []
-    ends = np.zeros((2, n_scenario), np.uint32)
-    #: Where a statistic of a scenario is found, `SHAPED` ones by the flare looked for.
-    place_of: dict[tuple[str, int, int], tuple[list[NDArray[np.float64]], int]] = {}
-    for scenario in range(n_scenario):
+    asked = [result.statistic(name) for name in result.statistics]
+    weighted, smoothed = _Rows(), _Rows()
+    for scenario in range(1 + len(batch)):
         # The quiescent draws meet every flare's shape, each flare only its own.
         shapes = [flare for i, flare in enumerate(batch) if scenario in (0, i + 1)]
-        wanted = [("matched", flare) for flare in shapes if "matched" in result.statistics]
-        for name, flare in (*wanted, *((name, 0) for name in shared)):
-            place_of[(name, scenario, flare)] = rows, len(rows)
-            weights = result.weights(name, flare)
-            assert weights is not None
-            rows.append(weights)
-        for flare in shapes if "paper" in result.statistics else ():
-            place_of[("paper", scenario, flare)] = scales, len(scales)
-            scales.append(result.smoothing.scale(result.flares[flare]))
-        ends[:, scenario] = len(rows), len(scales)
-    padded = np.zeros((len(rows), width), np.float32)
-    padded[:, : result.scene.n_pixel] = np.array(rows).reshape(len(rows), result.scene.n_pixel)
-    scaled = np.array(scales, np.float32) if scales else np.zeros((0, 1), np.float32)
+        # Those that look for a shape come first: the kernel sums the first row on its way.
+        for one in sorted(asked, key=lambda s: not s.shaped):
+            for flare in shapes if one.shaped else [0]:
+                looked_for = result.shape(one.name, flare)
+                if isinstance(one, LinearStatistic):
+                    weighted.add(one.name, scenario, flare, one.weights_per_dn(result.setting, looked_for))
+                elif isinstance(one, Paper):
+                    smoothed.add(one.name, scenario, flare, one.scale(result.setting, looked_for))
+        weighted.end()
+        smoothed.end()
+    n_scenario, fixed = 1 + len(batch), len(FIXED_STATISTICS)
 
-    def row(statistic: str, scenario: int, flare: int) -> int:
-        fixed = len(FIXED_STATISTICS)
-        if statistic in FIXED_STATISTICS:
-            return fixed * scenario + FIXED_STATISTICS.index(statistic)
-        among, place = place_of[(statistic, scenario, flare if statistic in SHAPED else 0)]
-        return fixed * n_scenario + place + (len(rows) if among is scales else 0)
+    def row(one: Statistic, scenario: int, flare: int) -> int:
+        if one.kernel_sum is not None:
+            return fixed * scenario + FIXED_STATISTICS.index(one.kernel_sum)
+        where = one.name, scenario, flare if one.shaped else 0
+        if isinstance(one, LinearStatistic):
+            return fixed * n_scenario + weighted.places[where]
+        return fixed * n_scenario + len(weighted.rows) + smoothed.places[where]
 
     grids: list[Grid] = []
     keys: list[Key] = []
 
-    def add(statistic: str, role: Role, flare: int, channel: int, shape: QuadraticForm | Normal) -> None:
+    def add(one: Statistic, role: Role, flare: int, channel: int, shape: QuadraticForm | Normal) -> None:
         grids.append(Grid(channel, shape.mean, shape.std))
-        keys.append((statistic, role, flare))
+        keys.append((one.name, role, flare))
 
-    for statistic in result.statistics:
-        if first and statistic not in SHAPED:
-            add(statistic, "null", 0, row(statistic, 0, 0), result.closed_form(statistic))
+    for one in asked:
+        if first and not one.shaped:
+            add(one, "null", 0, row(one, 0, 0), result.closed_form(one.name))
         for i, flare in enumerate(batch):
-            null = result.closed_form(statistic, template=flare)
-            if statistic in SHAPED:
-                add(statistic, "null", flare, row(statistic, 0, flare), null)
-            channel = row(statistic, i + 1, flare)
-            add(statistic, "flare_on_null_grid", flare, channel, null)
-            add(statistic, "flare", flare, channel, result.closed_form(statistic, flare))
-    return ChannelPlan(padded, ends[0], scaled, ends[1], grids, keys)
+            null = result.closed_form(one.name, template=flare)
+            if one.shaped:
+                add(one, "null", flare, row(one, 0, flare), null)
+            channel = row(one, i + 1, flare)
+            add(one, "flare_on_null_grid", flare, channel, null)
+            add(one, "flare", flare, channel, result.closed_form(one.name, flare))
+    weights = np.zeros((len(weighted.rows), len(result.scene.pixels)), np.float32)
+    weights[:, : result.scene.n_pixel] = np.array(weighted.rows).reshape(len(weights), result.scene.n_pixel)
+    scales = np.array(smoothed.rows, np.float32) if smoothed.rows else np.zeros((0, 1), np.float32)
+    linear_end, scale_end = (np.array(rows.ends, np.uint32) for rows in (weighted, smoothed))
+    return ChannelPlan(weights, linear_end, scales, scale_end, grids, keys)

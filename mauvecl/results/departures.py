@@ -12,7 +12,9 @@ from scipy import special
 
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.results.detection import countable
-from mauvecl.statistics.definitions import PAIRED, SHAPED, Interval, Normal, QuadraticForm
+from mauvecl.statistics.distributions import Normal, QuadraticForm
+from mauvecl.statistics.intervals import Interval
+from mauvecl.statistics.statistic import LinearStatistic, QuadraticStatistic
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -113,7 +115,7 @@ def departures(found: Detection, fap: float) -> list[Departure]:
     digital = _digital(found.quiet) if scene.clip else None
     rows = []
     for statistic in found.statistics:
-        for template in range(len(found.flares)) if statistic in SHAPED else (0,):
+        for template in range(len(found.flares)) if found.statistic(statistic).shaped else (0,):
             null = found.closed_form(statistic, template=template)
             cut = null.isf(fap)
             rounding = clipping = 0.0
@@ -152,7 +154,9 @@ def departure_table(found: Detection, amplitudes: Sequence[float], fap: float) -
     rows = departures(found, fap) if countable(fap, found.realisations) else []
     table = QTable()
     table["statistic"] = np.array([d.statistic for d in rows], str)
-    table["amplitude"] = np.array([amplitudes[d.template] if d.statistic in SHAPED else np.nan for d in rows])
+    table["amplitude"] = np.array(
+        [amplitudes[d.template] if found.statistic(d.statistic).shaped else np.nan for d in rows]
+    )
     for name, values, text in (
         ("gaussian_threshold", [d.threshold for d in rows], "threshold for Gaussian noise"),
         ("fap", [d.simulated.value for d in rows], "simulated false-alarm probability there"),
@@ -178,22 +182,24 @@ def _skewed(found: Detection, statistic: str, template: int, null: QuadraticForm
     scene, quiet = found.scene, found.quiet
     each = 1 if scene.frames else quiet.n_frames
     c, draws = Cumulants.of(quiet, each), quiet.n_frames // each
+    one, flare = found.statistic(statistic), found.shape(statistic, template)
     # Of the difference from the mean of some exposures.
-    share = 1.0 if statistic in PAIRED else scene.comparison.share
+    share = one.share(found.setting)
     third, fourth, sixth = (
         draws * (c.photon_cumulant(r) + c.dark_cumulant(r)) * (1.0 + (-1.0) ** r * share ** (r - 1)) for r in (3, 4, 6)
     )
-    weights = found.weights(statistic, template)
-    variance = (1.0 + share) * quiet.variance_dn2
-    if weights is not None:
+    variance = one.variance(found.setting)
+    if isinstance(one, LinearStatistic):
+        weights = one.weights_per_dn(found.setting, flare)
         sd = float(np.sqrt(weights**2 @ variance))
         z, skew, excess = cut / null.std, weights**3 @ third / sd**3, weights**4 @ fourth / sd**4
         # Edgeworth's series (Abramowitz & Stegun 26.2.48).
         series = skew * (z**2 - 1) / 6 + excess * (z**3 - 3 * z) / 24 + skew**2 * (z**5 - 10 * z**3 + 15 * z) / 72
         return float(special.ndtr(-z) + np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) * series)
+    assert isinstance(one, QuadraticStatistic)
     assert isinstance(null, QuadraticForm)
     # Each pixel's own square has more variance and more skew than a normal's.
-    own = _diagonal(found, statistic, template, variance)
+    own = one.own(found.setting, flare)
     second = null.std**2
     skewed = 8.0 * float(np.sum(null.weight**3))
     more = own**2 @ fourth, own**3 @ (12.0 * fourth * variance + 10.0 * third**2 + sixth)
@@ -209,33 +215,12 @@ def _gamma_sf(value: float, mean: float, variance: float, third: float) -> float
     return float(special.gammaincc(shape, max(shape + (value - mean) / np.sqrt(variance) * np.sqrt(shape), 0.0)))
 
 
-def _diagonal(found: Detection, statistic: str, template: int, variance: Float) -> Float:
-    """What multiplies each pixel's own square in a quadratic statistic, per DN^2, shape (n_pixel,)."""
-    used, quiet = found.scene.used, found.quiet
-    if statistic == "paper":
-        return found.smoothing.scale(found.flares[template]) @ found.smoothing.rows**2
-    if statistic == "chi2_element":
-        summed = quiet.per_element(variance * used)[quiet.element]
-        return np.asarray(np.divide(used, summed, out=np.zeros_like(summed), where=summed > 0))
-    return used / variance
-
-
 def _moved(found: Detection, statistic: str, template: int, shift: Float, variance: Float, cut: float) -> float:
     """False-alarm probability at a threshold if the exposure's counts had another mean and variance, per pixel."""
-    quiet, used = found.quiet, found.scene.used
-    share = 1.0 if statistic in PAIRED else found.scene.comparison.share
-    delta, true = np.where(used, (1.0 - (share > 0)) * shift, 0.0), (1.0 + share) * variance * used
-    weights = found.weights(statistic, template)
-    if weights is not None:
-        return Normal(float(weights @ delta), float(np.sqrt(weights**2 @ true))).sf(cut)
-    if statistic == "paper":
-        return found.smoothing.form(found.smoothing.scale(found.flares[template]), delta, true).sf(cut)
-    model = (1.0 + share) * quiet.variance_dn2 * used
-    if statistic == "chi2_element":
-        delta, true, model = (quiet.per_element(values) for values in (delta, true, model))
-    counts = (model > 0) & (true > 0)
-    delta, true, model = delta[counts], true[counts], model[counts]
-    return QuadraticForm(true / model, delta / np.sqrt(true)).sf(cut)
+    one, used = found.statistic(statistic), found.scene.used
+    share = one.share(found.setting)
+    delta, true = np.where(used, (1.0 - (share > 0)) * shift, 0.0), (1.0 + share) * variance
+    return one.form(found.setting, delta, true, found.shape(statistic, template)).sf(cut)
 
 
 def _digital(x: Expectation) -> tuple[tuple[Float, Float], tuple[Float, Float]]:

@@ -16,22 +16,12 @@ from mauvecl.noise.scene import Scene
 from mauvecl.results.channels import ChannelPlan, Key
 from mauvecl.results.roc import Roc
 from mauvecl.results.tally import Distribution, TailSamples, Tally
-from mauvecl.statistics.definitions import (
-    SHAPED,
-    STATISTICS,
-    UV_NM,
-    Interval,
-    Linear,
-    Normal,
-    QuadraticForm,
-    central_counts,
-    clopper_pearson,
-    closed_form,
-    matched_weights,
-    uv_weights,
-)
 from mauvecl.statistics.detection_interval import detection_interval
-from mauvecl.statistics.smoothing import Smoothing
+from mauvecl.statistics.distributions import Normal, QuadraticForm
+from mauvecl.statistics.intervals import Interval, central_counts, clopper_pearson
+from mauvecl.statistics.linear import Linear
+from mauvecl.statistics.registry import chosen
+from mauvecl.statistics.statistic import LinearStatistic, Setting, Statistic
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -103,43 +93,38 @@ class Detection:
     _forms: dict[tuple[str, int | None, int], QuadraticForm | Normal] = field(
         default_factory=dict, init=False, repr=False
     )
-    _own: dict[str, NDArray[np.float64]] = field(default_factory=dict, init=False, repr=False)
+    setting: Setting = field(init=False, repr=False)
+    _chosen: dict[str, Statistic] = field(init=False, repr=False)
     _found: dict[Key, Distribution] = field(default_factory=dict, init=False, repr=False)
     _samples: dict[Key, TailSamples] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
-        names = [one.name if isinstance(one, Linear) else one for one in self.asked]
-        self.statistics = tuple(dict.fromkeys(names))
-        if not self.statistics:
-            raise InputError(f"no statistic named, expected some of {', '.join(STATISTICS)}")
-        for one in self.asked:
-            if isinstance(one, Linear):
-                self._add(one)
-            elif one not in STATISTICS:
-                raise InputError(f"statistic {one!r} is unknown, expected one of {', '.join(STATISTICS)}")
-        shaped = [name for name in self.statistics if name in SHAPED]
-        if shaped and not self.flares:
-            raise InputError(f"no flare given, expected at least one for the statistic {shaped[0]!r}")
+        self._chosen = chosen(self.asked)
+        self.statistics = tuple(self._chosen)
+        self.setting = Setting(self.quiet, self.scene.used, self.scene.comparison, self.flares)
+        shaped = next((name for name, one in self._chosen.items() if one.shaped), None)
+        if shaped is not None and not self.flares:
+            raise InputError(f"no flare given, expected at least one for the statistic {shaped!r}")
         if not self.scene.used.any():
             raise InputError(f"every pixel of {self.quiet.name} is saturated, expected a fainter star")
-        if "uv_excess" in self.statistics and not uv_weights(self.quiet, self.scene.used).any():
-            raise InputError(
-                f"no pixel of {self.quiet.name} that counts lies at {UV_NM[0]:g}-{UV_NM[1]:g} nm, expected some for "
-                "the statistic 'uv_excess'"
-            )
+        for one in self._chosen.values():
+            one.check(self.setting)
 
-    def _add(self, own: Linear) -> None:
-        if own.name in self._own:
-            raise InputError(f"statistic {own.name!r} is given twice, expected different names")
-        if own.weights.size != self.scene.n_pixel:
-            raise InputError(
-                f"statistic {own.name!r} has {own.weights.size} weights, expected one for each of the "
-                f"{self.scene.n_pixel} pixels"
-            )
-        weights = own.weights * self.scene.used
-        if not weights.any():
-            raise InputError(f"statistic {own.name!r} weighs only saturated pixels, expected others")
-        self._own[own.name] = weights
+    def statistic(self, name: str) -> Statistic:
+        """One of those computed.
+
+        Raises
+        ------
+        InputError
+            If it was not.
+        """
+        if name not in self._chosen:
+            raise InputError(f"statistic {name!r} was not simulated, expected one of {', '.join(self.statistics)}")
+        return self._chosen[name]
+
+    def shape(self, statistic: str, template: int = 0) -> Expectation | None:
+        """The flare whose shape a statistic looks for; None for those that look for none."""
+        return self.flares[template] if self.statistic(statistic).shaped else None
 
     def weights(self, statistic: str, template: int = 0) -> NDArray[np.float64] | None:
         """Weights per DN of a linear statistic, shape (n_pixel,); None for the others.
@@ -148,18 +133,14 @@ class Detection:
         ----------
         statistic : str
         template : int
-            For `SHAPED` statistics: the flare whose shape is looked for.
+            For shaped statistics: the flare whose shape is looked for.
         """
-        if statistic == "matched":
-            return matched_weights(self.quiet, self.flares[template], self.scene.used, self.scene.comparison)
-        if statistic == "uv_excess":
-            return uv_weights(self.quiet, self.scene.used, self.scene.comparison)
-        return self._own.get(statistic)
-
-    @cached_property
-    def smoothing(self) -> Smoothing:
-        """Of the statistic `paper`."""
-        return Smoothing.of(self.quiet, self.scene.used, self.flares)
+        one = self.statistic(statistic)
+        return (
+            one.weights_per_dn(self.setting, self.shape(statistic, template))
+            if isinstance(one, LinearStatistic)
+            else None
+        )
 
     def collect(self, plan: ChannelPlan, tally: Tally, samples: Sequence[TailSamples | None]) -> None:
         """Take over the distributions and tails of one batch."""
@@ -192,7 +173,7 @@ class Detection:
         flare : int, optional
             Which flare; None for the null.
         template : int
-            For the null of `SHAPED` statistics: the flare whose shape is looked for.
+            For the null of shaped statistics: the flare whose shape is looked for.
         """
         self._check(statistic, flare, template)
         if flare is None:
@@ -217,21 +198,12 @@ class Detection:
 
     def _closed_form(self, statistic: str, flare: int | None, template: int) -> QuadraticForm | Normal:
         observed = self.quiet if flare is None else self.flares[flare]
-        template = template if flare is None else flare
-        if statistic == "paper":
-            scale = self.smoothing.scale(self.flares[template])
-            delta = observed.signal_dn - self.quiet.signal_dn
-            return self.smoothing.form(scale, delta, observed.variance_dn2 + self.quiet.variance_dn2)
-        weights = self.weights(statistic, template)
-        return closed_form(statistic, self.quiet, observed, self.scene.used, weights, self.scene.comparison)
+        looked_for = self.shape(statistic, template if flare is None else flare)
+        return self.statistic(statistic).closed_form(self.setting, observed, looked_for)
 
     def dof(self, statistic: str) -> int:
         """Degrees of freedom without a flare: pixels, resolution elements, or one."""
-        if self.weights(statistic) is not None:
-            return 1
-        if statistic == "chi2_element":
-            return int(np.unique(self.quiet.element[self.scene.used]).size)
-        return int(self.scene.used.sum())
+        return self.statistic(statistic).dof(self.setting)
 
     def histogram(
         self, statistic: str, flare: int | None = None, *, template: int = 0, bins: int = 200
@@ -248,7 +220,7 @@ class Detection:
             Per test.
         statistic : str
         template : int
-            For `SHAPED` statistics: the flare whose shape is looked for.
+            For shaped statistics: the flare whose shape is looked for.
 
         Returns
         -------
@@ -402,7 +374,7 @@ class Detection:
         return statistic, "null", self._null(statistic, template)
 
     def _null(self, statistic: str, template: int) -> int:
-        return template if statistic in SHAPED else 0
+        return template if self.statistic(statistic).shaped else 0
 
     def _cut(self, fap: float, statistic: str, template: int) -> Interval:
         """The threshold: as it was sampled, or the null's lowest edges with so many at or above them."""
@@ -415,9 +387,7 @@ class Detection:
         return Interval(*map(null.edge_with_at_most, wanted))
 
     def _check(self, statistic: str, flare: int | None, template: int = 0) -> None:
-        if statistic not in self.statistics:
-            raise InputError(f"statistic {statistic!r} was not simulated, expected one of {', '.join(self.statistics)}")
-        if flare is None and statistic in SHAPED:
+        if flare is None and self.statistic(statistic).shaped:
             flare = template
         if flare is not None and not 0 <= flare < len(self.flares):
             raise InputError(f"flare = {flare}, expected 0 to {len(self.flares) - 1}")

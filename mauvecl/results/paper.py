@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mauvecl.statistics.definitions import Interval
+from mauvecl.statistics.intervals import Interval
 from mauvecl.statistics.smoothing import Smoothing
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.statistics.definitions import CONFIDENCE, Interval, clopper_pearson
+from mauvecl.statistics.intervals import CONFIDENCE, Interval, clopper_pearson
 
 if TYPE_CHECKING:
     from astropy.table import QTable

@@ -16,7 +16,7 @@ from scipy import special
 
 from mauvecl.host.errors import InputError
 from mauvecl.noise import layout
-from mauvecl.statistics.definitions import CONFIDENCE, PAIRED, Interval
+from mauvecl.statistics.intervals import CONFIDENCE, Interval
 
 if TYPE_CHECKING:
     from mauvecl.noise.scene import Scene
@@ -153,30 +153,12 @@ class _Tilt:
     @classmethod
     def towards(cls, goal: float, found: Detection, statistic: str, template: int) -> _Tilt:
         """Such that the statistic comes near `goal` on average."""
-        from scipy.sparse import eye_array
-
-        scene, quiet = found.scene, found.quiet
-        sd = np.sqrt((1.0 + _share(found, statistic)) * quiet.variance_dn2) * scene.used
-        weights = found.weights(statistic, template)
-        if weights is not None:
+        tilt = found.statistic(statistic).tilt(found.setting, found.shape(statistic, template))
+        if tilt.square is None:
             # Linear: the mean moves along the statistic's own direction.
-            length = float(np.linalg.norm(weights * sd))
-            unit = 1.0 if scene.comparison.estimated else length
-            return cls((weights * sd / length)[None], np.ones(1), goal / unit)
+            return cls(tilt.directions, np.ones(1), goal / tilt.per_sigma)
         # Quadratic: the spread grows, by exponential tilting of each independent square.
-        if statistic == "paper":
-            scale = found.smoothing.scale(found.flares[template])
-            square, modes = found.smoothing.modes(scale, sd**2)
-            directions = modes * sd / np.sqrt(square)[:, None]
-        elif statistic == "chi2_element":
-            member = quiet.element[None, :] == np.unique(quiet.element[scene.used])[:, None]
-            directions = member * sd
-            directions /= np.linalg.norm(directions, axis=1)[:, None]
-            square = np.ones(len(directions))
-        else:
-            directions = eye_array(scene.n_pixel, format="csr")[scene.used]
-            square = np.ones(directions.shape[0])
-        return cls(directions, _stretch(square, goal))
+        return cls(tilt.directions, _stretch(tilt.square, goal))
 
     def moved(self, difference: Float) -> tuple[Float, Float]:
         """What is added to differences, shape (n, n_pixel), and the logarithms of the draws' weights."""
@@ -203,10 +185,6 @@ def _stretch(square: Float, goal: float) -> Float:
     return np.asarray(1.0 / np.sqrt(1.0 - share * square / most))
 
 
-def _share(found: Detection, statistic: str) -> float:
-    return 1.0 if statistic in PAIRED else found.scene.comparison.share
-
-
 def _tilted(
     found: Detection, statistic: str, template: int, tilt: _Tilt, seed: int, start: int, stop: int
 ) -> tuple[Float, Float]:
@@ -218,9 +196,10 @@ def _tilted(
 
 def _block(found: Detection, statistic: str, template: int, tilt: _Tilt, seed: int, block: int) -> tuple[Float, Float]:
     scene = found.scene
-    exposures = 1 if statistic in PAIRED else scene.comparison.exposures
+    one = found.statistic(statistic)
+    exposures = 1 if one.paired else scene.comparison.exposures
     z, *others = (_normals(scene.n_pixel, seed, block, exposure) for exposure in range(1 + exposures))
-    share = _share(found, statistic)
+    share = one.share(found.setting)
     # Only the difference is tilted; what it does not see stays as drawn.
     root = np.sqrt(1.0 + share)
     difference = (z - share * sum(others)) / root
@@ -233,23 +212,12 @@ def _block(found: Detection, statistic: str, template: int, tilt: _Tilt, seed: i
 
 def _value(found: Detection, statistic: str, template: int, excess: Float, mean: Float) -> Float:
     """The statistic of each draw, from observed less template and subtracted less template, DN, (n, n_pixel)."""
-    scene, quiet, share = found.scene, found.quiet, _share(found, statistic)
-    x = excess - mean
-    if statistic == "paper":
-        smoothed = x @ found.smoothing.rows.T
-        return np.asarray(smoothed**2 @ found.smoothing.scale(found.flares[template]))
-    variance = np.broadcast_to((1.0 + share) * quiet.variance_dn2, x.shape)
+    scene, one = found.scene, found.statistic(statistic)
+    x, share = excess - mean, one.share(found.setting)
+    variance = np.broadcast_to(one.variance(found.setting), x.shape)
     if scene.comparison.estimated:
         variance = _estimated(scene, excess) + share * _estimated(scene, mean)
-    weights = found.weights(statistic, template)
-    if weights is not None:
-        total = x @ weights
-        return np.asarray(total / np.sqrt(variance @ weights**2) if scene.comparison.estimated else total)
-    x, variance = x * scene.used, variance * scene.used
-    if statistic == "chi2_element":
-        starts = np.flatnonzero(np.append(True, np.diff(quiet.element) > 0))
-        x, variance = (np.add.reduceat(values, starts, axis=1) for values in (x, variance))
-    return np.asarray(np.sum(np.divide(x**2, variance, out=np.zeros_like(x), where=variance > 0), axis=1))
+    return one.values(found.setting, x, variance, found.shape(statistic, template))
 
 
 def _estimated(scene: Scene, excess: Float) -> Float:

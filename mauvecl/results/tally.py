@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mauvecl.host.errors import InputError
 from mauvecl.noise import layout
 from mauvecl.results.far import UNIT_BITS, Far, FarCounts, is_above
-from mauvecl.statistics.definitions import Interval, central_counts
+from mauvecl.statistics.intervals import Interval, central_counts
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from mauvecl.noise import layout
 from mauvecl.noise.scene import Scene
 from mauvecl.noise.twin import MAGIC, Floats, clipped, fma, nearest, observed
 from mauvecl.results.snr import Counts
+from mauvecl.statistics.paper import Paper
 
 if TYPE_CHECKING:
     from mauvecl.results.channels import ChannelPlan
@@ -141,8 +142,9 @@ class Smoothed:
     @classmethod
     def of(cls, found: Detection, plan: ChannelPlan) -> Smoothed:
         """Of a detection's channels."""
-        rows = np.zeros((len(found.smoothing.rows), len(found.scene.pixels)), np.float32)
-        rows[:, : found.scene.n_pixel] = found.smoothing.rows
+        smoothing = Paper().smoothing(found.setting)
+        rows = np.zeros((len(smoothing.rows), len(found.scene.pixels)), np.float32)
+        rows[:, : found.scene.n_pixel] = smoothing.rows
         return cls(rows, plan.scales, plan.scale_end)
 
     def sums(self, difference: Floats, k: int) -> list[Floats]:

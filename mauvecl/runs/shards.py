@@ -17,7 +17,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.noise.comparison import TEMPLATE, Comparison
-from mauvecl.noise.layout import USUAL_STATISTICS
 from mauvecl.noise.processes import NONE, Processes
 from mauvecl.noise.scene import BATCH, Mode, Recipe, Scene, prepare
 from mauvecl.results.channels import ChannelPlan, plan_channels
@@ -25,7 +24,8 @@ from mauvecl.results.detection import Detection, Tails
 from mauvecl.results.far import FarCounts
 from mauvecl.results.snr import Counts, SnrResult, elements, observers
 from mauvecl.results.tally import TailSamples, Tally
-from mauvecl.statistics.definitions import Linear
+from mauvecl.statistics.linear import Linear
+from mauvecl.statistics.registry import USUAL_STATISTICS
 
 if TYPE_CHECKING:
     from mauvecl.device.engine import Engine

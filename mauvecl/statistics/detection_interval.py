@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy import special
 
-from mauvecl.statistics.definitions import CONFIDENCE, Interval
+from mauvecl.statistics.intervals import CONFIDENCE, Interval
 
 #: Fewer are few.
 FEW = 10

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.statistics.definitions import QuadraticForm
+from mauvecl.statistics.distributions import QuadraticForm
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation

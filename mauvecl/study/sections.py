@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from mauvecl.noise.layout import USUAL_STATISTICS
+from mauvecl.statistics.registry import STATISTICS, USUAL_STATISTICS
 
 if TYPE_CHECKING:
     from mauvecl.host.sky.zodiacal import Sky
@@ -200,8 +200,6 @@ class Run(Part):
     @field_validator("statistics")
     @classmethod
     def _all(cls, given: tuple[str, ...]) -> tuple[str, ...]:
-        from mauvecl.statistics.definitions import STATISTICS
-
         return tuple(STATISTICS) if "all" in given else given
 
     @model_validator(mode="after")

@@ -16,7 +16,7 @@ from scipy import special
 
 from mauvecl.host.errors import InputError
 from mauvecl.results.detection import FEWEST_IN_TAIL
-from mauvecl.statistics.definitions import CONFIDENCE, Interval
+from mauvecl.statistics.intervals import CONFIDENCE, Interval
 
 if TYPE_CHECKING:
     from astropy.table import QTable

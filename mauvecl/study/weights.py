@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import LARGEST, SMALLEST, parsing, read_text
-from mauvecl.statistics.definitions import Linear
+from mauvecl.statistics.linear import Linear
 
 
 def read_weights(name: str, path: Path, wavelength_nm: NDArray[np.float64]) -> Linear:

@@ -11,7 +11,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.stars.bands import ALIASES
 from mauvecl.host.stars.catalogue import embedded, library_table
-from mauvecl.statistics.definitions import STATISTICS
+from mauvecl.statistics.registry import STATISTICS
 
 UPLOADED = "uploaded star"
 #: Realisations that a visitor may ask for.

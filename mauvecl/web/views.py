@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.detect import StarDetection
     from mauvecl.host.expectation import Expectation
     from mauvecl.host.stars.source import Source
-    from mauvecl.statistics.definitions import Normal, QuadraticForm
+    from mauvecl.statistics.distributions import Normal, QuadraticForm
 
 HEIGHT = 430
 

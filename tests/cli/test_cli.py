@@ -19,7 +19,7 @@ from mauvecl.answers.detect import detect
 from mauvecl.answers.simulate import simulate
 from mauvecl.device.engine import Engine
 from mauvecl.noise.processes import CosmicRays, Normal, Processes, Uniform
-from mauvecl.statistics.definitions import STATISTICS
+from mauvecl.statistics.registry import STATISTICS
 from mauvecl.study.sections import Star
 from mauvecl.study.study import Study
 

@@ -24,7 +24,7 @@ from mauvecl.results.channels import ChannelPlan, plan_channels
 from mauvecl.results.detection import Detection
 from mauvecl.results.snr import elements, observers
 from mauvecl.results.tally import Tally
-from mauvecl.statistics.definitions import STATISTICS
+from mauvecl.statistics.registry import STATISTICS
 
 RAYS = CosmicRays(rate_per_cm2_s=200.0)
 PRIORS = Processes(

@@ -11,7 +11,7 @@ from mauvecl.host.expectation import expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.sky.zodiacal import Sky
 from mauvecl.host.stars.source import Source
-from mauvecl.statistics.definitions import STATISTICS
+from mauvecl.statistics.registry import STATISTICS
 
 SCENES = 200
 #: Of the thresholds, and again of the false alarms counted with other draws.

@@ -9,7 +9,7 @@ from scenes import instrument, star
 from mauvecl.device.engine import Engine
 from mauvecl.noise.comparison import Comparison
 from mauvecl.results.departures import Departure, departures
-from mauvecl.statistics.definitions import STATISTICS
+from mauvecl.statistics.registry import STATISTICS
 
 N = 500_000
 FAP = 1e-3
@@ -68,7 +68,7 @@ def test_estimated_variances(engine: Engine) -> None:
 
 def test_the_causes_are_those_of_the_answer() -> None:
     kind = {"statistic": "chi2", "template": 0, "threshold": 1.0, "fap": 1e-3, "realisations": 10**6}
-    from mauvecl.statistics.definitions import Interval
+    from mauvecl.statistics.intervals import Interval
 
     there = Interval(2e-3, 1.9e-3, 2.1e-3)
     d = Departure(**kind, simulated=there, skew=0.01, rounding=0.0, clipping=0.0, others=())

@@ -18,7 +18,9 @@ from mauvecl.results import twin as reference_sums
 from mauvecl.results.detection import Detection
 from mauvecl.results.roc import Roc
 from mauvecl.results.tally import Distribution, Grid, Tally
-from mauvecl.statistics.definitions import STATISTICS, Linear, matched_weights
+from mauvecl.statistics.linear import Linear, Matched
+from mauvecl.statistics.registry import STATISTICS
+from mauvecl.statistics.statistic import Setting
 
 N = 1_000_000
 #: The paper's G2V star, with flares around the edge of detection for one statistic or another.
@@ -219,7 +221,7 @@ def test_a_statistic_of_ones_own(engine: Engine) -> None:
     """The matched filter given as weights is the matched filter; any other follows its normal."""
     quiet, *flares = star(amplitudes=AMPLITUDES)
     used = np.ones(quiet.wavelength_nm.size, bool)
-    twin = Linear("twin", matched_weights(quiet, flares[1], used))
+    twin = Linear("twin", Matched().weights_per_dn(Setting(quiet, used), flares[1]))
     slope = Linear("slope", np.linspace(-1.0, 2.0, used.size))
     found = engine.detect(
         quiet, flares, realisations=N, seed=3, statistics=("matched", twin, "uv_excess", slope, "chi2")

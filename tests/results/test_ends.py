@@ -20,7 +20,9 @@ from mauvecl.results.channels import plan_channels
 from mauvecl.results.detection import Detection
 from mauvecl.results.snr import PERCENTAGES
 from mauvecl.results.tally import Distribution
-from mauvecl.statistics.definitions import STATISTICS, Linear, central_counts
+from mauvecl.statistics.intervals import central_counts
+from mauvecl.statistics.linear import Linear
+from mauvecl.statistics.registry import STATISTICS
 
 N, FAP = 4000, 0.05
 STUDIES = 12

@@ -13,7 +13,7 @@ from mauvecl.noise.comparison import Comparison
 from mauvecl.noise.processes import Processes, Uniform
 from mauvecl.results.detection import Detection
 from mauvecl.results.tails import tail
-from mauvecl.statistics.definitions import STATISTICS
+from mauvecl.statistics.registry import STATISTICS
 
 #: A sixth of the pixels: brute force can then afford 3e7 draws, 30 of them beyond a threshold at 1e-6.
 PART = {"output_min_nm": 330.0, "output_max_nm": 360.0}

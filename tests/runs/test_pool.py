@@ -31,7 +31,7 @@ from mauvecl.runs import shards
 from mauvecl.runs.checkpoint import Checkpoint, _digest_of
 from mauvecl.runs.pool import LocalWorkers, Pool, Stopped, together
 from mauvecl.runs.shards import Arrays, DetectRequest, Share, SnrRequest, fingerprint
-from mauvecl.statistics.definitions import Linear
+from mauvecl.statistics.linear import Linear
 from mauvecl.study.study import Study
 
 pytestmark = pytest.mark.usefixtures("small_shares")

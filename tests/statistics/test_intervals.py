@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from mauvecl.statistics.definitions import central_counts, clopper_pearson
 from mauvecl.statistics.detection_interval import _orthant, detection_interval
+from mauvecl.statistics.intervals import central_counts, clopper_pearson
 
 #: Of the chi-squared statistic here.
 DOF = 48

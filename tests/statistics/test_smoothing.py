@@ -12,7 +12,7 @@ from mauvecl import Instrument, Source, expect
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise.comparison import Comparison
-from mauvecl.statistics.definitions import QuadraticForm
+from mauvecl.statistics.distributions import QuadraticForm
 from mauvecl.statistics.smoothing import SMOOTHING_NM, Smoothing
 
 

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from mauvecl.statistics.definitions import MANY, Normal, QuadraticForm, clopper_pearson
+from mauvecl.statistics.distributions import MANY, Normal, QuadraticForm
+from mauvecl.statistics.intervals import clopper_pearson
 
 
 @pytest.mark.parametrize("n", [10, 48, 1643])

@@ -13,7 +13,7 @@ from mauvecl.answers.limits import limiting_magnitude
 from mauvecl.answers.maps import detection_map
 from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError
-from mauvecl.statistics.definitions import Interval
+from mauvecl.statistics.intervals import Interval
 from mauvecl.study.study import Study
 from mauvecl.study.unknowns import average, drawn, shares
 

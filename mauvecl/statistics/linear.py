@@ -1,0 +1,101 @@
+"""Weighted sums: the matched filter, the excess in the ultraviolet, and statistics of one's own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.host.errors import InputError
+from mauvecl.statistics.statistic import Float, LinearStatistic, Setting
+
+if TYPE_CHECKING:
+    from mauvecl.host.expectation import Expectation
+
+#: Where `uv_excess` looks, nm.
+UV_NM = (200.0, 360.0)
+
+
+class Matched(LinearStatistic):
+    """The flare's own shape as weights, delta / v / sqrt(lambda), with lambda = sum delta^2 / v.
+
+    It has variance one without a flare, and mean sqrt(lambda) with it; v is the variance of the difference, that of
+    what is subtracted included.
+    """
+
+    name = "matched"
+    definition: ClassVar[str] = "weighted sum with the flare's own shape as template, in standard deviations"
+    label: ClassVar[str] = "matched filter (standard deviations)"
+    shaped: ClassVar[bool] = True
+
+    def weights_per_dn(self, setting: Setting, flare: Expectation | None = None) -> Float:
+        assert flare is not None
+        delta = np.where(setting.used, flare.signal_dn - setting.quiet.signal_dn, 0.0)
+        variance = self.variance(setting)
+        strength = float(np.sqrt(np.sum(delta**2 / variance)))
+        return np.asarray(delta / variance / (strength or 1.0))
+
+
+class UvExcess(LinearStatistic):
+    """Net counts in the ultraviolet over the noise of their sum."""
+
+    name = "uv_excess"
+    definition: ClassVar[str] = f"net counts from {UV_NM[0]:g} to {UV_NM[1]:g} nm, in standard deviations"
+    label: ClassVar[str] = "UV excess (standard deviations)"
+
+    def check(self, setting: Setting) -> None:
+        if not self._inside(setting).any():
+            raise InputError(
+                f"no pixel of {setting.quiet.name} that counts lies at {UV_NM[0]:g}-{UV_NM[1]:g} nm, expected some for "
+                "the statistic 'uv_excess'"
+            )
+
+    def weights_per_dn(self, setting: Setting, flare: Expectation | None = None) -> Float:
+        inside = self._inside(setting)
+        return np.asarray(inside / (np.sqrt(np.sum(self.variance(setting)[inside])) or 1.0))
+
+    def _inside(self, setting: Setting) -> NDArray[np.bool_]:
+        wavelength = setting.quiet.wavelength_nm
+        return np.asarray(setting.used & (wavelength >= UV_NM[0]) & (wavelength <= UV_NM[1]))
+
+
+@dataclass(frozen=True, eq=False)
+class Linear(LinearStatistic):
+    """A statistic of one's own: the sum over pixels of weight times (observed - template), DN of the exposure.
+
+    Attributes
+    ----------
+    name : str
+    weights : ndarray, shape (n_pixel,)
+        Per DN; pixels that a template saturates are left out.
+    """
+
+    name: str
+    weights: NDArray[np.float64]
+
+    definition: ClassVar[str] = "a weighted sum of one's own"
+    label: ClassVar[str] = ""
+
+    def __post_init__(self) -> None:
+        weights = np.array(self.weights, np.float64)
+        object.__setattr__(self, "weights", weights)
+        if weights.ndim != 1 or not np.isfinite(weights).all() or not weights.any():
+            bad = int((~np.isfinite(weights)).sum())
+            raise InputError(
+                f"statistic {self.name!r} has weights of the shape {weights.shape}, {bad} of them no numbers, expected "
+                "one finite value per pixel, not all zero"
+            )
+
+    def check(self, setting: Setting) -> None:
+        if self.weights.size != setting.used.size:
+            raise InputError(
+                f"statistic {self.name!r} has {self.weights.size} weights, expected one for each of the "
+                f"{setting.used.size} pixels"
+            )
+        if not (self.weights * setting.used).any():
+            raise InputError(f"statistic {self.name!r} weighs only saturated pixels, expected others")
+
+    def weights_per_dn(self, setting: Setting, flare: Expectation | None = None) -> Float:
+        return np.asarray(self.weights * setting.used)

@@ -1,0 +1,202 @@
+"""What all detection statistics have in common: a definition, weights or sums, a distribution for Gaussian noise."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.noise.comparison import TEMPLATE, Comparison
+from mauvecl.statistics.distributions import Normal, QuadraticForm
+
+if TYPE_CHECKING:
+    from mauvecl.host.expectation import Expectation
+
+Float = NDArray[np.float64]
+T = TypeVar("T")
+
+
+@dataclass(frozen=True, eq=False)
+class Setting:
+    """What the statistics of one detection look at.
+
+    Attributes
+    ----------
+    quiet : Expectation
+        The star without a flare: the template, and the model of the variances.
+    used : ndarray of bool, shape (n_pixel,)
+        Pixels that count.
+    comparison : Comparison
+        What is subtracted, and by whose variances.
+    flares : sequence of Expectation
+        What may be looked for.
+    """
+
+    quiet: Expectation
+    used: NDArray[np.bool_]
+    comparison: Comparison = TEMPLATE
+    flares: Sequence[Expectation] = ()
+    _kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
+
+    def remembered(self, name: str, make: Callable[[], T]) -> T:
+        """What is dear to make and asked for again."""
+        if name not in self._kept:
+            self._kept[name] = make()
+        return cast("T", self._kept[name])
+
+
+@dataclass(frozen=True, eq=False)
+class Tilt:
+    """Directions along which importance sampling moves or stretches the noise.
+
+    Attributes
+    ----------
+    directions : ndarray or sparse array, shape (n_direction, n_pixel)
+        Orthonormal, in standard deviations of each pixel's difference.
+    square : ndarray, shape (n_direction,), optional
+        What the square of a standard normal along each direction adds to a quadratic statistic; none for a linear one.
+    per_sigma : float
+        What a linear statistic gains by one standard deviation along its direction.
+    """
+
+    directions: Any
+    square: Float | None = None
+    per_sigma: float = 1.0
+
+
+class Statistic(ABC):
+    """One detection statistic; it holds no data, so that one object serves every detection.
+
+    `flare` is the expectation whose shape is looked for; statistics that are not `shaped` take none.
+    """
+
+    #: As studies, tables and flags call it.
+    name: str
+    #: What it is, for users.
+    definition: ClassVar[str]
+    #: For the axes of pictures.
+    label: ClassVar[str]
+    #: Whether it looks for one flare's shape: each flare then has a null of its own.
+    shaped: ClassVar[bool] = False
+    #: Whether it compares with one noisy quiescent exposure, whatever the others are compared with.
+    paired: ClassVar[bool] = False
+    #: Which of the sums that kernels always know it is (`layout.FIXED_STATISTICS`); none where it brings weights.
+    kernel_sum: ClassVar[str | None] = None
+
+    def share(self, setting: Setting) -> float:
+        """Variance of what is subtracted, as a share of one exposure's."""
+        return 1.0 if self.paired else setting.comparison.share
+
+    def variance(self, setting: Setting) -> Float:
+        """Of a pixel's difference without a flare, DN^2, shape (n_pixel,)."""
+        return np.asarray((1.0 + self.share(setting)) * setting.quiet.variance_dn2)
+
+    def check(self, setting: Setting) -> None:
+        """Refuse a setting in which the statistic says nothing.
+
+        Raises
+        ------
+        InputError
+        """
+        return
+
+    def closed_form(
+        self, setting: Setting, observed: Expectation, flare: Expectation | None = None
+    ) -> QuadraticForm | Normal:
+        """The distribution for Gaussian noise (METHODS section 6).
+
+        Parameters
+        ----------
+        setting : Setting
+        observed : Expectation
+            What is on the sky; the quiescent star for the null.
+        flare : Expectation, optional
+
+        Notes
+        -----
+        Estimated variances are taken for the true ones, which is what they are on average.
+        """
+        delta = np.where(setting.used, observed.signal_dn - setting.quiet.signal_dn, 0.0)
+        true = observed.variance_dn2 + self.share(setting) * setting.quiet.variance_dn2
+        return self.form(setting, delta, true, flare, estimated=setting.comparison.estimated)
+
+    @abstractmethod
+    def dof(self, setting: Setting) -> int:
+        """Degrees of freedom without a flare."""
+
+    @abstractmethod
+    def form(
+        self, setting: Setting, delta: Float, true: Float, flare: Expectation | None = None, *, estimated: bool = False
+    ) -> QuadraticForm | Normal:
+        """The distribution for differences that are Gaussian.
+
+        Parameters
+        ----------
+        setting : Setting
+        delta, true : ndarray, shape (n_pixel,)
+            Mean, DN, and variance, DN^2, of each pixel's difference.
+        flare : Expectation, optional
+        estimated : bool
+            Whether the statistic divides by the true variances or by the model's.
+        """
+
+    @abstractmethod
+    def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
+        """The statistic of given differences, on the host.
+
+        Parameters
+        ----------
+        setting : Setting
+        x, variance : ndarray, shape (n, n_pixel)
+            Differences, DN, and the variances that are divided by, DN^2.
+        flare : Expectation, optional
+
+        Returns
+        -------
+        ndarray, shape (n,)
+        """
+
+    @abstractmethod
+    def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
+        """Where importance sampling looks for alarms."""
+
+
+class LinearStatistic(Statistic):
+    """A weighted sum of the differences: normal for Gaussian noise."""
+
+    @abstractmethod
+    def weights_per_dn(self, setting: Setting, flare: Expectation | None = None) -> Float:
+        """Weights per DN, shape (n_pixel,); zero for pixels that do not count."""
+
+    def dof(self, setting: Setting) -> int:
+        return 1
+
+    def form(
+        self, setting: Setting, delta: Float, true: Float, flare: Expectation | None = None, *, estimated: bool = False
+    ) -> Normal:
+        weights = self.weights_per_dn(setting, flare)
+        mean, spread = float(weights @ delta), float(np.sqrt(weights**2 @ true))
+        # By estimated variances a linear statistic comes in its own standard deviations.
+        return Normal(mean / spread, 1.0) if estimated else Normal(mean, spread)
+
+    def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
+        weights = self.weights_per_dn(setting, flare)
+        total = x @ weights
+        return np.asarray(total / np.sqrt(variance @ weights**2) if setting.comparison.estimated else total)
+
+    def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
+        along = self.weights_per_dn(setting, flare) * np.sqrt(self.variance(setting))
+        length = float(np.linalg.norm(along))
+        return Tilt((along / length)[None], per_sigma=1.0 if setting.comparison.estimated else length)
+
+
+class QuadraticStatistic(Statistic):
+    """A sum of squares of the differences: a generalised chi-squared for Gaussian noise."""
+
+    @abstractmethod
+    def own(self, setting: Setting, flare: Expectation | None = None) -> Float:
+        """What multiplies each pixel's own square, per DN^2, shape (n_pixel,)."""
