@@ -15,9 +15,9 @@ from scipy import special
 
 from .errors import InputError
 from .instrument.instrument import Instrument
+from .measured_noise import below_zero
 from .response import Order, electrons_per_second
 from .sky.zodiacal import Sky
-from .spectra.measured_noise import below_zero
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -423,7 +423,8 @@ def expect(
         },
     )
     messages = [*_saturation(plain), *(f"{source.name}: {text}." for text in source.told)]
-    messages += below_zero(source, instrument, plain, electrons, order)
+    drawn = np.sqrt(plain.variance_dn2) / (n_frames * plain.gain_dn_per_electron)
+    messages += below_zero(source, instrument, electrons, drawn, order)
     if n_frames * instrument.frame_s > asked_s * (1 + 1e-9):
         messages.append(
             f"The exposure of {asked_s:g} s is rounded up to {plain.exposure_s:g} s, "

@@ -8,6 +8,8 @@ from __future__ import annotations
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from mauvecl.host.version import VERSION
+
 if TYPE_CHECKING:
     from mauvecl.answers.exposures import exposure_for
     from mauvecl.answers.gaussian import gaussian_report
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
     from mauvecl.statistics.linear import Linear
     from mauvecl.study.study import Study
 
-__version__ = "0.1.0"
+__version__ = VERSION
 __all__ = [
     "Comparison",
     "Engine",

@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .columns import NEEDED_NM, looks_like
-from .measured_noise import point_noise
+from .scatter import point_noise
 from .values import check_values
 
 if TYPE_CHECKING:
-    from ..response import Line
+    from ..instrument.line import Line
 
 Float = NDArray[np.float64]
 
@@ -153,7 +153,7 @@ def remarks(wavelength: Float, flux: Float) -> tuple[str, ...]:
 @cache
 def _line() -> Line:
     from ..instrument.instrument import Instrument
-    from ..response import Line
+    from ..instrument.line import Line
 
     return Line.of(Instrument.load("mauve"))
 

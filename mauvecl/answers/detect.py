@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mauvecl.host.plotting import picture
 from mauvecl.results.campaign import campaign
 from mauvecl.results.departures import departure_table
 from mauvecl.results.detection import Detection, check_fap, countable
@@ -98,9 +99,7 @@ class DetectAnswer:
 
     def plot(self, path: str | Path | None = None) -> object:
         """Null and flare distributions of every star and statistic; needs matplotlib."""
-        from mauvecl.pictures.answers import detection
-
-        return detection([star.shown for star in self.stars], self.study.run.fap, path)
+        return picture("answers.detection", [star.shown for star in self.stars], self.study.run.fap, path)
 
     def _detections(self, star: StarDetection) -> QTable:
         table = star.found.table(self.study.run.fap)

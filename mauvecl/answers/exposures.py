@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 
 from mauvecl.host.errors import InputError
+from mauvecl.host.plotting import picture
 from mauvecl.study.labels import described, label, told
 from mauvecl.study.questions import QUANTITIES
 from mauvecl.study.sections import Star
@@ -83,9 +84,7 @@ class ExposureResult:
 
     def plot(self, path: str | Path | None = None) -> object:
         """S/N against exposure, and the answers on it; needs matplotlib."""
-        from mauvecl.pictures.plans import exposures
-
-        return exposures(self, path)
+        return picture("plans.exposures", self, path)
 
 
 def snr_at(x: Expectation, wavelength_nm: float, per: Per = "element") -> float:

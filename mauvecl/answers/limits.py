@@ -11,6 +11,7 @@ import numpy as np
 
 from mauvecl.answers.limit_search import MarginalQuestion, Point, Question, Unknown, settle
 from mauvecl.host.errors import InputError
+from mauvecl.host.plotting import picture
 from mauvecl.results.detection import check_fap
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, stacked, told
@@ -165,9 +166,7 @@ class LimitResult:
 
     def plot(self, path: str | Path | None = None) -> object:
         """Detection probability against the quantity: every simulated point and the limits; needs matplotlib."""
-        from mauvecl.pictures.plans import limits
-
-        return limits(self, path)
+        return picture("plans.limits", self, path)
 
 
 def solve(

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.plotting import picture
 from mauvecl.results.detection import check_fap
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, told
@@ -101,9 +102,7 @@ class MapResult:
 
     def plot(self, path: str | Path | None = None) -> object:
         """One panel per statistic, with contours at the study's powers; needs matplotlib."""
-        from mauvecl.pictures.plans import detection_map as draw
-
-        return draw(self, path)
+        return picture("plans.detection_map", self, path)
 
 
 def detection_map(

@@ -11,8 +11,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import mauvecl
 from mauvecl.host.errors import InputError
+from mauvecl.host.version import VERSION
 from mauvecl.runs.durable import write_whole
 
 if TYPE_CHECKING:
@@ -101,7 +101,7 @@ def write_record(
         What the reader was told.
     """
     record: dict[str, Any] = {
-        "mauvecl": mauvecl.__version__,
+        "mauvecl": VERSION,
         "verb": verb,
         "date_utc": datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds"),
         "wall_time_s": round(seconds, 3),

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mauvecl.host.plotting import picture
 from mauvecl.noise.components import components
 from mauvecl.study.labels import described, label, told
 from mauvecl.study.study import Study
@@ -26,10 +27,8 @@ class SimulateAnswer:
 
     def plot(self, path: str | Path | None = None, *, number: int = 0) -> object:
         """One of the observations and what it is made of; needs matplotlib."""
-        from mauvecl.pictures.answers import observation
-
         title, _, table = self.observations[number]
-        return observation(title, table, path)
+        return picture("answers.observation", title, table, path)
 
 
 def simulate(study: Study, *, realisation: int = 0, flaring: bool = False) -> SimulateAnswer:

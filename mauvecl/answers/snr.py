@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mauvecl.host.plotting import picture
 from mauvecl.runs.pool import Pool, together
 from mauvecl.study.labels import label, stacked, titled, told
 from mauvecl.study.study import Study
@@ -79,9 +80,7 @@ class SnrAnswer:
 
     def plot(self, path: str | Path | None = None) -> object:
         """S/N per pixel and element, closed form and realisations; needs matplotlib."""
-        from mauvecl.pictures.answers import signal_to_noise
-
-        return signal_to_noise([(s.title, s.result) for s in self.stars], path)
+        return picture("answers.signal_to_noise", [(s.title, s.result) for s in self.stars], path)
 
     def together(self, table_of: Callable[[SnrResult], QTable]) -> QTable:
         """A table of each star and cell as one, with the star and what is swept in front."""

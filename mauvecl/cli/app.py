@@ -9,7 +9,6 @@ from typing import Annotated
 
 import typer
 
-from mauvecl import __version__
 from mauvecl.cli.boundary import EXIT_CODES, guarded
 from mauvecl.cli.bulk import export, realise, verify
 from mauvecl.cli.detect import detect, gaussian
@@ -18,6 +17,7 @@ from mauvecl.cli.library import app as library
 from mauvecl.cli.limits import detection_map, limit
 from mauvecl.cli.observe import exposure, simulate, snr
 from mauvecl.cli.serve import serve
+from mauvecl.host.version import VERSION
 
 app = typer.Typer(
     name="mauvecl",
@@ -123,7 +123,7 @@ for verb in (realise, verify, export, serve):
 
 def _version(wanted: bool) -> None:
     if wanted:
-        print(f"mauvecl {__version__}")
+        print(f"mauvecl {VERSION}")
         raise typer.Exit
 
 

@@ -199,12 +199,12 @@ def _discard() -> None:
 
 def _write_traceback(error: Exception) -> Path | str:
     """The traceback in a file: in the output folder where there is one, else in the folder of temporary files."""
-    from mauvecl import __version__
+    from mauvecl.host.version import VERSION
 
     now = datetime.datetime.now(datetime.UTC).strftime("%Y%m%dT%H%M%S")
     text = "\n".join(
         [
-            f"mauvecl {__version__}, Python {platform.python_version()}, {platform.platform()}",
+            f"mauvecl {VERSION}, Python {platform.python_version()}, {platform.platform()}",
             f"command: {sys.argv!r}"[:20_000],
             "".join(traceback.format_exception(error, limit=-60)),
         ]

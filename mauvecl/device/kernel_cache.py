@@ -23,7 +23,7 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 
-from mauvecl import __version__
+from mauvecl.host.version import VERSION
 
 #: What PoCL needs to build the kernels of a session, bytes.
 ROOM = 64 * 2**20
@@ -185,7 +185,7 @@ def kernel_cache() -> KernelCache:
     import platformdirs
 
     wanted = os.environ.get("MAUVECL_CACHE_DIR") or platformdirs.user_cache_dir("mauvecl")
-    base = Path(wanted) / f"kernels-{__version__}"
+    base = Path(wanted) / f"kernels-{VERSION}"
     for parent in (base, Path(tempfile.gettempdir()), Path("/dev/shm")):
         work = _working_folder(parent)
         if work is not None:

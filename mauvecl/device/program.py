@@ -15,9 +15,9 @@ from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
-from mauvecl import __version__
 from mauvecl.device import processor
 from mauvecl.device.kernel_cache import kernel_cache
+from mauvecl.host.version import VERSION
 from mauvecl.noise import layout
 
 if TYPE_CHECKING:
@@ -248,7 +248,7 @@ def render(rooms: tuple[str, ...], variant: Variant) -> str:
 
     def make() -> str:
         parts = (str(_template(text).render(**values)) for text in texts)
-        return "\n".join((f"/* mauvecl {__version__} */", structs, *parts))
+        return "\n".join((f"/* mauvecl {VERSION} */", structs, *parts))
 
     # Rendering takes longer than starting a kernel that is built already.
     return kernel_cache().remembered(hashlib.sha256(repr((structs, values, texts)).encode()).hexdigest()[:32], make)

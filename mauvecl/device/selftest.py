@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl import __version__
 from mauvecl.device.engine import Engine
 from mauvecl.device.kernel_cache import kernel_cache
 from mauvecl.device.probes import Probes
 from mauvecl.device.program import SAME_BITS
 from mauvecl.host.expectation import Expectation
+from mauvecl.host.version import VERSION
 from mauvecl.noise import layout
 from mauvecl.noise import twin as reference
 from mauvecl.noise.comparison import Comparison
@@ -342,7 +342,7 @@ def run(engine: Engine, told: Callable[[Check], None] = lambda check: None) -> l
 def keep(engine: Engine, checks: list[Check], seconds: float) -> None:
     """Remember the outcome for later run records on the same device, driver and version."""
     record = {
-        "mauvecl": __version__,
+        "mauvecl": VERSION,
         "device": asdict(engine.device),
         "date_utc": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
         "seconds": round(seconds, 1),
@@ -359,5 +359,5 @@ def last(device: DeviceRecord) -> dict[str, Any] | None:
 
 
 def _key(device: DeviceRecord) -> str:
-    said = f"selftest {__version__} {device.label} {device.driver}"
+    said = f"selftest {VERSION} {device.label} {device.driver}"
     return hashlib.sha256(said.encode()).hexdigest()[:32]

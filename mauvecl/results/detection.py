@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
+from mauvecl.host.plotting import picture
 from mauvecl.noise.scene import Scene
 from mauvecl.results.channels import ChannelPlan, Key
 from mauvecl.results.roc import Roc
@@ -326,10 +327,8 @@ class Detection:
 
     def plot(self, path: str | Path | None = None, *, fap: float = 1e-3) -> object:
         """Null and flare distributions by every statistic, with thresholds; needs matplotlib."""
-        from mauvecl.pictures.answers import detection
-
         flares = [f"flare {k + 1}" for k in range(len(self.flares))]
-        return detection([(self.quiet.name, self, flares)], fap, path)
+        return picture("answers.detection", [(self.quiet.name, self, flares)], fap, path)
 
     def table(self, fap: float = 1e-3) -> QTable:
         """One row per flare and statistic: expected and simulated values, threshold and probability.

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from mauvecl.host.plotting import picture
 from mauvecl.statistics.intervals import CONFIDENCE, Interval, clopper_pearson
 
 if TYPE_CHECKING:
@@ -74,9 +75,7 @@ class Roc:
 
     def plot(self, path: str | Path | None = None, *, name: str = "") -> object:
         """Detection probability against false-alarm probability; needs matplotlib."""
-        from mauvecl.pictures.answers import roc
-
-        return roc([(name, self)], path)
+        return picture("answers.roc", [(name, self)], path)
 
     def table(self, rows: int = 200) -> QTable:
         """Some rows of the curve, both probabilities with their Clopper-Pearson intervals; the area in the meta data.

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
+from mauvecl.host.plotting import picture
 from mauvecl.noise import layout
 from mauvecl.noise.scene import Scene
 from mauvecl.noise.twin import Floats, fma
@@ -227,9 +228,7 @@ class SnrResult:
 
     def plot(self, path: str | Path | None = None) -> object:
         """S/N per pixel and element, closed form and realisations; needs matplotlib."""
-        from mauvecl.pictures.answers import signal_to_noise
-
-        return signal_to_noise([(self.expectation.name, self)], path)
+        return picture("answers.signal_to_noise", [(self.expectation.name, self)], path)
 
     def _table(
         self,

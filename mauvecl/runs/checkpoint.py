@@ -24,10 +24,10 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from mauvecl import __version__
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import read_bytes
 from mauvecl.host.files.parsed import json_data, read_text
+from mauvecl.host.version import VERSION
 from mauvecl.runs.durable import UNFINISHED, alone, differing_keys, write_whole
 from mauvecl.runs.shards import FORM
 
@@ -147,7 +147,7 @@ class Checkpoint:
                 f"the unfinished run in {str(self.folder)!r} keeps its counts in form {form}, expected form {FORM} as "
                 "this version writes: --restart to forget it"
             )
-        ours = {"mauvecl": __version__, "verb": self.verb, **self._plain_study()}
+        ours = {"mauvecl": VERSION, "verb": self.verb, **self._plain_study()}
         differing = differing_keys(ours, theirs)
         if differing:
             raise InputError(
@@ -238,7 +238,7 @@ class Checkpoint:
         return dict(tomllib.loads(self.study.toml()))
 
     def _write_manifest(self) -> None:
-        manifest = {"mauvecl": __version__, "form": FORM, "verb": self.verb, "study": self._plain_study()}
+        manifest = {"mauvecl": VERSION, "form": FORM, "verb": self.verb, "study": self._plain_study()}
         text = json.dumps(manifest | {"digest": _digest_of(manifest)}, indent=2)
         write_whole(self.folder / MANIFEST, text.encode())
 

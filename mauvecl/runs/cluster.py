@@ -15,11 +15,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from mauvecl import __version__
 from mauvecl.device.program import DeviceError, DeviceRecord
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import is_file, json_data, read_text
+from mauvecl.host.version import VERSION
 from mauvecl.runs.pool import Stopped
 from mauvecl.runs.shards import Arrays, Countable, Share
 
@@ -84,10 +84,10 @@ class DaskWorkers:
             for worker, answer in found.items():
                 if isinstance(answer, BaseException):
                     raise DeviceError(
-                        f"worker {worker} cannot work ({answer}), expected mauvecl {__version__} and OpenCL there"
+                        f"worker {worker} cannot work ({answer}), expected mauvecl {VERSION} and OpenCL there"
                     )
-                if answer[0] != __version__:
-                    raise DeviceError(f"worker {worker} has mauvecl {answer[0]}, expected {__version__} as here")
+                if answer[0] != VERSION:
+                    raise DeviceError(f"worker {worker} has mauvecl {answer[0]}, expected {VERSION} as here")
             self._devices = [record for _, record in found.values()]
             self._counted = len(found), time.monotonic()
         except BaseException:
@@ -310,7 +310,7 @@ def _engine_here(device: str | None, threads: int) -> Engine:
 
 def _introduce(device: str | None, dask_worker: Any = None) -> tuple[str, DeviceRecord]:
     with _one_at_a_time:
-        return __version__, _engine_here(device, dask_worker.state.nthreads).device
+        return VERSION, _engine_here(device, dask_worker.state.nthreads).device
 
 
 def _count(request: Countable, share: Share, device: str | None) -> Arrays:

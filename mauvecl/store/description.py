@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl import __version__
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import read_bytes
+from mauvecl.host.version import VERSION
 from mauvecl.study.labels import told as messages_of
 
 if TYPE_CHECKING:
@@ -45,7 +45,7 @@ def describe(store: Store, folder: Path) -> None:
         warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
         root = zarr.open_group(folder, mode="w", zarr_format=3)
         run: dict[str, Any] = signed(study) | {"seed": store.study.run.seed, "realisations": store.rows}
-        root.attrs.update(run | {"mauvecl": __version__, "draws": COMMON_DRAWS, "throughput": NOMINAL})
+        root.attrs.update(run | {"mauvecl": VERSION, "draws": COMMON_DRAWS, "throughput": NOMINAL})
         for scene in store.scenes:
             x, group = scene.expectation, root.require_group(scene.group)
             if scene.name == "quiescent":

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl import __version__
 from mauvecl.host.errors import InputError
+from mauvecl.host.version import VERSION
 from mauvecl.runs.durable import UNFINISHED, write_whole
 from mauvecl.store.description import CALIBRATION, COMMON_DRAWS, NOMINAL
 from mauvecl.store.form import Scene, Store
@@ -121,7 +121,7 @@ def _fits(selection: Selection) -> HDUList:
 
     store = selection.store
     primary = fits.PrimaryHDU()
-    primary.header["ORIGIN"] = (f"mauvecl {__version__}", "simulated, not observed")
+    primary.header["ORIGIN"] = (f"mauvecl {VERSION}", "simulated, not observed")
     primary.header["SEED"] = (str(store.study.run.seed), "of the random numbers")
     primary.header["FIRSTROW"] = (selection.first, "realisation of the first row of each image")
     for line in (COMMON_DRAWS, NOMINAL):
@@ -187,7 +187,7 @@ def _hdf5(selection: Selection, place: io.BytesIO) -> None:
 
     store = selection.store
     with h5py.File(place, "w") as file:
-        file.attrs.update({"mauvecl": __version__, "study": store.study.toml(), "seed": str(store.study.run.seed)})
+        file.attrs.update({"mauvecl": VERSION, "study": store.study.toml(), "seed": str(store.study.run.seed)})
         file.attrs.update({"first_row": selection.first, "draws": COMMON_DRAWS, "throughput": NOMINAL})
         for scene in selection.scenes:
             group = file.require_group(scene.group)

@@ -13,7 +13,8 @@ from scipy.special import erf
 from mauvecl.host import response
 from mauvecl.host.errors import InputError
 from mauvecl.host.instrument.instrument import Instrument
-from mauvecl.host.response import Line, Order, electrons_per_second, response_matrix
+from mauvecl.host.instrument.line import Line
+from mauvecl.host.response import Order, electrons_per_second, response_matrix
 
 Float = NDArray[np.float64]
 
