@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
+from scipy.linalg import solve_triangular
 
 from mauvecl.statistics.distributions import QuadraticForm
+from mauvecl.statistics.nuisances import Nuisances
 from mauvecl.statistics.statistic import Float, QuadraticStatistic, Setting, Tilt
 
 if TYPE_CHECKING:
@@ -22,7 +24,11 @@ class Chi2(QuadraticStatistic):
     kernel_sum: ClassVar[str | None] = "chi2"
 
     def dof(self, setting: Setting) -> int:
-        return int(setting.used.sum())
+        return int(setting.used.sum()) - self._free(setting)
+
+    @staticmethod
+    def _free(setting: Setting) -> int:
+        return setting.nuisances.free if setting.nuisances else 0
 
     def form(
         self, setting: Setting, delta: Float, true: Float, flare: Expectation | None = None, *, estimated: bool = False
@@ -32,11 +38,35 @@ class Chi2(QuadraticStatistic):
         delta, model, true = (self._grouped(setting, values) for values in (delta, model, true))
         counts = (model > 0) & (true > 0)
         delta, model, true = delta[counts], model[counts], true[counts]
+        if setting.nuisances:
+            return self._marginal_form(setting.nuisances, self._spectra(setting)[:, counts], delta, model, true)
         return QuadraticForm(true / model, delta / np.sqrt(true))
 
+    @staticmethod
+    def _marginal_form(nuisances: Nuisances, spectra: Float, delta: Float, model: Float, true: Float) -> QuadraticForm:
+        """Of x^T C^-1 x, x normal of mean delta and of the true variances with the unknowns' own."""
+        if not delta.any() and np.array_equal(model, true):
+            size = delta.size - nuisances.free
+            return QuadraticForm(np.ones(size), np.zeros(size))
+        rows, drawn = nuisances.rows(model, spectra), nuisances.finite(spectra)
+        root = np.linalg.cholesky(np.diag(true) + drawn.T @ drawn)
+        weight, vectors = np.linalg.eigh((root.T / model) @ root - (root.T @ rows.T) @ (rows @ root))
+        # What is projected out has no weight.
+        kept = weight > 1e-9 * weight[-1]
+        shift = vectors.T @ solve_triangular(root, delta, lower=True)
+        return QuadraticForm(weight[kept], shift[kept])
+
     def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
+        subtracted = np.sum((x @ self.subtracted(setting).T) ** 2, axis=-1)
         x, variance = (self._grouped(setting, values * setting.used) for values in (x, variance))
-        return np.asarray(np.sum(np.divide(x**2, variance, out=np.zeros_like(x), where=variance > 0), axis=-1))
+        total = np.sum(np.divide(x**2, variance, out=np.zeros_like(x), where=variance > 0), axis=-1)
+        return np.asarray(total - subtracted)
+
+    def subtracted(self, setting: Setting) -> Float:
+        if not setting.nuisances:
+            return super().subtracted(setting)
+        model = self._grouped(setting, self.variance(setting) * setting.used)
+        return self._per_pixel(setting, setting.nuisances.rows(model, self._spectra(setting))) * setting.used
 
     def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
         from scipy.sparse import eye_array
@@ -45,11 +75,23 @@ class Chi2(QuadraticStatistic):
         return Tilt(directions, np.ones(directions.shape[0]))
 
     def own(self, setting: Setting, flare: Expectation | None = None) -> Float:
-        return np.asarray(setting.used / self.variance(setting))
+        model = self._grouped(setting, self.variance(setting) * setting.used)
+        inverse = np.divide(1.0, model, out=np.zeros_like(model), where=model > 0)
+        own = self._per_pixel(setting, inverse) * setting.used - np.sum(self.subtracted(setting) ** 2, axis=0)
+        return np.asarray(own)
 
     def _grouped(self, setting: Setting, values: Float) -> Float:
         """What is squared, from values per pixel along the last axis."""
         return values
+
+    def _per_pixel(self, setting: Setting, values: Float) -> Float:
+        """For each pixel the value of what it belongs to."""
+        return values
+
+    def _spectra(self, setting: Setting) -> Float:
+        """Of the unknowns, in what is squared."""
+        assert setting.nuisances is not None
+        return self._grouped(setting, setting.nuisances.spectra * setting.used)
 
 
 class Chi2Element(Chi2):
@@ -61,7 +103,7 @@ class Chi2Element(Chi2):
     kernel_sum: ClassVar[str | None] = "chi2_element"
 
     def dof(self, setting: Setting) -> int:
-        return int(np.unique(setting.quiet.element[setting.used]).size)
+        return int(np.unique(setting.quiet.element[setting.used]).size) - self._free(setting)
 
     def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
         element = setting.quiet.element
@@ -69,16 +111,12 @@ class Chi2Element(Chi2):
         directions = member * np.sqrt(self.variance(setting)) * setting.used
         return Tilt(directions / np.linalg.norm(directions, axis=1)[:, None], np.ones(len(directions)))
 
-    def own(self, setting: Setting, flare: Expectation | None = None) -> Float:
-        element = setting.quiet.element
-        summed = self._grouped(setting, self.variance(setting) * setting.used)[
-            np.unique(element, return_inverse=True)[1]
-        ]
-        return np.asarray(np.divide(setting.used, summed, out=np.zeros_like(summed), where=summed > 0))
-
     def _grouped(self, setting: Setting, values: Float) -> Float:
         starts = np.flatnonzero(np.append(True, np.diff(setting.quiet.element) > 0))
         return np.asarray(np.add.reduceat(values, starts, axis=-1))
+
+    def _per_pixel(self, setting: Setting, values: Float) -> Float:
+        return np.asarray(values[..., np.unique(setting.quiet.element, return_inverse=True)[1]])
 
 
 class Chi2Pair(Chi2):
@@ -89,3 +127,4 @@ class Chi2Pair(Chi2):
     label: ClassVar[str] = "chi2 against a noisy exposure"
     kernel_sum: ClassVar[str | None] = "chi2_pair"
     paired: ClassVar[bool] = True
+    marginal: ClassVar[bool] = False

@@ -30,7 +30,7 @@ class Matched(LinearStatistic):
     label: ClassVar[str] = "matched filter (standard deviations)"
     shaped: ClassVar[bool] = True
 
-    def weights_per_dn(self, setting: Setting, flare: Expectation | None = None) -> Float:
+    def plain_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
         assert flare is not None
         delta = np.where(setting.used, flare.signal_dn - setting.quiet.signal_dn, 0.0)
         variance = self.variance(setting)
@@ -46,13 +46,14 @@ class UvExcess(LinearStatistic):
     label: ClassVar[str] = "UV excess (standard deviations)"
 
     def check(self, setting: Setting) -> None:
+        super().check(setting)
         if not self._inside(setting).any():
             raise InputError(
                 f"no pixel of {setting.quiet.name} that counts lies at {UV_NM[0]:g}-{UV_NM[1]:g} nm, expected some for "
                 "the statistic 'uv_excess'"
             )
 
-    def weights_per_dn(self, setting: Setting, flare: Expectation | None = None) -> Float:
+    def plain_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
         inside = self._inside(setting)
         return np.asarray(inside / (np.sqrt(np.sum(self.variance(setting)[inside])) or 1.0))
 
@@ -77,6 +78,7 @@ class Linear(LinearStatistic):
 
     definition: ClassVar[str] = "a weighted sum of one's own"
     label: ClassVar[str] = ""
+    normalised: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         weights = np.array(self.weights, np.float64)
@@ -89,6 +91,7 @@ class Linear(LinearStatistic):
             )
 
     def check(self, setting: Setting) -> None:
+        super().check(setting)
         if self.weights.size != setting.used.size:
             raise InputError(
                 f"statistic {self.name!r} has {self.weights.size} weights, expected one for each of the "
@@ -97,5 +100,5 @@ class Linear(LinearStatistic):
         if not (self.weights * setting.used).any():
             raise InputError(f"statistic {self.name!r} weighs only saturated pixels, expected others")
 
-    def weights_per_dn(self, setting: Setting, flare: Expectation | None = None) -> Float:
+    def plain_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
         return np.asarray(self.weights * setting.used)

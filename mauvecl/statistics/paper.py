@@ -25,6 +25,7 @@ class Paper(QuadraticStatistic):
     label: ClassVar[str] = "the paper's sum on smoothed spectra"
     shaped: ClassVar[bool] = True
     paired: ClassVar[bool] = True
+    marginal: ClassVar[bool] = False
 
     def smoothing(self, setting: Setting) -> Smoothing:
         """The paper's, on the pixels that count."""

@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.errors import InputError
 from mauvecl.noise.comparison import TEMPLATE, Comparison
 from mauvecl.statistics.distributions import Normal, QuadraticForm
+from mauvecl.statistics.nuisances import Nuisances, joined
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -34,12 +36,15 @@ class Setting:
         What is subtracted, and by whose variances.
     flares : sequence of Expectation
         What may be looked for.
+    nuisances : Nuisances, optional
+        What is marginalised over.
     """
 
     quiet: Expectation
     used: NDArray[np.bool_]
     comparison: Comparison = TEMPLATE
     flares: Sequence[Expectation] = ()
+    nuisances: Nuisances | None = None
     _kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
 
     def remembered(self, name: str, make: Callable[[], T]) -> T:
@@ -86,6 +91,8 @@ class Statistic(ABC):
     paired: ClassVar[bool] = False
     #: Which of the sums that kernels always know it is (`layout.FIXED_STATISTICS`); none where it brings weights.
     kernel_sum: ClassVar[str | None] = None
+    #: Whether it can be marginalised over what is unknown.
+    marginal: ClassVar[bool] = True
 
     def share(self, setting: Setting) -> float:
         """Variance of what is subtracted, as a share of one exposure's."""
@@ -102,7 +109,12 @@ class Statistic(ABC):
         ------
         InputError
         """
-        return
+        if setting.nuisances and (setting.comparison.estimated or not self.marginal):
+            why = "with estimated variances" if self.marginal else "which compares with one noisy exposure"
+            raise InputError(
+                f"statistic {self.name!r} {why} cannot be marginalised over {joined(setting.nuisances.names)}, "
+                "expected no unknowns, or another statistic by the model's variances"
+            )
 
     def closed_form(
         self, setting: Setting, observed: Expectation, flare: Expectation | None = None
@@ -168,9 +180,40 @@ class Statistic(ABC):
 class LinearStatistic(Statistic):
     """A weighted sum of the differences: normal for Gaussian noise."""
 
+    #: Whether its weights are scaled such that it has variance one without a flare.
+    normalised: ClassVar[bool] = True
+
     @abstractmethod
+    def plain_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
+        """Weights per DN where all is known, shape (n_pixel,); zero for pixels that do not count."""
+
     def weights_per_dn(self, setting: Setting, flare: Expectation | None = None) -> Float:
-        """Weights per DN, shape (n_pixel,); zero for pixels that do not count."""
+        """Weights per DN, shape (n_pixel,); zero for pixels that do not count.
+
+        Raises
+        ------
+        InputError
+            If what is looked for cannot be told from what is unknown.
+
+        Notes
+        -----
+        Plain weights w look for the spectrum V w. Marginalised they are C^-1 V w (generalised least squares), which for
+        the matched filter is C^-1 delta.
+        """
+        weights = self.plain_weights(setting, flare)
+        if not setting.nuisances:
+            return weights
+        variance = self.variance(setting) * setting.used
+        sought = variance * weights
+        rows = setting.nuisances.rows(variance, setting.nuisances.spectra * setting.used)
+        found = weights - (rows @ sought) @ rows
+        power = float(found @ sought)
+        if power <= 1e-10 * float(weights @ sought):
+            raise InputError(
+                f"statistic {self.name!r} looks for what cannot be told from {joined(setting.nuisances.names)}, "
+                "expected fewer unknowns or smaller standard deviations"
+            )
+        return np.asarray(found / np.sqrt(power) if self.normalised else found)
 
     def dof(self, setting: Setting) -> int:
         return 1
@@ -179,7 +222,10 @@ class LinearStatistic(Statistic):
         self, setting: Setting, delta: Float, true: Float, flare: Expectation | None = None, *, estimated: bool = False
     ) -> Normal:
         weights = self.weights_per_dn(setting, flare)
-        mean, spread = float(weights @ delta), float(np.sqrt(weights**2 @ true))
+        mean, variance = float(weights @ delta), float(weights**2 @ true)
+        if setting.nuisances:
+            variance += float(np.sum((setting.nuisances.finite(setting.nuisances.spectra) @ weights) ** 2))
+        spread = float(np.sqrt(variance))
         # By estimated variances a linear statistic comes in its own standard deviations.
         return Normal(mean / spread, 1.0) if estimated else Normal(mean, spread)
 
@@ -200,3 +246,7 @@ class QuadraticStatistic(Statistic):
     @abstractmethod
     def own(self, setting: Setting, flare: Expectation | None = None) -> Float:
         """What multiplies each pixel's own square, per DN^2, shape (n_pixel,)."""
+
+    def subtracted(self, setting: Setting) -> Float:
+        """Weights per DN of the sums whose squares are subtracted to marginalise, shape (k, n_pixel)."""
+        return np.zeros((0, setting.used.size))

@@ -1,0 +1,162 @@
+"""What the observer does not know: amplitudes of known spectra, which statistics marginalise over (METHODS section 7).
+
+An exposure's covariance is C = V + U^T S U: V the diagonal of the noise, U the spectra of the unknowns, S the variances
+of their amplitudes; an amplitude of infinite variance is projected out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.host.errors import InputError
+
+if TYPE_CHECKING:
+    from mauvecl.host.expectation import Expectation
+
+Float = NDArray[np.float64]
+
+#: Half of the output's range, over which `tilt` counts, and its middle, nm.
+TILT_NM, MIDDLE_NM = 250.0, 450.0
+#: Spectra of the unknowns that a setting brings along, and the unit of their amplitudes.
+NUISANCES = {
+    "dark": "detector temperature, deg C",
+    "light": "throughput, pointing or the star's own level, relative",
+    "sky": "brightness of the sky, relative",
+    "tilt": "colour of the response, relative at 200 and 700 nm",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class Nuisances:
+    """Unknown amplitudes of known spectra.
+
+    Attributes
+    ----------
+    names : tuple of str
+    spectra : ndarray, shape (k, n_pixel)
+        DN of the exposure for an amplitude of one.
+    sd : ndarray, shape (k,)
+        Prior standard deviations of the amplitudes; infinite where nothing is known.
+    """
+
+    names: tuple[str, ...]
+    spectra: Float
+    sd: Float
+
+    def __post_init__(self) -> None:
+        for name, spectrum, sd in zip(self.names, self.spectra, self.sd, strict=True):
+            if not np.isfinite(spectrum).all():
+                raise InputError(f"the spectrum of the unknown {name!r} is not finite everywhere, expected numbers")
+            if not sd > 0:
+                raise InputError(
+                    f"the unknown {name!r} has a standard deviation of {sd:g}, expected one above 0 or 'free'"
+                )
+
+    @classmethod
+    def of(
+        cls, quiet: Expectation, sd: Mapping[str, float], own: Mapping[str, NDArray[np.float64]] | None = None
+    ) -> Nuisances:
+        """Of a quiescent exposure.
+
+        Parameters
+        ----------
+        quiet : Expectation
+        sd : mapping of str to float
+            Of `NUISANCES` and of one's own; infinite for what is projected out.
+        own : mapping of str to ndarray, shape (n_pixel,), optional
+            Spectra of one's own, DN of the exposure for an amplitude of one.
+
+        Raises
+        ------
+        InputError
+            For a name without a spectrum, or a spectrum that is zero everywhere.
+        """
+        own = own or {}
+        spectra = []
+        for name in sd:
+            if name in own:
+                spectrum = np.asarray(own[name], np.float64)
+                if spectrum.shape != quiet.wavelength_nm.shape:
+                    raise InputError(
+                        f"the spectrum of the unknown {name!r} has the shape {spectrum.shape}, expected one value for "
+                        f"each of the {quiet.wavelength_nm.size} pixels"
+                    )
+            else:
+                spectrum = spectrum_of(name, quiet)
+            if not spectrum.any():
+                raise InputError(f"the unknown {name!r} changes no pixel of {quiet.name}, expected one that does")
+            spectra.append(spectrum)
+        shape = len(spectra), quiet.wavelength_nm.size
+        return cls(tuple(sd), np.array(spectra).reshape(shape), np.array(list(sd.values()), np.float64))
+
+    def __bool__(self) -> bool:
+        return bool(self.names)
+
+    @property
+    def free(self) -> int:
+        """How many are projected out."""
+        return int(np.isinf(self.sd).sum())
+
+    def finite(self, spectra: Float) -> Float:
+        """Spectra of those with a prior, times their standard deviations, shape (k_finite, n)."""
+        known = np.isfinite(self.sd)
+        return np.asarray(spectra[known] * self.sd[known, None])
+
+    def rows(self, variance: Float, spectra: Float) -> Float:
+        """What is subtracted from chi-squared: x^T C^-1 x = sum x^2 / v - sum (rows @ x)^2 (Woodbury).
+
+        Parameters
+        ----------
+        variance : ndarray, shape (n,)
+            Positive where a value counts, zero elsewhere.
+        spectra : ndarray, shape (k, n)
+
+        Returns
+        -------
+        ndarray, shape (k, n)
+
+        Raises
+        ------
+        InputError
+            If two that are projected out have the same shape.
+        """
+        inverse = np.divide(1.0, variance, out=np.zeros_like(variance), where=variance > 0)
+        information = np.diag(self.sd**-2.0) + (spectra * inverse) @ spectra.T
+        # Amplitudes have units of their own: compared in standard deviations.
+        scale = np.sqrt(np.diag(information))
+        eigenvalues = np.linalg.eigvalsh(information / np.outer(scale, scale))
+        if eigenvalues[0] < 1e-10:
+            raise InputError(
+                f"the unknowns {', '.join(self.names)} cannot be told apart in these pixels, expected fewer of them or "
+                "standard deviations instead of 'free'"
+            )
+        return np.asarray(np.linalg.solve(np.linalg.cholesky(information), spectra * inverse))
+
+
+def spectrum_of(name: str, quiet: Expectation) -> Float:
+    """One of `NUISANCES`, DN of the exposure for an amplitude of one, shape (n_pixel,).
+
+    Raises
+    ------
+    InputError
+        For another name.
+    """
+    if name == "dark":
+        return np.asarray(quiet.n_frames * quiet.dark_dn * quiet.conditions["dark_slope_per_c"])
+    if name == "light":
+        return np.asarray(quiet.signal_dn)
+    if name == "sky":
+        return np.asarray(quiet.n_frames * quiet.gain_dn_per_electron * quiet.sky_electrons)
+    if name == "tilt":
+        return np.asarray(quiet.signal_dn * (quiet.wavelength_nm - MIDDLE_NM) / TILT_NM)
+    raise InputError(f"the unknown {name!r} has no spectrum, expected one of {', '.join(NUISANCES)} or a file")
+
+
+def joined(names: Sequence[str]) -> str:
+    """Names in a sentence."""
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
