@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +23,7 @@ from mauvecl.results.snr import Counts, SnrResult
 from mauvecl.results.tally import TailSamples, Tally
 from mauvecl.runs.shards import DetectRequest, SnrRequest
 from mauvecl.statistics.linear import Linear
+from mauvecl.statistics.nuisances import Nuisances, known
 from mauvecl.statistics.paper import Paper
 from mauvecl.statistics.registry import USUAL_STATISTICS
 
@@ -271,6 +272,7 @@ class Engine:
         recipe: Recipe = "auto",
         comparison: Comparison = TEMPLATE,
         tails: Tails = "counted",
+        nuisances: Nuisances | Mapping[str, float] | None = None,
     ) -> Detection:
         """Null and flare distributions of detection statistics, all on common draws (METHODS section 6).
 
@@ -296,13 +298,16 @@ class Engine:
             What is subtracted, and by whose variances; the template and the model's by default.
         tails : {"counted", "sampled"}
             Thresholds beyond what is drawn: refused, or by importance sampling (`tails.tail`).
+        nuisances : Nuisances or mapping of str to float, optional
+            What the statistics are marginalised over: standard deviations by name (`nuisances.NUISANCES`), infinite for
+            what is projected out.
 
         Raises
         ------
         InputError
             For an unknown statistic, scenarios that do not belong together, or an impossible number, seed or mode.
         """
-        how = (mode, start, processes, recipe, comparison, tails)
+        how = (mode, start, processes, recipe, comparison, tails, nuisances)
         request = DetectRequest(quiet, tuple(flares), realisations, seed, statistics, *how)
         for part, (plan, _) in enumerate(request.plans):
             tally, samples = Tally(plan.grids), plan.tails()
@@ -352,12 +357,13 @@ class Engine:
         processes: Processes = NONE,
         recipe: Recipe = "auto",
         comparison: Comparison = TEMPLATE,
+        nuisances: Nuisances | Mapping[str, float] | None = None,
     ) -> NDArray[np.float32]:
         """What `detect` counts, realisation by realisation, for up to 15 flares (7 drawn frame by frame).
 
         Parameters
         ----------
-        quiet, flares, seed, statistics, mode, processes, recipe, comparison
+        quiet, flares, seed, statistics, mode, processes, recipe, comparison, nuisances
             As for `detect`.
         start, count : int
             Realisations start to start + count - 1.
@@ -366,8 +372,8 @@ class Engine:
         -------
         ndarray of float32, shape (n_channel, count)
             For each scenario chi2, chi2_element and chi2_pair, zero where not asked for; then the linear ones, scenario
-            by scenario: ``matched`` (without a flare for each flare's template) and the others in the order asked for;
-            then ``paper``, as ``matched``.
+            by scenario: ``matched`` (without a flare for each flare's template) and the others in the order asked for,
+            among them the sums that a marginalised chi2 takes away; then ``paper``, as ``matched``.
 
         Raises
         ------
@@ -378,7 +384,7 @@ class Engine:
         scene = prepare([quiet, *flares], mode, processes=processes, recipe=recipe, comparison=comparison)
         if len(flares) >= BATCH[scene.frames]:
             raise InputError(f"{len(flares)} flares, expected at most {BATCH[scene.frames] - 1} in one launch")
-        result = Detection(quiet, tuple(flares), statistics, scene, count)
+        result = Detection(quiet, tuple(flares), statistics, scene, count, nuisances=known(nuisances, quiet))
         plan = plan_channels(result, range(len(flares)), first=True)
         out = np.empty((plan.n_rows, count), np.float32)
 
@@ -405,6 +411,8 @@ class Engine:
             slots=bands.shape[1],
         )
         run.weigh(plan.weights, plan.linear_end)
+        if plan.subtractions.size:
+            run.marginalise(plan.subtractions)
         if run.variant.compared:
             run.compare(bands, finished, plan.scales, plan.scale_end)
         return run

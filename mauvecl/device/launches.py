@@ -24,7 +24,7 @@ MOST_COUNTED = 2**25
 #: Raw spectra looked at together on the host.
 PIECE = 4096
 #: Kernels of a detection, the first where more is compared than the template.
-COMPARED, DETECTION = ("comparison", "tally"), ("statistics", "tally")
+COMPARED, DETECTION = ("comparison", "tally", "marginal"), ("statistics", "tally", "marginal")
 #: Work-items to an element or channel of a histogram, on a device of many.
 SHARES = 1024
 
@@ -70,6 +70,7 @@ class Run:
         self._named: dict[str, Any] = {}
         self._kernels: dict[str, Any] = {}
         self._counted = 0
+        self._subtractions: list[Any] = []
         job = scene.job.copy()
         job["seed_low"], job["seed_high"] = seed & 0xFFFFFFFF, seed >> 32
         self._arguments = [
@@ -128,7 +129,7 @@ class Run:
         if name not in self._kernels:
             # One build for the two that are always used together.
             detection = COMPARED if self.variant.compared else DETECTION
-            rooms = detection if name in DETECTION else (name,)
+            rooms = detection if name in ("statistics", "tally", "marginalise") else (name,)
             self._kernels[name] = self._engine.kernel(rooms, self.variant, name)
         local = (1,) * len(items) if self.variant.width > 1 else None
         self._kernels[name](self._queue, items, local, *arguments)
@@ -246,6 +247,10 @@ class Run:
         self._weighing = [*map(self.upload, (scene.constants(weights, linear_end), padded, linear_end))]
         self._rows = len(layout.FIXED_STATISTICS) * len(scene.levels) + len(weights)
 
+    def marginalise(self, subtractions: NDArray[np.uint32]) -> None:
+        """Upload which squares are taken away from which rows; see `ChannelPlan`."""
+        self._subtractions = [np.uint32(subtractions.shape[1]), *map(self.upload, subtractions)]
+
     def compare(
         self,
         bands: NDArray[np.float32],
@@ -276,6 +281,9 @@ class Run:
         self._launch(
             "statistics", items, *self._arguments, *tile.address(), *self._weighing, np.uint32(tile.size), values
         )
+        if self._subtractions:
+            items = (tile.size // self.variant.width,)
+            self._launch("marginalise", items, *self._subtractions, np.uint32(tile.size), values)
 
     def values(self, tile: Tile) -> NDArray[np.float32]:
         """The channels of the tile computed last, shape (n_channel, tile.wanted)."""

@@ -13,7 +13,7 @@ from mauvecl.noise.layout import FIXED_STATISTICS
 from mauvecl.results.tally import Grid, TailSamples
 from mauvecl.statistics.distributions import Normal, QuadraticForm
 from mauvecl.statistics.paper import Paper
-from mauvecl.statistics.statistic import LinearStatistic, Statistic
+from mauvecl.statistics.statistic import LinearStatistic, QuadraticStatistic, Statistic
 
 if TYPE_CHECKING:
     from mauvecl.results.detection import Detection
@@ -38,6 +38,8 @@ class ChannelPlan:
     grids : list of Grid
     keys : list of (statistic, role, flare)
         What each grid holds.
+    subtractions : ndarray of uint32, shape (3, n)
+        Rows of chi-squared, and the first and one past the last of the rows whose squares are taken away from it.
     """
 
     weights: NDArray[np.float32]
@@ -46,6 +48,7 @@ class ChannelPlan:
     scale_end: NDArray[np.uint32]
     grids: list[Grid]
     keys: list[Key]
+    subtractions: NDArray[np.uint32]
 
     def tails(self) -> list[TailSamples | None]:
         """What keeps the extremes of each grid: a null's largest values, a flare's smallest."""
@@ -98,6 +101,9 @@ def plan_channels(result: Detection, batch: Sequence[int], *, first: bool) -> Ch
                 looked_for = result.shape(one.name, flare)
                 if isinstance(one, LinearStatistic):
                     weighted.add(one.name, scenario, flare, one.weights_per_dn(result.setting, looked_for))
+                elif isinstance(one, QuadraticStatistic) and one.kernel_sum is not None:
+                    for number, own in enumerate(one.subtracted(result.setting)):
+                        weighted.add(one.name, scenario, number, own)
                 elif isinstance(one, Paper):
                     smoothed.add(one.name, scenario, flare, one.scale(result.setting, looked_for))
         weighted.end()
@@ -112,6 +118,12 @@ def plan_channels(result: Detection, batch: Sequence[int], *, first: bool) -> Ch
             return fixed * n_scenario + weighted.places[where]
         return fixed * n_scenario + len(weighted.rows) + smoothed.places[where]
 
+    nuisances = result.setting.nuisances
+    subtractions = []
+    for one in asked if nuisances else []:
+        for scenario in range(n_scenario) if one.kernel_sum is not None else []:
+            begin = fixed * n_scenario + weighted.places[one.name, scenario, 0]
+            subtractions.append((row(one, scenario, 0), begin, begin + len(nuisances.names if nuisances else ())))
     grids: list[Grid] = []
     keys: list[Key] = []
 
@@ -133,4 +145,5 @@ def plan_channels(result: Detection, batch: Sequence[int], *, first: bool) -> Ch
     weights[:, : result.scene.n_pixel] = np.array(weighted.rows).reshape(len(weights), result.scene.n_pixel)
     scales = np.array(smoothed.rows, np.float32) if smoothed.rows else np.zeros((0, 1), np.float32)
     linear_end, scale_end = (np.array(rows.ends, np.uint32) for rows in (weighted, smoothed))
-    return ChannelPlan(weights, linear_end, scales, scale_end, grids, keys)
+    taken = np.array(subtractions, np.uint32).reshape(len(subtractions), 3).T
+    return ChannelPlan(weights, linear_end, scales, scale_end, grids, keys, taken)

@@ -21,6 +21,7 @@ from mauvecl.statistics.detection_interval import detection_interval
 from mauvecl.statistics.distributions import Normal, QuadraticForm
 from mauvecl.statistics.intervals import Interval, central_counts, clopper_pearson
 from mauvecl.statistics.linear import Linear
+from mauvecl.statistics.nuisances import Nuisances
 from mauvecl.statistics.registry import chosen
 from mauvecl.statistics.statistic import LinearStatistic, Setting, Statistic
 
@@ -78,6 +79,8 @@ class Detection:
         Whether a threshold beyond what was drawn is refused, or found by importance sampling.
     seed : int
         Of the draws.
+    nuisances : Nuisances, optional
+        What the statistics are marginalised over.
     statistics : tuple of str
         Their names.
     """
@@ -89,6 +92,7 @@ class Detection:
     realisations: int
     tails: Tails = "counted"
     seed: int = 0
+    nuisances: Nuisances | None = None
     statistics: tuple[str, ...] = field(init=False)
     _tails: dict[tuple[str, int, float], Tail] = field(default_factory=dict, init=False, repr=False)
     _forms: dict[tuple[str, int | None, int], QuadraticForm | Normal] = field(
@@ -102,7 +106,7 @@ class Detection:
     def __post_init__(self) -> None:
         self._chosen = chosen(self.asked)
         self.statistics = tuple(self._chosen)
-        self.setting = Setting(self.quiet, self.scene.used, self.scene.comparison, self.flares)
+        self.setting = Setting(self.quiet, self.scene.used, self.scene.comparison, self.flares, self.nuisances)
         shaped = next((name for name, one in self._chosen.items() if one.shaped), None)
         if shaped is not None and not self.flares:
             raise InputError(f"no flare given, expected at least one for the statistic {shaped!r}")

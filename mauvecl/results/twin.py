@@ -131,6 +131,15 @@ def _element_sum(scene: Scene, k: int, y: Floats, variance: Floats) -> Floats:
     return total
 
 
+def marginalise(values: NDArray[np.float32], subtractions: NDArray[np.uint32]) -> NDArray[np.float32]:
+    """The kernel of that name: the channels with squares taken away, shape as given."""
+    out = values.copy()
+    for base, first, end in subtractions.T:
+        for row in out[first:end]:
+            out[base] = fma(-row, row, out[base])
+    return out
+
+
 @dataclass(frozen=True, eq=False)
 class Smoothed:
     """What the statistic `paper` needs: weights of each centre, shape (n_centre, n_padded), and factors of squares."""

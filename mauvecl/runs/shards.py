@@ -25,6 +25,7 @@ from mauvecl.results.far import FarCounts
 from mauvecl.results.snr import Counts, SnrResult, elements, observers
 from mauvecl.results.tally import TailSamples, Tally
 from mauvecl.statistics.linear import Linear
+from mauvecl.statistics.nuisances import Nuisances, known
 from mauvecl.statistics.registry import USUAL_STATISTICS
 
 if TYPE_CHECKING:
@@ -110,6 +111,10 @@ class DetectRequest:
     recipe: Recipe = "auto"
     comparison: Comparison = TEMPLATE
     tails: Tails = "counted"
+    nuisances: Nuisances | Mapping[str, float] | None = None
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "nuisances", known(self.nuisances, self.quiet))
 
     def __getstate__(self) -> dict[str, Any]:
         return _asked(self)
@@ -119,7 +124,8 @@ class DetectRequest:
         """Nothing counted yet."""
         how = {"processes": self.processes, "recipe": self.recipe, "comparison": self.comparison}
         scene = prepare([self.quiet, *self.flares], self.mode, **how)  # type: ignore[arg-type]
-        return Detection(self.quiet, self.flares, self.statistics, scene, self.realisations, self.tails, self.seed)
+        asked = (self.realisations, self.tails, self.seed, known(self.nuisances, self.quiet))
+        return Detection(self.quiet, self.flares, self.statistics, scene, *asked)
 
     @cached_property
     def plans(self) -> list[tuple[ChannelPlan, Scene]]:

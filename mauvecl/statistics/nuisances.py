@@ -157,6 +157,13 @@ def spectrum_of(name: str, quiet: Expectation) -> Float:
     raise InputError(f"the unknown {name!r} has no spectrum, expected one of {', '.join(NUISANCES)} or a file")
 
 
+def known(given: Nuisances | Mapping[str, float] | None, quiet: Expectation) -> Nuisances | None:
+    """What a caller names, as a setting takes it."""
+    if given is None or isinstance(given, Nuisances):
+        return given
+    return Nuisances.of(quiet, given) if given else None
+
+
 def joined(names: Sequence[str]) -> str:
     """Names in a sentence."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -418,8 +418,8 @@ def test_a_pixels_error_is_the_scatter_of_its_means() -> None:
     200 draws tell a standard deviation to 5 %, and the error told, a mean over 20 of them, is right to 3 %: 0.75 to
     1.25 is beyond four deviations and fails by chance less than once in 1e3 for any of ten pixels, of a fixed seed.
     """
-    from mauvecl.host.response import electrons_per_second
     from mauvecl.host.measured_noise import error_per_second
+    from mauvecl.host.response import electrons_per_second
 
     mauve = Instrument.load("mauve")
     nm = np.arange(170.0, 800.0, 0.5)

@@ -46,7 +46,7 @@ def setting(quiet: Expectation, sd: dict[str, float]) -> Setting:
 def test_the_table_of_the_methods(
     star: Any, known: float, dark: tuple[float, float], light: tuple[float, float], both: float
 ) -> None:
-    """Numbers computed apart from this project, with Vega at V = 0; to half a unit of their last digit, 2 % of 0.23, or to 1 %."""
+    """Numbers computed apart from this project, Vega at V = 0; to 1 %, or half a unit of the last digit of 0.23."""
     quiet, flare = pair(*star)
     matched, plain = Matched(), Setting(quiet, ~quiet.saturated)
     weights, delta = matched.plain_weights(plain, flare), flare.signal_dn - quiet.signal_dn
