@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.host.plotting import picture
+from mauvecl.answers.answer import Answer
 from mauvecl.results.campaign import campaign
 from mauvecl.results.departures import departure_table
 from mauvecl.results.detection import Detection, check_fap, countable
@@ -25,10 +24,14 @@ from mauvecl.study.study import PAPER_STARS, Study
 from mauvecl.study.weights import read_weights
 
 if TYPE_CHECKING:
-    from astropy.table import QTable
+    from astropy.table import QTable, Table
 
     from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
+
+
+#: Stars, or cells of a sweep, in one picture.
+MOST_DRAWN = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +55,7 @@ class StarDetection:
 
 
 @dataclass(eq=False)
-class DetectAnswer:
+class DetectAnswer(Answer):
     """What `mauvecl detect` answers.
 
     Attributes
@@ -94,12 +97,31 @@ class DetectAnswer:
         """The extremes of every null (amplitude 0) and flare, with their realisations."""
         return self._together(_tails)
 
-    def _repr_html_(self) -> str:
-        return str(self.table._repr_html_())
+    @property
+    def tables(self) -> dict[str, Table]:
+        """Detections, departures from the closed form, ROC and extremes."""
+        return {"detection": self.table, "departures": self.departures, "roc": self.roc, "tails": self.tails}
 
-    def plot(self, path: str | Path | None = None) -> object:
-        """Null and flare distributions of every star and statistic; needs matplotlib."""
-        return picture("answers.detection", [star.shown for star in self.stars], self.study.run.fap, path)
+    @property
+    def inputs(self) -> list[Expectation]:
+        return [x for star in self.stars for x in (star.found.quiet, *star.found.flares)]
+
+    @property
+    def pictures(self) -> dict[str, tuple[Any, ...]]:
+        """Null and flare distributions of every statistic, and spectra; more stars would be too small to read."""
+        shown = [star.shown for star in self.stars[:MOST_DRAWN]]
+        return {"detection": ("answers.detection", shown, self.study.run.fap), "spectra": ("answers.spectra", shown)}
+
+    @property
+    def remarks(self) -> list[str]:
+        """The comparison with the paper's values."""
+        return self.paper
+
+    def as_json(self) -> dict[str, Any]:
+        from mauvecl.answers.report import rows
+
+        tables = {"rows": rows(self.table), "departures": rows(self.departures)}
+        return {"messages": self.messages, "paper": self.paper} | tables
 
     def _detections(self, star: StarDetection) -> QTable:
         table = star.found.table(self.study.run.fap)

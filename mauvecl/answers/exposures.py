@@ -3,20 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
+from mauvecl.answers.answer import Answer
 from mauvecl.host.errors import InputError
-from mauvecl.host.plotting import picture
 from mauvecl.study.labels import described, label, told
 from mauvecl.study.questions import QUANTITIES
 from mauvecl.study.sections import Star
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
-    from astropy.table import QTable
+    from astropy.table import QTable, Table
 
     from mauvecl.host.expectation import Expectation
 
@@ -39,7 +38,7 @@ class Exposure:
 
 
 @dataclass(frozen=True)
-class ExposureResult:
+class ExposureResult(Answer):
     """What `exposure_for` answers, one row per star.
 
     Attributes
@@ -47,11 +46,14 @@ class ExposureResult:
     study : Study
     exposures : tuple of Exposure
     messages : tuple of str
+    expectations : tuple of Expectation
+        Each star at its exposure.
     """
 
     study: Study
     exposures: tuple[Exposure, ...]
     messages: tuple[str, ...]
+    expectations: tuple[Expectation, ...]
 
     @property
     def table(self) -> QTable:
@@ -75,16 +77,19 @@ class ExposureResult:
         table.meta["study"] = self.study.toml()
         return described(table)
 
-    def write(self, folder: str | Path) -> list[Path]:
-        """The table as ECSV, and the study that gives it again."""
-        from mauvecl.answers.report import make_folder, write_study, write_table
+    @property
+    def tables(self) -> dict[str, Table]:
+        """The one table."""
+        return {"exposure": self.table}
 
-        place = make_folder(Path(folder))
-        return [write_table(self.table, place / "exposure.ecsv"), write_study(self.study, place)]
+    @property
+    def inputs(self) -> list[Expectation]:
+        return list(self.expectations)
 
-    def plot(self, path: str | Path | None = None) -> object:
-        """S/N against exposure, and the answers on it; needs matplotlib."""
-        return picture("plans.exposures", self, path)
+    @property
+    def pictures(self) -> dict[str, tuple[Any, ...]]:
+        """S/N against exposure, and the answers on it."""
+        return {"exposure": ("plans.exposures", self)}
 
 
 def snr_at(x: Expectation, wavelength_nm: float, per: Per = "element") -> float:
@@ -144,7 +149,7 @@ def exposure_for(
         answer, x = _one(study, star, snr, wavelength_nm, per)
         found.append(answer)
         seen.append(x)
-    return ExposureResult(study, tuple(found), tuple(told(seen)))
+    return ExposureResult(study, tuple(found), tuple(told(seen)), tuple(seen))
 
 
 def _one(study: Study, star: Star, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposure, Expectation]:

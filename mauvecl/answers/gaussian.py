@@ -8,12 +8,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from mauvecl.answers.answer import Answer
 from mauvecl.answers.detect import DetectAnswer, detect
 from mauvecl.answers.snr import SnrAnswer, snr
 from mauvecl.noise.cumulants import Cumulants
@@ -23,7 +24,7 @@ from mauvecl.study.questions import UNITS, Axis, Sweep
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
-    from astropy.table import QTable
+    from astropy.table import QTable, Table
 
     from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
@@ -125,7 +126,7 @@ def _promises(result: SnrResult) -> QTable:
 
 
 @dataclass(eq=False)
-class GaussianReport:
+class GaussianReport(Answer):
     """What `gaussian_report` answers.
 
     Attributes
@@ -138,6 +139,24 @@ class GaussianReport:
     study: Study
     signal: SnrAnswer
     detection: DetectAnswer
+
+    @property
+    def messages(self) -> list[str]:
+        return self.detection.messages
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        """The worst of each promise, each element's, each threshold's."""
+        return {"gaussian": self.cells, "elements": self.elements, "thresholds": self.thresholds}
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        return self.signal.inputs
+
+    @property
+    def pictures(self) -> dict[str, tuple[Any, ...]]:
+        """The promises over what is swept."""
+        return {"gaussian": ("plans.gaussian", self)}
 
     @cached_property
     def elements(self) -> QTable:

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.answers.answer import Answer
 from mauvecl.answers.limit_search import MarginalQuestion, Point, Question, Unknown, settle
 from mauvecl.host.errors import InputError
-from mauvecl.host.plotting import picture
 from mauvecl.results.detection import check_fap
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, stacked, told
@@ -21,9 +21,10 @@ from mauvecl.study.study import Study
 from mauvecl.study.unknowns import draws_table
 
 if TYPE_CHECKING:
-    from astropy.table import QTable
+    from astropy.table import QTable, Table
 
     from mauvecl.device.engine import Engine
+    from mauvecl.host.expectation import Expectation
     from mauvecl.runs.pool import Pool
 
 
@@ -80,17 +81,20 @@ class Limit:
 
 
 @dataclass(eq=False)
-class LimitResult:
+class LimitResult(Answer):
     """What `limiting_magnitude` and its relatives answer.
 
     Attributes
     ----------
     study : Study
     limits : list of Limit
+    assumptions : QTable, optional
+        How far what is assumed of the instrument moves them (`assumptions.what_matters`).
     """
 
     study: Study
     limits: list[Limit] = field(default_factory=list)
+    assumptions: QTable | None = None
 
     @property
     def table(self) -> QTable:
@@ -151,22 +155,34 @@ class LimitResult:
             parts.append(({"star": one.star, **swept, **amplitude, "statistic": one.statistic}, table))
         return stacked(parts, study=self.study.toml())
 
-    def _repr_html_(self) -> str:
-        return str(self.table._repr_html_())
+    @property
+    def tables(self) -> dict[str, Table]:
+        """The limits, the draws of what is unknown, and what is assumed, where asked for."""
+        more = {"unknowns": self.draws} if self.study.unknowns.draws else {}
+        return {"limit": self.table} | more | ({} if self.assumptions is None else {"assumptions": self.assumptions})
 
-    def write(self, folder: str | Path) -> list[Path]:
-        """The table as ECSV, that of the unknown's draws where there are any, and the study that gives them again."""
-        from mauvecl.answers.report import make_folder, write_study, write_table
+    @cached_property
+    def inputs(self) -> list[Expectation]:
+        """Each star at its own magnitude."""
+        return [self.study.expect([entry.source()])[0] for entry in self.study.star]
 
-        place = make_folder(Path(folder))
-        files = [write_table(self.table, place / "limit.ecsv")]
-        if self.study.unknowns.draws:
-            files.append(write_table(self.draws, place / "unknowns.ecsv"))
-        return [*files, write_study(self.study, place)]
+    @property
+    def messages(self) -> list[str]:
+        """What holds at the limits, then what is told of the stars."""
+        # What is told of a star at its own magnitude need not hold at the limit.
+        stars = [text for text in told(self.inputs) if not text.startswith("SATURATED")]
+        return [*dict.fromkeys(text for one in self.limits for text in one.messages), *stars]
 
-    def plot(self, path: str | Path | None = None) -> object:
-        """Detection probability against the quantity: every simulated point and the limits; needs matplotlib."""
-        return picture("plans.limits", self, path)
+    @property
+    def pictures(self) -> dict[str, tuple[Any, ...]]:
+        """Detection probability against the quantity: every simulated point and the limits."""
+        return {"limit": ("plans.limits", self)}
+
+    def as_json(self) -> dict[str, Any]:
+        from mauvecl.answers.report import rows
+
+        more = {} if self.assumptions is None else {"assumptions": rows(self.assumptions)}
+        return super().as_json() | more
 
 
 def solve(

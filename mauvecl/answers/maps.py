@@ -4,13 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.plotting import picture
+from mauvecl.answers.answer import Answer
 from mauvecl.results.detection import check_fap
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, told
@@ -19,7 +18,7 @@ from mauvecl.study.study import Study
 from mauvecl.study.unknowns import average, drawn, shares
 
 if TYPE_CHECKING:
-    from astropy.table import QTable
+    from astropy.table import QTable, Table
 
     from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
@@ -30,7 +29,7 @@ OF_FLARE = ("amplitude", "flare_temperature")
 
 
 @dataclass(frozen=True, eq=False)
-class MapResult:
+class MapResult(Answer):
     """What `detection_map` answers, for the study's first star.
 
     Attributes
@@ -90,19 +89,22 @@ class MapResult:
         }
         return described(table)
 
-    def _repr_html_(self) -> str:
-        return str(self.table._repr_html_())
+    ENDINGS = ("ecsv", "fits")
 
-    def write(self, folder: str | Path) -> list[Path]:
-        """The table as ECSV and FITS, and the study that gives it again."""
-        from mauvecl.answers.report import make_folder, write_study, write_table
+    @property
+    def tables(self) -> dict[str, Table]:
+        """The one table."""
+        return {"map": self.table}
 
-        place, table = make_folder(Path(folder)), self.table
-        return [*(write_table(table, place / f"map.{e}") for e in ("ecsv", "fits")), write_study(self.study, place)]
+    @property
+    def inputs(self) -> list[Expectation]:
+        """The star without a flare, as the study has it."""
+        return self.study.expect([self.study.star[0].source()])
 
-    def plot(self, path: str | Path | None = None) -> object:
-        """One panel per statistic, with contours at the study's powers; needs matplotlib."""
-        return picture("plans.detection_map", self, path)
+    @property
+    def pictures(self) -> dict[str, tuple[Any, ...]]:
+        """One panel per statistic, with contours at the study's powers."""
+        return {"map": ("plans.detection_map", self)}
 
 
 def detection_map(

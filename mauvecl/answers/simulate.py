@@ -4,28 +4,70 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from mauvecl.answers.answer import Answer
 from mauvecl.host.plotting import picture
 from mauvecl.noise.components import components
 from mauvecl.study.labels import described, label, told
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
-    from astropy.table import QTable
+    from astropy.table import QTable, Table
 
     from mauvecl.host.expectation import Expectation
 
 
 @dataclass(eq=False)
-class SimulateAnswer:
+class SimulateAnswer(Answer):
     """What `mauvecl simulate` answers: one table of components per star and stage."""
+
+    ENDINGS = ("ecsv", "fits")
 
     study: Study
     observations: list[tuple[str, Expectation, QTable]]
     messages: list[str]
 
-    def plot(self, path: str | Path | None = None, *, number: int = 0) -> object:
+    @property
+    def tables(self) -> dict[str, Table]:
+        """One per observation."""
+        return {f"observation-{n}": table for n, (_, _, table) in enumerate(self.observations, 1)}
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        return [x for _, x, _ in self.observations]
+
+    @property
+    def pictures(self) -> dict[str, tuple[Any, ...]]:
+        """One per observation."""
+        return {
+            f"observation-{n}": ("answers.observation", title, table)
+            for n, (title, _, table) in enumerate(self.observations, 1)
+        }
+
+    @property
+    def summary(self) -> list[dict[str, Any]]:
+        """Peak, best closed-form S/N and saturated pixels of each observation."""
+        rows = []
+        for title, x, _ in self.observations:
+            peak = int(x.signal_dn.argmax())
+            rows.append(
+                {
+                    "observation": title,
+                    "frames": x.n_frames,
+                    "peak_nm": float(x.wavelength_nm[peak]),
+                    "peak_dn": float(x.signal_dn[peak]),
+                    "snr_pixel": float(x.snr().max()),
+                    "snr_element": float(x.snr_per_element().max()),
+                    "saturated_pixels": int(x.saturated.sum()),
+                }
+            )
+        return rows
+
+    def as_json(self) -> dict[str, Any]:
+        return {"messages": self.messages, "observations": self.summary}
+
+    def plot(self, path: str | Path | None = None, *, number: int = 0) -> Any:
         """One of the observations and what it is made of; needs matplotlib."""
         title, _, table = self.observations[number]
         return picture("answers.observation", title, table, path)

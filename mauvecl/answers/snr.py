@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from mauvecl.host.plotting import picture
+from mauvecl.answers.answer import Answer
 from mauvecl.runs.pool import Pool, together
 from mauvecl.study.labels import label, stacked, titled, told
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
-    from astropy.table import QTable
+    from astropy.table import QTable, Table
 
     from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
@@ -22,6 +21,8 @@ if TYPE_CHECKING:
 
 #: Wavelengths of the elements that terminal and pictures show, nm; the tables hold all of them.
 SHOWN_NM = (250.0, 300.0, 400.0, 550.0)
+#: Stars, or cells of a sweep, in one picture.
+MOST_DRAWN = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +46,7 @@ class StarSnr:
 
 
 @dataclass(eq=False)
-class SnrAnswer:
+class SnrAnswer(Answer):
     """What `mauvecl snr` answers.
 
     Attributes
@@ -75,12 +76,31 @@ class SnrAnswer:
         """Noise by origin, DN rms per pixel, one row per star, cell and pixel."""
         return self.together(lambda result: result.expectation.noise_budget())
 
-    def _repr_html_(self) -> str:
-        return str(self.element._repr_html_())
+    @property
+    def tables(self) -> dict[str, Table]:
+        """S/N per element and per pixel, and the noise by origin."""
+        return {"snr-element": self.element, "snr-pixel": self.pixel, "noise-budget": self.noise_budget}
 
-    def plot(self, path: str | Path | None = None) -> object:
-        """S/N per pixel and element, closed form and realisations; needs matplotlib."""
-        return picture("answers.signal_to_noise", [(s.title, s.result) for s in self.stars], path)
+    @property
+    def inputs(self) -> list[Expectation]:
+        return [star.result.expectation for star in self.stars]
+
+    @property
+    def pictures(self) -> dict[str, tuple[Any, ...]]:
+        """S/N per pixel and element, closed form and realisations; noise by origin; S/N over what is swept."""
+        drawn: dict[str, tuple[Any, ...]] = {}
+        if len(self.stars) <= MOST_DRAWN:
+            drawn["snr"] = ("answers.signal_to_noise", [(s.title, s.result) for s in self.stars])
+        drawn["noise-budget"] = ("plans.noise_budgets", self)
+        if self.study.sweep.axes:
+            drawn["snr-sweep"] = ("plans.snr_sweep", self)
+        return drawn
+
+    def as_json(self) -> dict[str, Any]:
+        from mauvecl.answers.report import rows
+
+        tables = {"snr-element": self.element, "noise-budget": self.noise_budget}
+        return {"messages": self.messages} | {name: rows(table) for name, table in tables.items()}
 
     def together(self, table_of: Callable[[SnrResult], QTable]) -> QTable:
         """A table of each star and cell as one, with the star and what is swept in front."""

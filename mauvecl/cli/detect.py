@@ -11,12 +11,10 @@ from mauvecl.cli.flags import DETECTION, DRAWS, FLARE, SWEEP, TEMPLATE, takes_st
 if TYPE_CHECKING:
     from astropy.table import QTable
 
+    from mauvecl.answers.detect import DetectAnswer
+    from mauvecl.answers.gaussian import GaussianReport
     from mauvecl.cli.session import Session
     from mauvecl.study.study import Study
-
-
-#: Stars, or cells of a sweep, in one picture.
-MOST_DRAWN = 6
 
 
 @takes_study(FLARE, DRAWS, DETECTION, TEMPLATE, SWEEP)
@@ -31,31 +29,17 @@ def detect(
 
     Example: mauvecl detect --star K5V --magnitude 6 --amplitude 0.05 --amplitude 0.1 --exposure 30
     """
-    from mauvecl.answers import report
     from mauvecl.answers.detect import detect as compute
-    from mauvecl.cli.console import show_table
 
     with session.pool() as engine:
         found = compute(study, engine)
-    session.say(found.messages)
-    session.write(found.table, "detection.ecsv")
-    session.write(found.departures, "departures.ecsv")
-    session.write(found.roc, "roc.ecsv")
-    session.write(found.tails, "tails.ecsv")
-    if session.draws_pictures:
-        from mauvecl.pictures.answers import detection, spectra
+    session.answer(found, lambda: _show_detections(found))
 
-        # More would be too small to read; the tables hold all of them.
-        shown = [star.shown for star in found.stars[:MOST_DRAWN]]
-        session.leave(lambda: detection(shown, study.run.fap, session.folder / "detection.png"))
-        session.leave(lambda: spectra(shown, session.folder / "spectra.png"))
-    inputs = [x for s in found.stars for x in (s.found.quiet, *s.found.flares)]
-    session.record(study, inputs, [*found.messages, *found.paper])
-    if session.as_json:
-        out = {"messages": found.messages, "paper": found.paper, "rows": report.rows(found.table),
-               "departures": report.rows(found.departures)}  # fmt: skip
-        session.print_json(out)
-        return
+
+def _show_detections(found: DetectAnswer) -> None:
+    from mauvecl.cli.console import show_table
+
+    study = found.study
     run = study.run
     exposures = " and ".join(
         dict.fromkeys(f"{x.exposure_s:g} s ({x.n_frames} frames)" for x in (s.found.quiet for s in found.stars))
@@ -80,8 +64,6 @@ def detect(
         cells,
     )
     _show_departures(found.departures, run.fap)
-    session.say(found.paper)
-    session.finish()
 
 
 def _show_departures(table: QTable, fap: float) -> None:
@@ -119,25 +101,17 @@ def gaussian(
 
     Example: mauvecl gaussian --star G2V --sweep magnitude=6,10 --sweep exposure=5,50
     """
-    from mauvecl.answers import report
     from mauvecl.answers.gaussian import gaussian_report
-    from mauvecl.cli.console import show_table
 
     with session.pool() as engine:
         found = gaussian_report(study, engine)
-    messages = found.detection.messages
-    session.say(messages)
-    tables = {"gaussian": found.cells, "elements": found.elements, "thresholds": found.thresholds}
-    for name, table in tables.items():
-        session.write(table, f"{name}.ecsv")
-    if session.draws_pictures:
-        from mauvecl.pictures.plans import gaussian as draw
+    session.answer(found, lambda: _show_promises(found))
 
-        session.leave(lambda: draw(found, session.folder / "gaussian.png"))
-    session.record(found.study, [star.result.expectation for star in found.signal.stars], messages)
-    if session.as_json:
-        session.print_json({"messages": messages, "rows": report.rows(tables["gaussian"])})
-        return
+
+def _show_promises(found: GaussianReport) -> None:
+    from mauvecl.cli.console import show_table
+
+    study = found.study
     swept = [axis.quantity for axis in found.study.sweep.axes]
     show_table(
         f"The root-of-N formula beside {study.run.realisations:,} realisations; promised: no difference in S/N, "
@@ -151,7 +125,6 @@ def gaussian(
              f"{row['five_sigma_above']:.2f}, {row['five_sigma_below']:.2f}",
              f"{row['fap_ratio']:.3f}",
              row["statistic"], row["why"], f"{row['probability_off_by']:+.4f}")
-            for row in tables["gaussian"]
+            for row in found.cells
         ],
     )  # fmt: skip
-    session.finish()

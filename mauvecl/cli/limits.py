@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -11,7 +10,8 @@ from mauvecl.cli.console import short
 from mauvecl.cli.flags import DETECTION, DRAWS, FLARE, LIMIT, MAP, SWEEP, UNKNOWN, takes_study
 
 if TYPE_CHECKING:
-    from mauvecl.answers.limits import Limit
+    from mauvecl.answers.limits import Limit, LimitResult
+    from mauvecl.answers.maps import MapResult
     from mauvecl.cli.session import Session
     from mauvecl.study.study import Study
 
@@ -30,32 +30,21 @@ def limit(
 
     Example: mauvecl limit --star G2V --amplitude 0.24 --exposure 50
     """
-    from mauvecl.answers import report
     from mauvecl.answers.limits import limiting_magnitude
-    from mauvecl.cli.console import show_table
-    from mauvecl.study.labels import told
 
     with session.pool() as engine:
         found = limiting_magnitude(study, engine)
-    inputs = [study.expect([entry.source()])[0] for entry in study.star]
-    # What is told of a star at its own magnitude need not hold at the limit.
-    messages = [m for m in told(inputs) if not m.startswith("SATURATED")]
-    messages = [*dict.fromkeys(text for one in found.limits for text in one.messages), *messages]
-    session.say(messages)
-    session.leave(lambda: found.write(session.folder))
-    moved = None
     if assumptions:
         from mauvecl.answers.assumptions import what_matters
 
-        moved = what_matters(study)
-        session.write(moved, "assumptions.ecsv")
-    if session.draws_pictures:
-        session.leave(lambda: drawn(found, session.folder / "limit.png"))
-    session.record(study, inputs, messages)
-    if session.as_json:
-        rows = {"messages": messages, "rows": report.rows(found.table)}
-        session.print_json(rows if moved is None else rows | {"assumptions": report.rows(moved)})
-        return
+        found.assumptions = what_matters(study)
+    session.answer(found, lambda: _show_limits(found))
+
+
+def _show_limits(found: LimitResult) -> None:
+    from mauvecl.cli.console import show_table
+
+    study = found.study
     asked, run = study.limit, study.run
     swept = [axis.quantity for axis in study.sweep.axes if axis.quantity != "amplitude"]
     cells = []
@@ -82,17 +71,16 @@ def limit(
             ("star", *swept, "flare", "statistic", "95 % of limits", "matters most, share of the variance"),
             [(*row[: 3 + len(swept)], *_unknown(one, digits)) for row, one in zip(cells, found.limits, strict=True)],
         )
-    if moved is not None:
+    if found.assumptions is not None:
         show_table(
             f"What is assumed, and how far it moves the closed-form limit of {asked.of}, the largest first",
             ("star", "flare", "statistic", "assumption", "from", "to", "limit from", "to", "moves by"),
             [
                 (m["star"], f"{100 * m['amplitude']:g} %", m["statistic"], m["assumption"], m["low_end"], m["high_end"],
                  f"{m['at_low_end']:.3f}", f"{m['at_high_end']:.3f}", f"{m['span']:.3f}")
-                for m in moved
+                for m in found.assumptions
             ],
         )  # fmt: skip
-    session.finish()
 
 
 def _unknown(one: Limit, digits: str) -> tuple[str, str]:
@@ -101,12 +89,6 @@ def _unknown(one: Limit, digits: str) -> tuple[str, str]:
     low, high = one.unknown.range
     first = list(one.unknown.shares.items())[:3]
     return f"{low:{digits}} to {high:{digits}}", ", ".join(f"{name} {100 * share:.0f} %" for name, share in first)
-
-
-def drawn(found: Any, path: Path) -> Path:
-    """An answer's own picture."""
-    found.plot(path)
-    return path
 
 
 @takes_study(MAP, FLARE, DRAWS, DETECTION, UNKNOWN, name="map", fewer=True)
@@ -121,27 +103,18 @@ def detection_map(
 
     Example: mauvecl map --star G2V --x magnitude:4:10:16 --y amplitude:0.01:1:16:log
     """
-    from mauvecl.answers import report
     from mauvecl.answers.maps import detection_map as compute
 
     with session.pool(unit="cells") as engine:
         found = compute(study, engine, progress=session.meter)
-    session.say(found.messages)
-    session.leave(lambda: found.write(session.folder))
-    if session.draws_pictures:
-        session.leave(lambda: drawn(found, session.folder / "map.png"))
-    inputs = [found.study.expect([found.study.star[0].source()])[0]]
-    session.record(study, inputs, found.messages)
-    if session.as_json:
-        session.print_json({"messages": found.messages, "rows": report.rows(found.table)})
-        return
-    _show(found, study)
-    session.finish()
+    session.answer(found, lambda: _show_map(found))
 
 
-def _show(found: Any, study: Study) -> None:
+def _show_map(found: MapResult) -> None:
     """The map as tables of percentages, one per statistic."""
     from mauvecl.cli.console import show, show_table
+
+    study = found.study
 
     def text(value: float | str) -> str:
         return value if isinstance(value, str) else f"{value:.3g}"

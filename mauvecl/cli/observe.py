@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -12,6 +10,8 @@ from mauvecl.cli.console import short
 from mauvecl.cli.flags import DRAWS, FLARE, SIGNAL, SWEEP, takes_study
 
 if TYPE_CHECKING:
+    from mauvecl.answers.exposures import ExposureResult
+    from mauvecl.answers.simulate import SimulateAnswer
     from mauvecl.answers.snr import SnrAnswer
     from mauvecl.cli.session import Session
     from mauvecl.study.study import Study
@@ -31,32 +31,10 @@ def simulate(
     from mauvecl.answers.simulate import simulate as compute
 
     found = compute(study, realisation=realisation, flaring=bool(given["amplitude"]))
-    session.say(found.messages)
-    summary = []
-    for number, (title, x, table) in enumerate(found.observations, 1):
-        stem = f"observation-{number}"
-        for ending in (".ecsv", ".fits"):
-            session.write(table, f"{stem}{ending}")
-        if session.draws_pictures:
-            from mauvecl.pictures.answers import observation
+    session.answer(found, lambda: _show_observations(found))
 
-            session.leave(partial(observation, title, table, session.folder / f"{stem}.png"))
-        peak = int(x.signal_dn.argmax())
-        summary.append(
-            {
-                "observation": title,
-                "frames": x.n_frames,
-                "peak_nm": float(x.wavelength_nm[peak]),
-                "peak_dn": float(x.signal_dn[peak]),
-                "snr_pixel": float(x.snr().max()),
-                "snr_element": float(x.snr_per_element().max()),
-                "saturated_pixels": int(x.saturated.sum()),
-            }
-        )
-    session.record(study, [x for _, x, _ in found.observations], found.messages)
-    if session.as_json:
-        session.print_json({"messages": found.messages, "observations": summary})
-        return
+
+def _show_observations(found: SimulateAnswer) -> None:
     from mauvecl.cli.console import show_table
 
     show_table(
@@ -65,10 +43,9 @@ def simulate(
         [
             (s["observation"], str(s["frames"]), f"{s['peak_nm']:.1f}", f"{s['peak_dn']:.0f}", f"{s['snr_pixel']:.2f}",
              f"{s['snr_element']:.1f}", str(s["saturated_pixels"]))
-            for s in summary
+            for s in found.summary
         ],
     )  # fmt: skip
-    session.finish()
 
 
 def _budgets_or_star(given: dict[str, Any]) -> Study:
@@ -92,36 +69,11 @@ def snr(
 
     mauvecl snr --star G2V --sweep magnitude=4,6,8,10 --sweep exposure=5,50,600
     """
-    from mauvecl.answers import report
     from mauvecl.answers.snr import snr as compute
 
     with session.pool() as engine:
         found = compute(study, engine)
-    session.say(found.messages)
-    tables = {"snr-pixel": found.pixel, "snr-element": found.element, "noise-budget": found.noise_budget}
-    for name, table in tables.items():
-        session.write(table, f"{name}.ecsv")
-    if session.draws_pictures:
-        session.leave(lambda: _snr_pictures(found, session.folder))
-    session.record(study, [star.result.expectation for star in found.stars], found.messages)
-    if session.as_json:
-        out = {name: report.rows(tables[name]) for name in ("snr-element", "noise-budget")}
-        session.print_json({"messages": found.messages} | out)
-        return
-    _show_snr(found)
-    session.finish()
-
-
-def _snr_pictures(found: SnrAnswer, folder: Path) -> list[Path]:
-    from mauvecl.pictures.answers import signal_to_noise
-    from mauvecl.pictures.plans import noise_budgets, snr_sweep
-
-    files = [noise_budgets(found, folder / "noise-budget.png")]
-    if len(found.stars) <= 6:
-        files.append(signal_to_noise([(s.title, s.result) for s in found.stars], folder / "snr.png"))
-    if found.study.sweep.axes:
-        files.append(snr_sweep(found, folder / "snr-sweep.png"))
-    return files
+    session.answer(found, lambda: _show_snr(found))
 
 
 def _show_snr(found: SnrAnswer) -> None:
@@ -164,19 +116,16 @@ def exposure(
 
     Example: mauvecl exposure --snr 10 --at 300 --star G2V --magnitude 7.4
     """
-    from mauvecl.answers import report
     from mauvecl.answers.exposures import exposure_for
-    from mauvecl.cli.console import show_table
-    from mauvecl.cli.limits import drawn
 
-    found, wanted = exposure_for(study), study.signal
-    session.leave(lambda: found.write(session.folder))
-    if session.draws_pictures:
-        session.leave(lambda: drawn(found, session.folder / "exposure.png"))
-    session.say(list(found.messages))
-    if session.as_json:
-        session.print_json({"messages": list(found.messages), "rows": report.rows(found.table)})
-        return
+    found = exposure_for(study)
+    session.answer(found, lambda: _show_exposures(found))
+
+
+def _show_exposures(found: ExposureResult) -> None:
+    from mauvecl.cli.console import show_table
+
+    wanted = found.study.signal
     show_table(
         f"Exposure for an S/N of {wanted.snr:g} per {wanted.per} at {wanted.wavelength_nm:g} nm "
         "(closed form, whole frames)",
@@ -187,4 +136,3 @@ def exposure(
             for e in found.exposures
         ],
     )  # fmt: skip
-    session.finish()

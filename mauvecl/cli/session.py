@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -19,6 +19,7 @@ from mauvecl.cli.boundary import writes_to
 if TYPE_CHECKING:
     from astropy.table import Table
 
+    from mauvecl.answers.answer import Answer
     from mauvecl.cli.console import Meter
     from mauvecl.host.expectation import Expectation
     from mauvecl.runs.checkpoint import Checkpoint
@@ -194,6 +195,31 @@ class Session:
         )
         if self._pool is not None and not self._lost:
             self._checkpoint.forget()
+
+    def answer(self, found: Answer, show: Callable[[], None]) -> None:
+        """Tell an answer and leave its files.
+
+        Parameters
+        ----------
+        found : Answer
+        show : callable
+            Prints its tables.
+        """
+        self.say(found.messages)
+        for name, table in found.files.items():
+            self.write(table, name)
+        if self.draws_pictures:
+            from mauvecl.host.plotting import picture
+
+            for name, (function, *given) in found.pictures.items():
+                self.leave(partial(picture, function, *given, self.folder / f"{name}.png"))
+        self.record(found.study, found.inputs, [*found.messages, *found.remarks])
+        if self.as_json:
+            self.print_json(found.as_json())
+            return
+        show()
+        self.say(found.remarks)
+        self.finish()
 
     def print_json(self, content: dict[str, Any]) -> None:
         """The answer for machines."""

@@ -1,0 +1,89 @@
+"""What all answers have in common: study, messages, inputs, tables, pictures, files."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, ClassVar
+
+from mauvecl.host.plotting import picture
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from astropy.table import Table
+
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.study.study import Study
+
+
+class Answer(ABC):
+    """The answer to one question of a study."""
+
+    #: Endings of the files of each table; the first table's alone in some answers.
+    ENDINGS: ClassVar[tuple[str, ...]] = ("ecsv",)
+
+    if TYPE_CHECKING:
+
+        @property
+        def study(self) -> Study:
+            """The study that gives it again."""
+
+        @property
+        def messages(self) -> Sequence[str]:
+            """What the reader must be told, worst first."""
+
+    @property
+    @abstractmethod
+    def tables(self) -> dict[str, Table]:
+        """Every table by the name of its file; the first is the answer itself."""
+
+    @property
+    @abstractmethod
+    def inputs(self) -> list[Expectation]:
+        """Expectations that it rests on, for the record of a run."""
+
+    @property
+    @abstractmethod
+    def pictures(self) -> dict[str, tuple[Any, ...]]:
+        """Every picture by the name of its file: a function of `mauvecl.pictures`, and what it takes before a path."""
+
+    @property
+    def remarks(self) -> list[str]:
+        """What is said below the tables."""
+        return []
+
+    def _repr_html_(self) -> str:
+        return str(next(iter(self.tables.values()))._repr_html_())
+
+    def as_json(self) -> dict[str, Any]:
+        """What `--json` prints."""
+        from mauvecl.answers.report import rows
+
+        return {"messages": list(self.messages), "rows": rows(next(iter(self.tables.values())))}
+
+    def plot(self, path: str | Path | None = None) -> Any:
+        """The first of its pictures, saved where a path is given; needs matplotlib."""
+        name, *given = next(iter(self.pictures.values()))
+        return picture(name, *given, path)
+
+    def write(self, folder: str | Path) -> list[Path]:
+        """Every table, and the study that gives them again.
+
+        Raises
+        ------
+        InputError
+            If one cannot be written; what was at its place is still there.
+        """
+        from mauvecl.answers.report import make_folder, write_study, write_table
+
+        place = make_folder(Path(folder))
+        return [
+            *(write_table(table, place / name) for name, table in self.files.items()),
+            write_study(self.study, place),
+        ]
+
+    @property
+    def files(self) -> dict[str, Table]:
+        """The tables by the full names of their files."""
+        return {f"{name}.{ending}": table for name, table in self.tables.items() for ending in self.ENDINGS}
