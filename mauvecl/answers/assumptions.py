@@ -6,8 +6,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.limit_search import Question
+from mauvecl.noise.processes import Uniform
 from mauvecl.study.labels import described
-from mauvecl.study.sections import Star
+from mauvecl.study.sections import Star, Unknowns
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -27,29 +28,30 @@ class Assumption:
     changes: tuple[Mapping[str, Any], Mapping[str, Any]]
 
 
+#: What the uncertain values of the payload are called in tables.
+NAMES = {
+    "temperature_c": "detector temperature (C)",
+    "light_loss": "light loss",
+    "pointing_loss": "pointing loss",
+    "qe_scale": "quantum efficiency, scale",
+    "conversion_uv_per_electron": "charge conversion (uV per electron)",
+    "read_noise_dn": "read noise (DN)",
+}
+
+
 def assumptions(nominal: Instrument) -> tuple[Assumption, ...]:
-    """The uncertain values of the payload and their ranges."""
-    area = nominal.collecting_area_cm2
-    return (
-        Assumption("detector temperature (C)", ("13", "21"), ({"temperature_c": 13.0}, {"temperature_c": 21.0})),
-        Assumption("light loss", ("0.24", "0.44"), ({"light_loss": 0.24}, {"light_loss": 0.44})),
-        Assumption("pointing loss", ("0", "0.05"), ({"pointing_loss": 0.0}, {"pointing_loss": 0.05})),
+    """The uncertain values of the payload and their ranges, those of a study's `Unknowns` to one standard deviation."""
+    found = []
+    for name, prior in Unknowns().priors().items():
+        ends = (prior.low, prior.high) if isinstance(prior, Uniform) else (prior.mean - prior.sd, prior.mean + prior.sd)
         # The quantum efficiency scales all light alike, as the area does.
-        Assumption(
-            "quantum efficiency, scale",
-            ("0.7", "1.3"),
-            ({"collecting_area_cm2": 0.7 * area}, {"collecting_area_cm2": 1.3 * area}),
-        ),
-        Assumption(
-            "charge conversion (uV per electron)",
-            ("20", "25"),
-            ({"conversion_uv_per_electron": 20.0}, {"conversion_uv_per_electron": 25.0}),
-        ),
-        Assumption("read noise (DN)", ("11", "13"), ({"read_noise_dn": 11.0}, {"read_noise_dn": 13.0})),
-        Assumption(
-            "dark counts are Poisson in", ("DN", "electrons"), ({"dark_unit": "DN"}, {"dark_unit": "electrons"})
-        ),
+        key, scale = ("collecting_area_cm2", nominal.collecting_area_cm2) if name == "qe_scale" else (name, 1.0)
+        low, high = ({key: scale * float(f"{end:.12g}")} for end in ends)
+        found.append(Assumption(NAMES[name], (f"{ends[0]:g}", f"{ends[1]:g}"), (low, high)))
+    dark = Assumption(
+        "dark counts are Poisson in", ("DN", "electrons"), ({"dark_unit": "DN"}, {"dark_unit": "electrons"})
     )
+    return (*found, dark)
 
 
 @dataclass(frozen=True)

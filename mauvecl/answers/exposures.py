@@ -10,7 +10,7 @@ import numpy as np
 from mauvecl.answers.answer import Answer
 from mauvecl.host.errors import InputError
 from mauvecl.study.labels import described, label, told
-from mauvecl.study.questions import QUANTITIES
+from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.sections import Star
 from mauvecl.study.study import Study
 
@@ -159,7 +159,7 @@ def _one(study: Study, star: Star, snr: float, wavelength_nm: float, per: Per) -
         return study.at("exposure", frames * frame_s).expect([source])[0]
 
     one = snr_at(after(1), wavelength_nm, per)
-    longest = QUANTITIES["exposure"][1]
+    longest = QUANTITIES["exposure"].high
     if not one > 0 or (snr / one) ** 2 * frame_s > longest:
         raise InputError(
             f"{star.library or star.file} has an S/N of {one:.3g} per {per} at {wavelength_nm:g} nm in one frame, "

@@ -20,7 +20,8 @@ from mauvecl.answers.snr import SnrAnswer, snr
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.results.snr import steps_of
 from mauvecl.study.labels import described
-from mauvecl.study.questions import UNITS, Axis, Sweep
+from mauvecl.study.quantities import UNITS
+from mauvecl.study.questions import Axis, Sweep
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:

@@ -15,7 +15,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.noise.scene import prepare
 from mauvecl.results.detection import Detection
 from mauvecl.statistics.intervals import Interval
-from mauvecl.study.questions import QUANTITIES
+from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.sections import Star
 from mauvecl.study.study import Study
 from mauvecl.study.unknowns import Draws, average, drawn, shares
@@ -218,7 +218,7 @@ def _further(of: str) -> Callable[[float, float], float]:
 
 def _span(of: str) -> str:
     hardest, easiest = SEARCH[of]
-    ends = sorted(e for e in (hardest if hardest is not None else QUANTITIES[of][0], easiest))
+    ends = sorted(e for e in (hardest if hardest is not None else QUANTITIES[of].low, easiest))
     return f"{ends[0]:g} and {ends[1]:g}"
 
 

@@ -15,7 +15,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.results.detection import check_fap
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, stacked, told
-from mauvecl.study.questions import UNITS
+from mauvecl.study.quantities import UNITS
 from mauvecl.study.sections import Star
 from mauvecl.study.study import Study
 from mauvecl.study.unknowns import draws_table

@@ -13,7 +13,7 @@ from mauvecl.answers.answer import Answer
 from mauvecl.results.detection import check_fap
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, told
-from mauvecl.study.questions import UNITS
+from mauvecl.study.quantities import UNITS
 from mauvecl.study.study import Study
 from mauvecl.study.unknowns import average, drawn, shares
 

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.pictures.style import AXES, COLOURS, NULL, STYLE, finished, pyplot
+from mauvecl.pictures.style import COLOURS, NULL, STYLE, finished, pyplot
 from mauvecl.statistics.registry import label
 from mauvecl.study.labels import titled
+from mauvecl.study.quantities import QUANTITIES
 
 if TYPE_CHECKING:
     from mauvecl.answers.exposures import ExposureResult
@@ -44,9 +45,9 @@ def detection_map(found: MapResult, path: str | Path | None) -> Any:
                     getattr(axis, f"set_{which}ticks")(place, values)
                 elif described.log:
                     getattr(axis, f"set_{which}scale")("log")
-            axis.set_xlabel(AXES[question.x.quantity])
+            axis.set_xlabel(QUANTITIES[question.x.quantity].axis)
             axis.set_title(label(statistic))
-        axes[0][0].set_ylabel(AXES[question.y.quantity])
+        axes[0][0].set_ylabel(QUANTITIES[question.y.quantity].axis)
         figure.colorbar(mesh, ax=list(axes[0]), label="detection probability")
         figure.suptitle(
             f"{found.star}, false-alarm probability {found.study.run.fap:g} per test; nominal throughput", fontsize=9
@@ -81,7 +82,7 @@ def limits(found: LimitResult, path: str | Path | None) -> Any:
         axis.axhline(power, color="black", linewidth=0.8, linestyle="--")
         if of != "magnitude":
             axis.set_xscale("log")
-        axis.set(xlabel=AXES[of], ylabel="detection probability", ylim=(-0.02, 1.02))
+        axis.set(xlabel=QUANTITIES[of].axis, ylabel="detection probability", ylim=(-0.02, 1.02))
         axis.set_title(
             f"Limits at a power of {power:g}, false-alarm probability {found.study.run.fap:g} per test\n"
             "points: simulated, 95 %; lines: Gaussian noise; nominal throughput"
@@ -164,7 +165,7 @@ def snr_sweep(found: SnrAnswer, path: str | Path | None = None) -> Any:
             if first == "exposure":
                 axis.set_xscale("log")
             axis.set_title(f"{wavelength:g} nm")
-            axis.set_xlabel(AXES[first])
+            axis.set_xlabel(QUANTITIES[first].axis)
         axes[0][0].set_ylabel("S/N per 10.5 nm element")
         handles, names = axes[0][0].get_legend_handles_labels()
         figure.legend(handles, names, loc="outside lower center", ncols=min(len(names), 4))

@@ -27,16 +27,6 @@ STYLE = {
     "lines.linewidth": 1.2,
 }
 
-AXES = {
-    "magnitude": "magnitude",
-    "amplitude": "flare amplitude",
-    "flare_temperature": "flare temperature (K)",
-    "exposure": "exposure (s)",
-    "detector_temperature": "detector temperature (deg C)",
-    "sky": "sky brightness (V mag / arcsec²)",
-    "star": "star",
-}
-
 
 def available() -> bool:
     """Whether matplotlib is installed."""

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from mauvecl.study.questions import UNITS
+from mauvecl.study.quantities import QUANTITIES, UNITS
 from mauvecl.study.sections import Star
 
 if TYPE_CHECKING:
@@ -63,9 +63,8 @@ def stacked(parts: Iterable[tuple[Mapping[str, float | str], QTable]], **meta: o
 
 def titled(name: str, at: Mapping[str, float | str]) -> str:
     """A star with the values of its cell, for pictures; its magnitude and name are there already."""
-    units = {"flare_temperature": " K", "exposure": " s", "detector_temperature": " deg C", "sky": " mag/arcsec2"}
     parts = [
-        f"{quantity.replace('_', ' ')} {value:g}{units.get(quantity, '')}"
+        f"{quantity.replace('_', ' ')} {value:g}{QUANTITIES[quantity].suffix}"
         for quantity, value in at.items()
         if quantity not in ("magnitude", "star") and not isinstance(value, str)
     ]
@@ -73,49 +72,46 @@ def titled(name: str, at: Mapping[str, float | str]) -> str:
 
 
 #: What columns hold that many tables have.
-COLUMNS = {
-    "star": "library name or file, with its magnitude",
-    "statistic": "detection statistic",
-    "amplitude": "flare amplitude: relative rise of the photons in the flare's band",
-    "template": "amplitude of the flare that the statistic looks for",
-    "magnitude": "magnitude of the star in its band",
-    "flare_temperature": "blackbody temperature of the flare",
-    "exposure": "length of the exposure",
-    "detector_temperature": "temperature of the detector",
-    "sky": "zodiacal surface brightness in V",
-    "wavelength": "vacuum wavelength, the middle of the pixel or element",
-    "threshold": "value at and above which a detection is claimed",
-    "fap_low": "95 % interval of the false-alarm probability, lower end",
-    "fap_high": "95 % interval of the false-alarm probability, upper end",
-    "probability_low": "95 % interval of the detection probability, lower end",
-    "probability_high": "95 % interval of the detection probability, upper end",
-    "area_low": "95 % interval of the area, lower end",
-    "area_high": "95 % interval of the area, upper end",
-    "realisation": "number of the realisation, by which it can be drawn again",
-    "source_photon": "photon noise of the star, rms",
-    "zodiacal_photon": "photon noise of the zodiacal light, rms",
-    "dark": "noise of the dark current, rms",
-    "read": "read noise, rms",
-    "total": "all of them in quadrature, without the ADC's rounding",
-    "why": "main cause of a difference from the closed form",
-    "per": "pixel, or resolution element of 10.5 nm",
-    "wanted": "wanted S/N",
-    "frames": "frames of the exposure",
-    "snr": "closed-form S/N reached",
-    "snr_one_frame_less": "closed-form S/N of one frame less",
-    "matters_most": "unknown that explains most of the limits' variance",
-    "assumption": "what is assumed of the instrument",
-    "low_end": "lower end of its sensible range",
-    "high_end": "upper end of its sensible range",
-    "at_low_end": "closed-form limit with the assumption at its lower end",
-    "at_high_end": "closed-form limit with the assumption at its upper end",
-    "temperature_c": "detector temperature of the draw, deg C",
-    "light_loss": "light loss of the draw",
-    "pointing_loss": "pointing loss of the draw",
-    "qe_scale": "factor on the quantum efficiency of the draw",
-    "conversion_uv_per_electron": "charge conversion of the draw, uV per electron",
-    "read_noise_dn": "read noise of the draw, DN",
-} | {f"q{p}": f"{p} % quantile of the realisations" for p in ("0.135", "2.5", "16", "50", "84", "97.5", "99.865")}
+COLUMNS = (
+    {name: quantity.description for name, quantity in QUANTITIES.items()}
+    | {
+        "statistic": "detection statistic",
+        "template": "amplitude of the flare that the statistic looks for",
+        "wavelength": "vacuum wavelength, the middle of the pixel or element",
+        "threshold": "value at and above which a detection is claimed",
+        "fap_low": "95 % interval of the false-alarm probability, lower end",
+        "fap_high": "95 % interval of the false-alarm probability, upper end",
+        "probability_low": "95 % interval of the detection probability, lower end",
+        "probability_high": "95 % interval of the detection probability, upper end",
+        "area_low": "95 % interval of the area, lower end",
+        "area_high": "95 % interval of the area, upper end",
+        "realisation": "number of the realisation, by which it can be drawn again",
+        "source_photon": "photon noise of the star, rms",
+        "zodiacal_photon": "photon noise of the zodiacal light, rms",
+        "dark": "noise of the dark current, rms",
+        "read": "read noise, rms",
+        "total": "all of them in quadrature, without the ADC's rounding",
+        "why": "main cause of a difference from the closed form",
+        "per": "pixel, or resolution element of 10.5 nm",
+        "wanted": "wanted S/N",
+        "frames": "frames of the exposure",
+        "snr": "closed-form S/N reached",
+        "snr_one_frame_less": "closed-form S/N of one frame less",
+        "matters_most": "unknown that explains most of the limits' variance",
+        "assumption": "what is assumed of the instrument",
+        "low_end": "lower end of its sensible range",
+        "high_end": "upper end of its sensible range",
+        "at_low_end": "closed-form limit with the assumption at its lower end",
+        "at_high_end": "closed-form limit with the assumption at its upper end",
+        "temperature_c": "detector temperature of the draw, deg C",
+        "light_loss": "light loss of the draw",
+        "pointing_loss": "pointing loss of the draw",
+        "qe_scale": "factor on the quantum efficiency of the draw",
+        "conversion_uv_per_electron": "charge conversion of the draw, uV per electron",
+        "read_noise_dn": "read noise of the draw, DN",
+    }
+    | {f"q{p}": f"{p} % quantile of the realisations" for p in ("0.135", "2.5", "16", "50", "84", "97.5", "99.865")}
+)
 
 
 def described(table: QTable) -> QTable:

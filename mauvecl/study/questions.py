@@ -9,27 +9,11 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from mauvecl.host.errors import InputError
+from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.sections import Part
 
-#: What a limit is asked for, or an axis of a map runs over, and where it may lie.
-QUANTITIES: dict[str, tuple[float, float]] = {
-    "magnitude": (-2.0, 25.0),
-    "amplitude": (1e-6, 1e4),
-    "flare_temperature": (1_000.0, 100_000.0),
-    "exposure": (1e-3, 1e7),
-    "detector_temperature": (-100.0, 60.0),
-    "sky": (10.0, 30.0),
-}
 #: Combinations of a sweep, at most: each has expectations of its own.
 MOST_CELLS = 100_000
-#: Units of these, where they have any.
-UNITS = {
-    "magnitude": "mag",
-    "flare_temperature": "K",
-    "exposure": "s",
-    "detector_temperature": "deg_C",
-    "sky": "mag / arcsec2",
-}
 
 
 class CampaignQuestion(Part):
@@ -106,7 +90,7 @@ class Axis(Part):
             if (self.quantity == "star") != isinstance(value, str):
                 raise ValueError(f"the axis {self.quantity!r} has the value {value!r}, expected {self._expected()}")
             if not isinstance(value, str):
-                low, high = QUANTITIES[self.quantity]
+                low, high = QUANTITIES[self.quantity].low, QUANTITIES[self.quantity].high
                 if not low <= value <= high:
                     raise ValueError(f"the axis {self.quantity!r} reaches {value:g}, expected {low:g} to {high:g}")
         return self

@@ -1,0 +1,53 @@
+"""What a study sweeps over, a map's axes run over, or a limit is asked for: one record each."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """One quantity.
+
+    Attributes
+    ----------
+    description : str
+        For the columns of tables.
+    axis : str
+        For the axes of pictures, with the unit.
+    low, high : float
+        Where it may lie; NaN for names.
+    unit : str
+        As astropy reads it; empty where it has none.
+    suffix : str
+        What follows a value in a title.
+    """
+
+    description: str
+    axis: str
+    low: float = float("nan")
+    high: float = float("nan")
+    unit: str = ""
+    suffix: str = ""
+
+
+QUANTITIES: dict[str, Quantity] = {
+    "magnitude": Quantity("magnitude of the star in its band", "magnitude", -2.0, 25.0, "mag"),
+    "amplitude": Quantity(
+        "flare amplitude: relative rise of the photons in the flare's band", "flare amplitude", 1e-6, 1e4
+    ),
+    "flare_temperature": Quantity(
+        "blackbody temperature of the flare", "flare temperature (K)", 1_000.0, 100_000.0, "K", " K"
+    ),
+    "exposure": Quantity("length of the exposure", "exposure (s)", 1e-3, 1e7, "s", " s"),
+    "detector_temperature": Quantity(
+        "temperature of the detector", "detector temperature (deg C)", -100.0, 60.0, "deg_C", " deg C"
+    ),
+    "sky": Quantity(
+        "zodiacal surface brightness in V", "sky brightness (V mag / arcsec²)", 10.0, 30.0, "mag / arcsec2",
+        " mag/arcsec2",
+    ),
+    "star": Quantity("library name or file, with its magnitude", "star"),
+}  # fmt: skip
+#: Units of those that have any.
+UNITS = {name: quantity.unit for name, quantity in QUANTITIES.items() if quantity.unit}
