@@ -23,10 +23,12 @@ import numpy as np
 from astropy.table import Table
 
 from mauvecl.device.engine import Engine
+from mauvecl.results.requests import DetectRequest, Share
+from mauvecl.results.sums import DetectionSums
 from mauvecl.runs.checkpoint import Checkpoint
 from mauvecl.runs.cluster import DaskWorkers
 from mauvecl.runs.pool import LocalWorkers, Pool
-from mauvecl.runs.shards import DetectRequest, fingerprint, shares
+from mauvecl.runs.shards import fingerprint, shares
 from mauvecl.study.sections import Run
 from mauvecl.study.study import Study
 
@@ -81,13 +83,13 @@ def main() -> None:
 
         # The parts of one share's overhead.
         request = DetectRequest(quiet, tuple(flares), n, 1, *how)
-        fixed = timed(lambda: request.count(engine, 0, 0, 64))[0]
+        fixed = timed(lambda: engine.count(request, Share(0, 0, 64)))[0]
         prepared = timed(lambda: pickle.loads(pickle.dumps(request)).plans)[0]
-        share = request.count(engine, 0, 0, size)
+        share = engine.count(request, Share(0, 0, size))
         bare = timed(lambda: engine.detect(quiet, flares, realisations=size, seed=1))[0]
         packing, sent = timed(lambda: pickle.dumps(share))
-        adding = timed(lambda: DetectRequest(quiet, tuple(flares), n, 1, *how).add(0, pickle.loads(sent)))[0]
-        adding -= timed(lambda: DetectRequest(quiet, tuple(flares), n, 1, *how).plans)[0]
+        sums = DetectionSums(request)
+        adding = timed(lambda: sums.add(0, pickle.loads(sent)))[0]
         body = io.BytesIO()
         np.savez(body, **share)
         key = fingerprint(request)

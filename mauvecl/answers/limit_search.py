@@ -13,7 +13,7 @@ from scipy import special
 
 from mauvecl.host.errors import InputError
 from mauvecl.noise.scene import prepare
-from mauvecl.results.detection import Detection
+from mauvecl.results.hypotheses import Hypotheses
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.sections import Star
@@ -107,9 +107,9 @@ class Question:
         scene = prepare([quiet, flare], comparison=self.study.run.comparison())
         if not scene.used.any():
             return 0.0
-        found = Detection(quiet, (flare,), (self.statistic,), scene, self.study.run.realisations)
-        limit = found.closed_form(self.statistic).isf(self.fap)
-        return found.closed_form(self.statistic, 0).sf(limit)
+        theory = Hypotheses(quiet, (flare,), (self.statistic,), scene)
+        limit = theory.closed_form(self.statistic).isf(self.fap)
+        return theory.closed_form(self.statistic, 0).sf(limit)
 
     def simulated(self, value: float, seed: int) -> Interval:
         """Detection probability with its interval, by the engine."""

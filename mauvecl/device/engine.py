@@ -19,9 +19,11 @@ from mauvecl.noise.processes import NONE, Processes
 from mauvecl.noise.scene import BATCH, PIXEL_BLOCK, Mode, Recipe, Scene, prepare
 from mauvecl.results.channels import ChannelPlan, plan_channels
 from mauvecl.results.detection import Detection, Tails
-from mauvecl.results.snr import Counts, SnrResult
+from mauvecl.results.hypotheses import Hypotheses
+from mauvecl.results.requests import Countable, DetectRequest, RealiseRequest, Share, SnrRequest
+from mauvecl.results.snr import Counts, SnrResult, elements, observers
+from mauvecl.results.sums import Arrays, DetectionSums, SnrSums, packed_detection, packed_snr
 from mauvecl.results.tally import TailSamples, Tally
-from mauvecl.runs.shards import DetectRequest, SnrRequest
 from mauvecl.statistics.linear import Linear
 from mauvecl.statistics.nuisances import Nuisances, known
 from mauvecl.statistics.paper import Paper
@@ -246,17 +248,54 @@ class Engine:
             For an impossible number, seed or mode.
         """
         request = SnrRequest(expectation, realisations, seed, mode, start, processes, recipe)
-        self.count_snr(request, start, realisations, request.answer.counts)
-        return request.answer
+        sums = SnrSums(request)
+        sums.add(0, packed_snr(self._snr(request, Share(0, start, realisations))))
+        return sums.answer()
 
-    def count_snr(self, request: SnrRequest, start: int, count: int, counts: Counts) -> None:
-        """Add some realisations of a request to counts; `shards` cuts it into such shares."""
-        self._check(start, count, request.seed)
-        asked = request.answer
-        with self._scene(asked.scene, request.seed) as run:
-            run.observe(asked.observers, asked.elements)
-            self._over(start, count, 0, lambda tile, done: run.histogram(tile, counts))
+    def count(self, request: Countable, share: Share, *, out: NDArray[Any] | None = None) -> Arrays:
+        """What a share of a request comes to, as `sums` adds it up.
+
+        Parameters
+        ----------
+        request : DetectRequest, SnrRequest or RealiseRequest
+        share : Share
+            `shards.shares` cuts requests into them.
+        out : ndarray, optional
+            As for `realise`.
+
+        Returns
+        -------
+        dict of str to ndarray
+            Raw spectra as ``rows``.
+        """
+        match request:
+            case DetectRequest():
+                return packed_detection(*self._detection(request, share))
+            case SnrRequest():
+                return packed_snr(self._snr(request, share))
+            case RealiseRequest():
+                rows = self.realise(
+                    request.expectation,
+                    start=share.start,
+                    count=share.count,
+                    seed=request.seed,
+                    mode=request.mode,
+                    processes=request.processes,
+                    recipe=request.recipe,
+                    first_frame=request.first_frame,
+                    out=out,
+                )
+                return {"rows": rows}
+
+    def _snr(self, request: SnrRequest, share: Share) -> Counts:
+        self._check(share.start, share.count, request.seed)
+        scene, observed = request.scene, elements(request.expectation)
+        counts = Counts(scene.n_pixel, len(observed))
+        with self._scene(scene, request.seed) as run:
+            run.observe(observers(request.expectation, scene), observed)
+            self._over(share.start, share.count, 0, lambda tile, done: run.histogram(tile, counts))
             run.flush_counts(counts)
+        return counts
 
     def detect(
         self,
@@ -309,40 +348,33 @@ class Engine:
         """
         how = (mode, start, processes, recipe, comparison, tails, nuisances)
         request = DetectRequest(quiet, tuple(flares), realisations, seed, statistics, *how)
-        for part, (plan, _) in enumerate(request.plans):
-            tally, samples = Tally(plan.grids), plan.tails()
-            done, total = part * realisations, request.parts * realisations
-            self.count_detection(request, part, start, realisations, tally, samples, before=done, total=total)
-            request.answer.collect(plan, tally, samples)
-        return request.answer
+        sums, total = DetectionSums(request), request.parts * realisations
+        for part in range(request.parts):
+            share = Share(part, start, realisations)
+            sums.add(part, packed_detection(*self._detection(request, share, before=part * realisations, total=total)))
+        return sums.answer()
 
-    def count_detection(
-        self,
-        request: DetectRequest,
-        part: int,
-        start: int,
-        count: int,
-        tally: Tally,
-        samples: list[TailSamples | None],
-        *,
-        before: int = 0,
-        total: int | None = None,
-    ) -> None:
-        """Add some realisations of one part of a request to a tally; `shards` cuts it into such shares."""
-        self._check(start, count, request.seed)
-        plan, scene = request.plans[part]
+    def _detection(
+        self, request: DetectRequest, share: Share, *, before: int = 0, total: int | None = None
+    ) -> tuple[Tally, list[TailSamples | None]]:
+        self._check(share.start, share.count, request.seed)
+        plan, scene = request.plans[share.part]
+        tally, samples = Tally(plan.grids), plan.tails()
 
         def work(run: Run, tile: Tile, done: int) -> None:
             run.statistics(tile)
             run.tally(tile, tally)
             for grid, kept in zip(tally.grids, samples, strict=True):
                 if kept is not None:
-                    kept.add(run.channel(tile, grid.channel), start + done)
+                    kept.add(run.channel(tile, grid.channel), share.start + done)
 
-        with self._statistics(scene, request.seed, plan, request.answer) as run:
+        with self._statistics(scene, request.seed, plan, request.hypotheses) as run:
             each = 4 * plan.n_rows
-            self._over(start, count, each, lambda tile, done: work(run, tile, done), before=before, total=total)
+            self._over(
+                share.start, share.count, each, lambda tile, done: work(run, tile, done), before=before, total=total
+            )
             run.flush(tally)
+        return tally, samples
 
     def statistic_values(
         self,
@@ -384,19 +416,19 @@ class Engine:
         scene = prepare([quiet, *flares], mode, processes=processes, recipe=recipe, comparison=comparison)
         if len(flares) >= BATCH[scene.frames]:
             raise InputError(f"{len(flares)} flares, expected at most {BATCH[scene.frames] - 1} in one launch")
-        result = Detection(quiet, tuple(flares), statistics, scene, count, nuisances=known(nuisances, quiet))
-        plan = plan_channels(result, range(len(flares)), first=True)
+        asked = Hypotheses(quiet, tuple(flares), statistics, scene, nuisances=known(nuisances, quiet))
+        plan = plan_channels(asked, range(len(flares)), first=True)
         out = np.empty((plan.n_rows, count), np.float32)
 
         def work(run: Run, tile: Tile, done: int) -> None:
             run.statistics(tile)
             out[:, done : done + tile.wanted] = run.values(tile)
 
-        with self._statistics(scene, seed, plan, result) as run:
+        with self._statistics(scene, seed, plan, asked) as run:
             self._over(start, count, 4 * plan.n_rows, lambda tile, done: work(run, tile, done))
         return out
 
-    def _statistics(self, scene: Scene, seed: int, plan: ChannelPlan, asked: Detection) -> Run:
+    def _statistics(self, scene: Scene, seed: int, plan: ChannelPlan, asked: Hypotheses) -> Run:
         bands, finished = np.zeros((1, 0, 1), np.float32), np.zeros(1, np.uint32)
         if len(plan.scales):
             bands, finished = Paper().smoothing(asked.setting).bands(len(scene.pixels), self.variant.chunk)

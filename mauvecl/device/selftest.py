@@ -26,7 +26,7 @@ from mauvecl.noise.processes import CosmicRays, Processes, Uniform
 from mauvecl.noise.scene import Scene, prepare
 from mauvecl.results import twin as reference_sums
 from mauvecl.results.channels import ChannelPlan, plan_channels
-from mauvecl.results.detection import Detection
+from mauvecl.results.hypotheses import Hypotheses
 from mauvecl.results.snr import Counts, elements, observers
 from mauvecl.results.tally import Tally
 from mauvecl.statistics.registry import STATISTICS
@@ -175,7 +175,7 @@ def _statistics(name: str, scene: Scene) -> tuple[NDArray[np.float32], ChannelPl
     """Every statistic of a case by the twin, and which is which."""
     options, _ = CASES[name]
     quiet, flare = toy(**options), toy(flare=0.3, **options)
-    found = Detection(quiet, (flare,), tuple(STATISTICS), scene, COUNT)
+    found = Hypotheses(quiet, (flare,), tuple(STATISTICS), scene)
     plan = plan_channels(found, range(1), first=True)
     index = np.arange(START, START + COUNT, dtype=np.uint64)
     smoothed = reference_sums.Smoothed.of(found, plan)

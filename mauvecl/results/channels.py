@@ -4,19 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.noise.layout import FIXED_STATISTICS
+from mauvecl.results.hypotheses import Hypotheses
 from mauvecl.results.tally import Grid, TailSamples
 from mauvecl.statistics.distributions import Normal, QuadraticForm
 from mauvecl.statistics.paper import Paper
 from mauvecl.statistics.statistic import LinearStatistic, QuadraticStatistic, Statistic
-
-if TYPE_CHECKING:
-    from mauvecl.results.detection import Detection
 
 #: Which distribution: without a flare; with it, binned around the null; with it, around its own mean.
 Role = Literal["null", "flare_on_null_grid", "flare"]
@@ -79,18 +77,18 @@ class _Rows:
         self.ends.append(len(self.rows))
 
 
-def plan_channels(result: Detection, batch: Sequence[int], *, first: bool) -> ChannelPlan:
+def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) -> ChannelPlan:
     """Lay out the channels of a batch of flares; scenario 0 is always the quiescent one.
 
     Parameters
     ----------
-    result : Detection
+    hypotheses : Hypotheses
     batch : sequence of int
         Flares of this launch.
     first : bool
         Whether nulls shared by all batches are counted in this one.
     """
-    asked = [result.statistic(name) for name in result.statistics]
+    asked = [hypotheses.statistic(name) for name in hypotheses.statistics]
     weighted, smoothed = _Rows(), _Rows()
     for scenario in range(1 + len(batch)):
         # The quiescent draws meet every flare's shape, each flare only its own.
@@ -98,14 +96,14 @@ def plan_channels(result: Detection, batch: Sequence[int], *, first: bool) -> Ch
         # Those that look for a shape come first: the kernel sums the first row on its way.
         for one in sorted(asked, key=lambda s: not s.shaped):
             for flare in shapes if one.shaped else [0]:
-                looked_for = result.shape(one.name, flare)
+                looked_for = hypotheses.shape(one.name, flare)
                 if isinstance(one, LinearStatistic):
-                    weighted.add(one.name, scenario, flare, one.weights_per_dn(result.setting, looked_for))
+                    weighted.add(one.name, scenario, flare, one.weights_per_dn(hypotheses.setting, looked_for))
                 elif isinstance(one, QuadraticStatistic) and one.kernel_sum is not None:
-                    for number, own in enumerate(one.subtracted(result.setting)):
+                    for number, own in enumerate(one.subtracted(hypotheses.setting)):
                         weighted.add(one.name, scenario, number, own)
                 elif isinstance(one, Paper):
-                    smoothed.add(one.name, scenario, flare, one.scale(result.setting, looked_for))
+                    smoothed.add(one.name, scenario, flare, one.scale(hypotheses.setting, looked_for))
         weighted.end()
         smoothed.end()
     n_scenario, fixed = 1 + len(batch), len(FIXED_STATISTICS)
@@ -118,7 +116,7 @@ def plan_channels(result: Detection, batch: Sequence[int], *, first: bool) -> Ch
             return fixed * n_scenario + weighted.places[where]
         return fixed * n_scenario + len(weighted.rows) + smoothed.places[where]
 
-    nuisances = result.setting.nuisances
+    nuisances = hypotheses.setting.nuisances
     subtractions = []
     for one in asked if nuisances else []:
         for scenario in range(n_scenario) if one.kernel_sum is not None else []:
@@ -133,16 +131,16 @@ def plan_channels(result: Detection, batch: Sequence[int], *, first: bool) -> Ch
 
     for one in asked:
         if first and not one.shaped:
-            add(one, "null", 0, row(one, 0, 0), result.closed_form(one.name))
+            add(one, "null", 0, row(one, 0, 0), hypotheses.closed_form(one.name))
         for i, flare in enumerate(batch):
-            null = result.closed_form(one.name, template=flare)
+            null = hypotheses.closed_form(one.name, template=flare)
             if one.shaped:
                 add(one, "null", flare, row(one, 0, flare), null)
             channel = row(one, i + 1, flare)
             add(one, "flare_on_null_grid", flare, channel, null)
-            add(one, "flare", flare, channel, result.closed_form(one.name, flare))
-    weights = np.zeros((len(weighted.rows), len(result.scene.pixels)), np.float32)
-    weights[:, : result.scene.n_pixel] = np.array(weighted.rows).reshape(len(weights), result.scene.n_pixel)
+            add(one, "flare", flare, channel, hypotheses.closed_form(one.name, flare))
+    weights = np.zeros((len(weighted.rows), len(hypotheses.scene.pixels)), np.float32)
+    weights[:, : hypotheses.scene.n_pixel] = np.array(weighted.rows).reshape(len(weights), hypotheses.scene.n_pixel)
     scales = np.array(smoothed.rows, np.float32) if smoothed.rows else np.zeros((0, 1), np.float32)
     linear_end, scale_end = (np.array(rows.ends, np.uint32) for rows in (weighted, smoothed))
     taken = np.array(subtractions, np.uint32).reshape(len(subtractions), 3).T

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
@@ -13,22 +12,16 @@ from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.plotting import picture
-from mauvecl.noise.scene import Scene
 from mauvecl.results.channels import ChannelPlan, Key
+from mauvecl.results.hypotheses import Hypotheses
 from mauvecl.results.roc import Roc
 from mauvecl.results.tally import Distribution, TailSamples, Tally
 from mauvecl.statistics.detection_interval import detection_interval
-from mauvecl.statistics.distributions import Normal, QuadraticForm
 from mauvecl.statistics.intervals import Interval, central_counts, clopper_pearson
-from mauvecl.statistics.linear import Linear
-from mauvecl.statistics.nuisances import Nuisances
-from mauvecl.statistics.registry import chosen
-from mauvecl.statistics.statistic import LinearStatistic, Setting, Statistic
 
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-    from mauvecl.host.expectation import Expectation
     from mauvecl.results.tails import Tail
 
 #: A threshold needs this many realisations beyond it; a rarer tail is refused, never extrapolated.
@@ -64,88 +57,26 @@ def check_fap(fap: float, realisations: int, tails: Tails = "counted") -> None:
 
 
 @dataclass(eq=False)
-class Detection:
-    """Null and flare distributions of one study; made by `Engine.detect`.
+class Detection(Hypotheses):
+    """Null and flare distributions as they were counted; made by `Engine.detect`.
+
+    Parameters and attributes are those of `Hypotheses` and these.
 
     Attributes
     ----------
-    quiet : Expectation
-    flares : tuple of Expectation
-    asked : sequence of str or Linear
-        Statistics.
-    scene : Scene
     realisations : int
     tails : {"counted", "sampled"}
         Whether a threshold beyond what was drawn is refused, or found by importance sampling.
     seed : int
         Of the draws.
-    nuisances : Nuisances, optional
-        What the statistics are marginalised over.
-    statistics : tuple of str
-        Their names.
     """
 
-    quiet: Expectation
-    flares: tuple[Expectation, ...]
-    asked: Sequence[str | Linear]
-    scene: Scene
     realisations: int
     tails: Tails = "counted"
     seed: int = 0
-    nuisances: Nuisances | None = None
-    statistics: tuple[str, ...] = field(init=False)
     _tails: dict[tuple[str, int, float], Tail] = field(default_factory=dict, init=False, repr=False)
-    _forms: dict[tuple[str, int | None, int], QuadraticForm | Normal] = field(
-        default_factory=dict, init=False, repr=False
-    )
-    setting: Setting = field(init=False, repr=False)
-    _chosen: dict[str, Statistic] = field(init=False, repr=False)
     _found: dict[Key, Distribution] = field(default_factory=dict, init=False, repr=False)
     _samples: dict[Key, TailSamples] = field(default_factory=dict, init=False, repr=False)
-
-    def __post_init__(self) -> None:
-        self._chosen = chosen(self.asked)
-        self.statistics = tuple(self._chosen)
-        self.setting = Setting(self.quiet, self.scene.used, self.scene.comparison, self.flares, self.nuisances)
-        shaped = next((name for name, one in self._chosen.items() if one.shaped), None)
-        if shaped is not None and not self.flares:
-            raise InputError(f"no flare given, expected at least one for the statistic {shaped!r}")
-        if not self.scene.used.any():
-            raise InputError(f"every pixel of {self.quiet.name} is saturated, expected a fainter star")
-        for one in self._chosen.values():
-            one.check(self.setting)
-
-    def statistic(self, name: str) -> Statistic:
-        """One of those computed.
-
-        Raises
-        ------
-        InputError
-            If it was not.
-        """
-        if name not in self._chosen:
-            raise InputError(f"statistic {name!r} was not simulated, expected one of {', '.join(self.statistics)}")
-        return self._chosen[name]
-
-    def shape(self, statistic: str, template: int = 0) -> Expectation | None:
-        """The flare whose shape a statistic looks for; None for those that look for none."""
-        return self.flares[template] if self.statistic(statistic).shaped else None
-
-    def weights(self, statistic: str, template: int = 0) -> NDArray[np.float64] | None:
-        """Weights per DN of a linear statistic, shape (n_pixel,); None for the others.
-
-        Parameters
-        ----------
-        statistic : str
-        template : int
-            For shaped statistics: the flare whose shape is looked for.
-        """
-        one = self.statistic(statistic)
-        return (
-            one.weights_per_dn(self.setting, self.shape(statistic, template))
-            if isinstance(one, LinearStatistic)
-            else None
-        )
 
     def collect(self, plan: ChannelPlan, tally: Tally, samples: Sequence[TailSamples | None]) -> None:
         """Take over the distributions and tails of one batch."""
@@ -153,21 +84,6 @@ class Detection:
             self._found[key] = tally.distribution(index)
             if kept is not None:
                 self._samples[key] = kept
-
-    @cached_property
-    def blinding(self) -> tuple[int, ...]:
-        """Flares that saturate every pixel that counts."""
-        used = self.scene.used
-        return tuple(k for k, x in enumerate(self.flares) if x.saturated[used].all())
-
-    @property
-    def messages(self) -> tuple[str, ...]:
-        """What the reader must be told of these flares."""
-        return tuple(
-            f"SATURATED: flare {k + 1} saturates every pixel of {self.quiet.name} that counts: what is recorded no "
-            "longer depends on the flare, and no number is given."
-            for k in self.blinding
-        )
 
     def distribution(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Distribution:
         """The simulated distribution of a statistic.
@@ -192,23 +108,6 @@ class Detection:
         of = "without a flare" if role == "null" else f"with flare {flare + 1}"
         found.refuse_undefined(f"statistic {statistic!r} {of}")
         return found
-
-    def closed_form(self, statistic: str, flare: int | None = None, *, template: int = 0) -> QuadraticForm | Normal:
-        """The same distribution for Gaussian noise; parameters as for `distribution`."""
-        self._check(statistic, flare, template)
-        key = statistic, flare, template
-        if key not in self._forms:
-            self._forms[key] = self._closed_form(statistic, flare, template)
-        return self._forms[key]
-
-    def _closed_form(self, statistic: str, flare: int | None, template: int) -> QuadraticForm | Normal:
-        observed = self.quiet if flare is None else self.flares[flare]
-        looked_for = self.shape(statistic, template if flare is None else flare)
-        return self.statistic(statistic).closed_form(self.setting, observed, looked_for)
-
-    def dof(self, statistic: str) -> int:
-        """Degrees of freedom without a flare: pixels, resolution elements, or one."""
-        return self.statistic(statistic).dof(self.setting)
 
     def histogram(
         self, statistic: str, flare: int | None = None, *, template: int = 0, bins: int = 200
@@ -388,12 +287,6 @@ class Detection:
         n_low, n_high = central_counts(null.n, fap)
         wanted = (int(np.floor(fap * null.n * (1 + 1e-12))), n_high, max(n_low - 1, 0))
         return Interval(*map(null.edge_with_at_most, wanted))
-
-    def _check(self, statistic: str, flare: int | None, template: int = 0) -> None:
-        if flare is None and self.statistic(statistic).shaped:
-            flare = template
-        if flare is not None and not 0 <= flare < len(self.flares):
-            raise InputError(f"flare = {flare}, expected 0 to {len(self.flares) - 1}")
 
 
 DESCRIPTIONS = {

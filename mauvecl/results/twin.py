@@ -16,7 +16,7 @@ from mauvecl.statistics.paper import Paper
 
 if TYPE_CHECKING:
     from mauvecl.results.channels import ChannelPlan
-    from mauvecl.results.detection import Detection
+    from mauvecl.results.hypotheses import Hypotheses
 
 
 def statistics(
@@ -149,7 +149,7 @@ class Smoothed:
     scale_end: NDArray[np.uint32]
 
     @classmethod
-    def of(cls, found: Detection, plan: ChannelPlan) -> Smoothed:
+    def of(cls, found: Hypotheses, plan: ChannelPlan) -> Smoothed:
         """Of a detection's channels."""
         smoothing = Paper().smoothing(found.setting)
         rows = np.zeros((len(smoothing.rows), len(found.scene.pixels)), np.float32)

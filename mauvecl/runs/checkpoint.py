@@ -32,7 +32,7 @@ from mauvecl.runs.durable import UNFINISHED, alone, differing_keys, write_whole
 from mauvecl.runs.shards import FORM
 
 if TYPE_CHECKING:
-    from mauvecl.runs.shards import Arrays
+    from mauvecl.results.sums import Arrays
     from mauvecl.study.study import Study
 
 FOLDER, MANIFEST = "checkpoint", "manifest.json"

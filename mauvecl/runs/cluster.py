@@ -15,13 +15,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
+from numpy.typing import NDArray
+
 from mauvecl.device.program import DeviceError, DeviceRecord
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import is_file, json_data, read_text
 from mauvecl.host.version import VERSION
+from mauvecl.results.requests import Countable, Share
+from mauvecl.results.sums import Arrays
 from mauvecl.runs.pool import Stopped
-from mauvecl.runs.shards import Arrays, Countable, Share
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -111,8 +114,15 @@ class DaskWorkers:
         """The devices of the workers that were there at the beginning."""
         return self._devices
 
-    def submit(self, request: Countable, key: str, share: Share, tick: Callable[[int], None]) -> Future[Arrays]:
-        """Have a share counted by whichever worker is free."""
+    def submit(
+        self,
+        request: Countable,
+        key: str,
+        share: Share,
+        tick: Callable[[int], None],
+        out: NDArray[Any] | None = None,
+    ) -> Future[Arrays]:
+        """Have a share counted by whichever worker is free; raw spectra travel, and `out` stays as it is."""
         found: Future[Arrays] = Future()
         self._send(found, request, key, share, 1)
         return found
@@ -138,7 +148,13 @@ class DaskWorkers:
         sent.add_done_callback(partial(self._came, found, request, key, share, tried))
 
     def _came(
-        self, found: Future[Arrays], request: Countable, key: str, share: Share, tried: int, sent: DaskFuture[Any]
+        self,
+        found: Future[Arrays],
+        request: Countable,
+        key: str,
+        share: Share,
+        tried: int,
+        sent: DaskFuture[Any],
     ) -> None:
         with self._lock:
             if self._sent.pop(sent, None) is None:
@@ -318,4 +334,4 @@ def _count(request: Countable, share: Share, device: str | None) -> Arrays:
 
     with _one_at_a_time:
         engine = _engine_here(device, get_worker().state.nthreads)
-        return request.count(engine, share.part, share.start, share.count)
+        return engine.count(request, share)

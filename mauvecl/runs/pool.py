@@ -14,17 +14,9 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 from numpy.typing import NDArray
 
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine, Progress
-from mauvecl.runs.shards import (
-    Arrays,
-    Countable,
-    DetectRequest,
-    RealiseRequest,
-    Request,
-    Share,
-    SnrRequest,
-    fingerprint,
-    shares,
-)
+from mauvecl.results.requests import Countable, DetectRequest, RealiseRequest, Request, Share, SnrRequest
+from mauvecl.results.sums import Arrays, DetectionSums, SnrSums
+from mauvecl.runs.shards import fingerprint, shares
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -64,8 +56,18 @@ class Workers(Protocol):
     def describe(self) -> list[DeviceRecord]:
         """The devices, for run records."""
 
-    def submit(self, request: Countable, key: str, share: Share, tick: Callable[[int], None]) -> Future[Arrays]:
-        """Have a share counted; `tick` may be called with realisations done of it."""
+    def submit(
+        self,
+        request: Countable,
+        key: str,
+        share: Share,
+        tick: Callable[[int], None],
+        out: NDArray[Any] | None = None,
+    ) -> Future[Arrays]:
+        """Have a share counted; `tick` may be called with realisations done of it.
+
+        Raw spectra go into `out` where a worker of this process draws them.
+        """
 
     def stop(self) -> None:
         """End what is under way as soon as may be."""
@@ -118,22 +120,35 @@ class LocalWorkers:
         """The devices."""
         return [engine.device for engine in self._engines]
 
-    def submit(self, request: Countable, key: str, share: Share, tick: Callable[[int], None]) -> Future[Arrays]:
+    def submit(
+        self,
+        request: Countable,
+        key: str,
+        share: Share,
+        tick: Callable[[int], None],
+        out: NDArray[Any] | None = None,
+    ) -> Future[Arrays]:
         """Count a share: at once where there is one device."""
         if self._threads is not None:
-            return self._threads.submit(self._count, request, share, tick)
-        found: Future[Arrays] = Future()
-        found.set_result(self._count(request, share, tick))
-        return found
+            return self._threads.submit(self._count, request, share, tick, out)
+        future: Future[Arrays] = Future()
+        future.set_result(self._count(request, share, tick, out))
+        return future
 
-    def _count(self, request: Countable, share: Share, tick: Callable[[int], None]) -> Arrays:
+    def _count(
+        self,
+        request: Countable,
+        share: Share,
+        tick: Callable[[int], None],
+        out: NDArray[Any] | None,
+    ) -> Arrays:
         with self._lock:
             place = self._free.pop(0)
         self._ticks[place] = tick
         try:
             for tried in range(1, TRIES + 1):
                 try:
-                    return request.count(self._engines[place], share.part, share.start, share.count)
+                    return self._engines[place].count(request, share, out=out)
                 except Exception as error:
                     engine = self._engines[place]
                     launch = isinstance(error, engine.cl.Error)
@@ -245,31 +260,31 @@ class Pool:
     def detect(self, quiet: Expectation, flares: Sequence[Expectation], **how: Any) -> Detection:
         """As `Engine.detect`, with the same keywords."""
         request = DetectRequest(quiet, tuple(flares), **how)
-        self._answer(request)
-        return request.answer
+        sums = DetectionSums(request)
+        self._add_up(request, sums)
+        return sums.answer()
 
     def snr(self, expectation: Expectation, **how: Any) -> SnrResult:
         """As `Engine.snr`, with the same keywords."""
         request = SnrRequest(expectation, **how)
-        self._answer(request)
-        return request.answer
+        sums = SnrSums(request)
+        self._add_up(request, sums)
+        return sums.answer()
 
     def realise(
         self, expectation: Expectation, *, count: int, out: NDArray[Any] | None = None, **how: Any
     ) -> NDArray[Any]:
         """As `Engine.realise`, with the same keywords, by one worker; several calls at a time keep all of them busy."""
-        # A worker of this process writes into `out` itself.
-        here = out if self.workers.first is not None else None
-        request = RealiseRequest(expectation, count, out=here, **how)
+        request = RealiseRequest(expectation, count, **how)
         share = Share(0, request.start, count)
-        found = self.workers.submit(request, uuid.uuid4().hex, share, lambda done: None)
-        rows: NDArray[Any] = found.result()["rows"]
-        if out is None or here is not None:
+        future = self.workers.submit(request, uuid.uuid4().hex, share, lambda done: None, out)
+        rows: NDArray[Any] = future.result()["rows"]
+        if out is None or rows is out:
             return rows
         out[:] = rows
         return out
 
-    def _answer(self, request: Request) -> None:
+    def _add_up(self, request: Request, sums: DetectionSums | SnrSums) -> None:
         key = fingerprint(request)
         todo = shares(request)
         with self._lock:
@@ -281,27 +296,27 @@ class Pool:
             name = f"{key}-{share.name}"
             known = None if self.checkpoint is None else self.checkpoint.get(name)
             if known is not None:
-                request.add(share.part, known)
+                sums.add(share.part, known)
                 self._finished(name, share, resumed=True)
                 continue
             if self._stopping:
                 raise Stopped
             while len(waiting) >= self.workers.count * AHEAD:
-                self._collect(request, key, waiting)
+                self._collect(sums, key, waiting)
             tick = partial(self._tick, name)
             waiting[self.workers.submit(request, key, share, tick)] = share
         while waiting:
-            self._collect(request, key, waiting)
+            self._collect(sums, key, waiting)
 
-    def _collect(self, request: Request, key: str, waiting: dict[Future[Arrays], Share]) -> None:
+    def _collect(self, sums: DetectionSums | SnrSums, key: str, waiting: dict[Future[Arrays], Share]) -> None:
         finished, _ = wait(waiting, return_when=FIRST_COMPLETED)
         for future in finished:
             share = waiting.pop(future)
-            found = future.result()
-            request.add(share.part, found)
+            counted = future.result()
+            sums.add(share.part, counted)
             name = f"{key}-{share.name}"
             if self.checkpoint is not None:
-                self.checkpoint.put(name, found)
+                self.checkpoint.put(name, counted)
             self._finished(name, share)
 
     def _tick(self, name: str, done: int) -> None:

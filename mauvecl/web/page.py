@@ -20,7 +20,7 @@ from mauvecl.device.program import DeviceError
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.noise.scene import prepare
-from mauvecl.results.detection import Detection
+from mauvecl.results.hypotheses import Hypotheses
 from mauvecl.study.labels import told
 from mauvecl.study.study import Study
 from mauvecl.web.asked import detect_and_snr, map_around, picture
@@ -64,7 +64,7 @@ class Page:
         self._told: list[tuple[str, str]] = []
         self.quiet: Expectation | None = None
         self.flare: Expectation | None = None
-        self.theory: Detection | None = None
+        self.theory: Hypotheses | None = None
         self.alerts = line()
         self.summary = line(styles={"font-size": "110%"}, html_attributes={"aria-live": "polite"})
         self.status = line()
@@ -215,9 +215,7 @@ class Page:
         self.light = source, study.flaring(source, study.flare.amplitudes[0])
         quiet, flare = study.expect(list(self.light))
         scene = prepare([quiet, flare], comparison=study.run.comparison())
-        self.theory = Detection(
-            quiet, (flare,), study.run.statistics, scene, study.run.realisations, seed=study.run.seed
-        )
+        self.theory = Hypotheses(quiet, (flare,), study.run.statistics, scene)
         self.cut = self.theory.closed_form(q.statistic).isf(q.fap)
         chance = float("nan") if self.theory.blinding else self.theory.closed_form(q.statistic, 0).sf(self.cut)
         self.quiet, self.flare = quiet, flare

@@ -74,7 +74,8 @@ def test_false_alarms_and_power_with_the_unknown_drawn(engine: Engine, sd: float
 
 
 def test_requests_carry_what_is_unknown(engine: Engine) -> None:
-    from mauvecl.runs.shards import DetectRequest, fingerprint
+    from mauvecl.results.requests import DetectRequest
+    from mauvecl.runs.shards import fingerprint
 
     quiet, flare = star(amplitudes=(0.24,))
     one, other = (DetectRequest(quiet, (flare,), 1000, 1, nuisances=n) for n in ({"dark": 0.1}, {"dark": 0.2}))

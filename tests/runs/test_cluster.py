@@ -26,7 +26,7 @@ from mauvecl.cli.app import app
 from mauvecl.device.engine import DeviceError, Engine
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
-from mauvecl.runs import shards
+from mauvecl.results.requests import RealiseRequest, Share
 from mauvecl.runs.cluster import DaskWorkers
 from mauvecl.runs.pool import Pool, Stopped, together
 from mauvecl.store import bulk
@@ -117,12 +117,9 @@ def test_a_mistake_on_a_worker_is_a_sentence(workers: DaskWorkers, scene: list[E
     """An error that another try would not mend is not tried again."""
     before = workers.retries
 
-    class Impossible:
-        def count(self, *given: Any) -> Any:
-            raise InputError("frames = -1, expected at least 1")
-
-    with pytest.raises(DeviceError, match=r"cluster local:2 failed at realisations 0 to 9: .*frames = -1"):
-        workers.submit(Impossible(), "key", shards.Share(0, 0, 10), lambda done: None).result()
+    impossible = RealiseRequest(scene[0], 10, seed=-1)
+    with pytest.raises(DeviceError, match=r"cluster local:2 failed at realisations 0 to 9: seed = -1, expected"):
+        workers.submit(impossible, "key", Share(0, 0, 10), lambda done: None).result()
     assert workers.retries == before
 
 

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -27,10 +28,12 @@ from mauvecl.host.expectation import Expectation
 from mauvecl.noise.comparison import Comparison
 from mauvecl.noise.processes import Processes, Uniform
 from mauvecl.results.detection import Detection
+from mauvecl.results.requests import DetectRequest, Share, SnrRequest
+from mauvecl.results.sums import Arrays
 from mauvecl.runs import shards
 from mauvecl.runs.checkpoint import Checkpoint, _digest_of
 from mauvecl.runs.pool import LocalWorkers, Pool, Stopped, together
-from mauvecl.runs.shards import Arrays, DetectRequest, Share, SnrRequest, fingerprint
+from mauvecl.runs.shards import fingerprint
 from mauvecl.statistics.linear import Linear
 from mauvecl.study.study import Study
 
@@ -49,14 +52,16 @@ class Shuffled(LocalWorkers):
     def count(self) -> int:
         return 4
 
-    def submit(self, request: Any, key: str, share: Share, tick: Callable[[int], None]) -> Future[Arrays]:
+    def submit(
+        self, request: Any, key: str, share: Share, tick: Callable[[int], None], out: Any = None
+    ) -> Future[Arrays]:
         sent = pickle.loads(pickle.dumps(request))
         wait = self._random.uniform(0.0, 0.05)
 
         def work() -> Arrays:
             time.sleep(wait)
             with self._alone:
-                found = sent.count(self.first, share.part, share.start, share.count)
+                found = self.first.count(sent, share)
             time.sleep(wait)
             return dict(pickle.loads(pickle.dumps(found)))
 
@@ -106,14 +111,14 @@ def test_several_devices_of_different_form(scene: list[Expectation], engine: Eng
 
     workers = LocalWorkers([None, "0"], make=make)
     counted: list[Engine] = []
-    real = Engine.count_detection
+    real = Engine.count
 
-    def noted(self: Engine, *given: Any, **more: Any) -> None:
+    def noted(self: Engine, *given: Any, **more: Any) -> Arrays:
         counted.append(self)
-        real(self, *given, **more)
+        return real(self, *given, **more)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Engine, "count_detection", noted)
+        patch.setattr(Engine, "count", noted)
         found = Pool(workers).detect(quiet, flares, realisations=N, seed=2)
     workers.close()
     assert len(set(map(id, counted))) == 2, "both worked"
@@ -127,13 +132,13 @@ class Failing:
         self._engine, self._fails, self._calls = engine, fails, calls
         self.cl, self.device, self.device_name = engine.cl, engine.device, engine.device_name
 
-    def count_detection(self, *given: Any) -> None:
+    def count(self, request: Any, share: Share, **more: Any) -> Arrays:
         self._calls.append(len(self._calls))
         if self._calls[-1] in self._fails:
             # Half of the share is counted already when it fails.
-            self._engine.count_detection(given[0], given[1], given[2], given[3] // 2, *given[4:])
+            self._engine.count(request, replace(share, count=share.count // 2))
             raise self.cl.RuntimeError("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES", -5, "")
-        self._engine.count_detection(*given)
+        return self._engine.count(request, share, **more)
 
 
 def test_a_failed_launch_is_counted_again(engine: Engine, scene: list[Expectation]) -> None:
@@ -183,8 +188,6 @@ def test_every_study_gives_the_same_table(
 
 def test_fingerprints_tell_requests_apart(scene: list[Expectation]) -> None:
     """Everything that changes an answer changes the name of its shares, and nothing else does."""
-    from dataclasses import replace
-
     quiet, *flares = scene
     base = DetectRequest(quiet, tuple(flares), N, 5, ("chi2", "matched"))
     brighter = replace(flares[1], source_electrons=np.nextafter(flares[1].source_electrons, np.inf))
