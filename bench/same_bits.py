@@ -23,7 +23,7 @@ from astropy.table import Table
 CHILD = """
 import json, sys
 from dataclasses import asdict
-from mauvecl import selftest
+from mauvecl.device import selftest
 from mauvecl.device.engine import Engine, devices
 for number, record in enumerate(devices()):
     found = {}

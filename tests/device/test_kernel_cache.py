@@ -21,7 +21,7 @@ from mauvecl.device.kernel_cache import KernelCache
 #: Two kernels on the toy scene; tells whether they came from the store.
 RUN = """
 import hashlib, sys
-from mauvecl import kernel_cache, selftest
+from mauvecl.device import kernel_cache, selftest
 def digest(engine):
     x = selftest.toy(frames=1)
     raw, seen = engine.realise(x, count=64, seed=1), engine.snr(x, realisations=64, seed=1)
@@ -181,7 +181,7 @@ def test_what_a_killed_process_leaves_is_swept_up(filled: tuple[Path, str], tmp_
 
 
 HOLDS = "from mauvecl.device.kernel_cache import kernel_cache; print(kernel_cache().work, flush=True); input()"
-SWEEPS = "import sys, pathlib; from mauvecl import kernel_cache; kernel_cache._sweep(pathlib.Path(sys.argv[1]))"
+SWEEPS = "import sys, pathlib; from mauvecl.device import kernel_cache; kernel_cache._sweep(pathlib.Path(sys.argv[1]))"
 #: Commands that run another as on a machine of its own: with its own processes, and its own name.
 ELSEWHERE = {
     "another container": ["unshare", "--pid", "--fork", "--mount-proc"],
