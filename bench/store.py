@@ -29,7 +29,7 @@ from mauvecl.study.study import Study
 
 CHILD = """
 import resource, sys
-from mauvecl import bulk
+from mauvecl.store import bulk
 from mauvecl.device.engine import Engine
 sys.path.insert(0, sys.argv[1])
 from store import study

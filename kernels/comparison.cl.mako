@@ -209,14 +209,14 @@ void statistics(SCENE, const uint first_low, const uint first_high,
 % endif
     }
 
-    /* One row per channel: three fixed ones a scenario, then the linear ones, then the smoothed ones. */
+    /* One row per channel: the fixed ones of each scenario, then the linear ones, then the smoothed ones. */
     __global float *out = values + item * ${width}u;
     for (uint k = 0; k < scenario_count; k++) {
-        STORE(SUM(chi2[k]) + constants[k], out + (3u * k) * stride);
-        STORE(chi2_element[k], out + (3u * k + 1u) * stride);
-        STORE(chi2_pair[k], out + (3u * k + 2u) * stride);
+        STORE(SUM(chi2[k]) + constants[k], out + ${fixed}u * k * stride);
+        STORE(chi2_element[k], out + (${fixed}u * k + 1u) * stride);
+        STORE(chi2_pair[k], out + (${fixed}u * k + 2u) * stride);
     }
-    out += 3u * scenario_count * stride;
+    out += ${fixed}u * scenario_count * stride;
     for (uint l = 0; l < linear_count; l++) {
 % if estimated:
         STORE(SUM(linear[l]) / root(SUM(linear_variance[l])), out + l * stride);

@@ -189,15 +189,15 @@ void statistics(SCENE, const uint first_low, const uint first_high,
         }
     }
 
-    /* One row per channel: three fixed ones a scenario, then the linear ones. */
+    /* One row per channel: the fixed ones of each scenario, then the linear ones. */
     for (uint v = 0; v < ${vectors}u; v++) {
         __global float *out = values + (item * ${vectors}u + v) * ${width}u;
         for (uint k = 0; k < scenario_count; k++) {
-            STORE(SUM(chi2[k][v]) + constants[k], out + (3u * k) * stride);
-            STORE(chi2_element[k][v], out + (3u * k + 1u) * stride);
-            STORE((floatv)0.0f, out + (3u * k + 2u) * stride);
+            STORE(SUM(chi2[k][v]) + constants[k], out + ${fixed}u * k * stride);
+            STORE(chi2_element[k][v], out + (${fixed}u * k + 1u) * stride);
+            STORE((floatv)0.0f, out + (${fixed}u * k + 2u) * stride);
         }
         for (uint l = 0; l < linear_count; l++)
-            STORE(SUM(linear[l][v]) + constants[scenario_count + l], out + (3u * scenario_count + l) * stride);
+            STORE(SUM(linear[l][v]) + constants[scenario_count + l], out + (${fixed}u * scenario_count + l) * stride);
     }
 }

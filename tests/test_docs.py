@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 import re
 import shlex
@@ -79,6 +80,20 @@ def test_what_the_documentation_names_is_there() -> None:
     ]
     assert not undefined
     assert len([name for *_, name in named if name]) > 40
+
+
+def test_what_pages_and_scripts_import_is_there() -> None:
+    """Every import of mauvecl on a page, in a bench, a tool, or a program that a test starts."""
+    files = [*all_pages(), *(path for folder in ("bench", "tools", "tests") for path in (ROOT / folder).rglob("*.py"))]
+    seen = 0
+    for path in files:
+        text = path.read_text(encoding="utf-8")
+        for home, names in re.findall(r"^from (mauvecl[\w.]*) import (\w+(?:, \w+)*)", text, re.MULTILINE):
+            module = importlib.import_module(home)
+            for name in names.split(", "):
+                assert hasattr(module, name) or importlib.util.find_spec(f"{home}.{name}"), (path.name, home, name)
+                seen += 1
+    assert seen > 300
 
 
 def test_studies_and_instruments_shown_are_valid() -> None:

@@ -9,7 +9,7 @@ import pytest
 from astropy.table import Table
 
 ROOT = Path(__file__).parent.parent
-LIBRARY = ROOT / "host" / "library"
+LIBRARY = ROOT / "host" / "stars" / "library"
 #: What their licences ask to be kept with every copy.
 NOTICES = {
     "pyphot": ("Copyright (c) 2016 Morgan Fouesneau", "The above copyright notice and this permission notice shall be"),
@@ -38,5 +38,5 @@ def test_wheels_and_sdists_take_them_along() -> None:
     texts = set((LIBRARY / "licenses").iterdir())
     assert len(texts) == len(NOTICES)
     assert texts <= {p for glob in project["project"]["license-files"] for p in ROOT.glob(glob)}
-    patterns = project["tool"]["setuptools"]["package-data"]["mauvecl.host"]
-    assert texts <= {p for glob in patterns for p in (ROOT / "host").glob(glob)}
+    patterns = project["tool"]["setuptools"]["package-data"]["mauvecl.host.stars"]
+    assert texts <= {p for glob in patterns for p in LIBRARY.parent.glob(glob)}

@@ -88,7 +88,11 @@ class KernelCache:
 
     @contextlib.contextmanager
     def building(self, key: str) -> Iterator[None]:
-        """Learn which of PoCL's folders belongs to the program built inside the block."""
+        """Learn which of PoCL's folders belongs to the program built inside the block.
+
+        Those built before go into the store then, not only at the end, so that processes that run beside this one need
+        not build them: PoCL finishes a kernel at its first launch, beside its folder, and moves it there when whole.
+        """
         with contextlib.suppress(OSError):
             os.utime(self._lock)
         before = set(self._programs())
@@ -96,6 +100,7 @@ class KernelCache:
         new = [folder for folder in self._programs() if folder not in before]
         if len(new) == 1:
             self._folders[key] = new[0]
+        self._keep()
 
     def _programs(self) -> Iterator[str]:
         for path in self.work.glob("*/*/program.bc"):
@@ -127,16 +132,21 @@ class KernelCache:
             new.replace(path)
 
     def publish(self) -> None:
-        """Put what was built since into the store; whatever prevents it is no fault of the run."""
+        """Put what was built since into the store, and keep that to its size."""
+        self._keep()
         with contextlib.suppress(OSError):
-            for key, folder in self._folders.items():
+            self._prune()
+
+    def _keep(self) -> None:
+        """Put what was built since into the store; whatever prevents it is no fault of the run."""
+        for key, folder in self._folders.items():
+            with contextlib.suppress(OSError):
                 files = [
                     path for path in (self.work / folder).rglob("*") if path.suffix in (".bc", ".so") and path.is_file()
                 ]
                 if len(files) != self._published.get(key):
                     self._put(key, folder, files)
                     self._published[key] = len(files)
-            self._prune()
 
     def _put(self, key: str, folder: str, files: list[Path]) -> None:
         self.store.mkdir(parents=True, exist_ok=True)

@@ -230,6 +230,7 @@ def render(rooms: tuple[str, ...], variant: Variant) -> str:
         "two_ln2": f"{layout.TWO_LN2}f",
         "magic": f"{layout.MAGIC}f",
         "reference": layout.REFERENCE,
+        "fixed": len(layout.FIXED_STATISTICS),
         "linear": variant.linears > 0,
         "modulated": bool(variant.modulations),
         "jitter": next((i for i, (name, _) in enumerate(variant.modulations) if name == "jitter"), None),

@@ -21,7 +21,7 @@ from mauvecl.device.kernel_cache import KernelCache
 #: Two kernels on the toy scene; tells whether they came from the store.
 RUN = """
 import hashlib, sys
-from mauvecl import kernel_cache, selftest
+from mauvecl.device import kernel_cache, selftest
 def digest(engine):
     x = selftest.toy(frames=1)
     raw, seen = engine.realise(x, count=64, seed=1), engine.snr(x, realisations=64, seed=1)
@@ -90,17 +90,30 @@ DAMAGE = {
 }
 
 
-@pytest.mark.parametrize(
-    ("kind", "ending"),
-    [
-        *((kind, ".so") for kind in DAMAGE),
-        ("a flipped bit", ".bc"),
-        ("emptied", ".bc"),
-        ("a flipped bit", ".json"),
-        ("garbage", ".json"),
-        ("a flipped bit", ".txt"),
-    ],
-)
+def store_of(cache: Path) -> Path:
+    (store,) = cache.glob("*/store")
+    return store
+
+
+@pytest.mark.parametrize("ending", [".so", ".bc", ".json"])
+@pytest.mark.parametrize("kind", DAMAGE)
+def test_a_damaged_program_is_never_restored(
+    filled: tuple[Path, str], tmp_path: Path, kind: str, ending: str
+) -> None:
+    """Whatever happened to whichever file: nothing reaches the folder that PoCL reads."""
+    shutil.copytree(store_of(filled[0]), tmp_path / "store")
+    cache = KernelCache(tmp_path, tmp_path / "work")
+    programs = [path for path in cache.store.iterdir() if path.is_dir()]
+    assert len(programs) >= 2
+    for program in programs:
+        damaged = [path for path in files_of(program) if path.suffix == ending]
+        assert damaged
+        DAMAGE[kind](damaged[-1])
+        assert not cache.restore(program.name)
+        assert files_of(cache.work) == []
+
+
+@pytest.mark.parametrize(("kind", "ending"), [("a flipped bit", ".so"), ("garbage", ".json"), ("a flipped bit", ".txt")])
 def test_a_damaged_store_is_built_again(filled: tuple[Path, str], tmp_path: Path, kind: str, ending: str) -> None:
     source, digest = filled
     cache = tmp_path / "cache"
@@ -117,6 +130,21 @@ def test_a_damaged_store_is_built_again(filled: tuple[Path, str], tmp_path: Path
     healed = run(cache)
     restored, _, wanted = healed["restored"].partition(" of ")
     assert (healed["digest"], restored) == (digest, wanted)
+
+
+def test_processes_beside_each_other_share_what_they_build(tmp_path: Path) -> None:
+    """A program is in the store from the next build on, not only when the process ends."""
+    one = KernelCache(tmp_path, tmp_path / "work-1")
+    for number in range(2):
+        with one.building(f"key{number}"):
+            (one.work / "AA" / f"program{number}").mkdir(parents=True)
+            (one.work / "AA" / f"program{number}" / "program.bc").write_bytes(bytes(100))
+        if number == 0:
+            # Finished by its first launch.
+            (one.work / "AA" / "program0" / "kernel.so").write_bytes(bytes(100))
+    other = KernelCache(tmp_path, tmp_path / "work-2")
+    assert other.restore("key0")
+    assert [path.name for path in files_of(other.work)] == ["kernel.so", "program.bc"]
 
 
 MANIFESTS = ("", "[]", "3", '{"files": {}}', '{"files": 1}', '{"folder": "x"}', '{"folder": 3, "files": {"a": "b"}}')
@@ -181,7 +209,7 @@ def test_what_a_killed_process_leaves_is_swept_up(filled: tuple[Path, str], tmp_
 
 
 HOLDS = "from mauvecl.device.kernel_cache import kernel_cache; print(kernel_cache().work, flush=True); input()"
-SWEEPS = "import sys, pathlib; from mauvecl import kernel_cache; kernel_cache._sweep(pathlib.Path(sys.argv[1]))"
+SWEEPS = "import sys, pathlib; from mauvecl.device import kernel_cache; kernel_cache._sweep(pathlib.Path(sys.argv[1]))"
 #: Commands that run another as on a machine of its own: with its own processes, and its own name.
 ELSEWHERE = {
     "another container": ["unshare", "--pid", "--fork", "--mount-proc"],

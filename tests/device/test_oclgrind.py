@@ -17,9 +17,10 @@ pytestmark = pytest.mark.skipif(ICD is None, reason="Oclgrind is not installed (
 KERNELS = """
 import sys
 import numpy as np
-from mauvecl import layout, selftest
+from mauvecl.device import selftest
 from mauvecl.device.engine import Engine
 from mauvecl.device.probes import Probes
+from mauvecl.noise import layout
 
 engine = Engine("Oclgrind", width=int(sys.argv[1]))
 for name in selftest.CASES:

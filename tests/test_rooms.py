@@ -1,0 +1,51 @@
+"""The rule of the rooms is held: imports that it forbids are found, wherever and however they are written."""
+
+from __future__ import annotations
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parent.parent
+#: Who must not import whom: up, up for types alone, up inside the host, and OpenCL outside the device's room.
+FORBIDDEN = {
+    "noise/layout.py": ("import mauvecl.study.study", "mauvecl.noise.layout -> mauvecl.study.study"),
+    "results/roc.py": (
+        "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from mauvecl.cli.app import main",
+        "mauvecl.results.roc -> mauvecl.cli.app",
+    ),
+    "host/files/bounded.py": (
+        "from mauvecl.host.stars.source import Source",
+        "mauvecl.host.files.bounded -> mauvecl.host.stars.source",
+    ),
+    "study/study.py": ("def late():\n    import pyopencl", "mauvecl.study.study -> pyopencl"),
+}
+
+
+def test_forbidden_imports_are_found(tmp_path: Path) -> None:
+    """In a copy of the package with one more import in each of four files."""
+    pytest.importorskip("importlinter")
+    sources = [path for path in (ROOT / "mauvecl").glob("*") if path.name != "__pycache__"]
+    (tmp_path / "mauvecl").mkdir()
+    for path in sources:
+        if path.is_dir():
+            shutil.copytree(path, tmp_path / "mauvecl" / path.name, ignore=only_python)
+        elif path.suffix == ".py":
+            shutil.copy(path, tmp_path / "mauvecl")
+    shutil.copy(ROOT / "pyproject.toml", tmp_path)
+    for file, (text, _) in FORBIDDEN.items():
+        with (tmp_path / "mauvecl" / file).open("a") as opened:
+            opened.write(f"\n\n{text}\n")
+    code = "from importlinter.cli import lint_imports; import sys; sys.exit(lint_imports(no_cache=True))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 1, done.stdout + done.stderr
+    told = " ".join(done.stdout.split())
+    for _, arrow in FORBIDDEN.values():
+        assert arrow in told
+
+
+def only_python(folder: str, names: list[str]) -> list[str]:
+    return [name for name in names if not (name.endswith(".py") or (Path(folder) / name).is_dir())]
