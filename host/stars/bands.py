@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files.bounded import shortened
+from ..remembered import remembered
 from .catalogue import band_table, find, spectrum_table
 
 #: Band names and what else they answer to.
@@ -152,6 +153,7 @@ def _check_system(system: str) -> None:
         raise InputError(f"magnitude system {shortened(str(system))} is unknown, expected one of {', '.join(SYSTEMS)}")
 
 
+@remembered(256)
 def magnitude(
     wavelength_nm: NDArray[np.float64],
     flux_flam: NDArray[np.float64],
@@ -195,6 +197,7 @@ def magnitude(
     return float(value.value) + (chosen.vega if system == "catalogue" and not ab else 0.0)
 
 
+@remembered(256)
 def photons(wavelength_nm: NDArray[np.float64], flux_flam: NDArray[np.float64], name: str) -> float:
     """Photons s-1 cm-2 in a band, weighted with its throughput; errors as `magnitude`."""
     level = _level(flux_flam)

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..remembered import remembered
 from .bands import photons
 
 Geometry = Literal["added", "replaces"]
@@ -16,6 +17,7 @@ Geometry = Literal["added", "replaces"]
 TEMPERATURE_RANGE = (1_000.0, 200_000.0)
 
 
+@remembered(32)
 def blackbody(wavelength_nm: NDArray[np.float64], temperature_k: float) -> NDArray[np.float64]:
     """Surface flux pi B_lambda of a blackbody, erg s-1 cm-2 A-1, shape (n,).
 

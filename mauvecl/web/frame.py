@@ -59,6 +59,8 @@ def layout(page: Page) -> Any:
         theme_toggle=False,
         main_layout=None,
         design=Fast,
+        # One for all visitors: each change of any of them would be told to everybody.
+        busy_indicator=None,
     )
     template.font, template.font_url = "system-ui", ""
     return template

@@ -15,7 +15,7 @@ from mauvecl.pictures.style import COLOURS, NULL
 
 if TYPE_CHECKING:
     from astropy.table import QTable
-    from numpy.typing import NDArray
+    from numpy.typing import ArrayLike, NDArray
 
     from mauvecl.answers.detect import StarDetection
     from mauvecl.host.expectation import Expectation
@@ -71,9 +71,14 @@ class Lines:
 
     def show(self, **lines: tuple[NDArray[np.float64], NDArray[np.float64]]) -> None:
         """Replace lines, by name with underscores for spaces; those not named become empty."""
-        for name, source in self._sources.items():
-            x, y = lines.get(name.replace(" ", "_"), ((), ()))
-            source.data = {"x": np.asarray(x, float), "y": np.asarray(y, float)}
+        for name in self._sources:
+            self.put(name, *lines.get(name.replace(" ", "_"), ((), ())))
+
+    def put(self, name: str, x: ArrayLike, y: ArrayLike) -> None:
+        """Replace one line; browsers are sent what has changed of it, nothing if nothing has."""
+        source, found = self._sources[name], {"x": np.asarray(x, float), "y": np.asarray(y, float)}
+        if not all(np.array_equal(source.data[key], value, equal_nan=True) for key, value in found.items()):
+            source.data = found
 
 
 class Observation:
@@ -83,23 +88,22 @@ class Observation:
         names = ("raw spectrum with flare", "star", "star with flare", "sky", "dark", "bias")
         self.lines = Lines("One observation", "wavelength (nm)", "DN in the exposure", names)
         self.plot = self.lines.plot
-        self._parts: dict[str, Any] = {}
 
     def show(self, quiet: Expectation, flare: Expectation) -> None:
         """The mean components; the raw spectrum follows when it is drawn."""
         w, gain = quiet.wavelength_nm, quiet.n_frames * quiet.gain_dn_per_electron
-        self._parts = {
+        parts = {
             "star": (w, gain * quiet.source_electrons),
             "star_with_flare": (w, gain * flare.source_electrons),
             "sky": (w, gain * quiet.sky_electrons),
             "dark": (w, quiet.n_frames * quiet.dark_dn),
             "bias": (w, quiet.n_frames * quiet.bias_dn),
         }
-        self.lines.show(**self._parts)
+        self.lines.show(**parts)
 
     def add(self, quiet: Expectation, raw: NDArray[Any]) -> None:
         """A drawn raw spectrum."""
-        self.lines.show(raw_spectrum_with_flare=(quiet.wavelength_nm, raw), **self._parts)
+        self.lines.put("raw spectrum with flare", quiet.wavelength_nm, raw)
 
 
 class InputSpectrum:
