@@ -107,7 +107,14 @@ class Question:
         scene = prepare([quiet, flare], comparison=self.study.run.comparison())
         if not scene.used.any():
             return 0.0
-        found = Detection(quiet, (flare,), (self.statistic,), scene, self.study.run.realisations)
+        found = Detection(
+            quiet,
+            (flare,),
+            (self.statistic,),
+            scene,
+            self.study.run.realisations,
+            nuisances=self.study.nuisances.marginalised(quiet),
+        )
         limit = found.closed_form(self.statistic).isf(self.fap)
         return found.closed_form(self.statistic, 0).sf(limit)
 
@@ -116,7 +123,7 @@ class Question:
         assert self.engine is not None
         quiet, flare = self.pair(value)
         found = self.engine.detect(
-            quiet, [flare], seed=seed, **self.study.detecting | {"statistics": (self.statistic,)}
+            quiet, [flare], seed=seed, **self.study.detecting(quiet) | {"statistics": (self.statistic,)}
         )
         for message in found.messages:
             raise InputError(f"at a {self.of} of {value:g}: {message} Expected a limit where some pixel tells")

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mauvecl.cli.console import short
-from mauvecl.cli.flags import DETECTION, DRAWS, FLARE, LIMIT, MAP, SWEEP, UNKNOWN, takes_study
+from mauvecl.cli.flags import DETECTION, DRAWS, FLARE, LIMIT, MAP, NUISANCES, SWEEP, UNKNOWN, takes_study
 
 if TYPE_CHECKING:
     from mauvecl.answers.limits import Limit
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
 
-@takes_study(LIMIT, FLARE, DRAWS, DETECTION, UNKNOWN, SWEEP)
+@takes_study(LIMIT, FLARE, DRAWS, DETECTION, NUISANCES, UNKNOWN, SWEEP)
 def limit(
     study: Study,
     session: Session,
@@ -109,7 +109,7 @@ def drawn(found: Any, path: Path) -> Path:
     return path
 
 
-@takes_study(MAP, FLARE, DRAWS, DETECTION, UNKNOWN, name="map", fewer=True)
+@takes_study(MAP, FLARE, DRAWS, DETECTION, NUISANCES, UNKNOWN, name="map", fewer=True)
 def detection_map(
     study: Study,
     session: Session,
