@@ -117,7 +117,7 @@ def _span(vectors: Float, ratio: Float) -> tuple[Float, Float]:
     -------
     basis : ndarray, shape (n, m)
     rest : ndarray, shape (n - m,)
-        What a square along each direction beside them is multiplied with: the mean of its group, so that the sum is kept.
+        What multiplies a square along each direction beside them: its group's mean, so that the sum is kept.
 
     Notes
     -----

@@ -24,7 +24,7 @@ FREE = float("inf")
 
 @cache
 def pair(star: str = "G2V", magnitude: float = 7.4, amplitude: float = 0.02) -> tuple[Expectation, Expectation]:
-    source = Source.from_library(star).at_magnitude(magnitude)
+    source = Source.from_library(star).at_magnitude(magnitude, "V", "vega")
     mauve, sky = Instrument.load("mauve"), Sky.of_brightness(22.1)
     return expect(source, mauve, exposure=50.0, sky=sky), expect(
         source.flaring(amplitude), mauve, exposure=50.0, sky=sky
