@@ -1,4 +1,4 @@
-"""Values that were computed already, remembered by what they were computed from: changes of one thing compute no other."""
+"""Values computed already, remembered by what they were computed from."""
 
 from __future__ import annotations
 
@@ -9,7 +9,8 @@ from typing import Any, ParamSpec, TypeVar
 
 import numpy as np
 
-P, R = ParamSpec("P"), TypeVar("R")
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 class _Given:

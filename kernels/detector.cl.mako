@@ -25,8 +25,9 @@ typedef struct {
 % endif
 } Draws;
 
-/* Factors on light and dark of one draw, less one. */
-typedef struct { floatv light, dark; } Factors;
+<% skies = any(factor == "sky" for _, factor in modulations) %>\
+/* Factors on light, dark and sky of one draw, less one. */
+typedef struct { floatv light, dark${", sky" if skies else ""}; } Factors;
 
 /* Words first, then normals: each is a long chain of dependent operations, and only short bodies without
    ties between their turns keep the pipelines filled. */
@@ -75,7 +76,7 @@ INLINE void draw(SCENE_GIVEN, const Address *at, uint exposure, uint start, Draw
 /* Factors of the realisation, less one, the same in all its frames and pixels. */
 INLINE Factors factors_of(SCENE_GIVEN, uintv realisation, uint realisation_high)
 {
-    Factors f = {(floatv)0.0f, (floatv)0.0f};
+    Factors f = {(floatv)0.0f, (floatv)0.0f${", (floatv)0.0f" if skies else ""}};
 % if modulated:
     const Address at = address(realisation, realisation_high, 0u, job->seed_low, job->seed_high);
     Words w;
@@ -118,7 +119,13 @@ INLINE floatv analogue(SCENE_GIVEN, const Draws *drawn, uint i, __global const L
     floatv z = drawn->z[i];
 % if modulated:
     __global const Response *r = responses + at;
-    floatv light = factors->light + 1.0f, dark = factors->dark + 1.0f;
+% if skies:
+    /* The sky's light follows the factors on all light, too. */
+    const floatv changed = factors->sky * (floatv)r->sky_share, more = TOGETHER(factors->light, changed);
+% else:
+    const floatv more = factors->light;
+% endif
+    floatv light = more + 1.0f, dark = factors->dark + 1.0f;
     floatv variance = FMA(light, (floatv)r->light_variance, FMA(dark, (floatv)r->dark_variance, (floatv)r->other_variance));
     floatv third = FMA(light, (floatv)r->light_third, dark * r->dark_third);
     floatv fourth = FMA(light, (floatv)r->light_fourth, dark * r->dark_fourth);
@@ -134,7 +141,7 @@ INLINE floatv analogue(SCENE_GIVEN, const Draws *drawn, uint i, __global const L
     even = even + share * share * third * FMA(zz, FMA(zz, (floatv)0.037037037f, (floatv)-0.16358025f), (floatv)0.052469134f);
     v += even / (variance * variance);
 % endif
-    v += FMA(factors->light, (floatv)r->light, factors->dark * r->dark);
+    v += FMA(more, (floatv)r->light, factors->dark * r->dark);
 % elif joint:
 % if quartic:
     floatv v = FMA(z, (floatv)level->c4, (floatv)level->c3);

@@ -191,7 +191,7 @@ def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
 
     def answered(one: tuple[Mapping[str, float | str], Study, Star, list[Expectation]]) -> StarDetection:
         at, cell, star, (quiet, *flares) = one
-        how = cell.detecting
+        how = cell.detecting(quiet)
         own = [read_weights(name, path, quiet.wavelength_nm) for name, path in run.weights.items()]
         how["statistics"] = (*run.statistics, *own, *_other_templates(cell, star, quiet))
         found = engine.detect(quiet, flares, seed=run.seed, **how)
@@ -249,19 +249,14 @@ def _template_costs(study: Study, star: StarDetection) -> list[str]:
     """What looking for the wrong temperature costs, for Gaussian noise."""
     found, lines = star.found, []
     for temperature in study.run.template_temperatures_k:
-        right = float(np.sqrt(_strength(found, 0)))
-        kept = found.closed_form(f"matched {temperature:g} K", 0).mean / right if right else 0.0
+        right = Matched().closed_form(found.setting, found.flares[0], found.flares[0]).mean
+        name = f"matched {temperature:g} K"
+        kept = found.closed_form(name, 0).mean / found.closed_form(name).std / right if right else 0.0
         lines.append(
             f"{star.label}: looking for a flare of {temperature:g} K in one of {study.flare.temperature_k:g} K keeps "
             f"{100 * kept:.1f} % of the matched statistic's S/N."
         )
     return lines
-
-
-def _strength(found: Detection, flare: int) -> float:
-    """The largest S/N that any linear statistic can have, squared."""
-    delta = np.where(found.scene.used, found.flares[flare].signal_dn - found.quiet.signal_dn, 0.0)
-    return float(np.sum(delta**2 / found.quiet.variance_dn2)) / (1.0 + found.scene.comparison.share)
 
 
 def _campaign(study: Study, quiet: Expectation) -> list[str]:

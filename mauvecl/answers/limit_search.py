@@ -107,7 +107,8 @@ class Question:
         scene = prepare([quiet, flare], comparison=self.study.run.comparison())
         if not scene.used.any():
             return 0.0
-        theory = Hypotheses(quiet, (flare,), (self.statistic,), scene)
+        unknown = self.study.nuisances.marginalised(quiet)
+        theory = Hypotheses(quiet, (flare,), (self.statistic,), scene, nuisances=unknown)
         limit = theory.closed_form(self.statistic).isf(self.fap)
         return theory.closed_form(self.statistic, 0).sf(limit)
 
@@ -116,7 +117,7 @@ class Question:
         assert self.engine is not None
         quiet, flare = self.pair(value)
         found = self.engine.detect(
-            quiet, [flare], seed=seed, **self.study.detecting | {"statistics": (self.statistic,)}
+            quiet, [flare], seed=seed, **self.study.detecting(quiet) | {"statistics": (self.statistic,)}
         )
         for message in found.messages:
             raise InputError(f"at a {self.of} of {value:g}: {message} Expected a limit where some pixel tells")

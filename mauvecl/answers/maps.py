@@ -247,7 +247,7 @@ def _fill(
     engine: Engine | Pool,
 ) -> None:
     run = study.run
-    result = engine.detect(quiet, flares, seed=run.seed, **study.detecting)
+    result = engine.detect(quiet, flares, seed=run.seed, **study.detecting(quiet))
     for s, statistic in enumerate(run.statistics):
         probabilities = result.detection_probability(run.fap, statistic)
         for k, ((i, j), p) in enumerate(zip(cells, probabilities, strict=True)):

@@ -96,6 +96,23 @@ VariancesFlag = Annotated[
     str | None,
     typer.Option(help="model, or estimated from the counts as an observer must [model].", show_default=False),
 ]
+NuisanceFlag = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--nuisance",
+        help="Marginalise over dark, light, sky, tilt or a file's spectrum, with a standard deviation or free, as in "
+        "dark=0.1 or stray.txt=free; may be repeated.",
+        show_default=False,
+    ),
+]
+WithUnknownsFlag = Annotated[
+    bool | None,
+    typer.Option(
+        "--with-unknowns",
+        help="Draw the documented unknowns (detector temperature, throughput, sky) and marginalise over them.",
+        show_default=False,
+    ),
+]
 TemplateFlag = Annotated[
     list[float] | None,
     typer.Option(
@@ -254,6 +271,7 @@ DETECTION = {
     "reference": Option(ReferenceFlag, "run", "reference"),
     "variances": Option(VariancesFlag, "run", "variances"),
 }
+NUISANCES = {"nuisance": Option(NuisanceFlag), "with_unknowns": Option(WithUnknownsFlag, "nuisances", "usual")}
 TEMPLATE = {"template": Option(TemplateFlag, "run", "template_temperatures_k")}
 SIGNAL = {
     "snr": Option(SnrFlag, "signal", "snr"),
@@ -398,6 +416,8 @@ def _study(
                         f"{option.section}.{option.key}"
                     )
                 changes.setdefault(option.section, {})[option.key] = option.convert(value) if option.convert else value
+    if given.get("nuisance"):
+        changes.setdefault("nuisances", {}).update(_nuisances(study, given["nuisance"]))
     changed = study.with_changes(changes, _stars(study, given))
     return changed.with_settings(given["settings"]) if given["settings"] else changed
 
@@ -415,6 +435,28 @@ def _sky(given: dict[str, Any]) -> dict[str, Any]:
         except ValueError as error:
             raise InputError(f"--sky {text!r}, expected V mag/arcsec^2 or none") from error
     return found
+
+
+def _nuisances(study: Study, texts: list[str]) -> dict[str, Any]:
+    """What is unknown, as words: dark=0.1, or a file's name, as in stray.txt=free."""
+    from mauvecl.host.errors import InputError
+    from mauvecl.host.files.bounded import shortened
+    from mauvecl.statistics.nuisances import NUISANCES
+
+    found: dict[str, Any] = {}
+    own = {name: one.model_dump() for name, one in study.nuisances.own.items()}
+    for text in texts:
+        name, _, sd = (part.strip() for part in text.rpartition("="))
+        if not (name and sd):
+            raise InputError(
+                f"--nuisance {shortened(text)}, expected NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, "
+                "and a standard deviation or free"
+            )
+        if name in NUISANCES:
+            found[name] = sd
+        else:
+            own[Path(name).stem] = {"file": Path(name), "sd": sd}
+    return found | ({"own": own} if own else {})
 
 
 def _stars(study: Study, given: dict[str, Any]) -> list[dict[str, Any]] | None:

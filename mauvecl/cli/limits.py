@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mauvecl.cli.console import short
-from mauvecl.cli.flags import DETECTION, DRAWS, FLARE, LIMIT, MAP, SWEEP, UNKNOWN, takes_study
+from mauvecl.cli.flags import DETECTION, DRAWS, FLARE, LIMIT, MAP, NUISANCES, SWEEP, UNKNOWN, takes_study
 
 if TYPE_CHECKING:
     from mauvecl.answers.limits import Limit, LimitResult
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
 
-@takes_study(LIMIT, FLARE, DRAWS, DETECTION, UNKNOWN, SWEEP)
+@takes_study(LIMIT, FLARE, DRAWS, DETECTION, NUISANCES, UNKNOWN, SWEEP)
 def limit(
     study: Study,
     session: Session,
@@ -91,7 +91,7 @@ def _unknown(one: Limit, digits: str) -> tuple[str, str]:
     return f"{low:{digits}} to {high:{digits}}", ", ".join(f"{name} {100 * share:.0f} %" for name, share in first)
 
 
-@takes_study(MAP, FLARE, DRAWS, DETECTION, UNKNOWN, name="map", fewer=True)
+@takes_study(MAP, FLARE, DRAWS, DETECTION, NUISANCES, UNKNOWN, name="map", fewer=True)
 def detection_map(
     study: Study,
     session: Session,

@@ -65,7 +65,7 @@ def components(
     raw = np.zeros(n)
     for frame in range(scene.n_draws):
         factors = reference.factors(scene, index, frame, seed)
-        light, warm = ((1.0 + float(f[0])) * middle for f, middle in zip(factors, scene.medians, strict=True))
+        light, warm, glow = ((1.0 + float(f[0])) * middle for f, middle in zip(factors, scene.medians, strict=True))
         dark_dn, photon_dn, cosmic, analogue, dn = np.zeros((5, len(scene.pixels)))
         u_dark, z_split = np.zeros((2, len(scene.pixels)))
         for group in range(len(scene.pixels) // 4):
@@ -88,7 +88,7 @@ def components(
                     photon_dn[p] = (
                         source["gain"] * reference.poisson_draw(drawn.photon, i, source, scene.tables, pairs)[0]
                     )
-        source, sky = (each * light * gain * e for e in (x.source_electrons, x.sky_electrons))
+        source, sky = each * light * gain * x.source_electrons, each * light * glow * gain * x.sky_electrons
         photon_variance = gain * (source + sky)
         read_variance = each * x.read_noise_dn**2 + (each - 1) / 12
         mean_dark = each * warm * x.dark_dn

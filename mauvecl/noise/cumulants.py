@@ -117,7 +117,7 @@ class Cumulants:
             found.append(of_light + of_dark)
         return found
 
-    def scaled(self, light: float, dark: float) -> Cumulants:
+    def scaled(self, light: float | Float, dark: float) -> Cumulants:
         """The same draw with so many times the light and the dark."""
         gaussian_light = np.where(self.photon_step > 0, 0.0, self.light_variance)
         return Cumulants(

@@ -24,6 +24,7 @@ STREAMS = {
     "qe_scale": 8,
     "split": 9,
     "split_dark": 10,
+    "sky_level": 11,
 }
 #: Added to the stream for the draws of a reference exposure.
 REFERENCE = 64
@@ -98,7 +99,8 @@ POISSON = np.dtype(
     ]
 )
 
-#: How a joint draw follows factors on light and dark: their means, variances, third to fifth cumulants, DN.
+#: How a joint draw follows factors on light and dark: their means, variances, third to fifth cumulants, DN; and the
+#: share of the light that is the sky's.
 RESPONSE = np.dtype(
     [
         ("light", "f4"),
@@ -112,6 +114,7 @@ RESPONSE = np.dtype(
         ("dark_fourth", "f4"),
         ("light_fifth", "f4"),
         ("dark_fifth", "f4"),
+        ("sky_share", "f4"),
     ]
 )
 

@@ -20,6 +20,9 @@ from mauvecl.noise.priors import Normal, Prior, Uniform, table_of
 __all__ = ["LIMITS", "NONE", "CosmicRays", "Factors", "Normal", "Prior", "Processes", "Uniform"]
 
 Float = NDArray[np.float64]
+Modulated = Literal["light", "dark", "sky"]
+#: What a prior changes, where not the light.
+CHANGED: dict[str, Modulated] = {"detector_temperature": "dark", "sky_level": "sky"}
 
 
 @dataclass(frozen=True)
@@ -104,6 +107,8 @@ class Processes:
         In place of the instrument's value, drawn for every realisation.
     qe_scale : Prior, optional
         Factor on the quantum efficiency, drawn for every realisation.
+    sky_level : Prior, optional
+        Factor on the sky's light, drawn for every realisation.
     """
 
     cosmic_rays: CosmicRays | None = None
@@ -112,18 +117,19 @@ class Processes:
     light_loss: Prior | None = None
     pointing_loss: Prior | None = None
     qe_scale: Prior | None = None
+    sky_level: Prior | None = None
 
     @property
-    def modulations(self) -> tuple[tuple[str, Literal["light", "dark"]], ...]:
+    def modulations(self) -> tuple[tuple[str, Modulated], ...]:
         """Names of the priors given, and what each changes."""
         return tuple(
-            (name, "dark" if name == "detector_temperature" else "light")
+            (name, CHANGED.get(name, "light"))
             for name in (f.name for f in fields(self))
             if name != "cosmic_rays" and getattr(self, name) is not None
         )
 
     def factors(self, conditions: Mapping[str, float]) -> Factors:
-        """What is drawn of each prior: factors on light or dark, less one.
+        """What is drawn of each prior: factors on light, dark or sky, less one.
 
         Parameters
         ----------
@@ -143,10 +149,11 @@ class Processes:
             "light_loss": lambda lost: (conditions["light_loss"] - lost) / (1.0 - conditions["light_loss"]),
             "pointing_loss": lambda lost: (conditions["pointing_loss"] - lost) / (1.0 - conditions["pointing_loss"]),
             "qe_scale": lambda scale: scale - 1.0,
+            "sky_level": lambda level: level - 1.0,
         }
         tables = np.empty((len(self.modulations), 2 * layout.PRIOR_NODES), np.float32)
-        ends = {"light": (1.0, 1.0), "dark": (1.0, 1.0)}
-        centre = {"light": 1.0, "dark": 1.0}
+        ends = {"light": (1.0, 1.0), "dark": (1.0, 1.0), "sky": (1.0, 1.0)}
+        centre = dict.fromkeys(ends, 1.0)
         for row, (name, factor) in enumerate(self.modulations):
             prior = getattr(self, name)
             first, last = prior.quantile(np.array([0.0, 1.0]))
@@ -157,28 +164,35 @@ class Processes:
             centre[factor] *= 1.0 + middle
             least, most = sorted(1.0 + changes[name](np.array([first, last])))
             ends[factor] = ends[factor][0] * float(least), ends[factor][1] * float(most)
-        return Factors(tables, centre["light"], centre["dark"], ends["light"], ends["dark"])
+        return Factors(tables, centre["light"], centre["dark"], centre["sky"], ends["light"], ends["dark"], ends["sky"])
 
 
 @dataclass(frozen=True, eq=False)
 class Factors:
-    """What priors do to light and dark.
+    """What priors do to light, dark and sky; the sky's light follows the factors on light as well.
 
     Attributes
     ----------
     tables : ndarray of float32, shape (n_modulation, 2 * layout.PRIOR_NODES)
         See `priors.table_of`.
-    light, dark : float
+    light, dark, sky : float
         Factors of priors at their medians, which the tables are relative to.
-    light_ends, dark_ends : tuple of float, shape (2,)
+    light_ends, dark_ends, sky_ends : tuple of float, shape (2,)
         Smallest and largest factors of all priors together.
     """
 
     tables: NDArray[np.float32]
     light: float
     dark: float
+    sky: float
     light_ends: tuple[float, float]
     dark_ends: tuple[float, float]
+    sky_ends: tuple[float, float]
+
+    @staticmethod
+    def on_light(light: float, sky: float, share: Float) -> Float:
+        """The factor on all light of each pixel, shape (n_pixel,), where the sky has such a share of it."""
+        return np.asarray(light * (1.0 + (sky - 1.0) * share))
 
 
 #: Where each prior's values must lie.
@@ -188,5 +202,6 @@ LIMITS = {
     "light_loss": (0.0, 0.99),
     "pointing_loss": (0.0, 0.99),
     "qe_scale": (0.01, 100.0),
+    "sky_level": (0.01, 100.0),
 }
 NONE = Processes()

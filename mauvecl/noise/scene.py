@@ -14,7 +14,7 @@ from mauvecl.noise import layout
 from mauvecl.noise.comparison import TEMPLATE, Comparison
 from mauvecl.noise.cumulants import Cumulants, joint_is_exact, needs_fourth_power, polynomial, stack_is_exact
 from mauvecl.noise.poisson import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, table_of, table_set
-from mauvecl.noise.processes import NONE, CosmicRays, Factors, Processes
+from mauvecl.noise.processes import NONE, CosmicRays, Factors, Modulated, Processes
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -58,7 +58,7 @@ class Scene:
     clip : bool
         Whether single draws meet the ADC's rails.
     modulations : tuple of (name, factor)
-        Priors that change light or dark; see `Processes`.
+        Priors that change light, dark or sky; see `Processes`.
     job : ndarray of layout.JOB, shape ()
         Without the seed.
     pixels : ndarray of layout.PIXEL, shape (n_padded,)
@@ -68,8 +68,8 @@ class Scene:
     tables : ndarray of uint32
         Alias tables, end to end.
     priors : ndarray of float32, shape (n_modulation, 2 * PRIOR_NODES)
-    medians : tuple of float, shape (2,)
-        Factors on light and dark of priors at their medians.
+    medians : tuple of float, shape (3,)
+        Factors on light, dark and sky of priors at their medians.
     templates : ndarray of uint32, shape (n_scenario,)
         For each scenario the one whose mean and variance it is compared with.
     fraction : ndarray, shape (n_scenario, n_padded)
@@ -90,7 +90,7 @@ class Scene:
     quartic: bool
     photons: bool
     clip: bool
-    modulations: tuple[tuple[str, Literal["light", "dark"]], ...]
+    modulations: tuple[tuple[str, Modulated], ...]
     job: NDArray[np.void]
     pixels: NDArray[np.void]
     levels: NDArray[np.void]
@@ -100,7 +100,7 @@ class Scene:
     responses: NDArray[np.void]
     tables: NDArray[np.uint32]
     priors: NDArray[np.float32]
-    medians: tuple[float, float]
+    medians: tuple[float, float, float]
     templates: NDArray[np.uint32]
     fraction: Float
     estimates: NDArray[np.void]
@@ -151,7 +151,8 @@ def near_rail(x: Expectation, factors: Factors, rays: CosmicRays | None) -> NDAr
     variance, light = x.unsaturated_variance_dn2 / x.n_frames, x.light_dn / x.n_frames
     mean = x.mean_raw_dn
     ends = []
-    for more_light, more_dark in zip(factors.light_ends, factors.dark_ends, strict=True):
+    for end_light, more_dark, sky in zip(factors.light_ends, factors.dark_ends, factors.sky_ends, strict=True):
+        more_light = factors.on_light(end_light, sky, sky_share(x))
         there = mean + (more_light - 1.0) * light + (more_dark - 1.0) * x.dark_dn
         more = (more_light - 1.0) * x.gain_dn_per_electron * light + (more_dark - 1.0) * x.dark_variance_dn2
         ends.append((there, RAIL_SIGMA * np.sqrt(variance + np.maximum(more, 0.0))))
@@ -212,7 +213,7 @@ def prepare(
     n_pixel = quiet.wavelength_nm.size
     padded = -(-n_pixel // PIXEL_BLOCK) * PIXEL_BLOCK
     cumulants = [Cumulants.of(x, each) for x in scenarios]
-    varied = [[c.scaled(*corner) for corner in corners] for c in cumulants]
+    varied = [[_scaled(x, c, corner) for corner in corners] for x, c in zip(scenarios, cumulants, strict=True)]
     joint = _joint(scenarios, varied, recipe)
     shapes = [polynomial(c) for c in cumulants] if joint and not modulations else []
     quartic = joint and any(needs_fourth_power(c, varying=bool(modulations)) for row in varied for c in row)
@@ -249,7 +250,8 @@ def prepare(
     noisier = 1.0 + comparison.share
     levels["shift"] = edges["low"] = edges["high"] = layout.MAGIC
     for k, (x, c) in enumerate(zip(scenarios, cumulants, strict=True)):
-        mean = c.mean + (factors.light - 1.0) * c.light_dn + (factors.dark - 1.0) * c.dark_dn
+        light = factors.on_light(factors.light, factors.sky, sky_share(x))
+        mean = c.mean + (light - 1.0) * c.light_dn + (factors.dark - 1.0) * c.dark_dn
         if not joint:
             mean = each * x.bias_dn + quiet.dark_step_dn * dark_centre
             if photons:
@@ -259,7 +261,7 @@ def prepare(
         base[k] = np.clip(np.rint(mean), 0, x.highest_dn if each == 1 else np.inf)
         level = levels[k, :n_pixel]
         if modulations:
-            _respond(responses[k, :n_pixel], c, factors)
+            _respond(responses[k, :n_pixel], x, c, factors)
             _check_reach(x, c, factors)
         elif joint:
             for name, coefficient in zip(("c0", "c1", "c2", "c3", "c4"), shapes[k], strict=True):
@@ -316,7 +318,7 @@ def prepare(
         responses=responses,
         tables=np.concatenate([np.zeros(1, np.uint32)[:0], *(t.entries for t in tables)]).astype(np.uint32),
         priors=factors.tables,
-        medians=(factors.light, factors.dark),
+        medians=(factors.light, factors.dark, factors.sky),
         templates=compared,
         fraction=fraction,
         estimates=estimates,
@@ -326,11 +328,22 @@ def prepare(
     )
 
 
-def _corners(factors: Factors) -> list[tuple[float, float]]:
-    """Factors on light and dark over all that the priors allow, neighbours at most a factor of 2 apart."""
-    ends = (factors.light_ends, factors.dark_ends)
+def sky_share(x: Expectation) -> Float:
+    """The sky's share of the light of each pixel, shape (n_pixel,); zero where there is none."""
+    light = x.source_electrons + x.sky_electrons
+    return np.divide(x.sky_electrons, light, out=np.zeros_like(light), where=light > 0)
+
+
+def _corners(factors: Factors) -> list[tuple[float, float, float]]:
+    """Factors on light, dark and sky over all that the priors allow, neighbours at most a factor of 2 apart."""
+    ends = (factors.light_ends, factors.dark_ends, factors.sky_ends)
     grids = [np.geomspace(low, high, 1 + int(np.ceil(np.log2(high / low)))) for low, high in ends]
-    return [(float(light), float(dark)) for light in grids[0] for dark in grids[1]]
+    return [(float(light), float(dark), float(sky)) for light in grids[0] for dark in grids[1] for sky in grids[2]]
+
+
+def _scaled(x: Expectation, c: Cumulants, corner: tuple[float, float, float]) -> Cumulants:
+    light, dark, sky = corner
+    return c.scaled(light if sky == 1.0 else Factors.on_light(light, sky, sky_share(x)), dark)
 
 
 def _joint(scenarios: Sequence[Expectation], varied: Sequence[Sequence[Cumulants]], recipe: Recipe) -> bool:
@@ -391,9 +404,12 @@ def _estimate(out: NDArray[np.void], template: Expectation, fraction: Float, mea
     out["variance"][:n_pixel] = np.maximum(template.n_frames * known, NO_VARIANCE)
 
 
-def _respond(out: NDArray[np.void], c: Cumulants, factors: Factors) -> None:
-    """How a draw follows factors on light and dark, from what they are at the priors' medians."""
-    light, dark = factors.light, factors.dark
+def _respond(out: NDArray[np.void], x: Expectation, c: Cumulants, factors: Factors) -> None:
+    """How a draw follows factors on light, dark and sky, from what they are at the priors' medians."""
+    share, dark = sky_share(x), factors.dark
+    light = factors.on_light(factors.light, factors.sky, share)
+    # The sky's light follows both factors.
+    out["sky_share"] = factors.light * factors.sky * share / light
     out["light"], out["dark"] = light * c.light_dn, dark * c.dark_dn
     out["light_variance"], out["dark_variance"] = light * c.light_variance, dark * c.dark_variance
     # A pixel without any noise must not divide zero by zero.
@@ -405,11 +421,12 @@ def _respond(out: NDArray[np.void], c: Cumulants, factors: Factors) -> None:
 
 def _check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
     """Refuse what the priors could carry further than the device rounds."""
-    light, dark = (
-        max(most - middle, middle - least)
-        for (least, most), middle in ((factors.light_ends, factors.light), (factors.dark_ends, factors.dark))
-    )
-    variance = c.variance + factors.light_ends[1] * c.light_variance + factors.dark_ends[1] * c.dark_variance
+    share = sky_share(x)
+    least, most = (factors.on_light(*ends, share) for ends in zip(factors.light_ends, factors.sky_ends, strict=True))
+    middle = factors.on_light(factors.light, factors.sky, share)
+    light = np.maximum(most - middle, middle - least)
+    dark = max(factors.dark_ends[1] - factors.dark, factors.dark - factors.dark_ends[0])
+    variance = c.variance + most * c.light_variance + factors.dark_ends[1] * c.dark_variance
     reach = light * c.light_dn + dark * c.dark_dn + 8.0 * np.sqrt(variance)
     if (reach >= REACH_DN).any():
         pixel = int(np.argmax(reach))
@@ -424,7 +441,7 @@ def _draw_frames(
     mode: Mode,
     factors: Factors,
     rays: CosmicRays | None,
-    corners: Sequence[tuple[float, float]],
+    corners: Sequence[tuple[float, float, float]],
 ) -> bool:
     if mode not in ("auto", "frames", "stacked"):
         raise InputError(f"mode = {mode!r}, expected 'auto', 'frames' or 'stacked'")
@@ -434,7 +451,7 @@ def _draw_frames(
     for x in scenarios:
         near = near_rail(x, factors, rays)
         # The less light and dark, the less the rounding is noise.
-        coarse = ~stack_is_exact(Cumulants.of(x, 1).scaled(*corners[0]), x)
+        coarse = ~stack_is_exact(_scaled(x, Cumulants.of(x, 1), corners[0]), x)
         for found, why in (
             (near, f"cannot clip, and a frame comes within {RAIL_SIGMA:g} sigma of zero or saturation"),
             (coarse, "takes rounding for noise, and a frame has too little noise of its own for that"),

@@ -200,9 +200,14 @@ def together(a: Floats, b: Floats) -> Floats:
 
 def factors(
     scene: Scene, realisation: NDArray[np.uint64], frame: int, seed: int, *, exposure: int = 0
-) -> tuple[Floats, Floats]:
-    """Factors on light and dark of one draw, over those at the priors' medians and less one, shape (n_realisation,)."""
-    found = {"light": np.zeros(len(realisation), np.float32), "dark": np.zeros(len(realisation), np.float32)}
+) -> tuple[Floats, Floats, Floats]:
+    """Factors on light, dark and sky of one draw, over those at the priors' medians and less one.
+
+    Returns
+    -------
+    three of ndarray of float32, shape (n_realisation,)
+    """
+    found = {factor: np.zeros(len(realisation), np.float32) for factor in ("light", "dark", "sky")}
     kept = np.zeros(len(realisation), np.float32)
     first = int(scene.job["first_frame"]) + frame
     for (name, factor), table in zip(scene.modulations, scene.priors, strict=True):
@@ -215,13 +220,17 @@ def factors(
             kept = kept + quantile(words[f % 4], words[(f + 1) % 4], table)
         if not scene.frames:
             kept = kept * (np.float32(1.0) / np.float32(scene.n_frames))
-    return together(found["light"], kept), found["dark"]
+    return together(found["light"], kept), found["dark"], found["sky"]
 
 
-def analogue(scene: Scene, drawn: Draws, i: int, pixel: int, k: int, light: Floats, dark: Floats) -> Floats:
+def analogue(
+    scene: Scene, drawn: Draws, i: int, pixel: int, k: int, light: Floats, dark: Floats, sky: Floats
+) -> Floats:
     """The count above the level's base before the ADC, shape (n_realisation,)."""
     level, z = scene.levels[k, pixel], drawn.z[i]
     if scene.modulations:
+        if any(factor == "sky" for _, factor in scene.modulations):
+            light = together(light, sky * scene.responses[k, pixel]["sky_share"])
         v = _responding(scene.responses[k, pixel], level["c0"], z, light, dark, quartic=scene.quartic)
     elif scene.joint:
         first, *rest = ("c4", "c3", "c2", "c1", "c0") if scene.quartic else ("c3", "c2", "c1", "c0")
@@ -296,12 +305,12 @@ def observed(
     total = np.zeros((len(chosen), len(scene.pixels), len(realisation)), np.float32)
     for frame in range(number * scene.n_draws, (number + 1) * scene.n_draws):
         first = frame if scene.frames else number * scene.n_frames
-        light, dark = factors(scene, realisation, first, seed, exposure=exposure)
+        changes = factors(scene, realisation, first, seed, exposure=exposure)
         for group in range(len(scene.pixels) // 4):
             drawn = draws(scene, realisation, frame, group, seed, exposure=exposure)
             for i, p in enumerate(range(4 * group, 4 * group + 4)):
                 for row, k in enumerate(chosen):
-                    v = analogue(scene, drawn, i, p, k, light, dark)
+                    v = analogue(scene, drawn, i, p, k, *changes)
                     total[row, p] += digitise(v, scene.edges[k, p], clip=scene.clip)
     return total
 
@@ -316,11 +325,11 @@ def clipped(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray
     count = np.zeros((len(realisation), len(scene.pixels), 2), np.int64)
     if scene.clip:
         for frame in range(scene.n_draws):
-            light, dark = factors(scene, realisation, frame, seed)
+            changes = factors(scene, realisation, frame, seed)
             for group in range(-(-scene.n_pixel // 4)):
                 drawn = draws(scene, realisation, frame, group, seed)
                 for i, p in enumerate(range(4 * group, min(4 * group + 4, len(scene.pixels)))):
-                    r = analogue(scene, drawn, i, p, 0, light, dark) + MAGIC
+                    r = analogue(scene, drawn, i, p, 0, *changes) + MAGIC
                     count[:, p, 0] += r < scene.edges[0, p]["low"]
                     count[:, p, 1] += r > scene.edges[0, p]["high"]
     return count[:, : scene.n_pixel]

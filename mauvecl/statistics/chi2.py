@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
 
 
+#: Pixels whose ratios of true to assumed variance differ by less, relatively, are taken together in closed forms.
+ALIKE = 0.005
+
+
 class Chi2(QuadraticStatistic):
     """Sum over pixels of the squared difference over its variance."""
 
@@ -48,13 +52,18 @@ class Chi2(QuadraticStatistic):
         if not delta.any() and np.array_equal(model, true):
             size = delta.size - nuisances.free
             return QuadraticForm(np.ones(size), np.zeros(size))
-        rows, drawn = nuisances.rows(model, spectra), nuisances.finite(spectra)
-        root = np.linalg.cholesky(np.diag(true) + drawn.T @ drawn)
-        weight, vectors = np.linalg.eigh((root.T / model) @ root - (root.T @ rows.T) @ (rows @ root))
+        scale = np.sqrt(model)
+        rows, drawn = nuisances.rows(model, spectra) * scale, nuisances.finite(spectra) / scale
+        basis, rest = _span(np.vstack([spectra, delta]) / scale, true / model)
+        # In the span: the covariance, and what the statistic multiplies.
+        noise = basis.T @ ((true / model)[:, None] * basis) + (drawn @ basis).T @ (drawn @ basis)
+        taken, root = rows @ basis, np.linalg.cholesky(noise)
+        weight, vectors = np.linalg.eigh(root.T @ root - (taken @ root).T @ (taken @ root))
         # What is projected out has no weight.
         kept = weight > 1e-9 * weight[-1]
-        shift = vectors.T @ solve_triangular(root, delta, lower=True)
-        return QuadraticForm(weight[kept], shift[kept])
+        shift = vectors.T @ solve_triangular(root, basis.T @ (delta / scale), lower=True)
+        weights, shifts = np.append(weight[kept], rest), np.append(shift[kept], np.zeros(rest.size))
+        return QuadraticForm(weights, shifts)
 
     def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
         subtracted = np.sum((x @ self.subtracted(setting).T) ** 2, axis=-1)
@@ -92,6 +101,42 @@ class Chi2(QuadraticStatistic):
         """Of the unknowns, in what is squared."""
         assert setting.nuisances is not None
         return self._grouped(setting, setting.nuisances.spectra * setting.used)
+
+
+def _span(vectors: Float, ratio: Float) -> tuple[Float, Float]:
+    """Orthonormal vectors that hold some vectors' parts in pixels of nearly equal ratios, and the other weights.
+
+    Parameters
+    ----------
+    vectors : ndarray, shape (k, n)
+        In standard deviations of each value.
+    ratio : ndarray, shape (n,)
+        Of the true variances to the model's.
+
+    Returns
+    -------
+    basis : ndarray, shape (n, m)
+    rest : ndarray, shape (n - m,)
+        What multiplies a square along each direction beside them: its group's mean, so that the sum is kept.
+
+    Notes
+    -----
+    Exact where the ratios of a group are equal. Groups are `ALIKE` wide, and what couples the span and the rest moves
+    eigenvalues by the square of that.
+    """
+    order = np.argsort(ratio)
+    group = np.floor(np.log(ratio[order] / ratio[order[0]]) / ALIKE)
+    parts, rest = [], []
+    for members in np.split(order, np.flatnonzero(np.diff(group)) + 1):
+        found, sizes, _ = np.linalg.svd(vectors[:, members].T, full_matrices=False)
+        found = found[:, sizes > 1e-13 * sizes[0]] if sizes[0] > 0 else found[:, :0]
+        part = np.zeros((ratio.size, found.shape[1]))
+        part[members] = found
+        parts.append(part)
+        left = members.size - found.shape[1]
+        total = float(ratio[members].sum() - ratio[members] @ np.sum(found**2, axis=1))
+        rest.append(np.full(left, total / max(left, 1)))
+    return np.hstack(parts), np.concatenate(rest)
 
 
 class Chi2Element(Chi2):

@@ -168,6 +168,7 @@ class NoiseProcesses(Part):
     light_loss: PriorText | None = None
     pointing_loss: PriorText | None = None
     qe_scale: PriorText | None = None
+    sky_level: PriorText | None = None
 
     @model_validator(mode="after")
     def _possible(self) -> Self:

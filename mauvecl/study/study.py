@@ -11,6 +11,7 @@ from pydantic import Field, ValidationError
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import possible, read_text, toml
+from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.study.questions import (
     Axis,
     BulkQuestion,
@@ -52,6 +53,7 @@ class Study(Part):
     observation: Observation = Observation()
     sky: SkyLight = SkyLight()
     processes: NoiseProcesses = NoiseProcesses()
+    nuisances: NuisanceChoice = NuisanceChoice()
     run: Run = Run()
     campaign: CampaignQuestion = CampaignQuestion()
     signal: SignalQuestion = SignalQuestion()
@@ -80,6 +82,11 @@ class Study(Part):
         run = data.get("run")
         if isinstance(run, dict) and isinstance(run.get("weights"), dict):
             run["weights"] = {k: str(path.parent / v) if isinstance(v, str) else v for k, v in run["weights"].items()}
+        nuisances = data.get("nuisances")
+        own = nuisances.get("own") if isinstance(nuisances, dict) else None
+        for one in own.values() if isinstance(own, dict) else ():
+            if isinstance(one, dict) and isinstance(one.get("file"), str):
+                one["file"] = str(path.parent / one["file"])
         return cls.build(data, path.name)
 
     @classmethod
@@ -139,6 +146,11 @@ class Study(Part):
             del data["signal"]
         if self.bulk == BulkQuestion():
             del data["bulk"]
+        if self.nuisances == NuisanceChoice():
+            del data["nuisances"]
+        else:
+            for one in data["nuisances"]["own"].values():
+                one["file"] = str(Path(one["file"]).resolve())
         for section in ("processes", "campaign"):
             if not data[section]:
                 del data[section]
@@ -215,14 +227,23 @@ class Study(Part):
     def drawing(self) -> dict[str, Any]:
         """How the engine is to draw: mode, recipe, processes."""
         o = self.observation
-        return {"mode": o.mode, "recipe": o.recipe, "processes": self.processes.processes()}
+        processes = self.processes.processes()
+        if self.nuisances.usual:
+            processes = self.nuisances.processes(processes, self.load_instrument().temperature_c)
+        return {"mode": o.mode, "recipe": o.recipe, "processes": processes}
 
-    @property
-    def detecting(self) -> dict[str, Any]:
-        """How the engine is to draw and compare: everything that `Engine.detect` takes but stars and seed."""
+    def detecting(self, quiet: Expectation) -> dict[str, Any]:
+        """How the engine is to draw and compare: everything that `Engine.detect` takes but stars and seed.
+
+        Parameters
+        ----------
+        quiet : Expectation
+            The star without a flare, whose pixels the unknowns' spectra change.
+        """
         run = self.run
         how = {"realisations": run.realisations, "statistics": run.statistics, "tails": run.tails}
-        return self.drawing | how | {"comparison": run.comparison()}
+        marginal = {"nuisances": self.nuisances.marginalised(quiet)}
+        return self.drawing | how | marginal | {"comparison": run.comparison()}
 
     def expectations(self, star: Star) -> list[Expectation]:
         """A star without a flare, then with each of the flares."""

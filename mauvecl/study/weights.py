@@ -1,4 +1,4 @@
-"""Linear statistics of a user's own, from files of weights."""
+"""What a user brings in two columns: weights of a linear statistic, or the spectrum of something unknown."""
 
 from __future__ import annotations
 
@@ -30,25 +30,39 @@ def read_weights(name: str, path: Path, wavelength_nm: NDArray[np.float64]) -> L
         If the file holds no such columns, a number that cannot be, or no weight for any pixel.
     """
     what = f"weights {shortened(path.name)} of {shortened(name)}"
-    text = read_text(path, "weights")
+    return Linear(name, _read_values(what, "weights", path, wavelength_nm))
+
+
+def read_spectrum(name: str, path: Path, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
+    """What an unknown amplitude of one adds to each pixel: wavelengths, nm, and DN of the exposure, as `read_weights`.
+
+    Returns
+    -------
+    ndarray, shape (n_pixel,)
+    """
+    return _read_values(f"spectrum {shortened(path.name)} of {shortened(name)}", "DN", path, wavelength_nm)
+
+
+def _read_values(what: str, kind: str, path: Path, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
+    text = read_text(path, kind if kind == "weights" else "spectrum")
     with parsing(what, "two columns"):
         columns = np.array([[float(word) for word in row] for line in text.splitlines() if (row := _words(line))])
     if columns.ndim != 2 or columns.shape[1] != 2 or not np.all(np.diff(columns[:, 0]) > 0):
         raise InputError(
             f"{what} have {columns.shape[1] if columns.ndim == 2 else 'no'} columns, expected ascending wavelengths in "
-            "nm and weights"
+            f"nm and {kind}"
         )
     sizes = np.abs(columns)
     bad = ~((columns == 0) | ((sizes >= SMALLEST) & (sizes <= LARGEST)))
     if bad.any():
         raise InputError(f"{what} hold {columns[bad][0]!r}, expected 0 or a size from {SMALLEST:g} to {LARGEST:g}")
-    weights = np.interp(wavelength_nm, columns[:, 0], columns[:, 1], left=0.0, right=0.0)
-    if not weights.any():
+    values = np.interp(wavelength_nm, columns[:, 0], columns[:, 1], left=0.0, right=0.0)
+    if not values.any():
         raise InputError(
-            f"{what} are 0 at every pixel, expected some light of {wavelength_nm.min():.0f}-{wavelength_nm.max():.0f} "
-            "nm weighed"
+            f"{what} are 0 at every pixel, expected some of {wavelength_nm.min():.0f}-{wavelength_nm.max():.0f} nm to "
+            "count"
         )
-    return Linear(name, weights)
+    return np.asarray(values)
 
 
 def _words(line: str) -> list[str]:

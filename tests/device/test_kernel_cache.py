@@ -97,9 +97,7 @@ def store_of(cache: Path) -> Path:
 
 @pytest.mark.parametrize("ending", [".so", ".bc", ".json"])
 @pytest.mark.parametrize("kind", DAMAGE)
-def test_a_damaged_program_is_never_restored(
-    filled: tuple[Path, str], tmp_path: Path, kind: str, ending: str
-) -> None:
+def test_a_damaged_program_is_never_restored(filled: tuple[Path, str], tmp_path: Path, kind: str, ending: str) -> None:
     """Whatever happened to whichever file: nothing reaches the folder that PoCL reads."""
     shutil.copytree(store_of(filled[0]), tmp_path / "store")
     cache = KernelCache(tmp_path, tmp_path / "work")
@@ -113,7 +111,9 @@ def test_a_damaged_program_is_never_restored(
         assert files_of(cache.work) == []
 
 
-@pytest.mark.parametrize(("kind", "ending"), [("a flipped bit", ".so"), ("garbage", ".json"), ("a flipped bit", ".txt")])
+@pytest.mark.parametrize(
+    ("kind", "ending"), [("a flipped bit", ".so"), ("garbage", ".json"), ("a flipped bit", ".txt")]
+)
 def test_a_damaged_store_is_built_again(filled: tuple[Path, str], tmp_path: Path, kind: str, ending: str) -> None:
     source, digest = filled
     cache = tmp_path / "cache"

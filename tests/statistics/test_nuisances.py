@@ -13,6 +13,7 @@ from mauvecl.host.expectation import Expectation, expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.sky.zodiacal import Sky
 from mauvecl.host.stars.source import Source
+from mauvecl.statistics.distributions import QuadraticForm
 from mauvecl.statistics.linear import Linear, Matched
 from mauvecl.statistics.nuisances import Nuisances
 from mauvecl.statistics.registry import STATISTICS
@@ -23,7 +24,7 @@ FREE = float("inf")
 
 @cache
 def pair(star: str = "G2V", magnitude: float = 7.4, amplitude: float = 0.02) -> tuple[Expectation, Expectation]:
-    source = Source.from_library(star).at_magnitude(magnitude)
+    source = Source.from_library(star).at_magnitude(magnitude, "V", "vega")
     mauve, sky = Instrument.load("mauve"), Sky.of_brightness(22.1)
     return expect(source, mauve, exposure=50.0, sky=sky), expect(
         source.flaring(amplitude), mauve, exposure=50.0, sky=sky
@@ -144,3 +145,23 @@ def test_what_cannot_be_is_refused_in_a_sentence() -> None:
     for name in ("chi2_pair", "paper"):
         with pytest.raises(InputError, match="cannot be marginalised over dark"):
             STATISTICS[name].check(s)
+
+
+@pytest.mark.parametrize("amplitude", [0.24, 3.0])
+def test_the_closed_form_in_the_span_of_few_vectors_is_that_of_all(amplitude: float) -> None:
+    """Every fourth pixel, against the eigenvalues of the whole covariance."""
+    quiet, flare = pair(amplitude=amplitude)
+    used = np.arange(quiet.wavelength_nm.size) % 4 == 0
+    s = Setting(quiet, used, nuisances=Nuisances.of(quiet, {"dark": 0.5, "light": FREE, "sky": 0.1}))
+    assert s.nuisances is not None
+    spectra, model, true = s.nuisances.spectra[:, used], quiet.variance_dn2[used], flare.variance_dn2[used]
+    rows, drawn = s.nuisances.rows(model, spectra), s.nuisances.finite(spectra)
+    root = np.linalg.cholesky(np.diag(true) + drawn.T @ drawn)
+    weight, vectors = np.linalg.eigh((root.T / model) @ root - (root.T @ rows.T) @ (rows @ root))
+    shift = vectors.T @ np.linalg.solve(root, (flare.signal_dn - quiet.signal_dn)[used])
+    kept = weight > 1e-9
+    full, found = QuadraticForm(weight[kept], shift[kept]), STATISTICS["chi2"].closed_form(s, flare, flare)
+    assert found.mean == pytest.approx(full.mean, rel=1e-9)
+    assert found.std == pytest.approx(full.std, rel=1e-5)
+    for probability in (0.9, 0.1, 1e-3, 1e-6):
+        assert found.sf(full.isf(probability)) == pytest.approx(probability, rel=1e-4)

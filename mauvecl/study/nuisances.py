@@ -1,0 +1,93 @@
+"""What a study says is unknown from exposure to exposure: drawn, and marginalised over."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field
+
+from mauvecl.host.files.bounded import shortened
+from mauvecl.noise.usual import USUAL
+from mauvecl.statistics.nuisances import Nuisances, spectrum_of
+from mauvecl.study.sections import Part
+from mauvecl.study.weights import read_spectrum
+
+if TYPE_CHECKING:
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.noise.processes import Processes
+
+
+def _spread(given: Any) -> Any:
+    """A standard deviation, or "free"."""
+    if given == "free":
+        return given
+    try:
+        value = float(given) if not isinstance(given, bool) else float("nan")
+    except (TypeError, ValueError):
+        value = float("nan")
+    if not 0 < value < float("inf"):
+        raise ValueError(
+            f"an unknown has the standard deviation {shortened(str(given))}, expected a number above 0, or 'free'"
+        )
+    return value
+
+
+Spread = Annotated[float | Literal["free"], BeforeValidator(_spread)]
+
+
+class OwnNuisance(Part):
+    """A spectrum of one's own: two columns, nm and DN of the exposure for an amplitude of one."""
+
+    file: Path
+    sd: Spread = "free"
+
+
+class NuisanceChoice(Part):
+    """Amplitudes that statistics are marginalised over: prior standard deviations, or "free" (projected out).
+
+    With `usual` the documented set is drawn and marginalised over; what is named beside it takes its place.
+    """
+
+    usual: bool = False
+    dark: Spread | None = None
+    light: Spread | None = None
+    sky: Spread | None = None
+    tilt: Spread | None = None
+    own: dict[str, OwnNuisance] = Field(default_factory=dict)
+
+    def marginalised(self, quiet: Expectation) -> Nuisances | None:
+        """As the engine takes them; None where nothing is unknown.
+
+        Raises
+        ------
+        InputError
+            For a file that cannot be read, or a spectrum that changes no pixel.
+        """
+        sd: dict[str, float] = {}
+        if self.usual:
+            sd |= usual_spreads(quiet)
+        for name in ("dark", "light", "sky", "tilt"):
+            spread = getattr(self, name)
+            if spread is not None:
+                sd[name] = float("inf") if spread == "free" else spread
+        own: dict[str, NDArray[np.float64]] = {}
+        for name, one in self.own.items():
+            own[name] = read_spectrum(name, one.file, quiet.wavelength_nm)
+            sd[name] = float("inf") if one.sd == "free" else float(one.sd)
+        return Nuisances.of(quiet, sd, own) if sd else None
+
+    def processes(self, named: Processes, temperature_c: float) -> Processes:
+        """What is drawn: the processes that a study names, and with `usual` the documented ones beside them."""
+        if not self.usual:
+            return named
+        added: dict[str, Any] = {u.process: u.prior(temperature_c) for u in USUAL if getattr(named, u.process) is None}
+        return replace(named, **added)
+
+
+def usual_spreads(quiet: Expectation) -> dict[str, float]:
+    """Standard deviations of the documented set; without a sky, that of the sky is left out."""
+    return {u.nuisance: u.sd for u in USUAL if spectrum_of(u.nuisance, quiet).any()}
