@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from .columns import NEEDED_NM, looks_like
 from .scatter import point_noise
-from .values import check_values
+from .values import BRIGHTEST, FAINTEST, check_values
 
 if TYPE_CHECKING:
     from ..instrument.line import Line
@@ -26,8 +26,6 @@ MOST_CONTINUED = 0.01
 END_NM, JOIN_NM, ELEMENT_NM = 5.0, 10.0, 10.5
 #: A level to scale by must be so many times its error.
 JOIN_ERRORS = 5.0
-#: Fluxes beyond these are those of no star, and end in overflow; wavelengths closer than this share are one.
-FAINTEST, BRIGHTEST, SMALLEST_STEP = 1e-60, 1e30, 1e-12
 #: A gap between points is told beyond this width, nm, and this multiple of the usual spacing.
 GAP_NM, GAP_TIMES = 10.5, 10.0
 
@@ -50,7 +48,7 @@ def check_points(name: str, wavelength: Float, flux: Float) -> None:
             "above 0"
         )
     # Steps below the rounding of a change of units are none.
-    back = np.flatnonzero(np.diff(wavelength) <= SMALLEST_STEP * wavelength[:-1])
+    back = np.flatnonzero(np.diff(wavelength) <= 0)
     if back.size:
         i = int(back[0])
         raise InputError(

@@ -10,9 +10,9 @@ from ..errors import InputError
 #: Where a wavelength may lie, nm: from gamma rays to metre waves, whose squares and products double precision holds.
 NEAREST_NM, FARTHEST_NM = 1e-6, 1e9
 #: Neighbours apart by less of their value are one wavelength: conversions round by some 1e-16 each.
-CLOSEST = 1e-13
+CLOSEST = 1e-12
 #: Largest flux of a spectrum, erg s-1 cm-2 A-1; the faintest star seen has some 1e-21, a white dwarf's surface 1e10.
-FAINTEST, BRIGHTEST = 1e-40, 1e40
+FAINTEST, BRIGHTEST = 1e-40, 1e30
 
 
 def check_values(name: str, wavelength: NDArray[np.float64], flux: NDArray[np.float64]) -> None:
