@@ -351,7 +351,7 @@ def expect(
     >>> quiet.n_frames, quiet.exposure_s
     (10, 50.0)
     >>> float(round(quiet.snr().max(), 2)), float(round(quiet.snr_per_element().max(), 1))
-    (8.07, 47.6)
+    (8.29, 48.9)
     """
     sky = Sky.none() if sky is None else sky
     asked_s = _seconds(exposure)

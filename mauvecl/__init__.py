@@ -11,67 +11,114 @@ from typing import TYPE_CHECKING, Any
 from mauvecl.host.version import VERSION
 
 if TYPE_CHECKING:
+    from mauvecl.answers.assumptions import what_matters
+    from mauvecl.answers.detect import detect
     from mauvecl.answers.exposures import exposure_for
     from mauvecl.answers.gaussian import gaussian_report
     from mauvecl.answers.limits import limiting_magnitude, shortest_exposure, smallest_amplitude
     from mauvecl.answers.maps import detection_map
+    from mauvecl.answers.simulate import simulate
+    from mauvecl.answers.snr import snr
     from mauvecl.device.engine import Engine
     from mauvecl.host.errors import InputError
     from mauvecl.host.expectation import Expectation, expect
     from mauvecl.host.instrument.instrument import Instrument
+    from mauvecl.host.instrument.pixel_map import PixelMap
     from mauvecl.host.sky.zodiacal import Sky
     from mauvecl.host.stars.source import Source
     from mauvecl.noise.comparison import Comparison
-    from mauvecl.runs.pool import Pool
+    from mauvecl.noise.priors import Normal, Uniform
+    from mauvecl.noise.processes import CosmicRays, Processes
+    from mauvecl.results.departures import departures
+    from mauvecl.results.detection import Detection
+    from mauvecl.runs.cluster import DaskWorkers
+    from mauvecl.runs.pool import LocalWorkers, Pool
     from mauvecl.statistics.linear import Linear
-    from mauvecl.study.study import Study
+    from mauvecl.statistics.nuisances import Nuisances
+    from mauvecl.store import bulk
+    from mauvecl.study.study import PAPER_BUDGETS, Study
 
 __version__ = VERSION
 __all__ = [
+    "PAPER_BUDGETS",
     "Comparison",
+    "CosmicRays",
+    "DaskWorkers",
+    "Detection",
     "Engine",
     "Expectation",
     "InputError",
     "Instrument",
     "Linear",
+    "LocalWorkers",
+    "Normal",
+    "Nuisances",
+    "PixelMap",
     "Pool",
+    "Processes",
     "Sky",
     "Source",
     "Study",
+    "Uniform",
+    "bulk",
+    "departures",
+    "detect",
     "detection_map",
     "expect",
     "exposure_for",
     "gaussian_report",
     "limiting_magnitude",
     "shortest_exposure",
+    "simulate",
     "smallest_amplitude",
+    "snr",
+    "what_matters",
 ]
 
+#: Where each is at home; `bulk` is a module.
 _HOMES = {
     "Comparison": "noise.comparison",
+    "CosmicRays": "noise.processes",
+    "DaskWorkers": "runs.cluster",
+    "Detection": "results.detection",
     "Engine": "device.engine",
     "Expectation": "host.expectation",
     "InputError": "host.errors",
     "Instrument": "host.instrument.instrument",
     "Linear": "statistics.linear",
+    "LocalWorkers": "runs.pool",
+    "Normal": "noise.priors",
+    "Nuisances": "statistics.nuisances",
+    "PAPER_BUDGETS": "study.study",
+    "PixelMap": "host.instrument.pixel_map",
     "Pool": "runs.pool",
+    "Processes": "noise.processes",
     "Sky": "host.sky.zodiacal",
     "Source": "host.stars.source",
     "Study": "study.study",
+    "Uniform": "noise.priors",
+    "bulk": "store",
+    "departures": "results.departures",
+    "detect": "answers.detect",
     "detection_map": "answers.maps",
     "expect": "host.expectation",
     "exposure_for": "answers.exposures",
     "gaussian_report": "answers.gaussian",
     "limiting_magnitude": "answers.limits",
     "shortest_exposure": "answers.limits",
+    "simulate": "answers.simulate",
     "smallest_amplitude": "answers.limits",
+    "snr": "answers.snr",
+    "what_matters": "answers.assumptions",
 }
 
 
 def __getattr__(name: str) -> Any:
     if name not in _HOMES:
         raise AttributeError(f"module 'mauvecl' has no attribute {name!r}")
-    return getattr(import_module(f"mauvecl.{_HOMES[name]}"), name)
+    home = import_module(f"mauvecl.{_HOMES[name]}")
+    # A module of a room is no attribute of it before it is imported.
+    return getattr(home, name, None) or import_module(f"{home.__name__}.{name}")
 
 
 def __dir__() -> list[str]:

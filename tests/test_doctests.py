@@ -31,3 +31,12 @@ def test_there_are_examples() -> None:
     for name in ("Source", "Sky", "Instrument", "expect", "Engine", "Study"):
         thing = getattr(mauvecl, name)
         assert any(test.examples for test in finder.find(thing, name)), name
+
+
+def test_every_public_name_is_found() -> None:
+    """Each from its home, and typed as such where it is imported."""
+    import mauvecl
+
+    for name in mauvecl.__all__:
+        assert getattr(mauvecl, name) is not None, name
+    assert set(mauvecl.__all__) <= set(dir(mauvecl))
