@@ -217,8 +217,8 @@ def test_manifests_that_are_none(content: str, tmp_path: Path) -> None:
     assert "no store" in refused("verify", "store", folder=tmp_path)
     from mauvecl.runs.checkpoint import Checkpoint
 
-    with Checkpoint(tmp_path / "run", "detect", Study(), resume=True) as checkpoint:
-        assert "damaged" in checkpoint.messages[0]
+    with pytest.raises(InputError, match=r"manifest.json' is not mauvecl's, expected another output folder"):
+        Checkpoint(tmp_path / "run", "detect", Study(), resume=True).__enter__()
 
 
 def test_what_is_read_is_a_regular_file(tmp_path: Path) -> None:
