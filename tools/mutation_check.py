@@ -130,11 +130,11 @@ MUTATIONS = {
         "tests/kernels/test_normal.py::test_a_thousand_million_draws",
     ),
     "carry of the index dropped between launches": Mutation(
-        (("mauvecl/device/launches.py", "np.uint32(self.first >> 32)", "np.uint32(0)"),),
+        (("mauvecl/device/tiles.py", "np.uint32(self.first >> 32)", "np.uint32(0)"),),
         "tests/noise/test_extremes.py::test_counter_boundaries",
     ),
     "carry of the index dropped within a launch": Mutation(
-        (("mauvecl/device/engine.py", "first = index - index % size", "first = index - index % self._step"),),
+        (("mauvecl/device/tiles.py", "first = index - index % size", "first = index - index % self._step"),),
         "tests/noise/test_extremes.py::test_counter_boundaries",
     ),
     "carry of the product dropped in odd lanes": Mutation(

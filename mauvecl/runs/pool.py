@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from numpy.typing import NDArray
 
-from mauvecl.device.engine import DeviceError, DeviceRecord, Engine, Progress
+from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
+from mauvecl.device.tiles import Progress
 from mauvecl.results.requests import Countable, DetectRequest, RealiseRequest, Request, Share, SnrRequest
 from mauvecl.results.sums import Arrays, DetectionSums, SnrSums
 from mauvecl.runs.shards import fingerprint, shares
@@ -151,7 +152,7 @@ class LocalWorkers:
                     return self._engines[place].count(request, share, out=out)
                 except Exception as error:
                     engine = self._engines[place]
-                    launch = isinstance(error, engine.cl.Error)
+                    launch = isinstance(error, engine.opened.cl.Error)
                     if not launch or self._stopping:
                         raise
                     if tried == TRIES:

@@ -130,14 +130,14 @@ class Failing:
 
     def __init__(self, engine: Engine, fails: set[int], calls: list[int]) -> None:
         self._engine, self._fails, self._calls = engine, fails, calls
-        self.cl, self.device, self.device_name = engine.cl, engine.device, engine.device_name
+        self.opened, self.device, self.device_name = engine.opened, engine.device, engine.device_name
 
     def count(self, request: Any, share: Share, **more: Any) -> Arrays:
         self._calls.append(len(self._calls))
         if self._calls[-1] in self._fails:
             # Half of the share is counted already when it fails.
             self._engine.count(request, replace(share, count=share.count // 2))
-            raise self.cl.RuntimeError("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES", -5, "")
+            raise self.opened.cl.RuntimeError("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES", -5, "")
         return self._engine.count(request, share, **more)
 
 
