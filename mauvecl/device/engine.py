@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,8 @@ from mauvecl.device.program import DeviceError, DeviceRecord, devices
 from mauvecl.device.tiles import Progress, Tile, Tiles
 from mauvecl.host.errors import InputError
 from mauvecl.noise.comparison import TEMPLATE, Comparison
-from mauvecl.noise.processes import NONE, Processes
-from mauvecl.noise.scene import BATCH, Mode, Recipe, prepare
+from mauvecl.noise.drawing import Drawing, DrawingWords
+from mauvecl.noise.scene import BATCH, prepare
 from mauvecl.results.channels import plan_channels
 from mauvecl.results.detection import Detection, Tails
 from mauvecl.results.hypotheses import Hypotheses
@@ -107,11 +107,8 @@ class Engine:
         start: int = 0,
         count: int,
         seed: int,
-        mode: Mode = "auto",
-        processes: Processes = NONE,
-        recipe: Recipe = "auto",
-        first_frame: int = 0,
         out: NDArray[Any] | None = None,
+        **drawing: Unpack[DrawingWords],
     ) -> NDArray[Any]:
         """Raw spectra, each addressed by its realisation index alone.
 
@@ -122,15 +119,10 @@ class Engine:
             Realisations start to start + count - 1.
         seed : int
             0 to 2**64 - 1.
-        mode : {"auto", "frames", "stacked"}
-        processes : Processes
-        recipe : {"auto", "joint", "apart"}
-            See `scene.prepare`.
-        first_frame : int
-            Where frames are counted from: one frame k of an exposure is drawn with an expectation of one frame and
-            ``first_frame=k``.
         out : ndarray, shape (count, n_pixel), optional
             Where to write, contiguous and of the type below.
+        mode, recipe, processes, first_frame
+            See `Drawing`.
 
         Returns
         -------
@@ -142,17 +134,7 @@ class Engine:
         InputError
             For an impossible range, seed or mode.
         """
-        return self.realise_and_count(
-            expectation,
-            start=start,
-            count=count,
-            seed=seed,
-            mode=mode,
-            processes=processes,
-            recipe=recipe,
-            first_frame=first_frame,
-            out=out,
-        )[0]
+        return self.realise_and_count(expectation, start=start, count=count, seed=seed, out=out, **drawing)[0]
 
     def realise_and_count(
         self,
@@ -161,11 +143,8 @@ class Engine:
         start: int = 0,
         count: int,
         seed: int,
-        mode: Mode = "auto",
-        processes: Processes = NONE,
-        recipe: Recipe = "auto",
-        first_frame: int = 0,
         out: NDArray[Any] | None = None,
+        **drawing: Unpack[DrawingWords],
     ) -> tuple[NDArray[Any], NDArray[np.uint32]]:
         """`realise`, with the number of clipped samples of each realisation: pixels times frames that met a rail.
 
@@ -175,7 +154,7 @@ class Engine:
         clipped : ndarray of uint32, shape (count,)
         """
         self._check(start, count, seed)
-        scene = prepare([expectation], mode, processes=processes, recipe=recipe, first_frame=first_frame)
+        scene = prepare([expectation], **drawing)
         narrow = scene.n_frames == 1 and expectation.adc_max_dn < 2**16
         shape, dtype = (count, scene.n_pixel), np.dtype(np.uint16 if narrow else np.int32)
         if scene.n_frames * expectation.adc_max_dn >= 2**31:
@@ -206,10 +185,8 @@ class Engine:
         *,
         realisations: int,
         seed: int,
-        mode: Mode = "auto",
         start: int = 0,
-        processes: Processes = NONE,
-        recipe: Recipe = "auto",
+        **drawing: Unpack[DrawingWords],
     ) -> SnrResult:
         """Distributions of the S/N per pixel and per resolution element (METHODS section 5).
 
@@ -219,19 +196,17 @@ class Engine:
         realisations : int
         seed : int
             0 to 2**64 - 1.
-        mode : {"auto", "frames", "stacked"}
         start : int
             First realisation.
-        processes : Processes
-        recipe : {"auto", "joint", "apart"}
-            See `scene.prepare`.
+        mode, recipe, processes, first_frame
+            See `Drawing`.
 
         Raises
         ------
         InputError
             For an impossible number, seed or mode.
         """
-        request = SnrRequest(expectation, realisations, seed, mode, start, processes, recipe)
+        request = SnrRequest(expectation, realisations, seed, start, Drawing(**drawing))
         sums = SnrSums(request)
         sums.add(0, packed_snr(self._snr(request, Share(0, start, realisations))))
         return sums.answer()
@@ -258,17 +233,9 @@ class Engine:
             case SnrRequest():
                 return packed_snr(self._snr(request, share))
             case RealiseRequest():
-                rows = self.realise(
-                    request.expectation,
-                    start=share.start,
-                    count=share.count,
-                    seed=request.seed,
-                    mode=request.mode,
-                    processes=request.processes,
-                    recipe=request.recipe,
-                    first_frame=request.first_frame,
-                    out=out,
-                )
+                x, seed = request.expectation, request.seed
+                how = request.drawing.words
+                rows = self.realise(x, start=share.start, count=share.count, seed=seed, out=out, **how)
                 return {"rows": rows}
 
     def _snr(self, request: SnrRequest, share: Share) -> Counts:
@@ -289,13 +256,11 @@ class Engine:
         realisations: int,
         seed: int,
         statistics: Sequence[str | Linear] = USUAL_STATISTICS,
-        mode: Mode = "auto",
         start: int = 0,
-        processes: Processes = NONE,
-        recipe: Recipe = "auto",
         comparison: Comparison = TEMPLATE,
         tails: Tails = "counted",
         nuisances: Nuisances | Mapping[str, float] | None = None,
+        **drawing: Unpack[DrawingWords],
     ) -> Detection:
         """Null and flare distributions of detection statistics, all on common draws (METHODS section 6).
 
@@ -311,12 +276,10 @@ class Engine:
             0 to 2**64 - 1.
         statistics : sequence of str or Linear
             Names of `statistics.STATISTICS`, and statistics of one's own.
-        mode : {"auto", "frames", "stacked"}
         start : int
             First realisation.
-        processes : Processes
-        recipe : {"auto", "joint", "apart"}
-            See `scene.prepare`.
+        mode, recipe, processes, first_frame
+            See `Drawing`.
         comparison : Comparison
             What is subtracted, and by whose variances; the template and the model's by default.
         tails : {"counted", "sampled"}
@@ -330,7 +293,7 @@ class Engine:
         InputError
             For an unknown statistic, scenarios that do not belong together, or an impossible number, seed or mode.
         """
-        how = (mode, start, processes, recipe, comparison, tails, nuisances)
+        how = (start, Drawing(**drawing), comparison, tails, nuisances)
         request = DetectRequest(quiet, tuple(flares), realisations, seed, statistics, *how)
         sums, total = DetectionSums(request), request.parts * realisations
         for part in range(request.parts):
@@ -366,17 +329,15 @@ class Engine:
         count: int,
         seed: int,
         statistics: Sequence[str | Linear] = USUAL_STATISTICS,
-        mode: Mode = "auto",
-        processes: Processes = NONE,
-        recipe: Recipe = "auto",
         comparison: Comparison = TEMPLATE,
         nuisances: Nuisances | Mapping[str, float] | None = None,
+        **drawing: Unpack[DrawingWords],
     ) -> NDArray[np.float32]:
         """What `detect` counts, realisation by realisation, for up to 15 flares (7 drawn frame by frame).
 
         Parameters
         ----------
-        quiet, flares, seed, statistics, mode, processes, recipe, comparison, nuisances
+        quiet, flares, seed, statistics, comparison, nuisances, mode, recipe, processes, first_frame
             As for `detect`.
         start, count : int
             Realisations start to start + count - 1.
@@ -394,7 +355,7 @@ class Engine:
             As `detect`, and for more flares than one launch holds.
         """
         self._check(start, count, seed)
-        scene = prepare([quiet, *flares], mode, processes=processes, recipe=recipe, comparison=comparison)
+        scene = prepare([quiet, *flares], comparison=comparison, **drawing)
         if len(flares) >= BATCH[scene.frames]:
             raise InputError(f"{len(flares)} flares, expected at most {BATCH[scene.frames] - 1} in one launch")
         asked = Hypotheses(quiet, tuple(flares), statistics, scene, nuisances=known(nuisances, quiet))

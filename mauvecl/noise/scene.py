@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,16 +13,15 @@ from mauvecl.host.errors import InputError
 from mauvecl.noise import layout
 from mauvecl.noise.comparison import TEMPLATE, Comparison
 from mauvecl.noise.cumulants import Cumulants, joint_is_exact, needs_fourth_power, polynomial, stack_is_exact
+from mauvecl.noise.drawing import Drawing, DrawingWords, Mode, Recipe
 from mauvecl.noise.poisson import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, table_of, table_set
-from mauvecl.noise.processes import NONE, CosmicRays, Factors, Modulated, Processes
+from mauvecl.noise.processes import CosmicRays, Factors, Modulated
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
 
 #: Scenarios in one launch: drawn as stacks, or frame by frame, which needs room for each.
 BATCH = {False: 16, True: 8}
-Mode = Literal["auto", "frames", "stacked"]
-Recipe = Literal["auto", "joint", "apart"]
 Float = NDArray[np.float64]
 
 #: Pixels are padded to a multiple of this with ones that never contribute.
@@ -164,14 +163,12 @@ def near_rail(x: Expectation, factors: Factors, rays: CosmicRays | None) -> NDAr
 
 def prepare(
     scenarios: Sequence[Expectation],
-    mode: Mode = "auto",
+    drawing: Drawing | None = None,
     *,
-    processes: Processes = NONE,
     templates: Sequence[int] | None = None,
-    recipe: Recipe = "auto",
     comparison: Comparison = TEMPLATE,
-    first_frame: int = 0,
     first_group: int = 0,
+    **words: Unpack[DrawingWords],
 ) -> Scene:
     """Lay out scenarios for the device.
 
@@ -179,19 +176,14 @@ def prepare(
     ----------
     scenarios : sequence of Expectation
         On one instrument and exposure.
-    mode : {"auto", "frames", "stacked"}
-        Draw each frame, or all at once; by itself frames only near a rail, and where a frame has so little noise that
-        its rounding is none.
-    processes : Processes
+    drawing : Drawing, optional
+        Or its fields by their names.
     templates : sequence of int, optional
         For each scenario the quiescent one it is compared with; the first for all by default.
-    recipe : {"auto", "joint", "apart"}
-        Draw all noise of a pixel from one normal, or Poisson counts apart; by itself apart only where the joint draw
-        would not be exact.
     comparison : Comparison
         What is subtracted, and by whose variances.
-    first_frame, first_group : int
-        Where frames and groups of four pixels begin to be counted in the generator's counter.
+    first_group : int
+        Where groups of four pixels begin to be counted in the generator's counter.
 
     Raises
     ------
@@ -199,6 +191,8 @@ def prepare(
         If the scenarios differ in anything but their light, stacked draws are asked for near a rail, or a process
         needs joint draws where there are none.
     """
+    drawing = drawing or Drawing(**words)
+    processes = drawing.processes
     quiet = scenarios[0]
     if quiet.wavelength_nm.size > MOST_PIXELS:
         raise InputError(f"{quiet.wavelength_nm.size} pixels, expected at most {MOST_PIXELS}")
@@ -208,13 +202,13 @@ def prepare(
     compared = np.zeros(len(scenarios), np.uint32) if templates is None else np.array(templates, np.uint32)
     modulations = processes.modulations
     corners = _corners(factors)
-    frames = _draw_frames(scenarios, mode, factors, processes.cosmic_rays, corners)
+    frames = _draw_frames(scenarios, drawing.mode, factors, processes.cosmic_rays, corners)
     each = 1 if frames else quiet.n_frames
     n_pixel = quiet.wavelength_nm.size
     padded = -(-n_pixel // PIXEL_BLOCK) * PIXEL_BLOCK
     cumulants = [Cumulants.of(x, each) for x in scenarios]
     varied = [[_scaled(x, c, corner) for corner in corners] for x, c in zip(scenarios, cumulants, strict=True)]
-    joint = _joint(scenarios, varied, recipe)
+    joint = _joint(scenarios, varied, drawing.recipe)
     shapes = [polynomial(c) for c in cumulants] if joint and not modulations else []
     quartic = joint and any(needs_fourth_power(c, varying=bool(modulations)) for row in varied for c in row)
     photons = not joint and quiet.photon_noise == "poisson"
@@ -292,7 +286,7 @@ def prepare(
     job = np.zeros((), layout.JOB)
     job["pixel_count"], job["padded_count"], job["scenario_count"] = n_pixel, padded, len(scenarios)
     job["draw_count"], job["frame_count"] = quiet.n_frames if frames else 1, quiet.n_frames
-    job["first_frame"], job["first_group"] = first_frame, first_group
+    job["first_frame"], job["first_group"] = drawing.first_frame, first_group
     job["reference_count"], job["reference_share"] = comparison.exposures, comparison.share
     job["pair_scale"] = noisier / 2.0
     if processes.cosmic_rays is not None:
@@ -348,8 +342,6 @@ def _scaled(x: Expectation, c: Cumulants, corner: tuple[float, float, float]) ->
 
 def _joint(scenarios: Sequence[Expectation], varied: Sequence[Sequence[Cumulants]], recipe: Recipe) -> bool:
     """Whether every pixel's noise may come from one normal, whatever the factors on light and dark."""
-    if recipe not in ("auto", "joint", "apart"):
-        raise InputError(f"recipe = {recipe!r}, expected 'auto', 'joint' or 'apart'")
     if recipe == "apart":
         return False
     for x, c in ((x, c) for x, row in zip(scenarios, varied, strict=True) for c in row):
@@ -443,8 +435,6 @@ def _draw_frames(
     rays: CosmicRays | None,
     corners: Sequence[tuple[float, float, float]],
 ) -> bool:
-    if mode not in ("auto", "frames", "stacked"):
-        raise InputError(f"mode = {mode!r}, expected 'auto', 'frames' or 'stacked'")
     if scenarios[0].n_frames == 1 or mode == "frames":
         # One frame is its own stack: the same draws either way.
         return mode == "frames" and scenarios[0].n_frames > 1

@@ -260,14 +260,14 @@ class Pool:
 
     def detect(self, quiet: Expectation, flares: Sequence[Expectation], **how: Any) -> Detection:
         """As `Engine.detect`, with the same keywords."""
-        request = DetectRequest(quiet, tuple(flares), **how)
+        request = DetectRequest.of(quiet, tuple(flares), **how)
         sums = DetectionSums(request)
         self._add_up(request, sums)
         return sums.answer()
 
     def snr(self, expectation: Expectation, **how: Any) -> SnrResult:
         """As `Engine.snr`, with the same keywords."""
-        request = SnrRequest(expectation, **how)
+        request = SnrRequest.of(expectation, **how)
         sums = SnrSums(request)
         self._add_up(request, sums)
         return sums.answer()
@@ -276,7 +276,7 @@ class Pool:
         self, expectation: Expectation, *, count: int, out: NDArray[Any] | None = None, **how: Any
     ) -> NDArray[Any]:
         """As `Engine.realise`, with the same keywords, by one worker; several calls at a time keep all of them busy."""
-        request = RealiseRequest(expectation, count, **how)
+        request = RealiseRequest.of(expectation, count, **how)
         share = Share(0, request.start, count)
         future = self.workers.submit(request, uuid.uuid4().hex, share, lambda done: None, out)
         rows: NDArray[Any] = future.result()["rows"]

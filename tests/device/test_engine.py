@@ -180,7 +180,7 @@ def test_modes_meet_the_rails(engine: Engine) -> None:
     raw = engine.realise(bright, count=200, seed=1)
     assert raw.max() == 2 * bright.highest_dn == 2 * 59_578
     with pytest.raises(InputError, match="stacked"):
-        prepare([bright], "stacked")
+        prepare([bright], mode="stacked")
     (faint, *_), _ = case("stack")
     assert not prepare([faint]).frames
 

@@ -26,6 +26,7 @@ from mauvecl.device.engine import DeviceError, Engine
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise.comparison import Comparison
+from mauvecl.noise.drawing import Drawing
 from mauvecl.noise.processes import Processes, Uniform
 from mauvecl.results.detection import Detection
 from mauvecl.results.requests import DetectRequest, Share, SnrRequest
@@ -199,8 +200,8 @@ def test_fingerprints_tell_requests_apart(scene: list[Expectation]) -> None:
         replace(base, flares=tuple(flares[::-1])),
         replace(base, flares=(flares[0], brighter)),
         replace(base, comparison=Comparison.of("exposure")),
-        replace(base, processes=Processes(jitter=Uniform(0.0, 0.01))),
-        replace(base, mode="frames"),
+        replace(base, drawing=Drawing(processes=Processes(jitter=Uniform(0.0, 0.01)))),
+        replace(base, drawing=Drawing(mode="frames")),
         SnrRequest(quiet, N, 5),
     ]
     names = [fingerprint(one) for one in (base, *others)]
