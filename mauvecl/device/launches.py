@@ -11,7 +11,8 @@ from mauvecl.device.opened import Device
 from mauvecl.device.program import DeviceError, out_of_memory
 from mauvecl.device.tiles import Tile
 from mauvecl.noise import layout
-from mauvecl.noise.scene import PIXEL_BLOCK, Scene
+from mauvecl.noise.pixels import PIXEL_BLOCK
+from mauvecl.noise.scene import Scene
 from mauvecl.results.snr import Counts
 from mauvecl.results.tally import Grid, Tally
 

@@ -7,7 +7,7 @@ from typing import Any
 
 from mauvecl.device import program
 from mauvecl.device.program import DeviceError, Variant
-from mauvecl.noise.scene import PIXEL_BLOCK
+from mauvecl.noise.pixels import PIXEL_BLOCK
 
 #: Vectors of realisations that one work-item of the kernels of a detection follows on a processor.
 VECTORS = 4
