@@ -21,8 +21,8 @@ from astropy.table import Table
 from rates import engine_lines
 
 from mauvecl import Engine
-from mauvecl.device.engine import VECTORS
 from mauvecl.device.kernel_cache import kernel_cache
+from mauvecl.device.opened import VECTORS
 
 PEAK = """
 typedef float float16_;
@@ -47,14 +47,14 @@ LOOPS = (("words", 8), ("normals", 8), ("statistic", 4 * VECTORS))
 
 def peak_rate(engine: Engine, turns: int = 3_000_000) -> float:
     """512-bit fused multiply-adds per second of the whole device."""
-    cl, items = engine.cl, engine.device.compute_units
-    kernel = cl.Kernel(cl.Program(engine.context, PEAK).build(), "peak")
-    out = cl.Buffer(engine.context, cl.mem_flags.READ_WRITE, 4 * items)
+    cl, items = engine.opened.cl, engine.device.compute_units
+    kernel = cl.Kernel(cl.Program(engine.opened.context, PEAK).build(), "peak")
+    out = cl.Buffer(engine.opened.context, cl.mem_flags.READ_WRITE, 4 * items)
     seconds = []
     for _ in range(7):
         start = time.perf_counter()
-        kernel(engine.queue, (items,), (1,), np.uint32(turns), out)
-        engine.queue.finish()
+        kernel(engine.opened.queue, (items,), (1,), np.uint32(turns), out)
+        engine.opened.queue.finish()
         seconds.append(time.perf_counter() - start)
     return items * turns * 24 / float(np.median(seconds))
 

@@ -92,7 +92,7 @@ MUTATIONS = {
         "tests/kernels/test_joint.py::test_pearson_of_raw_counts",
     ),
     "skew-only expansion of the dark": Mutation(
-        (("mauvecl/noise/scene.py", "= -1 / (72 * root)", "= 0.0"),),
+        (("mauvecl/noise/pixels.py", "= -1 / (72 * root)", "= 0.0"),),
         "tests/kernels/test_poisson.py::test_no_number_of_draws_would_tell_the_expansion",
     ),
     "joint draw allowed by its skew alone": Mutation(
@@ -115,7 +115,7 @@ MUTATIONS = {
         "tests/kernels/test_joint_bound.py::test_factors_follow_the_cumulants",
     ),
     "pairs of two ways": Mutation(
-        (("mauvecl/noise/scene.py", "_both_of_a_pair(mean >= SMALLEST_EXPANDED)", "mean >= SMALLEST_EXPANDED"),),
+        (("mauvecl/noise/pixels.py", "_both_of_a_pair(mean >= SMALLEST_EXPANDED)", "mean >= SMALLEST_EXPANDED"),),
         "tests/noise/test_correlations.py::test_no_two_draws_are_tied",
     ),
     "skew-only expansion of the joint draw": Mutation(
@@ -130,11 +130,11 @@ MUTATIONS = {
         "tests/kernels/test_normal.py::test_a_thousand_million_draws",
     ),
     "carry of the index dropped between launches": Mutation(
-        (("mauvecl/device/launches.py", "np.uint32(self.first >> 32)", "np.uint32(0)"),),
+        (("mauvecl/device/tiles.py", "np.uint32(self.first >> 32)", "np.uint32(0)"),),
         "tests/noise/test_extremes.py::test_counter_boundaries",
     ),
     "carry of the index dropped within a launch": Mutation(
-        (("mauvecl/device/engine.py", "first = index - index % size", "first = index - index % self._step"),),
+        (("mauvecl/device/tiles.py", "first = index - index % size", "first = index - index % self._step"),),
         "tests/noise/test_extremes.py::test_counter_boundaries",
     ),
     "carry of the product dropped in odd lanes": Mutation(
@@ -185,7 +185,7 @@ MUTATIONS = {
         "tests/noise/test_saturation.py::test_closed_forms_are_those_of_what_is_drawn",
     ),
     "noise of what is subtracted forgotten": Mutation(
-        (("mauvecl/noise/scene.py", "noisier = 1.0 + comparison.share", "noisier = 1.0"),),
+        (("mauvecl/noise/scene.py", "return 1.0 + comparison.share", "return 1.0"),),
         "tests/results/test_tails.py::test_brute_force_agrees_whatever_is_compared",
     ),
     "quiescent exposures with the observed draws": Mutation(

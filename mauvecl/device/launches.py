@@ -1,22 +1,22 @@
-"""One scene on the device: its buffers and launches."""
+"""One scene on a device: its buffers and launches."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.device.opened import Device
 from mauvecl.device.program import DeviceError, out_of_memory
+from mauvecl.device.tiles import Tile
 from mauvecl.noise import layout
-from mauvecl.noise.scene import PIXEL_BLOCK, Scene
+from mauvecl.noise.pixels import PIXEL_BLOCK
+from mauvecl.noise.scene import Scene
 from mauvecl.results.snr import Counts
 from mauvecl.results.tally import Grid, Tally
 
 if TYPE_CHECKING:
-    from mauvecl.device.engine import Engine
     from mauvecl.device.program import Variant
 
 #: Realisations, times frames, counted on the device before its 32-bit bins and 64-bit sums are emptied.
@@ -29,43 +29,12 @@ COMPARED, DETECTION = ("comparison", "tally", "marginal"), ("statistics", "tally
 SHARES = 1024
 
 
-@dataclass(frozen=True)
-class Tile:
-    """Realisations from `first` on, a multiple of the vector width; [start, stop) of these `size` are wanted."""
-
-    first: int
-    size: int
-    start: int
-    stop: int
-
-    @property
-    def wanted(self) -> int:
-        """How many are wanted."""
-        return self.stop - self.start
-
-    def address(self) -> tuple[np.uint32, np.uint32]:
-        """Both words of the first index."""
-        return np.uint32(self.first & 0xFFFFFFFF), np.uint32(self.first >> 32)
-
-    def rows(self) -> tuple[np.uint32, np.uint32]:
-        """Which of the tile are wanted."""
-        return np.uint32(self.start), np.uint32(self.stop)
-
-    def pieces(self, size: int) -> Iterator[Tile]:
-        """The same realisations in tiles of at most so many, a multiple of what a work-item follows."""
-        for begin in range(0, self.size, size):
-            length = min(size, self.size - begin)
-            start, stop = max(self.start - begin, 0), min(self.stop - begin, length)
-            if start < stop:
-                yield Tile(self.first + begin, length, start, stop)
-
-
-class Run:
+class Launches:
     """One scene on the device; its buffers are released at the end of the `with` block."""
 
-    def __init__(self, engine: Engine, scene: Scene, variant: Variant, seed: int) -> None:
-        self._engine, self._scene, self.variant = engine, scene, variant
-        self._cl, self._queue = engine.cl, engine.queue
+    def __init__(self, device: Device, scene: Scene, variant: Variant, seed: int) -> None:
+        self._device, self._scene, self.variant = device, scene, variant
+        self._cl, self._queue = device.cl, device.queue
         self._buffers: list[Any] = []
         self._named: dict[str, Any] = {}
         self._kernels: dict[str, Any] = {}
@@ -103,12 +72,12 @@ class Run:
         flags = self._cl.mem_flags
         data = np.ascontiguousarray(array if array.size else np.zeros(1, array.dtype))
         try:
-            buffer = self._cl.Buffer(self._engine.context, flags.READ_WRITE | flags.COPY_HOST_PTR, hostbuf=data)
+            buffer = self._cl.Buffer(self._device.context, flags.READ_WRITE | flags.COPY_HOST_PTR, hostbuf=data)
         except self._cl.Error as error:
             if not out_of_memory(error):
                 raise
             raise DeviceError(
-                f"{self._engine.device_name} has too little memory for {data.nbytes} bytes of a scene: {error}"
+                f"{self._device.name} has too little memory for {data.nbytes} bytes of a scene: {error}"
             ) from error
         self._buffers.append(buffer)
         return buffer
@@ -120,7 +89,7 @@ class Run:
             if found is not None:
                 self._buffers.remove(found)
                 found.release()
-            found = self._cl.Buffer(self._engine.context, self._cl.mem_flags.READ_WRITE, size)
+            found = self._cl.Buffer(self._device.context, self._cl.mem_flags.READ_WRITE, size)
             self._named[name] = found
             self._buffers.append(found)
         return found
@@ -130,7 +99,7 @@ class Run:
             # One build for the two that are always used together.
             detection = COMPARED if self.variant.compared else DETECTION
             rooms = detection if name in ("statistics", "tally", "marginalise") else (name,)
-            self._kernels[name] = self._engine.kernel(rooms, self.variant, name)
+            self._kernels[name] = self._device.kernel(rooms, self.variant, name)
         local = (1,) * len(items) if self.variant.width > 1 else None
         self._kernels[name](self._queue, items, local, *arguments)
 
@@ -151,9 +120,9 @@ class Run:
         clipped = np.empty(tile.wanted, np.uint32)
         counts = self._room("clipped", clipped.nbytes)
         # A processor's own memory needs no copy.
-        shared = self._engine.device.kind == "cpu"
+        shared = self._device.record.kind == "cpu"
         if shared:
-            rows = self._cl.Buffer(self._engine.context, flags.WRITE_ONLY | flags.USE_HOST_PTR, hostbuf=out)
+            rows = self._cl.Buffer(self._device.context, flags.WRITE_ONLY | flags.USE_HOST_PTR, hostbuf=out)
         else:
             rows = self._room("rows", out.nbytes)
         try:
@@ -336,7 +305,7 @@ class Run:
             found = tally.add_far(int(index), self.channel(tile, tally.grids[index].channel))
             if found != outside[index]:
                 raise DeviceError(
-                    f"{self._engine.device_name} has {outside[index]} values outside a histogram where the host has "
+                    f"{self._device.name} has {outside[index]} values outside a histogram where the host has "
                     f"{found}, expected the same arithmetic"
                 )
 

@@ -11,11 +11,11 @@ from mauvecl.device import program
 from mauvecl.device.program import Variant
 
 if TYPE_CHECKING:
-    from mauvecl.device.engine import Engine
+    from mauvecl.device.opened import Device
 
 
 class Probes:
-    """The probe kernels of an engine's device, in its own form or another.
+    """The probe kernels of a device, in its own form or another.
 
     Parameters
     ----------
@@ -23,12 +23,12 @@ class Probes:
         Realisations in a vector.
     vector_forms : bool, optional
         Whether PoCL's fast forms are used, or built-ins.
-    engine : Engine
+    device : Device
     """
 
-    def __init__(self, *, width: int | None = None, vector_forms: bool | None = None, engine: Engine) -> None:
-        self.cl, self.context, self.queue = engine.cl, engine.context, engine.queue
-        plain = engine.variant
+    def __init__(self, *, width: int | None = None, vector_forms: bool | None = None, device: Device) -> None:
+        self.cl, self.context, self.queue = device.cl, device.context, device.queue
+        plain = device.variant
         self.width = width or plain.width
         forms = plain.vector_forms if vector_forms is None else vector_forms
         variant = Variant(width=self.width, vector_forms=forms and self.width > 1, chunk=32 if self.width > 1 else 4)

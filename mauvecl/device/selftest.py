@@ -209,7 +209,7 @@ def _digest(*arrays: NDArray[Any]) -> str:
 def known_answers(engine: Engine) -> Check:
     """Philox against Random123's vectors, on the device."""
     counters, keys, answers = (np.array([row[i] for row in KNOWN], np.uint32) for i in range(3))
-    out = Probes(engine=engine).philox(counters, keys)
+    out = Probes(device=engine.opened).philox(counters, keys)
     right = np.array_equal(out[:, :4], answers) and np.array_equal(out[:, 4:], answers)
     return Check("Philox4x32-10, known answers", right, f"{len(KNOWN)} vectors of Random123")
 

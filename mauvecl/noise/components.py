@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.noise import twin as reference
-from mauvecl.noise.processes import NONE, Processes
-from mauvecl.noise.scene import Mode, Recipe, prepare
+from mauvecl.noise.drawing import DrawingWords
+from mauvecl.noise.scene import prepare
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -25,9 +25,7 @@ def components(
     *,
     realisation: int,
     seed: int,
-    mode: Mode = "auto",
-    processes: Processes = NONE,
-    recipe: Recipe = "auto",
+    **drawing: Unpack[DrawingWords],
 ) -> QTable:
     """The draws behind one raw spectrum, by the slow twin.
 
@@ -36,9 +34,8 @@ def components(
     x : Expectation
     realisation : int
     seed : int
-    mode : {"auto", "frames", "stacked"}
-    processes : Processes
-    recipe : {"auto", "joint", "apart"}
+    mode, recipe, processes, first_frame
+        See `Drawing`.
 
     Returns
     -------
@@ -56,7 +53,7 @@ def components(
     import astropy.units as u
     from astropy.table import QTable
 
-    scene = prepare([x], mode, processes=processes, recipe=recipe)
+    scene = prepare([x], **drawing)
     index = np.array([realisation], np.uint64)
     n = scene.n_pixel
     each = x.n_frames // scene.n_draws  # frames in one draw

@@ -4,37 +4,25 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Unpack
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.errors import InputError
-from mauvecl.noise import layout
+from mauvecl.noise import layout, pixels
+from mauvecl.noise.choice import Choice, check_reach, choose
 from mauvecl.noise.comparison import TEMPLATE, Comparison
-from mauvecl.noise.cumulants import Cumulants, joint_is_exact, needs_fourth_power, polynomial, stack_is_exact
-from mauvecl.noise.poisson import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, table_of, table_set
-from mauvecl.noise.processes import NONE, CosmicRays, Factors, Modulated, Processes
+from mauvecl.noise.cumulants import polynomial
+from mauvecl.noise.drawing import Drawing, DrawingWords
+from mauvecl.noise.poisson import AliasTable, table_of
+from mauvecl.noise.processes import Factors, Modulated
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
 
 #: Scenarios in one launch: drawn as stacks, or frame by frame, which needs room for each.
 BATCH = {False: 16, True: 8}
-Mode = Literal["auto", "frames", "stacked"]
-Recipe = Literal["auto", "joint", "apart"]
 Float = NDArray[np.float64]
-
-#: Pixels are padded to a multiple of this with ones that never contribute.
-PIXEL_BLOCK = 32
-#: `frames` is chosen where a pixel's mean is within this many sigma of a rail.
-RAIL_SIGMA = 8.0
-#: Counts further from their base than this are not rounded to whole DN by the device.
-REACH_DN = 2.0**22
-#: DN^2 in place of none at all.
-NO_VARIANCE = 1e-12
-#: Groups of four pixels have 24 bits in the counter.
-MOST_PIXELS = 65_536
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,35 +131,14 @@ class Scene:
         return replace(self, job=job, templates=templates, **per_scenario)
 
 
-def near_rail(x: Expectation, factors: Factors, rays: CosmicRays | None) -> NDArray[np.bool_]:
-    """Pixels whose single frame comes within `RAIL_SIGMA` of zero or of saturation, shape (n_pixel,).
-
-    With priors wherever they carry it, and with a cosmic ray's hit.
-    """
-    variance, light = x.unsaturated_variance_dn2 / x.n_frames, x.light_dn / x.n_frames
-    mean = x.mean_raw_dn
-    ends = []
-    for end_light, more_dark, sky in zip(factors.light_ends, factors.dark_ends, factors.sky_ends, strict=True):
-        more_light = factors.on_light(end_light, sky, sky_share(x))
-        there = mean + (more_light - 1.0) * light + (more_dark - 1.0) * x.dark_dn
-        more = (more_light - 1.0) * x.gain_dn_per_electron * light + (more_dark - 1.0) * x.dark_variance_dn2
-        ends.append((there, RAIL_SIGMA * np.sqrt(variance + np.maximum(more, 0.0))))
-    hit = 0.0 if rays is None else x.gain_dn_per_electron * rays.electrons[1]
-    low: NDArray[np.bool_] = ends[0][0] - ends[0][1] < 0.0
-    high: NDArray[np.bool_] = ends[1][0] + ends[1][1] + hit > x.highest_dn
-    return low | high
-
-
 def prepare(
     scenarios: Sequence[Expectation],
-    mode: Mode = "auto",
+    drawing: Drawing | None = None,
     *,
-    processes: Processes = NONE,
     templates: Sequence[int] | None = None,
-    recipe: Recipe = "auto",
     comparison: Comparison = TEMPLATE,
-    first_frame: int = 0,
     first_group: int = 0,
+    **words: Unpack[DrawingWords],
 ) -> Scene:
     """Lay out scenarios for the device.
 
@@ -179,19 +146,14 @@ def prepare(
     ----------
     scenarios : sequence of Expectation
         On one instrument and exposure.
-    mode : {"auto", "frames", "stacked"}
-        Draw each frame, or all at once; by itself frames only near a rail, and where a frame has so little noise that
-        its rounding is none.
-    processes : Processes
+    drawing : Drawing, optional
+        Or its fields by their names.
     templates : sequence of int, optional
         For each scenario the quiescent one it is compared with; the first for all by default.
-    recipe : {"auto", "joint", "apart"}
-        Draw all noise of a pixel from one normal, or Poisson counts apart; by itself apart only where the joint draw
-        would not be exact.
     comparison : Comparison
         What is subtracted, and by whose variances.
-    first_frame, first_group : int
-        Where frames and groups of four pixels begin to be counted in the generator's counter.
+    first_group : int
+        Where groups of four pixels begin to be counted in the generator's counter.
 
     Raises
     ------
@@ -199,291 +161,167 @@ def prepare(
         If the scenarios differ in anything but their light, stacked draws are asked for near a rail, or a process
         needs joint draws where there are none.
     """
+    drawing = drawing or Drawing(**words)
     quiet = scenarios[0]
-    if quiet.wavelength_nm.size > MOST_PIXELS:
-        raise InputError(f"{quiet.wavelength_nm.size} pixels, expected at most {MOST_PIXELS}")
-    for other in scenarios[1:]:
-        _check_same_detector(quiet, other)
-    factors = processes.factors(quiet.conditions)
+    factors = drawing.processes.factors(quiet.conditions)
+    choice = choose(scenarios, drawing, factors)
     compared = np.zeros(len(scenarios), np.uint32) if templates is None else np.array(templates, np.uint32)
-    modulations = processes.modulations
-    corners = _corners(factors)
-    frames = _draw_frames(scenarios, mode, factors, processes.cosmic_rays, corners)
-    each = 1 if frames else quiet.n_frames
-    n_pixel = quiet.wavelength_nm.size
-    padded = -(-n_pixel // PIXEL_BLOCK) * PIXEL_BLOCK
-    cumulants = [Cumulants.of(x, each) for x in scenarios]
-    varied = [[_scaled(x, c, corner) for corner in corners] for x, c in zip(scenarios, cumulants, strict=True)]
-    joint = _joint(scenarios, varied, recipe)
-    shapes = [polynomial(c) for c in cumulants] if joint and not modulations else []
-    quartic = joint and any(needs_fourth_power(c, varying=bool(modulations)) for row in varied for c in row)
-    photons = not joint and quiet.photon_noise == "poisson"
-    if modulations and not joint:
-        raise InputError(
-            f"{modulations[0][0]} varies within a run, and the noise of {quiet.name} cannot be drawn jointly, expected "
-            "Gaussian noise of 1.5 Poisson counts and more in each pixel, more where counts are few, or no such process"
-        )
-    tables: list[AliasTable] = []
     used = ~np.any([scenarios[t].saturated for t in np.unique(compared)], axis=0)
+    n_pixel, tables = used.size, list[AliasTable]()
 
-    pixels = np.zeros(padded, layout.PIXEL)
-    pixels["used"][:n_pixel] = used
-    ends = np.append(np.diff(quiet.element) > 0, True)
-    pixels["element_end"][:n_pixel] = ends
-    # Fours within one element that all count need no look at each pixel.
-    uneven = (pixels["element_end"] > 0) | (pixels["used"] == 0)
-    pixels["four_uneven"] = np.repeat(uneven.reshape(-1, 4).any(axis=1), 4)
-    pixels["cosmic_gain"][:n_pixel] = quiet.gain_dn_per_electron
-    darks, dark_centre = np.zeros(padded, layout.POISSON), np.zeros(n_pixel)
-    if not joint:
+    darks, dark_centre = np.zeros(pixels.padded(n_pixel), layout.POISSON), np.zeros(n_pixel)
+    if not choice.joint:
         step = quiet.dark_step_dn
-        dark_centre = _counts(darks[:n_pixel], each * quiet.dark_dn / step, step, tables)
-
-    shape = (len(scenarios), padded)
-    levels, edges = np.zeros(shape, layout.LEVEL), np.zeros(shape, layout.EDGE)
-    counts = np.zeros(shape if photons else 0, layout.POISSON)
-    responses = np.zeros(shape if modulations else 0, layout.RESPONSE)
-    responses["other_variance"] = NO_VARIANCE
-    fraction, base = np.zeros(shape), np.zeros((len(scenarios), n_pixel), np.int64)
-    estimates = np.zeros(shape if comparison.estimated else 0, layout.ESTIMATE)
-    # What is subtracted adds its noise to the null's variance.
-    noisier = 1.0 + comparison.share
-    levels["shift"] = edges["low"] = edges["high"] = layout.MAGIC
-    for k, (x, c) in enumerate(zip(scenarios, cumulants, strict=True)):
-        light = factors.on_light(factors.light, factors.sky, sky_share(x))
-        mean = c.mean + (light - 1.0) * c.light_dn + (factors.dark - 1.0) * c.dark_dn
-        if not joint:
-            mean = each * x.bias_dn + quiet.dark_step_dn * dark_centre
-            if photons:
-                mean += x.gain_dn_per_electron * _counts(counts[k, :n_pixel], c.photons, x.gain_dn_per_electron, tables)
-            else:
-                mean += x.gain_dn_per_electron * c.photons
-        base[k] = np.clip(np.rint(mean), 0, x.highest_dn if each == 1 else np.inf)
-        level = levels[k, :n_pixel]
-        if modulations:
-            _respond(responses[k, :n_pixel], x, c, factors)
-            _check_reach(x, c, factors)
-        elif joint:
-            for name, coefficient in zip(("c0", "c1", "c2", "c3", "c4"), shapes[k], strict=True):
-                level[name] = coefficient
-        else:
-            level["c1"] = np.sqrt(c.gaussian)
-        level["c0"] += mean - base[k]
-        template = scenarios[compared[k]]
-        mean_sum = template.recorded_dn
-        whole = (quiet.n_frames // each) * base[k] - np.rint(mean_sum)
-        if not comparison.exposures:
-            fraction[k, :n_pixel] = np.rint(mean_sum) - mean_sum
-        level["shift"] = layout.MAGIC - whole
-        variance = noisier * template.variance_dn2
-        level["inverse_variance"] = used / variance
-        level["twice"] = 2.0 * fraction[k, :n_pixel] * level["inverse_variance"]
-        edge = edges[k, :n_pixel]
-        edge["base"], edge["whole"] = base[k], whole
-        edge["low"] = layout.MAGIC - base[k]
-        edge["high"] = layout.MAGIC + (x.highest_dn - base[k])
-        if comparison.estimated:
-            _estimate(estimates[k], template, fraction[k], np.rint(mean_sum))
-        element_variance = np.bincount(quiet.element, variance * used)
-        with np.errstate(divide="ignore"):
-            edge["inverse_element_variance"][ends] = np.where(element_variance > 0, 1.0 / element_variance, 0.0)
-        edge["element_offset"][ends] = np.bincount(quiet.element, fraction[k, :n_pixel] * used)
-
-    job = np.zeros((), layout.JOB)
-    job["pixel_count"], job["padded_count"], job["scenario_count"] = n_pixel, padded, len(scenarios)
-    job["draw_count"], job["frame_count"] = quiet.n_frames if frames else 1, quiet.n_frames
-    job["first_frame"], job["first_group"] = first_frame, first_group
-    job["reference_count"], job["reference_share"] = comparison.exposures, comparison.share
-    job["pair_scale"] = noisier / 2.0
-    if processes.cosmic_rays is not None:
-        table = table_of(processes.cosmic_rays.charge(each * quiet.frame_s))
-        job["cosmic_table"] = sum(t.entries.size for t in tables)
-        job["cosmic_bits"], job["cosmic_low"] = table.bits, table.low
-        tables.append(table)
+        dark_centre = pixels.poisson_counts(darks[:n_pixel], choice.each * quiet.dark_dn / step, step, tables)
+    arrays = _PerScenario.empty(scenarios, choice, comparison, modulated=bool(drawing.processes.modulations))
+    for k, x in enumerate(scenarios):
+        arrays.fill_draw(k, x, choice, factors, quiet.dark_step_dn * dark_centre, tables)
+        arrays.fill_comparison(k, x, scenarios[compared[k]], choice, comparison, used)
+    job = _job(scenarios, drawing, choice, comparison, first_group, tables)
     return Scene(
         n_pixel=n_pixel,
         n_frames=quiet.n_frames,
-        frames=frames,
-        joint=joint,
-        quartic=quartic,
-        photons=photons,
-        clip=each == 1,
-        modulations=modulations,
+        frames=choice.frames,
+        joint=choice.joint,
+        quartic=choice.quartic,
+        photons=choice.photons,
+        clip=choice.each == 1,
+        modulations=drawing.processes.modulations,
         job=job,
-        pixels=pixels,
-        levels=levels,
-        edges=edges,
+        pixels=pixels.of_detector(quiet, used),
         dark_counts=darks,
-        photon_counts=counts,
-        responses=responses,
-        tables=np.concatenate([np.zeros(1, np.uint32)[:0], *(t.entries for t in tables)]).astype(np.uint32),
+        tables=np.concatenate([np.zeros(0, np.uint32), *(t.entries for t in tables)]).astype(np.uint32),
         priors=factors.tables,
         medians=(factors.light, factors.dark, factors.sky),
         templates=compared,
-        fraction=fraction,
-        estimates=estimates,
         comparison=comparison,
-        base_dn=base,
         used=used,
+        **vars(arrays),
     )
 
 
-def sky_share(x: Expectation) -> Float:
-    """The sky's share of the light of each pixel, shape (n_pixel,); zero where there is none."""
-    light = x.source_electrons + x.sky_electrons
-    return np.divide(x.sky_electrons, light, out=np.zeros_like(light), where=light > 0)
+@dataclass(eq=False)
+class _PerScenario:
+    """Arrays of a `Scene` with a row for each scenario, as they are filled."""
 
+    levels: NDArray[np.void]
+    edges: NDArray[np.void]
+    photon_counts: NDArray[np.void]
+    responses: NDArray[np.void]
+    fraction: Float
+    estimates: NDArray[np.void]
+    base_dn: NDArray[np.int64]
 
-def _corners(factors: Factors) -> list[tuple[float, float, float]]:
-    """Factors on light, dark and sky over all that the priors allow, neighbours at most a factor of 2 apart."""
-    ends = (factors.light_ends, factors.dark_ends, factors.sky_ends)
-    grids = [np.geomspace(low, high, 1 + int(np.ceil(np.log2(high / low)))) for low, high in ends]
-    return [(float(light), float(dark), float(sky)) for light in grids[0] for dark in grids[1] for sky in grids[2]]
-
-
-def _scaled(x: Expectation, c: Cumulants, corner: tuple[float, float, float]) -> Cumulants:
-    light, dark, sky = corner
-    return c.scaled(light if sky == 1.0 else Factors.on_light(light, sky, sky_share(x)), dark)
-
-
-def _joint(scenarios: Sequence[Expectation], varied: Sequence[Sequence[Cumulants]], recipe: Recipe) -> bool:
-    """Whether every pixel's noise may come from one normal, whatever the factors on light and dark."""
-    if recipe not in ("auto", "joint", "apart"):
-        raise InputError(f"recipe = {recipe!r}, expected 'auto', 'joint' or 'apart'")
-    if recipe == "apart":
-        return False
-    for x, c in ((x, c) for x, row in zip(scenarios, varied, strict=True) for c in row):
-        exact = joint_is_exact(c)
-        if not exact.all():
-            if recipe == "joint":
-                pixel = int(np.argmin(exact))
-                raise InputError(
-                    f"recipe = 'joint', and pixel {pixel} of {x.name} has {np.sqrt(c.gaussian[pixel]):.3g} DN of "
-                    "Gaussian noise beside Poisson counts, expected recipe 'apart' or 'auto'"
-                )
-            return False
-    return True
-
-
-def _counts(out: NDArray[np.void], mean: Float, gain: Float, tables: list[AliasTable]) -> Float:
-    """Fill in how Poisson counts are drawn; returns the whole numbers they are relative to, shape (n_pixel,)."""
-    centre = np.rint(mean)
-    # A pair shares two words: a table takes one, the expansion both. Two of a pair never go different ways.
-    expanded = _both_of_a_pair(mean >= SMALLEST_EXPANDED)
-    if (mean[~expanded] > LARGEST_MEAN).any():
-        pixel = int(np.argmax(np.where(expanded, 0.0, mean)))
-        raise InputError(
-            f"pixel {pixel} has a Poisson mean of {mean[pixel]:.3g} in one draw beside a pixel of less than "
-            f"{SMALLEST_EXPANDED:g}, expected at most {LARGEST_MEAN:g} there: draw frame by frame"
+    @classmethod
+    def empty(
+        cls, scenarios: Sequence[Expectation], choice: Choice, comparison: Comparison, *, modulated: bool
+    ) -> _PerScenario:
+        """All that padding needs."""
+        n_pixel = scenarios[0].wavelength_nm.size
+        shape = (len(scenarios), pixels.padded(n_pixel))
+        arrays = cls(
+            levels=np.zeros(shape, layout.LEVEL),
+            edges=np.zeros(shape, layout.EDGE),
+            photon_counts=np.zeros(shape if choice.photons else 0, layout.POISSON),
+            responses=np.zeros(shape if modulated else 0, layout.RESPONSE),
+            fraction=np.zeros(shape),
+            estimates=np.zeros(shape if comparison.estimated else 0, layout.ESTIMATE),
+            base_dn=np.zeros((len(scenarios), n_pixel), np.int64),
         )
-    found, starts = table_set(mean[~expanded].tolist(), tables)
-    out["table"][~expanded] = starts
-    out["bits"][~expanded] = [t.bits for t in found]
-    out["low"][~expanded] = np.array([t.low for t in found]) - centre[~expanded]
-    root = np.sqrt(mean[expanded])
-    out["offset"][expanded] = (mean - centre)[expanded] - 1 / 6
-    out["slope"][expanded] = root - 1 / (36 * root)
-    out["cubic"][expanded] = -1 / (72 * root)
-    out["gain"] = gain
-    return centre
+        arrays.responses["other_variance"] = pixels.NO_VARIANCE
+        for name, array in (("shift", arrays.levels), ("low", arrays.edges), ("high", arrays.edges)):
+            array[name] = layout.MAGIC
+        return arrays
+
+    def fill_draw(
+        self, k: int, x: Expectation, choice: Choice, factors: Factors, dark_dn: Float, tables: list[AliasTable]
+    ) -> None:
+        """How scenario k is drawn; `dark_dn` is what its dark counts are relative to."""
+        c, level = choice.cumulants[k], self.levels[k, : dark_dn.size]
+        mean = self._mean(k, x, choice, factors, dark_dn, tables)
+        base = self.base_dn[k] = np.clip(np.rint(mean), 0, x.highest_dn if choice.each == 1 else np.inf)
+        if self.responses.size:
+            pixels.respond(self.responses[k, : dark_dn.size], x, c, factors)
+            check_reach(x, c, factors)
+        elif choice.joint:
+            for name, coefficient in zip(("c0", "c1", "c2", "c3", "c4"), polynomial(c), strict=True):
+                level[name] = coefficient
+        else:
+            level["c1"] = np.sqrt(c.gaussian)
+        level["c0"] += mean - base
+
+    def _mean(
+        self, k: int, x: Expectation, choice: Choice, factors: Factors, dark_dn: Float, tables: list[AliasTable]
+    ) -> Float:
+        """DN that a draw is relative to: of Poisson counts drawn apart, whole ones."""
+        c, gain = choice.cumulants[k], x.gain_dn_per_electron
+        if choice.joint:
+            light = factors.on_light(factors.light, factors.sky, pixels.sky_share(x))
+            return np.asarray(c.mean + (light - 1.0) * c.light_dn + (factors.dark - 1.0) * c.dark_dn)
+        mean = choice.each * x.bias_dn + dark_dn
+        if choice.photons:
+            out = self.photon_counts[k, : dark_dn.size]
+            return np.asarray(mean + gain * pixels.poisson_counts(out, c.photons, gain, tables))
+        return np.asarray(mean + gain * c.photons)
+
+    def fill_comparison(
+        self,
+        k: int,
+        x: Expectation,
+        template: Expectation,
+        choice: Choice,
+        comparison: Comparison,
+        used: NDArray[np.bool_],
+    ) -> None:
+        """What scenario k is compared with."""
+        base, n_pixel = self.base_dn[k], used.size
+        level, edge, fraction = self.levels[k, :n_pixel], self.edges[k, :n_pixel], self.fraction[k, :n_pixel]
+        mean_sum = template.recorded_dn
+        whole = (x.n_frames // choice.each) * base - np.rint(mean_sum)
+        if not comparison.exposures:
+            fraction[:] = np.rint(mean_sum) - mean_sum
+        level["shift"] = layout.MAGIC - whole
+        variance = noisier(comparison) * template.variance_dn2
+        level["inverse_variance"] = used / variance
+        level["twice"] = 2.0 * fraction * level["inverse_variance"]
+        edge["base"], edge["whole"] = base, whole
+        edge["low"] = layout.MAGIC - base
+        edge["high"] = layout.MAGIC + (x.highest_dn - base)
+        if comparison.estimated:
+            pixels.estimate(self.estimates[k], template, self.fraction[k], np.rint(mean_sum))
+        ends = pixels.element_ends(x)
+        element_variance = np.bincount(x.element, variance * used)
+        with np.errstate(divide="ignore"):
+            edge["inverse_element_variance"][ends] = np.where(element_variance > 0, 1.0 / element_variance, 0.0)
+        edge["element_offset"][ends] = np.bincount(x.element, fraction * used)
 
 
-def _both_of_a_pair(chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Pixels 2i and 2i + 1 where both are chosen; a last one without a neighbour decides alone."""
-    pairs = np.append(chosen, chosen[-1:]) if chosen.size % 2 else chosen
-    return np.repeat(pairs.reshape(-1, 2).all(axis=1), 2)[: chosen.size]
+def noisier(comparison: Comparison) -> float:
+    """By how much what is subtracted adds its noise to the null's variance."""
+    return 1.0 + comparison.share
 
 
-def _estimate(out: NDArray[np.void], template: Expectation, fraction: Float, mean_sum: Float) -> None:
-    """How an observer who knows the detector estimates variances; padding has some, to divide by."""
-    n_pixel, known = template.wavelength_nm.size, template.read_noise_dn**2 + template.dark_variance_dn2 + 1 / 12
-    out["variance"] = 1.0
-    out["fraction"] = fraction
-    out["net_offset"][:n_pixel] = mean_sum - template.n_frames * (template.bias_dn + template.dark_dn)
-    out["gain"][:n_pixel] = template.gain_dn_per_electron
-    out["variance"][:n_pixel] = np.maximum(template.n_frames * known, NO_VARIANCE)
-
-
-def _respond(out: NDArray[np.void], x: Expectation, c: Cumulants, factors: Factors) -> None:
-    """How a draw follows factors on light, dark and sky, from what they are at the priors' medians."""
-    share, dark = sky_share(x), factors.dark
-    light = factors.on_light(factors.light, factors.sky, share)
-    # The sky's light follows both factors.
-    out["sky_share"] = factors.light * factors.sky * share / light
-    out["light"], out["dark"] = light * c.light_dn, dark * c.dark_dn
-    out["light_variance"], out["dark_variance"] = light * c.light_variance, dark * c.dark_variance
-    # A pixel without any noise must not divide zero by zero.
-    out["other_variance"] = np.maximum(c.variance - c.light_variance - c.dark_variance, NO_VARIANCE)
-    for order, name in ((3, "third"), (4, "fourth"), (5, "fifth")):
-        out[f"light_{name}"] = light * c.photon_cumulant(order)
-        out[f"dark_{name}"] = dark * c.dark_cumulant(order)
-
-
-def _check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
-    """Refuse what the priors could carry further than the device rounds."""
-    share = sky_share(x)
-    least, most = (factors.on_light(*ends, share) for ends in zip(factors.light_ends, factors.sky_ends, strict=True))
-    middle = factors.on_light(factors.light, factors.sky, share)
-    light = np.maximum(most - middle, middle - least)
-    dark = max(factors.dark_ends[1] - factors.dark, factors.dark - factors.dark_ends[0])
-    variance = c.variance + most * c.light_variance + factors.dark_ends[1] * c.dark_variance
-    reach = light * c.light_dn + dark * c.dark_dn + 8.0 * np.sqrt(variance)
-    if (reach >= REACH_DN).any():
-        pixel = int(np.argmax(reach))
-        raise InputError(
-            f"the priors carry pixel {pixel} of {x.name} {reach[pixel]:.3g} DN away from its mean, expected less than "
-            f"{REACH_DN:g}: shorten the exposure or draw frame by frame"
-        )
-
-
-def _draw_frames(
+def _job(
     scenarios: Sequence[Expectation],
-    mode: Mode,
-    factors: Factors,
-    rays: CosmicRays | None,
-    corners: Sequence[tuple[float, float, float]],
-) -> bool:
-    if mode not in ("auto", "frames", "stacked"):
-        raise InputError(f"mode = {mode!r}, expected 'auto', 'frames' or 'stacked'")
-    if scenarios[0].n_frames == 1 or mode == "frames":
-        # One frame is its own stack: the same draws either way.
-        return mode == "frames" and scenarios[0].n_frames > 1
-    for x in scenarios:
-        near = near_rail(x, factors, rays)
-        # The less light and dark, the less the rounding is noise.
-        coarse = ~stack_is_exact(_scaled(x, Cumulants.of(x, 1), corners[0]), x)
-        for found, why in (
-            (near, f"cannot clip, and a frame comes within {RAIL_SIGMA:g} sigma of zero or saturation"),
-            (coarse, "takes rounding for noise, and a frame has too little noise of its own for that"),
-        ):
-            if found.any():
-                if mode == "stacked":
-                    where = float(x.wavelength_nm[found][0])
-                    raise InputError(
-                        f"mode = 'stacked' {why} in the pixel at {where:.1f} nm of {x.name}, expected mode 'frames' or "
-                        "'auto'"
-                    )
-                return True
-    return False
-
-
-def _check_same_detector(quiet: Expectation, other: Expectation) -> None:
-    for name in (
-        "wavelength_nm",
-        "dark_dn",
-        "bias_dn",
-        "read_noise_dn",
-        "gain_dn_per_electron",
-        "element",
-        "n_frames",
-        "frame_s",
-        "dark_unit",
-        "photon_noise",
-        "adc_max_dn",
-        "saturation_dn",
-    ):
-        if not np.array_equal(getattr(quiet, name), getattr(other, name)):
-            raise InputError(
-                f"{name} of {other.name} differs from that of {quiet.name}, expected scenarios of one study "
-                "to share instrument and exposure"
-            )
+    drawing: Drawing,
+    choice: Choice,
+    comparison: Comparison,
+    first_group: int,
+    tables: list[AliasTable],
+) -> NDArray[np.void]:
+    """What a launch reads once: layout.JOB, shape (); the table of cosmic rays comes behind the others."""
+    quiet = scenarios[0]
+    job = np.zeros((), layout.JOB)
+    n_pixel = quiet.wavelength_nm.size
+    job["pixel_count"], job["padded_count"], job["scenario_count"] = n_pixel, pixels.padded(n_pixel), len(scenarios)
+    job["draw_count"], job["frame_count"] = quiet.n_frames if choice.frames else 1, quiet.n_frames
+    job["first_frame"], job["first_group"] = drawing.first_frame, first_group
+    job["reference_count"], job["reference_share"] = comparison.exposures, comparison.share
+    job["pair_scale"] = noisier(comparison) / 2.0
+    rays = drawing.processes.cosmic_rays
+    if rays is not None:
+        table = table_of(rays.charge(choice.each * quiet.frame_s))
+        job["cosmic_table"] = sum(t.entries.size for t in tables)
+        job["cosmic_bits"], job["cosmic_low"] = table.bits, table.low
+        tables.append(table)
+    return job

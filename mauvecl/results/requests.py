@@ -9,12 +9,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise.comparison import TEMPLATE, Comparison
-from mauvecl.noise.processes import NONE, Processes
-from mauvecl.noise.scene import BATCH, Mode, Recipe, Scene, prepare
+from mauvecl.noise.drawing import AUTOMATIC, Drawing, DrawingWords
+from mauvecl.noise.scene import BATCH, Scene, prepare
 from mauvecl.results.channels import ChannelPlan, plan_channels
 from mauvecl.results.detection import Tails
 from mauvecl.results.hypotheses import Hypotheses
@@ -40,6 +40,12 @@ class Share:
 class _Asked:
     """What travels to a worker: the question without anything made of it."""
 
+    @classmethod
+    def of(cls, *what: Any, **how: Any) -> Self:
+        """With the fields of a `Drawing` among the keywords."""
+        words = {name: how.pop(name) for name in DrawingWords.__annotations__ if name in how}
+        return cls(*what, **how | {"drawing": Drawing(**words)})
+
     def __getstate__(self) -> dict[str, Any]:
         return {each.name: getattr(self, each.name) for each in fields(self)}  # type: ignore[arg-type]
 
@@ -53,10 +59,8 @@ class DetectRequest(_Asked):
     realisations: int
     seed: int
     statistics: Sequence[str | Linear] = USUAL_STATISTICS
-    mode: Mode = "auto"
     start: int = 0
-    processes: Processes = NONE
-    recipe: Recipe = "auto"
+    drawing: Drawing = AUTOMATIC
     comparison: Comparison = TEMPLATE
     tails: Tails = "counted"
     nuisances: Nuisances | Mapping[str, float] | None = None
@@ -67,8 +71,7 @@ class DetectRequest(_Asked):
     @cached_property
     def hypotheses(self) -> Hypotheses:
         """What is drawn, and what is computed of it."""
-        how = {"processes": self.processes, "recipe": self.recipe, "comparison": self.comparison}
-        scene = prepare([self.quiet, *self.flares], self.mode, **how)  # type: ignore[arg-type]
+        scene = prepare([self.quiet, *self.flares], self.drawing, comparison=self.comparison)
         nuisances = known(self.nuisances, self.quiet)
         return Hypotheses(self.quiet, self.flares, self.statistics, scene, nuisances=nuisances)
 
@@ -101,17 +104,15 @@ class SnrRequest(_Asked):
     expectation: Expectation
     realisations: int
     seed: int
-    mode: Mode = "auto"
     start: int = 0
-    processes: Processes = NONE
-    recipe: Recipe = "auto"
+    drawing: Drawing = AUTOMATIC
 
     parts = 1
 
     @cached_property
     def scene(self) -> Scene:
         """What is drawn."""
-        return prepare([self.expectation], self.mode, processes=self.processes, recipe=self.recipe)
+        return prepare([self.expectation], self.drawing)
 
     @property
     def work(self) -> int:
@@ -126,11 +127,8 @@ class RealiseRequest(_Asked):
     expectation: Expectation
     realisations: int
     seed: int
-    mode: Mode = "auto"
     start: int = 0
-    processes: Processes = NONE
-    recipe: Recipe = "auto"
-    first_frame: int = 0
+    drawing: Drawing = AUTOMATIC
 
 
 #: What is cut into shares: its `work` is about pixels times scenarios of one realisation.

@@ -13,7 +13,8 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 from numpy.typing import NDArray
 
-from mauvecl.device.engine import DeviceError, DeviceRecord, Engine, Progress
+from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
+from mauvecl.device.tiles import Progress
 from mauvecl.results.requests import Countable, DetectRequest, RealiseRequest, Request, Share, SnrRequest
 from mauvecl.results.sums import Arrays, DetectionSums, SnrSums
 from mauvecl.runs.shards import fingerprint, shares
@@ -151,7 +152,7 @@ class LocalWorkers:
                     return self._engines[place].count(request, share, out=out)
                 except Exception as error:
                     engine = self._engines[place]
-                    launch = isinstance(error, engine.cl.Error)
+                    launch = isinstance(error, engine.opened.cl.Error)
                     if not launch or self._stopping:
                         raise
                     if tried == TRIES:
@@ -259,14 +260,14 @@ class Pool:
 
     def detect(self, quiet: Expectation, flares: Sequence[Expectation], **how: Any) -> Detection:
         """As `Engine.detect`, with the same keywords."""
-        request = DetectRequest(quiet, tuple(flares), **how)
+        request = DetectRequest.of(quiet, tuple(flares), **how)
         sums = DetectionSums(request)
         self._add_up(request, sums)
         return sums.answer()
 
     def snr(self, expectation: Expectation, **how: Any) -> SnrResult:
         """As `Engine.snr`, with the same keywords."""
-        request = SnrRequest(expectation, **how)
+        request = SnrRequest.of(expectation, **how)
         sums = SnrSums(request)
         self._add_up(request, sums)
         return sums.answer()
@@ -275,7 +276,7 @@ class Pool:
         self, expectation: Expectation, *, count: int, out: NDArray[Any] | None = None, **how: Any
     ) -> NDArray[Any]:
         """As `Engine.realise`, with the same keywords, by one worker; several calls at a time keep all of them busy."""
-        request = RealiseRequest(expectation, count, **how)
+        request = RealiseRequest.of(expectation, count, **how)
         share = Share(0, request.start, count)
         future = self.workers.submit(request, uuid.uuid4().hex, share, lambda done: None, out)
         rows: NDArray[Any] = future.result()["rows"]

@@ -13,6 +13,7 @@ from scenes import instrument, star
 from scipy import stats
 
 from mauvecl.device.engine import Engine
+from mauvecl.device.forms import scene_launches
 from mauvecl.host.errors import InputError
 from mauvecl.host.instrument.pixel_map import PixelMap
 from mauvecl.noise import twin as reference
@@ -179,7 +180,7 @@ def test_modes_meet_the_rails(engine: Engine) -> None:
     raw = engine.realise(bright, count=200, seed=1)
     assert raw.max() == 2 * bright.highest_dn == 2 * 59_578
     with pytest.raises(InputError, match="stacked"):
-        prepare([bright], "stacked")
+        prepare([bright], mode="stacked")
     (faint, *_), _ = case("stack")
     assert not prepare([faint]).frames
 
@@ -228,8 +229,8 @@ def test_frames_are_uncorrelated(engine: Engine) -> None:
     z = []
     for frame in (0, 1, 2**32 - 1):
         scene, out = prepare([x], first_frame=frame), np.empty((20_000, x.wavelength_nm.size), np.int32)
-        with engine._scene(scene, 9) as run:
-            engine._over(
+        with scene_launches(engine.opened, scene, 9) as run:
+            engine._tiles.over(
                 0, 20_000, 4 * scene.n_pixel, lambda t, n, run=run, out=out: run.realise(t, out[n : n + t.wanted])
             )
         z.append((out - x.mean_raw_dn) / np.sqrt(x.variance_dn2))
@@ -266,6 +267,7 @@ import hashlib, sys
 sys.path.insert(0, {tests!r})
 from answers import same_counts
 from scenes import star
+from mauvecl.device.forms import scene_launches
 from mauvecl.device.engine import Engine
 quiet, *flares = star(amplitudes=(0.081, 0.24))
 found = Engine().detect(quiet, flares, realisations=20_000, seed=3)

@@ -86,7 +86,7 @@ def test_a_failing_build_shows_the_numbered_source(engine: Engine) -> None:
     from mauvecl.device.program import BuildError, build
 
     with pytest.raises(BuildError, match=r"   2  nonsense here"):
-        build(engine.context, "// a comment\nnonsense here\n")
+        build(engine.opened.context, "// a comment\nnonsense here\n")
 
 
 def refuse_beyond(monkeypatch: pytest.MonkeyPatch, limit: int, *, scenes: bool = False) -> list[int]:

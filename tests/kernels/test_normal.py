@@ -102,7 +102,7 @@ def test_a_thousand_million_draws(probes_fast: Probes) -> None:
 
 @pytest.fixture(scope="module")
 def probes_fast(engine: Engine) -> Probes:
-    return Probes(engine=engine)
+    return Probes(device=engine.opened)
 
 
 def test_the_fused_multiply_add_is_rounded_once() -> None:

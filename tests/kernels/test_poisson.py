@@ -127,7 +127,7 @@ def test_the_expansion_is_the_twins(probes: Probes) -> None:
 
 @pytest.fixture(scope="session")
 def probes_fast(engine: Engine) -> Probes:
-    return Probes(engine=engine)
+    return Probes(device=engine.opened)
 
 
 def test_moments_of_the_table() -> None:

@@ -9,7 +9,8 @@ import pytest
 from scenes import instrument, star
 
 from mauvecl.device.engine import Engine
-from mauvecl.device.launches import Tile
+from mauvecl.device.forms import scene_launches
+from mauvecl.device.tiles import Tile
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise import layout
@@ -45,10 +46,10 @@ def place_of(words: tuple[int, int, int, int], stream: str) -> tuple[int, int, i
 def draw_one(engine: Engine, scene: Scene, index: int, seed: int) -> np.ndarray:
     """One realisation of a scene by the production kernel."""
     out = np.empty((1, scene.n_pixel), np.int32)
-    tile = engine._tile_at(index, 1, 4096)
+    tile = engine._tiles.at(index, 1, 4096)
     assert isinstance(tile, Tile)
-    with engine._scene(scene, seed) as run:
-        run.realise(tile, out)
+    with scene_launches(engine.opened, scene, seed) as launches:
+        launches.realise(tile, out)
     return out
 
 

@@ -157,7 +157,7 @@ def test_one_process_moves_no_other(engine: Engine) -> None:
         ),
         (
             lambda: prepare(
-                star(magnitude=3.0, exposure=80_000.0), "stacked", processes=Processes(qe_scale=Uniform(0.5, 1.5))
+                star(magnitude=3.0, exposure=80_000.0), mode="stacked", processes=Processes(qe_scale=Uniform(0.5, 1.5))
             ),
             r"the priors carry pixel \d+ of G2V",
         ),

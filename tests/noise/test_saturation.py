@@ -69,7 +69,7 @@ def test_the_twin_cuts_off_alike(engine: Engine) -> None:
     index = np.arange(64, dtype=np.uint64)
     for x in (quiet, flare):
         raw, cut = engine.realise_and_count(x, count=64, seed=9, mode="frames")
-        scene = prepare([x], "frames")
+        scene = prepare([x], mode="frames")
         np.testing.assert_array_equal(raw, reference.realise(scene, index, 9))
         np.testing.assert_array_equal(cut, reference.clipped(scene, index, 9).sum(axis=(1, 2)))
         counts = engine.snr(x, realisations=N, seed=9, mode="frames").counts.clipped[:, 1]

@@ -95,7 +95,7 @@ def test_random_stacks_of_quiet_frames() -> None:
         assert frames or min(told) > SOONEST
         if frames:
             with pytest.raises(InputError, match="mode = 'stacked' takes rounding for noise"):
-                prepare([x], "stacked")
+                prepare([x], mode="stacked")
     assert stacked > 20
     assert wrong > 20
 

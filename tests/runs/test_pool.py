@@ -26,6 +26,7 @@ from mauvecl.device.engine import DeviceError, Engine
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise.comparison import Comparison
+from mauvecl.noise.drawing import Drawing
 from mauvecl.noise.processes import Processes, Uniform
 from mauvecl.results.detection import Detection
 from mauvecl.results.requests import DetectRequest, Share, SnrRequest
@@ -130,14 +131,14 @@ class Failing:
 
     def __init__(self, engine: Engine, fails: set[int], calls: list[int]) -> None:
         self._engine, self._fails, self._calls = engine, fails, calls
-        self.cl, self.device, self.device_name = engine.cl, engine.device, engine.device_name
+        self.opened, self.device, self.device_name = engine.opened, engine.device, engine.device_name
 
     def count(self, request: Any, share: Share, **more: Any) -> Arrays:
         self._calls.append(len(self._calls))
         if self._calls[-1] in self._fails:
             # Half of the share is counted already when it fails.
             self._engine.count(request, replace(share, count=share.count // 2))
-            raise self.cl.RuntimeError("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES", -5, "")
+            raise self.opened.cl.RuntimeError("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES", -5, "")
         return self._engine.count(request, share, **more)
 
 
@@ -199,8 +200,8 @@ def test_fingerprints_tell_requests_apart(scene: list[Expectation]) -> None:
         replace(base, flares=tuple(flares[::-1])),
         replace(base, flares=(flares[0], brighter)),
         replace(base, comparison=Comparison.of("exposure")),
-        replace(base, processes=Processes(jitter=Uniform(0.0, 0.01))),
-        replace(base, mode="frames"),
+        replace(base, drawing=Drawing(processes=Processes(jitter=Uniform(0.0, 0.01)))),
+        replace(base, drawing=Drawing(mode="frames")),
         SnrRequest(quiet, N, 5),
     ]
     names = [fingerprint(one) for one in (base, *others)]

@@ -1,0 +1,199 @@
+"""How scenarios must be drawn, chosen by what their noise allows; what cannot be drawn is refused."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.host.errors import InputError
+from mauvecl.noise.cumulants import Cumulants, joint_is_exact, needs_fourth_power, stack_is_exact
+from mauvecl.noise.drawing import Drawing, Mode, Recipe
+from mauvecl.noise.pixels import sky_share
+from mauvecl.noise.processes import CosmicRays, Factors
+
+if TYPE_CHECKING:
+    from mauvecl.host.expectation import Expectation
+
+#: `frames` is chosen where a pixel's mean is within this many sigma of a rail.
+RAIL_SIGMA = 8.0
+#: Counts further from their base than this are not rounded to whole DN by the device.
+REACH_DN = 2.0**22
+#: Groups of four pixels have 24 bits in the counter.
+MOST_PIXELS = 65_536
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """How scenarios are drawn.
+
+    Attributes
+    ----------
+    frames, joint, quartic, photons : bool
+        See `Scene`.
+    each : int
+        Frames in one draw.
+    cumulants : list of Cumulants
+        Of one draw of each scenario.
+    """
+
+    frames: bool
+    joint: bool
+    quartic: bool
+    photons: bool
+    each: int
+    cumulants: list[Cumulants]
+
+
+def choose(scenarios: Sequence[Expectation], drawing: Drawing, factors: Factors) -> Choice:
+    """How scenarios are drawn.
+
+    Raises
+    ------
+    InputError
+        If they cannot be drawn as asked for, or not together.
+    """
+    quiet, processes = scenarios[0], drawing.processes
+    modulations = processes.modulations
+    if quiet.wavelength_nm.size > MOST_PIXELS:
+        raise InputError(f"{quiet.wavelength_nm.size} pixels, expected at most {MOST_PIXELS}")
+    for other in scenarios[1:]:
+        _check_same_detector(quiet, other)
+    corners = _corners(factors)
+    frames = _draw_frames(scenarios, drawing.mode, factors, processes.cosmic_rays, corners)
+    each = 1 if frames else quiet.n_frames
+    cumulants = [Cumulants.of(x, each) for x in scenarios]
+    varied = [[_scaled(x, c, corner) for corner in corners] for x, c in zip(scenarios, cumulants, strict=True)]
+    joint = _joint(scenarios, varied, drawing.recipe)
+    if modulations and not joint:
+        raise InputError(
+            f"{modulations[0][0]} varies within a run, and the noise of {quiet.name} cannot be drawn jointly, expected "
+            "Gaussian noise of 1.5 Poisson counts and more in each pixel, more where counts are few, or no such process"
+        )
+    return Choice(
+        frames=frames,
+        joint=joint,
+        quartic=joint and any(needs_fourth_power(c, varying=bool(modulations)) for row in varied for c in row),
+        photons=not joint and quiet.photon_noise == "poisson",
+        each=each,
+        cumulants=cumulants,
+    )
+
+
+def near_rail(x: Expectation, factors: Factors, rays: CosmicRays | None) -> NDArray[np.bool_]:
+    """Pixels whose single frame comes within `RAIL_SIGMA` of zero or of saturation, shape (n_pixel,).
+
+    With priors wherever they carry it, and with a cosmic ray's hit.
+    """
+    variance, light = x.unsaturated_variance_dn2 / x.n_frames, x.light_dn / x.n_frames
+    mean = x.mean_raw_dn
+    ends = []
+    for end_light, more_dark, sky in zip(factors.light_ends, factors.dark_ends, factors.sky_ends, strict=True):
+        more_light = factors.on_light(end_light, sky, sky_share(x))
+        there = mean + (more_light - 1.0) * light + (more_dark - 1.0) * x.dark_dn
+        more = (more_light - 1.0) * x.gain_dn_per_electron * light + (more_dark - 1.0) * x.dark_variance_dn2
+        ends.append((there, RAIL_SIGMA * np.sqrt(variance + np.maximum(more, 0.0))))
+    hit = 0.0 if rays is None else x.gain_dn_per_electron * rays.electrons[1]
+    low: NDArray[np.bool_] = ends[0][0] - ends[0][1] < 0.0
+    high: NDArray[np.bool_] = ends[1][0] + ends[1][1] + hit > x.highest_dn
+    return low | high
+
+
+def _corners(factors: Factors) -> list[tuple[float, float, float]]:
+    """Factors on light, dark and sky over all that the priors allow, neighbours at most a factor of 2 apart."""
+    ends = (factors.light_ends, factors.dark_ends, factors.sky_ends)
+    grids = [np.geomspace(low, high, 1 + int(np.ceil(np.log2(high / low)))) for low, high in ends]
+    return [(float(light), float(dark), float(sky)) for light in grids[0] for dark in grids[1] for sky in grids[2]]
+
+
+def _scaled(x: Expectation, c: Cumulants, corner: tuple[float, float, float]) -> Cumulants:
+    light, dark, sky = corner
+    return c.scaled(light if sky == 1.0 else Factors.on_light(light, sky, sky_share(x)), dark)
+
+
+def _joint(scenarios: Sequence[Expectation], varied: Sequence[Sequence[Cumulants]], recipe: Recipe) -> bool:
+    """Whether every pixel's noise may come from one normal, whatever the factors on light and dark."""
+    if recipe == "apart":
+        return False
+    for x, c in ((x, c) for x, row in zip(scenarios, varied, strict=True) for c in row):
+        exact = joint_is_exact(c)
+        if not exact.all():
+            if recipe == "joint":
+                pixel = int(np.argmin(exact))
+                raise InputError(
+                    f"recipe = 'joint', and pixel {pixel} of {x.name} has {np.sqrt(c.gaussian[pixel]):.3g} DN of "
+                    "Gaussian noise beside Poisson counts, expected recipe 'apart' or 'auto'"
+                )
+            return False
+    return True
+
+
+def _draw_frames(
+    scenarios: Sequence[Expectation],
+    mode: Mode,
+    factors: Factors,
+    rays: CosmicRays | None,
+    corners: Sequence[tuple[float, float, float]],
+) -> bool:
+    if scenarios[0].n_frames == 1 or mode == "frames":
+        # One frame is its own stack: the same draws either way.
+        return mode == "frames" and scenarios[0].n_frames > 1
+    for x in scenarios:
+        near = near_rail(x, factors, rays)
+        # The less light and dark, the less the rounding is noise.
+        coarse = ~stack_is_exact(_scaled(x, Cumulants.of(x, 1), corners[0]), x)
+        for found, why in (
+            (near, f"cannot clip, and a frame comes within {RAIL_SIGMA:g} sigma of zero or saturation"),
+            (coarse, "takes rounding for noise, and a frame has too little noise of its own for that"),
+        ):
+            if found.any():
+                if mode == "stacked":
+                    where = float(x.wavelength_nm[found][0])
+                    raise InputError(
+                        f"mode = 'stacked' {why} in the pixel at {where:.1f} nm of {x.name}, expected mode 'frames' or "
+                        "'auto'"
+                    )
+                return True
+    return False
+
+
+def check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
+    """Refuse what the priors could carry further than the device rounds."""
+    share = sky_share(x)
+    least, most = (factors.on_light(*ends, share) for ends in zip(factors.light_ends, factors.sky_ends, strict=True))
+    middle = factors.on_light(factors.light, factors.sky, share)
+    light = np.maximum(most - middle, middle - least)
+    dark = max(factors.dark_ends[1] - factors.dark, factors.dark - factors.dark_ends[0])
+    variance = c.variance + most * c.light_variance + factors.dark_ends[1] * c.dark_variance
+    reach = light * c.light_dn + dark * c.dark_dn + 8.0 * np.sqrt(variance)
+    if (reach >= REACH_DN).any():
+        pixel = int(np.argmax(reach))
+        raise InputError(
+            f"the priors carry pixel {pixel} of {x.name} {reach[pixel]:.3g} DN away from its mean, expected less than "
+            f"{REACH_DN:g}: shorten the exposure or draw frame by frame"
+        )
+
+
+def _check_same_detector(quiet: Expectation, other: Expectation) -> None:
+    for name in (
+        "wavelength_nm",
+        "dark_dn",
+        "bias_dn",
+        "read_noise_dn",
+        "gain_dn_per_electron",
+        "element",
+        "n_frames",
+        "frame_s",
+        "dark_unit",
+        "photon_noise",
+        "adc_max_dn",
+        "saturation_dn",
+    ):
+        if not np.array_equal(getattr(quiet, name), getattr(other, name)):
+            raise InputError(
+                f"{name} of {other.name} differs from that of {quiet.name}, expected scenarios of one study "
+                "to share instrument and exposure"
+            )
