@@ -18,7 +18,7 @@ demo: .venv/plot.stamp
 	$(BIN)/mauvecl detect --output demo
 
 test: .venv/test.stamp
-	$(BIN)/python -m pytest -n 3 --dist worksteal
+	$(BIN)/python -m pytest -n 3
 
 lint: .venv/test.stamp .venv/lint.stamp
 	$(BIN)/ruff check .
@@ -28,7 +28,7 @@ lint: .venv/test.stamp .venv/lint.stamp
 
 # While editing: what can be known in two minutes on two cores.
 check: lint
-	$(BIN)/python -m pytest -n 3 --dist worksteal -q -m 'not long'
+	$(BIN)/python -m pytest -n 3 -q -m 'not long'
 
 docs: .venv/docs.stamp
 	$(BIN)/sphinx-build -W -q -b html docs docs/_build

@@ -65,6 +65,7 @@ def files_of(cache: Path) -> list[Path]:
     return sorted(path for path in cache.rglob("*") if path.is_file())
 
 
+@pytest.mark.long
 def test_the_second_process_builds_nothing(filled: tuple[Path, str]) -> None:
     cache, digest = filled
     again = run(cache)
@@ -95,6 +96,7 @@ def store_of(cache: Path) -> Path:
     return store
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("ending", [".so", ".bc", ".json"])
 @pytest.mark.parametrize("kind", DAMAGE)
 def test_a_damaged_program_is_never_restored(filled: tuple[Path, str], tmp_path: Path, kind: str, ending: str) -> None:
@@ -111,6 +113,7 @@ def test_a_damaged_program_is_never_restored(filled: tuple[Path, str], tmp_path:
         assert files_of(cache.work) == []
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("kind", "ending"), [("a flipped bit", ".so"), ("garbage", ".json"), ("a flipped bit", ".txt")]
 )
@@ -161,6 +164,7 @@ def test_any_manifest_is_read_without_trust(tmp_path: Path, text: str) -> None:
     assert not (cache.work / "a").exists()
 
 
+@pytest.mark.long
 def test_a_full_store_is_no_obstacle(filled: tuple[Path, str], tmp_path: Path) -> None:
     """The disk fills while the store is written to: the run is as ever, and nothing half-written is ever read."""
     before = f"""
@@ -183,6 +187,7 @@ def test_without_any_room_one_sentence_says_what_to_do(tmp_path: Path) -> None:
     assert "\n" not in said
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("folder", ["/proc/mauvecl", "/dev/null/mauvecl"])
 def test_a_folder_that_cannot_be_made_is_replaced(filled: tuple[Path, str], folder: str) -> None:
     found = run(folder)
@@ -190,6 +195,7 @@ def test_a_folder_that_cannot_be_made_is_replaced(filled: tuple[Path, str], fold
     assert not found["work"].startswith(folder)
 
 
+@pytest.mark.long
 def test_what_a_killed_process_leaves_is_swept_up(filled: tuple[Path, str], tmp_path: Path) -> None:
     code = "import time; from mauvecl.device.engine import Engine; Engine(); print('up', flush=True); time.sleep(60)"
     child = subprocess.Popen(
@@ -218,6 +224,7 @@ ELSEWHERE = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("place", ELSEWHERE)
 @pytest.mark.parametrize("holder", ["here", "there"])
 def test_containers_that_share_a_home_leave_each_other_alone(tmp_path: Path, place: str, holder: str) -> None:
@@ -262,6 +269,7 @@ def test_another_hosts_folder_goes_by_age_and_lock(tmp_path: Path, days: int, lo
     assert folder.exists() == (locked or days < 30)
 
 
+@pytest.mark.long
 def test_a_second_engine_leaves_loaded_kernels_alone(filled: tuple[Path, str]) -> None:
     """A loaded kernel whose file is written anew ends the process at its next use."""
     before = """

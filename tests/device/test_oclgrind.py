@@ -12,7 +12,10 @@ import pytest
 ICD = next(
     (path for root in ("/usr/lib", "/usr/local/lib") for path in Path(root).rglob("liboclgrind-rt-icd.so")), None
 )
-pytestmark = pytest.mark.skipif(ICD is None, reason="Oclgrind is not installed (Debian: apt-get install oclgrind)")
+pytestmark = [
+    pytest.mark.long,
+    pytest.mark.skipif(ICD is None, reason="Oclgrind is not installed (Debian: apt-get install oclgrind)"),
+]
 
 KERNELS = """
 import sys

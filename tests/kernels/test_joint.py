@@ -89,6 +89,7 @@ def span(x: Expectation) -> tuple[int, int]:
     return int(x.mean_raw_dn[0]) - reach, 2 * reach
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", PIXELS)
 def test_no_number_of_draws_would_tell(name: str) -> None:
     """Pearson's test would need 1e12 draws to see the polynomial at five sigma; most cases far more."""
@@ -122,6 +123,7 @@ def test_what_is_not_smooth_is_drawn_apart() -> None:
 ROWS = 610_000
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("recipe", ["joint", "apart"])
 @pytest.mark.parametrize("name", ["payload", "cold", "counting", "electrons"])
 def test_pearson_of_raw_counts(engine: Engine, name: str, recipe: str) -> None:

@@ -73,6 +73,7 @@ class Noise:
 BOUNDS = [(np.log10(1.5), 1.5), (-0.5, 0.5), (-2.5, 3.3), (-1.0, 1.0), (-4.5, 3.3), (0.0, 1.0)]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("varying", [False, True], ids=["steady", "factors on light and dark"])
 @pytest.mark.parametrize("what", ["Pearson", "tails"])
 def test_the_worst_that_is_allowed(what: str, varying: bool) -> None:

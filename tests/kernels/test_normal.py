@@ -51,6 +51,7 @@ def test_the_twin_has_the_same_bits(probes: Probes) -> None:
     )
 
 
+@pytest.mark.long
 def test_distribution(probes: Probes) -> None:
     """Kolmogorov-Smirnov on 8e6 draws; fails by chance once in 1e6 runs of new words."""
     n = 2**22
@@ -64,6 +65,7 @@ def test_distribution(probes: Probes) -> None:
         assert abs(np.sum(x * y)) < 5 * np.sqrt(np.sum((x * y) ** 2))
 
 
+@pytest.mark.long
 def test_every_word_is_finite(probes_fast: Probes) -> None:
     """All 2**32 radius words, with angles at the ends of the sine's range and at the turn by pi."""
     items, per_item = 2**14, 2**18
@@ -76,6 +78,7 @@ def test_every_word_is_finite(probes_fast: Probes) -> None:
         assert 6.75 < reach < 6.77
 
 
+@pytest.mark.long
 def test_a_thousand_million_draws(probes_fast: Probes) -> None:
     """Pearson, Kolmogorov-Smirnov and tails to six sigma at 1e9; each fails by chance once in 1e6 new seeds."""
     items, groups = 4096, 3815

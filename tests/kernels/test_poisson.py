@@ -50,35 +50,48 @@ def pearson(counts: np.ndarray, low: int, mean: float) -> float:
     return selftest.pearson(counts, stats.poisson.pmf(low + np.arange(counts.size), mean))
 
 
-BLOCK = 2_500_000
+#: Draws of each mean, and Philox counters whose words make them, so many at a time.
+DRAWS, BLOCK = 100_000_000, 2_500_000
+EXPANDED = [SMALLEST_EXPANDED, 2225.0, 22250.0, 222500.0]
 
 
+@pytest.fixture(scope="module")
+def drawn(probes_fast: Probes) -> dict[tuple[str, float], np.ndarray]:
+    """How often each count was drawn of each mean, by table and by expansion: the same 1e8 words for all."""
+    tables = {mean: alias_table(mean) for mean in MEANS}
+    half = {mean: int(10 * np.sqrt(mean)) for mean in EXPANDED}
+    counts = {("table", mean): np.zeros(2**table.bits, np.int64) for mean, table in tables.items()}
+    counts |= {("expansion", mean): np.zeros(2 * half[mean], np.int64) for mean in EXPANDED}
+    for i in range(DRAWS // (4 * BLOCK)):
+        w = np.array(reference.words_at(np.arange(i * BLOCK, (i + 1) * BLOCK), 3, "dark", 7, 99))
+        for mean, table in tables.items():
+            found = probes_fast.alias(w.ravel(), table.entries, table.bits)
+            counts["table", mean] += np.bincount(found, minlength=2**table.bits)
+        for mean in EXPANDED:
+            found = probes_fast.expansion(w[[0, 2]].ravel(), w[[1, 3]].ravel(), mean)
+            counts["expansion", mean] += np.bincount(found.ravel() + half[mean], minlength=2 * half[mean])
+    return counts
+
+
+@pytest.mark.long
 @pytest.mark.parametrize("mean", MEANS)
-def test_pearson_of_the_table(probes_fast: Probes, mean: float) -> None:
+def test_pearson_of_the_table(drawn: dict[tuple[str, float], np.ndarray], mean: float) -> None:
     """Pearson's test at 1e8 draws; fails by chance once in 1e6 runs of a new seed."""
-    table = alias_table(mean)
-    counts = np.zeros(2**table.bits, np.int64)
-    for i in range(10):
-        words = np.concatenate(reference.words_at(np.arange(i * BLOCK, (i + 1) * BLOCK), 3, "dark", 7, 99))
-        counts += np.bincount(probes_fast.alias(words, table.entries, table.bits), minlength=counts.size)
-    assert counts.sum() == 100_000_000
+    counts = drawn["table", mean]
+    assert counts.sum() == DRAWS
     if mean == 0.0:
         assert counts[0] == counts.sum()
     else:
-        assert pearson(counts, table.low, mean) > 1e-6
+        assert pearson(counts, alias_table(mean).low, mean) > 1e-6
 
 
-@pytest.mark.parametrize("mean", [SMALLEST_EXPANDED, 2225.0, 22250.0, 222500.0])
-def test_pearson_of_the_expansion(probes_fast: Probes, mean: float) -> None:
+@pytest.mark.long
+@pytest.mark.parametrize("mean", EXPANDED)
+def test_pearson_of_the_expansion(drawn: dict[tuple[str, float], np.ndarray], mean: float) -> None:
     """The same for counts from the expansion. A rounded normal of mean 2225 gives p < 1e-100 here."""
-    half = int(10 * np.sqrt(mean))
-    counts = np.zeros(2 * half, np.int64)
-    for i in range(10):
-        w = np.array(reference.words_at(np.arange(i * BLOCK, (i + 1) * BLOCK), 5, "dark", 9, 99))
-        drawn = probes_fast.expansion(w[[0, 2]].ravel(), w[[1, 3]].ravel(), mean)
-        counts += np.bincount(drawn.ravel() + half, minlength=counts.size)
-    assert counts.sum() == 100_000_000
-    assert pearson(counts, round(mean) - half, mean) > 1e-6
+    counts = drawn["expansion", mean]
+    assert counts.sum() == DRAWS
+    assert pearson(counts, round(mean) - int(10 * np.sqrt(mean)), mean) > 1e-6
 
 
 def draws_to_tell(mean: float, offset: float, slope: float, cubic: float) -> float:

@@ -43,6 +43,7 @@ SCENES = {
 ROWS = 50_000
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SCENES)
 def test_no_two_draws_are_tied(engine: Engine, name: str) -> None:
     """Values, squares and neighbours' products of 64 pixels in two frames, each with each: |z| < 6.5 for 73 000

@@ -35,6 +35,7 @@ def bright(seed: int) -> tuple[Expectation, Expectation]:
     return found[0], found[1]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("seed", range(12))
 def test_closed_forms_are_those_of_what_is_drawn(engine: Engine, seed: int) -> None:
     """Means, variances and statistics of random bright stars and flares, in single frames and sums of some.

@@ -50,6 +50,7 @@ def both(x: Expectation, pixel: int) -> tuple[np.ndarray, np.ndarray, int]:
     return frames, exact.counts(n * read + (n - 1) / 12, together, n * mean, low, 2 * half), low
 
 
+@pytest.mark.long
 def test_the_worst_stack_that_is_allowed() -> None:
     """A search over read noise, counts, gain, frames and phase for what tells a stack from its frames soonest."""
     tried = 0
@@ -75,6 +76,7 @@ def test_the_worst_stack_that_is_allowed() -> None:
     assert SOONEST < 10**found.fun < 3 * SOONEST
 
 
+@pytest.mark.long
 def test_random_stacks_of_quiet_frames() -> None:
     """Where `auto` stacks, mean, variance and shape are those of the frames; where they are not, it draws frames."""
     generator = np.random.default_rng(14)

@@ -38,6 +38,7 @@ def scene(number: int) -> tuple:
     )
 
 
+@pytest.mark.long
 def test_false_alarms_come_as_often_as_they_should(engine: Engine) -> None:
     """Eighteen sums over 200 scenes, and their scatter; both together fail by chance once in 1e6 runs.
 

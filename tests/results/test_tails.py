@@ -26,6 +26,7 @@ def found(engine: Engine) -> Detection:
     return engine.detect(quiet, [flare], realisations=N, seed=11, statistics=tuple(STATISTICS), tails="sampled")
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("statistic", STATISTICS)
 @pytest.mark.parametrize("fap", [1e-2, 1e-4, 1e-6])
 def test_brute_force_agrees(found: Detection, statistic: str, fap: float) -> None:
@@ -39,6 +40,7 @@ def test_brute_force_agrees(found: Detection, statistic: str, fap: float) -> Non
     assert sampled.threshold.low < sampled.threshold.value < sampled.threshold.high
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("statistic", STATISTICS)
 @pytest.mark.parametrize("fap", [1e-3, 1e-6, 1e-9])
 def test_the_closed_form_where_it_is_exact(engine: Engine, statistic: str, fap: float) -> None:
@@ -72,6 +74,7 @@ def test_no_bin_moves_a_sampled_threshold(engine: Engine, statistic: str) -> Non
             assert p.low <= p.value <= p.high
 
 
+@pytest.mark.long
 def test_intervals_cover(engine: Engine) -> None:
     """Of 60 intervals of 95 %, at least 50 hold the closed form: fewer once in 2000 runs of new seeds."""
     payload = instrument(dark_scale_dn_per_s=0.0, read_noise_dn=60.0, output_min_nm=350.0, output_max_nm=360.0)
@@ -123,6 +126,7 @@ def test_what_cannot_be_tilted_is_refused(engine: Engine, options: dict, sentenc
         plain.threshold(1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("statistic", STATISTICS)
 @pytest.mark.parametrize("comparison", [Comparison(4), Comparison(1, True)], ids=["stack", "estimated"])
 def test_brute_force_agrees_whatever_is_compared(engine: Engine, statistic: str, comparison: Comparison) -> None:

@@ -31,7 +31,7 @@ from mauvecl.runs.cluster import DaskWorkers
 from mauvecl.runs.pool import Pool, Stopped, together
 from mauvecl.store import bulk
 
-pytestmark = pytest.mark.usefixtures("small_shares")
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("small_shares")]
 
 
 @pytest.fixture(scope="module")

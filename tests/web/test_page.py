@@ -28,6 +28,8 @@ if CHROMIUM is None:
 if TYPE_CHECKING:
     from playwright.sync_api import Browser, Page
 
+pytestmark = pytest.mark.long
+
 #: Milliseconds: generous, for tests that share two cores.
 PATIENCE = 90_000
 CLOSED, SIMULATED = "of such flares are detected", "simulated flares are detected"
