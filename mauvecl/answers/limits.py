@@ -135,7 +135,7 @@ class LimitResult:
             "power": self.study.limit.power,
             "fap": self.study.run.fap,
             "realisations": self.study.run.realisations,
-            "study": self.study.toml(),
+            "study": self.study.text(),
         }
         return described(table)
 
@@ -149,7 +149,7 @@ class LimitResult:
             amplitude = {} if np.isnan(one.amplitude) else {"amplitude": one.amplitude}
             swept = {k: v for k, v in one.at.items() if k != "amplitude"}
             parts.append(({"star": one.star, **swept, **amplitude, "statistic": one.statistic}, table))
-        return stacked(parts, study=self.study.toml())
+        return stacked(parts, study=self.study.text())
 
     def _repr_html_(self) -> str:
         return str(self.table._repr_html_())

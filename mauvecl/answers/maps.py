@@ -86,7 +86,7 @@ class MapResult:
             "star": self.star,
             "fap": self.study.run.fap,
             "realisations": self.study.run.realisations,
-            "study": self.study.toml(),
+            "study": self.study.text(),
         }
         return described(table)
 
