@@ -492,7 +492,7 @@ def _saturation(x: Expectation) -> tuple[str, ...]:
     )
     often = (
         f"frames are cut off there: {cut.sum():.3g} pixels of a frame on average, at least one in "
-        f"{100 * touched:.3g} % of exposures"
+        f"{100 * touched:.3g} % of exposures (closed form)"
     )
     if not x.saturated.any():
         return (f"SATURATED at times: pixels of {name} come near {x.ceiling_dn:.0f} DN, and {often}.",)

@@ -1,4 +1,4 @@
-"""Values computed already, remembered by what they were computed from."""
+"""Values remembered by what they were computed from: a change of one thing computes no other again."""
 
 from __future__ import annotations
 

@@ -9,23 +9,30 @@ from __future__ import annotations
 import datetime
 import hashlib
 import http.client
+import io
 import os
 import re
+import sys
+import tempfile
+import time
 import urllib.error
+import urllib.request
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import IO, TYPE_CHECKING
 from urllib.parse import urljoin, urlsplit
 
 import numpy as np
 
 from ..errors import InputError
-from ..files.bounded import read_bytes, shortened
+from ..files.bounded import limit_bytes, read_bytes, shortened
 from ..files.ecsv import read_ecsv
 from ..files.parsed import parsing
+from ..files.whole import write_whole
 from ..spectra.formats import without_columns
+from ..version import VERSION
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -36,7 +43,9 @@ if TYPE_CHECKING:
 TIMEOUT_S = 20.0
 #: Schemes of an address; a local file is added, not fetched.
 SCHEMES = ("http", "https", "ftp")
-#: Bytes of a listing that are looked at.
+#: Seconds that a file may take to come: `bounded.LIMITS` at 0.5 MB/s.
+LONGEST_S = 600.0
+#: Bytes of a listing, at most.
 MOST_LISTED = 20 * 2**20
 
 
@@ -178,16 +187,12 @@ def add(
     place = there.path if there is not None else folder() / f"{re.sub(r'[^A-Za-z0-9.+-]', '_', name)}.ecsv"
     if there is None and place.exists():
         raise InputError(f"star name {name!r} is too much like another kept star's, expected another name")
-    beside = place.with_suffix(f".{os.getpid()}.part")
+    text = io.StringIO()
+    table.write(text, format="ascii.ecsv")
     try:
-        place.parent.mkdir(parents=True, exist_ok=True)
-        table.write(beside, format="ascii.ecsv", overwrite=True)
-        beside.replace(place)
-    except OSError as error:
-        raise InputError(
-            f"star folder {str(place.parent)!r} cannot be written ({error.strerror}), expected a writable one: set "
-            "MAUVECL_DATA_DIR"
-        ) from error
+        write_whole(place, text.getvalue().encode(), shared=True)
+    except InputError as error:
+        raise InputError(f"star folder: {error}; MAUVECL_DATA_DIR sets another") from error
     found = find(name)
     assert found is not None
     return found
@@ -325,7 +330,7 @@ def fetch(
         try:
             _check_address(address)
             url = urljoin(_folder(address), collection.file_of(star, partial(_listing, address)))
-            downloaded = Path(_download(url, show_progress))
+            downloaded = _download(url, show_progress)
         except FileNotFoundError:
             continue
         file = url.rsplit("/", 1)[1]
@@ -362,20 +367,27 @@ def _check_address(address: str) -> None:
         )
 
 
-def _download(url: str, show_progress: bool) -> str:
-    """A file of the network, by astropy; FileNotFoundError where the server has none."""
-    from astropy.utils.data import download_file
-
+def _download(url: str, show_progress: bool, most: int | None = None) -> Path:
+    """A file of the network, within limits of size and time; FileNotFoundError where the server has none."""
+    most = limit_bytes("MAUVECL_LARGEST_FILE_MIB") if most is None else most
+    descriptor, name = tempfile.mkstemp(prefix="mauvecl-fetch-")
     try:
-        return str(download_file(url, cache=False, show_progress=show_progress, timeout=TIMEOUT_S))
-    except urllib.error.HTTPError as error:
-        if error.code in (403, 404, 410):
-            # Archives on object stores answer 403 where there is nothing.
-            raise FileNotFoundError(url) from error
-        raise InputError(f"{url} answers {error.code} {error.reason}, expected the file: try again later") from error
-    except urllib.error.ContentTooShortError as error:
-        raise InputError(f"{url} broke off ({error.reason}), expected the whole file: try again") from error
-    except (urllib.error.URLError, OSError, ValueError, http.client.HTTPException) as error:
+        with open(descriptor, "wb") as file:
+            _receive(url, file, most, show_progress)
+        return Path(name)
+    except BaseException as error:
+        Path(name).unlink(missing_ok=True)
+        if isinstance(error, InputError):
+            raise
+        if isinstance(error, urllib.error.HTTPError):
+            if error.code in (403, 404, 410):
+                # Archives on object stores answer 403 where there is nothing.
+                raise FileNotFoundError(url) from error
+            raise InputError(
+                f"{url} answers {error.code} {error.reason}, expected the file: try again later"
+            ) from error
+        if not isinstance(error, OSError | ValueError | http.client.HTTPException):
+            raise
         # Names that no host has are ValueErrors of the IDNA codec, wrong answers HTTPExceptions.
         reason = getattr(error, "reason", error)
         raise InputError(
@@ -384,11 +396,38 @@ def _download(url: str, show_progress: bool) -> str:
         ) from error
 
 
+def _receive(url: str, file: IO[bytes], most: int, show_progress: bool) -> None:
+    """Write what a server sends, piece by piece, for it may tell a wrong size or none, and never end."""
+    from astropy.utils.console import ProgressBarOrSpinner
+
+    latest, got = time.monotonic() + LONGEST_S, 0
+    request = urllib.request.Request(url, headers={"User-Agent": f"mauvecl/{VERSION}"})
+    with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer:
+        length = answer.headers.get("Content-Length", "")
+        size = int(length) if length.isascii() and length.isdigit() and len(length) < 20 else None
+        shown = sys.stderr if show_progress else io.StringIO()
+        with ProgressBarOrSpinner(size, f"Fetching {url}", file=shown) as bar:
+            while (size is None or size <= most) and (piece := answer.read1(1 << 16)):
+                file.write(piece)
+                got += len(piece)
+                bar.update(got)
+                if got > most:
+                    size = got
+                if time.monotonic() > latest:
+                    raise InputError(f"{url} takes more than {LONGEST_S:.0f} s to come, expected less: try again later")
+    if size is not None and size > most:
+        raise InputError(
+            f"{url} has more than {most >> 20} MiB, expected less; MAUVECL_LARGEST_FILE_MIB sets the limit of files"
+        )
+    if size is not None and got < size:
+        raise InputError(f"{url} broke off ({got} of {size} bytes came), expected the whole file: try again")
+
+
 def _listing(address: str, below: str) -> list[str]:
     """Names of the files that a server's page of a folder links to."""
-    page = Path(_download(urljoin(_folder(address), below), False))
+    page = _download(urljoin(_folder(address), below), False, MOST_LISTED)
     try:
-        text = page.read_bytes()[:MOST_LISTED].decode("utf-8", errors="replace")
+        text = page.read_text(encoding="utf-8", errors="replace")
     finally:
         page.unlink(missing_ok=True)
     return [link.rsplit("/", 1)[-1] for link in re.findall(r'href="([^"?#]+)"', text, flags=re.IGNORECASE)]

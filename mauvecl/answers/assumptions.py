@@ -112,7 +112,7 @@ def what_matters(study: Study) -> QTable:
     for name in (of, "at_low_end", "at_high_end", "span"):
         table[name].info.format = ".3f"
     table["span"].info.description = f"how far the closed-form limit of {of} moves from end to end"
-    table.meta |= {"power": study.limit.power, "fap": study.run.fap, "study": study.toml()}
+    table.meta |= {"power": study.limit.power, "fap": study.run.fap, "study": study.text()}
     return described(table)
 
 

@@ -140,7 +140,7 @@ class DetectAnswer(Answer):
             # A flare's amplitude has its own column.
             swept = {name: value for name, value in star.at.items() if name != "amplitude"}
             parts.append(({"star": star.label, **swept}, table_of(star)))
-        return stacked(parts, study=self.study.toml())
+        return stacked(parts, study=self.study.text())
 
 
 def _rocs(star: StarDetection) -> QTable:

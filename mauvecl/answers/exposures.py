@@ -74,7 +74,7 @@ class ExposureResult(Answer):
         table["saturated"] = [r.saturated for r in rows]
         table["exposure"].info.description = "the fewest frames whose closed-form S/N reaches the wanted one"
         table["saturated"].info.description = "whether the pixel, or one of the element, saturates in a single frame"
-        table.meta["study"] = self.study.toml()
+        table.meta["study"] = self.study.text()
         return described(table)
 
     @property

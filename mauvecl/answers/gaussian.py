@@ -222,7 +222,7 @@ class GaussianReport(Answer):
             ("fap_ratio", "most wrong false-alarm probability over the promised one; 1 if none differs"),
         ):
             table[name].info.description = text
-        table.meta |= {"fap": self.study.run.fap, "study": self.study.toml()}
+        table.meta |= {"fap": self.study.run.fap, "study": self.study.text()}
         return described(table)
 
 

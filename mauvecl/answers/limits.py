@@ -139,7 +139,7 @@ class LimitResult(Answer):
             "power": self.study.limit.power,
             "fap": self.study.run.fap,
             "realisations": self.study.run.realisations,
-            "study": self.study.toml(),
+            "study": self.study.text(),
         }
         return described(table)
 
@@ -153,7 +153,7 @@ class LimitResult(Answer):
             amplitude = {} if np.isnan(one.amplitude) else {"amplitude": one.amplitude}
             swept = {k: v for k, v in one.at.items() if k != "amplitude"}
             parts.append(({"star": one.star, **swept, **amplitude, "statistic": one.statistic}, table))
-        return stacked(parts, study=self.study.toml())
+        return stacked(parts, study=self.study.text())
 
     @property
     def tables(self) -> dict[str, Table]:

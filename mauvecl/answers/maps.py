@@ -85,7 +85,7 @@ class MapResult(Answer):
             "star": self.star,
             "fap": self.study.run.fap,
             "realisations": self.study.run.realisations,
-            "study": self.study.toml(),
+            "study": self.study.text(),
         }
         return described(table)
 

@@ -5,8 +5,9 @@ from __future__ import annotations
 import datetime
 import io
 import json
+import math
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -126,8 +127,21 @@ def write_record(
 
 def write_json(content: Any, path: Path) -> Path:
     """Anything plain as JSON; errors as `write_table`."""
-    write_whole(path, (json.dumps(content, indent=2, default=str) + "\n").encode())
+    write_whole(path, (json_text(content) + "\n").encode())
     return path
+
+
+def json_text(content: Any) -> str:
+    """Anything plain as JSON: null where there is no number, for JSON has none that is not one."""
+    return json.dumps(_finite(content), indent=2, default=str, allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if isinstance(value, Mapping):
+        return {key: _finite(one) for key, one in value.items()}
+    return [_finite(one) for one in value] if isinstance(value, list | tuple) else value
 
 
 def _versions(*names: str) -> dict[str, str]:

@@ -81,7 +81,7 @@ def simulate(study: Study, *, realisation: int = 0, flaring: bool = False) -> Si
         for i, x in enumerate(xs):
             title = label(star, x) + (f", flare {100 * study.flare.amplitudes[i - 1]:g} %" if i else "")
             table = components(x, realisation=realisation, seed=study.run.seed, **study.drawing)
-            table.meta["study"] = study.toml()
+            table.meta["study"] = study.text()
             observations.append((title, x, described(table)))
         everything += xs
     return SimulateAnswer(study, observations, told(everything))

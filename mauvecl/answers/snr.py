@@ -105,7 +105,7 @@ class SnrAnswer(Answer):
     def together(self, table_of: Callable[[SnrResult], QTable]) -> QTable:
         """A table of each star and cell as one, with the star and what is swept in front."""
         parts = (({"star": star.label, **star.at}, table_of(star.result)) for star in self.stars)
-        return stacked(parts, realisations=self.study.run.realisations, study=self.study.toml())
+        return stacked(parts, realisations=self.study.run.realisations, study=self.study.text())
 
 
 def snr(study: Study, engine: Engine | Pool) -> SnrAnswer:

@@ -141,6 +141,7 @@ def export(
         typer.Option("--array", help="Such as star-1/flare-2; may be repeated [all].", show_default=False),
     ] = None,
     rows: RowsFlag = None,
+    replace: Annotated[bool, typer.Option("--replace", help="Take the place of a file that is there.")] = False,
     quiet: QuietFlag = False,
 ) -> None:
     """Some of a store as one FITS or HDF5 file.
@@ -152,7 +153,7 @@ def export(
     from mauvecl.store.export import export as write
     from mauvecl.store.form import Store
 
-    write(Selection.of(Store.open(store), array, _rows_of(rows)), file)
+    write(Selection.of(Store.open(store), array, _rows_of(rows)), file, replace=replace)
     if not quiet:
         show([f"Wrote {file}, {file.stat().st_size / 2**20:.1f} MiB."])
 

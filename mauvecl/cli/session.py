@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import signal
 import sys
 import threading
@@ -223,7 +222,9 @@ class Session:
 
     def print_json(self, content: dict[str, Any]) -> None:
         """The answer for machines."""
-        print(json.dumps(content, indent=2))
+        from mauvecl.answers.report import json_text
+
+        print(json_text(content))
 
     def finish(self) -> None:
         """Name the files written."""

@@ -23,6 +23,7 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from pathlib import Path
 
+from mauvecl.host.files.bounded import read_bytes
 from mauvecl.host.version import VERSION
 
 #: What PoCL needs to build the kernels of a session, bytes.
@@ -65,15 +66,15 @@ class KernelCache:
             # Already in the working folder, and perhaps in use: a loaded kernel's file must not be written again.
             return True
         folder = self.store / key
+        if not (folder / "manifest.json").exists():
+            return False
         try:
-            manifest = json.loads((folder / "manifest.json").read_text(encoding="utf-8"))
+            manifest = json.loads(read_bytes(folder / "manifest.json", "manifest"))
             there, contents = self.work / manifest["folder"], {}
             for name, digest in manifest["files"].items():
-                contents[name] = (folder / name).read_bytes()
+                contents[name] = read_bytes(folder / name, "kernel")
                 if hashlib.sha256(contents[name]).hexdigest() != digest:
                     raise ValueError(name)
-        except FileNotFoundError:
-            return False
         except (OSError, ValueError, KeyError, TypeError, AttributeError):
             shutil.rmtree(folder, ignore_errors=True)
             return False

@@ -77,7 +77,7 @@ class Selection:
         return np.asarray(array[self.first : self.stop])
 
 
-def export(selection: Selection, path: str | Path) -> Path:
+def export(selection: Selection, path: str | Path, *, replace: bool = False) -> Path:
     """Write spectra, calibration and origin into one file, whole or not at all.
 
     Parameters
@@ -86,15 +86,20 @@ def export(selection: Selection, path: str | Path) -> Path:
     path : str or Path
         Ending in .fits, .h5 or .hdf5. In FITS an image per array, its wavelengths as a spectral axis looked up in a
         table (the -TAB form of the FITS standard, section 8.3), and a table of the calibration per star.
+    replace : bool
+        Take the place of a file that is there.
 
     Raises
     ------
     InputError
-        For another ending, or if the file cannot be written.
+        For another ending, if there is such a file already, or if the file cannot be written.
     """
     path = Path(path)
     if path.suffix not in ENDINGS:
         raise InputError(f"export {path.name!r}, expected a name ending in {', '.join(ENDINGS)}")
+    if path.exists() and not (replace and path.is_file()):
+        expected = "another name, or --replace" if path.is_file() else "a file's name"
+        raise InputError(f"export {str(path)!r} exists already, expected {expected}")
     if path.suffix != ".fits":
         # In memory first: on a full disk the HDF5 library ends the whole process.
         packed = io.BytesIO()

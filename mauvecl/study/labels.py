@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from mauvecl.noise.cumulants import Cumulants, stack_is_exact
 from mauvecl.study.quantities import QUANTITIES, UNITS
 from mauvecl.study.sections import Star
 
@@ -14,6 +15,11 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.host.expectation import Expectation
+
+
+#: Read noise, DN, from which rounding is like noise whatever the light: the wave that it leaves of the sawtooth's first
+#: harmonic is exp(-2 pi^2), 3e-9, or less.
+NOISY_DN = 1.0
 
 
 def label(star: Star, x: Expectation) -> str:
@@ -24,9 +30,22 @@ def label(star: Star, x: Expectation) -> str:
 
 
 def told(expectations: list[Expectation]) -> list[str]:
-    """Their messages, each once, saturation first."""
-    messages = list(dict.fromkeys(message for x in expectations for message in x.messages))
+    """Their messages and where closed forms do not hold, each once, saturation first."""
+    messages = list(dict.fromkeys(message for x in expectations for message in (*x.messages, *_coarse(x))))
     return sorted(messages, key=lambda m: not m.startswith("SATURATED"))
+
+
+def _coarse(x: Expectation) -> tuple[str, ...]:
+    """The sentence on pixels that rounding rules, if any."""
+    if float(np.min(x.read_noise_dn)) >= NOISY_DN:
+        return ()
+    found = int(np.count_nonzero(~stack_is_exact(Cumulants.of(x, 1), x)))
+    if not found:
+        return ()
+    return (
+        f"In {found} of {x.wavelength_nm.size} pixels of {x.name} a frame has too little noise for its rounding to "
+        "whole DN to be like noise: closed forms take it for noise, and are wrong there; simulated numbers round each frame.",
+    )
 
 
 def put_first(table: QTable, values: Mapping[str, float | str]) -> None:

@@ -22,7 +22,7 @@ from mauvecl.study.questions import (
     Sweep,
 )
 from mauvecl.study.sections import FILE_KEYS, Flare, NoiseProcesses, Observation, Part, Run, SkyLight, Star, Unknowns
-from mauvecl.study.study_text import put, sentence, study_of, toml_value
+from mauvecl.study.study_text import find_files, in_table, put, sentence, study_of, toml_value
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -75,6 +75,8 @@ class Study(Part):
         path = Path(path)
         text = study_of(path) if path.suffix == ".ecsv" else read_text(path, "study file")
         data = toml(text, f"study file {shortened(path.name)}")
+        if path.suffix == ".ecsv":
+            find_files(data, path)
         for star in data.get("star", []) if isinstance(data.get("star"), list) else []:
             # Files are named as seen from the study.
             if isinstance(star, dict) and isinstance(star.get("file"), str):
@@ -161,6 +163,10 @@ class Study(Part):
             if "file" in star:
                 star["file"] = str(Path(star["file"]).resolve())
         return tomli_w.dumps(data)
+
+    def text(self) -> str:
+        """The study as answers' tables hold it: stars' files by name and digest, the same wherever they are."""
+        return in_table(self.toml(), [star.file for star in self.star])
 
     def load_instrument(self) -> Instrument:
         """The instrument with what the study changes of it: its ``changes``, and the detector's temperature."""

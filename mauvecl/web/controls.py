@@ -11,7 +11,6 @@ from bokeh.models.widgets import Div
 
 from mauvecl.web.fields import FIELDS, UPLOADED, Choice, star_names
 from mauvecl.web.state import State
-from mauvecl.web.upload import ENDINGS
 
 WRONG = ":host(.wrong) input, :host(.wrong) select { border: 2px solid #b00020 !important; }"
 GROUPS = (
@@ -45,9 +44,7 @@ class Controls:
         self._widgets = {name: _widget(name) for name in FIELDS}
         for name, widget in self._widgets.items():
             widget.param.watch(lambda event, name=name: self._entered(name, event.new), "value")
-        self._file = pn.widgets.FileInput(
-            accept=",".join(ENDINGS), name="Your own spectrum", sizing_mode="stretch_width", multiple=False
-        )
+        self._file = pn.widgets.FileInput(name="Your own spectrum", sizing_mode="stretch_width", multiple=False)
         self._file.param.watch(lambda *_: self._chosen(upload), ["value", "filename"])
         self._taken: tuple[str | None, bytes | None] = None, None
         self._faults: dict[str, Any] = {}

@@ -28,15 +28,10 @@ def study_file(study: Study) -> io.BytesIO:
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
         archive.write(file, STAR_FILE)
-        archive.writestr("study.toml", without_folder(study.toml(), study))
+        # The file as seen from the study: not where the server has it.
+        archive.writestr("study.toml", study.toml().replace(str(file.resolve()), STAR_FILE))
     out.seek(0)
     return out
-
-
-def without_folder(text: str, study: Study) -> str:
-    """A study's text with an uploaded star's file as seen from the study: not where the server has it."""
-    file = study.star[0].file
-    return text if file is None else text.replace(str(file.resolve()), STAR_FILE)
 
 
 def as_file(name: str, ending: str, study: Study, quiet: Expectation, found: Mapping[str, Any]) -> io.BytesIO:
@@ -64,10 +59,7 @@ def as_file(name: str, ending: str, study: Study, quiet: Expectation, found: Map
         if ending == "png":
             _draw(name, study, quiet, found, path)
         else:
-            table = _table(name, study, quiet, found).copy(copy_data=False)
-            if "study" in table.meta:
-                table.meta["study"] = without_folder(str(table.meta["study"]), study)
-            write_table(table, path)
+            write_table(_table(name, study, quiet, found), path)
         return io.BytesIO(path.read_bytes())
 
 

@@ -31,7 +31,7 @@ WORDS = ("name", "origin", "notes", "told", "measured_nm", "unscaled")
 _turns = threading.BoundedSemaphore(TOGETHER)
 
 
-def read_limited(content: bytes, ending: str) -> Source:
+def read_limited(content: bytes) -> Source:
     """A spectrum from the bytes of a file, as `Source.read` reads it, in a process with limits of memory and time.
 
     Blocks for about a second, most of it for the start of Python: call it from a thread.
@@ -39,8 +39,7 @@ def read_limited(content: bytes, ending: str) -> Source:
     Parameters
     ----------
     content : bytes
-    ending : str
-        Of the file's name, such as ``.fits``.
+        What it is shows in itself: a name says nothing.
 
     Raises
     ------
@@ -50,7 +49,7 @@ def read_limited(content: bytes, ending: str) -> Source:
     if not _turns.acquire(timeout=SECONDS):
         raise InputError("too many uploads are read at the same time, expected yours again in a minute")
     try:
-        answer = _read_apart(content, ending)
+        answer = _read_apart(content)
     finally:
         _turns.release()
     with np.load(io.BytesIO(answer), allow_pickle=False) as found:
@@ -68,7 +67,7 @@ def read_limited(content: bytes, ending: str) -> Source:
         )
 
 
-def _read_apart(content: bytes, ending: str) -> bytes:
+def _read_apart(content: bytes) -> bytes:
     """What the reading process writes."""
     environment = os.environ | {
         # One thread of a numerical library needs no stacks of many.
@@ -78,7 +77,7 @@ def _read_apart(content: bytes, ending: str) -> bytes:
         "PYTHONPATH": os.pathsep.join(filter(None, (_here(), os.environ.get("PYTHONPATH")))),
     }
     # A fresh interpreter, as spawn makes one: OpenCL does not survive a fork.
-    command = [sys.executable, "-m", "mauvecl.web.limited", ending, str(MEMORY_MIB), str(SECONDS)]
+    command = [sys.executable, "-m", "mauvecl.web.limited", str(MEMORY_MIB), str(SECONDS)]
     with tempfile.TemporaryDirectory(prefix="mauvecl-upload-") as folder:
         try:
             done = subprocess.run(
@@ -99,7 +98,7 @@ def _read_apart(content: bytes, ending: str) -> bytes:
             f"the upload takes more than {MEMORY_MIB} MiB of memory to read, expected a spectrum of some thousand "
             "points"
         )
-    raise InputError("the upload ends its reader, expected a spectrum as text, ECSV or FITS")
+    raise InputError("the upload ends its reader, expected a spectrum as text, ECSV, VOTable or FITS")
 
 
 def _here() -> str:
@@ -125,10 +124,10 @@ def _limit(memory_mib: int, seconds: int) -> None:
 
 def _main() -> int:
     """The reading process: bytes of a file come in on standard input, arrays go out, a sentence to standard error."""
-    ending, memory_mib, seconds = sys.argv[1:]
+    memory_mib, seconds = sys.argv[1:]
     _limit(int(memory_mib), int(seconds))
     try:
-        file = Path(f"upload{ending}")
+        file = Path("upload")
         file.write_bytes(sys.stdin.buffer.read())
         source = Source.read(file)
         out = io.BytesIO()

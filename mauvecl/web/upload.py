@@ -3,18 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 from mauvecl.host.errors import InputError
-from mauvecl.host.files.bounded import shortened
 from mauvecl.host.stars.source import Source
 from mauvecl.web.fields import UPLOADED
 from mauvecl.web.limited import read_limited
 
 #: Bytes of an upload, and points of its spectrum, at most.
 MOST_UPLOADED, MOST_POINTS = 4 * 2**20, 200_000
-#: What uploads may be; the archive formats that unpack to more are left out.
-ENDINGS = (".txt", ".dat", ".csv", ".ecsv", ".fits")
 
 
 def too_large(size: float) -> str:
@@ -28,21 +24,19 @@ def read_upload(name: str, content: bytes) -> Source:
     Parameters
     ----------
     name : str
-        As the visitor's computer has it; its ending says what the file is.
+        As the visitor's computer has it; what the file is shows in its content.
     content : bytes
+        Packed or not.
 
     Raises
     ------
     InputError
-        If it is too large, of another kind, or holds no usable spectrum. Called on a thread of its own; any other
+        If it is too large or holds no usable spectrum. Called on a thread of its own; any other
         exception is told to the visitor too.
     """
-    ending = Path(name).suffix.lower()
-    if ending not in ENDINGS:
-        raise InputError(f"upload {shortened(Path(name).name)}, expected a name ending in {', '.join(ENDINGS)}")
     if len(content) > MOST_UPLOADED:
         raise InputError(too_large(len(content)))
-    source = read_limited(content, ending)
+    source = read_limited(content)
     if source.wavelength_nm.size > MOST_POINTS:
         raise InputError(f"upload of {source.wavelength_nm.size} points, expected at most {MOST_POINTS}")
     return replace(source, name=UPLOADED, origin="upload")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.server
 import io
 import threading
@@ -107,12 +108,21 @@ class Archive(http.server.BaseHTTPRequestHandler):
     """Serves `files`; addresses in `broken` break off, hang or fail."""
 
     files: ClassVar[dict[str, bytes]] = {}
+    over: ClassVar[threading.Event]
     protocol_version = "HTTP/1.1"
 
     def do_GET(self) -> None:
         path = self.path.lstrip("/")
         if path.endswith("hang"):
             time.sleep(3)
+        if "endless" in path or "slow" in path:
+            self.send_response(200)
+            self.end_headers()
+            with contextlib.suppress(OSError):
+                while not self.over.wait(0.02 if "slow" in path else 0.0):
+                    self.wfile.write(bytes(1 << 6 if "slow" in path else 1 << 16))
+            self.close_connection = True
+            return
         if path not in self.files:
             self.send_error(503 if "busy" in path else 404)
             return
@@ -152,9 +162,11 @@ def archive() -> Iterator[str]:
         "ngsl/hd000002/h_stis_ngsl_hd000002_v2.fits": b"<html>Sorry</html>",
         f"lowlib/{lowlib.format('hd146233')}": archive_file(("Angstrom", "erg/s/cm2/A")),
     }
+    Archive.over = threading.Event()
     server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Archive)
     threading.Thread(target=server.serve_forever, daemon=True).start()
     yield f"http://127.0.0.1:{server.server_port}"
+    Archive.over.set()
     server.shutdown()
     server.server_close()
 
@@ -242,6 +254,25 @@ def test_what_goes_wrong_is_a_sentence(
         monkeypatch.setattr(own_stars, "COLLECTIONS", (collection,))
     with pytest.raises(InputError, match=sentence):
         own_stars.fetch(name, base=base, show_progress=False)
+    assert own_stars.kept() == []
+
+
+@pytest.mark.parametrize(
+    ("name", "below", "sentence"),
+    [
+        ("ngsl:HD 1", "endless", r"_v2.fits has more than 1 MiB, expected less"),
+        ("calspec:x", "endless", r"/endless/ has more than 1 MiB, expected less"),
+        ("ngsl:HD 1", "slow", r"_v2.fits takes more than 0 s to come, expected less: try again later"),
+    ],
+)
+def test_what_never_ends_is_not_fetched(
+    archive: str, name: str, below: str, sentence: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("MAUVECL_LARGEST_FILE_MIB", "1")
+    monkeypatch.setattr(own_stars, "MOST_LISTED", 1 << 20)
+    monkeypatch.setattr(own_stars, "LONGEST_S", 0.3 if below == "slow" else 60.0)
+    with pytest.raises(InputError, match=sentence):
+        own_stars.fetch(name, base=f"{archive}/{below}", show_progress=False)
     assert own_stars.kept() == []
 
 

@@ -388,6 +388,12 @@ def test_the_verbs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert run(app, ["verify", "f.zarr", "--repair"]).exit_code == 0
     assert run(app, ["verify", "f.zarr", "--redraw", "--rows", "0:10"]).exit_code == 0
     assert run(app, ["export", "f.zarr", "f.h5", "--rows", "0:10"]).exit_code == 0
+    written = Path("f.h5").read_bytes()
+    refused = run(app, ["export", "f.zarr", "f.h5", "--rows", "0:5"])
+    assert (refused.exit_code, Path("f.h5").read_bytes()) == (2, written)
+    assert "exists already, expected another name, or --replace" in str(refused.exception)
+    assert run(app, ["export", "f.zarr", "f.h5", "--rows", "0:5", "--replace"]).exit_code == 0
+    assert Path("f.h5").read_bytes() != written
     direct = run(app, ["realise", "study.toml", "--output", "f.fits", "--quiet"])
     assert direct.exit_code == 0, direct.output
     assert sorted(p.name for p in tmp_path.iterdir()) == ["f.fits", "f.h5", "f.zarr", "study.toml"]

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import bz2
+import gzip
 import io
 import json
 import logging
+import lzma
 import re
+import resource
 import socket
 import subprocess
 import sys
-import tomllib
+import threading
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -18,7 +22,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from astropy.table import QTable
 
 pytest.importorskip("panel")
 
@@ -27,11 +30,14 @@ from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 
 from mauvecl.host.errors import InputError
+from mauvecl.runs.pool import Pool
+from mauvecl.study.study import Study
 from mauvecl.web import doors, page, server
+from mauvecl.web.asked import detect_and_snr
 from mauvecl.web.fields import FIELDS, star_names
 from mauvecl.web.plain_log import Plain
 from mauvecl.web.state import State
-from mauvecl.web.upload import MOST_UPLOADED
+from mauvecl.web.upload import MOST_UPLOADED, read_upload
 from mauvecl.web.words import alerts
 from mauvecl.web.work import reading
 
@@ -164,18 +170,66 @@ def test_an_upload_that_fails_in_any_way_leaves_no_answer(monkeypatch: pytest.Mo
     monkeypatch.undo()
     for name, content in (
         ("a.txt", b""),
-        ("a.exe", good),
         ("a.txt", b"200 1\n300 2 3\n"),
         ("a.fits", b"SIMPLE  = " * 300),
     ):
         found._upload(name, content)
         assert answerless(settled(found)), name
-    found._upload("a.txt", good)
-    assert not answerless(settled(found))
+    found._upload("a.exe", gzip.compress(good))
+    assert not answerless(settled(found)), "what it is shows in its content"
     assert found.uploaded
     found._refused(50e6)
     assert answerless(found)
     assert "47.7 MiB" in found.state.faults["star"]
+
+
+def test_answers_go_on_while_an_upload_is_read(monkeypatch: pytest.MonkeyPatch) -> None:
+    wait = threading.Event()
+
+    def slow(name: str, content: bytes) -> Any:
+        assert wait.wait(60.0)
+        raise InputError("no spectrum")
+
+    monkeypatch.setattr(page, "read_upload", slow)
+    first, other = page.Page(), page.Page()
+    first._upload("star.txt", b"")
+    assert "is being read" in first.state.faults["star"]
+    # Would the event loop wait for the reader, it would wait for ever.
+    other.enter({"magnitude": "8"})
+    assert not answerless(other)
+    wait.set()
+    settled(first)
+    assert first.state.faults["star"] == "no spectrum"
+
+
+WIDE = (
+    "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: w, datatype: float64}\n# meta:\n#   a0: &a0 [x, x, x, x, x, x, x, x]\n"
+)
+ALIASES = "".join(f"#   a{i}: &a{i} [{', '.join(8 * [f'*a{i - 1}'])}]\n" for i in range(1, 9))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        pytest.param(bz2.compress(bytes(2**28)), id="bzip2 of zeros"),
+        pytest.param(gzip.compress(gzip.compress(bytes(2**28))), id="gzip twice"),
+        pytest.param(lzma.compress(bytes(2**27)), id="xz of zeros"),
+        pytest.param(f"{WIDE}{ALIASES}w\n1\n".encode(), id="YAML aliases"),
+        pytest.param(b"# %ECSV 1.0\n# ---\n# meta: " + b"[" * 200_000 + b"\n", id="deep YAML"),
+        pytest.param(b'<?xml version="1.0"?><!DOCTYPE l [<!ENTITY a "b">]><VOTABLE>&a;</VOTABLE>', id="XML entities"),
+    ],
+)
+def test_bombs_end_in_a_sentence_and_take_little(content: bytes) -> None:
+    def spent() -> tuple[float, int]:
+        used = resource.getrusage(resource.RUSAGE_CHILDREN)
+        return used.ru_utime + used.ru_stime, used.ru_maxrss
+
+    before, _ = spent()
+    with pytest.raises(InputError, match=r", expected [^\n]*$"):
+        read_upload("star.fits", content)
+    # The clock's limit is the reader's own; processor time is the same on a busy machine, 3 s with the start of Python.
+    assert spent()[0] - before < 10.0
+    assert spent()[1] < 700 * 1024, "KiB, of all processes that these tests have started"
 
 
 def test_a_star_chosen_while_an_upload_is_read_stays(tmp_path: Path) -> None:
@@ -197,45 +251,35 @@ def test_a_fault_of_our_own_leaves_no_answer(monkeypatch: pytest.MonkeyPatch) ->
     assert not answerless(found)
 
 
-def test_an_uploaded_star_gives_the_same_table_on_the_command_line(tmp_path: Path) -> None:
-    found = page.Page("?magnitude=8")
+def test_an_uploaded_star_gives_the_same_bytes_on_the_command_line(tmp_path: Path) -> None:
+    found = page.Page("?magnitude=8&realisations=10000&fap=0.01")
     found._upload("star.txt", star_file(tmp_path / "star.txt"))
     settled(found)
-    table = found.file("observation", "ecsv").read()
-    assert found._folder.name.encode() not in table
-    assert b"mauvecl-page" not in table
+    study = found.study()
+    found.found["detection"], found.found["snr"] = detect_and_snr(study, Pool())
     with zipfile.ZipFile(io.BytesIO(found.study_of().read())) as archive:
         archive.extractall(tmp_path / "study")
-    text = (tmp_path / "study" / "study.toml").read_text()
-    assert 'file = "star.ecsv"' in text
-    assert found._folder.name not in text
-    command = [
-        sys.executable,
-        "-m",
-        "mauvecl",
-        "simulate",
-        "study.toml",
-        "-a",
-        "0.24",
-        "--no-pictures",
-        "--quiet",
-        "-o",
-        "out",
-    ]
-    subprocess.run(command, cwd=tmp_path / "study", check=True, capture_output=True)
-    mine = told_apart(table)
-    written = [told_apart(file.read_bytes()) for file in (tmp_path / "study" / "out").glob("*.ecsv")]
-    (same,) = (one for one in written if one[1] == mine[1])
-    # The command line names the file in full, and the form of its text depends on how long that is.
-    assert mine[0]["star"][0].pop("file") == "star.ecsv"
-    assert Path(same[0]["star"][0].pop("file")) == (tmp_path / "study" / "star.ecsv").resolve()
-    assert mine[0] == same[0]
-
-
-def told_apart(table: bytes) -> tuple[dict[str, Any], list[bytes]]:
-    """A table's study, and its rows."""
-    study = tomllib.loads(QTable.read(io.BytesIO(table), format="ascii.ecsv").meta["study"])
-    return study, [line for line in table.splitlines() if not line.startswith(b"#")]
+    assert 'file = "star.ecsv"' in (tmp_path / "study" / "study.toml").read_text()
+    for verb, *flags in (["simulate", "-a", "0.24"], ["detect"], ["snr"]):
+        command = [sys.executable, "-m", "mauvecl", verb, "study.toml", *flags, "--no-pictures", "--quiet", "-o", "out"]
+        subprocess.run(command, cwd=tmp_path / "study", check=True, capture_output=True)
+    for name, file in (
+        ("observation", "observation-2.ecsv"),
+        ("detection", "detection.ecsv"),
+        ("roc", "roc.ecsv"),
+        ("snr", "snr-element.ecsv"),
+    ):
+        mine = found.file(name, "ecsv").read()
+        assert found._folder.name.encode() not in mine
+        assert b"mauvecl-page" not in mine
+        (written,) = (tmp_path / "study" / "out").glob(file)
+        assert mine == written.read_bytes(), name
+    # From another folder the table finds its star again, and no other file of that name.
+    again = Study.read(tmp_path / "study" / "out" / "detection.ecsv")
+    assert again.star[0].file == (tmp_path / "study" / "star.ecsv").resolve()
+    (tmp_path / "study" / "star.ecsv").write_bytes(star_file(tmp_path / "other.txt"))
+    with pytest.raises(InputError, match="is not there as it was"):
+        Study.read(tmp_path / "study" / "out" / "detection.ecsv")
 
 
 # Who is let in
