@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mauvecl.answers.limit_search import MarginalQuestion, Point, Question, Unknown, settle
+from mauvecl.answers.unknown_cost import Cost, cost_lines, marginal_lines, unknown_cost
 from mauvecl.host.errors import InputError
 from mauvecl.host.plotting import picture
 from mauvecl.results.detection import check_fap
@@ -54,6 +55,8 @@ class Limit:
         Where the limit is averaged over what is unknown.
     messages : tuple of str
         What saturates at the limit, without the flare and with it.
+    cost : Cost, optional
+        What it costs there not to know all of the instrument.
     """
 
     star: str
@@ -70,6 +73,7 @@ class Limit:
     at: Mapping[str, float | str] = field(default_factory=dict)
     unknown: Unknown | None = None
     messages: tuple[str, ...] = ()
+    cost: Cost | None = None
 
     @property
     def agrees(self) -> bool:
@@ -91,6 +95,13 @@ class LimitResult:
 
     study: Study
     limits: list[Limit] = field(default_factory=list)
+
+    @property
+    def messages(self) -> list[str]:
+        """What the reader must be told, worst first."""
+        costs = [one.cost for one in self.limits if one.cost is not None]
+        saturated = dict.fromkeys(text for one in self.limits for text in one.messages)
+        return [*saturated, *marginal_lines(self.study), *cost_lines(costs, self.study)]
 
     @property
     def table(self) -> QTable:
@@ -199,6 +210,8 @@ def solve(
     quiet, flare = question.pair(value.value)
     shown = question.study.star[0]
     named = star.model_copy(update={"magnitude": None}) if question.of == "magnitude" else shown
+    rise = value.value if question.of == "amplitude" else question.study.flare.amplitudes[0]
+    where = f"{label(named, quiet)} at {question.of} {value.value:.4g}, flare of {100 * rise:.3g} %"
     return Limit(
         star=label(named, quiet),
         amplitude=float("nan") if amplitude is None else amplitude,
@@ -214,6 +227,7 @@ def solve(
         at=at or {},
         unknown=question.unknown(theory) if isinstance(question, MarginalQuestion) else None,
         messages=tuple(m for m in told([quiet, flare]) if m.startswith("SATURATED")),
+        cost=unknown_cost(where, quiet, flare, question.study),
     )
 
 

@@ -40,7 +40,8 @@ def limit(
     inputs = [study.expect([entry.source()])[0] for entry in study.star]
     # What is told of a star at its own magnitude need not hold at the limit.
     messages = [m for m in told(inputs) if not m.startswith("SATURATED")]
-    messages = [*dict.fromkeys(text for one in found.limits for text in one.messages), *messages]
+    saturated = [m for m in found.messages if m.startswith("SATURATED")]
+    messages = [*saturated, *messages, *(m for m in found.messages if m not in saturated)]
     session.say(messages)
     session.leave(lambda: found.write(session.folder))
     moved = None
