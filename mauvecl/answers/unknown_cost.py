@@ -88,8 +88,9 @@ def cost_lines(costs: Sequence[Cost], study: Study) -> list[str]:
     which = spoken(study.nuisances) if named else f"the usual unknowns ({spoken(_chosen(study))})"
     others = f", the faintest of {len(shown)}," if len(shown) > 1 else ""
     return [
-        f"What unknowns cost: {faintest.of}{others} has a matched S/N of {faintest.known:.3g} with everything known; with "
-        f"{which} it is {faintest.plain:.2g} by the plain statistic and {faintest.marginal:.3g} marginalised (closed forms)."
+        f"What unknowns cost: {faintest.of}{others} has a matched S/N of {faintest.known:.3g} with everything known; "
+        f"with {which} it is {faintest.plain:.2g} by the plain statistic and {faintest.marginal:.3g} marginalised "
+        "(closed forms)."
     ]
 
 

@@ -43,10 +43,10 @@ USUAL = (
         "dark",
         "detector_temperature",
         lambda t: Normal(t, 0.5, t - 2.5, t + 2.5),
-        0.5,
+        float("inf"),
         0.5,
         "detector temperature, normal, +-0.5 deg C around the nominal one, cut at 2.5 deg C",
-        "0.5 deg C",
+        "free: the dark current follows the temperature by an exponential, which is no normal amplitude",
         "assumption: the thermal cycle of one orbit",
     ),
     Usual(
