@@ -16,6 +16,7 @@ from mauvecl.answers.detect import detect
 from mauvecl.answers.limits import limiting_magnitude
 from mauvecl.answers.maps import detection_map
 from mauvecl.answers.unknown_cost import cost_lines, marginal_lines, unknown_cost
+from mauvecl.answers.unknown_table import power, unknown_table
 from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import expect
@@ -207,3 +208,16 @@ def test_false_alarms_as_asked_for_with_unknowns_drawn(engine: Engine) -> None:
         assert sum(abs(d) > 4 for d in deviations) <= 1, name
         assert abs(np.sum(deviations)) < 4 * np.sqrt(SCENES), name
     assert failed == SCENES
+
+
+def test_the_table_and_its_picture(tmp_path: Path) -> None:
+    """METHODS section 7's row again, and the smallest amplitude has the power asked for."""
+    found = unknown_table(study())
+    rows = {row["unknown"]: row for row in found.table}
+    assert rows["dark +-0.1 deg C"]["marginalised"] == pytest.approx(3.06, rel=0.01)
+    assert rows["dark and light, free"]["marginalised"] == pytest.approx(3.05, rel=0.01)
+    assert rows["light +-1 %"]["plain"] == pytest.approx(4.12, rel=0.01)
+    for name, row in rows.items():
+        snr = row["marginalised"] * found.smallest("G2V V = 7.4 (Vega = 0)", name) / row["amplitude"]
+        assert power(np.array([snr]), 1e-3)[0] == pytest.approx(0.9)
+    assert found.plot(tmp_path / "unknowns.png") == tmp_path / "unknowns.png"
