@@ -39,6 +39,24 @@ CUMULANTS = "mauvecl/noise/cumulants.py"
 SHAPE = "    g1, g2, g3 = c.shape()\n    sd ="
 
 MUTATIONS = {
+    "one unknown's row dropped": Mutation(
+        (
+            (
+                "mauvecl/results/channels.py",
+                "nuisances.names if nuisances else ()))",
+                "nuisances.names[1:] if nuisances else ()))",
+            ),
+        ),
+        "tests/device/test_marginal.py::test_false_alarms_and_power_with_the_unknown_drawn[0.1]",
+    ),
+    "a sky that follows no level": Mutation(
+        (("mauvecl/noise/scene.py", "factors.light * factors.sky * share / light", "0.0 * share / light"),),
+        "tests/noise/test_processes.py::test_the_sky_follows_its_own_level[level0]",
+    ),
+    "unknowns marginalised without their prior": Mutation(
+        (("mauvecl/statistics/nuisances.py", "np.diag(self.sd**-2.0) + ", "np.diag(0.0 * self.sd**-2.0) + "),),
+        "tests/statistics/test_nuisances.py::test_the_sums_subtracted_are_the_inverse_covariance[chi2]",
+    ),
     "a share under another's name": Mutation(
         (("mauvecl/runs/checkpoint.py", 'name.encode() + b"\\0" + body', "body"),),
         "tests/runs/test_pool.py::test_a_share_in_anothers_place",

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.answers.answer import Answer
+from mauvecl.answers.unknown_cost import cost_lines, marginal_lines, unknown_cost
 from mauvecl.results.campaign import campaign
 from mauvecl.results.departures import departure_table
 from mauvecl.results.detection import Detection, check_fap, countable
@@ -210,7 +211,13 @@ def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
             f"{100 * answer.table['fap_error'].max():.1f} % of it: {run.realisations} realisations leave fewer than "
             "100 beyond them."
         )
-    answer.messages = list(dict.fromkeys([*messages, *campaign_told, *costs, *_few_terms(stars)]))
+    unknown = [
+        unknown_cost(f"{star.label}, flare of {100 * amplitude:g} %", star.found.quiet, flare, cell)
+        for (_, cell, *_), star in zip(prepared, stars, strict=True)
+        for amplitude, flare in zip(star.amplitudes, star.found.flares, strict=True)
+    ]
+    last = [*_few_terms(stars), *marginal_lines(study), *cost_lines(unknown, study)]
+    answer.messages = list(dict.fromkeys([*messages, *campaign_told, *costs, *last]))
     answer.paper = _paper(study, [group for *_, group in prepared])
     return answer
 

@@ -11,6 +11,7 @@ import numpy as np
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.limit_search import MarginalQuestion, Point, Question, Unknown, settle
+from mauvecl.answers.unknown_cost import Cost, cost_lines, marginal_lines, unknown_cost
 from mauvecl.host.errors import InputError
 from mauvecl.results.detection import check_fap
 from mauvecl.statistics.intervals import Interval
@@ -55,6 +56,8 @@ class Limit:
         Where the limit is averaged over what is unknown.
     messages : tuple of str
         What saturates at the limit, without the flare and with it.
+    cost : Cost, optional
+        What it costs there not to know all of the instrument.
     """
 
     star: str
@@ -71,6 +74,7 @@ class Limit:
     at: Mapping[str, float | str] = field(default_factory=dict)
     unknown: Unknown | None = None
     messages: tuple[str, ...] = ()
+    cost: Cost | None = None
 
     @property
     def agrees(self) -> bool:
@@ -168,10 +172,12 @@ class LimitResult(Answer):
 
     @property
     def messages(self) -> list[str]:
-        """What holds at the limits, then what is told of the stars."""
+        """What holds at the limits, what is told of the stars, and what is unknown."""
+        saturated = dict.fromkeys(text for one in self.limits for text in one.messages)
         # What is told of a star at its own magnitude need not hold at the limit.
         stars = [text for text in told(self.inputs) if not text.startswith("SATURATED")]
-        return [*dict.fromkeys(text for one in self.limits for text in one.messages), *stars]
+        costs = [one.cost for one in self.limits if one.cost is not None]
+        return [*saturated, *stars, *marginal_lines(self.study), *cost_lines(costs, self.study)]
 
     @property
     def pictures(self) -> dict[str, tuple[Any, ...]]:
@@ -215,6 +221,8 @@ def solve(
     quiet, flare = question.pair(value.value)
     shown = question.study.star[0]
     named = star.model_copy(update={"magnitude": None}) if question.of == "magnitude" else shown
+    rise = value.value if question.of == "amplitude" else question.study.flare.amplitudes[0]
+    where = f"{label(named, quiet)} at {question.of} {value.value:.4g}, flare of {100 * rise:.3g} %"
     return Limit(
         star=label(named, quiet),
         amplitude=float("nan") if amplitude is None else amplitude,
@@ -230,6 +238,7 @@ def solve(
         at=at or {},
         unknown=question.unknown(theory) if isinstance(question, MarginalQuestion) else None,
         messages=tuple(m for m in told([quiet, flare]) if m.startswith("SATURATED")),
+        cost=unknown_cost(where, quiet, flare, question.study),
     )
 
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
+from mauvecl.answers.unknown_cost import cost_lines, marginal_lines, unknown_cost
 from mauvecl.results.detection import check_fap
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, told
@@ -161,10 +162,23 @@ def detection_map(
         x=x,
         y=y,
         statistics=study.run.statistics,
-        messages=[*_blinded(found["probability"]), *told(seen)],
+        messages=[*_blinded(found["probability"]), *told(seen), *marginal_lines(study), *_cost(study, x, y)],
         shares=parts,
         **found,
     )
+
+
+def _cost(study: Study, x: tuple[float | str, ...], y: tuple[float | str, ...]) -> list[str]:
+    """What unknowns cost in the middle of the map."""
+    middle = x[len(x) // 2], y[len(y) // 2]
+    quiet, (flare,) = _expectations(study, [middle])
+    names = (axis.quantity.replace("_", " ") for axis in (study.map.x, study.map.y))
+    at = " and ".join(f"{name} {_shown(value)}" for name, value in zip(names, middle, strict=True))
+    return cost_lines([unknown_cost(f"the cell of {at}", quiet, flare, study)], study)
+
+
+def _shown(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:.3g}"
 
 
 def _blinded(probability: NDArray[np.float64]) -> list[str]:

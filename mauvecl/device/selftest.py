@@ -29,6 +29,7 @@ from mauvecl.results.channels import ChannelPlan, plan_channels
 from mauvecl.results.hypotheses import Hypotheses
 from mauvecl.results.snr import Counts, elements, observers
 from mauvecl.results.tally import Tally
+from mauvecl.statistics.nuisances import known
 from mauvecl.statistics.registry import STATISTICS
 
 if TYPE_CHECKING:
@@ -118,6 +119,13 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
         {"frames": 5, "photon_noise": "poisson"},
         {"mode": "frames", "processes": Processes(None, Uniform(0.0, 0.05), Uniform(13.0, 21.0))},
     ),
+    "marginalised, the sky unknown": (
+        {"frames": 5},
+        {
+            "processes": Processes(jitter=Uniform(0.0, 0.05), sky_level=Uniform(0.5, 1.5)),
+            "nuisances": {"dark": 0.1, "light": 0.02, "tilt": float("inf")},
+        },
+    ),
 }
 #: Statistics that the fast kernel knows, where nothing but the template is compared.
 FAST = tuple(name for name, one in STATISTICS.items() if not one.paired)
@@ -134,9 +142,9 @@ def digests(engine: Engine, name: str) -> dict[str, str]:
     seen = engine.snr(quiet, realisations=COUNT, **place, **_drawing(how))
     values, fast = (
         engine.statistic_values(quiet, [flare], count=COUNT, statistics=names, **place, **how)
-        for names in (tuple(STATISTICS), FAST)
+        for names in (_asked(how), _asked(how, FAST))
     )
-    found = engine.detect(quiet, [flare], realisations=COUNT, statistics=FAST, **place, **how)
+    found = engine.detect(quiet, [flare], realisations=COUNT, statistics=_asked(how, FAST), **place, **how)
     null = found.distribution("chi2")
     return {
         "raw": _digest(raw.astype(np.int64), clipped),
@@ -151,8 +159,8 @@ def twin_digests(name: str) -> dict[str, str]:
     """The same by the NumPy twin."""
     options, how = CASES[name]
     quiet, flare = toy(**options), toy(flare=0.3, **options)
-    scene, index = prepare([quiet], **how), np.arange(START, START + COUNT, dtype=np.uint64)
-    both = prepare([quiet, flare], **how)
+    scene, index = prepare([quiet], **_laid_out(how)), np.arange(START, START + COUNT, dtype=np.uint64)
+    both = prepare([quiet, flare], **_laid_out(how))
     raw = reference.realise(scene, index, SEED)
     clipped = reference.clipped(scene, index, SEED)
     seen = reference_sums.histograms(scene, observers(quiet, scene), elements(quiet), index, SEED)
@@ -173,18 +181,31 @@ def twin_digests(name: str) -> dict[str, str]:
 
 def _statistics(name: str, scene: Scene) -> tuple[NDArray[np.float32], ChannelPlan]:
     """Every statistic of a case by the twin, and which is which."""
-    options, _ = CASES[name]
+    options, how = CASES[name]
     quiet, flare = toy(**options), toy(flare=0.3, **options)
-    found = Hypotheses(quiet, (flare,), tuple(STATISTICS), scene)
+    unknown = known(how.get("nuisances"), quiet)
+    found = Hypotheses(quiet, (flare,), _asked(how), scene, nuisances=unknown)
     plan = plan_channels(found, range(1), first=True)
     index = np.arange(START, START + COUNT, dtype=np.uint64)
-    smoothed = reference_sums.Smoothed.of(found, plan)
-    return reference_sums.statistics(scene, index, SEED, plan.weights, plan.linear_end, smoothed=smoothed), plan
+    smoothed = reference_sums.Smoothed.of(found, plan) if len(plan.scales) else None
+    paired = "chi2_pair" in _asked(how)
+    sums = reference_sums.statistics(scene, index, SEED, plan.weights, plan.linear_end, pair=paired, smoothed=smoothed)
+    return reference_sums.marginalise(sums, plan.subtractions), plan
 
 
 def _drawing(how: dict[str, Any]) -> dict[str, Any]:
     """How a case is drawn, whatever it is compared with."""
-    return {key: value for key, value in how.items() if key != "comparison"}
+    return {key: value for key, value in how.items() if key not in ("comparison", "nuisances")}
+
+
+def _laid_out(how: dict[str, Any]) -> dict[str, Any]:
+    """What `prepare` takes of a case."""
+    return {key: value for key, value in how.items() if key != "nuisances"}
+
+
+def _asked(how: dict[str, Any], names: tuple[str, ...] = tuple(STATISTICS)) -> tuple[str, ...]:
+    """Statistics of a case: where it is marginalised, those that can be."""
+    return tuple(n for n in names if STATISTICS[n].marginal) if "nuisances" in how else names
 
 
 def _fast(values: NDArray[np.float32], plan: ChannelPlan) -> NDArray[np.float32]:
@@ -234,12 +255,10 @@ def _nearly(engine: Engine, name: str) -> tuple[bool, str]:
     quiet, flare = toy(**options), toy(flare=0.3, **options)
     index = np.arange(START, START + COUNT, dtype=np.uint64)
     raw = engine.realise(quiet, start=START, count=COUNT, seed=SEED, **_drawing(how)).astype(np.int64)
-    off = np.abs(raw - reference.realise(prepare([quiet], **how), index, SEED))
+    off = np.abs(raw - reference.realise(prepare([quiet], **_laid_out(how)), index, SEED))
     share = float(np.mean(off > 0))
-    ours = engine.statistic_values(
-        quiet, [flare], start=START, count=COUNT, seed=SEED, statistics=tuple(STATISTICS), **how
-    )
-    twin = _statistics(name, prepare([quiet, flare], **how))[0]
+    ours = engine.statistic_values(quiet, [flare], start=START, count=COUNT, seed=SEED, statistics=_asked(how), **how)
+    twin = _statistics(name, prepare([quiet, flare], **_laid_out(how)))[0]
     apart = float(np.max(np.abs(ours - twin).max(axis=1) / np.maximum(twin.std(axis=1), 1e-3)))
     return (
         bool(off.max() <= 1 and share < 1e-2 and apart < 0.2),

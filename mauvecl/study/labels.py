@@ -44,7 +44,7 @@ def _coarse(x: Expectation) -> tuple[str, ...]:
         return ()
     return (
         f"In {found} of {x.wavelength_nm.size} pixels of {x.name} a frame has too little noise for its rounding to "
-        "whole DN to be like noise: closed forms take it for noise, and are wrong there; simulated numbers round each frame.",
+        "whole DN to be like noise: closed forms take it for noise, and are wrong there; simulations round each frame.",
     )
 
 

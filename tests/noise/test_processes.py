@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from scenes import instrument, star
@@ -247,3 +249,22 @@ def test_no_two_draws_share_a_counter(monkeypatch: pytest.MonkeyPatch) -> None:
     assert len(set(streams)) == len(streams)
     assert max(streams) < 256
     assert 65_536 // 4 <= 2**24
+
+
+@pytest.mark.parametrize("level", [Uniform(0.5, 1.5), Uniform(0.2, 9.0)])
+def test_the_sky_follows_its_own_level(engine: Engine, level: Uniform) -> None:
+    """The sky's spectrum alone moves, and jitter dims it like the star: five standard errors, by chance once in 4e5."""
+    (star_alone,) = star(payload=instrument(part=True))
+    # As bright as the star, of another shape.
+    slope = np.linspace(0.5, 1.5, star_alone.wavelength_nm.size)
+    x = replace(star_alone, sky_electrons=100.0 * slope, source_electrons=100.0 / slope)
+    light = np.array([x.source_electrons, x.sky_electrons]) * x.n_frames * x.gain_dn_per_electron
+    for jitter, kept in ((None, 1.0), (Uniform(0.02, 0.02), 0.98)):
+        raw = engine.realise(x, count=N // 4, seed=4, processes=Processes(jitter=jitter, sky_level=level))
+        (of_star, of_sky), *_ = np.linalg.lstsq(light.T, (raw - x.n_frames * (x.bias_dn + x.dark_dn)).T, rcond=None)
+        noise = np.sqrt(np.diag(np.linalg.inv(light @ light.T / x.variance_dn2.max())))
+        assert abs(of_star.mean() - kept) < 5 * 2 * noise[0] / np.sqrt(of_star.size)
+        wanted = kept * (level.low + level.high) / 2, kept * (level.high - level.low) / np.sqrt(12)
+        assert abs(of_sky.mean() - wanted[0]) < 5 * wanted[1] / np.sqrt(of_sky.size)
+        spread = np.sqrt(max(of_sky.var() - of_star.var(), 0.0))
+        assert abs(spread / wanted[1] - 1) < 0.15

@@ -1,0 +1,223 @@
+"""Unknowns from the question to the answer: study, flags, files, what they cost, and false alarms as asked for."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from commands import ended, run
+from scenes import instrument
+
+from mauvecl.answers.detect import detect
+from mauvecl.answers.limits import limiting_magnitude
+from mauvecl.answers.maps import detection_map
+from mauvecl.answers.unknown_cost import cost_lines, marginal_lines, unknown_cost
+from mauvecl.answers.unknown_table import power, unknown_table
+from mauvecl.device.engine import Engine
+from mauvecl.host.errors import InputError
+from mauvecl.host.expectation import expect
+from mauvecl.host.sky.zodiacal import Sky
+from mauvecl.host.stars.source import Source
+from mauvecl.noise.scene import prepare
+from mauvecl.noise.usual import USUAL
+from mauvecl.statistics.nuisances import Nuisances
+from mauvecl.study.nuisances import NuisanceChoice
+from mauvecl.study.study import Study
+
+STRAY = "200 1\n450 3\n700 1  # DN\n"
+
+
+def study(**nuisances: Any) -> Study:
+    """The G2V star of METHODS section 7 with its 2 % flare, Vega at V = 0."""
+    star = {"library": "G2V", "magnitude": 7.4, "magnitude_system": "vega"}
+    run = {"realisations": 100_000, "statistics": ["matched"]}
+    return Study.build({"star": [star], "flare": {"amplitudes": [0.02]}, "run": run, "nuisances": nuisances}, "test")
+
+
+@pytest.mark.parametrize(
+    ("nuisances", "known", "plain", "marginal"),
+    [
+        ({"dark": 0.1}, 8.36, 0.23, 3.06),
+        ({"light": 0.01}, 8.36, 4.12, 5.67),
+        ({"dark": "free", "light": "free"}, 8.36, 0, 3.05),
+    ],
+)
+def test_the_cost_is_that_of_the_methods(
+    nuisances: dict[str, Any], known: float, plain: float, marginal: float
+) -> None:
+    asked = study(**nuisances)
+    found = unknown_cost("it", *asked.expectations(asked.star[0]), asked)
+    assert found.known == pytest.approx(known, rel=0.01)
+    assert found.plain == pytest.approx(plain, rel=0.022)
+    assert found.marginal == pytest.approx(marginal, rel=0.01)
+    (line,) = cost_lines([found], asked)
+    assert f"{found.marginal:.3g} marginalised" in line
+    # Where the study names none, the documented ones, and it says so.
+    (line,) = cost_lines([unknown_cost("it", *asked.expectations(asked.star[0]), study())], study())
+    assert all(u.nuisance in line for u in USUAL)
+    assert not marginal_lines(study())
+
+
+def test_every_answer_says_what_unknowns_cost(engine: Engine) -> None:
+    small = study().with_settings(
+        ["run.fap=0.01", "run.realisations=20000", "map.x={quantity='magnitude', values=[6, 8]}",
+         "map.y={quantity='amplitude', values=[0.02, 0.2]}"]
+    )  # fmt: skip
+    marginal = small.with_changes({"nuisances": {"dark": 0.1}}, None)
+    for ask in (detect, limiting_magnitude, detection_map):
+        plain, other = (ask(s, engine) for s in (small, marginal))
+        for answer in (plain, other):
+            assert len([m for m in answer.messages if m.startswith("What unknowns cost")]) == 1
+        assert any("marginalised over dark +-0.1 deg C" in m for m in other.messages)
+        assert "[nuisances]" in other.table.meta["study"]
+        assert "[nuisances]" not in plain.table.meta["study"]
+    # What is marginalised detects less.
+    assert limiting_magnitude(marginal, engine).limits[0].closed_form < limiting_magnitude(small).limits[0].closed_form
+
+
+def test_a_study_reads_back_with_its_files(tmp_path: Path, engine: Engine) -> None:
+    (tmp_path / "stray.txt").write_text(STRAY)
+    text = "[nuisances]\ndark = 0.1\n[nuisances.own.stray]\nfile = 'stray.txt'\nsd = 2.0\n"
+    (tmp_path / "study.toml").write_text(text)
+    asked = Study.read(tmp_path / "study.toml")
+    (tmp_path / "elsewhere").mkdir()
+    again = tmp_path / "elsewhere" / "again.toml"
+    again.write_text(asked.toml())
+    assert Study.read(again).nuisances == asked.nuisances
+    quiet, flare = asked.expectations(asked.star[1])[:2]
+    found = asked.nuisances.marginalised(quiet)
+    assert found is not None
+    own = np.interp(quiet.wavelength_nm, [200, 450, 700], [1, 3, 1])
+    np.testing.assert_allclose(found.spectra[found.names.index("stray")], own)
+    # The same from Python, and from the command line.
+    by_hand = Nuisances.of(quiet, {"dark": 0.1, "stray": 2.0}, {"stray": own})
+    values = [
+        engine.statistic_values(quiet, [flare], count=40, seed=1, statistics=("chi2", "matched"), nuisances=n)
+        for n in (found, by_hand)
+    ]
+    np.testing.assert_array_equal(*values)
+    flags = ("--star", "G2V", "-m", "7.4", "-a", "0.02", "-n", "20000", "--fap", "0.01", "--statistic", "matched")
+    run("detect", *flags, "--nuisance", "dark=0.1", "--nuisance", "stray.txt=2", "--no-pictures", folder=tmp_path)
+    kept = Study.read(tmp_path / "mauvecl-detect" / "detection.ecsv").nuisances
+    assert kept == asked.nuisances.model_copy(
+        update={"own": {"stray": asked.nuisances.own["stray"].model_copy(update={"file": tmp_path / "stray.txt"})}}
+    )
+
+
+@pytest.mark.parametrize(
+    "flag",
+    ["dark", "dark=", "dark=0", "dark=-1", "dark=nan", "dark=inf", "dark=much", "dust=1", "=0.1", "missing.txt=free"],
+)
+def test_flags_that_cannot_be_are_refused(flag: str, tmp_path: Path) -> None:
+    star = ("--star", "G2V", "-m", "7.4", "-n", "20000", "--fap", "0.01")
+    code, _, told = ended("detect", *star, "--nuisance", flag, folder=tmp_path)
+    assert code == 2
+    assert told.startswith("mauvecl: ")
+    assert "expected" in told
+    assert told.count("\n") == 1
+
+
+@pytest.mark.parametrize("spread", [0, -1.0, True, "much", float("inf"), float("nan"), [1]])
+def test_spreads_that_cannot_be_are_refused(spread: Any) -> None:
+    for given in ({"dark": spread}, {"own": {"x": {"file": "x.txt", "sd": spread}}}):
+        with pytest.raises(InputError, match="expected a number above 0, or 'free'"):
+            study(**given)
+
+
+def test_the_usual_unknowns_are_drawn_where_the_study_observes() -> None:
+    """Around the study's own temperature; what it draws itself stays; without a sky none is unknown."""
+    asked = study(usual=True).with_settings(
+        ["observation.temperature_c=13", "processes.jitter={uniform=[0.0, 0.01]}", "nuisances.dark=0.3"]
+    )
+    processes = asked.drawing["processes"]
+    assert processes.detector_temperature.mean == 13
+    assert processes.jitter.high == 0.01
+    quiet, _ = asked.expectations(asked.star[0])
+    found = asked.nuisances.marginalised(quiet)
+    assert found is not None
+    assert dict(zip(found.names, found.sd, strict=True)) == {"dark": 0.3, "light": np.inf, "sky": 0.1}
+    dark_sky = asked.with_changes({"sky": {"none": True}}, None)
+    found = dark_sky.nuisances.marginalised(dark_sky.expectations(asked.star[0])[0])
+    assert found is not None
+    assert found.names == ("dark", "light")
+    assert study().drawing["processes"].detector_temperature is None
+
+
+def test_the_documentation_holds_the_usual_unknowns() -> None:
+    page = re.sub(r"\s+", " ", (Path(__file__).parents[2] / "docs" / "unknowns.md").read_text(encoding="utf-8"))
+    for one in USUAL:
+        for text in (one.drawn, one.marginalised, one.source):
+            assert text in page
+
+
+def test_priors_have_their_joint_draw_on_both_instruments() -> None:
+    """Priors are refused where noise must be drawn apart: nobody meets that here, at any usual setting."""
+    payloads, temperatures = ("mauve", "mauve-electrons"), (-20.0, 0.0, 13.0, 21.0, 25.0)
+    for payload, temperature, exposure in itertools.product(payloads, temperatures, (5.0, 50.0, 600.0)):
+        mauve = instrument(payload, part=True, temperature_c=temperature, output_max_nm=310.0)
+        for magnitude in (-1.0, 5.0, 20.0):
+            star = Source.from_library("G2V").at_magnitude(magnitude)
+            seen = [expect(star, mauve, exposure=exposure, sky=Sky.of_brightness(22.1))]
+            asked = study(usual=True).with_settings([f"observation.temperature_c={temperature}"])
+            assert prepare(seen, processes=asked.drawing["processes"]).joint
+
+
+#: Draws of each scene, the false-alarm probability asked for, and scenes.
+DRAWS, FAP, SCENES = 20_000, 0.01, 100
+SEEDS = itertools.count(2026)
+
+
+def test_false_alarms_as_asked_for_with_unknowns_drawn(engine: Engine) -> None:
+    """100 random scenes with the documented unknowns drawn, 2e4 draws each.
+
+    Marginalised: the simulated threshold on fresh draws, for which its own error counts as much as theirs, for every
+    statistic; and the closed form's for `matched`: the sky's prior is Gaussian, dark and light are projected out. Of
+    100 comparisons each one may leave 4 standard errors, which by chance happens in 1 run of 40; two would in 1 of
+    50 000. And all 100 together within 4 standard errors. Plain: the same by its usual threshold, which fails.
+    """
+    rng = np.random.default_rng(16)
+    statistics = ("chi2", "chi2_element", "matched")
+    error = np.sqrt(FAP * (1 - FAP) / DRAWS)
+    off: dict[str, list[float]] = {name: [] for name in (*statistics, "closed form")}
+    failed = 0
+    for _ in range(SCENES):
+        temperature, magnitude = rng.uniform(13, 21), rng.uniform(6, 10)
+        payload = instrument(str(rng.choice(["mauve", "mauve-electrons"])), part=True, temperature_c=temperature)
+        star = Source.from_library(str(rng.choice(["G2V", "K3V", "M3V", "F5V"]))).at_magnitude(magnitude)
+        sky = Sky.of_brightness(rng.uniform(19, 23))
+        exposure = float(rng.choice([5.0, 50.0]))
+        quiet, flare = (expect(s, payload, exposure=exposure, sky=sky) for s in (star, star.flaring(0.1)))
+        choice = NuisanceChoice(usual=True)
+        how: dict[str, Any] = {"realisations": DRAWS, "statistics": statistics}
+        how["processes"] = choice.processes(study().drawing["processes"], temperature)
+        unknown = choice.marginalised(quiet)
+        first, fresh = (engine.detect(quiet, [flare], seed=next(SEEDS), nuisances=unknown, **how) for _ in range(2))
+        plain = engine.detect(quiet, [flare], seed=next(SEEDS), **how)
+        for name in statistics:
+            alarms = fresh.false_alarm_probability(first.threshold(FAP, name).value, name).value
+            off[name].append((alarms - FAP) / (np.sqrt(2) * error))
+        cut = first.closed_form("matched").isf(FAP)
+        off["closed form"].append((first.false_alarm_probability(cut, "matched").value - FAP) / error)
+        usual = plain.closed_form("matched").isf(FAP)
+        failed += abs(plain.false_alarm_probability(usual, "matched").value - FAP) > 4 * error
+    for name, deviations in off.items():
+        assert sum(abs(d) > 4 for d in deviations) <= 1, name
+        assert abs(np.sum(deviations)) < 4 * np.sqrt(SCENES), name
+    assert failed == SCENES
+
+
+def test_the_table_and_its_picture(tmp_path: Path) -> None:
+    """METHODS section 7's row again, and the smallest amplitude has the power asked for."""
+    found = unknown_table(study())
+    rows = {row["unknown"]: row for row in found.table}
+    assert rows["dark +-0.1 deg C"]["marginalised"] == pytest.approx(3.06, rel=0.01)
+    assert rows["dark and light, free"]["marginalised"] == pytest.approx(3.05, rel=0.01)
+    assert rows["light +-1 %"]["plain"] == pytest.approx(4.12, rel=0.01)
+    for name, row in rows.items():
+        snr = row["marginalised"] * found.smallest("G2V V = 7.4 (Vega = 0)", name) / row["amplitude"]
+        assert power(np.array([snr]), 1e-3)[0] == pytest.approx(0.9)
+    assert found.plot(tmp_path / "unknowns.png") == tmp_path / "unknowns.png"
