@@ -112,6 +112,8 @@ def departures(found: Detection, fap: float) -> list[Departure]:
         others.append("cosmic rays")
     if scene.modulations:
         others.append("priors that the template does not know")
+    elif found.nuisances is not None:
+        others.append("unknowns that are marginalised over and not drawn")
     digital = _digital(found.quiet) if scene.clip else None
     rows = []
     for statistic in found.statistics:
