@@ -34,6 +34,7 @@ def study(**changes: Any) -> Study:
 FEW = {"statistics": ("matched",), "realisations": 20_000}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("power", [0.5, 0.9])
 def test_the_limiting_magnitude_has_the_power_asked_for(engine: Engine, power: float) -> None:
     """By a fresh simulation, within three half-widths of its 95 % interval: four statistics, 1e-4 by chance."""

@@ -31,6 +31,7 @@ def answered(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     return folder, started("detect", "-n", "100000", folder=folder).stdout
 
 
+@pytest.mark.long
 def test_detect_answers_the_papers_question(answered: tuple[Path, str]) -> None:
     folder, text = answered
     lines = text.splitlines()
@@ -79,6 +80,7 @@ def test_files_and_record(answered: tuple[Path, str]) -> None:
         assert (out / picture).read_bytes()[:8] == b"\x89PNG\r\n\x1a\n"
 
 
+@pytest.mark.long
 def test_everything_side_by_side(tmp_path: Path) -> None:
     """Six statistics against noisy exposures and by estimated variances, and the study that says so."""
     words = ("detect", "--star", "G2V", "-m", "7.4", "-a", "0.1", "-n", "20000", "--fap", "0.01", "--no-pictures")
@@ -175,6 +177,7 @@ fap = 0.1
 """
 
 
+@pytest.mark.long
 def test_a_study_may_ask_for_processes(tmp_path: Path, engine: Engine) -> None:
     """As the engine given them in Python, and written back as they were read."""
     (tmp_path / "study.toml").write_text(PROCESSES)
@@ -220,6 +223,7 @@ def test_a_simulation_is_the_engines_realisation() -> None:
         np.testing.assert_array_equal(table["raw"].value, Engine().realise(x, start=123, count=1, seed=4)[0])
 
 
+@pytest.mark.long
 def test_the_parts_of_a_simulation_have_their_variances() -> None:
     """Photon and read noise apart: 197 pixels x 30 realisations, each sum of squares within 5 standard errors."""
     from scenes import instrument, star
@@ -246,6 +250,7 @@ def test_snr(tmp_path: Path) -> None:
     assert names <= {p.name for p in (tmp_path / "out").iterdir()}
 
 
+@pytest.mark.long
 def test_snr_of_the_papers_budgets_and_a_sweep(tmp_path: Path) -> None:
     """Without arguments the paper's three stars at 50 s and 600 s; with a sweep every combination, or a list."""
     shown = run("snr", "-n", "500", folder=tmp_path).stdout
@@ -458,6 +463,7 @@ def never_stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder / "out"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_stopped_and_resumed_as_if_never_stopped(stop: signal.Signals, tmp_path: Path, never_stopped: Path) -> None:
     """Ctrl-C, the end of a batch job, kill -9: a second run goes on, and writes the same tables."""

@@ -63,6 +63,7 @@ def test_pipes_get_no_colour_and_errors_their_own_way(tmp_path: Path) -> None:
     assert "detetc" in unknown.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "words",
     [
@@ -76,6 +77,7 @@ def test_json_is_alone_on_standard_output(words: tuple[str, ...], tmp_path: Path
     assert json.loads(started(*words, folder=tmp_path).stdout)
 
 
+@pytest.mark.long
 def test_quiet_prints_no_progress_and_no_files(tmp_path: Path) -> None:
     words = ("detect", "--star", "G2V", "-m", "8", "-a", "0.1", "-n", "100000", "--no-pictures")
     loud, quiet = (started(*words, *more, folder=tmp_path) for more in ((), ("--quiet",)))

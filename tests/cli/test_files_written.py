@@ -45,6 +45,7 @@ def full_from(step: int, monkeypatch: pytest.MonkeyPatch) -> list[str]:
     return tried
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("verb", VERBS)
 def test_the_answer_is_told_though_the_disk_is_full(
     verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -61,6 +62,7 @@ def test_the_answer_is_told_though_the_disk_is_full(
     assert [(p.name, p.read_text()) for p in out.iterdir()] == [(f"{verb}.ecsv", "of an earlier run")]
 
 
+@pytest.mark.long
 def test_a_disk_that_fills_at_every_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -84,6 +86,7 @@ def test_a_disk_that_fills_at_every_file(
         assert capsys.readouterr().out.partition("Wrote")[0] == plain.partition("Wrote")[0]
 
 
+@pytest.mark.long
 def test_a_disk_that_is_really_full(small_disk: Path, capsys: pytest.CaptureFixture[str]) -> None:
     out = small_disk / "out"
     words = [*VERBS["simulate"], "--no-pictures", "--output", str(out)]

@@ -82,7 +82,7 @@ def case(name: str) -> tuple[list, dict]:
     return star(magnitude=magnitude, amplitudes=(0.081, 0.24), exposure=exposure, payload=payload), how
 
 
-@pytest.fixture(scope="module", params=["vectors", "scalar"])
+@pytest.fixture(scope="module", params=["vectors", pytest.param("scalar", marks=pytest.mark.long)])
 def any_width(request: pytest.FixtureRequest, engine: Engine) -> Engine:
     """The engine as processors run it, and one realisation to a work-item, as a GPU does."""
     return engine if request.param == "vectors" else Engine(width=1)

@@ -48,6 +48,7 @@ def test_every_marginalised_statistic_is_the_twins(any_width: Engine, exposure: 
     assert (values[0] < sums[0]).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sd", [0.1, FREE])
 def test_false_alarms_and_power_with_the_unknown_drawn(engine: Engine, sd: float) -> None:
     """The marginalised statistics keep their false-alarm probability and power; the plain ones do not.

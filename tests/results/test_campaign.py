@@ -42,6 +42,7 @@ def test_two_overlapping_stacks_exactly() -> None:
     assert abs(found.overlapping.value - (1 - both)) < 4 * np.sqrt(both * (1 - both) / 20_000)
 
 
+@pytest.mark.long
 def test_long_campaigns_are_joined_from_stretches() -> None:
     """Ten times the frames: the chance of no alarm to the tenth power, to four standard errors."""
     one, ten = campaign(1e-5, 40_005, 10, step=1), campaign(1e-5, 400_050, 10, step=1, seed=2)

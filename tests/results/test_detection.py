@@ -43,6 +43,7 @@ def ks_probability(d: Distribution, sf: object) -> float:
     return float(stats.kstwo.sf(np.abs(ours - theirs).max(), d.n))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("statistic", STATISTICS)
 def test_the_null_is_its_closed_form(found: Detection, statistic: str) -> None:
     """At 1e6 realisations of a star where Gaussian limits hold; fails by chance once in 1e6 seeds."""
@@ -54,6 +55,7 @@ def test_the_null_is_its_closed_form(found: Detection, statistic: str) -> None:
     assert d.far.n == 0
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("statistic", STATISTICS)
 @pytest.mark.parametrize("flare", range(len(AMPLITUDES)))
 def test_a_flare_follows_its_closed_form(found: Detection, statistic: str, flare: int) -> None:
@@ -61,6 +63,7 @@ def test_a_flare_follows_its_closed_form(found: Detection, statistic: str, flare
     assert ks_probability(found.distribution(statistic, flare), found.closed_form(statistic, flare).sf) > 1e-6
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("statistic", STATISTICS)
 @pytest.mark.parametrize("fap", [1e-2, 1e-3])
 def test_detection_probabilities_agree_with_the_closed_form(found: Detection, statistic: str, fap: float) -> None:
@@ -79,6 +82,7 @@ def test_detection_probabilities_agree_with_the_closed_form(found: Detection, st
         assert p.low <= p.value <= p.high
 
 
+@pytest.mark.long
 def test_the_paper_flares_have_an_order(found: Detection) -> None:
     """More flare is never harder to see, and the right template is never beaten (Neyman & Pearson)."""
     probability = {s: [p.value for p in found.detection_probability(1e-3, s)] for s in STATISTICS}
@@ -90,6 +94,7 @@ def test_the_paper_flares_have_an_order(found: Detection) -> None:
     assert probability["chi2_element"][0] > 2 * probability["chi2"][0]
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("statistic", STATISTICS)
 def test_thresholds_invert(found: Detection, statistic: str) -> None:
     for fap in (0.5, 0.1, 1e-2, 1e-3, 1e-4):
@@ -102,6 +107,7 @@ def test_thresholds_invert(found: Detection, statistic: str) -> None:
         assert cut.low - 1e-9 <= exact <= cut.high or abs(cut.value - exact) < 4 * (cut.high - cut.low) / 3.92
 
 
+@pytest.mark.long
 def test_roc(found: Detection) -> None:
     curve = found.roc("matched", 1)
     fap, probability = curve.fap, curve.probability
@@ -117,6 +123,7 @@ def test_roc(found: Detection) -> None:
     assert len(table) <= 201
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("flare", range(len(AMPLITUDES)))
 def test_the_area_under_a_roc_is_its_closed_form(found: Detection, flare: int) -> None:
     """Of two unit normals a distance d apart it is Phi(d / sqrt(2)): 4 half-widths of DeLong's, 6e-15 by chance."""
@@ -162,6 +169,7 @@ def test_tail_samples_are_the_extremes_and_can_be_drawn_again(engine: Engine) ->
             np.testing.assert_array_equal(ours["realisation"], theirs["realisation"])
 
 
+@pytest.mark.long
 def test_rare_tails_are_refused_not_extrapolated(found: Detection) -> None:
     with pytest.raises(InputError, match="ask for 10000000 realisations"):
         found.threshold(1e-5)
@@ -171,6 +179,7 @@ def test_rare_tails_are_refused_not_extrapolated(found: Detection) -> None:
             found.threshold(fap)
 
 
+@pytest.mark.long
 def test_table(found: Detection) -> None:
     table = found.table(fap=1e-3)
     assert len(table) == len(AMPLITUDES) * len(STATISTICS)
@@ -217,6 +226,7 @@ def test_wider_wings_than_the_grid_are_counted(engine: Engine) -> None:
     assert own.far.n == 0
 
 
+@pytest.mark.long
 def test_a_statistic_of_ones_own(engine: Engine) -> None:
     """The matched filter given as weights is the matched filter; any other follows its normal."""
     quiet, *flares = star(amplitudes=AMPLITUDES)
@@ -261,6 +271,7 @@ def test_uv_excess_needs_uv(engine: Engine) -> None:
         engine.detect(quiet, [flare], realisations=10, seed=1, statistics=("uv_excess",))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", range(5))
 def test_random_scenes_agree_with_theory(engine: Engine, number: int) -> None:
     """Detection probabilities of random scenes at 1e6, within 4 standard errors: 30 values, 2e-3 by chance.

@@ -107,6 +107,7 @@ def check_distribution(d: Distribution, exact: Sorted) -> None:
     assert (np.abs(np.cumsum(direct) - np.cumsum(counts)) <= np.array(near[1:]) + 1).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", range(STUDIES))
 def test_every_number_is_that_of_sorting(engine: Engine, number: int) -> None:
     (quiet, *flares), how = study(number)
@@ -153,6 +154,7 @@ def check_answers(found: Detection, statistic: str, k: int, null: Sorted, flare:
     assert abs(curve.area.value - beaten.sum() / (2 * N**2)) <= unsure.sum() / (2 * N**2) + 1e-12
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("number", [*range(3), 5])
 @pytest.mark.parametrize("width", [1, 16])
 def test_signal_to_noise_is_that_of_sorting(width: int, number: int) -> None:

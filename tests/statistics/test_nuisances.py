@@ -62,6 +62,7 @@ def test_the_table_of_the_methods(
     assert matched.closed_form(s, flare, flare).mean == pytest.approx(both, rel=0.01)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("sd", [{"dark": 0.1}, {"dark": FREE, "light": 0.02}, {"dark": 0.3, "sky": 1.0, "tilt": FREE}])
 @pytest.mark.parametrize("name", ["chi2", "chi2_element", "matched", "uv_excess", "own"])
 def test_distributions_against_draws_with_the_unknowns_drawn(name: str, sd: dict[str, float]) -> None:

@@ -27,6 +27,7 @@ def whole(quiet: Expectation, flare: Expectation) -> tuple[np.ndarray, np.ndarra
     return rows, factor, modes[modes > 1e-10 * modes.max()]
 
 
+@pytest.mark.long
 def test_few_centres_say_what_all_pixels_say() -> None:
     """Draw by draw to 1e-3, thresholds to 1e-4, false alarms to 1e-3 at 1e-2 and to 5e-3 at 1e-10."""
     quiet, flare = star(amplitudes=(0.081,))

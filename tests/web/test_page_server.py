@@ -143,6 +143,7 @@ def answerless(found: page.Page) -> bool:
     )
 
 
+@pytest.mark.long
 def test_an_upload_that_fails_in_any_way_leaves_no_answer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     good = star_file(tmp_path / "star.txt")
     found = page.Page()
@@ -453,6 +454,7 @@ NONSENSE = [
 ]
 
 
+@pytest.mark.long
 def test_nonsense_gives_no_traceback_and_no_path(served: Any, caplog: pytest.LogCaptureFixture) -> None:
     told: list[str] = []
 
