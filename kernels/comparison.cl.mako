@@ -16,7 +16,7 @@ INLINE floatv variance_of(floatv x, __global const Estimate *e)
 % endif
 
 __kernel ${attributes}
-void statistics(SCENE, const uint first_low, const uint first_high,
+void comparison(SCENE, const uint first_low, const uint first_high,
                 __global const uint *restrict templates, __global const float *restrict constants,
                 __global const float *restrict weights, __global const uint *restrict linear_end,
                 __global const Estimate *restrict estimates, __global const float *restrict bands,

@@ -213,7 +213,7 @@ MUTATIONS = {
     "shifts forgotten in the closed form's phase": Mutation(
         (
             (
-                "mauvecl/statistics/definitions.py",
+                "mauvecl/statistics/distributions.py",
                 "phase = 0.5 * np.arctan(turn).sum(axis=1) + (u[:, None] * pull / spread).sum(axis=1)",
                 "phase = 0.5 * np.arctan(turn).sum(axis=1) + 0.0 * u",
             ),

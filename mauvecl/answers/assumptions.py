@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from mauvecl.answers.limit_search import Question
+from mauvecl.answers.limit_search import LimitSearch
 from mauvecl.noise.processes import Uniform
 from mauvecl.study.labels import described
 from mauvecl.study.sections import Star, Unknowns
@@ -117,12 +117,12 @@ def what_matters(study: Study) -> QTable:
 
 
 def _moves(study: Study, star: Star, amplitude: float | None, statistic: str) -> list[Moved]:
-    question = Question(study, star, amplitude, statistic)
+    question = LimitSearch(study, star, amplitude, statistic)
     nominal = question.root()
     found = []
     for assumption in assumptions(study.load_instrument()):
         ends = [
-            Question(study.with_instrument(change), star, amplitude, statistic).root(near=nominal)
+            LimitSearch(study.with_instrument(change), star, amplitude, statistic).root(near=nominal)
             for change in assumption.changes
         ]
         found.append(

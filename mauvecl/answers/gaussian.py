@@ -34,6 +34,10 @@ if TYPE_CHECKING:
 
 #: Share of normal values within one standard deviation.
 ONE_SIGMA = float(special.ndtr(1.0) - special.ndtr(-1.0))
+#: Standard errors beyond which a difference is told, and how many of them a 95 % interval is wide.
+SURE, ERRORS_IN_INTERVAL = 4, 3.92
+#: A false-alarm probability further below the promised one is as wrong as this.
+SMALLEST_RATIO = 1e-3
 #: Looked at where a study sweeps over nothing.
 GRID = Sweep(
     axes=(
@@ -175,37 +179,11 @@ class GaussianReport(Answer):
         import astropy.units as u
         from astropy.table import QTable
 
-        rows = []
-        elements, thresholds = self.elements, self.thresholds
-        flares = self.detection.table
-        each, tests, powers = (len(t) // len(self.signal.stars) for t in (elements, thresholds, flares))
-        for k, star in enumerate(self.signal.stars):
-            here = elements[k * each : (k + 1) * each]
-            sure = here[np.abs(here["mean"] - here["expected"]) > 4 * here["error"]]
-            worst = sure[np.argmax(np.abs(sure["mean"] - sure["expected"]))] if len(sure) else None
-            tested = thresholds[k * tests : (k + 1) * tests]
-            off = tested[tested["differs"]]
-            wrong = off[np.argmax(np.abs(np.log(np.maximum(off["ratio"], 1e-3))))] if len(off) else None
-            power = flares[k * powers : (k + 1) * powers]
-            missed = power["probability"] - power["closed_form_probability"]
-            # Beyond 4 standard errors, the threshold's own included.
-            missed = np.where(np.abs(missed) > (power["high"] - power["low"]) * 4 / 3.92, missed, 0.0)
-            rows.append(
-                {"star": star.label, **star.at}
-                | {
-                    "best_snr": float(here["expected"].max()),
-                    "snr_off_by": 0.0 if worst is None else float(worst["mean"] - worst["expected"]),
-                    "at_nm": np.nan if worst is None else float(worst["wavelength"].value),
-                    "coverage_low": float(here["coverage"].min()),
-                    "coverage_high": float(here["coverage"].max()),
-                    "five_sigma_above": float((beyond(star.result.expectation, 5.0) / special.ndtr(-5.0)).max()),
-                    "five_sigma_below": float((beyond(star.result.expectation, -5.0) / special.ndtr(-5.0)).min()),
-                    "fap_ratio": 1.0 if wrong is None else float(wrong["ratio"]),
-                    "statistic": "" if wrong is None else str(wrong["statistic"]),
-                    "why": "" if wrong is None else str(wrong["why"]),
-                    "probability_off_by": float(missed[np.argmax(np.abs(missed))]),
-                }
-            )
+        tables = [_by_star(t, len(self.signal.stars)) for t in (self.elements, self.thresholds, self.detection.table)]
+        rows = [
+            {"star": star.label, **star.at} | _of_signal(star.result, elements) | _of_thresholds(tested, flares)
+            for star, elements, tested, flares in zip(self.signal.stars, *tables, strict=True)
+        ]
         table = QTable(rows=rows)
         for axis in self.study.sweep.axes:
             if axis.quantity in UNITS:
@@ -224,6 +202,44 @@ class GaussianReport(Answer):
             table[name].info.description = text
         table.meta |= {"fap": self.study.run.fap, "study": self.study.text()}
         return described(table)
+
+
+def _by_star(table: QTable, stars: int) -> list[QTable]:
+    """Equal parts of a table, in order."""
+    each = len(table) // stars
+    return [table[k * each : (k + 1) * each] for k in range(stars)]
+
+
+def _of_signal(result: SnrResult, elements: QTable) -> dict[str, float]:
+    """The worst of a star's S/N, and of the intervals made of it."""
+    sure = elements[np.abs(elements["mean"] - elements["expected"]) > SURE * elements["error"]]
+    worst = sure[np.argmax(np.abs(sure["mean"] - sure["expected"]))] if len(sure) else None
+    x, rare = result.expectation, special.ndtr(-5.0)
+    return {
+        "best_snr": float(elements["expected"].max()),
+        "snr_off_by": 0.0 if worst is None else float(worst["mean"] - worst["expected"]),
+        "at_nm": np.nan if worst is None else float(worst["wavelength"].value),
+        "coverage_low": float(elements["coverage"].min()),
+        "coverage_high": float(elements["coverage"].max()),
+        "five_sigma_above": float((beyond(x, 5.0) / rare).max()),
+        "five_sigma_below": float((beyond(x, -5.0) / rare).min()),
+    }
+
+
+def _of_thresholds(tested: QTable, flares: QTable) -> dict[str, float | str]:
+    """The worst of a star's false-alarm and detection probabilities."""
+    off = tested[tested["differs"]]
+    wrong = off[np.argmax(np.abs(np.log(np.maximum(off["ratio"], SMALLEST_RATIO))))] if len(off) else None
+    missed = flares["probability"] - flares["closed_form_probability"]
+    # The threshold's own error is in the interval.
+    sure = np.abs(missed) > (flares["high"] - flares["low"]) * SURE / ERRORS_IN_INTERVAL
+    missed = np.where(sure, missed, 0.0)
+    return {
+        "fap_ratio": 1.0 if wrong is None else float(wrong["ratio"]),
+        "statistic": "" if wrong is None else str(wrong["statistic"]),
+        "why": "" if wrong is None else str(wrong["why"]),
+        "probability_off_by": float(missed[np.argmax(np.abs(missed))]),
+    }
 
 
 def gaussian_report(study: Study, engine: Engine | Pool | None = None) -> GaussianReport:

@@ -18,7 +18,7 @@ from mauvecl.statistics.intervals import Interval
 from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.sections import Star
 from mauvecl.study.study import Study
-from mauvecl.study.unknowns import Draws, average, drawn, shares
+from mauvecl.study.unknowns import DrawnStudies, average, drawn, shares
 
 if TYPE_CHECKING:
     from mauvecl.device.engine import Engine
@@ -48,14 +48,14 @@ class Unknown:
 
     Attributes
     ----------
-    draws : Draws
+    draws : DrawnStudies
     limits : ndarray, shape (n_draw,)
         The closed-form limit of each draw; NaN where there is none.
     shares : dict of float
         Share of the limits' variance that each unknown explains, the largest first.
     """
 
-    draws: Draws
+    draws: DrawnStudies
     limits: NDArray[np.float64]
     shares: dict[str, float]
 
@@ -66,7 +66,7 @@ class Unknown:
         return float(low), float(high)
 
 
-class Question:
+class LimitSearch:
     """One star, flare and statistic: detection probability as a function of the quantity."""
 
     def __init__(
@@ -181,7 +181,7 @@ class Question:
         return float((above - below) / (2 * width))
 
 
-class MarginalQuestion(Question):
+class MarginalLimitSearch(LimitSearch):
     """The same, averaged over what is unknown of the instrument."""
 
     def __init__(
@@ -189,7 +189,7 @@ class MarginalQuestion(Question):
     ) -> None:
         super().__init__(study, star, amplitude, statistic, engine)
         self.draws = drawn(study)
-        self.each = [Question(one, star, amplitude, statistic, engine) for one in self.draws.studies]
+        self.each = [LimitSearch(one, star, amplitude, statistic, engine) for one in self.draws.studies]
 
     def theory(self, value: float) -> float:
         """Mean over the draws of the unknown."""
@@ -241,7 +241,7 @@ def _bisect_frames(seen: Callable[[float], bool], low: float, high: float, frame
     return many * frame_s
 
 
-def settle(question: Question, start: float) -> Interval:
+def settle(question: LimitSearch, start: float) -> Interval:
     """The value at which the power is simulated, with its interval, searched from a start near it.
 
     Raises
@@ -252,7 +252,7 @@ def settle(question: Question, start: float) -> Interval:
     return (_settle_frames if question.of == "exposure" else _settle)(question, start)
 
 
-def _settle(question: Question, start: float) -> Interval:
+def _settle(question: LimitSearch, start: float) -> Interval:
     """Newton's steps in the probit, with the closed form's slope; then the interval by the same slope."""
     of, seed = question.of, question.study.run.seed
     slope, goal = question.slope(start), float(special.ndtri(question.power))
@@ -276,7 +276,7 @@ def _settle(question: Question, start: float) -> Interval:
     raise InputError(f"the limit of {of} did not settle in {MOST_EVALUATIONS} simulations near {_value(of, at):g}")
 
 
-def _settle_frames(question: Question, start: float) -> Interval:
+def _settle_frames(question: LimitSearch, start: float) -> Interval:
     """Whole frames: the fewest that reach the power, and the fewest by either end of the interval."""
     seed, frame_s = question.study.run.seed, question.frame_s
     known: dict[int, Interval] = {}

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.answers.answer import Answer
-from mauvecl.answers.limit_search import MarginalQuestion, Point, Question, Unknown, settle
+from mauvecl.answers.limit_search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle
 from mauvecl.answers.unknown_cost import Cost, cost_lines, marginal_lines, unknown_cost
 from mauvecl.host.errors import InputError
 from mauvecl.results.detection import check_fap
@@ -209,10 +209,10 @@ def solve(
         If the power is not crossed in the range searched, or the false-alarm probability cannot be settled.
     """
     check_fap(study.run.fap, study.run.realisations, study.run.tails)
-    kind = MarginalQuestion if study.unknowns.draws else Question
+    kind = MarginalLimitSearch if study.unknowns.draws else LimitSearch
     question = kind(study, star, amplitude, statistic, engine)
     # The nominal instrument's root is near, and quickly found.
-    theory = question.root(near=Question(study, star, amplitude, statistic).root() if study.unknowns.draws else None)
+    theory = question.root(near=LimitSearch(study, star, amplitude, statistic).root() if study.unknowns.draws else None)
     value = settle(question, theory)
     simulated = tuple(question.points)
     # Another seed, far from any that a user would take for a neighbour.
@@ -236,7 +236,7 @@ def solve(
         points=simulated,
         curve=question.curve(value.value),
         at=at or {},
-        unknown=question.unknown(theory) if isinstance(question, MarginalQuestion) else None,
+        unknown=question.unknown(theory) if isinstance(question, MarginalLimitSearch) else None,
         messages=tuple(m for m in told([quiet, flare]) if m.startswith("SATURATED")),
         cost=unknown_cost(where, quiet, flare, question.study),
     )

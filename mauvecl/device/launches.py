@@ -96,9 +96,9 @@ class Launches:
 
     def _launch(self, name: str, items: tuple[int, ...], *arguments: Any) -> None:
         if name not in self._kernels:
-            # One build for the two that are always used together.
+            # One build for those that are always used together.
             detection = COMPARED if self.variant.compared else DETECTION
-            rooms = detection if name in ("statistics", "tally", "marginalise") else (name,)
+            rooms = detection if name in (detection[0], "tally", "marginalise") else (name,)
             self._kernels[name] = self._device.kernel(rooms, self.variant, name)
         local = (1,) * len(items) if self.variant.width > 1 else None
         self._kernels[name](self._queue, items, local, *arguments)
@@ -246,10 +246,9 @@ class Launches:
     def statistics(self, tile: Tile) -> None:
         """Compute every channel of a tile into values[channel][realisation]."""
         values = self._room("values", 4 * self._rows * tile.size)
+        kernel = (COMPARED if self.variant.compared else DETECTION)[0]
         items = (tile.size // (self.variant.width * self.variant.vectors),)
-        self._launch(
-            "statistics", items, *self._arguments, *tile.address(), *self._weighing, np.uint32(tile.size), values
-        )
+        self._launch(kernel, items, *self._arguments, *tile.address(), *self._weighing, np.uint32(tile.size), values)
         if self._subtractions:
             items = (tile.size // self.variant.width,)
             self._launch("marginalise", items, *self._subtractions, np.uint32(tile.size), values)

@@ -12,7 +12,7 @@ from scipy import special
 
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.results.detection import countable
-from mauvecl.statistics.distributions import Normal, QuadraticForm
+from mauvecl.statistics.distributions import Gaussian, QuadraticForm
 from mauvecl.statistics.intervals import Interval
 from mauvecl.statistics.statistic import LinearStatistic, QuadraticStatistic
 
@@ -179,7 +179,7 @@ def departure_table(found: Detection, amplitudes: Sequence[float], fap: float) -
     return table
 
 
-def _skewed(found: Detection, statistic: str, template: int, null: QuadraticForm | Normal, cut: float) -> float:
+def _skewed(found: Detection, statistic: str, template: int, null: QuadraticForm | Gaussian, cut: float) -> float:
     """False-alarm probability at a threshold with the noise's third and fourth cumulants."""
     scene, quiet = found.scene, found.quiet
     each = 1 if scene.frames else quiet.n_frames

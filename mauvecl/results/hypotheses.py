@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise.scene import Scene
-from mauvecl.statistics.distributions import Normal, QuadraticForm
+from mauvecl.statistics.distributions import Gaussian, QuadraticForm
 from mauvecl.statistics.linear import Linear
 from mauvecl.statistics.nuisances import Nuisances
 from mauvecl.statistics.registry import chosen
@@ -50,7 +50,7 @@ class Hypotheses:
     statistics: tuple[str, ...] = field(init=False)
     setting: Setting = field(init=False, repr=False)
     _chosen: dict[str, Statistic] = field(init=False, repr=False)
-    _forms: dict[tuple[str, int | None, int], QuadraticForm | Normal] = field(
+    _forms: dict[tuple[str, int | None, int], QuadraticForm | Gaussian] = field(
         default_factory=dict, init=False, repr=False
     )
 
@@ -113,7 +113,7 @@ class Hypotheses:
             for k in self.blinding
         )
 
-    def closed_form(self, statistic: str, flare: int | None = None, *, template: int = 0) -> QuadraticForm | Normal:
+    def closed_form(self, statistic: str, flare: int | None = None, *, template: int = 0) -> QuadraticForm | Gaussian:
         """A statistic's distribution for Gaussian noise; parameters as for `Detection.distribution`."""
         self._check(statistic, flare, template)
         key = statistic, flare, template
@@ -121,7 +121,7 @@ class Hypotheses:
             self._forms[key] = self._closed_form(statistic, flare, template)
         return self._forms[key]
 
-    def _closed_form(self, statistic: str, flare: int | None, template: int) -> QuadraticForm | Normal:
+    def _closed_form(self, statistic: str, flare: int | None, template: int) -> QuadraticForm | Gaussian:
         observed = self.quiet if flare is None else self.flares[flare]
         looked_for = self.shape(statistic, template if flare is None else flare)
         return self.statistic(statistic).closed_form(self.setting, observed, looked_for)

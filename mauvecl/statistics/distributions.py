@@ -114,7 +114,7 @@ class QuadraticForm:
 
 
 @dataclass(frozen=True)
-class Normal:
+class Gaussian:
     """A normal distribution, with the same face as `QuadraticForm`."""
 
     mean: float

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
 from mauvecl.noise.comparison import TEMPLATE, Comparison
-from mauvecl.statistics.distributions import Normal, QuadraticForm
+from mauvecl.statistics.distributions import Gaussian, QuadraticForm
 from mauvecl.statistics.nuisances import Nuisances, joined
 
 if TYPE_CHECKING:
@@ -118,7 +118,7 @@ class Statistic(ABC):
 
     def closed_form(
         self, setting: Setting, observed: Expectation, flare: Expectation | None = None
-    ) -> QuadraticForm | Normal:
+    ) -> QuadraticForm | Gaussian:
         """The distribution for Gaussian noise (METHODS section 6).
 
         Parameters
@@ -143,7 +143,7 @@ class Statistic(ABC):
     @abstractmethod
     def form(
         self, setting: Setting, delta: Float, true: Float, flare: Expectation | None = None, *, estimated: bool = False
-    ) -> QuadraticForm | Normal:
+    ) -> QuadraticForm | Gaussian:
         """The distribution for differences that are Gaussian.
 
         Parameters
@@ -220,14 +220,14 @@ class LinearStatistic(Statistic):
 
     def form(
         self, setting: Setting, delta: Float, true: Float, flare: Expectation | None = None, *, estimated: bool = False
-    ) -> Normal:
+    ) -> Gaussian:
         weights = self.weights_per_dn(setting, flare)
         mean, variance = float(weights @ delta), float(weights**2 @ true)
         if setting.nuisances:
             variance += float(np.sum((setting.nuisances.finite(setting.nuisances.spectra) @ weights) ** 2))
         spread = float(np.sqrt(variance))
         # By estimated variances a linear statistic comes in its own standard deviations.
-        return Normal(mean / spread, 1.0) if estimated else Normal(mean, spread)
+        return Gaussian(mean / spread, 1.0) if estimated else Gaussian(mean, spread)
 
     def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
         weights = self.weights_per_dn(setting, flare)

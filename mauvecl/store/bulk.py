@@ -17,7 +17,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.runs.durable import UNFINISHED, alone, write_whole
 from mauvecl.runs.pool import Pool, together
 from mauvecl.store.export import Selection, export
-from mauvecl.store.form import CRC_BYTES, Chunk, Scene, Store, crc, digest
+from mauvecl.store.form import CRC_BYTES, Chunk, Store, StoredScene, crc, digest
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -32,7 +32,7 @@ MOST_MISSING = 100_000
 
 
 def draw(
-    study: Study, scene: Scene, engine: Engine | Pool, start: int, count: int, out: NDArray[Any] | None = None
+    study: Study, scene: StoredScene, engine: Engine | Pool, start: int, count: int, out: NDArray[Any] | None = None
 ) -> NDArray[Any]:
     """Rows of one array, from the engine alone.
 
@@ -40,7 +40,7 @@ def draw(
     ----------
     study : Study
         Its seed, mode, recipe and processes.
-    scene : Scene
+    scene : StoredScene
     engine : Engine or Pool
     start, count : int
         Realisations start to start + count - 1.

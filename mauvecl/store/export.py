@@ -17,7 +17,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.version import VERSION
 from mauvecl.runs.durable import UNFINISHED, write_whole
 from mauvecl.store.description import CALIBRATION, COMMON_DRAWS, NOMINAL
-from mauvecl.store.form import Scene, Store
+from mauvecl.store.form import Store, StoredScene
 
 if TYPE_CHECKING:
     from astropy.io.fits import BinTableHDU, HDUList, ImageHDU
@@ -33,7 +33,7 @@ class Selection:
     """Arrays and rows of a store."""
 
     store: Store
-    scenes: Sequence[Scene]
+    scenes: Sequence[StoredScene]
     first: int
     stop: int
 
@@ -69,7 +69,7 @@ class Selection:
                 raise InputError(f"{chunk.key} is missing, expected a whole store: `mauvecl realise --resume` draws it")
         return found
 
-    def rows(self, scene: Scene) -> NDArray[Any]:
+    def rows(self, scene: StoredScene) -> NDArray[Any]:
         """The spectra of one array."""
         import zarr
 
@@ -142,7 +142,7 @@ def _fits(selection: Selection) -> HDUList:
     return fits.HDUList([primary, *parts])
 
 
-def _image(selection: Selection, scene: Scene, table: str) -> ImageHDU:
+def _image(selection: Selection, scene: StoredScene, table: str) -> ImageHDU:
     from astropy.io import fits
 
     x = scene.expectation
@@ -169,7 +169,7 @@ def _image(selection: Selection, scene: Scene, table: str) -> ImageHDU:
     return hdu
 
 
-def _calibration(scene: Scene) -> BinTableHDU:
+def _calibration(scene: StoredScene) -> BinTableHDU:
     """Calibration of the pixels, a row each, and all wavelengths in one cell, as the -TAB axis wants them."""
     from astropy.io import fits
 

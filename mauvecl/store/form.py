@@ -38,7 +38,7 @@ CRC_BYTES = 4
 
 
 @dataclass(frozen=True, eq=False)
-class Scene:
+class StoredScene:
     """One array of a store: a star without a flare, or with one."""
 
     group: str
@@ -77,7 +77,7 @@ class Scene:
         return max(min(CHUNK_BYTES // self.row_bytes, realisations), 1)
 
 
-def scenes(study: Study) -> list[Scene]:
+def scenes(study: Study) -> list[StoredScene]:
     """What a study's store holds: every star in every cell of the sweep, without and with each of its flares."""
     found = []
     number = 0
@@ -89,9 +89,9 @@ def scenes(study: Study) -> list[Scene]:
             # A flare's amplitude stands with its own array.
             swept = {name: value for name, value in at.items() if name != "amplitude"}
             name = titled(label(star, quiet), swept)
-            found.append(Scene(f"star-{number}", "quiescent", name, 0.0, quiet, chosen, swept))
+            found.append(StoredScene(f"star-{number}", "quiescent", name, 0.0, quiet, chosen, swept))
             for k, (amplitude, x) in enumerate(zip(cell.flare.amplitudes, flares, strict=True), 1):
-                found.append(Scene(f"star-{number}", f"flare-{k}", name, amplitude, x, chosen, swept))
+                found.append(StoredScene(f"star-{number}", f"flare-{k}", name, amplitude, x, chosen, swept))
     return found
 
 
@@ -99,7 +99,7 @@ def scenes(study: Study) -> list[Scene]:
 class Chunk:
     """One chunk of one scene: rows `start` to `stop` - 1 of its array."""
 
-    scene: Scene
+    scene: StoredScene
     number: int
     start: int
     stop: int
@@ -169,11 +169,11 @@ class Store:
         return found
 
     @cached_property
-    def scenes(self) -> list[Scene]:
+    def scenes(self) -> list[StoredScene]:
         """Its arrays of spectra."""
         return scenes(self.study)
 
-    def scene(self, path: str) -> Scene:
+    def scene(self, path: str) -> StoredScene:
         """One of them, such as ``star-1/flare-2``.
 
         Raises
@@ -209,7 +209,7 @@ class Store:
         """How many chunks `chunks` goes through; known without going through them."""
         return sum(len(self._numbers(scene, first, stop)) for scene in self.scenes)
 
-    def _numbers(self, scene: Scene, first: int = 0, stop: int | None = None) -> range:
+    def _numbers(self, scene: StoredScene, first: int = 0, stop: int | None = None) -> range:
         rows = scene.chunk_rows(self.rows)
         return range(first // rows, -(-(self.rows if stop is None else stop) // rows))
 

@@ -27,7 +27,7 @@ Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Draws:
+class DrawnStudies:
     """Values of the unknown, one row a draw.
 
     Attributes
@@ -43,7 +43,7 @@ class Draws:
     studies: tuple[Study, ...]
 
 
-def drawn(study: Study) -> Draws:
+def drawn(study: Study) -> DrawnStudies:
     """Draws from the study's priors, even in each of them (a Latin hypercube, seeded with the study's seed).
 
     Raises
@@ -72,7 +72,7 @@ def drawn(study: Study) -> Draws:
         except InputError as error:
             raise InputError(f"the priors of what is unknown reach too far: {error}") from error
         studies.append(changed)
-    return Draws(tuple(priors), values, tuple(studies))
+    return DrawnStudies(tuple(priors), values, tuple(studies))
 
 
 def share_of_realisations(study: Study) -> int:
@@ -96,12 +96,12 @@ def average(found: Sequence[Interval]) -> Interval:
     return Interval(mean, max(mean - half, 0.0), min(mean + half, 1.0))
 
 
-def shares(draws: Draws, outcome: Float) -> dict[str, float]:
+def shares(draws: DrawnStudies, outcome: Float) -> dict[str, float]:
     """Share of an outcome's variance that each unknown explains, the largest first, by a linear fit.
 
     Parameters
     ----------
-    draws : Draws
+    draws : DrawnStudies
     outcome : ndarray, shape (n_draw,)
     """
     kept = np.isfinite(outcome)
@@ -114,7 +114,7 @@ def shares(draws: Draws, outcome: Float) -> dict[str, float]:
     return {draws.names[k]: float(explained[k]) for k in np.argsort(-explained)}
 
 
-def draws_table(draws: Draws, outcomes: dict[str, Float]) -> QTable:
+def draws_table(draws: DrawnStudies, outcomes: dict[str, Float]) -> QTable:
     """One row per draw: the unknown values, and what came of them."""
     from astropy.table import QTable
 

@@ -8,7 +8,7 @@ import panel as pn
 
 from mauvecl.web.buttons import downloads
 from mauvecl.web.fields import TABS
-from mauvecl.web.views import Distributions, InputSpectrum, NoiseBudget, Observation, Roc, SignalToNoise, Smooth
+from mauvecl.web.views import Distributions, InputSpectrum, NoiseBudget, RawSpectrum, Roc, SignalToNoise, Smooth
 
 if TYPE_CHECKING:
     from mauvecl.web.page import Page
@@ -74,7 +74,7 @@ class Tabs:
             self._observation.add(self._page.quiet, raw)
 
     def _make_observation(self) -> Any:
-        page, view, spectrum = self._page, Observation(), InputSpectrum()
+        page, view, spectrum = self._page, RawSpectrum(), InputSpectrum()
         self._observation = view
         self._rooms["observation"].objects = [view.plot, spectrum.plot, downloads(page, "observation")]
 

@@ -10,7 +10,7 @@ import pytest
 from astropy.table import QTable
 
 from mauvecl.answers.assumptions import what_matters
-from mauvecl.answers.limit_search import Question
+from mauvecl.answers.limit_search import LimitSearch
 from mauvecl.answers.limits import limiting_magnitude, shortest_exposure, smallest_amplitude
 from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError
@@ -135,6 +135,6 @@ def test_what_is_assumed_moves_the_limit_as_physics_says() -> None:
     assert rows["dark counts are Poisson in"]["at_high_end"] > rows["dark counts are Poisson in"]["at_low_end"]
     lossy = asked.with_instrument({"light_loss": 0.44})
     assert lossy.load_instrument().light_loss == 0.44
-    root = Question(lossy, lossy.star[0], 0.24, "matched").root()
+    root = LimitSearch(lossy, lossy.star[0], 0.24, "matched").root()
     assert rows["light loss"]["at_high_end"] == pytest.approx(root, abs=1e-3)
     assert Study.build(lossy.model_dump(), "again") == lossy

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from mauvecl.statistics.distributions import MANY, Normal, QuadraticForm
+from mauvecl.statistics.distributions import MANY, Gaussian, QuadraticForm
 from mauvecl.statistics.intervals import clopper_pearson
 
 
@@ -127,7 +127,7 @@ def test_unequal_weights_against_simulation() -> None:
 
 def test_quantiles_invert_probabilities() -> None:
     form = QuadraticForm(np.linspace(0.5, 2.0, 100), np.linspace(0.0, 1.0, 100))
-    for distribution in (form, Normal(2.0, 3.0)):
+    for distribution in (form, Gaussian(2.0, 3.0)):
         for p in (0.9, 0.1, 1e-3, 1e-6):
             assert distribution.sf(distribution.isf(p)) == pytest.approx(p, rel=1e-5)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mauvecl.answers.limit_search import MarginalQuestion, Question
+from mauvecl.answers.limit_search import LimitSearch, MarginalLimitSearch
 from mauvecl.answers.limits import limiting_magnitude
 from mauvecl.answers.maps import detection_map
 from mauvecl.device.engine import Engine
@@ -67,7 +67,7 @@ def test_a_limit_over_the_unknown_has_the_power_on_average(engine: Engine) -> No
     asked = study({"draws": 24})
     result = limiting_magnitude(asked, engine)
     (limit,) = result.limits
-    question = MarginalQuestion(asked, asked.star[0], 0.24, "matched")
+    question = MarginalLimitSearch(asked, asked.star[0], 0.24, "matched")
     assert question.theory(limit.closed_form) == pytest.approx(0.9, abs=1e-3)
     assert limit.agrees
     found = limit.unknown
@@ -138,7 +138,7 @@ def test_light_is_linear(of: str, geometry: str) -> None:
     asked = study({"draws": 0}, limit={"of": of}).with_settings(
         [f"flare.geometry={geometry}", "flare.photosphere_temperature_k=5800"]
     )
-    question = Question(asked, asked.star[0], None if of == "amplitude" else 0.24, "matched")
+    question = LimitSearch(asked, asked.star[0], None if of == "amplitude" else 0.24, "matched")
     for value in {"magnitude": (6.0, 11.3), "amplitude": (0.02, 0.7), "exposure": (5.0, 35.0)}[of]:
         for scaled, whole in zip(question.scaled(value), question.pair(value), strict=True):
             np.testing.assert_allclose(scaled.signal_dn, whole.signal_dn, rtol=1e-9)
