@@ -141,7 +141,7 @@ def export(
         typer.Option("--array", help="Such as star-1/flare-2; may be repeated [all].", show_default=False),
     ] = None,
     rows: RowsFlag = None,
-    replace: Annotated[bool, typer.Option("--replace", help="Take the place of a file that is there.")] = False,
+    replace: Annotated[bool, typer.Option("--replace", help="Take the place of what has that name.")] = False,
     quiet: QuietFlag = False,
 ) -> None:
     """Some of a store as one FITS or HDF5 file.

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mauvecl.host.stars.own_stars import OwnStar
 
 app = typer.Typer(invoke_without_command=True, rich_markup_mode=None)
-ReplaceFlag = Annotated[bool, typer.Option("--replace", help="Take the place of a kept star of that name.")]
+ReplaceFlag = Annotated[bool, typer.Option("--replace", help="Take the place of what has that name.")]
 
 
 @app.callback()

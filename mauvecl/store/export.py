@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import os
+import re
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,6 +22,8 @@ from mauvecl.store.form import Store, StoredScene
 
 if TYPE_CHECKING:
     from astropy.io.fits import BinTableHDU, HDUList, ImageHDU
+
+    from mauvecl.study.study import Study
 
 #: Bytes of spectra in one file, at most; more belongs into the store.
 LARGEST = 4 * 2**30
@@ -131,15 +134,27 @@ def _fits(selection: Selection) -> HDUList:
     primary.header["FIRSTROW"] = (selection.first, "realisation of the first row of each image")
     for line in (COMMON_DRAWS, NOMINAL):
         primary.header["COMMENT"] = f"{line[0].upper()}{line[1:]}."
-    primary.header["HISTORY"] = "Study that gives these spectra again:"
-    for line in store.study.toml().splitlines():
-        primary.header["HISTORY"] = line.expandtabs(4) or " "
+    primary.header["HISTORY"] = "The table STUDY holds the study that gives these spectra again."
     parts: list[ImageHDU | BinTableHDU] = []
     for group in dict.fromkeys(scene.group for scene in selection.scenes):
         here = [scene for scene in selection.scenes if scene.group == group]
         table = _calibration(here[0])
         parts += [*(_image(selection, scene, table.name) for scene in here), table]
-    return fits.HDUList([primary, *parts])
+    return fits.HDUList([primary, *parts, _study(store.study)])
+
+
+def _study(study: Study) -> BinTableHDU:
+    """A study's lines as a table: a card holds 72 letters of a line, and a file's name may be longer."""
+    from astropy.io import fits
+
+    # FITS has ASCII alone; TOML spells other letters so within its strings.
+    lines = [re.sub(r"[^\x00-\x7f]", _spelt, line) for line in study.toml().splitlines()]
+    column = fits.Column("LINE", f"{max(map(len, lines))}A", array=lines)
+    return fits.BinTableHDU.from_columns([column], name="STUDY")
+
+
+def _spelt(letter: re.Match[str]) -> str:
+    return f"\\U{ord(letter[0]):08X}"
 
 
 def _image(selection: Selection, scene: StoredScene, table: str) -> ImageHDU:

@@ -27,7 +27,7 @@ from mauvecl.runs import durable
 from mauvecl.runs.durable import alone
 from mauvecl.store import bulk
 from mauvecl.store import form as store
-from mauvecl.store.export import Selection, export
+from mauvecl.store.export import Selection, _study, export
 from mauvecl.store.form import Store
 from mauvecl.study.study import Study
 
@@ -332,11 +332,19 @@ def test_the_fits_export(tmp_path: Path, engine: Engine) -> None:
             np.testing.assert_allclose(wavelength, scene.expectation.wavelength_nm, rtol=1e-12)
             np.testing.assert_array_equal(row, 13)
         np.testing.assert_array_equal(hdus[3].data["DARK_DN"][0], made.scenes[0].expectation.dark_dn)
-        history = "\n".join(hdus[0].header["HISTORY"])
-        assert Study.build(tomllib.loads(history.partition("again:\n")[2]), "fits") == made.study
+        assert "table STUDY" in str(hdus[0].header["HISTORY"])
+        assert Study.build(tomllib.loads("\n".join(hdus["STUDY"].data["LINE"])), "fits") == made.study
     if shutil.which("fitsverify"):
         told = subprocess.run(["fitsverify", path], capture_output=True, text=True, check=True).stdout
         assert "0 warning(s) and 0 error(s)" in told, told
+
+
+def test_fits_holds_studies_with_any_names() -> None:
+    name = f'/{"long/" * 30}ein "Stern" \\ λ Vir 🌟.txt'
+    asked = Study.build({"star": [{"file": name, "magnitude": 5.0}]}, "test")
+    lines = "\n".join(_study(asked).data["LINE"])
+    assert lines.isascii()
+    assert Study.build(tomllib.loads(lines), "fits") == asked
 
 
 def test_the_hdf5_export_of_frames(tmp_path: Path, engine: Engine) -> None:
@@ -389,9 +397,9 @@ def test_the_verbs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert run(app, ["verify", "f.zarr", "--redraw", "--rows", "0:10"]).exit_code == 0
     assert run(app, ["export", "f.zarr", "f.h5", "--rows", "0:10"]).exit_code == 0
     written = Path("f.h5").read_bytes()
-    refused = run(app, ["export", "f.zarr", "f.h5", "--rows", "0:5"])
-    assert (refused.exit_code, Path("f.h5").read_bytes()) == (2, written)
-    assert "exists already, expected another name, or --replace" in str(refused.exception)
+    with pytest.raises(InputError, match="exists already, expected another name, or --replace"):
+        app(["export", "f.zarr", "f.h5", "--rows", "0:5"], standalone_mode=False)
+    assert Path("f.h5").read_bytes() == written
     assert run(app, ["export", "f.zarr", "f.h5", "--rows", "0:5", "--replace"]).exit_code == 0
     assert Path("f.h5").read_bytes() != written
     direct = run(app, ["realise", "study.toml", "--output", "f.fits", "--quiet"])
