@@ -16,6 +16,7 @@ import panel as pn
 
 from mauvecl.answers.limits import LimitResult, limiting_magnitude
 from mauvecl.answers.maps import MapResult
+from mauvecl.answers.unknown_cost import cost_lines, marginal_lines, unknown_cost
 from mauvecl.device.program import DeviceError
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
@@ -216,7 +217,13 @@ class Page:
         quiet, flare = study.expect(list(self.light))
         scene = prepare([quiet, flare], comparison=study.run.comparison())
         self.theory = Detection(
-            quiet, (flare,), study.run.statistics, scene, study.run.realisations, seed=study.run.seed
+            quiet,
+            (flare,),
+            study.run.statistics,
+            scene,
+            study.run.realisations,
+            seed=study.run.seed,
+            nuisances=study.nuisances.marginalised(quiet),
         )
         self.cut = self.theory.closed_form(q.statistic).isf(q.fap)
         chance = float("nan") if self.theory.blinding else self.theory.closed_form(q.statistic, 0).sf(self.cut)
@@ -227,9 +234,9 @@ class Page:
             f"{quiet.snr().max():.3g} a pixel, {quiet.snr_per_element().max():.3g} an element; exposure "
             f"{quiet.exposure_s:g} s in {quiet.n_frames} frames."
         )
-        self._tell(
-            [*self._stray(), *((m, "danger" if m.startswith("SATURATED") else "info") for m in told([quiet, flare]))]
-        )
+        cost = unknown_cost("this flare", quiet, flare, study)
+        sentences = [*told([quiet, flare]), *marginal_lines(study), *cost_lines([cost], study)]
+        self._tell([*self._stray(), *((m, "danger" if m.startswith("SATURATED") else "info") for m in sentences)])
         self.tabs.renew()
 
     def draw_soon(self) -> None:
