@@ -444,7 +444,7 @@ def _nuisances(study: Study, texts: list[str]) -> dict[str, Any]:
     from mauvecl.statistics.nuisances import NUISANCES
 
     found: dict[str, Any] = {}
-    own = {name: one.model_dump() for name, one in study.nuisances.own.items()}
+    own = {name: one.model_dump(exclude_none=True) for name, one in study.nuisances.own.items()}
     for text in texts:
         name, _, sd = (part.strip() for part in text.rpartition("="))
         if not (name and sd):

@@ -29,7 +29,9 @@ def unknowns(found: UnknownTable, path: str | Path | None = None) -> Any:
             amplitude, costs = next((a, c) for (s, a), c in found.costs.items() if s == star)
             relative = np.geomspace(0.03, 300.0, 200) * found.smallest(star, None)
             known = next(iter(costs.values())).known
-            axis.plot(relative, power(known * relative / amplitude, fap), color="black", label="everything known")
+            axis.plot(
+                relative, power(known * relative / amplitude, fap), color="black", linewidth=3, label="everything known"
+            )
             for colour, (unknown, cost) in zip(COLOURS, costs.items(), strict=False):
                 axis.plot(relative, power(cost.marginal * relative / amplitude, fap), color=colour, label=unknown)
                 axis.plot(relative, power(cost.plain * relative / amplitude, fap), color=colour, linestyle="--")

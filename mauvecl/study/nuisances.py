@@ -4,17 +4,17 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field
+from pydantic import BeforeValidator, Field, model_validator
 
 from mauvecl.host.files.bounded import shortened
 from mauvecl.noise.usual import USUAL
 from mauvecl.statistics.nuisances import Nuisances, spectrum_of
 from mauvecl.study.sections import Part
-from mauvecl.study.weights import read_spectrum
+from mauvecl.study.weights import at_pixels, read_spectrum
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -40,10 +40,29 @@ Spread = Annotated[float | Literal["free"], BeforeValidator(_spread)]
 
 
 class OwnNuisance(Part):
-    """A spectrum of one's own: two columns, nm and DN of the exposure for an amplitude of one."""
+    """A spectrum of one's own: nm and DN of the exposure for an amplitude of one, as a file's two columns or points."""
 
-    file: Path
+    file: Path | None = None
+    points: tuple[tuple[float, float], ...] | None = None
     sd: Spread = "free"
+
+    @model_validator(mode="after")
+    def _one_spectrum(self) -> Self:
+        if (self.file is None) == (self.points is None):
+            raise ValueError("an unknown of one's own has neither or both of file and points, expected one of them")
+        return self
+
+    def spectrum(self, name: str, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """DN of the exposure for an amplitude of one, shape (n_pixel,).
+
+        Raises
+        ------
+        InputError
+            For a file or points that hold no spectrum.
+        """
+        if self.file is not None:
+            return read_spectrum(name, self.file, wavelength_nm)
+        return at_pixels(f"points of {shortened(name)}", "DN", np.array(self.points), wavelength_nm)
 
 
 class NuisanceChoice(Part):
@@ -76,7 +95,7 @@ class NuisanceChoice(Part):
                 sd[name] = float("inf") if spread == "free" else spread
         own: dict[str, NDArray[np.float64]] = {}
         for name, one in self.own.items():
-            own[name] = read_spectrum(name, one.file, quiet.wavelength_nm)
+            own[name] = one.spectrum(name, quiet.wavelength_nm)
             sd[name] = float("inf") if one.sd == "free" else float(one.sd)
         return Nuisances.of(quiet, sd, own) if sd else None
 

@@ -152,7 +152,8 @@ class Study(Part):
             del data["nuisances"]
         else:
             for one in data["nuisances"]["own"].values():
-                one["file"] = str(Path(one["file"]).resolve())
+                if "file" in one:
+                    one["file"] = str(Path(one["file"]).resolve())
         for section in ("processes", "campaign"):
             if not data[section]:
                 del data[section]

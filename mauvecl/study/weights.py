@@ -47,6 +47,26 @@ def _read_values(what: str, kind: str, path: Path, wavelength_nm: NDArray[np.flo
     text = read_text(path, kind if kind == "weights" else "spectrum")
     with parsing(what, "two columns"):
         columns = np.array([[float(word) for word in row] for line in text.splitlines() if (row := _words(line))])
+    return at_pixels(what, kind, columns, wavelength_nm)
+
+
+def at_pixels(
+    what: str, kind: str, columns: NDArray[np.float64], wavelength_nm: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Values between rows of wavelengths, nm, and values, straight between them, zero beyond; shape (n_pixel,).
+
+    Parameters
+    ----------
+    what, kind : str
+        What holds them and what they are, for messages.
+    columns : ndarray, shape (n, 2)
+    wavelength_nm : ndarray, shape (n_pixel,)
+
+    Raises
+    ------
+    InputError
+        If there are other columns, a number that cannot be, or nothing for any pixel.
+    """
     if columns.ndim != 2 or columns.shape[1] != 2 or not np.all(np.diff(columns[:, 0]) > 0):
         raise InputError(
             f"{what} have {columns.shape[1] if columns.ndim == 2 else 'no'} columns, expected ascending wavelengths in "

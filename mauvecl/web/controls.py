@@ -17,7 +17,7 @@ GROUPS = (
     ("Star", ("star", "magnitude", "band")),
     ("Observation", ("exposure_s", "temperature_c", "instrument", "sky", "sky_brightness", "target", "time")),
     ("Flare", ("amplitude_percent", "flare_temperature_k")),
-    ("Detection", ("statistic", "fap", "realisations", "seed")),
+    ("Detection", ("statistic", "fap", "unknown", "own_unknown", "realisations", "seed")),
 )
 #: Fields that ask for something under one sky only.
 ASKED_UNDER = {"sky_brightness": "brightness", "target": "target and time", "time": "target and time"}

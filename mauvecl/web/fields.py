@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -16,6 +17,8 @@ from mauvecl.statistics.registry import STATISTICS
 UPLOADED = "uploaded star"
 #: Realisations that a visitor may ask for.
 REALISATIONS = (10_000, 100_000, 1_000_000, 4_000_000)
+#: What is taken for unknown on the page.
+UNKNOWN = ("nothing", "the usual")
 SKIES = ("brightness", "target and time", "none")
 TABS = ("observation", "snr", "noise", "detection", "limit")
 #: What may be simulated on the page.
@@ -68,6 +71,18 @@ def several(text: str) -> tuple[str, ...]:
     if len(names) > len(SIMULATIONS) or not set(names) <= set(SIMULATIONS):
         raise InputError(f"{shortened(text)} is no simulation, expected some of {', '.join(SIMULATIONS)}")
     return tuple(dict.fromkeys(names))
+
+
+def points(text: str) -> tuple[tuple[float, float], ...]:
+    """A spectrum as pairs of nm and DN of the exposure; none where nothing is entered."""
+    number = Number(-1e30, 1e30)
+    pairs = [pair.split() for pair in text.split(",") if text.strip()]
+    if any(len(pair) != 2 for pair in pairs):
+        raise InputError(f"{shortened(text)} is no spectrum, expected pairs of nm and DN with commas between them")
+    found = tuple((float(number(nm)), float(number(dn))) for nm, dn in pairs)
+    if any(low >= high for (low, _), (high, _) in itertools.pairwise(found)):
+        raise InputError(f"{shortened(text)} does not ascend in nm, expected pairs of nm and DN that do")
+    return found
 
 
 def star_name(text: str) -> str:
@@ -125,6 +140,8 @@ FIELDS = {
     "statistic": Field("Detection statistic", "matched", Choice(tuple(STATISTICS))),
     "fap": Field("False-alarm probability per test", "0.001", Number(1e-6, 0.5)),
     "realisations": Field("Realisations", "100000", Choice(tuple(map(str, REALISATIONS)), int)),
+    "unknown": Field("Unknown, drawn and marginalised over", UNKNOWN[0], Choice(UNKNOWN)),
+    "own_unknown": Field("Also unknown: DN at nm, such as 200 1, 450 3, 700 1", "", points),
     "seed": Field("Seed", "1", Number(0, 2**31, whole=True)),
 }
 #: What a link holds beside the question.

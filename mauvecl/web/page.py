@@ -16,6 +16,7 @@ import panel as pn
 
 from mauvecl.answers.limits import LimitResult, limiting_magnitude
 from mauvecl.answers.maps import MapResult
+from mauvecl.answers.unknown_cost import cost_lines, marginal_lines, unknown_cost
 from mauvecl.device.program import DeviceError
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
@@ -215,7 +216,8 @@ class Page:
         self.light = source, study.flaring(source, study.flare.amplitudes[0])
         quiet, flare = study.expect(list(self.light))
         scene = prepare([quiet, flare], comparison=study.run.comparison())
-        self.theory = Hypotheses(quiet, (flare,), study.run.statistics, scene)
+        unknown = study.nuisances.marginalised(quiet)
+        self.theory = Hypotheses(quiet, (flare,), study.run.statistics, scene, nuisances=unknown)
         self.cut = self.theory.closed_form(q.statistic).isf(q.fap)
         chance = float("nan") if self.theory.blinding else self.theory.closed_form(q.statistic, 0).sf(self.cut)
         self.quiet, self.flare = quiet, flare
@@ -225,9 +227,9 @@ class Page:
             f"{quiet.snr().max():.3g} a pixel, {quiet.snr_per_element().max():.3g} an element; exposure "
             f"{quiet.exposure_s:g} s in {quiet.n_frames} frames."
         )
-        self._tell(
-            [*self._stray(), *((m, "danger" if m.startswith("SATURATED") else "info") for m in told([quiet, flare]))]
-        )
+        cost = unknown_cost("this flare", quiet, flare, study)
+        sentences = [*told([quiet, flare]), *marginal_lines(study), *cost_lines([cost], study)]
+        self._tell([*self._stray(), *((m, "danger" if m.startswith("SATURATED") else "info") for m in sentences)])
         self.tabs.renew()
 
     def draw_soon(self) -> None:

@@ -36,6 +36,8 @@ class Question:
     statistic: str
     fap: float
     realisations: int
+    unknown: str
+    own_unknown: tuple[tuple[float, float], ...]
     seed: int
     uploaded: Source | None = None
 
@@ -64,6 +66,7 @@ class Question:
             "target and time": {"target": self.target, "time": self.time},
             "none": {"none": True},
         }
+        own = {"own": {"points": self.own_unknown}} if self.own_unknown else {}
         data = {
             "star": [star],
             "flare": {"amplitudes": [self.amplitude_percent / 100.0], "temperature_k": self.flare_temperature_k},
@@ -73,6 +76,7 @@ class Question:
                 "instrument": self.instrument,
             },
             "sky": skies[self.sky],
+            "nuisances": {"usual": self.unknown == "the usual", "own": own},
             "run": {
                 "realisations": self.realisations,
                 "seed": self.seed,

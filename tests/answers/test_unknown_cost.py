@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import re
+import tomllib
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +28,8 @@ from mauvecl.noise.usual import USUAL
 from mauvecl.statistics.nuisances import Nuisances
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.study.study import Study
+from mauvecl.web.fields import points
+from mauvecl.web.state import State
 
 STRAY = "200 1\n450 3\n700 1  # DN\n"
 
@@ -106,6 +109,36 @@ def test_a_study_reads_back_with_its_files(tmp_path: Path, engine: Engine) -> No
     assert kept == asked.nuisances.model_copy(
         update={"own": {"stray": asked.nuisances.own["stray"].model_copy(update={"file": tmp_path / "stray.txt"})}}
     )
+
+
+def test_points_in_a_study_are_the_files() -> None:
+    asked = study(own={"x": {"points": [[200, 1], [450, 3], [700, 1]], "sd": 2.0}})
+    again = Study.build(tomllib.loads(asked.toml()), "text")
+    assert again == asked
+    quiet, _ = asked.expectations(asked.star[0])
+    found = asked.nuisances.marginalised(quiet)
+    assert found is not None
+    np.testing.assert_allclose(found.spectra[0], np.interp(quiet.wavelength_nm, [200, 450, 700], [1, 3, 1]))
+    with pytest.raises(InputError, match="expected ascending"):
+        study(own={"x": {"points": [[450, 1], [200, 1]]}}).nuisances.marginalised(quiet)
+    for wrong in ({}, {"points": [[200, 1]], "file": "x.txt"}):
+        with pytest.raises(InputError, match="neither or both of file and points"):
+            study(own={"x": wrong})
+
+
+@pytest.mark.parametrize("text", ["200 1, 450", "200", "a b", "200 1, 200 2", "200 1 2", ","])
+def test_the_page_refuses_what_is_no_spectrum(text: str) -> None:
+    with pytest.raises(InputError, match="expected"):
+        points(text)
+
+
+def test_the_page_asks_for_the_same(tmp_path: Path) -> None:
+    state = State()
+    state.enter({"unknown": "the usual", "own_unknown": "200 1, 450 3, 700 1"})
+    asked = state.question().study(tmp_path)
+    assert asked.nuisances.usual
+    assert asked.nuisances.own["own"].points == ((200, 1), (450, 3), (700, 1))
+    assert State().question().study(tmp_path).nuisances == NuisanceChoice()
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,10 @@ def test_detect_answers_the_papers_question(answered: tuple[Path, str]) -> None:
     lines = text.splitlines()
     assert "not a flight calibration" in lines[0]
     assert lines[1] == "Magnitudes in V are as in catalogues: Vega has 0.03."
-    assert "false-alarm probability of 0.001 per test, 50 s (10 frames), 100,000 realisations" in lines[2]
+    assert "false-alarm probability of 0.001 per test, 50 s (10 frames), 100,000 realisations" in lines[3]
+    # One line says what the unknowns of the instrument would cost.
+    assert lines[2].startswith("What unknowns cost: G2V V = 7.4, flare of 0.76 %, the faintest of 8, has")
+    assert "a matched S/N of 3.27 with everything known" in lines[2]
     assert "\x1b" not in text
     table = QTable.read(folder / "mauvecl-detect" / "detection.ecsv")
     assert len(table) == 2 * 4 * 3
