@@ -1,0 +1,24 @@
+"""What answers tell beside their numbers."""
+
+from __future__ import annotations
+
+import json
+
+from mauvecl.answers.report import json_text
+from mauvecl.study.labels import told
+from mauvecl.study.study import Study
+
+
+def test_closed_forms_that_rounding_spoils_are_told() -> None:
+    quiet = {"observation.changes={read_noise_dn=0.1}", "observation.temperature_c=-40"}
+    asked = Study().with_changes({}, [{"library": "G2V", "magnitude": 12.0}])
+    for settings, is_told in ((quiet, True), ((), False)):
+        x, *_ = asked.with_settings(sorted(settings)).expectations(asked.star[0])
+        assert any("rounding to whole DN" in text for text in told([x])) == is_told
+
+
+def test_json_has_no_number_that_is_none() -> None:
+    assert json.loads(json_text({"a": [float("nan"), 1.5], "b": {"c": (float("inf"), "NaN")}})) == {
+        "a": [None, 1.5],
+        "b": {"c": [None, "NaN"]},
+    }
