@@ -112,7 +112,7 @@ def test_a_data_frame_and_a_fits_table(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("time,flux\n1,2\n", "has the columns time, flux, expected one named ampl_rec"),
+        ("time,flux\n1,2\n", "has the columns 'time, flux', expected one named ampl_rec"),
         ("ampl_rec\n0.1\n-0.2\n", "the amplitude of flare 1 is -0.2, expected a relative rise above 0"),
         ("ampl_rec\n", "holds 0 flares, expected 1 to 500"),
     ],

@@ -158,7 +158,8 @@ def test_saturation_is_told_first(mauve: Instrument) -> None:
     x = expect(star, mauve, exposure=7)
     assert x.messages[0].startswith("SATURATED: ")
     assert "rounded up to 10 s" in x.messages[1]
-    assert "not a flight calibration" in x.messages[-1]
+    assert "not a flight calibration" in x.messages[-2]
+    assert x.messages[-1] == "Magnitudes in V are as in catalogues: Vega has 0.03."
     hit = x.wavelength_nm[x.saturated]
     assert f"{hit[0]:.1f}-" in x.messages[0]
     assert f"-{hit[-1]:.1f} nm" in x.messages[0]
