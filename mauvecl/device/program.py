@@ -1,6 +1,6 @@
 """Find a device, render the kernels, build them, keep them in a private cache.
 
-This module and `engine` are the only ones that touch pyopencl.
+Only this room touches pyopencl.
 """
 
 from __future__ import annotations
