@@ -336,7 +336,7 @@ def test_progress_is_reported_and_may_stop(engine: Engine) -> None:
     with pytest.raises(KeyboardInterrupt):
         stopping.realise(quiet, count=5000, seed=1)
     # The engine works on.
-    stopping._progress = None
+    stopping._tiles._progress = None
     assert stopping.realise(quiet, count=3, seed=1).shape[0] == 3
 
 
