@@ -122,7 +122,7 @@ def realise_file(
     store.make_folder()
     with alone(store.path, "store"):
         _complete(store, engine, resume, restart, progress)
-        export(Selection.of(store), file)
+        export(Selection.of(store), file, replace=restart)
         store.clear()
         store.path.rmdir()
     return store

@@ -110,7 +110,7 @@ def test_an_export_onto_a_full_disk(name: str, small_disk: Path, tmp_path: Path)
     store = bulk.realise(study(4000), tmp_path / "s.zarr", painter)
     (small_disk / name).write_text("of an earlier run")
     with pytest.raises(InputError, match="cannot be written"):
-        export(Selection.of(store), small_disk / name)
+        export(Selection.of(store), small_disk / name, replace=True)
     assert [(p.name, p.read_text()) for p in small_disk.iterdir()] == [(name, "of an earlier run")]
 
 

@@ -63,7 +63,7 @@ def test_the_weaker_promise_is_kept_and_marked(monkeypatch: pytest.MonkeyPatch, 
     weak = Engine()
     strict = list(selftest.twins(weak))
     assert not all(check.passed for check in strict), "a device that promises the same bits must give them"
-    weak.device = replace(weak.device, promise=WEAKER)
+    weak.opened.record = replace(weak.device, promise=WEAKER)
     checks = list(selftest.twins(weak))
     assert [check.name for check in checks if not check.passed] == []
     marked = [check for check in checks if "weaker promise" in check.found]
@@ -75,7 +75,7 @@ def test_a_wrong_kernel_keeps_no_promise(monkeypatch: pytest.MonkeyPatch) -> Non
     rendered_otherwise(monkeypatch, another_key_schedule)
     wrong = Engine()
     assert not selftest.known_answers(wrong).passed
-    wrong.device = replace(wrong.device, promise=WEAKER)
+    wrong.opened.record = replace(wrong.device, promise=WEAKER)
     assert not any(check.passed for check in selftest.twins(wrong))
 
 

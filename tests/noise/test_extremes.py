@@ -126,9 +126,9 @@ def test_as_many_pixels_as_the_counter_holds(engine: Engine) -> None:
     index = np.array([2**40, 2**40 + 1], np.uint64)
     for group in (0, 1, 8191, 8192, 16_382, 16_383):
         drawn = reference.draws(scene, index, 0, group, 3)
-        one = np.ones(2, np.float32)
+        same = (np.ones(2, np.float32),) * 3
         for i, p in enumerate(range(4 * group, 4 * group + 4)):
-            v = reference.analogue(scene, drawn, i, p, 0, one, one)
+            v = reference.analogue(scene, drawn, i, p, 0, *same)
             twin = reference.digitise(v, scene.edges[0, p], clip=scene.clip) + scene.base_dn[0, p]
             np.testing.assert_array_equal(raw[:, p], twin)
     z = (raw - x.mean_raw_dn) / np.sqrt(x.variance_dn2)
