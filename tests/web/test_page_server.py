@@ -25,6 +25,8 @@ import pytest
 
 pytest.importorskip("panel")
 
+from bokeh.document import Document
+from bokeh.io.doc import patch_curdoc
 from bokeh.util.token import generate_jwt_token
 from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
@@ -128,6 +130,12 @@ def star_file(path: Path) -> bytes:
     return path.read_bytes()
 
 
+def alone(link: str = "") -> page.Page:
+    """A page of no session: servers of other tests may have left theirs as the current document."""
+    with patch_curdoc(Document()):
+        return page.Page(link)
+
+
 def settled(found: page.Page) -> page.Page:
     """Once its upload is read."""
     reading(lambda name, content: None, "", b"").result()
@@ -146,7 +154,7 @@ def answerless(found: page.Page) -> bool:
 @pytest.mark.long
 def test_an_upload_that_fails_in_any_way_leaves_no_answer(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     good = star_file(tmp_path / "star.txt")
-    found = page.Page()
+    found = alone()
     for fault in (
         InputError("no spectrum"),
         RuntimeError("odd"),
@@ -192,7 +200,7 @@ def test_answers_go_on_while_an_upload_is_read(monkeypatch: pytest.MonkeyPatch) 
         raise InputError("no spectrum")
 
     monkeypatch.setattr(page, "read_upload", slow)
-    first, other = page.Page(), page.Page()
+    first, other = alone(), alone()
     first._upload("star.txt", b"")
     assert "is being read" in first.state.faults["star"]
     # Would the event loop wait for the reader, it would wait for ever.
@@ -235,7 +243,7 @@ def test_bombs_end_in_a_sentence_and_take_little(content: bytes) -> None:
 
 
 def test_a_star_chosen_while_an_upload_is_read_stays(tmp_path: Path) -> None:
-    found = page.Page()
+    found = alone()
     found._upload("star.txt", star_file(tmp_path / "star.txt"))
     found.enter({"star": "Vega"})
     settled(found)
@@ -244,7 +252,7 @@ def test_a_star_chosen_while_an_upload_is_read_stays(tmp_path: Path) -> None:
 
 
 def test_a_fault_of_our_own_leaves_no_answer(monkeypatch: pytest.MonkeyPatch) -> None:
-    found = page.Page()
+    found = alone()
     monkeypatch.setattr(page, "prepare", lambda *_, **__: 1 / 0)
     found.enter({"magnitude": "8"})
     assert answerless(found)
@@ -254,7 +262,7 @@ def test_a_fault_of_our_own_leaves_no_answer(monkeypatch: pytest.MonkeyPatch) ->
 
 
 def test_an_uploaded_star_gives_the_same_bytes_on_the_command_line(tmp_path: Path) -> None:
-    found = page.Page("?magnitude=8&realisations=10000&fap=0.01")
+    found = alone("?magnitude=8&realisations=10000&fap=0.01")
     found._upload("star.txt", star_file(tmp_path / "star.txt"))
     settled(found)
     study = found.study()
