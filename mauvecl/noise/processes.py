@@ -6,7 +6,8 @@ What they draw is unknown to the observer: templates and variances stay those of
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
+from functools import partial
 from typing import Literal
 
 import numpy as np
@@ -17,12 +18,44 @@ from mauvecl.host.errors import InputError
 from mauvecl.noise import layout
 from mauvecl.noise.priors import Normal, Prior, Uniform, table_of
 
-__all__ = ["LIMITS", "NONE", "CosmicRays", "Factors", "Normal", "Prior", "Processes", "Uniform"]
+__all__ = ["NONE", "VARIED", "CosmicRays", "Factors", "Normal", "Prior", "Processes", "Uniform", "Varied"]
 
 Float = NDArray[np.float64]
+Conditions = Mapping[str, float]
 Modulated = Literal["light", "dark", "sky"]
-#: What a prior changes, where not the light.
-CHANGED: dict[str, Modulated] = {"detector_temperature": "dark", "sky_level": "sky"}
+
+
+@dataclass(frozen=True)
+class Varied:
+    """What a prior may be put on.
+
+    Attributes
+    ----------
+    low, high : float
+        Ends of what it may be.
+    change : callable
+        From an expectation's conditions and values drawn to the factor less one.
+    of : {"light", "dark", "sky"}
+        What the factor is on.
+    """
+
+    low: float
+    high: float
+    change: Callable[[Conditions, Float], Float]
+    of: Modulated = "light"
+
+
+#: The one list of them, in the order of their tables in kernels; `Processes` and the study's section have these names.
+VARIED = {
+    "jitter": Varied(0.0, 0.5, lambda _, lost: -lost),
+    "detector_temperature": Varied(
+        -100.0, 100.0, lambda at, t: np.expm1(at["dark_slope_per_c"] * (t - at["temperature_c"])), "dark"
+    ),
+    "light_loss": Varied(0.0, 0.99, lambda at, lost: (at["light_loss"] - lost) / (1.0 - at["light_loss"])),
+    "pointing_loss": Varied(0.0, 0.99, lambda at, lost: (at["pointing_loss"] - lost) / (1.0 - at["pointing_loss"])),
+    "qe_scale": Varied(0.01, 100.0, lambda _, scale: scale - 1.0),
+    "sky_level": Varied(0.01, 100.0, lambda _, level: level - 1.0, "sky"),
+}
 
 
 @dataclass(frozen=True)
@@ -122,13 +155,9 @@ class Processes:
     @property
     def modulations(self) -> tuple[tuple[str, Modulated], ...]:
         """Names of the priors given, and what each changes."""
-        return tuple(
-            (name, CHANGED.get(name, "light"))
-            for name in (f.name for f in fields(self))
-            if name != "cosmic_rays" and getattr(self, name) is not None
-        )
+        return tuple((name, varied.of) for name, varied in VARIED.items() if getattr(self, name) is not None)
 
-    def factors(self, conditions: Mapping[str, float]) -> Factors:
+    def factors(self, conditions: Conditions) -> Factors:
         """What is drawn of each prior: factors on light, dark or sky, less one.
 
         Parameters
@@ -141,28 +170,20 @@ class Processes:
         InputError
             For a prior that reaches where no value can be.
         """
-        changes: dict[str, Callable[[Float], Float]] = {
-            "jitter": lambda lost: -lost,
-            "detector_temperature": lambda t: np.expm1(
-                conditions["dark_slope_per_c"] * (t - conditions["temperature_c"])
-            ),
-            "light_loss": lambda lost: (conditions["light_loss"] - lost) / (1.0 - conditions["light_loss"]),
-            "pointing_loss": lambda lost: (conditions["pointing_loss"] - lost) / (1.0 - conditions["pointing_loss"]),
-            "qe_scale": lambda scale: scale - 1.0,
-            "sky_level": lambda level: level - 1.0,
-        }
         tables = np.empty((len(self.modulations), 2 * layout.PRIOR_NODES), np.float32)
         ends = {"light": (1.0, 1.0), "dark": (1.0, 1.0), "sky": (1.0, 1.0)}
         centre = dict.fromkeys(ends, 1.0)
         for row, (name, factor) in enumerate(self.modulations):
-            prior = getattr(self, name)
+            prior, varied = getattr(self, name), VARIED[name]
+            change = partial(varied.change, conditions)
             first, last = prior.quantile(np.array([0.0, 1.0]))
-            low, high = LIMITS[name]
-            if not (low <= first and last <= high):
-                raise InputError(f"the prior of {name} runs from {first:g} to {last:g}, expected {low:g} to {high:g}")
-            tables[row], middle = table_of(prior, changes[name])
+            if not (varied.low <= first and last <= varied.high):
+                raise InputError(
+                    f"the prior of {name} runs from {first:g} to {last:g}, expected {varied.low:g} to {varied.high:g}"
+                )
+            tables[row], middle = table_of(prior, change)
             centre[factor] *= 1.0 + middle
-            least, most = sorted(1.0 + changes[name](np.array([first, last])))
+            least, most = sorted(1.0 + change(np.array([first, last])))
             ends[factor] = ends[factor][0] * float(least), ends[factor][1] * float(most)
         return Factors(tables, centre["light"], centre["dark"], centre["sky"], ends["light"], ends["dark"], ends["sky"])
 
@@ -195,13 +216,4 @@ class Factors:
         return np.asarray(light * (1.0 + (sky - 1.0) * share))
 
 
-#: Where each prior's values must lie.
-LIMITS = {
-    "jitter": (0.0, 0.5),
-    "detector_temperature": (-100.0, 100.0),
-    "light_loss": (0.0, 0.99),
-    "pointing_loss": (0.0, 0.99),
-    "qe_scale": (0.01, 100.0),
-    "sky_level": (0.01, 100.0),
-}
 NONE = Processes()

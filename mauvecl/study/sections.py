@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, create_model, field_validator, model_validator
 
+from mauvecl.noise.processes import VARIED
 from mauvecl.statistics.registry import STATISTICS, USUAL_STATISTICS
 
 if TYPE_CHECKING:
@@ -159,16 +160,12 @@ class Rays(Part):
     weights: tuple[float, ...] | None = None
 
 
-class NoiseProcesses(Part):
-    """Optional noise processes, all off unless named; see `processes.Processes`."""
+#: The rays, and one key for each thing that a prior may be put on.
+_keys: Any = {"cosmic_rays": (Rays | None, None)} | dict.fromkeys(VARIED, (PriorText | None, None))
 
-    cosmic_rays: Rays | None = None
-    jitter: PriorText | None = None
-    detector_temperature: PriorText | None = None
-    light_loss: PriorText | None = None
-    pointing_loss: PriorText | None = None
-    qe_scale: PriorText | None = None
-    sky_level: PriorText | None = None
+
+class NoiseProcesses(create_model("_Priors", __base__=Part, **_keys)):  # type: ignore[misc]
+    """Optional noise processes, all off unless named; see `processes.VARIED` and `processes.CosmicRays`."""
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
@@ -180,8 +177,7 @@ class NoiseProcesses(Part):
         from mauvecl.noise.processes import CosmicRays, Processes
 
         rays = None if self.cosmic_rays is None else CosmicRays(**self.cosmic_rays.model_dump())
-        names = [name for name in type(self).model_fields if name != "cosmic_rays"]
-        given = {name: getattr(self, name) for name in names}
+        given = {name: getattr(self, name) for name in VARIED}
         return Processes(rays, **{name: None if text is None else text.prior() for name, text in given.items()})
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import replace
 
 import numpy as np
@@ -14,8 +15,9 @@ from mauvecl.host.errors import InputError
 from mauvecl.noise import layout
 from mauvecl.noise import twin as reference
 from mauvecl.noise.components import components
-from mauvecl.noise.processes import NONE, CosmicRays, Normal, Processes, Uniform
+from mauvecl.noise.processes import NONE, VARIED, CosmicRays, Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare
+from mauvecl.study.sections import NoiseProcesses
 
 N = 20_000
 
@@ -275,3 +277,9 @@ def test_the_sky_follows_its_own_level(engine: Engine, level: Uniform) -> None:
         # A uniform value's variance scatters by less than a normal's; the noise's grows with the light at most.
         wanted = sd**2 + noise[1]
         assert abs(of_sky.var() / wanted - 1) < 5 * error + abs(mean - 1) * noise[1] / wanted
+
+
+def test_the_list_of_what_priors_vary_is_one() -> None:
+    """The processes' fields, the study's keys and the list of what may vary name the same things in the same order."""
+    fields = [field.name for field in dataclasses.fields(Processes)]
+    assert fields == ["cosmic_rays", *VARIED] == list(NoiseProcesses.model_fields)
