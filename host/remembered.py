@@ -19,14 +19,14 @@ class _Given:
     __slots__ = ("digest", "values")
 
     def __init__(self, values: tuple[Any, ...]) -> None:
-        found = hashlib.sha256()
+        hashed = hashlib.sha256()
         for value in values:
             if isinstance(value, np.ndarray):
-                found.update(f"{value.dtype.str}{value.shape}".encode())
-                found.update(np.ascontiguousarray(value).data)
+                hashed.update(f"{value.dtype.str}{value.shape}".encode())
+                hashed.update(np.ascontiguousarray(value).data)
             else:
-                found.update(repr(value).encode())
-        self.values, self.digest = values, found.digest()
+                hashed.update(repr(value).encode())
+        self.values, self.digest = values, hashed.digest()
 
     def __hash__(self) -> int:
         return hash(self.digest)

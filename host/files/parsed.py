@@ -101,11 +101,11 @@ def toml(text: str, what: str) -> dict[str, Any]:
         raise InputError(f"{what} has a key of {parts} parts, expected at most {MOST_PARTS}")
     with parsing(what, "TOML"):
         try:
-            found = tomllib.loads(text)
+            tree = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
             raise InputError(f"{what} is not valid TOML: {_plain(str(error), 160)}") from error
-    possible(found, what)
-    return found
+    possible(tree, what)
+    return tree
 
 
 def json_data(text: str, what: str) -> Any:

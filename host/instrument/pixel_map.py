@@ -77,11 +77,11 @@ class PixelMap:
     @property
     def digest(self) -> str:
         """SHA-256 of the values."""
-        found = hashlib.sha256()
+        hashed = hashlib.sha256()
         for name in COLUMNS:
             if (values := getattr(self, name)) is not None:
-                found.update(name.encode() + values.tobytes())
-        return found.hexdigest()
+                hashed.update(name.encode() + values.tobytes())
+        return hashed.hexdigest()
 
     def __repr__(self) -> str:
         # The instrument's digest is made of representations.

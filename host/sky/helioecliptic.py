@@ -147,10 +147,10 @@ def _position(target: SkyCoord | str) -> SkyCoord:
 
 def _in_degrees(target: str) -> bool:
     """Whether a string is two plain numbers, degrees; astropy would wrap a right ascension of 700."""
-    found = _DEGREES.fullmatch(target)
-    if found and not 0 <= float(found[1]) <= 360:
-        raise InputError(f"target = {target!r} has a right ascension of {found[1]}, expected 0 to 360 degrees")
-    return found is not None
+    degrees = _DEGREES.fullmatch(target)
+    if degrees and not 0 <= float(degrees[1]) <= 360:
+        raise InputError(f"target = {target!r} has a right ascension of {degrees[1]}, expected 0 to 360 degrees")
+    return degrees is not None
 
 
 def _line(value: object) -> str:

@@ -109,18 +109,18 @@ def numbers(values: ArrayLike, what: str, none: Any = None) -> Float:
     """
     try:
         if isinstance(values, np.ma.MaskedArray):
-            found = np.ma.filled(values.astype(np.float64), np.nan)
+            plain = np.ma.filled(values.astype(np.float64), np.nan)
         else:
-            found = np.array(values, np.float64)
+            plain = np.array(values, np.float64)
     except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{what} holds no plain numbers, expected one number in each cell") from error
     if none is not None:
         with np.errstate(invalid="ignore", over="ignore"):
-            found[found == float(none)] = np.nan
-            if found.dtype == np.float64 and abs(float(none)) > 1e30:
-                found[np.isclose(found, float(none), rtol=1e-6)] = np.nan
-    found[~(np.abs(found) < INDEFINITE)] = np.nan
-    return found
+            plain[plain == float(none)] = np.nan
+            if plain.dtype == np.float64 and abs(float(none)) > 1e30:
+                plain[np.isclose(plain, float(none), rtol=1e-6)] = np.nan
+    plain[~(np.abs(plain) < INDEFINITE)] = np.nan
+    return plain
 
 
 def plain(name: str) -> str:
@@ -183,8 +183,8 @@ def _may_be_flux(name: str) -> bool:
 def _best(compared: Sequence[str], places: list[int], usual: tuple[str, ...]) -> list[int]:
     """Those with the most usual name, where there are any."""
     for name in usual:
-        if found := [i for i in places if compared[i] == name]:
-            return found
+        if same := [i for i in places if compared[i] == name]:
+            return same
     # Of both, vacuum is what is needed.
     return [i for i in places if "vac" in compared[i]] or places
 
@@ -211,8 +211,8 @@ def _is_flux_density(unit: Any) -> bool:
     import astropy.units as u
 
     try:
-        found = unit_of(unit) if isinstance(unit, str) else unit
-        return bool(found is not None and found.is_equivalent(u.W / u.m**3, u.spectral_density(500 * u.nm)))
+        physical = unit_of(unit) if isinstance(unit, str) else unit
+        return bool(physical is not None and physical.is_equivalent(u.W / u.m**3, u.spectral_density(500 * u.nm)))
     except (InputError, AttributeError):
         return False
 
@@ -248,12 +248,12 @@ def step_among(names: Sequence[str]) -> int | None:
     return next((i for i, name in enumerate(names) if plain(name) in _STEPS), None)
 
 
-def spectrum_of(found: Columns, wavelength_unit: Any = None, flux_unit: Any = None) -> ReadSpectrum:
+def spectrum_of(columns: Columns, wavelength_unit: Any = None, flux_unit: Any = None) -> ReadSpectrum:
     """The spectrum that two columns hold.
 
     Parameters
     ----------
-    found : Columns
+    columns : Columns
     wavelength_unit, flux_unit : str or Unit, optional
         What the user says; stands above what the file does. A wavelength's may end in "air" or "vacuum".
 
@@ -264,20 +264,20 @@ def spectrum_of(found: Columns, wavelength_unit: Any = None, flux_unit: Any = No
     """
     import astropy.units as u
 
-    told = list(found.told)
+    told = list(columns.told)
     medium: str | None = None
     if isinstance(wavelength_unit, str) and (
         match := re.fullmatch(r"\s*(.*?)\s*\b(air|vacuum)\s*", wavelength_unit, re.I)
     ):
         wavelength_unit, medium = match[1] or None, match[2].lower()
-    logarithmic = _logarithm(found)
-    length, assumed_length = _unit(found, 0, wavelength_unit, logarithmic, told)
-    density, assumed_flux = _unit(found, 1, flux_unit, False, told)
-    values = found.wavelength
+    logarithmic = _logarithm(columns)
+    length, assumed_length = _unit(columns, 0, wavelength_unit, logarithmic, told)
+    density, assumed_flux = _unit(columns, 1, flux_unit, False, told)
+    values = columns.wavelength
     if logarithmic:
         with np.errstate(over="ignore"):
             values = 10.0**values
-        told.append(f"its wavelengths are logarithms ({found.wavelength_name}), raised to powers of ten")
+        told.append(f"its wavelengths are logarithms ({columns.wavelength_name}), raised to powers of ten")
     flam = u.erg / (u.s * u.cm**2 * u.AA)
     with np.errstate(all="ignore"):
         try:
@@ -285,7 +285,7 @@ def spectrum_of(found: Columns, wavelength_unit: Any = None, flux_unit: Any = No
         except u.UnitConversionError as error:
             raise InputError(f"wavelengths in {length} are none, expected a length or a frequency") from error
         try:
-            flux = u.Quantity(found.flux, density).to_value(flam, u.spectral_density(u.Quantity(nm, u.nm)))
+            flux = u.Quantity(columns.flux, density).to_value(flam, u.spectral_density(u.Quantity(nm, u.nm)))
         except u.UnitConversionError as error:
             raise InputError(
                 f"the unit {density} is no flux density, expected one such as erg / (s cm2 Angstrom)"
@@ -293,33 +293,33 @@ def spectrum_of(found: Columns, wavelength_unit: Any = None, flux_unit: Any = No
     nm, flux = np.asarray(nm, np.float64), np.asarray(flux, np.float64)
     nm, flux = _in_order(nm, flux, told)
     if assumed_length:
-        _likely(nm, found, length)
+        _likely(nm, columns, length)
     if assumed_flux and flux.size and np.nanmin(flux) >= 2.0 and np.nanmax(flux) <= 40.0:
         raise InputError(
             f"fluxes of {np.nanmin(flux):g} to {np.nanmax(flux):g} without a unit look like magnitudes, expected a "
             "flux density: --flux-unit names its unit"
         )
-    nm = _in_vacuum(nm, found, medium, told)
+    nm = _in_vacuum(nm, columns, medium, told)
     nm, flux = _merged(nm, flux, told)
     unscaled = "its header says that it is the flux at the star's surface" if re.search(
-        r"surface\s+flux", found.words, re.I
+        r"surface\s+flux", columns.words, re.I
     ) else ""  # fmt: skip
-    notes = found.notes
-    if re.search(r"dereddened", found.words, re.I) and not any("dereddened" in note for note in notes):
+    notes = columns.notes
+    if re.search(r"dereddened", columns.words, re.I) and not any("dereddened" in note for note in notes):
         notes += ("dereddened, as its header says: counts need it reddened again",)
-    return ReadSpectrum(nm, flux, found.name, found.origin, notes, tuple(told), unscaled)
+    return ReadSpectrum(nm, flux, columns.name, columns.origin, notes, tuple(told), unscaled)
 
 
-def _logarithm(found: Columns) -> bool:
-    name, unit = found.wavelength_name.lower(), str(found.wavelength_unit or "").lower()
+def _logarithm(columns: Columns) -> bool:
+    name, unit = columns.wavelength_name.lower(), str(columns.wavelength_unit or "").lower()
     return bool(re.match(r"\s*log", name) or re.match(r"\s*(log|dex)", unit))
 
 
-def _unit(found: Columns, which: int, said: Any, logarithmic: bool, told: list[str]) -> tuple[Any, bool]:
+def _unit(columns: Columns, which: int, said: Any, logarithmic: bool, told: list[str]) -> tuple[Any, bool]:
     """A column's unit, and whether it is assumed."""
     what = ("wavelength", "flux")[which]
-    stated = (found.wavelength_unit, found.flux_unit)[which]
-    column = (found.wavelength_name, found.flux_name)[which]
+    stated = (columns.wavelength_unit, columns.flux_unit)[which]
+    column = (columns.wavelength_name, columns.flux_name)[which]
     if logarithmic and isinstance(stated, str):
         # "log(Angstrom)", "log10 nm"
         stated = re.sub(r"^\s*(log|dex)\w*[\s(\[]*|[)\]\s]+$", "", stated, flags=re.IGNORECASE) or None
@@ -335,17 +335,17 @@ def _unit(found: Columns, which: int, said: Any, logarithmic: bool, told: list[s
         raise InputError(f"{what} ({column}): {error}") from error
     if not which and logarithmic:
         return unit_of("Angstrom"), True
-    if found.usual is None:
+    if columns.usual is None:
         raise InputError(
             f"column {column} names no unit, expected one such as {('nm', 'erg / (s cm2 Angstrom)')[which]}: "
             f"--{what}-unit names it"
         )
-    unit = unit_of(found.usual[which])
+    unit = unit_of(columns.usual[which])
     told.append(f"ASSUMED: {what} in {unit}, because its file states no unit; --{what}-unit names another")
     return unit, True
 
 
-def _likely(nm: Float, found: Columns, unit: Any) -> None:
+def _likely(nm: Float, columns: Columns, unit: Any) -> None:
     """Refuse an assumed unit of the wavelength where another is as likely."""
     finite = nm[np.isfinite(nm)]
     if not finite.size:
@@ -420,10 +420,10 @@ _AIR = re.compile(
 _VACUUM = re.compile(r"(?:\b|_)vac(?:uum)?(?:\b|_)|\bvacuum", re.IGNORECASE)
 
 
-def _in_vacuum(nm: Float, found: Columns, medium: str | None, told: list[str]) -> Float:
+def _in_vacuum(nm: Float, columns: Columns, medium: str | None, told: list[str]) -> Float:
     """Vacuum wavelengths, from air where the file says so."""
     if medium is None:
-        for text in (found.wavelength_name, found.words):
+        for text in (columns.wavelength_name, columns.words):
             air, vacuum = bool(_AIR.search(text)), bool(_VACUUM.search(text))
             if air and vacuum:
                 told.append(

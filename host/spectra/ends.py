@@ -207,8 +207,8 @@ def means(wavelength: Float, flux: Float, edges: Float) -> Float:
     grid = np.union1d(wavelength, edges)
     values = np.interp(grid, wavelength, flux)
     area = np.concatenate([[0.0], np.cumsum(np.diff(grid) * (values[1:] + values[:-1]) / 2)])
-    found: Float = np.diff(area[np.searchsorted(grid, edges)]) / np.diff(edges)
-    return found
+    mean: Float = np.diff(area[np.searchsorted(grid, edges)]) / np.diff(edges)
+    return mean
 
 
 def extended(

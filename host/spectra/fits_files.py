@@ -150,24 +150,24 @@ def _named(primary: Any, header: Any, name: str) -> str:
 
 
 def _words(primary: Any, header: Any) -> str:
-    found = [_text(one, key) for one in ([primary] if primary is header else [primary, header]) for key in _WORDS]
+    words = [_text(one, key) for one in ([primary] if primary is header else [primary, header]) for key in _WORDS]
     for one in (primary, header):
         # AIRORVAC = 'air', VACUUM = T
         if _text(one, "AIRORVAC").lower() == "air" or _text(one, "VACUUM") == "False":
-            found.append("in air")
+            words.append("in air")
         if _text(one, "VACUUM") == "True":
-            found.append("vacuum")
-    return "\n".join(found)[:100_000]
+            words.append("vacuum")
+    return "\n".join(words)[:100_000]
 
 
 def _notes(primary: Any, header: Any, origin: str) -> tuple[str, ...]:
-    found = []
+    notes = []
     for key in ("DATAQUAL", "OFFSETPX"):
         if value := _text(primary, key) or _text(header, key):
-            found.append(f"{key} = {value[:60]}")
+            notes.append(f"{key} = {value[:60]}")
     if "lowlib" in origin.lower():
-        found.append("dereddened and at zero velocity: counts need it reddened again")
-    return tuple(found)
+        notes.append("dereddened and at zero velocity: counts need it reddened again")
+    return tuple(notes)
 
 
 def _table(hdu: Any, primary: Any, name: str, origin: str, asked: Sequence[str]) -> Columns:

@@ -57,10 +57,12 @@ def read_spectrum(
     content = read_bytes(place, "spectrum file")
     shown = place.name if len(place.name) <= 80 else shortened(place.name)
     try:
-        found = _columns(unpacked(content, "it"), _stem(place.name), f"file {shown}", asked, wavelength_unit, flux_unit)
+        columns = _columns(
+            unpacked(content, "it"), _stem(place.name), f"file {shown}", asked, wavelength_unit, flux_unit
+        )
         # Numbers beyond floats end in a sentence where points are checked.
         with np.errstate(all="ignore"):
-            return spectrum_of(found, wavelength_unit, flux_unit)
+            return spectrum_of(columns, wavelength_unit, flux_unit)
     except InputError as error:
         raise InputError(f"{shown}: {error}") from error
 

@@ -89,21 +89,21 @@ def first_fitting(tables: Sequence[tuple[str, Any]], asked: Sequence[str]) -> Co
     labels = [label for label, _ in tables]
     named = [i for i, label in enumerate(labels) if label.strip().lower() in {one.lower() for one in asked}]
     rest = [one for one in asked if one.lower() not in {labels[i].strip().lower() for i in named}]
-    found, errors = [], []
+    fitting, errors = [], []
     for i, (label, read) in enumerate(tables):
         if named and i not in named:
             continue
         try:
-            found.append((label, read(rest)))
+            fitting.append((label, read(rest)))
         except InputError as error:
             errors.append(error)
-    if len(found) > 1:
+    if len(fitting) > 1:
         raise InputError(
-            f"{len(found)} tables hold a spectrum: {listed([label for label, _ in found])}, expected one: name it as "
-            f"in FILE[{found[0][0].strip()}]"
+            f"{len(fitting)} tables hold a spectrum: {listed([label for label, _ in fitting])}, expected one: name it "
+            f"as in FILE[{fitting[0][0].strip()}]"
         )
-    if found:
-        chosen_one: Columns = found[0][1]
+    if fitting:
+        chosen_one: Columns = fitting[0][1]
         return chosen_one
     if errors:
         # Of several reasons the one that speaks of a choice helps most.
@@ -155,16 +155,27 @@ def columns_of(
     elif rest:
         raise InputError(f"no column is named {shortened(rest[0])}, expected one of {listed(names)}")
     missing = [None, None] if none is None else [none(wave), none(flux)]
-    found = [
+    picked = [
         numbers(cell, names[place].strip(), gap) for cell, place, gap in zip(cells, (wave, flux), missing, strict=True)
     ]
-    for array, place in zip(found, (wave, flux), strict=True):
+    for array, place in zip(picked, (wave, flux), strict=True):
         if array.ndim != 1:
             raise InputError(f"column {names[place].strip()} has the shape {array.shape}, expected one spectrum")
-    if found[0].size != found[1].size:
-        raise InputError(f"{found[0].size} wavelengths for {found[1].size} fluxes, expected as many")
+    if picked[0].size != picked[1].size:
+        raise InputError(f"{picked[0].size} wavelengths for {picked[1].size} fluxes, expected as many")
     return Columns(
-        found[0], found[1], name, origin, units[wave], units[flux], usual, names[wave], names[flux], words, notes, told
+        picked[0],
+        picked[1],
+        name,
+        origin,
+        units[wave],
+        units[flux],
+        usual,
+        names[wave],
+        names[flux],
+        words,
+        notes,
+        told,
     )
 
 
@@ -195,7 +206,7 @@ def _one_row(
     points = next(
         (i for i, one in enumerate(names) if re.fullmatch(r"n_?points|nelem|npts", one.strip().lower())), None
     )
-    found = row_of(cells[0][row], cells[1][row], None if step is None else values(step)[row], "its row")
-    if points is not None and 1 < (count := int(np.ravel(values(points)[row])[0])) < found[1].size:
-        return found[0][:count], found[1][:count]
-    return found
+    columns = row_of(cells[0][row], cells[1][row], None if step is None else values(step)[row], "its row")
+    if points is not None and 1 < (count := int(np.ravel(values(points)[row])[0])) < columns[1].size:
+        return columns[0][:count], columns[1][:count]
+    return columns

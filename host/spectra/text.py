@@ -248,11 +248,11 @@ def _from_arrays(
         )
     wave, value = chosen(names, asked)
     step = step_among(names)
-    found = row_of(
+    columns = row_of(
         _array(rows[0][wave]), _array(rows[0][value]), None if step is None else _array(rows[0][step]), "its row"
     )
     units = stated_units(_own_units(names, [], wave, value))
-    return Columns(found[0], found[1], name, origin, *units, USUAL, names[wave], names[value], "\n".join(header))
+    return Columns(columns[0], columns[1], name, origin, *units, USUAL, names[wave], names[value], "\n".join(header))
 
 
 def row_asked(rows: Sequence[Any], asked: Sequence[str]) -> tuple[list[Any], list[str]]:
@@ -264,20 +264,20 @@ def row_asked(rows: Sequence[Any], asked: Sequence[str]) -> tuple[list[Any], lis
         If several rows remain.
     """
     left = list(asked)
-    found = list(rows)
+    fitting = list(rows)
     for one in asked:
         fits = [row for row in rows if any(str(cell).strip() == one for cell in row if np.size(cell) == 1)]
         if fits:
-            found = fits
+            fitting = fits
             left.remove(one)
             break
-    if len(found) != 1:
-        labels = [next((str(c).strip()[:30] for c in row if np.size(c) == 1 and str(c).strip()), "") for row in found]
+    if len(fitting) != 1:
+        labels = [next((str(c).strip()[:30] for c in row if np.size(c) == 1 and str(c).strip()), "") for row in fitting]
         raise InputError(
-            f"{len(found)} spectra stand in it, one a row ({listed(labels)}), expected one: name it as in "
+            f"{len(fitting)} spectra stand in it, one a row ({listed(labels)}), expected one: name it as in "
             f"FILE[{labels[0]}]"
         )
-    return found, left
+    return fitting, left
 
 
 def _array(cell: str) -> Any:

@@ -113,20 +113,20 @@ def stated_units(header: str, *, wavelength: bool = True, flux: bool = True) -> 
         If it states several, and does not say which is meant, or that there is no flux.
     """
     text = header[:MOST_HEADER]
-    fluxes = [_unlined(found[0].strip()) for found in _FLUX.finditer(text)]
+    fluxes = [_unlined(match[0].strip()) for match in _FLUX.finditer(text)]
     distinct = _distinct(fluxes)
     if flux and len(distinct) > 1:
         beside = re.search(r"flux\w*\W{0,4}(?:in\W+)?(" + _FLUX.pattern + ")", text, re.IGNORECASE)
         if beside is None:
             raise InputError(f"its header names the units {', '.join(distinct)}, expected one: --flux-unit says which")
         distinct = [_unlined(beside[1].strip())]
-    if flux and not distinct and (found := _NO_FLUX_HERE.search(text)):
+    if flux and not distinct and (match := _NO_FLUX_HERE.search(text)):
         raise InputError(
-            f"its header speaks of {(found[1] or found[2])!r}, expected a flux density: --flux-unit names its unit"
+            f"its header speaks of {(match[1] or match[2])!r}, expected a flux density: --flux-unit names its unit"
         )
     rest = re.sub(_FLUX.pattern, " FLUXUNIT ", text)
-    adjacent = _distinct([found[1] for found in _BESIDE.finditer(rest)])
-    listed = [found[1] for line in rest.splitlines() if (found := _LIST.match(line.strip().lstrip("#!%;").strip()))]
+    adjacent = _distinct([match[1] for match in _BESIDE.finditer(rest)])
+    listed = [match[1] for line in rest.splitlines() if (match := _LIST.match(line.strip().lstrip("#!%;").strip()))]
     lengths = adjacent or _distinct(listed) or _distinct(_ANYWHERE.findall(rest))
     if wavelength and len(lengths) > 1:
         raise InputError(f"its header names the units {', '.join(lengths)}, expected one: --wavelength-unit says which")
@@ -150,10 +150,10 @@ def _unlined(name: str) -> str:
 
 def _distinct(names: list[str]) -> list[str]:
     """Each unit once, however it is spelt; what is none falls out."""
-    found: dict[object, str] = {}
+    units: dict[object, str] = {}
     for name in names:
         try:
-            found.setdefault(unit_of(name), name)
+            units.setdefault(unit_of(name), name)
         except InputError:
             continue
-    return list(found.values())
+    return list(units.values())

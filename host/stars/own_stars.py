@@ -193,9 +193,9 @@ def add(
         write_whole(place, text.getvalue().encode(), shared=True)
     except InputError as error:
         raise InputError(f"star folder: {error}; MAUVECL_DATA_DIR sets another") from error
-    found = find(name)
-    assert found is not None
-    return found
+    known = find(name)
+    assert known is not None
+    return known
 
 
 def remove(name: str) -> None:

@@ -145,13 +145,13 @@ def _draw_frames(
         near = near_rail(x, factors, rays)
         # The less light and dark, the less the rounding is noise.
         coarse = ~stack_is_exact(_scaled(x, Cumulants.of(x, 1), corners[0]), x)
-        for found, why in (
+        for pixels, why in (
             (near, f"cannot clip, and a frame comes within {RAIL_SIGMA:g} sigma of zero or saturation"),
             (coarse, "takes rounding for noise, and a frame has too little noise of its own for that"),
         ):
-            if found.any():
+            if pixels.any():
                 if mode == "stacked":
-                    where = float(x.wavelength_nm[found][0])
+                    where = float(x.wavelength_nm[pixels][0])
                     raise InputError(
                         f"mode = 'stacked' {why} in the pixel at {where:.1f} nm of {x.name}, expected mode 'frames' or "
                         "'auto'"

@@ -123,10 +123,10 @@ def components(
 
 def _dark_given_total(total: Float, mean: Float, step: Float, variance: Float, chance: Float) -> Float:
     """Dark counts, DN, given their sum with a Gaussian of this variance, each by inversion at `chance`."""
-    found = np.zeros(total.size)
+    dark = np.zeros(total.size)
     for p in np.flatnonzero(mean > 0):
         if variance[p] == 0:
-            found[p] = total[p]
+            dark[p] = total[p]
             continue
         expected = mean[p] / step[p]
         # Around both the prior and what is left of the sum.
@@ -135,8 +135,8 @@ def _dark_given_total(total: Float, mean: Float, step: Float, variance: Float, c
         log = special.xlogy(counts, expected) - special.gammaln(counts + 1.0)
         log -= (total[p] - step[p] * counts) ** 2 / (2.0 * variance[p])
         below = np.cumsum(np.exp(log - log.max()))
-        found[p] = step[p] * counts[np.searchsorted(below, chance[p] * below[-1])]
-    return found
+        dark[p] = step[p] * counts[np.searchsorted(below, chance[p] * below[-1])]
+    return dark
 
 
 DESCRIPTIONS = {

@@ -111,11 +111,11 @@ class Cumulants:
         each = np.divide(1.0, sd, out=np.zeros_like(sd), where=sd > 0)
         light, dark = self.photon_step * each, self.dark_step * each
         of_light, of_dark = self.photons * light**2, self.dark_dn * each * dark
-        found = []
+        bounds = []
         for _ in range(3, last + 1):
             of_light, of_dark = of_light * light, of_dark * dark
-            found.append(of_light + of_dark)
-        return found
+            bounds.append(of_light + of_dark)
+        return bounds
 
     def scaled(self, light: float | Float, dark: float) -> Cumulants:
         """The same draw with so many times the light and the dark."""
@@ -164,13 +164,13 @@ def left_out(c: Cumulants, *, fourth_power: bool, varying: bool = False) -> Floa
     fifth = g6 / 720 - 3 * g4**2 / 384 - 2 * g3 * g5 / 180 + 14 * g3**2 * g4 / 288 - 252 * g3_4 / 7776
     third = -6 * g4**2 / 384 - 3 * g3 * g5 / 180 + 37 * g3**2 * g4 / 288 - 832 * g3_4 / 7776
     first = -2 * g4**2 / 384 + 8 * g3**2 * g4 / 288 - 227 * g3_4 / 7776
-    found = 720 * fifth**2 + 24 * third**2 + 2 * first**2 + g7**2 / 5040
+    loss = 720 * fifth**2 + 24 * third**2 + 2 * first**2 + g7**2 / 5040
     if not fourth_power:
         second = 19 * g3_3 / 324 - g3 * g4 / 24
         fourth = g5 / 120 - g3 * g4 / 24 + g3_3 / 27
         # Without gamma_5 both Hermite terms are missing; `polynomial` lacks z^4 = He_4 + 6 He_2 + 3 alone.
-        found = found + (120 * fourth**2 + 6 * second**2 if varying else 345 * fourth**2)
-    return np.asarray(found)
+        loss = loss + (120 * fourth**2 + 6 * second**2 if varying else 345 * fourth**2)
+    return np.asarray(loss)
 
 
 def joint_is_exact(c: Cumulants) -> NDArray[np.bool_]:
@@ -213,7 +213,7 @@ def stack_is_exact(c: Cumulants, x: Expectation) -> NDArray[np.bool_]:
     counts = np.where(blur >= SMOOTH_STEPS * steps, np.stack([c.photons, dark]), 0.0)
     frame = c.gaussian + (counts * steps**2).sum(axis=0) + 1 / 12
     # Twice, here and below: for the Poisson counts' skew, and the sawtooth's square.
-    found = 2 * ((n - 1) / (120 * n**2 * frame**2)) ** 2 / 24
+    loss = 2 * ((n - 1) / (120 * n**2 * frame**2)) ** 2 / 24
     quietest = float(np.sqrt(c.gaussian.min()))
     last = HARMONICS if HARMONICS * quietest < 1.5 else int(np.ceil(1.5 / quietest))
     for k in range(1, last + 1):
@@ -221,10 +221,10 @@ def stack_is_exact(c: Cumulants, x: Expectation) -> NDArray[np.bool_]:
         size = 2 * np.pi**2 * k**2 * c.gaussian + 2 * (counts * turned**2).sum(axis=0)
         slope = 2 * np.pi * k * c.gaussian + 2 * (counts * steps * turned).sum(axis=0)
         ripple = slope**2 / (n * frame)
-        found += 2 * n / (np.pi**2 * k**2 * frame) * (1 + ripple) * np.exp(np.minimum(ripple - 2 * size, 0.0))
+        loss += 2 * n / (np.pi**2 * k**2 * frame) * (1 + ripple) * np.exp(np.minimum(ripple - 2 * size, 0.0))
     # What lies beyond is left to the Gaussian noise.
-    found += n / frame * np.exp(-4 * np.pi**2 * last**2 * c.gaussian)
-    return ~shows(found, n * frame)
+    loss += n / frame * np.exp(-4 * np.pi**2 * last**2 * c.gaussian)
+    return ~shows(loss, n * frame)
 
 
 def polynomial(c: Cumulants) -> tuple[Float, Float, Float, Float, Float]:

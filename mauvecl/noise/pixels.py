@@ -64,10 +64,10 @@ def poisson_counts(out: NDArray[np.void], mean: Float, gain: Float, tables: list
             f"pixel {pixel} has a Poisson mean of {mean[pixel]:.3g} in one draw beside a pixel of less than "
             f"{SMALLEST_EXPANDED:g}, expected at most {LARGEST_MEAN:g} there: draw frame by frame"
         )
-    found, starts = table_set(mean[~expanded].tolist(), tables)
+    alias, starts = table_set(mean[~expanded].tolist(), tables)
     out["table"][~expanded] = starts
-    out["bits"][~expanded] = [t.bits for t in found]
-    out["low"][~expanded] = np.array([t.low for t in found]) - centre[~expanded]
+    out["bits"][~expanded] = [t.bits for t in alias]
+    out["low"][~expanded] = np.array([t.low for t in alias]) - centre[~expanded]
     root = np.sqrt(mean[expanded])
     out["offset"][expanded] = (mean - centre)[expanded] - 1 / 6
     out["slope"][expanded] = root - 1 / (36 * root)

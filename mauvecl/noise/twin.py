@@ -203,20 +203,20 @@ def factors(
     -------
     three of ndarray of float32, shape (n_realisation,)
     """
-    found = {factor: np.zeros(len(realisation), np.float32) for factor in ("light", "dark", "sky")}
+    factor_of = {factor: np.zeros(len(realisation), np.float32) for factor in ("light", "dark", "sky")}
     kept = np.zeros(len(realisation), np.float32)
     first = int(scene.job["first_frame"]) + frame
     for (name, factor), table in zip(scene.modulations, scene.priors, strict=True):
         if name != "jitter":
             words = words_at(realisation, 0, name, 0, seed)
-            found[factor] = together(found[factor], quantile(words[0], words[1], table))
+            factor_of[factor] = together(factor_of[factor], quantile(words[0], words[1], table))
             continue
         for f in range(first, first + (1 if scene.frames else scene.n_frames)):
             words = words_at(realisation, f // 4, name, 0, seed, exposure)
             kept = kept + quantile(words[f % 4], words[(f + 1) % 4], table)
         if not scene.frames:
             kept = kept * (np.float32(1.0) / np.float32(scene.n_frames))
-    return together(found["light"], kept), found["dark"], found["sky"]
+    return together(factor_of["light"], kept), factor_of["dark"], factor_of["sky"]
 
 
 def analogue(

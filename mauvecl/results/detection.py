@@ -104,10 +104,10 @@ class Detection(Hypotheses):
     def _at(self, key: Key) -> Distribution:
         """What was counted; InputError where it has values that are no finite numbers."""
         statistic, role, flare = key
-        found = self._found[key]
+        counted = self._found[key]
         of = "without a flare" if role == "null" else f"with flare {flare + 1}"
-        found.refuse_undefined(f"statistic {statistic!r} {of}")
-        return found
+        counted.refuse_undefined(f"statistic {statistic!r} {of}")
+        return counted
 
     def histogram(
         self, statistic: str, flare: int | None = None, *, template: int = 0, bins: int = 200
@@ -177,23 +177,23 @@ class Detection(Hypotheses):
                 probabilities.append(Interval(np.nan, np.nan, np.nan))
                 continue
             cut = self._cut(fap, statistic, flare)
-            found = self._at((statistic, "flare_on_null_grid", flare))
-            above = [found.above(value) for value in (cut.value, cut.high, cut.low)]
+            counted = self._at((statistic, "flare_on_null_grid", flare))
+            above = [counted.above(value) for value in (cut.value, cut.high, cut.low)]
             shared = 0.0
-            if countable(fap, self.realisations) and found.std > 0:
+            if countable(fap, self.realisations) and counted.std > 0:
                 # A flare adds what is not correlated with the null; tilted draws are others than the flares'.
-                shared = min(self._at(self._null_key(statistic, flare)).std / found.std, 1.0)
-            probabilities.append(detection_interval(above, found.n, fap, shared))
+                shared = min(self._at(self._null_key(statistic, flare)).std / counted.std, 1.0)
+            probabilities.append(detection_interval(above, counted.n, fap, shared))
         return probabilities
 
     @staticmethod
-    def _share_above(found: Distribution, cut: Interval) -> Interval:
+    def _share_above(distribution: Distribution, cut: Interval) -> Interval:
         """The share at or above a threshold; its interval is of whole counts, at the ends of the threshold's own."""
-        value, low, high = (found.above(x) for x in (cut.value, cut.high, cut.low))
+        value, low, high = (distribution.above(x) for x in (cut.value, cut.high, cut.low))
         return Interval(
-            value / found.n,
-            clopper_pearson(int(np.floor(low)), found.n).low,
-            clopper_pearson(int(np.ceil(high)), found.n).high,
+            value / distribution.n,
+            clopper_pearson(int(np.floor(low)), distribution.n).low,
+            clopper_pearson(int(np.ceil(high)), distribution.n).high,
         )
 
     def quantile(

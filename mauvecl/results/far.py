@@ -75,9 +75,9 @@ def counted(keys: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int6
         return keys, keys
     low = int(keys.min())
     if int(keys.max()) - low < CLOSE:
-        found = np.bincount(keys - low)
-        where = np.flatnonzero(found)
-        return where + low, found[where]
+        counts = np.bincount(keys - low)
+        where = np.flatnonzero(counts)
+        return where + low, counts[where]
     return np.unique_counts(keys)
 
 

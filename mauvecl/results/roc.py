@@ -92,9 +92,9 @@ class Roc:
         chosen = np.unique(np.minimum(np.searchsorted(-self.fap, -wanted), self.fap.size - 1))
         table = QTable({"threshold": self.threshold[chosen]})
         for name, share in (("fap", self.fap), ("probability", self.probability)):
-            found = [clopper_pearson(round(p * n), n) for p in share[chosen]]
-            table[name] = [p.value for p in found]
-            table[f"{name}_low"], table[f"{name}_high"] = [p.low for p in found], [p.high for p in found]
+            intervals = [clopper_pearson(round(p * n), n) for p in share[chosen]]
+            table[name] = [p.value for p in intervals]
+            table[f"{name}_low"], table[f"{name}_high"] = [p.low for p in intervals], [p.high for p in intervals]
         table["fap"].info.description = "false-alarm probability per test, with a 95 % Clopper-Pearson interval"
         table["probability"].info.description = "detection probability, with a 95 % Clopper-Pearson interval"
         table.meta |= {

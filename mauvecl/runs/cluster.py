@@ -83,16 +83,16 @@ class DaskWorkers:
                 raise DeviceError(
                     f"cluster {where} has no worker, expected one within {WORKER_PATIENCE_S:g} s"
                 ) from error
-            found = self._client.run(_introduce, device, on_error="return")
-            for worker, answer in found.items():
+            introduced = self._client.run(_introduce, device, on_error="return")
+            for worker, answer in introduced.items():
                 if isinstance(answer, BaseException):
                     raise DeviceError(
                         f"worker {worker} cannot work ({answer}), expected mauvecl {VERSION} and OpenCL there"
                     )
                 if answer[0] != VERSION:
                     raise DeviceError(f"worker {worker} has mauvecl {answer[0]}, expected {VERSION} as here")
-            self._devices = [record for _, record in found.values()]
-            self._counted = len(found), time.monotonic()
+            self._devices = [record for _, record in introduced.values()]
+            self._counted = len(introduced), time.monotonic()
         except BaseException:
             self._open.close()
             raise
@@ -123,14 +123,14 @@ class DaskWorkers:
         out: NDArray[Any] | None = None,
     ) -> Future[Arrays]:
         """Have a share counted by whichever worker is free; raw spectra travel, and `out` stays as it is."""
-        found: Future[Arrays] = Future()
-        self._send(found, request, key, share, 1)
-        return found
+        awaited: Future[Arrays] = Future()
+        self._send(awaited, request, key, share, 1)
+        return awaited
 
-    def _send(self, found: Future[Arrays], request: Countable, key: str, share: Share, tried: int) -> None:
+    def _send(self, awaited: Future[Arrays], request: Countable, key: str, share: Share, tried: int) -> None:
         with self._lock:
             if self._closing:
-                found.set_exception(Stopped())
+                awaited.set_exception(Stopped())
                 return
             try:
                 if key not in self._given:
@@ -142,14 +142,14 @@ class DaskWorkers:
                 sent = self._client.submit(_count, self._given[key], share, self._device, key=name, pure=False)
             except (OSError, RuntimeError) as error:
                 # Dask raises either where its client has lost the scheduler.
-                found.set_exception(self._gone().with_traceback(error.__traceback__))
+                awaited.set_exception(self._gone().with_traceback(error.__traceback__))
                 return
-            self._sent[sent] = found
-        sent.add_done_callback(partial(self._came, found, request, key, share, tried))
+            self._sent[sent] = awaited
+        sent.add_done_callback(partial(self._came, awaited, request, key, share, tried))
 
     def _came(
         self,
-        found: Future[Arrays],
+        awaited: Future[Arrays],
         request: Countable,
         key: str,
         share: Share,
@@ -162,28 +162,28 @@ class DaskWorkers:
                 return
         try:
             if sent.status == "finished":
-                found.set_result(sent.result())
+                awaited.set_result(sent.result())
                 return
             error = sent.exception() if sent.status == "error" else None
             known = isinstance(error, InputError | DeviceError)
             if known or tried == TRIES:
                 told = error if known else f"{error or 'the scheduler is gone'}"
-                found.set_exception(
+                awaited.set_exception(
                     DeviceError(f"cluster {self._where} failed at realisations {share.start} to "
                                 f"{share.start + share.count - 1}: {told}")
                 )  # fmt: skip
             elif sent.status in ("cancelled", "lost") and self._client.status != "running":
-                found.set_exception(self._gone())
+                awaited.set_exception(self._gone())
             else:
                 with self._lock:
                     self.retries += 1
                     if error is None:
                         # The request itself was lost with its worker.
                         self._given.pop(key, None)
-                self._send(found, request, key, share, tried + 1)
+                self._send(awaited, request, key, share, tried + 1)
         except BaseException as error:
-            if not found.done():
-                found.set_exception(error)
+            if not awaited.done():
+                awaited.set_exception(error)
 
     def stop(self) -> None:
         """Take back what was sent out; a worker of another machine ends the share in its hands."""
@@ -192,8 +192,8 @@ class DaskWorkers:
             sent, self._sent = self._sent, {}
         # Whoever waits is told here: nothing that Dask does or fails to do, and no future that is merely cancelled,
         # would wake concurrent.futures.wait.
-        for found in sent.values():
-            found.set_exception(Stopped())
+        for awaited in sent.values():
+            awaited.set_exception(Stopped())
         with contextlib.suppress(OSError, RuntimeError, TimeoutError):
             self._client.cancel(list(sent))
         # Those of this machine need not end the share in their hands, which takes seconds.
@@ -248,8 +248,8 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
         elif "://" in where and _is_address(where):
             how = {"address": where}
         elif "://" not in where and is_file(Path(where)):
-            found = json_data(read_text(Path(where), "scheduler file"), f"scheduler file {shortened(where)}")
-            address = found.get("address") if isinstance(found, dict) else None
+            scheduler = json_data(read_text(Path(where), "scheduler file"), f"scheduler file {shortened(where)}")
+            address = scheduler.get("address") if isinstance(scheduler, dict) else None
             if not (isinstance(address, str) and _is_address(address)):
                 raise InputError(f"scheduler file {shortened(where)} names no address, expected one that Dask wrote")
             how = {"scheduler_file": where}

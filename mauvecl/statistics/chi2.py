@@ -128,13 +128,13 @@ def _span(vectors: Float, ratio: Float) -> tuple[Float, Float]:
     group = np.floor(np.log(ratio[order] / ratio[order[0]]) / ALIKE)
     parts, rest = [], []
     for members in np.split(order, np.flatnonzero(np.diff(group)) + 1):
-        found, sizes, _ = np.linalg.svd(vectors[:, members].T, full_matrices=False)
-        found = found[:, sizes > 1e-13 * sizes[0]] if sizes[0] > 0 else found[:, :0]
-        part = np.zeros((ratio.size, found.shape[1]))
-        part[members] = found
+        basis, sizes, _ = np.linalg.svd(vectors[:, members].T, full_matrices=False)
+        basis = basis[:, sizes > 1e-13 * sizes[0]] if sizes[0] > 0 else basis[:, :0]
+        part = np.zeros((ratio.size, basis.shape[1]))
+        part[members] = basis
         parts.append(part)
-        left = members.size - found.shape[1]
-        total = float(ratio[members].sum() - ratio[members] @ np.sum(found**2, axis=1))
+        left = members.size - basis.shape[1]
+        total = float(ratio[members].sum() - ratio[members] @ np.sum(basis**2, axis=1))
         rest.append(np.full(left, total / max(left, 1)))
     return np.hstack(parts), np.concatenate(rest)
 

@@ -45,18 +45,18 @@ def detection_interval(
     same correlation. Where fewer than ten flares are found or missed, Clopper and Pearson's interval takes the place of
     Jeffreys's.
     """
-    found, few, many = above
+    above_cut, few, many = above
     tail = (1.0 - confidence) / 2.0
-    middle, lower, upper = (_probit((k + 0.5) / (trials + 1.0)) for k in (found, few, many))
+    middle, lower, upper = (_probit((k + 0.5) / (trials + 1.0)) for k in (above_cut, few, many))
     # Jeffreys's interval falls short of its confidence where few are counted, Clopper and Pearson's nowhere.
-    more = 0.5 if min(found, trials - found) >= FEW else 0.0
-    low = _beta(found + more, trials - found + 1.0 - more, tail) if found else -np.inf
-    high = _beta(found + 1.0 - more, trials - found + more, 1.0 - tail) if found < trials else np.inf
+    more = 0.5 if min(above_cut, trials - above_cut) >= FEW else 0.0
+    low = _beta(above_cut + more, trials - above_cut + 1.0 - more, tail) if above_cut else -np.inf
+    high = _beta(above_cut + 1.0 - more, trials - above_cut + more, 1.0 - tail) if above_cut < trials else np.inf
     shared = _shared(fap, float(special.ndtr(middle)), correlation)
-    below = _together(middle - low, middle - lower, shared) if found else np.inf
-    beyond = _together(high - middle, upper - middle, shared) if found < trials else np.inf
+    below = _together(middle - low, middle - lower, shared) if above_cut else np.inf
+    beyond = _together(high - middle, upper - middle, shared) if above_cut < trials else np.inf
     ends = (float(special.ndtr(end)) for end in (middle - below, middle + beyond))
-    value = found / trials
+    value = above_cut / trials
     return Interval(value, min(next(ends), value), max(next(ends), value))
 
 

@@ -66,9 +66,9 @@ class QuadraticForm:
             return float(ncx2.sf(value, self.weight.size, np.sum(self.shift**2)))
         if self.effective_terms >= MANY and abs(value - self.mean) <= NEAR * self.std:
             u, size, phase = self._near
-            found = 0.5 + float(np.sum(size * np.sin(phase - u * value))) / np.pi
-            if found >= RARE:
-                return min(found, 1.0)
+            above = 0.5 + float(np.sum(size * np.sin(phase - u * value))) / np.pi
+            if above >= RARE:
+                return min(above, 1.0)
         upper = value > self.mean
         tail = float(np.exp(self._squares.tail(value / self._squares.unit, upper=upper)[0]))
         return tail if upper else 1.0 - tail

@@ -72,11 +72,11 @@ class Squares:
         scale = 1.0 / np.sqrt(self._slope(left, 2) + 1.0 / (0.5 - gap) ** 2)
         top = float(self._exponent(np.array([gap + 0j]), value, upper)[0].real)
         while True:
-            found = self._integral(value, upper, (gap, bend, scale), top)
-            if found is not None:
+            mass = self._integral(value, upper, (gap, bend, scale), top)
+            if mass is not None:
                 break
             bend = bend / 4 if bend * scale > 1e-6 else 0.0
-        probability, density = found
+        probability, density = mass
         return top + float(np.log(probability / np.pi)), density / probability
 
     def quantile(self, probability: float, *, upper: bool) -> float:
@@ -90,8 +90,8 @@ class Squares:
         at = float(np.log(max(start, 1e-300)))
         low, high = -700.0, 700.0
         for _ in range(MOST_STEPS):
-            found, ratio = self.tail(float(np.exp(at)), upper=upper)
-            off = found - goal
+            mass, ratio = self.tail(float(np.exp(at)), upper=upper)
+            off = mass - goal
             if (off > 0) == upper:
                 low = at
             else:

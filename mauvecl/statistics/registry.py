@@ -31,23 +31,23 @@ def chosen(asked: Sequence[str | Linear]) -> dict[str, Statistic]:
     InputError
         If none is asked for, a name is unknown, or one's own has the name of another.
     """
-    found: dict[str, Statistic] = {}
+    named: dict[str, Statistic] = {}
     own: set[str] = set()
     for one in asked:
         if isinstance(one, str):
             if one not in STATISTICS:
                 raise InputError(f"statistic {one!r} is unknown, expected one of {', '.join(STATISTICS)}")
-            found.setdefault(one, STATISTICS[one])
+            named.setdefault(one, STATISTICS[one])
             continue
         if one.name in STATISTICS:
             raise InputError(f"statistic {one.name!r} is one of mauvecl's own, expected another name")
         if one.name in own:
             raise InputError(f"statistic {one.name!r} is given twice, expected different names")
         own.add(one.name)
-        found[one.name] = one
-    if not found:
+        named[one.name] = one
+    if not named:
         raise InputError(f"no statistic named, expected some of {', '.join(STATISTICS)}")
-    return found
+    return named
 
 
 def label(name: str) -> str:

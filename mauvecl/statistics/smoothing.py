@@ -66,9 +66,9 @@ class Smoothing:
         sigma = SMOOTHING_NM / np.sqrt(8 * np.log(2)) / float(np.median(np.diff(x.wavelength_nm)))
         step = max(int(sigma / STEPS_PER_SIGMA), 1)
         rows = _rows(n, sigma)
-        found = cls(*_places(n, step), sigma, rows[_places(n, step)[0]] * used)
-        if step == 1 or all(found._follows(flare, rows * used) for flare in flares or (x,)):
-            return found
+        smoothing = cls(*_places(n, step), sigma, rows[_places(n, step)[0]] * used)
+        if step == 1 or all(smoothing._follows(flare, rows * used) for flare in flares or (x,)):
+            return smoothing
         return cls(np.arange(n), np.eye(n), sigma, rows * used)
 
     def _follows(self, flare: Expectation, rows: Float) -> bool:

@@ -55,11 +55,11 @@ def draw(
     how = study.drawing | {"start": start, "count": count, "seed": study.run.seed}
     if scene.frames is None:
         return engine.realise(scene.expectation, out=out, **how)
-    found = np.empty((count, *scene.row), scene.dtype) if out is None else out
+    rows = np.empty((count, *scene.row), scene.dtype) if out is None else out
     single = replace(scene.expectation, n_frames=1)
     for place, frame in enumerate(scene.frames):
-        found[:, place] = engine.realise(single, first_frame=frame, **how)
-    return found
+        rows[:, place] = engine.realise(single, first_frame=frame, **how)
+    return rows
 
 
 def realise(
@@ -316,15 +316,15 @@ def verify(
                 f"store {str(store.path)!r} holds {there} chunks where its study asks for {total}, expected at most "
                 f"{MOST_MISSING} missing: choose --rows, or `mauvecl realise --resume` draws them"
             )
-        found = list(_faults_of_description(store, repair))
+        faults = list(_faults_of_description(store, repair))
         for number, chunk in enumerate(store.chunks(first, last)):
             fault = _fault(store, chunk, engine, repair, redraw)
             if fault is not None:
-                found.append(fault)
+                faults.append(fault)
             if progress is not None:
                 progress(number + 1, total)
-        found += [Fault(key, "not of this store", False) for key, own in files if not own]
-    return found
+        faults += [Fault(key, "not of this store", False) for key, own in files if not own]
+    return faults
 
 
 def _fault(store: Store, chunk: Chunk, engine: Engine | Pool | None, repair: bool, redraw: bool) -> Fault | None:
@@ -396,5 +396,5 @@ def read(path: str | Path, scene: str = "star-1/quiescent") -> Any:
     store = Store.open(path)
     there = store.scene(scene)
     group = xarray.open_zarr(store.path, group=there.group, chunks=None, consolidated=False)
-    found = group[there.name].assign_coords(wavelength=group["wavelength_nm"])
-    return found if there.frames is None else found.assign_coords(frame=group["frame"])
+    data = group[there.name].assign_coords(wavelength=group["wavelength_nm"])
+    return data if there.frames is None else data.assign_coords(frame=group["frame"])

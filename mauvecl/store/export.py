@@ -61,7 +61,7 @@ class Selection:
         if not 0 <= first < stop <= store.rows:
             raise InputError(f"rows {first}:{stop}, expected a range within 0:{store.rows}")
         chosen = [store.scene(name) for name in scenes] if scenes else store.scenes
-        found = cls(store, chosen, first, stop)
+        selection = cls(store, chosen, first, stop)
         size = sum((stop - first) * scene.row_bytes for scene in chosen)
         if size > LARGEST:
             raise InputError(
@@ -70,7 +70,7 @@ class Selection:
         for chunk in store.chunks(first, stop):
             if any(chunk.scene is s for s in chosen) and not store.has(chunk):
                 raise InputError(f"{chunk.key} is missing, expected a whole store: `mauvecl realise --resume` draws it")
-        return found
+        return selection
 
     def rows(self, scene: StoredScene) -> NDArray[Any]:
         """The spectra of one array."""

@@ -79,7 +79,7 @@ class StoredScene:
 
 def scenes(study: Study) -> list[StoredScene]:
     """What a study's store holds: every star in every cell of the sweep, without and with each of its flares."""
-    found = []
+    stored = []
     number = 0
     for at, cell in study.cells():
         for star in cell.star:
@@ -89,10 +89,10 @@ def scenes(study: Study) -> list[StoredScene]:
             # A flare's amplitude stands with its own array.
             swept = {name: value for name, value in at.items() if name != "amplitude"}
             name = titled(label(star, quiet), swept)
-            found.append(StoredScene(f"star-{number}", "quiescent", name, 0.0, quiet, chosen, swept))
+            stored.append(StoredScene(f"star-{number}", "quiescent", name, 0.0, quiet, chosen, swept))
             for k, (amplitude, x) in enumerate(zip(cell.flare.amplitudes, flares, strict=True), 1):
-                found.append(StoredScene(f"star-{number}", f"flare-{k}", name, amplitude, x, chosen, swept))
-    return found
+                stored.append(StoredScene(f"star-{number}", f"flare-{k}", name, amplitude, x, chosen, swept))
+    return stored
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,9 +164,9 @@ class Store:
                 f"store {str(path)!r} holds two studies, {str(first)!r} and {str(second)!r} differ in {keys}, "
                 "expected one study: put the right one's file back"
             )
-        found = cls(path, Study.build(toml(text, path.name), path.name))
-        found.read_digests()
-        return found
+        store = cls(path, Study.build(toml(text, path.name), path.name))
+        store.read_digests()
+        return store
 
     @cached_property
     def scenes(self) -> list[StoredScene]:
@@ -283,14 +283,14 @@ class Store:
                 continue
             for line in text.splitlines():
                 name, _, rest = line.partition(" ")
-                found, _, check = rest.partition(" ")
-                if check == _check(name, found):
-                    self.digests[f"{scene.path}/{name}"] = found
+                written, _, check = rest.partition(" ")
+                if check == _check(name, written):
+                    self.digests[f"{scene.path}/{name}"] = written
 
-    def note(self, chunk: Chunk, found: str) -> None:
+    def note(self, chunk: Chunk, digest_text: str) -> None:
         """Add a chunk's digest to its array's list."""
-        self.digests[chunk.key] = found
-        line = f"{chunk.name} {found} {_check(chunk.name, found)}\n"
+        self.digests[chunk.key] = digest_text
+        line = f"{chunk.name} {digest_text} {_check(chunk.name, digest_text)}\n"
         try:
             # One short write at the end of the file; a line cut short by a full disk is closed by the next.
             with (self.path / chunk.scene.path / DIGESTS).open("a+b", buffering=0) as file:
@@ -355,14 +355,14 @@ class Store:
         InputError
             If something else is in the folder: then nothing is removed.
         """
-        found = list(self.files())
-        other = [key for key, own in found if not own]
+        files = list(self.files())
+        other = [key for key, own in files if not own]
         if other:
             raise InputError(
                 f"store {str(self.path)!r} holds {other[0]!r}, which is not of it, expected nothing else where a store "
                 "is to be removed"
             )
-        for key, _ in sorted(found, key=lambda entry: entry[0] == "zarr.json"):
+        for key, _ in sorted(files, key=lambda entry: entry[0] == "zarr.json"):
             (self.path / key).unlink(missing_ok=True)
         for folder, _, _ in os.walk(self.path, topdown=False):
             if folder != str(self.path):
@@ -385,10 +385,10 @@ def digest(*parts: bytes | memoryview) -> str:
     """XXH3, 128 bits, of some parts together."""
     import xxhash
 
-    found = xxhash.xxh3_128()
+    hashed = xxhash.xxh3_128()
     for part in parts:
-        found.update(part)
-    return found.hexdigest()
+        hashed.update(part)
+    return hashed.hexdigest()
 
 
 def _check(*words: str) -> str:

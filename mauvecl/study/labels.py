@@ -39,11 +39,11 @@ def _coarse(x: Expectation) -> tuple[str, ...]:
     """The sentence on pixels that rounding rules, if any."""
     if float(np.min(x.read_noise_dn)) >= NOISY_DN:
         return ()
-    found = int(np.count_nonzero(~stack_is_exact(Cumulants.of(x, 1), x)))
-    if not found:
+    pixels = int(np.count_nonzero(~stack_is_exact(Cumulants.of(x, 1), x)))
+    if not pixels:
         return ()
     return (
-        f"In {found} of {x.wavelength_nm.size} pixels of {x.name} a frame has too little noise for its rounding to "
+        f"In {pixels} of {x.wavelength_nm.size} pixels of {x.name} a frame has too little noise for its rounding to "
         "whole DN to be like noise: closed forms take it for noise, and are wrong there; simulations round each frame.",
     )
 

@@ -90,11 +90,11 @@ def toml_value(text: str) -> Any:
     """A value as TOML has it; a bare word is text."""
     with parsing(f"value {shortened(text)}", "a value as TOML has it"):
         try:
-            found = tomllib.loads(f"value = {text}")
+            parsed = tomllib.loads(f"value = {text}")
         except tomllib.TOMLDecodeError:
             return text
     # Several lines would be several keys.
-    return found["value"] if len(found) == 1 else text
+    return parsed["value"] if len(parsed) == 1 else text
 
 
 def put(data: Any, path: list[str], value: Any, text: str) -> None:
