@@ -1,0 +1,1 @@
+"""Flares in time: their shapes and energies, stares at a star, what a search finds in them."""

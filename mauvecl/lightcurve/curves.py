@@ -1,0 +1,97 @@
+"""What changes slowly in a stare: a sinusoid, or a table between whose points it is linear."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.host.errors import InputError
+
+Float = NDArray[np.float64]
+
+#: Period of the flown orbit, s: 94.635 min, from the mean motion of 15.21638735 revolutions a day in the public
+#: elements of NORAD 66756, epoch 2026 day 257.
+ORBIT_S = 86_400.0 / 15.21638735
+
+
+@dataclass(frozen=True)
+class Sinusoid:
+    """amplitude * sin(2 pi t / period + phase).
+
+    Attributes
+    ----------
+    amplitude : float
+        Half of the way from its lowest to its highest.
+    period_s : float
+        That of the orbit by default.
+    phase : float
+        Radians at the start of the stare.
+    """
+
+    amplitude: float
+    period_s: float = ORBIT_S
+    phase: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite([self.amplitude, self.period_s, self.phase]).all() and self.period_s > 0):
+            raise InputError(
+                f"a sinusoid of amplitude {self.amplitude:g}, period {self.period_s:g} s and phase {self.phase:g}, "
+                "expected finite numbers and a period above 0"
+            )
+
+    def mean_over(self, start_s: Float, frame_s: float) -> Float:
+        """Its mean over each frame, shape (n_frame,)."""
+        angle = 2 * np.pi * (start_s + frame_s / 2) / self.period_s + self.phase
+        return np.asarray(self.amplitude * np.sinc(frame_s / self.period_s) * np.sin(angle))
+
+
+@dataclass(frozen=True, eq=False)
+class Table:
+    """Values at times, linear between them, level before the first and after the last.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (n,)
+        Ascending.
+    values : ndarray, shape (n,)
+    """
+
+    time_s: Float
+    values: Float
+
+    def __post_init__(self) -> None:
+        for name in ("time_s", "values"):
+            kept = np.array(getattr(self, name), np.float64)
+            kept.setflags(write=False)
+            object.__setattr__(self, name, kept)
+        if self.time_s.ndim != 1 or self.time_s.shape != self.values.shape or self.time_s.size < 2:
+            raise InputError(
+                f"a curve has {self.time_s.size} times and {self.values.size} values, expected as many, at least 2"
+            )
+        if not (np.isfinite(self.time_s).all() and np.isfinite(self.values).all()):
+            raise InputError("a curve holds a time or value that is not finite, expected numbers")
+        steps = np.diff(self.time_s)
+        if not (steps > 0).all():
+            place = int(np.argmin(steps > 0))
+            raise InputError(
+                f"a curve's times go from {self.time_s[place]:g} to {self.time_s[place + 1]:g} s, expected ascending"
+            )
+
+    def mean_over(self, start_s: Float, frame_s: float) -> Float:
+        """Its mean over each frame, shape (n_frame,): exact, by the integral of what is linear between points."""
+        return np.asarray((self._until(start_s + frame_s) - self._until(start_s)) / frame_s)
+
+    def _until(self, t: Float) -> Float:
+        """Integral from the first point to a time, shape of t."""
+        time, value = self.time_s, self.values
+        slope = np.diff(value) / np.diff(time)
+        areas = np.concatenate([[0.0], np.cumsum(np.diff(time) * (value[1:] + value[:-1]) / 2)])
+        k = np.clip(np.searchsorted(time, t, side="right") - 1, 0, time.size - 2)
+        past = np.clip(t, time[0], time[-1]) - time[k]
+        inside = areas[k] + past * (value[k] + slope[k] * past / 2)
+        return np.asarray(inside + np.minimum(t - time[0], 0) * value[0] + np.maximum(t - time[-1], 0) * value[-1])
+
+
+Curve = Sinusoid | Table

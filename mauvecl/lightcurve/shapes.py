@@ -1,0 +1,361 @@
+"""Shapes of flares in time, as published: the excess over the quiescent flux for an amplitude of one.
+
+Times are tau = (t - peak) / half_width, "half width" being the scale t_1/2 of each publication, which is not the
+shape's own width at half of its peak: that is `Shape.width`. Integrals are closed forms.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, ClassVar
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy import special
+from scipy.optimize import brentq
+
+from mauvecl.host.errors import InputError
+from mauvecl.host.files.bounded import shortened
+
+Float = NDArray[np.float64]
+
+
+class Shape(ABC):
+    """The course of a flare, in units of amplitude and half width."""
+
+    #: As studies and flags have it, and where it was published.
+    name: str
+    source: str
+
+    @abstractmethod
+    def at(self, tau: ArrayLike) -> Float:
+        """Its value, shape of tau."""
+
+    @abstractmethod
+    def before(self, tau: ArrayLike) -> Float:
+        """Its integral from the beginning, in half widths, shape of tau."""
+
+    @abstractmethod
+    def after(self, tau: ArrayLike) -> Float:
+        """Its integral to the end, in half widths, shape of tau: keeps its digits where little is left."""
+
+    @property
+    @abstractmethod
+    def peak_at(self) -> float:
+        """Where its peak is, tau."""
+
+    @property
+    @abstractmethod
+    def square_integral(self) -> float:
+        """Integral of the square, in half widths: a matched filter's S/N grows as its root."""
+
+    @cached_property
+    def peak(self) -> float:
+        """Its highest value; not one where a publication's amplitude is something else."""
+        return float(self.at(self.peak_at))
+
+    @cached_property
+    def equivalent_duration(self) -> float:
+        """Its whole integral, in half widths."""
+        return float(self.before(0.0) + self.after(0.0))
+
+    @cached_property
+    def width(self) -> float:
+        """The time that it is above half of its peak, in half widths."""
+        half, at = self.peak / 2, self.peak_at
+        reach = 1.0
+        while float(self.at(at + reach)) > half:
+            reach *= 2
+        back = 1.0
+        while float(self.at(at - back)) > half:
+            back *= 2
+        return float(
+            brentq(lambda t: float(self.at(t)) - half, at, at + reach, xtol=1e-13)
+            - brentq(lambda t: float(self.at(t)) - half, at - back, at, xtol=1e-13)
+        )
+
+    def integral(self, first: ArrayLike, last: ArrayLike) -> Float:
+        """Its integral from one tau to another, elementwise, in half widths."""
+        first, last = np.asarray(first, np.float64), np.asarray(last, np.float64)
+        # Of two large integrals the difference has no digits: each side of the peak by what is left on that side.
+        late = first > 0
+        return np.asarray(
+            np.where(
+                late,
+                self.after(np.where(late, first, 0.0)) - self.after(np.maximum(last, 0.0)),
+                np.where(
+                    last <= 0,
+                    self.before(np.minimum(last, 0.0)) - self.before(np.minimum(first, 0.0)),
+                    self.before(0.0)
+                    - self.before(np.minimum(first, 0.0))
+                    + self.after(0.0)
+                    - self.after(np.maximum(last, 0.0)),
+                ),
+            )
+        )
+
+    def mean_over(self, edges_s: ArrayLike, peak_s: ArrayLike, t_half_s: ArrayLike) -> Float:
+        """Its mean over each frame, exact.
+
+        Parameters
+        ----------
+        edges_s : array_like, shape (n_frame + 1,) or (n_frame, 2)
+            Edges of frames that follow each other, or the start and end of each.
+        peak_s, t_half_s : array_like
+            When tau is 0, and the half width, s; shape (n, 1) gives a row to each.
+
+        Returns
+        -------
+        ndarray, shape (n_frame,), or (n, n_frame)
+        """
+        edges = np.asarray(edges_s, np.float64)
+        start, end = (edges[:, 0], edges[:, 1]) if edges.ndim == 2 else (edges[:-1], edges[1:])
+        peak, scale = np.asarray(peak_s, np.float64), np.asarray(t_half_s, np.float64)
+        return np.asarray(self.integral((start - peak) / scale, (end - peak) / scale) * scale / (end - start))
+
+
+class Davenport2014(Shape):
+    """A polynomial rise within one half width, two exponentials after it.
+
+    Davenport et al. 2014, ApJ 797, 122 (doi 10.1088/0004-637X/797/2/122). It begins with a step to 0.005, and steps
+    down by 0.008 at its peak.
+    """
+
+    name = "davenport2014"
+    source = "Davenport et al. 2014, doi 10.1088/0004-637X/797/2/122"
+    RISE: ClassVar = np.polynomial.Polynomial([1.0, 1.94053, -0.175084, -2.24588, -1.12498])
+    DECAY: ClassVar = ((0.689008, 1.60053), (0.302963, 0.278318))
+
+    def at(self, tau: ArrayLike) -> Float:
+        t = np.asarray(tau, np.float64)
+        rise = np.where((t > -1) & (t <= 0), self.RISE(np.clip(t, -1, 0)), 0.0)
+        late = np.maximum(t, 0.0)
+        return np.asarray(np.where(t > 0, sum(a * np.exp(-b * late) for a, b in self.DECAY), rise))
+
+    def before(self, tau: ArrayLike) -> Float:
+        t = np.asarray(tau, np.float64)
+        rise = self.RISE.integ(lbnd=-1)(np.clip(t, -1, 0))
+        late = np.maximum(t, 0.0)
+        return np.asarray(rise + sum(-a / b * np.expm1(-b * late) for a, b in self.DECAY))
+
+    def after(self, tau: ArrayLike) -> Float:
+        t = np.asarray(tau, np.float64)
+        primitive, late = self.RISE.integ(lbnd=-1), np.maximum(t, 0.0)
+        rise = primitive(0.0) - primitive(np.clip(t, -1, 0))
+        return np.asarray(rise + sum(a / b * np.exp(-b * late) for a, b in self.DECAY))
+
+    @property
+    def peak_at(self) -> float:
+        return 0.0
+
+    @cached_property
+    def square_integral(self) -> float:
+        rise = (self.RISE**2).integ(lbnd=-1)(0.0)
+        return float(rise + sum(a * c / (b + d) for a, b in self.DECAY for c, d in self.DECAY))
+
+
+class TovarMendoza2022(Shape):
+    """A Gaussian convolved with two exponentials, without a kink; its "amplitude" is not its peak.
+
+    Tovar Mendoza et al. 2022, AJ 164, 17 (doi 10.3847/1538-3881/ac6fe6). With g' = Gaussian - D g its integral is a
+    closed form.
+    """
+
+    name = "tovarmendoza2022"
+    source = "Tovar Mendoza et al. 2022, doi 10.3847/1538-3881/ac6fe6"
+    A, B, C = 0.9687734504375167, -0.251299705922117, 0.22675974948468916
+    #: Share and rate of each exponential.
+    DECAY: ClassVar = ((0.12695865022878844, 0.15551880775110513), (1 - 0.12695865022878844, 1.2150539528490194))
+    #: The Gaussian's height: the publication's form has the factor exp((B / C)^2) beside its convolution.
+    HEIGHT = A * float(np.exp((B / C) ** 2))
+
+    def _part(self, tau: Float, rate: float) -> Float:
+        """The Gaussian convolved with one exponential: the scaled erfcx where the plain product would overflow."""
+        z = (self.B - tau) / self.C
+        u = z + self.C * rate / 2
+        early = np.exp(-(z**2)) * special.erfcx(np.maximum(u, 0.0))
+        exponent = rate * (self.B - tau) + (rate * self.C / 2) ** 2
+        late = np.exp(np.where(u > 0, 0.0, exponent)) * special.erfc(np.minimum(u, 0.0))
+        return np.asarray(np.sqrt(np.pi) / 2 * self.HEIGHT * self.C * np.where(u > 0, early, late))
+
+    def _gaussian(self, z: Float) -> Float:
+        """The Gaussian's integral beyond z of its widths."""
+        return np.asarray(np.sqrt(np.pi) / 2 * self.HEIGHT * self.C * special.erfc(z))
+
+    def at(self, tau: ArrayLike) -> Float:
+        t = np.asarray(tau, np.float64)
+        return np.asarray(sum(share * self._part(t, rate) for share, rate in self.DECAY))
+
+    def before(self, tau: ArrayLike) -> Float:
+        t = np.asarray(tau, np.float64)
+        until = self._gaussian((self.B - t) / self.C)
+        return np.asarray(sum(share / rate * (until - self._part(t, rate)) for share, rate in self.DECAY))
+
+    def after(self, tau: ArrayLike) -> Float:
+        t = np.asarray(tau, np.float64)
+        rest = self._gaussian((t - self.B) / self.C)
+        return np.asarray(sum(share / rate * (rest + self._part(t, rate)) for share, rate in self.DECAY))
+
+    @cached_property
+    def peak_at(self) -> float:
+        def slope(tau: float) -> float:
+            gaussian = self.HEIGHT * np.exp(-(((tau - self.B) / self.C) ** 2))
+            return float(sum(s * (gaussian - rate * self._part(np.asarray(tau), rate)) for s, rate in self.DECAY))
+
+        return float(brentq(slope, -0.5, 0.5, xtol=1e-15))
+
+    @cached_property
+    def square_integral(self) -> float:
+        # Correlation of the Gaussian with itself times that of two exponentials, over all lags.
+        def lags(rate: float) -> Any:
+            return self.C * np.sqrt(np.pi / 2) * special.erfcx(rate * self.C / np.sqrt(2))
+
+        gaussian = self.HEIGHT**2 * self.C * np.sqrt(np.pi / 2)
+        pairs = [(f * g, c, d) for f, c in self.DECAY for g, d in self.DECAY]
+        return float(sum(share * gaussian * (lags(c) + lags(d)) / (c + d) for share, c, d in pairs))
+
+
+class Fiducial(Shape):
+    """A boxcar of two thirds of the fluence, and an exponential of one third: the fiducial flare of the MUSCLES survey.
+
+    Loyd et al. 2018, ApJ 867, 71 (doi 10.3847/1538-4357/aae2bd). It rises at tau = 0; its half width is its width at
+    half of its peak. How high and long it is for an equivalent duration is `Fiducial.of`.
+    """
+
+    name = "fiducial"
+    source = "Loyd et al. 2018, doi 10.3847/1538-4357/aae2bd"
+    #: Lengths of boxcar and exponential, in half widths: the exponential's is half of the boxcar's.
+    BOX = 1 / (1 + float(np.log(2)) / 2)
+    FOLD = BOX / 2
+
+    @classmethod
+    def of(cls, equivalent_duration_s: float) -> tuple[float, float]:
+        """Amplitude and half width, s, of the fiducial flare of an equivalent duration, s: height 0.3 (delta/s)^0.6."""
+        if not (np.isfinite(equivalent_duration_s) and equivalent_duration_s > 0):
+            raise InputError(f"equivalent duration = {equivalent_duration_s:g} s, expected a time above 0")
+        height = 0.3 * equivalent_duration_s**0.6
+        return height, equivalent_duration_s / 1.5 / height / cls.BOX
+
+    def at(self, tau: ArrayLike) -> Float:
+        t = np.asarray(tau, np.float64)
+        return np.asarray(np.where(t < 0, 0.0, np.exp(-np.maximum(t - self.BOX, 0.0) / self.FOLD)))
+
+    def before(self, tau: ArrayLike) -> Float:
+        t = np.asarray(tau, np.float64)
+        late = np.maximum(t - self.BOX, 0.0)
+        return np.asarray(np.clip(t, 0.0, self.BOX) - self.FOLD * np.expm1(-late / self.FOLD))
+
+    def after(self, tau: ArrayLike) -> Float:
+        t = np.asarray(tau, np.float64)
+        late = np.maximum(t - self.BOX, 0.0)
+        return np.asarray(self.BOX - np.clip(t, 0.0, self.BOX) + self.FOLD * np.exp(-late / self.FOLD))
+
+    @property
+    def peak_at(self) -> float:
+        return 0.0
+
+    @property
+    def square_integral(self) -> float:
+        return self.BOX + self.FOLD / 2
+
+    @cached_property
+    def width(self) -> float:
+        return self.BOX + self.FOLD * float(np.log(2))
+
+
+@dataclass(frozen=True, eq=False)
+class TableShape(Shape):
+    """A shape of one's own: linear between its points, zero outside them, scaled to a peak of one.
+
+    Attributes
+    ----------
+    tau : ndarray, shape (n,)
+        Ascending; in half widths, or in seconds for a half width of 1 s.
+    values : ndarray, shape (n,)
+        At least 0, with one above it; scaled so that the largest is 1.
+    name, source : str
+    """
+
+    tau: Float
+    values: Float
+    name: str = "table"
+    source: str = "a table of one's own"
+
+    def __post_init__(self) -> None:
+        tau, values = np.array(self.tau, np.float64), np.array(self.values, np.float64)
+        told = f"the flare shape {shortened(self.name)}"
+        if tau.ndim != 1 or tau.shape != values.shape or tau.size < 2:
+            raise InputError(f"{told} has {tau.size} times and {values.size} values, expected as many, at least 2")
+        if not (np.isfinite(tau).all() and (np.diff(tau) > 0).all()):
+            raise InputError(f"{told} has times that do not ascend, expected finite ones in ascending order")
+        if not (np.isfinite(values).all() and values.min() >= 0 and values.max() > 0):
+            raise InputError(
+                f"{told} has values from {values.min():g} to {values.max():g}, expected finite ones of at least 0, "
+                "some above it"
+            )
+        values = values / values.max()
+        for name, array in (("tau", tau), ("values", values)):
+            array.setflags(write=False)
+            object.__setattr__(self, name, array)
+
+    def at(self, tau: ArrayLike) -> Float:
+        return np.asarray(np.interp(np.asarray(tau, np.float64), self.tau, self.values, left=0.0, right=0.0))
+
+    def before(self, tau: ArrayLike) -> Float:
+        x, y = self.tau, self.values
+        t = np.clip(np.asarray(tau, np.float64), x[0], x[-1])
+        steps = np.diff(x)
+        areas = np.concatenate([[0.0], np.cumsum(steps * (y[1:] + y[:-1]) / 2)])
+        k = np.clip(np.searchsorted(x, t, side="right") - 1, 0, x.size - 2)
+        past = t - x[k]
+        return np.asarray(areas[k] + past * (y[k] + (y[k + 1] - y[k]) / steps[k] * past / 2))
+
+    def after(self, tau: ArrayLike) -> Float:
+        mirrored = TableShape(-self.tau[::-1], self.values[::-1])
+        return mirrored.before(-np.asarray(tau, np.float64))
+
+    @cached_property
+    def peak_at(self) -> float:
+        return float(self.tau[int(np.argmax(self.values))])
+
+    @cached_property
+    def square_integral(self) -> float:
+        a, b = self.values[:-1], self.values[1:]
+        return float(np.sum(np.diff(self.tau) * (a * a + a * b + b * b) / 3))
+
+    @cached_property
+    def width(self) -> float:
+        # Several peaks are above half of the highest several times.
+        a, b = self.values[:-1] - 0.5, self.values[1:] - 0.5
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = np.where(a * b < 0, np.maximum(a, b) / np.abs(b - a), (a + b >= 0) & (np.minimum(a, b) >= 0))
+        return float(np.sum(np.diff(self.tau) * share))
+
+
+#: Published shapes by name.
+SHAPES: dict[str, Shape] = {shape.name: shape for shape in (Davenport2014(), TovarMendoza2022(), Fiducial())}
+
+
+def shape_of(given: Shape | str) -> Shape:
+    """A shape, by name or as it is.
+
+    Raises
+    ------
+    InputError
+        For a name that is none.
+    """
+    if isinstance(given, Shape):
+        return given
+    if given not in SHAPES:
+        raise InputError(f"flare shape {shortened(str(given))} is unknown, expected one of {', '.join(SHAPES)}")
+    return SHAPES[given]
+
+
+def half_width_of_altaipony(duration: float, shape: Shape | str) -> float:
+    """The half width that AltaiPony's argument ``dur`` means, in the same unit.
+
+    Its `davenport2014` takes half of ``dur`` for t_1/2, its `mendoza2022` all of it (AltaiPony 2.1.2).
+    """
+    return duration / 2 if shape_of(shape).name == "davenport2014" else duration

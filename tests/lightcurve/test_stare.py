@@ -1,0 +1,106 @@
+"""Stares: frames and gaps, curves over frames, what is not known of them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.integrate import quad
+
+from mauvecl.host.errors import InputError
+from mauvecl.lightcurve.curves import ORBIT_S, Sinusoid, Table
+from mauvecl.lightcurve.stare import Stare, StareUnknown
+
+
+def test_frames_and_gaps():
+    stare = Stare.of(5998, gaps=[(1000, 2000), (3001, 3004.9)])
+    assert stare.n_frames == 1200 - 200 - 1
+    assert stare.duration_s == 6000.0
+    assert stare.observed_s == 5 * stare.n_frames
+    np.testing.assert_array_equal(stare.gtis, [[0, 1000], [2000, 3000], [3005, 6000]])
+    np.testing.assert_array_equal(stare.numbers * 5.0, stare.start_s)
+    assert not stare.start_s.flags.writeable
+
+
+def test_a_star_month_is_a_few_numbers_a_frame():
+    stare = Stare.of(30 * 86_400, thermal=1.0, drifts={"temperature": 0.01})
+    assert stare.n_frames == 518_400
+    held = sum(a.nbytes for a in (stare.start_s, stare.star, stare.light, stare.sky, stare.temperature_c))
+    assert held + stare.unknowns[0].curve.nbytes == 6 * 8 * 518_400
+
+
+@pytest.mark.parametrize(
+    "curve", [Sinusoid(0.3, 400.0, 1.0), Table(np.array([20.0, 33.0, 36.0, 90.0]), np.array([1.0, -2.0, 5.0, 0.5]))]
+)
+def test_curves_are_means_over_frames(curve):
+    def at(t):
+        if isinstance(curve, Sinusoid):
+            return curve.amplitude * np.sin(2 * np.pi * t / curve.period_s + curve.phase)
+        return np.interp(t, curve.time_s, curve.values)
+
+    start = np.arange(0.0, 120.0, 5.0)
+    exact = [quad(at, t, t + 5.0, points=[20.0, 33.0, 36.0, 90.0])[0] / 5.0 for t in start]
+    np.testing.assert_allclose(curve.mean_over(start, 5.0), exact, atol=1e-12)
+
+
+def test_known_conditions_and_unknowns():
+    stare = Stare.of(
+        ORBIT_S,
+        thermal=0.5,
+        temperature_c=13.0,
+        variability=Table(np.array([0.0, 6000.0]), np.array([0.0, 0.06])),
+        jitters={"light": 0.02, "temperature": 0.01},
+        offsets={"sky": 0.1},
+        drifts={"light": 0.01},
+        cycles={"temperature": 0.3},
+    )
+    assert np.ptp(stare.temperature_c) == pytest.approx(1.0, abs=1e-4)
+    assert stare.temperature_c.mean() == pytest.approx(13.0, abs=1e-3)
+    np.testing.assert_allclose(stare.star, 1 + 1e-5 * stare.middle_s)
+    np.testing.assert_array_equal(stare.sky, 1.0)
+    assert stare.jitters == {"light": 0.02, "sky": 0.0, "temperature": 0.01}
+    named = {unknown.name: unknown for unknown in stare.unknowns}
+    assert list(named) == ["sky offset", "light drift", "temperature sine", "temperature cosine"]
+    drift = named["light drift"].curve
+    assert drift.sum() == pytest.approx(0.0, abs=1e-9)
+    assert np.ptp(drift) == pytest.approx((stare.n_frames - 1) * 5 / 3600)
+    sine, cosine = named["temperature sine"].curve, named["temperature cosine"].curve
+    np.testing.assert_allclose(sine**2 + cosine**2, 1.0, atol=1e-5)
+
+
+def test_the_dark_follows_the_instruments_law():
+    from types import SimpleNamespace
+
+    stare = Stare.of(50.0, thermal=Table(np.array([0.0, 50.0]), np.array([1.0, 1.0])))
+    quiet = SimpleNamespace(conditions={"dark_slope_per_c": 0.0684, "temperature_c": 21.0})
+    np.testing.assert_allclose(stare.dark_factor(quiet), np.exp(0.0684))
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda: Stare.of(-5), "a stare of -5 s in frames of 5 s"),
+        (lambda: Stare.of(1e12), "expected at most 134217728"),
+        (lambda: Stare.of(100, gaps=[(0, 100)]), "the gaps leave no frame"),
+        (lambda: Stare.of(100, gaps=[(50, 40)]), "a gap from 50 to 40 s"),
+        (lambda: Stare.of(100, jitters={"star": 0.1}), "a jitter of 'star'"),
+        (lambda: Stare.of(100, jitters={"light": 0.5}), "light jitter has the standard deviation 0.5, expected 0"),
+        (lambda: Stare.of(86_400, drifts={"light": 0.05}), "light drift has the standard deviation"),
+        (lambda: Stare.of(100, offsets={"dark": 0.1}), "the unknown 'dark offset' is of 'dark'"),
+        (lambda: Stare.of(100, variability=Sinusoid(2.0)), None),
+        (lambda: Stare.of(6000, variability=Sinusoid(2.0)), "the factor on the star of frame"),
+        (lambda: Stare.of(100, orbit_s=0.0), "orbit_s = 0"),
+        (lambda: Sinusoid(1.0, -3.0), "a sinusoid of amplitude 1, period -3 s"),
+        (lambda: Table(np.array([1.0, 1.0]), np.zeros(2)), "times go from 1 to 1 s"),
+        (lambda: Table(np.array([1.0, 2.0]), np.zeros(3)), "2 times and 3 values"),
+        (lambda: Table(np.array([1.0, 2.0]), np.array([0.0, np.nan])), "not finite"),
+        (lambda: StareUnknown("x", "light", 0.0, np.ones(2)), "the x has the standard deviation 0, expected above 0"),
+        (lambda: Stare(np.array([0.0, 7.0]), 5.0, *[np.ones(2)] * 4), "ascending multiples of 5 s"),
+        (lambda: Stare(np.array([0.0, 5.0]), 5.0, *[np.ones(3)] * 4), "star of the stare has the shape"),
+    ],
+)  # fmt: skip
+def test_what_is_no_stare(make, told):
+    if told is None:
+        make()
+        return
+    with pytest.raises(InputError, match=told):
+        make()
