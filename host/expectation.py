@@ -6,7 +6,7 @@ import html
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import astropy.units as u
 import numpy as np
@@ -32,6 +32,10 @@ CUT_SIGMA = 8.0
 DAY_S = 86_400.0
 #: Frames of an exposure, at most: a day of 5 ms each, a thousandth of the payload's.
 MOST_FRAMES = 2**24
+#: What counts as signal: the star's light alone, to which the sky adds noise; or the zodiacal light too, as in the
+#: MauveSim paper.
+Signal = Literal["net", "paper"]
+SIGNALS: tuple[Signal, ...] = get_args(Signal)
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,6 +74,9 @@ class Expectation:
         ``pointing_loss``.
     messages : tuple of str
         What the user must be told, saturation first.
+    signal : {"net", "paper"}
+        What counts as signal: the star alone, the sky being subtracted as bias and dark are, its noise left; or, as in
+        the MauveSim paper, the zodiacal light too. The noise is the same.
     """
 
     wavelength_nm: Float
@@ -92,6 +99,7 @@ class Expectation:
     photon_noise: Literal["gaussian", "poisson"] = "gaussian"
     conditions: Mapping[str, float] = field(default_factory=dict)
     messages: tuple[str, ...] = ()
+    signal: Signal = "net"
 
     def to_specutils(self) -> Any:
         """The mean net signal of the exposure, DN, with its standard deviation, as a specutils Spectrum.
@@ -125,6 +133,8 @@ class Expectation:
         )
 
     def __post_init__(self) -> None:
+        if self.signal not in SIGNALS:
+            raise InputError(f"signal = {self.signal!r}, expected 'net' or 'paper'")
         for each in fields(self):
             value = getattr(self, each.name)
             if isinstance(value, np.ndarray):
@@ -158,12 +168,30 @@ class Expectation:
         return self.n_frames * self.gain_dn_per_electron * (self.source_electrons + self.sky_electrons)
 
     @cached_property
-    def signal_dn(self) -> Float:
-        """Mean net signal of the exposure as recorded, source and sky, DN, shape (n_pixel,).
+    def sky_dn(self) -> Float:
+        """Mean light of the sky in the exposure, DN, shape (n_pixel,)."""
+        return self.n_frames * self.gain_dn_per_electron * self.sky_electrons
 
-        `light_dn` less what saturation cuts off.
-        """
+    @cached_property
+    def recorded_light_dn(self) -> Float:
+        """Mean light of the exposure as recorded, source and sky, DN: `light_dn` less what saturation cuts off."""
         return self.light_dn - self._cut[0]
+
+    @cached_property
+    def subtracted_dn(self) -> Float:
+        """What an observer subtracts of the exposure beside bias and dark, DN, shape (n_pixel,).
+
+        The sky's mean, or nothing where the sky counts as signal.
+        """
+        return self.sky_dn if self.signal == "net" else np.zeros_like(self.sky_dn)
+
+    @cached_property
+    def signal_dn(self) -> Float:
+        """Mean signal of the exposure as recorded, DN, shape (n_pixel,).
+
+        The star's: `recorded_light_dn` less the sky's mean; with the sky's where `signal` is ``paper``.
+        """
+        return self.recorded_light_dn - self.subtracted_dn
 
     @cached_property
     def mean_raw_dn(self) -> Float:
@@ -202,10 +230,10 @@ class Expectation:
 
     @cached_property
     def _noise_dn2(self) -> Float:
-        return self._noise_of(self.signal_dn)
+        return self._noise_of(self.recorded_light_dn)
 
-    def _noise_of(self, signal_dn: Float) -> Float:
-        photon = self.gain_dn_per_electron * signal_dn
+    def _noise_of(self, light_dn: Float) -> Float:
+        photon = self.gain_dn_per_electron * light_dn
         return photon + self.n_frames * (self.read_noise_dn**2 + self.dark_variance_dn2)
 
     @cached_property
@@ -234,8 +262,9 @@ class Expectation:
     def snr(self) -> Float:
         """Signal to noise per pixel, shape (n_pixel,).
 
-        S / sqrt(sigma_S^2 + sigma_R^2 + sigma_D^2) of the paper, all in DN, with S the net signal, zodiacal light
-        included as there, and sigma_S the gain times the root of its electrons. Without the ADC's rounding.
+        S / sqrt(sigma_L^2 + sigma_R^2 + sigma_D^2), all in DN, with S the star's net signal and sigma_L the gain times
+        the root of all electrons of light, the sky's among them. Without the ADC's rounding. Where `signal` is
+        ``paper``, S holds the zodiacal light as well.
         """
         return _ratio(self.signal_dn, self._noise_dn2)
 
@@ -260,7 +289,7 @@ class Expectation:
 
         n, gain = self.n_frames, self.gain_dn_per_electron
         # One, but for what saturation cuts off.
-        kept = np.divide(self.signal_dn, self.light_dn, out=np.ones_like(gain), where=self.light_dn > 0)
+        kept = np.divide(self.recorded_light_dn, self.light_dn, out=np.ones_like(gain), where=self.light_dn > 0)
         variances = {
             "source_photon": n * gain**2 * self.source_electrons * kept,
             "zodiacal_photon": n * gain**2 * self.sky_electrons * kept,
@@ -323,6 +352,7 @@ def expect(
     exposure: u.Quantity | float,
     sky: Sky | None = None,
     order: Order = "paper",
+    signal: Signal = "net",
 ) -> Expectation:
     """What an instrument expects of a source: deterministic, nothing is drawn.
 
@@ -337,6 +367,8 @@ def expect(
         None by default.
     order : {"paper", "physical"}
         Whether efficiencies act after the line function or before; see `response_matrix`.
+    signal : {"net", "paper"}
+        What counts as signal in an S/N: the star alone, or the zodiacal light too, as in the MauveSim paper.
 
     Raises
     ------
@@ -397,6 +429,7 @@ def expect(
         element=element,
         element_wavelength_nm=element_wavelength,
         photon_noise=instrument.photon_noise,
+        signal=signal,
         adc_max_dn=instrument.adc_max_dn,
         saturation_dn=instrument.saturation_dn,
         conditions={
@@ -418,6 +451,7 @@ def expect(
             "instrument digest": instrument.digest,
             "detector temperature": f"{instrument.temperature_c:g} C",
             "order": order,
+            "signal": signal,
             "requested exposure": f"{asked_s:g} s",
             "exposure": f"{n_frames} x {instrument.frame_s:g} s",
         },
@@ -425,6 +459,8 @@ def expect(
     messages = [*_saturation(plain), *(f"{source.name}: {text}." for text in source.told)]
     drawn = np.sqrt(plain.variance_dn2) / (n_frames * plain.gain_dn_per_electron)
     messages += below_zero(source, instrument, electrons, drawn, order)
+    if signal == "paper" and plain.sky_electrons.any():
+        messages.append("S/N counts the zodiacal light as signal, as the MauveSim paper does.")
     if n_frames * instrument.frame_s > asked_s * (1 + 1e-9):
         messages.append(
             f"The exposure of {asked_s:g} s is rounded up to {plain.exposure_s:g} s, "

@@ -97,6 +97,8 @@ void histogram(SCENE, const uint first_low, const uint first_high, const uint st
 % endif
             }
         }
+        /* The sky is no signal, but its photons are noise. */
+        signal -= (floatv)element.sky;
         /* Zero where the observer knows of no noise. */
         floatv ratio = variance > 0.0f ? signal / root(variance) : (floatv)0.0f;
         floatv steps = (ratio - element.centre) * element.bins_per_unit;

@@ -56,7 +56,7 @@ def unknown_cost(of: str, quiet: Expectation, flare: Expectation, study: Study) 
     unknown = _chosen(study).marginalised(quiet)
     used, comparison, matched = ~quiet.saturated, study.run.comparison(), Matched()
     plain = Setting(quiet, used, comparison)
-    delta = np.where(used, flare.signal_dn - quiet.signal_dn, 0.0)
+    delta = np.where(used, flare.recorded_light_dn - quiet.recorded_light_dn, 0.0)
     if unknown is None or not delta.any():
         return Cost(of, 0.0, 0.0, 0.0)
     weights = matched.plain_weights(plain, flare)

@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from mauvecl.cli.console import short
-from mauvecl.cli.flags import DETECTION, DRAWS, FLARE, NUISANCES, SWEEP, TEMPLATE, takes_study
+from mauvecl.cli.flags import COUNTED, DETECTION, DRAWS, FLARE, NUISANCES, SWEEP, TEMPLATE, takes_study
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -90,7 +90,7 @@ def _show_departures(table: QTable, fap: float) -> None:
         )  # fmt: skip
 
 
-@takes_study(DRAWS, DETECTION, SWEEP, fewer=True)
+@takes_study(DRAWS, DETECTION, COUNTED, SWEEP, fewer=True)
 def gaussian(
     study: Study,
     session: Session,

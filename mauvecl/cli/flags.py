@@ -62,6 +62,14 @@ SkyFlag = Annotated[
 ]
 TargetFlag = Annotated[str | None, typer.Option(help="Coordinates, with --time: zodiacal light.", show_default=False)]
 TimeFlag = Annotated[str | None, typer.Option("--time", help="UTC of the observation.", show_default=False)]
+SignalFlag = Annotated[
+    str | None,
+    typer.Option(
+        "--signal",
+        help="In an S/N: net (the star alone) or paper (zodiacal light counts too) [net].",
+        show_default=False,
+    ),
+]
 AmplitudeFlag = Annotated[
     list[float] | None,
     typer.Option("--amplitude", "-a", help="Flare amplitude, 0.24 is 24 %; may be repeated.", show_default=False),
@@ -273,6 +281,8 @@ DETECTION = {
 }
 NUISANCES = {"nuisance": Option(NuisanceFlag), "with_unknowns": Option(WithUnknownsFlag, "nuisances", "usual")}
 TEMPLATE = {"template": Option(TemplateFlag, "run", "template_temperatures_k")}
+#: What verbs take that tell an S/N.
+COUNTED = {"signal": Option(SignalFlag, "observation", "signal")}
 SIGNAL = {
     "snr": Option(SnrFlag, "signal", "snr"),
     "at": Option(AtFlag, "signal", "wavelength_nm"),

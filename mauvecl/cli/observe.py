@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mauvecl.cli.console import short
-from mauvecl.cli.flags import DRAWS, FLARE, SIGNAL, SWEEP, takes_study
+from mauvecl.cli.flags import COUNTED, DRAWS, FLARE, SIGNAL, SWEEP, takes_study
 
 if TYPE_CHECKING:
     from mauvecl.answers.exposures import ExposureResult
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
 
-@takes_study(FLARE, {"seed": DRAWS["seed"]}, draws=False)
+@takes_study(FLARE, COUNTED, {"seed": DRAWS["seed"]}, draws=False)
 def simulate(
     study: Study,
     session: Session,
@@ -56,12 +56,14 @@ def _budgets_or_star(given: dict[str, Any]) -> Study:
     return Study() if named else PAPER_BUDGETS
 
 
-@takes_study(DRAWS, SWEEP, fewer=True, default=_budgets_or_star)
+@takes_study(DRAWS, COUNTED, SWEEP, fewer=True, default=_budgets_or_star)
 def snr(
     study: Study,
     session: Session,
 ) -> None:
     """Distributions of the signal-to-noise ratio per pixel and per resolution element, and noise budgets.
+
+    The signal is the star's alone: the sky is subtracted, and its photons are noise (`--signal paper`: signal as well).
 
     Without arguments: the three stars of the paper's noise budgets, 50 s and 600 s.
 
@@ -107,7 +109,7 @@ def _show_snr(found: SnrAnswer) -> None:
     )
 
 
-@takes_study(SIGNAL, without="exposure", draws=False)
+@takes_study(SIGNAL, COUNTED, without="exposure", draws=False)
 def exposure(
     study: Study,
     session: Session,

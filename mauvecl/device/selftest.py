@@ -290,13 +290,13 @@ def counts_of(engine: Engine, x: Expectation, realisations: int, recipe: Any) ->
 def exact_counts(x: Expectation, first: int) -> NDArray[np.float64]:
     """Probabilities of the same bins: Poisson dark with Gaussian noise, rounded; Gaussian photons."""
     mean, step = x.dark_dn[0], x.dark_step_dn[0]
-    sd = float(np.sqrt(x.read_noise_dn[0] ** 2 + x.gain_dn_per_electron[0] * x.signal_dn[0] / x.n_frames))
+    sd = float(np.sqrt(x.read_noise_dn[0] ** 2 + x.gain_dn_per_electron[0] * x.recorded_light_dn[0] / x.n_frames))
     expected = mean / step
     reach = 9.0 * np.sqrt(expected) + 20.0
     k = np.arange(max(int(expected - reach), 0), int(expected + reach))
     p = np.exp(special.xlogy(k, expected) - expected - special.gammaln(k + 1.0))
     edges = first + np.arange(layout.OBSERVER_BINS + 1) - 0.5
-    offset = x.bias_dn[0] + x.signal_dn[0] / x.n_frames
+    offset = x.bias_dn[0] + x.recorded_light_dn[0] / x.n_frames
     u = (edges[:, None] - offset - step * k[None, :]) / sd
     below, above = special.ndtr(u) @ p, special.ndtr(-u) @ p
     return np.asarray(np.where(below[1:] < 0.5, np.diff(below), -np.diff(above)))

@@ -114,10 +114,10 @@ def components(
     for name, values in parts.items():
         table[name] = values * u.adu
     table["digitisation"] = (raw - sum(parts.values())) * u.adu
-    table["net"] = (raw - x.n_frames * (x.bias_dn + x.dark_dn)) * u.adu
+    table["net"] = (raw - x.n_frames * (x.bias_dn + x.dark_dn) - x.subtracted_dn) * u.adu
     for name in table.colnames[1:]:
         table[name].info.description = DESCRIPTIONS[name]
-    table.meta |= {"name": x.name, "exposure_s": x.exposure_s, "frames": x.n_frames, "seed": seed}
+    table.meta |= {"signal": x.signal, "name": x.name, "exposure_s": x.exposure_s, "frames": x.n_frames, "seed": seed}
     return table
 
 
@@ -149,5 +149,5 @@ DESCRIPTIONS = {
     "read_noise": "drawn read noise",
     "cosmic_rays": "drawn charge of cosmic rays",
     "digitisation": "what rounding and clipping changed",
-    "net": "raw less bias and mean dark",
+    "net": "raw less bias, mean dark and, where the signal is the star's alone, mean sky",
 }

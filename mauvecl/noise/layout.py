@@ -126,8 +126,8 @@ OBSERVER = np.dtype([("net_offset", "f4"), ("gain", "f4"), ("variance", "f4"), (
 #: variance; and the template's fraction of a DN, zero where noisy exposures take its place.
 ESTIMATE = np.dtype([("net_offset", "f4"), ("gain", "f4"), ("variance", "f4"), ("fraction", "f4")])
 
-#: A resolution element: its pixels, and the grid of its S/N's histogram.
-ELEMENT = np.dtype([("first", "u4"), ("end", "u4"), ("centre", "f4"), ("bins_per_unit", "f4")])
+#: A resolution element: its pixels, the sky subtracted of their sum, DN, and the grid of its S/N's histogram.
+ELEMENT = np.dtype([("first", "u4"), ("end", "u4"), ("sky", "f4"), ("centre", "f4"), ("bins_per_unit", "f4")])
 
 #: One histogram: which channel of values it reads, its centre, and fine steps per unit of the statistic.
 GRID = np.dtype([("channel", "u4"), ("centre", "f4"), ("steps_per_unit", "f4")])

@@ -36,7 +36,7 @@ def reconstruct(quiet: Expectation, flare: Expectation) -> Interval:
     `scipy.stats.chisquare` would, with the flare's mean as the expected values.
     """
     smoothing = Smoothing.of(quiet, np.ones(quiet.wavelength_nm.size, bool), (flare,))
-    delta, variance = flare.signal_dn - quiet.signal_dn, flare.variance_dn2 + quiet.variance_dn2
+    delta, variance = flare.recorded_light_dn - quiet.recorded_light_dn, flare.variance_dn2 + quiet.variance_dn2
     form = smoothing.form(smoothing.scale(flare), delta, variance)
     middle, low, high = (form.isf(p) / quiet.wavelength_nm.size for p in (0.5, 0.975, 0.025))
     return Interval(middle, low, high)

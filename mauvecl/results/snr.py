@@ -29,7 +29,7 @@ PERCENTAGES = (0.135, 2.5, 16.0, 50.0, 84.0, 97.5, 99.865)
 
 
 def observers(x: Expectation, scene: Scene) -> NDArray[np.void]:
-    """What an observer subtracts and assumes in each pixel, for the device.
+    """What an observer subtracts (bias and dark; the sky by element) and assumes in each pixel, for the device.
 
     Returns
     -------
@@ -57,10 +57,11 @@ def elements(x: Expectation) -> NDArray[np.void]:
     first = np.searchsorted(x.element, np.arange(x.element_wavelength_nm.size))
     table = np.zeros(first.size, layout.ELEMENT)
     table["first"], table["end"] = first, np.append(first[1:], x.element.size)
-    signal = x.per_element(x.signal_dn)
-    shot = x.per_element(x.gain_dn_per_electron * x.signal_dn)
+    table["sky"] = x.per_element(x.subtracted_dn)
+    signal, light = x.per_element(x.signal_dn), x.per_element(x.recorded_light_dn)
+    shot = x.per_element(x.gain_dn_per_electron * x.recorded_light_dn)
     noise = np.sqrt(shot + x.per_element(x.n_frames * (x.read_noise_dn**2 + x.dark_variance_dn2)))
-    gain = np.divide(shot, signal, out=np.zeros_like(signal), where=signal > 0)
+    gain = np.divide(shot, light, out=np.zeros_like(light), where=light > 0)
     with np.errstate(invalid="ignore", divide="ignore"):
         slope = 1.0 / noise - signal * gain / (2.0 * noise**3)
         table["centre"] = np.nan_to_num(signal / noise)
@@ -127,7 +128,7 @@ class Counts:
             first, end = int(element["first"]), int(element["end"])
             for p in range(first, end):
                 self._count_far("pixel", p, dn[p].astype(np.int64) >> int(observers[p]["bin_shift"]))
-            ratio = signal_to_noise(dn[first:end], observers[first:end])
+            ratio = signal_to_noise(dn[first:end], observers[first:end], element["sky"])
             steps = np.rint((ratio - element["centre"]) * element["bins_per_unit"])
             if not (np.abs(steps) < MOST_BINS).all():
                 raise InputError(
@@ -157,13 +158,14 @@ class Counts:
         return np.insert(outside, below, numbers), np.insert(far.counts[mine], below, counts)
 
 
-def signal_to_noise(dn: NDArray[np.integer], observers: NDArray[np.void]) -> Floats:
+def signal_to_noise(dn: NDArray[np.integer], observers: NDArray[np.void], sky: np.float32) -> Floats:
     """An element's S/N as the device sums it, shape (n,), of its pixels' DN less the scene's base, (n_pixel, n)."""
     signal, variance = (np.zeros(dn.shape[1], np.float32) for _ in range(2))
     for n, observer in zip(dn, observers, strict=True):
         net = n.astype(np.float32) + observer["net_offset"]
         signal = signal + net
         variance = variance + fma(np.maximum(net, np.float32(0.0)), observer["gain"], observer["variance"])
+    signal = signal - sky
     # Zero where the observer knows of no noise.
     return np.divide(signal, np.sqrt(variance), out=np.zeros_like(signal), where=variance > 0)
 
@@ -191,17 +193,19 @@ class SnrResult:
     def pixel(self) -> QTable:
         """S/N per pixel: wavelength, closed form, simulated mean, standard deviation, quantiles, clipped frames.
 
+        The signal is what the expectation's `signal` says: the star's, the sky's mean being subtracted.
+
         The histogram is of whole DN, of which the S/N is a function; its bins are 1/64 of a standard deviation or less.
         """
         x, seen = self.expectation, self.observers[: self.scene.n_pixel]
-        width = 2.0 ** seen["bin_shift"].astype(float)
+        width, sky = 2.0 ** seen["bin_shift"].astype(float), x.subtracted_dn
 
         def snr(which: NDArray[np.intp], place: NDArray[np.number]) -> NDArray[np.float64]:
             # A bin holds the whole DN from its lower edge to one below the next.
             dn = width[which] * place - 0.5
             net = dn + seen["net_offset"].astype(float)[which]
             noise2 = np.maximum(net, 0.0) * seen["gain"][which] + seen["variance"][which]
-            return np.asarray(np.divide(net, np.sqrt(noise2), out=np.zeros_like(net), where=noise2 > 0))
+            return np.asarray(np.divide(net - sky[which], np.sqrt(noise2), out=np.zeros_like(net), where=noise2 > 0))
 
         table = self._table("pixel", x.wavelength_nm, x.snr(), snr)
         frames = self.counts.n * x.n_frames
@@ -276,6 +280,7 @@ class SnrResult:
         table.meta["realisations"] = self.counts.n
         table.meta["exposure_s"] = self.expectation.exposure_s
         table.meta["name"] = self.expectation.name
+        table.meta["signal"] = self.expectation.signal
         return table
 
 

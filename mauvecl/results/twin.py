@@ -209,6 +209,7 @@ def histograms(
             signal = signal + net
             variance = variance + fma(np.maximum(net, np.float32(0.0)), observer["gain"], observer["variance"])
             count("pixel", p, n[p].astype(np.int64) >> int(observer["bin_shift"]))
+        signal = signal - element["sky"]
         ratio = np.divide(signal, np.sqrt(variance), out=np.zeros_like(signal), where=variance > 0)
         steps = (ratio - element["centre"]) * element["bins_per_unit"]
         count("element", e, np.rint(steps).astype(np.int64))

@@ -32,7 +32,7 @@ class Matched(LinearStatistic):
 
     def plain_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
         assert flare is not None
-        delta = np.where(setting.used, flare.signal_dn - setting.quiet.signal_dn, 0.0)
+        delta = np.where(setting.used, flare.recorded_light_dn - setting.quiet.recorded_light_dn, 0.0)
         variance = self.variance(setting)
         strength = float(np.sqrt(np.sum(delta**2 / variance)))
         return np.asarray(delta / variance / (strength or 1.0))

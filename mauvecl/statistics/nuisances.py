@@ -149,11 +149,11 @@ def spectrum_of(name: str, quiet: Expectation) -> Float:
     if name == "dark":
         return np.asarray(quiet.n_frames * quiet.dark_dn * quiet.conditions["dark_slope_per_c"])
     if name == "light":
-        return np.asarray(quiet.signal_dn)
+        return np.asarray(quiet.recorded_light_dn)
     if name == "sky":
-        return np.asarray(quiet.n_frames * quiet.gain_dn_per_electron * quiet.sky_electrons)
+        return np.asarray(quiet.sky_dn)
     if name == "tilt":
-        return np.asarray(quiet.signal_dn * (quiet.wavelength_nm - MIDDLE_NM) / TILT_NM)
+        return np.asarray(quiet.recorded_light_dn * (quiet.wavelength_nm - MIDDLE_NM) / TILT_NM)
     raise InputError(f"the unknown {name!r} has no spectrum, expected one of {', '.join(NUISANCES)} or a file")
 
 

@@ -81,7 +81,7 @@ class Smoothing:
         """One over the smoothed flare in every pixel, DN/s, for squares of DN; zero where it has no light."""
         from scipy.ndimage import gaussian_filter1d
 
-        expected = gaussian_filter1d(flare.signal_dn, self.sigma, mode="nearest")
+        expected = gaussian_filter1d(flare.recorded_light_dn, self.sigma, mode="nearest")
         return np.asarray(1.0 / np.where(expected > 0, expected, np.inf) / flare.exposure_s)
 
     def scale(self, flare: Expectation) -> Float:

@@ -132,7 +132,7 @@ class Statistic(ABC):
         -----
         Estimated variances are taken for the true ones, which is what they are on average.
         """
-        delta = np.where(setting.used, observed.signal_dn - setting.quiet.signal_dn, 0.0)
+        delta = np.where(setting.used, observed.recorded_light_dn - setting.quiet.recorded_light_dn, 0.0)
         true = observed.variance_dn2 + self.share(setting) * setting.quiet.variance_dn2
         return self.form(setting, delta, true, flare, estimated=setting.comparison.estimated)
 

@@ -84,6 +84,7 @@ class Observation(Part):
     instrument: str = "mauve"
     temperature_c: float | None = None
     order: Literal["paper", "physical"] = "paper"
+    signal: Literal["net", "paper"] = "net"
     mode: Literal["auto", "frames", "stacked"] = "auto"
     recipe: Literal["auto", "joint", "apart"] = "auto"
     changes: dict[str, float | int | str] = Field(default_factory=dict)

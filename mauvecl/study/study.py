@@ -274,7 +274,8 @@ class Study(Part):
         from mauvecl.host.expectation import expect
 
         instrument, sky, o = self.load_instrument(), self.sky.sky(), self.observation
-        return [expect(s, instrument, exposure=o.exposure_s, sky=sky, order=o.order) for s in sources]
+        how: dict[str, Any] = {"exposure": o.exposure_s, "sky": sky, "order": o.order, "signal": o.signal}
+        return [expect(s, instrument, **how) for s in sources]
 
 
 #: The paper's noise budgets (its section "Noise"): the Be star HD 37202 and both flare stars, 50 s and 600 s.

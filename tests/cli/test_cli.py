@@ -236,7 +236,7 @@ def test_the_parts_of_a_simulation_have_their_variances() -> None:
     (x,) = star(magnitude=4.0, payload=instrument(part=True))
     tables = [components(x, realisation=i, seed=4) for i in range(30)]
     gain, n = x.gain_dn_per_electron, 30 * x.wavelength_nm.size
-    photon = np.array([t["photon_noise"].value for t in tables]) / np.sqrt(gain * x.signal_dn)
+    photon = np.array([t["photon_noise"].value for t in tables]) / np.sqrt(gain * x.recorded_light_dn)
     read = np.array([t["read_noise"].value for t in tables]) / np.sqrt(x.n_frames * 144 + (x.n_frames - 1) / 12)
     for z in (photon, read):
         assert abs((z**2).sum() - n) < 5 * np.sqrt(2 * n)

@@ -5,6 +5,8 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -318,6 +320,28 @@ def test_snr_follows_the_closed_form(engine: Engine) -> None:
         for column, p in (("q16", 0.16), ("q50", 0.5), ("q97.5", 0.975)):
             normal = table["mean"] + table["std"] * stats.norm.ppf(p)
             assert np.abs((table[column] - normal)[bright] / table["std"][bright]).max() < 0.08
+
+
+@pytest.mark.parametrize("signal", ["net", "paper"])
+def test_snr_of_each_realisation_takes_the_sky_for_noise(engine: Engine, signal: Any) -> None:
+    """Against raw spectra: what is subtracted, whose photons are under the root; a sky as bright as the star."""
+    (x,) = star(magnitude=9.0, exposure=100.0, payload=instrument(part=True))
+    x = replace(x, signal=signal, sky_electrons=x.source_electrons)
+    n = 4000
+    found = engine.snr(x, realisations=n, seed=6)
+    light = engine.realise(x, count=n, seed=6) - x.n_frames * (x.bias_dn + x.dark_dn)
+    net = light - (x.sky_dn if signal == "net" else 0.0)
+    noise2 = x.gain_dn_per_electron * np.maximum(light, 0) + x.n_frames * (x.read_noise_dn**2 + x.dark_variance_dn2)
+    summed = [np.array([x.per_element(row) for row in part]) for part in (net, noise2)]
+    for table, (s, v) in ((found.pixel, (net, noise2)), (found.element, summed)):
+        direct = s / np.sqrt(v)
+        # A bin is 1/64 of a standard deviation at most, and its middle counts.
+        np.testing.assert_allclose(table["mean"], direct.mean(axis=0), atol=0.01)
+        np.testing.assert_allclose(table["std"], direct.std(axis=0), atol=0.01)
+        np.testing.assert_allclose(table["q50"], np.median(direct, axis=0), atol=0.04)
+    # Five standard errors, of some 250 means.
+    assert np.abs(found.element["mean"] - found.element["expected"]).max() < 5 / np.sqrt(n)
+    assert found.element.meta["signal"] == signal
 
 
 def test_progress_is_reported_and_may_stop(engine: Engine) -> None:

@@ -60,16 +60,41 @@ def test_signal_is_linear_in_the_light(sunlike: Source, mauve: Instrument) -> No
     assert not faint.sky_electrons.any()
 
 
-def test_closed_form_signal_to_noise(quiet: Expectation) -> None:
-    # The paper's equation for one pixel, by hand: 10 frames, noise added in quadrature.
-    p = 900
-    electrons = 10 * (quiet.source_electrons[p] + quiet.sky_electrons[p])
-    signal = 0.5957818 * electrons
-    noise = np.sqrt((0.5957818 * np.sqrt(electrons)) ** 2 + 10 * 12.0**2 + 10 * 445.5337 * 5)
-    assert quiet.signal_dn[p] == pytest.approx(signal, rel=1e-6)
-    assert quiet.snr()[p] == pytest.approx(signal / noise, rel=1e-6)
-    assert quiet.variance_dn2[p] == pytest.approx(noise**2 + 10 / 12, rel=1e-6)
-    assert quiet.mean_raw_dn[p] == pytest.approx(signal / 10 + 445.5337 * 5 + 600, rel=1e-6)
+@pytest.mark.parametrize("signal", ["net", "paper"])
+def test_closed_form_signal_to_noise(quiet: Expectation, signal: Any) -> None:
+    # One pixel by hand: 10 frames, noise added in quadrature; the paper counts the zodiacal light as signal.
+    p, x = 900, replace(quiet, signal=signal)
+    star, sky = 10 * x.source_electrons[p], 10 * x.sky_electrons[p]
+    assert sky > 0.005 * star
+    counted = 0.5957818 * (star + sky if signal == "paper" else star)
+    light = 0.5957818 * (star + sky)
+    noise = np.sqrt((0.5957818 * np.sqrt(star + sky)) ** 2 + 10 * 12.0**2 + 10 * 445.5337 * 5)
+    assert x.signal_dn[p] == pytest.approx(counted, rel=1e-6)
+    assert x.recorded_light_dn[p] == pytest.approx(light, rel=1e-6)
+    assert x.snr()[p] == pytest.approx(counted / noise, rel=1e-6)
+    assert x.variance_dn2[p] == pytest.approx(noise**2 + 10 / 12, rel=1e-6)
+    assert x.mean_raw_dn[p] == pytest.approx(light / 10 + 445.5337 * 5 + 600, rel=1e-6)
+
+
+def test_the_sky_alone_has_no_signal(sunlike: Source, mauve: Instrument) -> None:
+    """A star of nothing has an S/N of nothing however bright the sky, unless the paper's convention is asked for."""
+    star = [expect(sunlike, mauve, exposure=50, sky=Sky.of_brightness(v)) for v in (22.1, 15.0)]
+    for x in star:
+        nothing = replace(x, source_electrons=np.zeros_like(x.source_electrons))
+        assert np.abs(nothing.snr()).max() < 1e-12
+        assert np.abs(nothing.snr_per_element()).max() < 1e-12
+        assert replace(nothing, signal="paper").snr().min() > 0
+        np.testing.assert_allclose(x.signal_dn, x.net_source_dn, rtol=1e-9)
+    assert (star[1].snr() < star[0].snr()).all(), "a brighter sky is noise"
+
+
+def test_the_papers_convention_is_told(sunlike: Source, mauve: Instrument) -> None:
+    sky = Sky.of_brightness(22.1)
+    told = expect(sunlike, mauve, exposure=50, sky=sky, signal="paper").messages
+    assert any("counts the zodiacal light as signal" in text for text in told)
+    assert not any("zodiacal" in text for text in expect(sunlike, mauve, exposure=50, sky=sky).messages)
+    with pytest.raises(InputError, match="signal = 'all', expected 'net' or 'paper'"):
+        expect(sunlike, mauve, exposure=50, signal="all")  # type: ignore[arg-type]
 
 
 def test_per_element(quiet: Expectation) -> None:

@@ -27,7 +27,7 @@ def total_light(engine: Engine, processes: Processes, *, exposure: float = 5.0, 
     (x,) = star(magnitude=4.0, exposure=exposure)
     raw = engine.realise(x, count=N, seed=12, processes=processes, mode=mode)
     net = raw.sum(axis=1) - np.sum(x.n_frames * (x.bias_dn + x.dark_dn))
-    return net / x.signal_dn.sum()
+    return net / x.recorded_light_dn.sum()
 
 
 def test_a_prior_is_what_the_light_follows(engine: Engine) -> None:
@@ -187,7 +187,7 @@ def test_components_add_up_and_scatter_as_they_should(engine: Engine, name: str,
     assert np.abs(table["digitisation"].value).max() < 0.502
     n, size = x.n_frames, x.wavelength_nm.size
     variances = {
-        "photon_noise": x.gain_dn_per_electron * x.signal_dn,
+        "photon_noise": x.gain_dn_per_electron * x.recorded_light_dn,
         "dark": n * x.dark_variance_dn2,
         "read_noise": n * x.read_noise_dn**2 + (n - 1) / 12,
     }

@@ -54,7 +54,7 @@ def test_closed_forms_are_those_of_what_is_drawn(engine: Engine, seed: int) -> N
         some = x.cut_share < 0.9  # rarer values than these have a variance too few realisations know
         error = square.std(axis=0)[some] / np.sqrt(N)
         assert np.all(np.abs(square.mean(axis=0) - x.variance_dn2)[some] < 6 * error)
-        np.testing.assert_allclose(x.signal_dn, x.recorded_dn - x.n_frames * (x.bias_dn + x.dark_dn), rtol=1e-9)
+        np.testing.assert_allclose(x.recorded_light_dn, x.recorded_dn - x.n_frames * (x.bias_dn + x.dark_dn), rtol=1e-9)
     found = engine.detect(quiet, [flare], realisations=N, seed=4, statistics=STATISTICS[:3])
     for statistic in found.statistics:
         for k in (None, 0):

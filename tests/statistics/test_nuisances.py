@@ -135,7 +135,7 @@ def test_what_cannot_be_is_refused_in_a_sentence() -> None:
         Nuisances.of(quiet, {"own": 1.0}, {"own": np.zeros(n)})
     with pytest.raises(InputError, match="expected one value for each"):
         Nuisances.of(quiet, {"own": 1.0}, {"own": np.ones(3)})
-    twice = Nuisances.of(quiet, {"light": FREE, "own": FREE}, {"own": 2.0 * quiet.signal_dn})
+    twice = Nuisances.of(quiet, {"light": FREE, "own": FREE}, {"own": 2.0 * quiet.recorded_light_dn})
     with pytest.raises(InputError, match="cannot be told apart"):
         STATISTICS["chi2"].subtracted(Setting(quiet, ~quiet.saturated, nuisances=twice))
     shape = flare.signal_dn - quiet.signal_dn

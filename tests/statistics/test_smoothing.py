@@ -21,7 +21,7 @@ def whole(quiet: Expectation, flare: Expectation) -> tuple[np.ndarray, np.ndarra
     n = quiet.wavelength_nm.size
     sigma = SMOOTHING_NM / np.sqrt(8 * np.log(2)) / np.median(np.diff(quiet.wavelength_nm))
     rows = gaussian_filter1d(np.eye(n), sigma, axis=0, mode="nearest")
-    factor = 1.0 / gaussian_filter1d(flare.signal_dn, sigma, mode="nearest") / flare.exposure_s
+    factor = 1.0 / gaussian_filter1d(flare.recorded_light_dn, sigma, mode="nearest") / flare.exposure_s
     half = np.sqrt(factor)[:, None] * rows
     modes = np.linalg.eigvalsh((half * (quiet.variance_dn2 + quiet.variance_dn2)) @ half.T)
     return rows, factor, modes[modes > 1e-10 * modes.max()]

@@ -135,7 +135,7 @@ def test_coverage_is_exact(engine: Engine) -> None:
     net = raw - quiet.n_frames * (quiet.bias_dn + quiet.dark_dn)
     known = quiet.n_frames * (quiet.read_noise_dn**2 + quiet.dark_variance_dn2)
     sigma = np.sqrt(quiet.gain_dn_per_electron * np.maximum(net, 0) + known)
-    direct = np.mean(np.abs(net - quiet.signal_dn) <= sigma, axis=0)
+    direct = np.mean(np.abs(net - quiet.recorded_light_dn) <= sigma, axis=0)
     np.testing.assert_allclose(coverage(result), direct, atol=0.01)
     assert coverage(result).mean() == pytest.approx(direct.mean(), abs=5e-4)
     # 198 pixels: the mean of so many is right to 2.4e-4, and a DN is 1/49 of sigma.
@@ -167,7 +167,8 @@ def test_pixels_beyond_five_sigma(name: str, temperature: float, sigmas: float) 
     # Photons and dark are then Poisson in electrons alike.
     mean = quiet.dark_dn[p] / step + (quiet.source_electrons + quiet.sky_electrons)[p] * poisson
     goal = sigmas * np.sqrt(quiet.variance_dn2[p] - 1 / 12)
-    sd = np.sqrt(quiet.read_noise_dn[p] ** 2 + quiet.gain_dn_per_electron[p] * quiet.signal_dn[p] * (not poisson))
+    photon = quiet.gain_dn_per_electron[p] * quiet.recorded_light_dn[p]
+    sd = np.sqrt(quiet.read_noise_dn[p] ** 2 + photon * (not poisson))
     counts = np.arange(int(mean + 14 * np.sqrt(mean) + 30))
     for side in (1, -1):
         exact = stats.poisson.pmf(counts, mean) @ stats.norm.sf((goal - side * (counts - mean) * step) / sd)
