@@ -28,7 +28,7 @@ FILE_KEYS = ("file", "wavelength_unit", "flux_unit", "extend")
 
 
 class Star(Part):
-    """Which spectrum, behind how much dust, how bright then."""
+    """Which spectrum, behind how much dust, how bright then; how far or large, for energies of flares."""
 
     library: str | None = None
     file: Path | None = None
@@ -40,6 +40,9 @@ class Star(Part):
     flux_unit: str | None = None
     extend: str | None = None
     bin_nm: float | None = None
+    distance_pc: Annotated[float, Field(gt=0)] | None = None
+    radius_rsun: Annotated[float, Field(gt=0)] | None = None
+    effective_temperature_k: Annotated[float, Field(gt=0)] | None = None
 
     @model_validator(mode="after")
     def _one_spectrum(self) -> Self:

@@ -22,6 +22,7 @@ from mauvecl.study.questions import (
     Sweep,
 )
 from mauvecl.study.sections import FILE_KEYS, Flare, NoiseProcesses, Observation, Part, Run, SkyLight, Star, Unknowns
+from mauvecl.study.stares import EventText, StareQuestion, find_curves, without_usual
 from mauvecl.study.study_text import find_files, in_table, put, sentence, study_of, toml_value
 
 if TYPE_CHECKING:
@@ -62,6 +63,8 @@ class Study(Part):
     bulk: BulkQuestion = BulkQuestion()
     sweep: Sweep = Sweep()
     unknowns: Unknowns = Unknowns()
+    stare: StareQuestion = StareQuestion()
+    events: tuple[EventText, ...] = ()
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
@@ -89,6 +92,7 @@ class Study(Part):
         for one in own.values() if isinstance(own, dict) else ():
             if isinstance(one, dict) and isinstance(one.get("file"), str):
                 one["file"] = str(path.parent / one["file"])
+        find_curves(data, path.parent)
         return cls.build(data, path.name)
 
     @classmethod
@@ -154,6 +158,7 @@ class Study(Part):
             for one in data["nuisances"]["own"].values():
                 if "file" in one:
                     one["file"] = str(Path(one["file"]).resolve())
+        without_usual(data, self)
         for section in ("processes", "campaign"):
             if not data[section]:
                 del data[section]

@@ -44,10 +44,33 @@ def read_spectrum(name: str, path: Path, wavelength_nm: NDArray[np.float64]) -> 
 
 
 def _read_values(what: str, kind: str, path: Path, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
-    text = read_text(path, kind if kind == "weights" else "spectrum")
+    return at_pixels(what, kind, _columns(what, kind if kind == "weights" else "spectrum", path), wavelength_nm)
+
+
+def read_columns(what: str, kind: str, path: Path) -> NDArray[np.float64]:
+    """Times and values from a file, shape (n, 2); # starts a comment.
+
+    Parameters
+    ----------
+    what, kind : str
+        What the file holds, and what its values are, for messages.
+    path : Path
+
+    Raises
+    ------
+    InputError
+        If it cannot be read or holds no two columns of numbers.
+    """
+    columns = _columns(f"{what} {shortened(path.name)}", what, path)
+    if columns.ndim != 2 or columns.shape[1] != 2:
+        raise InputError(f"{what} {shortened(path.name)} has no two columns, expected times and {kind}")
+    return columns
+
+
+def _columns(what: str, kind: str, path: Path) -> NDArray[np.float64]:
+    text = read_text(path, kind)
     with parsing(what, "two columns"):
-        columns = np.array([[float(word) for word in row] for line in text.splitlines() if (row := _words(line))])
-    return at_pixels(what, kind, columns, wavelength_nm)
+        return np.array([[float(word) for word in row] for line in text.splitlines() if (row := _words(line))])
 
 
 def at_pixels(
