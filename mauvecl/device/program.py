@@ -81,6 +81,12 @@ class Variant:
     cosmic: bool = False
     modulations: tuple[tuple[str, str], ...] = ()
     row_type: str = "int"
+    sums: int = 0
+    spectra: int = 0
+    unknown_groups: int = 0
+    counts: bool = False
+    fourths: bool = False
+    in_time: bool = False
 
     @property
     def compared(self) -> bool:
@@ -238,6 +244,9 @@ def render(rooms: tuple[str, ...], variant: Variant) -> str:
         "prior_finest": layout.PRIOR_FINEST,
         "prior_nodes": layout.PRIOR_NODES,
         "observer_bins": layout.OBSERVER_BINS,
+        "log2_e": f"{layout.LOG2_E}f",
+        "ln2_parts": layout.LN2_PARTS,
+        "exponential": [f"{c!r}f" for c in layout.EXPONENTIAL],
         "bins": layout.BINS,
         "fine_bits": layout.FINE_BITS,
         "structs": {name: dtype.names for name, dtype in layout.STRUCTS.items()},

@@ -1,43 +1,93 @@
-"""Frames of stares, drawn and reduced to a few weighted sums each."""
+"""Stares on a device: every frame drawn, and reduced there to a few weighted sums."""
 
 from __future__ import annotations
 
-from typing import Literal
+from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.device.launches import Launches, beyond
+from mauvecl.device.opened import Device
+from mauvecl.device.tiles import TILE_BYTES, Progress, Tile, Tiles
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.components import Components
+from mauvecl.lightcurve.scene import Flares, StareScene, padded_frames
 from mauvecl.lightcurve.stare import Stare
+from mauvecl.lightcurve.sums import SumTable, check_sums
+from mauvecl.noise.processes import CosmicRays
 
 Method = Literal["pixels", "cumulants"]
+Floats = NDArray[np.float32]
+
+#: Frames that one work-item follows where sums are drawn.
+FRAMES_EACH = 1024
 
 
 class Stares:
-    """Draws stares; for now in NumPy, from means and covariances alone.
+    """Draws stares on an OpenCL device.
 
     Parameters
     ----------
-    device : str, optional
-        As `Engine` takes it.
+    device : str or Device, optional
+        As `Engine` takes it, or a device that is open already.
+    progress : callable, optional
+        Called as ``progress(done, total)`` before and between tiles, in stares. It may raise to stop the work.
+    tile : int, optional
+        Stares in one launch, for tests; chosen from the device and the work by default. Never changes a result.
+    width : int, optional
+        Stares or frames in one work-item, for tests: 16 on CPUs, 1 elsewhere. Never changes a result.
+
+    Raises
+    ------
+    DeviceError
+        If there is no such device, or PoCL cannot work here.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from mauvecl import Instrument, Source, expect
+    >>> from mauvecl.device.stares import Stares
+    >>> from mauvecl.lightcurve.components import Components
+    >>> from mauvecl.lightcurve.stare import Stare
+    >>> star, mauve = Source.from_library("G2V").at_magnitude(7.4), Instrument.load("mauve")
+    >>> quiet, flare = (expect(s, mauve, exposure=5.0) for s in (star, star.flaring(1.0)))
+    >>> near_uv = (quiet.wavelength_nm < 360).astype(float)
+    >>> components = Components.of(quiet, [flare], near_uv[None])
+    >>> stare = Stare.of(600.0, jitters={"light": 0.01})
+    >>> y = Stares().frames(components, stare, first=7, count=3, seed=1)
+    >>> y.shape
+    (3, 120, 1)
+    >>> bool((Stares().frames(components, stare, first=8, count=1, seed=1) == y[1]).all())
+    True
     """
 
-    def __init__(self, device: str | None = None) -> None:
-        self._device = device
+    def __init__(
+        self,
+        device: str | Device | None = None,
+        *,
+        progress: Progress | None = None,
+        tile: int | None = None,
+        width: int | None = None,
+    ) -> None:
+        self.opened = device if isinstance(device, Device) else Device(device, width=width)
+        self._tiles = Tiles(self.opened, progress=progress, largest=tile)
 
     def frames(
         self,
         components: Components,
         stare: Stare,
-        flare: NDArray[np.float64] | None = None,
+        flare: NDArray[Any] | None = None,
         *,
         first: int = 0,
         count: int = 1,
         seed: int,
         method: Method = "pixels",
-        amplitudes: NDArray[np.float64] | None = None,
-    ) -> NDArray[np.float32]:
+        amplitudes: NDArray[Any] | None = None,
+        cosmic_rays: CosmicRays | None = None,
+    ) -> Floats:
         """Statistics of each frame of stares `first` to `first + count - 1`.
 
         Parameters
@@ -51,42 +101,175 @@ class Stares:
         seed : int
             0 to 2**64 - 1.
         method : {"pixels", "cumulants"}
-            Every pixel drawn, or the sums at once from their cumulants.
+            Every pixel drawn, or the sums at once from their cumulants. Conditions of frames are the same either way.
         amplitudes : ndarray, shape (n_scenario, count) or (n_scenario, 1), optional
             Factors on `flare`: as many scenarios on common draws.
+        cosmic_rays : CosmicRays, optional
+            By method "pixels".
 
         Returns
         -------
         ndarray of float32, shape (count, n_frame, n_statistic)
-            With `amplitudes` one axis more in front, (n_scenario, ...).
+            Sums over pixels of weights times raw counts less the quiescent star's mean; frames of one statistic lie
+            side by side in memory. With `amplitudes` one axis more in front, (n_scenario, ...).
+
+        Raises
+        ------
+        InputError
+            For an impossible range, seed or method, or what cannot be drawn by it.
         """
-        if method != "cumulants":
-            raise InputError(f"method = {method!r}, expected 'cumulants'")
-        shape = (stare.n_frames, components.n_flares)
-        given = np.zeros((1, *shape)) if flare is None else np.asarray(flare, np.float64).reshape(-1, *shape)
-        factors = np.ones((1, 1)) if amplitudes is None else np.asarray(amplitudes, np.float64)
-        known = components.coefficients(stare)
-        slope = components.quiet.conditions["dark_slope_per_c"]
-        rows = []
-        for i in range(count):
-            rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, first + i]))
-            moved = {
-                of: stare.jitters.get(of, 0.0) * rng.standard_normal(stare.n_frames)
-                for of in ("light", "sky", "temperature")
-            }
-            moved["star"] = np.zeros(stare.n_frames)
-            for unknown in stare.unknowns:
-                moved[unknown.of] = moved[unknown.of] + unknown.sd * rng.standard_normal() * unknown.curve
-            z = rng.standard_normal((stare.n_frames, components.n_statistics))
-            for row in factors:
-                c = known.copy()
-                c[:, 3:] = stare.light[:, None] * row[i % len(row)] * given[i % len(given)]
-                c[:, 0] *= 1.0 + moved["star"]
-                c[:, 1] *= 1.0 + moved["sky"]
-                c[:, [0, 1, *range(3, c.shape[1])]] *= 1.0 + moved["light"][:, None]
-                c[:, 2] *= np.exp(slope * moved["temperature"])
-                low = np.linalg.cholesky(components.covariance(c))
-                rows.append(components.means(c) + np.einsum("tkl,tl->tk", low, z))
-        found = np.array(rows, np.float32).reshape(count, len(factors), stare.n_frames, components.n_statistics)
-        found = np.moveaxis(found, 1, 0)
+        _check(first, count, seed, method)
+        flares = Flares.of(components, stare, flare, amplitudes, count)
+        shape = (len(flares.amplitudes), count, components.n_statistics, stare.n_frames)
+        out = np.empty(shape, np.float32)
+
+        def keep(values: Floats, done: int) -> None:
+            out[:, done : done + values.shape[1]] = values
+
+        self.over(components, stare, flares, first, count, seed, method, cosmic_rays, keep)
+        found = np.moveaxis(out, 2, 3)
         return found[0] if amplitudes is None else found
+
+    def over(
+        self,
+        components: Components,
+        stare: Stare,
+        flares: Flares,
+        first: int,
+        count: int,
+        seed: int,
+        method: Method,
+        cosmic_rays: CosmicRays | None,
+        work: Callable[[Floats, int], None],
+    ) -> None:
+        """Draw stares and give them to `work` a few at a time.
+
+        Parameters
+        ----------
+        work : callable
+            Called as ``work(values, done)`` with values of the shape (n_scenario, n, n_statistic, n_frame), valid
+            during the call, of stares ``first + done`` and on.
+        """
+        scene = StareScene.of(components, stare, cosmic_rays)
+        scene.check(flares)
+        if method == "cumulants":
+            check_sums(scene, flares)
+        each = 4 * len(flares.amplitudes) * components.n_statistics * padded_frames(stare.n_frames)
+        with StareLaunches(self.opened, scene, seed, method) as launches:
+
+            def one(tile: Tile, done: int) -> None:
+                launches.give(flares.part(done, tile.wanted))
+                work(launches.values(tile), done)
+
+            self._tiles.over(first, count, each, one)
+
+
+class StareLaunches(Launches):
+    """One stare on a device, its buffers released at the end of the `with` block."""
+
+    def __init__(self, device: Device, stare: StareScene, seed: int, method: Method) -> None:
+        self._in_time = method == "cumulants"
+        table = SumTable.of(stare.components) if self._in_time else None
+        scene = stare.scene
+        variant = replace(
+            device.variant,
+            clip=scene.clip,
+            cosmic=scene.cosmic,
+            sums=stare.components.n_statistics,
+            spectra=stare.components.n_flares,
+            unknown_groups=-(-len(stare.kinds) // 4),
+            counts=stare.counts,
+            fourths=table is not None and table.fourths,
+            in_time=self._in_time,
+        )
+        super().__init__(device, scene, variant, seed)
+        self._stare = stare
+        self._known = [*map(self.upload, (stare.numbers, stare.known, stare.curves, stare.kinds))]
+        if table is None:
+            more = (beyond(stare.mixtures), stare.spectra, stare.weights, stare.constants)
+            self._own = [*map(self.upload, more)]
+        else:
+            self._own = [self.upload(table.packed)]
+
+    def give(self, flares: Flares) -> None:
+        """Upload the flares of the stares that are drawn next."""
+        self._scenarios = len(flares.amplitudes)
+        self._flares = [
+            self._fill("staring", self._stare.staring_of(flares)),
+            *self._known,
+            self._fill("flares", flares.rows),
+            self._fill("amplitudes", flares.amplitudes),
+        ]
+
+    def _fill(self, name: str, array: NDArray[Any]) -> Any:
+        data = np.ascontiguousarray(array if array.size else np.zeros(1, array.dtype))
+        buffer = self._room(name, data.nbytes)
+        self._cl.enqueue_copy(self._queue, buffer, data)
+        return buffer
+
+    def values(self, tile: Tile) -> Floats:
+        """Statistics of a tile's frames, shape (n_scenario, tile.wanted, n_statistic, n_frame)."""
+        return self._by_cumulants(tile) if self._in_time else self._by_pixels(tile)
+
+    def _by_pixels(self, tile: Tile) -> Floats:
+        """A few frames of all stares at a time."""
+        n_frames, each = self._stare.stare.n_frames, self._scenarios * self.variant.sums * tile.size
+        out = np.empty((self._scenarios, tile.wanted, self.variant.sums, n_frames), np.float32)
+        block = max(1, TILE_BYTES // (4 * each))
+        kernel = self._device.kernel(("stare", "stare_pixels"), self._room_for_scenarios(), "stare_pixels")
+        for begin in range(0, n_frames, block):
+            size = min(block, n_frames - begin)
+            values = self._room("values", 4 * each * size)
+            kernel(
+                self._queue,
+                (tile.size // self.variant.width, size),
+                (1, 1) if self.variant.width > 1 else None,
+                *self._arguments,
+                *self._flares,
+                *tile.address(),
+                *tile.rows(),
+                np.uint32(begin),
+                *self._own,
+                np.uint32(tile.size),
+                values,
+            )
+            host = np.empty((size, self._scenarios, self.variant.sums, tile.size), np.float32)
+            self._cl.enqueue_copy(self._queue, host, values)
+            out[..., begin : begin + size] = host[..., tile.start : tile.stop].transpose(1, 3, 2, 0)
+        return out
+
+    def _by_cumulants(self, tile: Tile) -> Floats:
+        stare = self._stare.stare
+        padded = padded_frames(stare.n_frames)
+        kernel = self._device.kernel(("stare", "stare_sums"), self.variant, "stare_sums")
+        host = np.empty((self._scenarios, tile.wanted, self.variant.sums, padded), np.float32)
+        values = self._room("values", host.nbytes)
+        each = FRAMES_EACH if self.variant.width > 1 else 1
+        first = tile.first + tile.start
+        kernel(
+            self._queue,
+            (tile.wanted, -(-padded // each)),
+            (1, 1) if self.variant.width > 1 else None,
+            self._arguments[0],
+            *self._flares,
+            np.uint32(first & 0xFFFFFFFF),
+            np.uint32(first >> 32),
+            np.uint32(each),
+            *self._own,
+            values,
+        )
+        self._cl.enqueue_copy(self._queue, host, values)
+        return host[..., : stare.n_frames]
+
+    def _room_for_scenarios(self) -> Any:
+        """As much room as the scenarios need: powers of two, so that few programs are built."""
+        return replace(self.variant, scenarios=1 << (self._scenarios - 1).bit_length())
+
+
+def _check(first: int, count: int, seed: int, method: str) -> None:
+    if not (first >= 0 and count >= 1 and first + count <= 2**64):
+        raise InputError(f"{count} stares from number {first}, expected at least 1, numbered 0 to 2**64 - 1")
+    if not 0 <= seed < 2**64:
+        raise InputError(f"seed = {seed}, expected 0 to 2**64 - 1")
+    if method not in get_args(Method):
+        raise InputError(f"method = {method!r}, expected 'pixels' or 'cumulants'")

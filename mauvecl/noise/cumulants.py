@@ -7,6 +7,7 @@ into it. Where Gaussian noise smooths the Poisson steps away, no number of draws
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -157,7 +158,12 @@ def left_out(c: Cumulants, *, fourth_power: bool, varying: bool = False) -> Floa
         Whether it is the kernels' one for factors on light and dark, which without the fourth power has no term of
         gamma_5, rather than `polynomial`.
     """
-    g3, g4, g5, g6, g7 = c.over_sd(7)
+    return expansion_error(c.over_sd(7), fourth_power=fourth_power, varying=varying)
+
+
+def expansion_error(over_sd: Sequence[Float], *, fourth_power: bool, varying: bool = False) -> Float:
+    """`left_out` from the third to seventh cumulants over their powers of the standard deviation."""
+    g3, g4, g5, g6, g7 = over_sd
     g3_3 = g3 * g3 * g3
     g3_4 = g3_3 * g3
     # Abramowitz & Stegun 26.2.49 with gamma_1 there gamma_3 here: the terms after those of `polynomial`.

@@ -11,7 +11,8 @@ WORD_BITS = 32
 
 #: Each random process draws from its own stream, the top byte of the counter's last word, so that adding one moves no
 #: other. `noise` is the joint Gaussian or what is Gaussian alone, `dark` and `photon` their Poisson counts where drawn
-#: apart; `split` takes a drawn spectrum apart.
+#: apart; `split` takes a drawn spectrum apart. Of a stare `stare_unknown` holds what differs from stare to stare,
+#: `stare_frame` what does from frame to frame, and `stare_sums` the weighted sums where no pixel is drawn.
 STREAMS = {
     "noise": 0,
     "dark": 1,
@@ -25,6 +26,9 @@ STREAMS = {
     "split": 9,
     "split_dark": 10,
     "sky_level": 11,
+    "stare_unknown": 16,
+    "stare_frame": 17,
+    "stare_sums": 18,
 }
 #: Added to the stream for the draws of a reference exposure.
 REFERENCE = 64
@@ -132,6 +136,60 @@ ELEMENT = np.dtype([("first", "u4"), ("end", "u4"), ("sky", "f4"), ("centre", "f
 #: One histogram: which channel of values it reads, its centre, and fine steps per unit of the statistic.
 GRID = np.dtype([("channel", "u4"), ("centre", "f4"), ("steps_per_unit", "f4")])
 
+#: One pixel of a stare's frames: what is left of the mean at coefficients of one beside the whole DN that kernels leave
+#: out; star, sky and dark at a coefficient of one, DN; the photons' second to fifth cumulants over their mean; those of
+#: everything at coefficients of one; those of the dark alone.
+MIXTURE = np.dtype(
+    [
+        ("rest", "f4"),
+        ("star", "f4"),
+        ("sky", "f4"),
+        ("dark", "f4"),
+        ("photon_variance", "f4"),
+        ("photon_third", "f4"),
+        ("photon_fourth", "f4"),
+        ("photon_fifth", "f4"),
+        ("variance", "f4"),
+        ("third", "f4"),
+        ("fourth", "f4"),
+        ("fifth", "f4"),
+        ("dark_variance", "f4"),
+        ("dark_third", "f4"),
+        ("dark_fourth", "f4"),
+        ("dark_fifth", "f4"),
+    ]
+)
+
+#: What holds for all frames of a stare: how many there are, and with padding; what is unknown of it; its jitters; how
+#: the dark follows the temperature; rows of flares, and of factors on them, one or one to a stare.
+STARING = np.dtype(
+    [
+        ("frame_count", "u4"),
+        ("padded_frames", "u4"),
+        ("unknown_count", "u4"),
+        ("jittered", "u4"),
+        ("light_jitter", "f4"),
+        ("sky_jitter", "f4"),
+        ("temperature_jitter", "f4"),
+        ("dark_slope", "f4"),
+        ("scenario_count", "u4"),
+        ("flare_rows", "u4"),
+        ("amplitude_rows", "u4"),
+    ]
+)
+
+#: Rows of what is known of each frame: a coefficient, and the same less one.
+KNOWN_OF_FRAMES = ("star", "star_less_one", "sky", "sky_less_one", "dark", "dark_less_one")
+#: What an unknown of a stare is of: rows of what it moves.
+MOVED = ("star", "light", "sky", "temperature")
+#: Frames are padded to a multiple of this.
+FRAME_BLOCK = 16
+#: exp(r) = 1 + r + r^2 q(r): Taylor's coefficients of q, off by less than 4e-9 of exp(r) for |r| <= ln(2) / 2; and ln(2)
+#: in two parts, of which the first has nine bits, so that its multiples are exact.
+EXPONENTIAL = tuple(float(np.float32(1.0 / np.prod(np.arange(1.0, n + 3)))) for n in range(6))
+LN2_PARTS = (0.693359375, -2.1219444e-4)
+LOG2_E = 1.442695
+
 STRUCTS = {
     "Job": JOB,
     "Pixel": PIXEL,
@@ -143,6 +201,8 @@ STRUCTS = {
     "Estimate": ESTIMATE,
     "Element": ELEMENT,
     "Grid": GRID,
+    "Mixture": MIXTURE,
+    "Staring": STARING,
 }
 
 #: Statistics with a channel in every scenario, in the kernel's order; linear statistics follow them.

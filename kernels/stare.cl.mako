@@ -1,0 +1,67 @@
+## Frames of stares. What differs from frame to frame and from stare to stare is the strength of a few spectra;
+## see mauvecl/lightcurve/components.py. Lanes are stares where pixels are drawn, and frames where sums are.
+#define STARE_POINTERS(r) __global const Staring *r staring, __global const uint *r numbers, __global const float *r known, \
+    __global const float *r curves, __global const uint *r kinds, __global const float *r flares, __global const float *r amplitudes
+#define STARE STARE_POINTERS(restrict)
+#define STARE_GIVEN STARE_POINTERS()
+#define STARE_PASSED staring, numbers, known, curves, kinds, flares, amplitudes
+
+% if in_time:
+#define OF_FRAME(array) LOAD((array) + frame)
+% else:
+#define OF_FRAME(array) ((floatv)((array)[frame]))
+% endif
+
+/* Coefficients of star, sky and dark, less one, and the factor on all light, less one. */
+typedef struct { floatv star, sky, dark, light; } Strengths;
+
+/* exp(x) - 1, for |x| < 80 */
+INLINE floatv exponential_less_one(floatv x)
+{
+    const floatv whole = x * ${log2_e} + MAGIC, n = whole - MAGIC;
+    const floatv r = FMA(n, (floatv)${-ln2_parts[1]}f, FMA(n, (floatv)${-ln2_parts[0]}f, x));
+    floatv q = (floatv)${exponential[-1]};
+% for term in reversed(exponential[:-1]):
+    q = FMA(q, r, (floatv)${term});
+% endfor
+    const floatv scale = AS_FLOAT((AS_INT(whole) - AS_INT((floatv)MAGIC) + (intv)127) << 23);
+    return FMA(scale, FMA(r * r, q, r), scale - 1.0f);
+}
+
+/* The amplitudes of what is not known of a stare, in units of their standard deviations. */
+INLINE void unknowns_of(const Staring staring, uintv realisation, uint realisation_high, uint seed_low, uint seed_high, floatv *z)
+{
+    const Address at = address(realisation, realisation_high, 0u, seed_low, seed_high);
+    for (uint u = 0; u < staring.unknown_count; u += 4u) {
+        const Words x = words_at(&at, ${streams["stare_unknown"]}u, u / 4u);
+        const uintv w[4] = {x.a, x.b, x.c, x.d};
+        normal_pair(w, z + u);
+        normal_pair(w + 2, z + u + 2u);
+    }
+}
+
+INLINE Strengths strengths_of(STARE_GIVEN, uint frame, Words x, const floatv *z)
+{
+    const uint stride = staring->padded_frames;
+    floatv moved[4] = {(floatv)0.0f, (floatv)0.0f, (floatv)0.0f, (floatv)0.0f};
+    if (staring->jittered) {
+        const uintv w[4] = {x.a, x.b, x.c, x.d};
+        floatv jitter[4];
+        normal_pair(w, jitter);
+        normal_pair(w + 2, jitter + 2);
+        moved[1] = jitter[0] * staring->light_jitter;
+        moved[2] = jitter[1] * staring->sky_jitter;
+        moved[3] = jitter[2] * staring->temperature_jitter;
+    }
+    for (uint u = 0; u < staring->unknown_count; u++) {
+        const floatv more = OF_FRAME(curves + u * stride);
+        for (uint kind = 0; kind < 4u; kind++)
+            if (kinds[u] == kind) moved[kind] = FMA(z[u], more, moved[kind]);
+    }
+    Strengths s;
+    s.light = moved[1];
+    s.star = FMA(OF_FRAME(known), TOGETHER(moved[1], moved[0]), OF_FRAME(known + stride));
+    s.sky = FMA(OF_FRAME(known + 2u * stride), TOGETHER(moved[1], moved[2]), OF_FRAME(known + 3u * stride));
+    s.dark = FMA(OF_FRAME(known + 4u * stride), exponential_less_one(moved[3] * staring->dark_slope), OF_FRAME(known + 5u * stride));
+    return s;
+}

@@ -1,0 +1,136 @@
+## Stares without their pixels: the weighted sums of each frame from their joint cumulants, which are linear in the
+## strengths of the few spectra. All is done in sums that are independent and of variance one at coefficients of one.
+<%
+    from itertools import combinations_with_replacement
+    pairs = [(a, b) for a in range(sums) for b in range(a + 1)]
+    threes = [(a, b, c) for a, b in pairs for c in range(b + 1)]
+    fours = [(a, b, c, d) for a, b, c in threes for d in range(c + 1)] if fourths else []
+    row = sums + len(pairs) + len(threes) + len(fours)
+    at = {key: sums + i for i, key in enumerate(pairs + threes + fours)}
+    lights = ["strengths.star", "strengths.sky"] + [f"flare[{j}]" for j in range(spectra)]
+    def name(*key):
+        return "".join(str(i) for i in sorted(key, reverse=True))
+    def chain(terms):
+        """Products added up, the first one first."""
+        (a, b), *rest = terms
+        text = f"{a} * {b}"
+        for a, b in rest:
+            text = f"FMA({a}, {b}, {text})"
+        return text
+    def remaining(a, b):
+        """A covariance less what earlier columns of its factor account for."""
+        text = f"c{a}{b}"
+        for i in range(b):
+            text = f"FMA(-l{a}{i}, l{b}{i}, {text})"
+        return text
+    def cumulant(offset, lit=True):
+        """A cumulant at these strengths."""
+        text = f"(floatv)table[{offset}]"
+        rows = [("strengths.dark", 3)] + ([(s, r) for s, r in zip(lights, [1, 2, *range(4, 4 + spectra)])] if lit else [])
+        for strength, r in rows:
+            text = f"FMA({strength}, (floatv)table[{r * row + offset}], {text})"
+        return text
+%>\
+__kernel ${attributes}
+void stare_sums(__global const Job *restrict job, STARE, const uint first_low, const uint first_high, const uint frames_each,
+                __global const float *restrict table, __global float *restrict values)
+{
+    /* values[scenario][stare][statistic][frame] */
+    const uint stare = get_global_id(0), stride = staring->padded_frames, scenario_count = staring->scenario_count;
+    const uint begin = get_global_id(1) * frames_each, end = least(begin + frames_each, stride);
+    const uintv realisation = (uintv)(first_low + stare);
+    floatv unknown[${4 * unknown_groups + 1}];
+% if unknown_groups:
+    unknowns_of(*staring, realisation, first_high, job->seed_low, job->seed_high, unknown);
+% endif
+    __global const float *whole = table + ${row * (4 + spectra)}u;
+    for (uint frame = begin; frame < end; frame += ${width}u) {
+        const uintv number = LOAD(numbers + frame);
+        Words jitter = {(uintv)0u, (uintv)0u, (uintv)0u, (uintv)0u};
+        if (staring->jittered)
+            jitter = philox(realisation, (uintv)first_high, number, (uintv)${streams["stare_frame"] << 24}u, job->seed_low, job->seed_high);
+        const Strengths strengths = strengths_of(STARE_PASSED, frame, jitter, unknown);
+        floatv z[${-(-sums // 4) * 4}];
+% for group in range(-(-sums // 4)):
+        {
+            const Words x = philox(realisation, (uintv)first_high, number, (uintv)${(streams["stare_sums"] << 24) + group}u, job->seed_low, job->seed_high);
+            const uintv w[4] = {x.a, x.b, x.c, x.d};
+            normal_pair(w, z + ${4 * group});
+% if sums > 4 * group + 2:
+            normal_pair(w + 2, z + ${4 * group + 2});
+% endif
+        }
+% endfor
+        /* What skewness adds to each is a sum of these. */
+% for a, b in pairs:
+        const floatv q${a}${b} = ${f"FMA(z[{a}], z[{a}], (floatv)-1.0f) * 0.16666667f" if a == b else f"z[{a}] * z[{b}] * 0.33333334f"};
+% endfor
+        for (uint k = 0; k < scenario_count; k++) {
+% if spectra:
+            floatv flare[${spectra}];
+            const float amplitude = amplitudes[k * staring->amplitude_rows + (staring->amplitude_rows > 1u ? stare : 0u)];
+            __global const float *from = flares + (size_t)(staring->flare_rows > 1u ? stare : 0u) * ${spectra}u * stride;
+            for (uint j = 0; j < ${spectra}u; j++) {
+                flare[j] = OF_FRAME(from + j * stride) * amplitude;
+                flare[j] = FMA(strengths.light, flare[j], flare[j]);
+            }
+% endif
+            /* Covariances, their Cholesky factor l, and its inverse m. */
+% for a, b in pairs:
+            const floatv c${a}${b} = ${cumulant(at[a, b])};
+% endfor
+% for b in range(sums):
+            const floatv l${b}${b} = root(${remaining(b, b)}), m${b}${b} = 1.0f / l${b}${b};
+% for a in range(b + 1, sums):
+            const floatv l${a}${b} = ${remaining(a, b)} * m${b}${b};
+% endfor
+% endfor
+% for a in range(sums):
+% for b in range(a):
+            const floatv m${a}${b} = -(${chain([(f"l{a}{i}", f"m{i}{b}") for i in range(b, a)])}) * m${a}${a};
+% endfor
+% endfor
+            /* Third cumulants, turned into those of the independent z one index after the other. */
+% for key in threes:
+            const floatv t${name(*key)} = ${cumulant(at[key], lit=counts)};
+% endfor
+% for a in range(sums):
+% for b, c in pairs:
+            const floatv a${a}_${b}${c} = ${chain([(f"m{a}{i}", f"t{name(i, b, c)}") for i in range(a + 1)])};
+% endfor
+% endfor
+% for a, b in pairs:
+% for c in range(sums):
+            const floatv b${a}${b}_${c} = ${chain([(f"m{b}{i}", f"a{a}_{name(i, c)}") for i in range(b + 1)])};
+% endfor
+% endfor
+% for a, b, c in threes:
+            const floatv s${a}${b}${c} = ${chain([(f"m{c}{i}", f"b{a}{b}_{i}") for i in range(c + 1)])};
+% endfor
+% for a in range(sums):
+            floatv x${a} = z[${a}];
+% for b, c in pairs:
+            x${a} = FMA(s${name(a, b, c)}, q${b}${c}, x${a});
+% endfor
+% if fourths:
+            {
+                floatv f = (floatv)0.0f;
+% for key in combinations_with_replacement(range(a, -1, -1), 4):
+                f = FMA(${" * ".join(f"m{a}{i}" for i in key)}, ${cumulant(at[key], lit=counts)}, f);
+% endfor
+                const floatv zz = z[${a}] * z[${a}];
+                x${a} = FMA(f * z[${a}], FMA(zz, (floatv)0.041666668f, (floatv)-0.125f), x${a});
+                x${a} = FMA(-s${name(a, a, a)} * s${name(a, a, a)} * z[${a}], FMA(zz, (floatv)0.055555556f, (floatv)-0.1388889f), x${a});
+            }
+% endif
+% endfor
+% for a in range(sums):
+            const floatv u${a} = ${cumulant(a)} + (${chain([(f"l{a}{i}", f"x{i}") for i in range(a + 1)])});
+% endfor
+            __global float *out = values + ((size_t)k * get_global_size(0) + stare) * ${sums}u * stride + frame;
+% for a in range(sums):
+            STORE(${chain([(f"(floatv)whole[{pairs.index((a, i))}]", f"u{i}") for i in range(a + 1)])}, out + ${a}u * stride);
+% endfor
+        }
+    }
+}
