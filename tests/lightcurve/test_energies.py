@@ -1,0 +1,104 @@
+"""Energies of flares: durations, peaks and energies from each other; published and independent values."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mauvecl.host.errors import InputError
+from mauvecl.host.stars.bands import band
+from mauvecl.host.stars.source import Source
+from mauvecl.lightcurve import energies
+from mauvecl.lightcurve.energies import EnergyScale, share_within
+from mauvecl.lightcurve.events import Event
+from mauvecl.lightcurve.shapes import SHAPES
+
+
+@pytest.mark.parametrize(
+    ("kelvin", "share"), [(9000, 0.72246), (10_000, 0.74135), (14_000, 0.68203), (20_000, 0.48199)]
+)
+def test_share_of_a_blackbody_in_mauves_range(kelvin, share):
+    assert share_within(200, 700, kelvin) == pytest.approx(share, abs=6e-6)
+
+
+#: erg/s of Shibayama et al. 2013's formula by other tables of the bands, for flares of 9000 and 10 000 K.
+ELSEWHERE = [
+    ("Kepler", 5778, 1.0, 1.1774e33, 1.3289e33),
+    ("Kepler", 4830, 0.755, 2.9825e32, 3.3663e32),
+    ("Kepler", 3200, 0.2, 1.9525e30, 2.2037e30),
+    ("TESS", 5778, 1.0, 1.5365e33, 1.8197e33),
+]
+
+
+@pytest.mark.parametrize(("name", "kelvin", "radius", "cool", "hot"), ELSEWHERE)
+def test_bolometric_energies_by_other_tables_of_the_bands(name, kelvin, radius, cool, hot):
+    # The embedded bands are those of pyphot; another table of Kepler's or TESS's differs by up to 1.4 %.
+    for flare, value in ((9000.0, cool), (10_000.0, hot)):
+        found = EnergyScale.of_blackbody(radius, kelvin, band=name, flare_k=flare)
+        assert found.erg_per_s == pytest.approx(value, rel=0.015)
+
+
+@pytest.mark.parametrize("weighted", ["energy", "photons"])
+def test_bolometric_energies_by_an_integral_of_ones_own(weighted):
+    # Planck's law written out, Gauss-Legendre between the band's points; CODATA 2018.
+    h, c, k = 6.62607015e-27, 2.99792458e10, 1.380649e-16
+    found = band("Kepler")
+    nodes, weights = np.polynomial.legendre.leggauss(4)
+    a, b = found.wavelength_nm[:-1, None], found.wavelength_nm[1:, None]
+    nm, step = (a + b) / 2 + (b - a) / 2 * nodes, (b - a) / 2 * weights
+    response = np.interp(nm, found.wavelength_nm, found.throughput) * (nm if weighted == "photons" else 1.0)
+
+    def through(kelvin: float) -> float:
+        cm = nm * 1e-7
+        return float(np.sum(step * response / cm**5 / np.expm1(h * c / (cm * k * kelvin))))
+
+    exact = through(4830) / through(9000) * np.pi * (0.755 * 6.957e10) ** 2 * 5.670374419e-5 * 9000.0**4
+    scale = EnergyScale.of_blackbody(0.755, 4830, flare_k=9000.0, weighted=weighted)
+    assert scale.erg_per_s == pytest.approx(exact, rel=2e-7)
+
+
+def test_a_star_that_is_its_own_blackbody_gives_the_same():
+    from mauvecl.host.stars.flare import blackbody
+
+    nm = np.linspace(160, 1200, 20_801)
+    # Of one solar radius seen from 10 pc.
+    shrunk = (energies.SUN_CM / (10 * energies.PARSEC_CM)) ** 2
+    star = Source.from_arrays(nm, shrunk * blackbody(nm, 5778.0))
+    seen, made = EnergyScale.of_star(star, 10.0), EnergyScale.of_blackbody(1.0, 5778.0)
+    assert seen.kind == made.kind == "band"
+    assert seen.erg_per_s == pytest.approx(made.erg_per_s, rel=1e-5)
+    # Alike in all directions, against a patch seen face on.
+    seen, made = (EnergyScale.of_star(star, 10.0, flare_k=9e3), EnergyScale.of_blackbody(1.0, 5778.0, flare_k=9e3))
+    assert seen.erg_per_s == pytest.approx(4 * made.erg_per_s, rel=1e-5)
+
+
+@pytest.mark.parametrize("name", list(SHAPES))
+def test_duration_peak_and_energy_follow_from_each_other(name):
+    scale = EnergyScale.of_blackbody(1.0, 5778.0, flare_k=10_000.0)
+    flare = Event(100.0, 33.0, 0.4, shape=name)
+    same = Event.of_energy(flare.energy(scale), scale, peak_s=100.0, half_width_s=33.0, shape=name)
+    assert same.amplitude == pytest.approx(0.4, rel=1e-14)
+    duration = flare.equivalent_duration_s
+    assert energies.amplitude_of(duration, 33.0, name) == pytest.approx(0.4, rel=1e-14)
+    assert energies.half_width_of(duration, 0.4, name) == pytest.approx(33.0, rel=1e-14)
+    assert Event.of_peak(flare.peak, peak_s=100.0, half_width_s=33.0, shape=name).amplitude == pytest.approx(0.4)
+    assert flare.peak == pytest.approx(0.4 * SHAPES[name].peak)
+    # And the duration is the integral of what frames are given.
+    edges = np.arange(-100, 30_000) * 5.0
+    assert 5.0 * 0.4 * SHAPES[name].mean_over(edges, 100.0, 33.0).sum() == pytest.approx(duration, rel=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda: EnergyScale.of_blackbody(0.0, 5778.0), "radius_rsun = 0"),
+        (lambda: EnergyScale.of_blackbody(1.0, 10.0), "temperature_k = 10"),
+        (lambda: EnergyScale.of_blackbody(1.0, 5778.0, flare_k=10.0), "flare_k = 10"),
+        (lambda: EnergyScale.of_blackbody(1.0, 5778.0, band="Q"), "band 'Q' is unknown"),
+        (lambda: EnergyScale.of_star(Source.from_library("G2V"), -1.0), "distance_pc = -1"),
+        (lambda: EnergyScale.of_blackbody(1.0, 5778.0).equivalent_duration(0.0), "energy = 0 erg"),
+    ],
+)
+def test_energies_that_cannot_be(make, told):
+    with pytest.raises(InputError, match=told):
+        make()

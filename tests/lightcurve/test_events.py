@@ -1,0 +1,80 @@
+"""Flares of a stare: what they add to frames, with one temperature or cooling."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from mauvecl.host.errors import InputError
+from mauvecl.host.stars.flare import blackbody
+from mauvecl.lightcurve.events import Cooling, Event, coefficients, temperatures_of
+from mauvecl.lightcurve.shapes import SHAPES
+
+START = np.arange(400) * 5.0
+
+
+def test_several_peaks_add_up_in_their_temperatures():
+    assert temperatures_of([]).size == 0
+    one, two = Event(300.0, 20.0, 0.2), Event(420.0, 60.0, 0.1, 15_000.0, "tovarmendoza2022")
+    three = Event(500.0, 10.0, 0.3)
+    kelvin = temperatures_of([one, two, three])
+    np.testing.assert_array_equal(kelvin, [10_000.0, 15_000.0])
+    found = coefficients([one, two, three], START, 5.0, kelvin)
+    edges = np.arange(401) * 5.0
+    davenport, mendoza = SHAPES["davenport2014"], SHAPES["tovarmendoza2022"]
+    both = 0.2 * davenport.mean_over(edges, 300.0, 20.0) + 0.3 * davenport.mean_over(edges, 500.0, 10.0)
+    np.testing.assert_allclose(found[:, 0], both, rtol=1e-13)
+    np.testing.assert_allclose(found[:, 1], 0.1 * mendoza.mean_over(edges, 420.0, 60.0), rtol=1e-13)
+
+
+def test_frames_in_gaps_are_absent_and_others_unchanged():
+    flare = Event(500.0, 60.0, 0.5)
+    whole = coefficients([flare], START, 5.0, np.array([10_000.0]))
+    kept = np.r_[0:90, 130:400]
+    np.testing.assert_array_equal(coefficients([flare], START[kept], 5.0, np.array([10_000.0])), whole[kept])
+
+
+def test_a_cooling_flare_keeps_its_light_curve_and_its_spectrum():
+    flare = Event(500.0, 60.0, 0.5, Cooling(14_000.0, 6_000.0, 120.0))
+    kelvin = temperatures_of([flare])
+    found = coefficients([flare], START, 5.0, kelvin)
+    alone = coefficients([Event(500.0, 60.0, 0.5)], START, 5.0, np.array([10_000.0]))[:, 0]
+    # In the band in which amplitudes are measured every spectrum has an amplitude of one.
+    np.testing.assert_allclose(found.sum(axis=1), alone, rtol=1e-9, atol=1e-15)
+    # Spectra of one amplitude at 600 nm, mixed from the nodes, beside the blackbody of the frame's middle.
+    nm = np.linspace(200.0, 700.0, 101)
+    unit = np.array([blackbody(nm, k) / blackbody(np.array([600.0]), k) for k in kelvin])
+    for k in (95, 110, 130, 200):
+        temperature = float(flare.temperature.at(np.array(START[k] + 2.5 - 500.0)))
+        exact = alone[k] * blackbody(nm, temperature) / blackbody(np.array([600.0]), temperature)
+        mixed = found[k] @ unit
+        # Linear mixing is too bright by 5 % at most, and that where the flare is at its faintest.
+        np.testing.assert_allclose(mixed, exact, rtol=0.06)
+        np.testing.assert_allclose(mixed[nm > 300], exact[nm > 300], rtol=0.02)
+
+
+def test_a_flare_that_does_not_cool_is_one_of_a_temperature():
+    steady = Event(500.0, 60.0, 0.5, Cooling(9_000.0, 9_000.0, 100.0))
+    assert temperatures_of([steady]).tolist() == [9_000.0]
+    plain = Event(500.0, 60.0, 0.5, 9_000.0)
+    kelvin = np.array([6_000.0, 9_000.0, 12_000.0])
+    np.testing.assert_array_equal(coefficients([steady], START, 5.0, kelvin), coefficients([plain], START, 5.0, kelvin))
+
+
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda: Event(np.nan, 60.0, 0.1), "a flare peaks at nan s"),
+        (lambda: Event(0.0, 0.0, 0.1), "the half width of a flare = 0 s"),
+        (lambda: Event(0.0, 60.0, -0.1), "the amplitude of a flare = -0.1"),
+        (lambda: Event(0.0, 60.0, 0.1, 10.0), "flare temperature = 10 K"),
+        (lambda: Event(0.0, 60.0, 0.1, shape="box"), "flare shape 'box' is unknown"),
+        (lambda: Event.of_equivalent_duration(3.0, peak_s=0.0, half_width_s=0.0), "the half width of a flare = 0 s"),
+        (lambda: temperatures_of([Event(0.0, 60.0, 0.1, 5e3 + k) for k in range(9)]), "flares of 9 constant temp"),
+        (lambda: Cooling(6000.0, 9000.0, 60.0), "cools from 6000 to 9000 K"),
+        (lambda: coefficients([Event(0.0, 60.0, 0.1)], START, 5.0, np.array([6000.0])), "expected temperatures within"),
+    ],
+)
+def test_what_is_no_event(make, told):
+    with pytest.raises(InputError, match=told):
+        make()
