@@ -60,11 +60,11 @@ def helioecliptic(target: SkyCoord | str, time: Time | str) -> HelioEcliptic:
     InputError
         If either cannot be understood, is not finite, is more than one, or lies outside 1990-2100.
     """
-    with _offline():
+    with offline():
         from astropy.coordinates import GeocentricTrueEcliptic, get_sun
 
-        moment = _time(time)
-        position = _position(target)
+        moment = moment_of(time)
+        position = position_of(target)
         frame = GeocentricTrueEcliptic(equinox=moment, obstime=moment)
         sun = get_sun(moment).transform_to(frame)
         try:
@@ -83,7 +83,7 @@ def helioecliptic(target: SkyCoord | str, time: Time | str) -> HelioEcliptic:
 
 
 @contextmanager
-def _offline() -> Iterator[None]:
+def offline() -> Iterator[None]:
     """Astropy without the network and, for far years, without warnings; everything as before afterwards."""
     from astropy.utils import iers
 
@@ -98,7 +98,14 @@ def _offline() -> Iterator[None]:
             yield
 
 
-def _time(time: Time | str) -> Time:
+def moment_of(time: Time | str) -> Time:
+    """One time between 1990 and 2100; text is ISO 8601, UTC. To be called inside `offline`.
+
+    Raises
+    ------
+    InputError
+        If it cannot be understood, is not finite, is more than one, or lies outside these years.
+    """
     from astropy.time import Time
 
     expected = "expected a UTC time such as '2026-03-01T12:00:00'"
@@ -121,7 +128,14 @@ def _time(time: Time | str) -> Time:
     return moment
 
 
-def _position(target: SkyCoord | str) -> SkyCoord:
+def position_of(target: SkyCoord | str) -> SkyCoord:
+    """One position; text is ICRS, two numbers in degrees or sexagesimal hours and degrees.
+
+    Raises
+    ------
+    InputError
+        If it cannot be understood, is not finite, or is more than one.
+    """
     import astropy.units as u
     from astropy.coordinates import SkyCoord
     from astropy.coordinates.baseframe import BaseCoordinateFrame

@@ -1,0 +1,143 @@
+"""Orbital elements as two lines, from the package or a file of one's own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from importlib import resources
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..files.bounded import shortened
+from ..files.parsed import read_text
+from .earth import GRAVITY, J2, RADIUS_KM
+from .moments import DAY_S, utc_text
+
+
+@dataclass(frozen=True)
+class Elements:
+    """A two-line element set.
+
+    Attributes
+    ----------
+    first, second : str
+        Its lines.
+    source : str
+        Where they are from.
+    """
+
+    first: str
+    second: str
+    source: str
+
+    def __post_init__(self) -> None:
+        for number, line in enumerate((self.first, self.second), 1):
+            _check(line, number)
+        if self.first[2:7] != self.second[2:7]:
+            raise InputError(
+                f"orbital elements are of satellites {self.first[2:7]!r} and {self.second[2:7]!r}, expected one"
+            )
+        if self.satellite.error:
+            raise InputError(
+                f"orbital elements {shortened(self.second)} are refused by SGP4 (error {self.satellite.error}), "
+                "expected those of an orbit around the Earth"
+            )
+
+    @classmethod
+    def read(cls, path: str | Path) -> Elements:
+        """The first set in a file of two-line elements; titles and lines that begin with # are passed over.
+
+        Raises
+        ------
+        InputError
+            If there is none in it, or a line's checksum is wrong.
+        """
+        path = Path(path)
+        return cls._of(read_text(path, "orbit file"), f"file {path.name}", shortened(str(path)))
+
+    @classmethod
+    def embedded(cls) -> Elements:
+        """The public elements of Mauve that come with the package."""
+        text = resources.files(__package__).joinpath("mauve.tle").read_text(encoding="utf-8")
+        return cls._of(text, "public catalogue, object 66756, embedded", "the embedded elements")
+
+    @classmethod
+    def _of(cls, text: str, source: str, named: str) -> Elements:
+        lines = [line.rstrip() for line in text.splitlines()]
+        for one, two in pairwise(lines):
+            if one.startswith("1 ") and two.startswith("2 "):
+                return cls(one, two, source)
+        raise InputError(f"orbit file {named} holds no two lines of elements, expected a line '1 ...' before '2 ...'")
+
+    @cached_property
+    def satellite(self) -> Any:
+        """The set as `sgp4` takes it."""
+        from sgp4.api import WGS72, Satrec
+
+        return Satrec.twoline2rv(self.first, self.second, WGS72)
+
+    @property
+    def name(self) -> str:
+        """NORAD's number."""
+        return self.first[2:7].strip()
+
+    @property
+    def epoch_jd(self) -> float:
+        """Julian date, UTC."""
+        return float(self.satellite.jdsatepoch + self.satellite.jdsatepochF)
+
+    @property
+    def epoch(self) -> str:
+        """ISO 8601, UTC, to the second."""
+        return utc_text(self.epoch_jd)
+
+    @property
+    def revolutions_per_day(self) -> float:
+        """Mean motion."""
+        return float(self.satellite.no_kozai) * 1440 / (2 * np.pi)
+
+    @property
+    def period_s(self) -> float:
+        """Anomalistic period, s."""
+        return DAY_S / self.revolutions_per_day
+
+    @property
+    def axis_km(self) -> float:
+        """Semi-major axis by Kepler's third law from the mean motion."""
+        return float((GRAVITY / (2 * np.pi / self.period_s) ** 2) ** (1 / 3))
+
+    @property
+    def inclination_deg(self) -> float:
+        """Against the equator."""
+        return float(np.degrees(self.satellite.inclo))
+
+    @property
+    def node_drift_deg_per_day(self) -> float:
+        """How fast J2 turns the node eastward; the mean Sun moves 0.98565 deg a day."""
+        return float(np.degrees(-1.5 * self._oblate * np.cos(self.satellite.inclo)) * DAY_S)
+
+    @property
+    def latitude_rate_deg_per_day(self) -> float:
+        """How fast the mean argument of latitude grows: mean motion and the perigee's drift."""
+        perigee = 0.75 * self._oblate * (5 * np.cos(self.satellite.inclo) ** 2 - 1)
+        return 360.0 * self.revolutions_per_day + float(np.degrees(perigee)) * DAY_S
+
+    @property
+    def _oblate(self) -> float:
+        p = self.axis_km * (1 - self.satellite.ecco**2)
+        return float(2 * np.pi / self.period_s * J2 * (RADIUS_KM / p) ** 2)
+
+
+def _check(line: str, number: int) -> None:
+    """A line's form and checksum: the sum of its digits, with 1 for a minus, modulo 10."""
+    if len(line) < 69 or not line.isascii() or not line.startswith(f"{number} "):
+        raise InputError(f"orbital elements {shortened(line)}, expected line {number} with 69 characters")
+    found = sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10
+    if line[68] != str(found):
+        raise InputError(
+            f"orbital elements {shortened(line)} end in the checksum {line[68]!r}, expected {found}: one is wrong"
+        )

@@ -1,0 +1,164 @@
+"""Where a named star stands: the embedded list, coordinates as they are, or SIMBAD where it is asked for."""
+
+from __future__ import annotations
+
+import difflib
+import re
+from dataclasses import dataclass
+from functools import cache
+from importlib import resources
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from ..files.bounded import shortened
+from ..files.ecsv import parse_ecsv
+from ..sky.helioecliptic import offline, position_of
+from .earth import direction
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+#: Seconds that SIMBAD is waited for.
+TIMEOUT_S = 10.0
+
+
+@dataclass(frozen=True)
+class Target:
+    """A place on the sky, and what is known of the star there.
+
+    Attributes
+    ----------
+    name : str
+    ra_deg, dec_deg : float
+        ICRS.
+    source : str
+        Who says so.
+    distance_pc, magnitude : float or None
+        Magnitude in V.
+    spectral_type : str or None
+    """
+
+    name: str
+    ra_deg: float
+    dec_deg: float
+    source: str
+    distance_pc: float | None = None
+    magnitude: float | None = None
+    spectral_type: str | None = None
+
+    @classmethod
+    def of(cls, text: str, *, name: str | None = None, simbad: bool = False) -> Target:
+        """By a name of the embedded list, or by coordinates.
+
+        Parameters
+        ----------
+        text : str
+            A name, or ICRS coordinates: degrees ("290.0 -11.2") or sexagesimal ("19h22m00s -11d12m00s").
+        name : str, optional
+            What it is called; the text by default.
+        simbad : bool
+            Ask SIMBAD for a name that is not embedded (needs `mauvecl[names]` and a network).
+
+        Raises
+        ------
+        InputError
+            If it is neither, or SIMBAD does not answer.
+        """
+        row = _names().get(_key(text))
+        if row is not None:
+            return cls(name or row.name, row.ra_deg, row.dec_deg, row.source, row.distance_pc, row.magnitude,
+                       row.spectral_type)  # fmt: skip
+        if not re.match(r"\s*[+-]?\d", text):
+            if simbad:
+                return _from_simbad(text, name)
+            near = difflib.get_close_matches(_key(text), _names(), n=3, cutoff=0.5)
+            like = ", ".join(dict.fromkeys(_names()[one].name for one in near))
+            like = f"a name such as {like}" if like else "a name of the embedded list"
+            raise InputError(
+                f"target {shortened(text)} is not in the embedded list, expected {like}, coordinates such as "
+                "'290.0 -11.2', or --simbad to ask SIMBAD"
+            )
+        with offline():
+            place = position_of(text).icrs
+        return cls(name or text.strip(), float(place.ra.deg), float(place.dec.deg), "given")
+
+    @property
+    def direction(self) -> NDArray[np.float64]:
+        """Unit vector, ICRS, (3,)."""
+        return direction(self.ra_deg, self.dec_deg)
+
+
+@cache
+def _list() -> Table:
+    text = resources.files(__package__).joinpath("targets.ecsv").read_text(encoding="utf-8")
+    return parse_ecsv(text, "the embedded list of stars")
+
+
+@cache
+def _names() -> dict[str, Target]:
+    """Every name, without blanks and case, to its star."""
+    found = {}
+    for row in _list():
+        star = Target(
+            str(row["name"]), float(row["ra"]), float(row["dec"]), "embedded list (Hipparcos, I/311)",
+            float(row["distance"]), float(row["V"]), str(row["spectral_type"]),
+        )  # fmt: skip
+        for name in (star.name, *str(row["other_names"]).split(",")):
+            found[_key(name)] = star
+    return found
+
+
+def target_table() -> Table:
+    """The stars known by name: name, ra, dec, distance, V, spectral_type, other_names."""
+    return _list().copy()
+
+
+#: Greek letters as catalogues shorten them.
+_GREEK = {"alpha": "alp", "beta": "bet", "gamma": "gam", "delta": "del", "epsilon": "eps", "zeta": "zet", "iota": "iot",
+          "kappa": "kap", "sigma": "sig", "omicron": "omi"}  # fmt: skip
+
+
+def _key(name: str) -> str:
+    key = re.sub(r"[\s_*.']+", "", name).casefold()
+    for long, short in _GREEK.items():
+        if key.startswith(long):
+            return short + key.removeprefix(long)
+    return key
+
+
+def _from_simbad(text: str, name: str | None) -> Target:
+    """Ask SIMBAD, for so many seconds."""
+    try:
+        from astroquery.simbad import Simbad
+    except ImportError:
+        raise InputError(
+            f"target {shortened(text)} is not in the embedded list and astroquery is missing, expected coordinates, or "
+            "`pip install 'mauvecl[names]'`"
+        ) from None
+    service = Simbad()
+    service.timeout = TIMEOUT_S
+    try:
+        service.add_votable_fields("V", "plx_value", "sp_type")
+        table = service.query_object(text)
+    except Exception as error:  # the network fails in many ways
+        raise InputError(
+            f"target {shortened(text)} is not in the embedded list and SIMBAD did not answer within {TIMEOUT_S:g} s "
+            f"({type(error).__name__}), expected a network, or coordinates"
+        ) from error
+    if table is None or len(table) == 0:
+        raise InputError(f"target {shortened(text)} is unknown to SIMBAD, expected another name, or coordinates")
+    row = table[0]
+
+    def number(column: str) -> float | None:
+        value = row[column]
+        return None if np.ma.is_masked(value) or not np.isfinite(float(value)) else float(value)
+
+    parallax, ra, dec = number("plx_value"), number("ra"), number("dec")
+    if ra is None or dec is None:
+        raise InputError(f"target {shortened(text)} has no coordinates in SIMBAD, expected another name")
+    distance = None if parallax is None or parallax <= 0 else 1000 / parallax
+    kind = str(row["sp_type"]) or None
+    return Target(name or text.strip(), ra, dec, "SIMBAD", distance, number("V"), kind)

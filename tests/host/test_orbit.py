@@ -1,0 +1,185 @@
+"""The orbit: against SGP4's own vectors, astropy's frames, and closed forms of circular orbits."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+import sgp4
+
+from mauvecl.host.errors import InputError
+from mauvecl.host.orbit.earth import direction
+from mauvecl.host.orbit.elements import Elements
+from mauvecl.host.orbit.moments import Moments, utc_text
+from mauvecl.host.orbit.orbit import MEAN_FROM_D, Orbit, Track
+from mauvecl.host.sky.helioecliptic import offline
+
+VECTORS = Path(sgp4.__file__).parent
+
+
+@pytest.fixture(scope="module")
+def orbit() -> Orbit:
+    return Orbit.load()
+
+
+@pytest.fixture(scope="module")
+def day(orbit: Orbit) -> Track:
+    """A day at the elements' epoch."""
+    return orbit.track(Moments("2026-09-14T12:00", 1.0, 60.0))
+
+
+def verification() -> list[tuple[str, str, list[list[float]]]]:
+    """Elements and (minutes, x, y, z) of each satellite of SGP4's verification."""
+    lines = (VECTORS / "SGP4-VER.TLE").read_text().splitlines()
+    tles = [(a[:69], b[:69]) for a, b in pairwise(lines) if a[:2] == "1 " and b[:2] == "2 "]
+    blocks: list[list[list[float]]] = []
+    for line in (VECTORS / "tcppver.out").read_text().splitlines():
+        if line.rstrip().endswith("xx"):
+            blocks.append([])
+        elif line.strip():
+            blocks[-1].append([float(word) for word in line.split()[:4]])
+    return [(*tle, rows) for tle, rows in zip(tles, blocks, strict=True)]
+
+
+def test_verification_vectors() -> None:
+    """Of the satellites whose lines have right checksums: the gravity model and the reading of each field."""
+    seen = 0
+    for first, second, rows in verification():
+        try:
+            elements = Elements(first, second, "SGP4-VER")
+        except InputError:
+            continue
+        for minutes, *place in rows:
+            error, position, _ = elements.satellite.sgp4_tsince(minutes)
+            if not error:
+                assert position == pytest.approx(place, abs=2e-5), (first, minutes)
+                seen += 1
+    assert seen > 400
+
+
+def test_a_track_goes_through_the_verification_vectors() -> None:
+    """A satellite in low orbit, by the times of a plan: the text of its epoch is good to 20 m."""
+    first, second, rows = next(one for one in verification() if one[0][2:7] == "06251")
+    elements = Elements(first, second, "SGP4-VER")
+    minutes = np.array([row[0] for row in rows])
+    step = float(minutes[1] - minutes[0]) * 60
+    start = utc_text(elements.epoch_jd + (minutes[0] * 60 - step / 2) / 86_400, 6)
+    track = Orbit(elements, "tle").track(Moments(start, len(rows) * step / 86_400, step))
+    assert np.abs(track.of_date_km - np.array(rows)[:, 1:]).max() < 0.02
+
+
+def test_frames_are_astropys(day: Track) -> None:
+    with offline():
+        import astropy.units as u
+        from astropy.coordinates import GCRS, ITRS, TEME, CartesianRepresentation, get_body
+        from astropy.time import Time
+
+        times = Time(*day.moments.julian, format="jd", scale="utc")
+        here = TEME(CartesianRepresentation(day.of_date_km.T * u.km), obstime=times)
+        there = here.transform_to(GCRS(obstime=times)).cartesian.xyz.to_value("km").T
+        place = here.transform_to(ITRS(obstime=times)).earth_location.geodetic
+        moon = get_body("moon", times).cartesian.xyz.to_value("km").T
+        sun = get_body("sun", times).cartesian.xyz.to_value("km").T
+    assert np.abs(there - day.position_km).max() < 0.005
+    longitude, latitude = day.below_deg
+    assert np.abs((place.lon.deg - longitude + 180) % 360 - 180).max() < 0.005  # UT1 - UTC
+    assert np.abs(place.lat.deg - latitude).max() < 0.001
+    assert np.abs(moon - day.bodies.moon_km).max() < 2.0  # 1 arcsec
+    assert np.abs(sun / np.linalg.norm(sun, axis=1)[:, None] - day.bodies.sun).max() < 5e-7
+
+
+def test_check_values(orbit: Orbit, day: Track) -> None:
+    """TIME.md, section 5."""
+    from mauvecl.host.orbit.radiation import proton_map
+    from mauvecl.host.orbit.visibility import in_shadow
+
+    elements = orbit.elements
+    assert elements.period_s / 60 == pytest.approx(94.635, abs=0.001)
+    assert elements.axis_km == pytest.approx(6879.0, abs=0.1)
+    assert elements.epoch == "2026-09-14T15:42:13"
+    assert day.local_time_h.mean() * 60 == pytest.approx(10 * 60 + 26, abs=0.5)
+    # Ten whole orbits; a step of 20 s is 0.04 % of them.
+    whole = orbit.track(Moments("2026-09-14T12:00", 10 * elements.period_s / 86_400, 20.0))
+    assert in_shadow(whole).mean() == pytest.approx(0.368, abs=0.002)
+    year = orbit.track(Moments("2026-09-14", 365.0, 7200.0))
+    assert 16.5 < year.beta_deg.min() < 18.5
+    assert 27.5 < year.beta_deg.max() < 28.5
+    month = orbit.track(Moments("2026-09-14", 30.0, 60.0))
+    flux = proton_map().at(*month.below_deg)
+    shares = [100 * float((flux > limit).mean()) for limit in (1, 10, 100)]
+    assert shares == pytest.approx([6.3, 5.0, 3.2], abs=0.15)
+    longitude, latitude = (np.asarray(values)[flux > 10] for values in month.below_deg)
+    ends = [longitude.min(), longitude.max(), latitude.min(), latitude.max()]
+    assert ends == pytest.approx([-71, 31, -55, -10], abs=2.0)  # cells are 2 deg wide
+
+
+def test_mean_orbit(orbit: Orbit) -> None:
+    """It begins where SGP4 has the satellite, keeps its local time, and says what it is."""
+    near = Moments("2026-09-14T15:00", 0.1, 30.0)
+    mean, exact = (Orbit(orbit.elements, kind).track(near) for kind in ("mean", "tle"))
+    apart = np.linalg.norm(mean.of_date_km - exact.of_date_km, axis=1)
+    assert apart.max() < 30  # short-period terms of J2 and the eccentricity
+    later = Moments("2027-06-01", 30.0, 60.0)
+    assert orbit.resolved(later) == "mean"
+    assert np.abs(orbit.track(later).local_time_h - mean.local_time_h.mean()).max() < 0.01
+    assert "mean Sun-synchronous" in orbit.messages(later)[0]
+    # J2 turns the node of these very elements nearly as fast as the Sun moves.
+    assert orbit.elements.node_drift_deg_per_day == pytest.approx(0.98565, abs=0.002)
+
+
+def test_the_mean_orbit_follows_sgp4_for_a_fortnight(orbit: Orbit) -> None:
+    """Its node, and its place along the orbit but for drag, which SGP4 has and it has not."""
+    fortnight = Moments("2026-09-28T00:00", 0.1, 30.0)
+    mean, exact = (Orbit(orbit.elements, kind).track(fortnight) for kind in ("mean", "tle"))
+    assert np.degrees(np.arccos((mean.normal * exact.normal).sum(axis=1))).max() < 0.1
+    apart = np.linalg.norm(mean.of_date_km - exact.of_date_km, axis=1).max()
+    assert apart < 3 * orbit.along_track_km(14)
+
+
+def test_what_is_told_of_the_epoch(orbit: Orbit) -> None:
+    assert orbit.messages(Moments("2026-09-20", 5.0)) == []
+    told = orbit.messages(Moments("2026-10-10", 5.0))
+    assert len(told) == 1
+    assert "along its track" in told[0]
+    assert orbit.along_track_km(30) == pytest.approx(1 + 60 + 0.5 * 5.125e-5 * 900 * 2 * np.pi * 6879.04, rel=1e-4)
+    assert orbit.farthest_d(Moments("2026-10-10", 5.0)) < MEAN_FROM_D
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("no elements here", "holds no two lines"),
+        ("1 66756U 25276CU  26257.65431682  .00005125  00000+0  22992-3 0  9997\n2 66756", "checksum"),
+        ("1 66756U\n2 66756", "69 characters"),
+    ],
+)
+def test_bad_elements(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "bad.tle").write_text(text)
+    with pytest.raises(InputError, match=words):
+        Orbit.load(tmp_path / "bad.tle")
+
+
+def test_own_elements(tmp_path: Path, orbit: Orbit) -> None:
+    text = f"MAUVE\n{orbit.elements.first}\n{orbit.elements.second}\n"
+    (tmp_path / "own.tle").write_text(text)
+    assert Orbit.load(tmp_path / "own.tle").elements.satellite.ndot == orbit.elements.satellite.ndot
+
+
+@pytest.mark.parametrize("kwargs", [{"days": 0.0}, {"days": float("nan")}, {"step_s": 1e-3}, {"start": "yesterday"}])
+def test_impossible_times(kwargs: dict[str, float | str]) -> None:
+    with pytest.raises(InputError):
+        Moments(**({"start": "2027-01-01", "days": 365.0} | kwargs))  # type: ignore[arg-type]
+
+
+def test_nothing_global_is_left_changed(orbit: Orbit) -> None:
+    from astropy.coordinates import solar_system_ephemeris
+    from astropy.utils import iers
+
+    before = iers.conf.auto_download, solar_system_ephemeris.get()
+    _ = orbit.track(Moments("2027-03-01", 1.0)).beta_deg
+    assert (iers.conf.auto_download, solar_system_ephemeris.get()) == before
+
+
+def test_directions() -> None:
+    assert direction(90.0, 0.0) == pytest.approx([0, 1, 0], abs=1e-15)
+    assert direction(np.array([0.0, 10.0]), 90.0)[1] == pytest.approx([0, 0, 1], abs=1e-15)

@@ -1,0 +1,289 @@
+"""Visibility: closed forms of circular orbits, other definitions of the same limits, windows and how they add up."""
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from mauvecl.host.errors import InputError
+from mauvecl.host.orbit import constraints as must
+from mauvecl.host.orbit.conditions import Particles, Thermal
+from mauvecl.host.orbit.earth import direction, unit
+from mauvecl.host.orbit.moments import Moments
+from mauvecl.host.orbit.names import Target
+from mauvecl.host.orbit.orbit import Orbit, circular
+from mauvecl.host.orbit.radiation import proton_map
+from mauvecl.host.orbit.season import elongation_deg, zodiacal_light
+from mauvecl.host.orbit.visibility import Limits, Visibility
+from mauvecl.host.sky.helioecliptic import helioecliptic, offline
+from mauvecl.host.sky.zodiacal import zodiacal_brightness
+
+AXIS_KM = 6879.0
+
+
+@pytest.fixture(scope="module")
+def month() -> Visibility:
+    """Five targets, forty days over the end of a month."""
+    track = Orbit.load().track(Moments("2026-12-20T06:30", 40.0, 60.0))
+    names = ("eps Eri", "AU Mic", "V889 Her", "EK Dra", "DX Leo")
+    return Visibility.of(track, np.array([Target.of(name).direction for name in names]))
+
+
+@pytest.mark.parametrize(
+    ("from_plane_deg", "shares"),
+    [(0.0, (0.622, 0.567, 0.511)), (90 - 39.1, (0.703, 0.607, 0.518))],
+)
+def test_visible_share_of_a_circular_orbit(from_plane_deg: float, shares: tuple[float, ...]) -> None:
+    """TIME.md, section 5, to 0.5 %: 1 - arccos(cos(rho + x) / cos b) / pi."""
+    position, _ = circular(AXIS_KM, 1.2, 0.4, np.linspace(0, 2 * np.pi, 20_000, endpoint=False))
+    normal = unit(np.cross(position[0], position[5000]))
+    target = np.cos(np.radians(from_plane_deg)) * unit(position[0]) + np.sin(np.radians(from_plane_deg)) * normal
+    for margin, share in zip((0.0, 10.0, 20.0), shares, strict=True):
+        found = must.clear_of_earth(position, target[None], margin).mean()
+        assert found == pytest.approx(share, abs=0.005 * share)
+        rho = np.arcsin(6378.137 / AXIS_KM)
+        cosine = np.cos(rho + np.radians(margin)) / np.cos(np.radians(from_plane_deg))
+        assert found == pytest.approx(1 - np.arccos(cosine) / np.pi, abs=2e-4)
+
+
+@pytest.mark.parametrize("margin", [0.0, 10.0, 20.0])
+def test_continuous_viewing(margin: float) -> None:
+    """Always visible within 22.0 - x deg of the orbit's pole."""
+    position, _ = circular(AXIS_KM, 0.0, 0.0, np.linspace(0, 2 * np.pi, 400, endpoint=False))
+    from_pole = np.arange(0.0, 30.0, 0.05)
+    seen = must.clear_of_earth(position, direction(0.0, 90 - from_pole), margin).all(axis=0)
+    assert from_pole[seen].max(initial=-1.0) == pytest.approx(22.0 - margin, abs=0.1)
+
+
+def test_m4opts_definitions() -> None:
+    """The same angles as m4opt has them (its version 2.3.1, `m4opt.constraints`), by astropy's horizontal frame.
+
+    The Earth's limb: altitude + arccos(R_earth / distance); its altitude is over the ellipsoid's horizon, up to 0.2 deg
+    from the sphere's. Sun and Moon: `get_body` for the place, and `separation`.
+    """
+    track = Orbit.load().track(Moments("2026-09-14T12:00", 0.5, 600.0))
+    names = ("eps Eri", "AU Mic", "Vega")
+    target = np.array([Target.of(name).direction for name in names])
+    with offline():
+        import astropy.units as u
+        from astropy.constants import R_earth
+        from astropy.coordinates import AltAz, EarthLocation, SkyCoord, get_body
+        from astropy.time import Time
+
+        times = Time(*track.moments.julian, format="jd", scale="utc")
+        longitude, latitude = track.below_deg
+        height = np.linalg.norm(track.of_date_km, axis=1) * u.km
+        # The place at its true distance: geodetic height by the ellipsoid.
+        place = EarthLocation.from_geodetic(longitude * u.deg, latitude * u.deg, 0 * u.m)
+        up = np.linalg.norm([place.x.to_value("km"), place.y.to_value("km"), place.z.to_value("km")], axis=0)
+        place = EarthLocation.from_geodetic(longitude * u.deg, latitude * u.deg, height - up * u.km)
+        for star, name in zip(target, names, strict=True):
+            one = Target.of(name)
+            there = SkyCoord(one.ra_deg, one.dec_deg, unit="deg")
+            altitude = there.transform_to(AltAz(obstime=times, location=place)).alt.deg
+            theirs = altitude + np.degrees(np.arccos(R_earth.to_value("km") / height.to_value("km")))
+            ours = np.degrees(np.arccos(-unit(track.position_km) @ star) - must.limb_angle_rad(track.position_km))
+            assert np.abs(theirs - ours).max() < 0.25
+            for body, found in (
+                ("sun", track.bodies.sun),
+                ("moon", unit(track.bodies.moon_km - track.position_km)),
+            ):
+                seen = get_body(body, time=times, location=place).separation(there, origin_mismatch="ignore").deg
+                assert np.abs(seen - np.degrees(np.arccos(found @ star))).max() < 0.02
+
+
+def test_flags_are_the_angles(month: Visibility) -> None:
+    """Each limit, in float32 and by cosines, against angles in float64."""
+    track, target = month.track, month.target
+    part = slice(0, 3000)
+    at = track.position_km[part]
+    above = np.degrees(np.arccos(-unit(at) @ target.T) - must.limb_angle_rad(at)[:, None])
+    _agree(must.clear_of_earth(at, target, 25.0), above - 25.0)
+    sun = np.degrees(np.arccos(track.bodies.sun[part] @ target.T))
+    _agree(must.clear_of_sun(track.bodies.sun[part], target, 46.0), sun - 46.0)
+    moon = np.degrees(np.arccos(unit(track.bodies.moon_km[part] - at) @ target.T))
+    _agree(must.clear_of_moon(track.bodies.moon_km[part], at, target, 25.0), moon - 25.0)
+
+
+def _agree(flags: NDArray[np.bool_], over_deg: NDArray[np.float64]) -> None:
+    sure = np.abs(over_deg) > 1e-4
+    assert sure.mean() > 0.99
+    assert (flags == (over_deg >= 0))[sure].all()
+
+
+def test_windows_add_up(month: Visibility) -> None:
+    names, hours = month.by_month()
+    assert names == ["2026-12", "2027-01"]
+    for k in range(len(month.target)):
+        windows = month.windows(k)
+        total = month.hours[k]
+        assert windows.length_s.sum() / 3600 == pytest.approx(total)
+        assert hours[:, k].sum() == pytest.approx(total)
+        assert month.by_day(k).sum() == pytest.approx(total)
+        assert month.by_orbit(k).sum() / 60 == pytest.approx(total)
+        assert (windows.in_shadow_s <= windows.length_s).all()
+        assert (windows.start_s[1:] > windows.stop_s[:-1]).all()
+    # The first of January begins after 11 days and 17.5 hours.
+    split = month.track.moments.seconds < (11 * 24 + 17.5) * 3600
+    assert hours[0] == pytest.approx(month.seen[split].sum(axis=0) / 60)
+    # Orbits of 94.6 minutes in forty days.
+    assert len(month.by_orbit(0)) in (609, 610)
+
+
+def test_each_limit_leaves_its_share(month: Visibility) -> None:
+    """The limits together leave no more than each alone, and what none would take away is there."""
+    assert (month.share <= np.min(list(month.kept_by.values()), axis=0) + 1e-12).all()
+    free = Limits(earth_limb_deg=None, sun_deg=None, moon_deg=None, declination_deg=None, proton_flux=None)
+    assert Visibility.of(month.track, month.target, free).share == pytest.approx(1.0)
+
+
+def test_eclipse_as_a_condition(month: Visibility) -> None:
+    both, dark, light = (
+        Visibility.of(month.track, month.target, Limits(eclipse=rule)).seen for rule in ("any", "only", "never")
+    )
+    assert (dark ^ light == both).all()
+    assert (dark[~month.shadow] == 0).all()
+    assert month.windows(0).in_shadow_s.sum() == dark[:, 0].sum() * 60
+
+
+def test_declination_cone_and_duty_cycle(month: Visibility) -> None:
+    low = Visibility.of(month.track, month.target, Limits(declination_deg=(-90, 0))).share
+    south = month.target[:, 2] < 0
+    assert (low[~south] == 0).all()
+    assert (low[south] > 0).any()
+    cone = Visibility.of(month.track, month.target, Limits(normal_cone_deg=60.0, declination_deg=None))
+    angle = np.degrees(np.arccos(month.track.normal @ month.target.T))
+    assert not (cone.seen & (np.abs(angle - 90) < 29.9)).any()
+    half = Visibility.of(month.track, month.target, Limits(duty_cycle=0.5))
+    assert half.hours == pytest.approx(month.hours / 2)
+
+
+def test_short_windows_are_left_out(month: Visibility) -> None:
+    long = Visibility.of(month.track, month.target, Limits(shortest_s=1200.0))
+    for k in range(len(month.target)):
+        every, kept = month.windows(k), long.windows(k)
+        assert kept.start_s.tolist() == every.start_s[every.length_s >= 1200].tolist()
+
+
+def test_shadow_of_a_circular_orbit() -> None:
+    """Cylinder: arccos(sqrt(1 - (R/a)^2) / cos beta) / pi of the orbit, to the penumbra's width."""
+    position, _ = circular(AXIS_KM, 0.0, 0.0, np.linspace(0, 2 * np.pi, 50_000, endpoint=False))
+    for beta in (0.0, 17.0, 28.0, 60.0, 75.0):
+        sun = np.broadcast_to(direction(30.0, beta), position.shape)
+        found = (must.sunlight(position, sun, np.full(len(position), 1.496e8)) < 0.5).mean()
+        cosine = np.sqrt(1 - (6378.137 / AXIS_KM) ** 2) / np.cos(np.radians(beta))
+        assert found == pytest.approx(0.0 if cosine > 1 else np.arccos(cosine) / np.pi, abs=2e-4)
+
+
+def test_polygon_over_the_date_line() -> None:
+    corners = np.array([[170.0, -10.0], [-170.0, -10.0], [-170.0, 10.0], [170.0, 10.0]])
+    longitude = np.array([175.0, -175.0, 185.0, 165.0, -165.0, 0.0])
+    assert must.in_polygon(longitude, np.zeros(6), corners).tolist() == [True, True, True, False, False, False]
+    assert not must.in_polygon(np.array([180.0]), np.array([11.0]), corners)[0]
+
+
+def test_map_between_cells() -> None:
+    """At a cell its value, halfway the mean of two, over the date line and at the poles nothing odd."""
+    flux = proton_map()
+    grid = flux.flux[10]
+    row, column = np.unravel_index(np.argmax(grid), grid.shape)
+    longitude, latitude = -180 + 2.0 * column, -90 + 2.0 * row
+    assert flux.at(np.array([longitude]), np.array([latitude])) == pytest.approx(grid[row, column])
+    between = flux.at(np.array([longitude + 1.0]), np.array([latitude]))
+    assert between == pytest.approx(grid[row, column : column + 2].mean())
+    edge = np.array([-180.0, 179.999, 180.0])
+    assert flux.at(edge, np.array([-90.0, 0.0, 90.0])) == pytest.approx(0.0)
+    with pytest.raises(InputError, match="expected 10 or 30"):
+        flux.at(edge, edge * 0, above_mev=5)  # type: ignore[arg-type]
+
+
+def test_zodiacal_light_over_the_year() -> None:
+    """As `Sky.at` has it, target by target and day by day."""
+    moments = Moments("2027-01-01", 360.0, 86_400 * 30)
+    bodies = Orbit.load().track(moments).bodies
+    for name in ("eps Eri", "Vega"):
+        star = Target.of(name)
+        light, away = zodiacal_light(bodies, star.direction), elongation_deg(bodies.sun, star.direction)
+        for i, seconds in enumerate(moments.seconds):
+            place = helioecliptic(f"{star.ra_deg} {star.dec_deg}", moments.iso(float(seconds)))
+            assert away[i] == pytest.approx(place.separation_deg, abs=0.01)
+            if np.isfinite(light[i]):
+                assert light[i] == pytest.approx(zodiacal_brightness(place), abs=0.01)
+            else:
+                with pytest.raises(InputError, match="avoidance"):
+                    zodiacal_brightness(place)
+
+
+def test_temperature_follows_its_equation() -> None:
+    """A step from shadow to sunlight nears its end by exp(-t / tau); balance stays."""
+    thermal = Thermal(20.0, 10.0, 600.0)
+    assert thermal.temperature_c(np.full(50, 1.0), 30.0) == pytest.approx(20.0)
+    light = np.r_[np.zeros(5000), np.ones(100)]
+    found = thermal.temperature_c(light, 30.0)
+    t = 30.0 * np.arange(1, 101)
+    assert found[5000:] == pytest.approx(20 - 10 * np.exp(-t / 600), abs=1e-6)
+    # Steps of any length agree where they meet.
+    assert thermal.temperature_c(np.repeat(light, 3), 10.0)[2::3] == pytest.approx(found, abs=1e-9)
+
+
+def test_hits_along_the_orbit(month: Visibility) -> None:
+    rate = Particles(1.0, 0.5).rate_per_cm2_s(month.track)
+    assert rate.min() == 1.0
+    flux = proton_map().at(*month.track.below_deg, above_mev=30)
+    assert rate.max() == pytest.approx(1 + flux.max() / 2)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"), [("epsilon Errr", "such as eps Eri"), ("700 10", "0 to 360"), ("zzz", "embedded list")]
+)
+def test_unknown_targets(text: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        Target.of(text)
+
+
+def test_names_in_any_writing() -> None:
+    same = {Target.of(name) for name in ("eps Eri", "epsilon Eri", "EPS ERI", "HD 22049", "hd22049", "HIP 16537")}
+    assert len(same) == 1
+    assert Target.of("19h22m00s -11d12m00s").ra_deg == pytest.approx(290.5)
+
+
+def test_no_network_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With astroquery and a network that fails, and without astroquery."""
+    import sys
+    import types
+
+    class Simbad:
+        timeout = 0.0
+
+        def add_votable_fields(self, *_: str) -> None:
+            pass
+
+        def query_object(self, _: str) -> None:
+            assert self.timeout == 10.0
+            raise ConnectionError("no route to host")
+
+    monkeypatch.setitem(sys.modules, "astroquery", types.ModuleType("astroquery"))
+    simbad = types.ModuleType("astroquery.simbad")
+    simbad.Simbad = Simbad  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "astroquery.simbad", simbad)
+    with pytest.raises(InputError, match="did not answer within 10 s"):
+        Target.of("HD 1", simbad=True)
+    monkeypatch.setitem(sys.modules, "astroquery.simbad", None)
+    with pytest.raises(InputError, match=r"mauvecl\[names\]"):
+        Target.of("HD 1", simbad=True)
+
+
+@pytest.mark.parametrize(
+    "kwargs",
+    [
+        {"earth_limb_deg": 91.0},
+        {"declination_deg": (10.0, -10.0)},
+        {"eclipse": "sometimes"},
+        {"proton_flux": 0.0},
+        {"anomaly": ((0.0, 0.0), (1.0, 1.0))},
+        {"duty_cycle": 0.0},
+        {"shortest_s": -1.0},
+    ],
+)
+def test_impossible_limits(kwargs: dict[str, object]) -> None:
+    with pytest.raises(InputError):
+        Limits(**kwargs)  # type: ignore[arg-type]
