@@ -4,9 +4,6 @@
     single = pair or slots
     exposures = "job->reference_count" if noisy else "1u"
 %>\
-typedef struct { floatv a, b, c, d; } Four;
-#define NOTHING (Four){(floatv)0.0f, (floatv)0.0f, (floatv)0.0f, (floatv)0.0f}
-#define SUM(x) (((x).a + (x).b) + ((x).c + (x).d))
 % if estimated:
 /* What an observer takes a count for: photons as seen, the dark's and the readout's noise as known. */
 INLINE floatv variance_of(floatv x, __global const Estimate *e)
@@ -27,7 +24,7 @@ void comparison(SCENE, const uint first_low, const uint first_high,
     const uint item = get_global_id(0), padded = job->padded_count, scenario_count = job->scenario_count;
     const uint linear_count = linear_end[scenario_count - 1u], scale_count = scale_end[scenario_count - 1u];
     const uintv realisation = (uintv)(first_low + item * ${width}u) + LANE_INDEX;
-    const Factors steady = factors_of(SCENE_PASSED, realisation, first_high);
+    const Exposure observation = observed(SCENE_PASSED, realisation, first_high);
     Four chi2[${scenarios}], linear[${linears + 1}];
     floatv element[${scenarios}], chi2_element[${scenarios}], chi2_pair[${scenarios}];
 % if estimated:
@@ -59,21 +56,8 @@ void comparison(SCENE, const uint first_low, const uint first_high,
 
     for (uint start = 0; start < padded; start += CHUNK) {
         __global const Pixel *pixel = pixels + start;
-        Draws drawn;
-        floatv t[${scenarios}][${chunk}];
-        for (uint k = 0; k < scenario_count; k++)
-            for (uint i = 0; i < CHUNK; i++) t[k][i] = (floatv)edges[k * padded + start + i].whole;
-        for (uint frame = 0; frame < job->draw_count; frame++) {
-            const Address at = address(realisation, first_high, job->first_frame + frame, job->seed_low, job->seed_high);
-            Factors factors = steady;
-            factors.light = TOGETHER(factors.light, kept(SCENE_PASSED, realisation, first_high, 0u, frame));
-            draw(SCENE_PASSED, &at, 0u, start, &drawn);
-            for (uint k = 0; k < scenario_count; k++)
-                for (uint i = 0; i < CHUNK; i++) {
-                    const uint here = k * padded + start + i;
-                    t[k][i] += digitise(analogue(SCENE_PASSED, &drawn, i, levels + here, start + i, here, &factors), edges + here) - MAGIC;
-                }
-        }
+        intv counts[${scenarios}][${chunk}];
+        expose(SCENE_PASSED, &observation, start, 0u, scenario_count, counts, 0);
 % if noisy or single:
         /* The first quiescent exposure, and the sum of all; scenarios with one template share them. */
         floatv first[${chunk}], sum[${chunk}];
@@ -89,23 +73,19 @@ void comparison(SCENE, const uint first_low, const uint first_high,
 % if noisy or single:
             if (templates[k] != seen) {
                 seen = templates[k];
-                const uint quiet = seen * padded + start;
                 for (uint i = 0; i < CHUNK; i++) sum[i] = (floatv)0.0f;
-                for (uint exposure = 0; exposure < ${exposures}; exposure++) {
-                    for (uint frame = exposure * job->draw_count; frame < (exposure + 1u) * job->draw_count; frame++) {
-                        const Address at = address(realisation, first_high, job->first_frame + frame, job->seed_low, job->seed_high);
-                        Factors other = steady;
-                        other.light = TOGETHER(other.light, kept(SCENE_PASSED, realisation, first_high, REFERENCE, ${"frame" if frames else "exposure * job->frame_count"}));
-                        draw(SCENE_PASSED, &at, REFERENCE, start, &drawn);
-                        for (uint i = 0; i < CHUNK; i++)
-                            sum[i] += digitise(analogue(SCENE_PASSED, &drawn, i, levels + quiet + i, start + i, quiet + i, &other), edges + quiet + i) - MAGIC;
-                    }
-                    for (uint i = 0; i < CHUNK; i++) sum[i] += (floatv)edges[quiet + i].whole;
-                    if (exposure == 0u)
+                for (uint number = 0; number < ${exposures}; number++) {
+                    const Exposure other = another(SCENE_PASSED, observation, REFERENCE, number);
+                    intv quiet[1][${chunk}];
+                    expose(SCENE_PASSED, &other, start, seen, seen + 1u, quiet, 0);
+                    for (uint i = 0; i < CHUNK; i++) sum[i] += TO_FLOAT(quiet[0][i]) + (floatv)edges[seen * padded + start + i].whole;
+                    if (number == 0u)
                         for (uint i = 0; i < CHUNK; i++) first[i] = sum[i];
                 }
             }
 % endif
+            floatv t[${chunk}];
+            for (uint i = 0; i < CHUNK; i++) t[i] = TO_FLOAT(counts[k][i]) + (floatv)edge[i].whole;
             floatv x[${chunk}];
 % if estimated:
             __global const Estimate *estimate = estimates + k * padded + start;
@@ -113,12 +93,12 @@ void comparison(SCENE, const uint first_low, const uint first_high,
 % endif
 % if single:
             floatv apart[${chunk}];
-            for (uint i = 0; i < CHUNK; i++) apart[i] = t[k][i] - first[i];
+            for (uint i = 0; i < CHUNK; i++) apart[i] = t[i] - first[i];
 % endif
 % if pair:
             for (uint i = 0; i < CHUNK; i++) {
 % if estimated:
-                const floatv both = variance_of(t[k][i], estimate + i) + variance_of(first[i], estimate + i);
+                const floatv both = variance_of(t[i], estimate + i) + variance_of(first[i], estimate + i);
                 chi2_pair[k] = FMA(apart[i] * apart[i], (floatv)pixel[i].used / both, chi2_pair[k]);
 % else:
                 chi2_pair[k] = FMA(apart[i] * apart[i], (floatv)(job->pair_scale * level[i].inverse_variance), chi2_pair[k]);
@@ -126,9 +106,9 @@ void comparison(SCENE, const uint first_low, const uint first_high,
             }
 % endif
             for (uint i = 0; i < CHUNK; i++) {
-                x[i] = ${"FMA(sum[i], (floatv)-job->reference_share, t[k][i])" if noisy else "t[k][i]"};
+                x[i] = ${"FMA(sum[i], (floatv)-job->reference_share, t[i])" if noisy else "t[i]"};
 % if estimated:
-                variance[i] = variance_of(t[k][i], estimate + i);
+                variance[i] = variance_of(t[i], estimate + i);
 % if noisy:
                 variance[i] += job->reference_share * variance_of(sum[i] * job->reference_share, estimate + i);
 % endif

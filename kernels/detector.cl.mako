@@ -179,3 +179,77 @@ INLINE floatv digitise(floatv v, __global const Edge *edge)
 % endif
     return r;
 }
+
+<% sums = "+=" if frames else "=" %>\
+/* What all pixels of one draw share. */
+typedef struct { Address at; Factors factors; } Shared;
+
+/* One exposure of a vector of realisations: the observed one, or number so many of the REFERENCE ones. */
+typedef struct {
+    uintv realisation;
+    uint realisation_high, which, number;
+    Factors steady;
+% if not frames:
+    Shared only;
+% endif
+} Exposure;
+
+INLINE Shared shared_of(SCENE_GIVEN, const Exposure *x, uint draw_number)
+{
+    Shared s;
+    s.at = address(x->realisation, x->realisation_high, job->first_frame + draw_number, job->seed_low, job->seed_high);
+    s.factors = x->steady;
+    const uint frame = draw_number${"" if frames else " * job->frame_count"};
+    s.factors.light = TOGETHER(s.factors.light, kept(SCENE_PASSED, x->realisation, x->realisation_high, x->which, frame));
+    return s;
+}
+
+/* The same realisations' exposure of a kind. */
+INLINE Exposure another(SCENE_GIVEN, Exposure x, uint which, uint number)
+{
+    x.which = which;
+    x.number = number;
+% if not frames:
+    x.only = shared_of(SCENE_PASSED, &x, number);
+% endif
+    return x;
+}
+
+INLINE Exposure observed(SCENE_GIVEN, uintv realisation, uint realisation_high)
+{
+    Exposure x;
+    x.realisation = realisation;
+    x.realisation_high = realisation_high;
+    x.steady = factors_of(SCENE_PASSED, realisation, realisation_high);
+    return another(SCENE_PASSED, x, 0u, 0u);
+}
+
+/* Draws an exposure of CHUNK pixels from `start` on: whole DN above the base of scenarios `first` to `end` - 1, summed
+   over its draws. Where `cut` is given, draws cut off below and above are counted. */
+INLINE void expose(SCENE_GIVEN, const Exposure *x, uint start, uint first, uint end, intv (*counts)[${chunk}], uintv (*cut)[2])
+{
+% if frames:
+    for (uint k = first; k < end; k++)
+        for (uint i = 0; i < CHUNK; i++) counts[k - first][i] = 0;
+    if (cut)
+        for (uint i = 0; i < CHUNK; i++) cut[i][0] = cut[i][1] = 0u;
+% endif
+    for (uint n = 0; n < ${"job->draw_count" if frames else "1u"}; n++) {
+        const Shared shared = ${"shared_of(SCENE_PASSED, x, x->number * job->draw_count + n)" if frames else "x->only"};
+        Draws drawn;
+        draw(SCENE_PASSED, &shared.at, x->which, start, &drawn);
+        for (uint k = first; k < end; k++)
+            for (uint i = 0; i < CHUNK; i++) {
+                const uint here = k * job->padded_count + start + i;
+                const floatv v = analogue(SCENE_PASSED, &drawn, i, levels + here, start + i, here, &shared.factors);
+                const floatv r = digitise(v, edges + here);
+                counts[k - first][i] ${sums} AS_INT(r) - AS_INT((floatv)MAGIC);
+% if clip:
+                if (cut) {
+                    cut[i][0] ${sums} AS_UINT(TO_INT(PASSED(r, v + MAGIC)));
+                    cut[i][1] ${sums} AS_UINT(TO_INT(PASSED(v + MAGIC, r)));
+                }
+% endif
+            }
+    }
+}

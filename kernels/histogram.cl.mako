@@ -31,48 +31,20 @@ void histogram(SCENE, const uint first_low, const uint first_high, const uint st
 % endif
         const uintv realisation = (uintv)(first_low + row) + LANE_INDEX;
         const bool whole = row >= start_row && row + ${width}u <= stop_row;
-        const Factors steady = factors_of(SCENE_PASSED, realisation, first_high);
+        const Exposure observation = observed(SCENE_PASSED, realisation, first_high);
         floatv signal = 0.0f, variance = 0.0f;
         intv ended = 0;
-% if not frames:
-        const Address at = address(realisation, first_high, job->first_frame, job->seed_low, job->seed_high);
-        Factors factors = steady;
-        factors.light = TOGETHER(factors.light, kept(SCENE_PASSED, realisation, first_high, 0u, 0u));
-% endif
         for (uint start = element.first & ~3u; start < element.end; start += CHUNK) {
-            Draws drawn;
-            floatv n[${chunk}];
-% if clip:
-            uintv low[${chunk}], high[${chunk}];
-            for (uint i = 0; i < CHUNK; i++) low[i] = high[i] = 0u;
-% endif
-% if frames:
-            for (uint i = 0; i < CHUNK; i++) n[i] = 0.0f;
-            for (uint frame = 0; frame < job->draw_count; frame++) {
-                const Address at = address(realisation, first_high, job->first_frame + frame, job->seed_low, job->seed_high);
-                Factors factors = steady;
-                factors.light = TOGETHER(factors.light, kept(SCENE_PASSED, realisation, first_high, 0u, frame));
-% endif
-                draw(SCENE_PASSED, &at, 0u, start, &drawn);
-                for (uint i = 0; i < CHUNK; i++) {
-                    floatv v = analogue(SCENE_PASSED, &drawn, i, levels + start + i, start + i, start + i, &factors);
-                    floatv r = digitise(v, edges + start + i);
-% if clip:
-                    low[i] += AS_UINT(TO_INT(PASSED(r, v + MAGIC)));
-                    high[i] += AS_UINT(TO_INT(PASSED(v + MAGIC, r)));
-% endif
-                    n[i] ${"+=" if frames else "="} r - MAGIC;
-                }
-% if frames:
-            }
-% endif
+            intv n[1][${chunk}];
+            uintv cut[${chunk}][2];
+            expose(SCENE_PASSED, &observation, start, 0u, 1u, n, cut);
             for (uint i = 0; i < CHUNK; i++) {
                 const uint p = start + i;
                 if (p < element.first || p >= element.end) continue;
-                floatv net = n[i] + observers[p].net_offset;
+                floatv net = TO_FLOAT(n[0][i]) + observers[p].net_offset;
                 signal += net;
                 variance += FMA(most(net, (floatv)0.0f), (floatv)observers[p].gain, (floatv)observers[p].variance);
-                intv bin = (TO_INT(n[i]) >> (intv)(int)observers[p].bin_shift) + ${observer_bins // 2};
+                intv bin = (n[0][i] >> (intv)(int)observers[p].bin_shift) + ${observer_bins // 2};
                 bin = least(most(bin, (intv)0), (intv)${observer_bins - 1});
                 ended |= END(bin);
                 int lanes[${width}];
@@ -87,8 +59,8 @@ void histogram(SCENE, const uint first_low, const uint first_high, const uint st
                 }
 % if clip:
                 uint below[${width}], above[${width}];
-                STORE(low[i], below);
-                STORE(high[i], above);
+                STORE(cut[i][0], below);
+                STORE(cut[i][1], above);
                 for (uint lane = 0; lane < ${width}u; lane++) {
                     if (!WANTED(lane)) continue;
                     if (below[lane]) ADD(clipped + 2u * p, below[lane]);

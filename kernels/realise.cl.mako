@@ -11,39 +11,19 @@ void realise(SCENE, const uint first_low, const uint first_high, const uint star
     /* rows[realisation][pixel], clipped[realisation]; only rows start_row to stop_row - 1 of the launch are kept. */
     const uint item = get_global_id(0), pixel_count = job->pixel_count;
     const uintv realisation = (uintv)(first_low + item * ${width}u) + LANE_INDEX;
-    const Factors steady = factors_of(SCENE_PASSED, realisation, first_high);
+    const Exposure observation = observed(SCENE_PASSED, realisation, first_high);
     uintv met = 0u;
-% if not frames:
-    const Address at = address(realisation, first_high, job->first_frame, job->seed_low, job->seed_high);
-    Factors factors = steady;
-    factors.light = TOGETHER(factors.light, kept(SCENE_PASSED, realisation, first_high, 0u, 0u));
-% endif
     for (uint start = 0; start < pixel_count; start += CHUNK) {
-        Draws drawn;
-        intv dn[${chunk}];
-% if frames:
-        for (uint i = 0; i < CHUNK; i++) dn[i] = 0;
-        for (uint frame = 0; frame < job->draw_count; frame++) {
-            const Address at = address(realisation, first_high, job->first_frame + frame, job->seed_low, job->seed_high);
-            Factors factors = steady;
-            factors.light = TOGETHER(factors.light, kept(SCENE_PASSED, realisation, first_high, 0u, frame));
-% endif
-            draw(SCENE_PASSED, &at, 0u, start, &drawn);
-            for (uint i = 0; i < CHUNK; i++) {
-                floatv v = analogue(SCENE_PASSED, &drawn, i, levels + start + i, start + i, start + i, &factors);
-                floatv r = digitise(v, edges + start + i);
+        intv dn[1][${chunk}];
+        uintv cut[${chunk}][2];
+        expose(SCENE_PASSED, &observation, start, 0u, 1u, dn, cut);
 % if clip:
-                met += AS_UINT(TO_INT(PASSED(r, v + MAGIC) + PASSED(v + MAGIC, r)));
-% endif
-                dn[i] ${"+=" if frames else "="} (AS_INT(r) - AS_INT((floatv)MAGIC)) + (intv)edges[start + i].base;
-            }
-% if frames:
-        }
+        for (uint i = 0; i < CHUNK; i++) met += cut[i][0] + cut[i][1];
 % endif
         /* From pixels of WIDTH realisations to realisations of CHUNK pixels. */
         const uint end = pixel_count - start < CHUNK ? pixel_count - start : CHUNK;
         ${row_type} block[${chunk}][${width}];
-        for (uint i = 0; i < CHUNK; i++) STORE(CONVERT_ROW(dn[i]), block[i]);
+        for (uint i = 0; i < CHUNK; i++) STORE(CONVERT_ROW(dn[0][i] + (intv)(int)job->draw_count * (intv)edges[start + i].base), block[i]);
         for (uint lane = 0; lane < ${width}u; lane++) {
             const uint row = item * ${width}u + lane;
             if (row < start_row || row >= stop_row) continue;

@@ -24,7 +24,7 @@ MOST_COUNTED = 2**25
 #: Raw spectra looked at together on the host.
 PIECE = 4096
 #: Kernels of a detection, the first where more is compared than the template.
-COMPARED, DETECTION = ("comparison", "tally", "marginal"), ("statistics", "tally", "marginal")
+COMPARED, DETECTION = ("sums", "comparison", "tally", "marginal"), ("sums", "statistics", "tally", "marginal")
 #: Work-items to an element or channel of a histogram, on a device of many.
 SHARES = 1024
 
@@ -98,7 +98,7 @@ class Launches:
         if name not in self._kernels:
             # One build for those that are always used together.
             detection = COMPARED if self.variant.compared else DETECTION
-            rooms = detection if name in (detection[0], "tally", "marginalise") else (name,)
+            rooms = detection if name in (detection[1], "tally", "marginalise") else (name,)
             self._kernels[name] = self._device.kernel(rooms, self.variant, name)
         local = (1,) * len(items) if self.variant.width > 1 else None
         self._kernels[name](self._queue, items, local, *arguments)
@@ -246,7 +246,7 @@ class Launches:
     def statistics(self, tile: Tile) -> None:
         """Compute every channel of a tile into values[channel][realisation]."""
         values = self._room("values", 4 * self._rows * tile.size)
-        kernel = (COMPARED if self.variant.compared else DETECTION)[0]
+        kernel = (COMPARED if self.variant.compared else DETECTION)[1]
         items = (tile.size // (self.variant.width * self.variant.vectors),)
         self._launch(kernel, items, *self._arguments, *tile.address(), *self._weighing, np.uint32(tile.size), values)
         if self._subtractions:

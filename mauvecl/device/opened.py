@@ -10,7 +10,7 @@ from mauvecl.device.program import DeviceError, Variant
 from mauvecl.noise.pixels import PIXEL_BLOCK
 
 #: Vectors of realisations that one work-item of the kernels of a detection follows on a processor.
-VECTORS = 4
+VECTORS = 2
 
 
 class Device:
