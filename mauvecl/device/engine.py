@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.device import program
-from mauvecl.device.forms import detection_launches, scene_launches
+from mauvecl.device.forms import ELEMENT_CHUNK, detection_launches, scene_launches
 from mauvecl.device.opened import Device
 from mauvecl.device.program import DeviceError, DeviceRecord, devices
 from mauvecl.device.tiles import Progress, Tile, Tiles
@@ -242,7 +242,7 @@ class Engine:
         self._check(share.start, share.count, request.seed)
         scene, observed = request.scene, elements(request.expectation)
         counts = Counts(scene.n_pixel, len(observed))
-        with scene_launches(self.opened, scene, request.seed) as launches:
+        with scene_launches(self.opened, scene, request.seed, chunk=ELEMENT_CHUNK) as launches:
             launches.observe(observers(request.expectation, scene), observed)
             self._tiles.over(share.start, share.count, 0, lambda tile, done: launches.histogram(tile, counts))
             launches.flush_counts(counts)

@@ -13,6 +13,11 @@ from mauvecl.results.channels import ChannelPlan
 from mauvecl.results.hypotheses import Hypotheses
 from mauvecl.statistics.paper import Paper
 
+#: Vectors of realisations that one work-item follows where it sums more than chi-squared: registers hold no more sums.
+FEW_VECTORS = 2
+#: Pixels drawn at once for resolution elements, which have some 35 and begin anywhere.
+ELEMENT_CHUNK = 8
+
 
 def scene_launches(
     device: Device,
@@ -25,6 +30,7 @@ def scene_launches(
     smooths: int = 0,
     slots: int = 0,
     row_type: str = "int",
+    chunk: int | None = None,
 ) -> Launches:
     """A scene on a device, with kernels of the form that it needs and no more room than they need."""
     variant = replace(
@@ -45,9 +51,11 @@ def scene_launches(
         cosmic=scene.cosmic,
         modulations=scene.modulations,
         row_type=row_type,
+        chunk=min(chunk or device.variant.chunk, device.variant.chunk),
     )
     alone = device.width == 1 or scene.frames or variant.compared
-    return Launches(device, scene, replace(variant, vectors=1 if alone else VECTORS), seed)
+    many = VECTORS if not (variant.elements or variant.linears) else FEW_VECTORS
+    return Launches(device, scene, replace(variant, vectors=1 if alone else many), seed)
 
 
 def detection_launches(device: Device, scene: Scene, seed: int, plan: ChannelPlan, hypotheses: Hypotheses) -> Launches:

@@ -9,8 +9,8 @@ from mauvecl.device import program
 from mauvecl.device.program import DeviceError, Variant
 from mauvecl.noise.pixels import PIXEL_BLOCK
 
-#: Vectors of realisations that one work-item of the kernels of a detection follows on a processor.
-VECTORS = 2
+#: Vectors of realisations that one work-item of the kernels of a detection follows on a processor, at most.
+VECTORS = 4
 
 
 class Device:
