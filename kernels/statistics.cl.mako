@@ -4,9 +4,9 @@
     plain = joint and not (modulations or frames or photons or cosmic)
     powers = (["c4"] if quartic else []) + ["c3", "c2", "c1", "c0"]
 
-    def each(*statements):
-        """The statements for each vector of realisations, their steps in turn; @ is its number."""
-        return "\n".join(one.replace("@", str(v)) for one in statements for v in range(vectors))
+    def each(text):
+        """Statements, each for all vectors of realisations before the next; @ is a vector's number."""
+        return " ".join(one.replace("@", str(v)) + ";" for one in text.split(";")[:-1] for v in range(vectors))
 %>\
 ## x = observed - template, whole DN: what is left of the template's fraction of a DN is a constant of each sum.
 /* Each work-item follows ${vectors} vectors of realisations: what is read of a level serves them all. */
@@ -64,23 +64,25 @@ void statistics(SCENE, const uint first_low, const uint first_high,
 % if plain:
                 /* As analogue() has it, steps of the vectors in turn. */
                 ${each(f"y[@][{j}] = (floatv)four[{j}].{powers[0]};")}
-                ${each(*(f"y[@][{j}] = FMA(drawn[@].z[i + {j}u], y[@][{j}], (floatv)four[{j}].{power});" for power in powers[1:]))}
+% for power in powers[1:]:
+                ${each(f"y[@][{j}] = FMA(drawn[@].z[i + {j}u], y[@][{j}], (floatv)four[{j}].{power});")}
+% endfor
                 ${each(f"y[@][{j}] = digitise(y[@][{j}], edges + here + i + {j}u) - four[{j}].shift;")}
 % elif frames:
                 ${each(f"y[@][{j}] = TO_FLOAT(counts[@][k][i + {j}u]) + edges[here + i + {j}u].whole;")}
 % else:
-                ${each(f"y[@][{j}] = analogue(SCENE_PASSED, drawn + @, i + {j}u, four + {j}, start + i + {j}u, here + i + {j}u, &observation[@].only.factors);",
-                       f"y[@][{j}] = digitise(y[@][{j}], edges + here + i + {j}u) - four[{j}].shift;")}
+                ${each(f"y[@][{j}] = analogue(SCENE_PASSED, drawn + @, i + {j}u, four + {j}, start + i + {j}u, here + i + {j}u, &observation[@].only.factors); y[@][{j}] = digitise(y[@][{j}], edges + here + i + {j}u) - four[{j}].shift;")}
 % endif
-                ${each(f"term[@] = FMA(y[@][{j}], (floatv)four[{j}].inverse_variance, (floatv)four[{j}].twice);",
-                       f"sum[@].{part} = FMA(y[@][{j}], term[@], sum[@].{part});")}
+                ${each(f"term[@] = FMA(y[@][{j}], (floatv)four[{j}].inverse_variance, (floatv)four[{j}].twice); sum[@].{part} = FMA(y[@][{j}], term[@], sum[@].{part});")}
 % if linear:
                 ${each(f"own_sum[@].{part} = FMA(y[@][{j}], (floatv)own_weight[i + {j}u], own_sum[@].{part});")}
 % endif
 % endfor
 % if linear:
                 if (again_needed) {
-                    ${each(*(f"x[@][i + {j}u] = y[@][{j}];" for j in range(4)))}
+% for j in range(4):
+                    ${each(f"x[@][i + {j}u] = y[@][{j}];")}
+% endfor
                 }
 % endif
 % if elements:
@@ -92,9 +94,7 @@ void statistics(SCENE, const uint first_low, const uint first_high,
                     ${each(f"inside[@] = FMA(y[@][{j}], (floatv)pixel[i + {j}u].used, inside[@]);")}
                     if (pixel[i + ${j}u].element_end) {
                         __global const Edge *edge = edges + here + i + ${j}u;
-                        ${each("inside[@] += edge->element_offset;",
-                               "outside[@] = FMA(inside[@] * inside[@], (floatv)edge->inverse_element_variance, outside[@]);",
-                               "inside[@] = (floatv)0.0f;")}
+                        ${each("inside[@] += edge->element_offset; outside[@] = FMA(inside[@] * inside[@], (floatv)edge->inverse_element_variance, outside[@]); inside[@] = (floatv)0.0f;")}
                     }
 % endfor
                 }
