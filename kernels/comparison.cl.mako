@@ -16,6 +16,7 @@ __kernel ${attributes}
 void comparison(SCENE, const uint first_low, const uint first_high,
                 __global const uint *restrict templates, __global const float *restrict constants,
                 __global const float *restrict weights, __global const uint *restrict linear_end,
+                __global const uint *restrict pixels_end,
                 __global const Estimate *restrict estimates, __global const float *restrict bands,
                 __global const uint *restrict finished, __global const float *restrict scales,
                 __global const uint *restrict scale_end, const uint smoothed_count,
@@ -144,6 +145,10 @@ void comparison(SCENE, const uint first_low, const uint first_high,
                         element_variance[k] = (floatv)0.0f;
 % else:
                         element[k] += edge[j].element_offset;
+% if linear:
+                        for (uint q = pixels_end[k]; q < linear_end[k]; q++)
+                            linear[q].a = FMA(element[k], (floatv)weights[q * padded + start + j], linear[q].a);
+% endif
                         chi2_element[k] = FMA(element[k] * element[k], (floatv)edge[j].inverse_element_variance, chi2_element[k]);
 % endif
                         element[k] = (floatv)0.0f;
@@ -151,7 +156,7 @@ void comparison(SCENE, const uint first_low, const uint first_high,
                 }
             }
 % endif
-            for (; l < linear_end[k]; l++) {
+            for (; l < pixels_end[k]; l++) {
                 __global const float *weight = weights + l * padded + start;
                 for (uint i = 0; i < CHUNK; i += 4u) {
 % for j, part in enumerate("abcd"):
@@ -162,6 +167,7 @@ void comparison(SCENE, const uint first_low, const uint first_high,
 % endfor
                 }
             }
+            l = linear_end[k];
 % if slots:
             __global const float *band = bands + (size_t)(start / CHUNK) * ${slots}u * CHUNK;
             for (uint s = 0; s < ${slots}u; s += 4u) {

@@ -14,6 +14,7 @@ __kernel ${attributes}
 void statistics(SCENE, const uint first_low, const uint first_high,
                 __global const float *restrict constants,
                 __global const float *restrict weights, __global const uint *restrict linear_end,
+                __global const uint *restrict pixels_end,
                 const uint stride, __global float *restrict values)
 {
     const uint item = get_global_id(0), padded = job->padded_count, scenario_count = job->scenario_count;
@@ -49,11 +50,12 @@ void statistics(SCENE, const uint first_low, const uint first_high,
             ${each("sum[@] = chi2[k][@]; inside[@] = element[k][@]; outside[@] = chi2_element[k][@];")}
 % if linear:
             /* The scenario's first linear statistic is summed on the way; one without any adds nothing to the last. */
-            const uint own = l < linear_end[k] ? l++ : linear_count;
+            const uint own = l < pixels_end[k] ? l++ : linear_count;
             __global const float *own_weight = weights + own * padded + start;
             Four own_sum[${vectors}];
-            floatv x[${vectors}][${chunk}];
-            const bool again_needed = l < linear_end[k];
+            floatv x[${vectors}][${chunk}], ended[${vectors}][${chunk}];
+            uint end[${chunk}], count = 0;
+            const bool again_needed = l < pixels_end[k];
             ${each("own_sum[@] = linear[own][@];")}
 % endif
             for (uint i = 0; i < CHUNK; i += 4u) {
@@ -94,7 +96,12 @@ void statistics(SCENE, const uint first_low, const uint first_high,
                     ${each(f"inside[@] = FMA(y[@][{j}], (floatv)pixel[i + {j}u].used, inside[@]);")}
                     if (pixel[i + ${j}u].element_end) {
                         __global const Edge *edge = edges + here + i + ${j}u;
-                        ${each("inside[@] += edge->element_offset; outside[@] = FMA(inside[@] * inside[@], (floatv)edge->inverse_element_variance, outside[@]); inside[@] = (floatv)0.0f;")}
+                        ${each("inside[@] += edge->element_offset;")}
+% if linear:
+                        ${each(f"ended[@][count] = inside[@];")}
+                        end[count++] = start + i + ${j}u;
+% endif
+                        ${each("outside[@] = FMA(inside[@] * inside[@], (floatv)edge->inverse_element_variance, outside[@]); inside[@] = (floatv)0.0f;")}
                     }
 % endfor
                 }
@@ -103,7 +110,7 @@ void statistics(SCENE, const uint first_low, const uint first_high,
             ${each("chi2[k][@] = sum[@]; element[k][@] = inside[@]; chi2_element[k][@] = outside[@];")}
 % if linear:
             ${each("linear[own][@] = own_sum[@];")}
-            for (; l < linear_end[k]; l++) {
+            for (; l < pixels_end[k]; l++) {
                 __global const float *weight = weights + l * padded + start;
                 Four total[${vectors}];
                 ${each("total[@] = linear[l][@];")}
@@ -114,6 +121,13 @@ void statistics(SCENE, const uint first_low, const uint first_high,
                 }
                 ${each("linear[l][@] = total[@];")}
             }
+% if elements:
+            for (; l < linear_end[k]; l++)
+                for (uint n = 0; n < count; n++) {
+                    const float weight = weights[l * padded + end[n]];
+                    ${each("linear[l][@].a = FMA(ended[@][n], (floatv)weight, linear[l][@].a);")}
+                }
+% endif
 % endif
         }
     }

@@ -74,7 +74,7 @@ def detection_launches(device: Device, scene: Scene, seed: int, plan: ChannelPla
         smooths=len(plan.scales),
         slots=bands.shape[1],
     )
-    launches.weigh(plan.weights, plan.linear_end)
+    launches.weigh(plan.weights, plan.linear_end, plan.pixels_end)
     if plan.subtractions.size:
         launches.marginalise(plan.subtractions)
     if launches.variant.compared:

@@ -208,12 +208,15 @@ class Launches:
         self._cl.enqueue_copy(self._queue, buffer, np.zeros(shape, dtype))
         return host
 
-    def weigh(self, weights: NDArray[np.float32], linear_end: NDArray[np.uint32]) -> None:
-        """Upload the linear statistics' weights, and where each scenario's end."""
+    def weigh(
+        self, weights: NDArray[np.float32], linear_end: NDArray[np.uint32], pixels_end: NDArray[np.uint32]
+    ) -> None:
+        """Upload the linear statistics' weights, and where each scenario's end; see `ChannelPlan`."""
         scene = self._scene
         # A row of zeros behind them, for scenarios without any.
         padded = np.concatenate([weights, np.zeros((1, len(scene.pixels)), np.float32)])
-        self._weighing = [*map(self.upload, (scene.constants(weights, linear_end), padded, linear_end))]
+        constants = scene.constants(weights, linear_end, pixels_end)
+        self._weighing = [*map(self.upload, (constants, padded, linear_end, pixels_end))]
         self._rows = len(layout.FIXED_STATISTICS) * len(scene.levels) + len(weights)
 
     def marginalise(self, subtractions: NDArray[np.uint32]) -> None:

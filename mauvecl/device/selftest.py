@@ -189,7 +189,7 @@ def _statistics(name: str, scene: Scene) -> tuple[NDArray[np.float32], ChannelPl
     index = np.arange(START, START + COUNT, dtype=np.uint64)
     smoothed = reference_sums.Smoothed.of(found, plan) if len(plan.scales) else None
     paired = "chi2_pair" in _asked(how)
-    sums = reference_sums.statistics(scene, index, SEED, plan.weights, plan.linear_end, pair=paired, smoothed=smoothed)
+    sums = reference_sums.statistics(scene, index, SEED, plan, pair=paired, smoothed=smoothed)
     return reference_sums.marginalise(sums, plan.subtractions), plan
 
 

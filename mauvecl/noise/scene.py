@@ -106,8 +106,12 @@ class Scene:
         """Whether cosmic rays are drawn."""
         return bool(self.job["cosmic_bits"])
 
-    def constants(self, weights: NDArray[np.float32], linear_end: NDArray[np.uint32]) -> NDArray[np.float32]:
+    def constants(
+        self, weights: NDArray[np.float32], linear_end: NDArray[np.uint32], pixels_end: NDArray[np.uint32]
+    ) -> NDArray[np.float32]:
         """What the template's fractions add to each sum: chi-squared per scenario, then each linear statistic.
+
+        Sums of resolution elements hold them already.
 
         Returns
         -------
@@ -115,7 +119,7 @@ class Scene:
         """
         chi2 = np.sum(self.levels["inverse_variance"] * self.fraction**2, axis=1)
         scenario = np.searchsorted(linear_end, np.arange(len(weights)), side="right")
-        linear = [float(weights[i] @ self.fraction[k]) for i, k in enumerate(scenario)]
+        linear = [float(weights[i] @ self.fraction[k]) if i < pixels_end[k] else 0.0 for i, k in enumerate(scenario)]
         return np.array([*chi2, *linear], np.float32)
 
     def part(self, scenarios: Sequence[int]) -> Scene:

@@ -30,6 +30,9 @@ class ChannelPlan:
     weights : ndarray of float32, shape (n_linear, n_padded)
     linear_end : ndarray of uint32, shape (n_scenario,)
         One past the last linear statistic of each scenario.
+    pixels_end : ndarray of uint32, shape (n_scenario,)
+        One past the last of them that weighs pixels; those behind it weigh sums of resolution elements, at an element's
+        last pixel.
     scales : ndarray of float32, shape (n_smoothed, n_centre)
         Of the statistic `paper`; see `smoothing.Smoothing`.
     scale_end : ndarray of uint32, shape (n_scenario,)
@@ -42,6 +45,7 @@ class ChannelPlan:
 
     weights: NDArray[np.float32]
     linear_end: NDArray[np.uint32]
+    pixels_end: NDArray[np.uint32]
     scales: NDArray[np.float32]
     scale_end: NDArray[np.uint32]
     grids: list[Grid]
@@ -65,6 +69,8 @@ class _Rows:
 
     rows: list[NDArray[np.float64]] = field(default_factory=list)
     ends: list[int] = field(default_factory=list)
+    #: One past the last of each scenario that weighs pixels.
+    pixels_end: list[int] = field(default_factory=list)
     #: Where a statistic of a scenario is found; `shaped` ones by the flare looked for.
     places: dict[tuple[str, int, int], int] = field(default_factory=dict)
 
@@ -72,8 +78,14 @@ class _Rows:
         self.places[statistic, scenario, flare] = len(self.rows)
         self.rows.append(row)
 
+    def end_pixels(self) -> None:
+        """End what weighs pixels of a scenario."""
+        self.pixels_end.append(len(self.rows))
+
     def end(self) -> None:
         """End a scenario."""
+        if len(self.pixels_end) == len(self.ends):
+            self.end_pixels()
         self.ends.append(len(self.rows))
 
 
@@ -93,8 +105,10 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
     for scenario in range(1 + len(batch)):
         # The quiescent draws meet every flare's shape, each flare only its own.
         shapes = [flare for i, flare in enumerate(batch) if scenario in (0, i + 1)]
-        # Those that look for a shape come first: the kernel sums the first row on its way.
-        for one in sorted(asked, key=lambda s: not s.shaped):
+        # Those that look for a shape come first: the kernel sums the first row on its way. Sums of elements come last.
+        for one in sorted(asked, key=lambda s: (s.by_element, not s.shaped)):
+            if one.by_element:
+                weighted.end_pixels()
             for flare in shapes if one.shaped else [0]:
                 looked_for = hypotheses.shape(one.name, flare)
                 if isinstance(one, LinearStatistic):
@@ -142,6 +156,7 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
     weights = np.zeros((len(weighted.rows), len(hypotheses.scene.pixels)), np.float32)
     weights[:, : hypotheses.scene.n_pixel] = np.array(weighted.rows).reshape(len(weights), hypotheses.scene.n_pixel)
     scales = np.array(smoothed.rows, np.float32) if smoothed.rows else np.zeros((0, 1), np.float32)
-    linear_end, scale_end = (np.array(rows.ends, np.uint32) for rows in (weighted, smoothed))
+    ends = (np.array(places, np.uint32) for places in (weighted.ends, weighted.pixels_end, smoothed.ends))
+    linear_end, pixels_end, scale_end = ends
     taken = np.array(subtractions, np.uint32).reshape(len(subtractions), 3).T
-    return ChannelPlan(weights, linear_end, scales, scale_end, grids, keys, taken)
+    return ChannelPlan(weights, linear_end, pixels_end, scales, scale_end, grids, keys, taken)

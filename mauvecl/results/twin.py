@@ -23,8 +23,7 @@ def statistics(
     scene: Scene,
     realisation: NDArray[np.uint64],
     seed: int,
-    weights: NDArray[np.float32],
-    linear_end: NDArray[np.uint32],
+    plan: ChannelPlan,
     *,
     pair: bool = True,
     smoothed: Smoothed | None = None,
@@ -36,8 +35,8 @@ def statistics(
     scene : Scene
     realisation : ndarray of uint64, shape (n,)
     seed : int
-    weights : ndarray of float32, shape (n_linear, n_padded)
-    linear_end : ndarray of uint32, shape (n_scenario,)
+    plan : ChannelPlan
+        Its weights.
     pair : bool
         Whether `chi2_pair` is wanted; its rows are zero otherwise.
     smoothed : Smoothed, optional
@@ -48,7 +47,8 @@ def statistics(
     ndarray of float32, shape (3 n_scenario + n_linear + n_smoothed, n)
     """
     n_scenario, fixed = len(scene.levels), len(layout.FIXED_STATISTICS)
-    constants = scene.constants(weights, linear_end)
+    weights, linear_end, pixels_end = plan.weights, plan.linear_end, plan.pixels_end
+    constants = scene.constants(weights, linear_end, pixels_end)
     estimated, exposures = scene.comparison.estimated, scene.comparison.exposures
     share, scale = scene.job["reference_share"], scene.job["pair_scale"]
     out = np.zeros((fixed * n_scenario + len(weights), len(realisation)), np.float32)
@@ -82,7 +82,8 @@ def statistics(
                 slope = fma(y[p], level[p]["inverse_variance"], level[p]["twice"])
                 parts[p % 4] = fma(y[p], slope, parts[p % 4])
         out[fixed * k] = ((parts[0] + parts[1]) + (parts[2] + parts[3])) + constants[k]
-        out[fixed * k + 1] = _element_sum(scene, k, y, variance)
+        out[fixed * k + 1], of_elements = _element_sums(scene, k, y, variance, weights[pixels_end[k] : linear_end[k]])
+        out[fixed * n_scenario + int(pixels_end[k]) : fixed * n_scenario + int(linear_end[k])] = of_elements
         for p, pixel in enumerate(scene.pixels) if pair else ():
             d = raw[p] - others[0][t, p]
             if estimated:
@@ -91,7 +92,7 @@ def statistics(
             else:
                 weight = scale * level[p]["inverse_variance"]
             out[fixed * k + 2] = fma(d * d, weight, out[fixed * k + 2])
-        for linear in range(begin, int(linear_end[k])):
+        for linear in range(begin, int(pixels_end[k])):
             row = _summed(y, weights[linear])
             if estimated:
                 row = np.divide(row, np.sqrt(_summed(variance, weights[linear] * weights[linear])), dtype=np.float32)
@@ -110,9 +111,12 @@ def _variance(x: Floats, estimate: NDArray[np.void]) -> Floats:
     return fma(np.maximum(x + offset, np.float32(0.0)), gain, known)
 
 
-def _element_sum(scene: Scene, k: int, y: Floats, variance: Floats) -> Floats:
-    """The statistic `chi2_element` of a scenario, shape (n,)."""
+def _element_sums(
+    scene: Scene, k: int, y: Floats, variance: Floats, weights: NDArray[np.float32]
+) -> tuple[Floats, Floats]:
+    """The statistic `chi2_element` of a scenario, shape (n,), and weighted sums of its elements, shape (m, n)."""
     total: Floats = np.zeros_like(y[0])
+    weighted: Floats = np.zeros((len(weights), total.size), np.float32)
     inside, noise = total, total
     estimated = scene.comparison.estimated
     for p, (pixel, edge) in enumerate(zip(scene.pixels, scene.edges[k], strict=True)):
@@ -127,8 +131,9 @@ def _element_sum(scene: Scene, k: int, y: Floats, variance: Floats) -> Floats:
             else:
                 inside = np.add(inside, edge["element_offset"], dtype=np.float32)
                 total = fma(inside * inside, edge["inverse_element_variance"], total)
+                weighted = fma(inside, weights[:, p, None], weighted)
             inside, noise = np.zeros_like(total), np.zeros_like(total)
-    return total
+    return total, weighted
 
 
 def marginalise(values: NDArray[np.float32], subtractions: NDArray[np.uint32]) -> NDArray[np.float32]:

@@ -66,8 +66,9 @@ class Chi2(QuadraticStatistic):
         return QuadraticForm(weights, shifts)
 
     def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
+        x, variance = x * setting.used, variance * setting.used
         subtracted = np.sum((x @ self.subtracted(setting).T) ** 2, axis=-1)
-        x, variance = (self._grouped(setting, values * setting.used) for values in (x, variance))
+        x, variance = (self._grouped(setting, values) for values in (x, variance))
         total = np.sum(np.divide(x**2, variance, out=np.zeros_like(x), where=variance > 0), axis=-1)
         return np.asarray(total - subtracted)
 
@@ -75,7 +76,7 @@ class Chi2(QuadraticStatistic):
         if not setting.nuisances:
             return super().subtracted(setting)
         model = self._grouped(setting, self.variance(setting) * setting.used)
-        return self._per_pixel(setting, setting.nuisances.rows(model, self._spectra(setting))) * setting.used
+        return self._per_pixel(setting, setting.nuisances.rows(model, self._spectra(setting)))
 
     def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
         from scipy.sparse import eye_array
@@ -86,8 +87,8 @@ class Chi2(QuadraticStatistic):
     def own(self, setting: Setting, flare: Expectation | None = None) -> Float:
         model = self._grouped(setting, self.variance(setting) * setting.used)
         inverse = np.divide(1.0, model, out=np.zeros_like(model), where=model > 0)
-        own = self._per_pixel(setting, inverse) * setting.used - np.sum(self.subtracted(setting) ** 2, axis=0)
-        return np.asarray(own)
+        own = self._per_pixel(setting, inverse) - np.sum(self.subtracted(setting) ** 2, axis=0)
+        return np.asarray(own * setting.used)
 
     def _grouped(self, setting: Setting, values: Float) -> Float:
         """What is squared, from values per pixel along the last axis."""
@@ -146,6 +147,7 @@ class Chi2Element(Chi2):
     definition: ClassVar[str] = "the same over sums of 10.5 nm resolution elements"
     label: ClassVar[str] = "chi2 over 10.5 nm elements"
     kernel_sum: ClassVar[str | None] = "chi2_element"
+    by_element: ClassVar[bool] = True
 
     def dof(self, setting: Setting) -> int:
         return int(np.unique(setting.quiet.element[setting.used]).size) - self._free(setting)

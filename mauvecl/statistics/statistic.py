@@ -91,6 +91,8 @@ class Statistic(ABC):
     paired: ClassVar[bool] = False
     #: Which of the sums that kernels always know it is (`layout.FIXED_STATISTICS`); none where it brings weights.
     kernel_sum: ClassVar[str | None] = None
+    #: Whether it looks at sums of resolution elements, not at pixels.
+    by_element: ClassVar[bool] = False
     #: Whether it can be marginalised over what is unknown.
     marginal: ClassVar[bool] = True
 
@@ -248,5 +250,8 @@ class QuadraticStatistic(Statistic):
         """What multiplies each pixel's own square, per DN^2, shape (n_pixel,)."""
 
     def subtracted(self, setting: Setting) -> Float:
-        """Weights per DN of the sums whose squares are subtracted to marginalise, shape (k, n_pixel)."""
+        """Weights per DN of the sums whose squares are subtracted to marginalise, shape (k, n_pixel).
+
+        They apply to pixels that count, and are the same for all of an element where the statistic is `by_element`.
+        """
         return np.zeros((0, setting.used.size))

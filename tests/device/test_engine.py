@@ -109,7 +109,7 @@ def test_raw_spectra_are_the_twins(any_width: Engine, name: str) -> None:
 def _twin(found: Detection, plan: ChannelPlan) -> np.ndarray:
     """Every channel of a detection by the twin."""
     smoothed = reference_sums.Smoothed.of(found, plan)
-    return reference_sums.statistics(found.scene, INDEX, SEED, plan.weights, plan.linear_end, smoothed=smoothed)
+    return reference_sums.statistics(found.scene, INDEX, SEED, plan, smoothed=smoothed)
 
 
 @pytest.mark.parametrize("name", CASES)

@@ -42,7 +42,7 @@ def test_every_marginalised_statistic_is_the_twins(any_width: Engine, exposure: 
     scene = prepare([quiet, *flares])
     found = Detection(quiet, tuple(flares), asked, scene, INDEX.size, nuisances=Nuisances.of(quiet, sd))
     plan = plan_channels(found, range(len(flares)), first=True)
-    sums = twin.statistics(scene, INDEX, SEED, plan.weights, plan.linear_end, pair=False)
+    sums = twin.statistics(scene, INDEX, SEED, plan, pair=False)
     np.testing.assert_array_equal(values, twin.marginalise(sums, plan.subtractions))
     # What is taken away matters.
     assert (values[0] < sums[0]).all()
