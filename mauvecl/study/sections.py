@@ -26,6 +26,8 @@ class Part(BaseModel):
 
 #: What a star from a file has and one of the library has not.
 FILE_KEYS = ("file", "wavelength_unit", "flux_unit", "extend")
+#: What belongs to one star, and not to another in its place.
+STAR_KEYS = (*FILE_KEYS, "distance_pc", "radius_rsun", "effective_temperature_k")
 
 
 class Star(Part):
