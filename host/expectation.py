@@ -17,6 +17,7 @@ from .errors import InputError
 from .instrument.instrument import Instrument
 from .measured_noise import below_zero
 from .response import Order, electrons_per_second
+from .sky import DEFAULT_SKY
 from .sky.zodiacal import Sky
 
 if TYPE_CHECKING:
@@ -364,7 +365,7 @@ def expect(
     exposure : Quantity or float
         Time, or seconds; rounded up to whole frames, which `messages` then tells.
     sky : Sky, optional
-        None by default.
+        Zodiacal light of V = 22.1 mag arcsec^-2 by default, as for the command line; `Sky.none()` for none.
     order : {"paper", "physical"}
         Whether efficiencies act after the line function or before; see `response_matrix`.
     signal : {"net", "paper"}
@@ -385,7 +386,7 @@ def expect(
     >>> float(round(quiet.snr().max(), 2)), float(round(quiet.snr_per_element().max(), 1))
     (8.29, 48.9)
     """
-    sky = Sky.none() if sky is None else sky
+    sky = Sky.of_brightness(DEFAULT_SKY) if sky is None else sky
     asked_s = _seconds(exposure)
     # A hair less, so that 0.1 + 0.2 s is three frames of 0.1 s.
     n_frames = max(1, int(np.ceil(asked_s / instrument.frame_s * (1 - 1e-12))))

@@ -13,6 +13,10 @@ LIBRARY = ROOT / "host" / "stars" / "library"
 #: What their licences ask to be kept with every copy.
 NOTICES = {
     "pyphot": ("Copyright (c) 2016 Morgan Fouesneau", "The above copyright notice and this permission notice shall be"),
+    "speclite": (
+        "Copyright (c) 2015-2025, Speclite Developers",
+        "Redistributions in binary form must reproduce the above",
+    ),
     "EXOSIMS": ("Copyright (c) 2015, Dmitry Savransky", "Redistributions in binary form must reproduce the above"),
 }
 

@@ -16,11 +16,15 @@ from .catalogue import band_table, find, spectrum_table
 
 #: Band names and what else they answer to.
 ALIASES = {
-    "V": ("Johnson V", "V"),
+    "B": ("Johnson B",),
+    "V": ("Johnson V",),
     "Kepler": ("Kp", "Kepler Kp"),
     "TESS": ("T",),
     "Gaia G": ("G", "Gaia DR2 G"),
+    "Gaia BP": ("BP", "Gaia DR2 BP"),
+    "Gaia RP": ("RP", "Gaia DR2 RP"),
     "GALEX NUV": ("NUV",),
+    "GALEX NUV Vega": ("NUV Vega",),
 }
 #: What a magnitude may mean: what catalogues print in the band, Vega at zero in every band, or AB.
 System = Literal["catalogue", "vega", "ab"]

@@ -59,6 +59,8 @@ class Source:
         Its span without what was continued at the level of its ends; all of it by default.
     unscaled : str
         Why its flux is not that at the telescope, so that it needs a magnitude; empty where it is.
+    temperature_k : float, optional
+        Of its photosphere, which flares may take the place of; None where it is not known.
 
     Raises
     ------
@@ -85,6 +87,7 @@ class Source:
     told: tuple[str, ...] = ()
     measured_nm: tuple[float, float] | None = None
     unscaled: str = ""
+    temperature_k: float | None = None
 
     def __post_init__(self) -> None:
         for field in ("wavelength_nm", "flux_flam"):
@@ -119,12 +122,19 @@ class Source:
             )  # fmt: skip
         entry = catalogue.find(name)
         table = catalogue.spectrum_table(entry["file"])
+        noisy = entry["noisy_below_nm"]
         return cls(
             np.asarray(table["wavelength"], float),
             np.asarray(table["flux"], float),
             entry["name"],
             f"{entry['origin']}; {entry['citation']}",
-            (f"library spectrum {entry['name']} is {entry['star']}; {entry['uv_quality']}",),
+            (
+                f"library spectrum {entry['name']} is {entry['star']}; {entry['uv_quality']}",
+                f"photosphere of {entry['temperature_k']} K: {entry['temperature_source']}",
+            ),
+            told=(f"noise rules its ultraviolet below {noisy} nm, where its flux is an upper limit",) if noisy else (),
+            unscaled="" if entry["level"] == "as seen" else f"the library keeps it at {entry['level']}",
+            temperature_k=float(entry["temperature_k"]),
         )
 
     @classmethod
@@ -369,7 +379,7 @@ class Source:
         band : str
         geometry : {"added", "replaces"}
         photosphere_temperature : Quantity or float in K, optional
-            Needed by ``replaces``.
+            For ``replaces``, in place of the star's own `temperature_k`.
 
         Raises
         ------
@@ -377,6 +387,9 @@ class Source:
             For an impossible value, or a band that the spectrum does not cover.
         """
         amplitude, kelvin = _number("flare amplitude", amplitude), _number("temperature", temperature, "K")
+        photosphere = self.temperature_k
+        if photosphere_temperature is not None:
+            photosphere = _number("photosphere temperature", photosphere_temperature, "K")
         flux = with_flare(
             self.wavelength_nm,
             self.flux_flam,
@@ -384,11 +397,11 @@ class Source:
             temperature_k=kelvin,
             band=band,
             geometry=geometry,
-            photosphere_temperature_k=None
-            if photosphere_temperature is None
-            else _number("photosphere temperature", photosphere_temperature, "K"),
+            photosphere_temperature_k=photosphere,
         )
         title = f"flare of {100 * amplitude:g} % in {bands.band(band).name} at {kelvin:g} K, {geometry}"
+        if geometry == "replaces":
+            title += f" photosphere of {photosphere:g} K"
         return self._changed(flux, title)
 
     def reddened(self, ebv: float, *, rv: float = 3.1, law: str = "G23") -> Self:

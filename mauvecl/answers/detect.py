@@ -11,7 +11,8 @@ import numpy as np
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.unknown_cost import cost_lines, marginal_lines, unknown_cost
-from mauvecl.results.campaign import campaign
+from mauvecl.host.errors import InputError
+from mauvecl.results.campaign import campaign, per_test
 from mauvecl.results.departures import departure_table
 from mauvecl.results.detection import Detection, check_fap, countable
 from mauvecl.results.paper import PAPER_G2V, WHY, reconstruct
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
 
     from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
+    from mauvecl.study.questions import CampaignQuestion
 
 
 #: Stars, or cells of a sweep, in one picture.
@@ -273,13 +275,37 @@ def _campaign(study: Study, quiet: Expectation) -> list[str]:
         return []
     found = campaign(study.run.fap, asked.frames, quiet.n_frames, step=asked.step, seed=study.run.seed)
     text = (
-        f"A campaign of {asked.frames} frames makes {found.tests} tests: at {found.fap:g} per test the chance of any "
-        f"false alarm is {found.independent:.3g} if they are independent, and at most {found.at_most:.3g}"
+        f"A campaign of {asked.frames} frames makes {found.tests} tests: at {found.fap:g} per test "
+        f"{found.expected:.3g} false alarms are expected, and the chance of any is {found.independent:.3g} if tests "
+        f"are independent, at most {found.at_most:.3g}"
     )
     if found.overlapping is not None:
         o = found.overlapping
         text += f"; with the overlap of its stacks {o.value:.3g} [{o.low:.3g}, {o.high:.3g}] for a linear statistic"
-    return [text + "."]
+    return [text + ".", *_wanted(asked, found.tests, quiet.n_frames, study.run.seed)]
+
+
+def _wanted(asked: CampaignQuestion, tests: int, stack: int, seed: int) -> list[str]:
+    """What a test may have for the campaign's wanted values."""
+    lines = []
+    if asked.fap is not None and asked.frames is not None:
+        one = per_test(asked.fap, asked.frames, stack, step=asked.step, seed=seed)
+        text = (
+            f"For a chance of {asked.fap:g} of any false alarm in the campaign each of its {tests} tests may have "
+            f"{one.independent:.4g} if they are independent, {one.at_least:.4g} whatever they are"
+        )
+        if one.overlapping is not None:
+            o = one.overlapping
+            text += f", and with the overlap of its stacks {o.value:.3g} [{o.low:.3g}, {o.high:.3g}]"
+        lines.append(f"{text}: `--fap {one.at_least:.4g}`.")
+    if asked.alarms is not None:
+        if not asked.alarms < tests:
+            raise InputError(f"campaign.alarms = {asked.alarms:g} of {tests} tests, expected fewer than tests")
+        lines.append(
+            f"For {asked.alarms:g} false alarms expected in the campaign each of its {tests} tests may have "
+            f"{asked.alarms / tests:.4g}, whatever their dependence: `--fap {asked.alarms / tests:.4g}`."
+        )
+    return lines
 
 
 def _paper(study: Study, prepared: list[list[Expectation]]) -> list[str]:

@@ -6,7 +6,7 @@ import math
 from typing import TYPE_CHECKING
 
 from mauvecl.cli.console import short
-from mauvecl.cli.flags import COUNTED, DETECTION, DRAWS, FLARE, NUISANCES, SWEEP, TEMPLATE, takes_study
+from mauvecl.cli.flags import CAMPAIGN, COUNTED, DETECTION, DRAWS, FLARE, NUISANCES, SWEEP, TEMPLATE, takes_study
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
 
-@takes_study(FLARE, DRAWS, DETECTION, NUISANCES, TEMPLATE, SWEEP)
+@takes_study(FLARE, DRAWS, DETECTION, CAMPAIGN, NUISANCES, TEMPLATE, SWEEP)
 def detect(
     study: Study,
     session: Session,

@@ -130,6 +130,26 @@ TemplateFlag = Annotated[
     ),
 ]
 FapFlag = Annotated[float | None, typer.Option(help="False-alarm probability per test [0.001].", show_default=False)]
+CampaignFlag = Annotated[
+    int | None,
+    typer.Option("--campaign", help="Frames of a whole search: what one test means for all of it.", show_default=False),
+]
+CampaignStepFlag = Annotated[
+    int | None,
+    typer.Option("--campaign-step", help="Frames from one stack of it to the next [a stack].", show_default=False),
+]
+CampaignFapFlag = Annotated[
+    float | None,
+    typer.Option(
+        "--campaign-fap", help="Wanted chance of any false alarm in it: what a test may have.", show_default=False
+    ),
+]
+CampaignAlarmsFlag = Annotated[
+    float | None,
+    typer.Option(
+        "--campaign-alarms", help="Wanted number of false alarms in it: what a test may have.", show_default=False
+    ),
+]
 SetFlag = Annotated[
     list[str] | None,
     typer.Option("--set", help="Any key of the study, as in run.fap=0.01; may be repeated.", show_default=False),
@@ -278,6 +298,12 @@ DETECTION = {
     "fap": Option(FapFlag, "run", "fap"),
     "reference": Option(ReferenceFlag, "run", "reference"),
     "variances": Option(VariancesFlag, "run", "variances"),
+}
+CAMPAIGN = {
+    "campaign": Option(CampaignFlag, "campaign", "frames"),
+    "campaign_step": Option(CampaignStepFlag, "campaign", "step"),
+    "campaign_fap": Option(CampaignFapFlag, "campaign", "fap"),
+    "campaign_alarms": Option(CampaignAlarmsFlag, "campaign", "alarms"),
 }
 NUISANCES = {"nuisance": Option(NuisanceFlag), "with_unknowns": Option(WithUnknownsFlag, "nuisances", "usual")}
 TEMPLATE = {"template": Option(TemplateFlag, "run", "template_temperatures_k")}

@@ -17,10 +17,22 @@ MOST_CELLS = 100_000
 
 
 class CampaignQuestion(Part):
-    """How many tests a search makes: frames in all, and from one stack to the next."""
+    """How many tests a search makes: frames in all, and from one stack to the next; and what is wanted of all of them.
+
+    Wanted are the probability of any false alarm, or a number of false alarms to be expected.
+    """
 
     frames: Annotated[int, Field(ge=1)] | None = None
     step: Annotated[int, Field(ge=1)] | None = None
+    fap: Annotated[float, Field(gt=0, lt=1)] | None = None
+    alarms: Annotated[float, Field(gt=0)] | None = None
+
+    @model_validator(mode="after")
+    def _of_some_frames(self) -> Self:
+        given = next((name for name in ("step", "fap", "alarms") if getattr(self, name) is not None), None)
+        if given is not None and self.frames is None:
+            raise ValueError(f"campaign.{given} stands without campaign.frames, expected how many frames are searched")
+        return self
 
 
 class SignalQuestion(Part):

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, create_model, field_validator, model_validator
 
+from mauvecl.host.sky import DEFAULT_SKY
 from mauvecl.noise.processes import VARIED
 from mauvecl.statistics.registry import STATISTICS, USUAL_STATISTICS
 
@@ -25,6 +26,8 @@ class Part(BaseModel):
 
 #: What a star from a file has and one of the library has not.
 FILE_KEYS = ("file", "wavelength_unit", "flux_unit", "extend")
+#: What belongs to one star, and not to another in its place.
+STAR_KEYS = (*FILE_KEYS, "distance_pc", "radius_rsun", "effective_temperature_k")
 
 
 class Star(Part):
@@ -55,6 +58,8 @@ class Star(Part):
 
     def source(self) -> Source:
         """The star's spectrum at its magnitude; as stored where none is given."""
+        from dataclasses import replace
+
         from mauvecl.host.stars.source import Source
 
         if self.library is not None:
@@ -63,6 +68,8 @@ class Star(Part):
             found = Source.read(
                 self.file or "", wavelength_unit=self.wavelength_unit, flux_unit=self.flux_unit, extend=self.extend
             )
+        if self.effective_temperature_k is not None:
+            found = replace(found, temperature_k=self.effective_temperature_k)
         if self.bin_nm is not None:
             found = found.binned(self.bin_nm)
         if self.ebv is not None:
@@ -91,10 +98,6 @@ class Observation(Part):
     mode: Literal["auto", "frames", "stacked"] = "auto"
     recipe: Literal["auto", "joint", "apart"] = "auto"
     changes: dict[str, float | int | str] = Field(default_factory=dict)
-
-
-#: V mag arcsec-2 where a study says nothing of the sky: the ecliptic opposite the Sun.
-DEFAULT_SKY = 22.1
 
 
 class SkyLight(Part):

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
-from pydantic import Field, ValidationError
+from pydantic import Field, ValidationError, model_validator
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
@@ -21,7 +21,7 @@ from mauvecl.study.questions import (
     SignalQuestion,
     Sweep,
 )
-from mauvecl.study.sections import FILE_KEYS, Flare, NoiseProcesses, Observation, Part, Run, SkyLight, Star, Unknowns
+from mauvecl.study.sections import STAR_KEYS, Flare, NoiseProcesses, Observation, Part, Run, SkyLight, Star, Unknowns
 from mauvecl.study.stares import EventText, StareQuestion, find_curves, without_usual
 from mauvecl.study.study_text import find_files, in_table, put, sentence, study_of, toml_value
 
@@ -65,6 +65,16 @@ class Study(Part):
     unknowns: Unknowns = Unknowns()
     stare: StareQuestion = StareQuestion()
     events: tuple[EventText, ...] = ()
+
+    @model_validator(mode="after")
+    def _one_photosphere(self) -> Self:
+        own = [number for number, star in enumerate(self.star) if star.effective_temperature_k is not None]
+        if own and self.flare.geometry == "replaces" and self.flare.photosphere_temperature_k is not None:
+            raise ValueError(
+                f"flare.photosphere_temperature_k is that of every star, and star.{own[0]} has its own beside it, "
+                "expected one of them"
+            )
+        return self
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
@@ -201,7 +211,8 @@ class Study(Part):
         """
         change: dict[str, Any]
         if quantity in ("magnitude", "star"):
-            change = {"magnitude": value} if quantity == "magnitude" else {"library": value, **dict.fromkeys(FILE_KEYS)}
+            another = {"library": value, **dict.fromkeys(STAR_KEYS)}
+            change = {"magnitude": value} if quantity == "magnitude" else another
             return self.model_copy(update={"star": tuple(star.model_copy(update=change) for star in self.star)})
         if quantity in ("amplitude", "flare_temperature"):
             change = {"amplitudes": (value,)} if quantity == "amplitude" else {"temperature_k": value}

@@ -17,6 +17,7 @@ from mauvecl.host.expectation import Expectation, expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.sky.zodiacal import Sky
 from mauvecl.host.stars.source import Source
+from mauvecl.study.study import Study
 
 
 @pytest.fixture(scope="module")
@@ -54,10 +55,17 @@ def test_zodiacal_light_is_a_fifth_of_a_count(quiet: Expectation) -> None:
 
 
 def test_signal_is_linear_in_the_light(sunlike: Source, mauve: Instrument) -> None:
-    bright = expect(sunlike.at_magnitude(4.9), mauve, exposure=50)
-    faint = expect(sunlike, mauve, exposure=50)
+    bright = expect(sunlike.at_magnitude(4.9), mauve, exposure=50, sky=Sky.none())
+    faint = expect(sunlike, mauve, exposure=50, sky=Sky.none())
     np.testing.assert_allclose(bright.source_electrons, 10 * faint.source_electrons, rtol=1e-9)
     assert not faint.sky_electrons.any()
+
+
+def test_one_sky_where_nothing_is_said(sunlike: Source, mauve: Instrument) -> None:
+    """`expect` and studies, and so the command line, have the same default."""
+    (study,) = Study().expect([sunlike])
+    np.testing.assert_array_equal(expect(sunlike, mauve, exposure=50).sky_electrons, study.sky_electrons)
+    assert study.sky_electrons.any()
 
 
 @pytest.mark.parametrize("signal", ["net", "paper"])

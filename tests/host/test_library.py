@@ -7,6 +7,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from mauvecl.host.errors import InputError
+from mauvecl.host.expectation import expect
+from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.stars import bands, catalogue
 from mauvecl.host.stars.source import Source
 
@@ -22,16 +25,76 @@ def near_ultraviolet(name: str) -> float:
 
 
 def test_no_star_is_out_of_line_with_its_neighbours() -> None:
-    """From G5V to M3V the ratio falls by class; one twice its warmer neighbour would be a fault of its file."""
-    order = ["G5V", "G8V", "K1V", "K2.5V", "K5V", "K6V", "M0V", "M3V"]
+    """From G5V to M4V the ratio falls by class; one twice its warmer neighbour would be a fault of its file."""
+    order = ["G5V", "G8V", "K1V", "K2.5V", "K5V", "K6V", "M0V", "M1V", "M3V", "M4V"]
     ratios = [near_ultraviolet(name) for name in order]
     assert all(own < 2 * warm for warm, own in pairwise(ratios))
+
+
+def test_what_noise_rules_is_told() -> None:
+    """M5V and M6V are brighter at 300 nm than M4V: their files say that this is noise, and so does every answer."""
+    limits = {"M0V": 0.0, "M1V": 240.0, "M3V": 0.0, "M4V": 240.0, "M5V": 300.0, "M6V": 300.0}
+    for name, limit in limits.items():
+        told = Source.from_library(name).told
+        assert told == (
+            (f"noise rules its ultraviolet below {limit:g} nm, where its flux is an upper limit",) * (limit > 0)
+        )
+        assert (near_ultraviolet(name) > 2 * near_ultraviolet("M4V")) <= (limit >= 300 or name in ("M0V", "M1V"))
+        # Redder than that they fall, 20 nm by 20 nm.
+        star = Source.from_library(name)
+        bands = [
+            star.flux_flam[(star.wavelength_nm >= a) & (star.wavelength_nm < a + 20)].mean()
+            for a in np.arange(max(limit, 200.0), 400.0, 20.0)
+            if a != 280.0
+        ]
+        assert all(blue < 1.2 * red for blue, red in pairwise(bands))
+
+
+def test_colours_are_those_of_the_classes() -> None:
+    """B - V of Pickles' own table (1998, table 2) to 0.03, Vega's zero, and red stars red in Gaia's colour."""
+    for name, colour in (("B5V", -0.14), ("A5V", 0.17), ("F0V", 0.31), ("G0V", 0.59), ("G2V", 0.63), ("G5V", 0.68)):
+        star = Source.from_library(name)
+        assert star.magnitude("B") - star.magnitude("V") == pytest.approx(colour, abs=0.03)
+    gaia = [
+        Source.from_library(name).magnitude("Gaia BP") - Source.from_library(name).magnitude("Gaia RP")
+        for name in ("Vega", "G2V", "K5V", "M0V", "M3V", "M6V")
+    ]
+    assert gaia[0] == pytest.approx(0.0, abs=1e-9)
+    assert all(a < b for a, b in pairwise(gaia))
+
+
+def test_each_star_has_a_photosphere_of_its_own_with_its_source() -> None:
+    for row in catalogue.library_table():
+        assert row["temperature_source"]
+        assert 2500 < float(row["temperature_k"]) < 30_000
+        assert Source.from_library(row["name"]).temperature_k == float(row["temperature_k"])
+
+
+def test_galex_in_both_systems() -> None:
+    """AB less Vega is 1.64 by this Vega and curve; catalogues' conversions say 1.70 (Bianchi 2011)."""
+    star = Source.from_library("G2V").at_magnitude(12.0, "GALEX NUV Vega")
+    assert star.magnitude("GALEX NUV", "vega") == pytest.approx(12.0, abs=1e-6)
+    assert star.magnitude("GALEX NUV") - 12.0 == pytest.approx(1.69, abs=0.08)
+
+
+def test_a_library_star_without_a_magnitude_is_asked_for_one() -> None:
+    """Templates are kept at V = 0, and would be as bright as Vega; Vega itself is as it is seen."""
+    mauve = Instrument.load("mauve")
+    for row in catalogue.library_table():
+        star = Source.from_library(row["name"])
+        assert bool(star.unscaled) == (row["name"] not in ("Sun", "Vega"))
+        assert not star.at_magnitude(7.0).unscaled
+    with pytest.raises(InputError, match="the library keeps it at V = 0, expected a magnitude"):
+        expect(Source.from_library("G2V"), mauve, exposure=50)
+    with pytest.raises(InputError, match="expected a magnitude"):
+        expect(Source.from_library("G2V").flaring(0.1), mauve, exposure=50)
+    assert expect(Source.from_library("Vega"), mauve, exposure=5).saturated.any()
 
 
 def test_muscles_entries_admit_their_model_and_cite_their_data() -> None:
     table = catalogue.library_table()
     muscles = [row for row in table if "MUSCLES" in row["origin"]]
-    assert len(muscles) == 7
+    assert len(muscles) == 11
     assert all("PHOENIX model" in row["origin"] for row in muscles)
     assert all(row["citation"].endswith("10.17909/T9DG6F") for row in muscles)
 

@@ -97,7 +97,7 @@ def test_magnitudes_are_synphots(name: str, band: str) -> None:
 def test_vega_has_its_catalogued_magnitude_and_ten_is_fainter(sun: Source) -> None:
     """V = .03 (Johnson et al. 1966), T = 0 (Sullivan et al. 2015), G = .023 (Riello et al. 2021), AB elsewhere."""
     vega = Source.from_library("Vega")
-    for band, catalogued in (("V", 0.03), ("TESS", 0.0), ("Gaia G", 0.023)):
+    for band, catalogued in (("B", 0.03), ("V", 0.03), ("TESS", 0.0), ("Gaia G", 0.023), ("GALEX NUV Vega", 0.0)):
         assert vega.magnitude(band) == pytest.approx(catalogued, abs=1e-9)
     for band in bands.ALIASES:
         assert vega.magnitude(band, "vega") == pytest.approx(0.0, abs=1e-9)
@@ -182,8 +182,7 @@ def test_a_replacing_flare_hides_photosphere(sun: Source) -> None:
         ({"amplitude": np.nan}, "amplitude = nan"),
         ({"amplitude": 0.1, "temperature": 10.0}, "temperature = 10.0 K, expected 1000"),
         ({"amplitude": 0.1, "temperature": 1 * u.m}, "expected kelvin"),
-        ({"amplitude": 0.1, "band": "Q"}, "band 'Q' is unknown, expected one of V"),
-        ({"amplitude": 0.1, "geometry": "replaces"}, "needs a photosphere temperature"),
+        ({"amplitude": 0.1, "band": "Q"}, "band 'Q' is unknown, expected one of B, V"),
         ({"amplitude": 0.1, "geometry": "replaces", "photosphere_temperature": 2e4}, "no hotter"),
         ({"amplitude": 50.0, "geometry": "replaces", "photosphere_temperature": 5800}, "of the star's disc"),
         ({"amplitude": 0.1, "geometry": "sideways"}, "geometry = 'sideways'"),
@@ -192,6 +191,22 @@ def test_a_replacing_flare_hides_photosphere(sun: Source) -> None:
 def test_impossible_flares_are_refused(sun: Source, options: dict, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         sun.flaring(**options)
+
+
+def test_a_flare_takes_the_place_of_each_stars_own_photosphere(sun: Source) -> None:
+    """The library's temperature where none is given; a spectrum of one's own has none."""
+    assert (sun.temperature_k, Source.from_library("K2.5V").temperature_k) == (5636.0, 4783.0)
+    own = sun.flaring(0.1, geometry="replaces")
+    np.testing.assert_array_equal(
+        own.flux_flam, sun.flaring(0.1, geometry="replaces", photosphere_temperature=5636).flux_flam
+    )
+    assert own.history[-1].endswith("replaces photosphere of 5636 K")
+    assert not np.array_equal(
+        own.flux_flam, sun.flaring(0.1, geometry="replaces", photosphere_temperature=4783).flux_flam
+    )
+    unknown = Source.from_arrays(sun.wavelength_nm, sun.flux_flam)
+    with pytest.raises(InputError, match="needs a photosphere temperature"):
+        unknown.flaring(0.1, geometry="replaces")
 
 
 def test_bands_that_the_spectrum_does_not_cover_are_refused() -> None:

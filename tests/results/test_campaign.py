@@ -9,7 +9,7 @@ from scipy import stats
 from mauvecl.answers.detect import detect
 from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError
-from mauvecl.results.campaign import campaign
+from mauvecl.results.campaign import campaign, per_test
 from mauvecl.study.study import Study
 
 
@@ -61,19 +61,63 @@ def test_impossible_campaigns_are_refused(fap: float, frames: int, stack: int, s
         campaign(fap, frames, stack, step=step)
 
 
+@pytest.mark.parametrize("wanted", [1e-4, 0.01, 0.5])
+@pytest.mark.parametrize(("frames", "stack"), [(17_280, 1), (17_280, 10), (7, 7)])
+def test_what_a_test_may_have_is_the_inverse(wanted: float, frames: int, stack: int) -> None:
+    one = per_test(wanted, frames, stack)
+    there = campaign(one.independent, frames, stack)
+    assert there.independent == pytest.approx(wanted, rel=1e-9)
+    assert campaign(one.at_least, frames, stack).at_most == pytest.approx(wanted)
+    assert one.at_least <= one.independent
+    assert there.expected == pytest.approx(there.tests * one.independent)
+    assert one.overlapping is None
+
+
+def test_overlapping_stacks_may_have_more_each() -> None:
+    """There and back through other draws: 20 000 campaigns leave 0.05 to 6 %, four standard errors of both."""
+    one = per_test(0.05, 600, 10, step=1, seed=1)
+    assert one.overlapping is not None
+    assert one.overlapping.low <= one.overlapping.value <= one.overlapping.high
+    assert one.overlapping.value > one.independent
+    back = campaign(one.overlapping.value, 600, 10, step=1, seed=2).overlapping
+    assert back is not None
+    assert back.value == pytest.approx(0.05, abs=4 * np.sqrt(2 * 0.05 * 0.95 / 20_000))
+    # Ten of 20 000 settle nothing.
+    assert per_test(5e-4, 600, 10, step=1).overlapping is None
+
+
+@pytest.mark.parametrize(
+    ("campaign_asked", "sentence"),
+    [
+        ({"fap": 0.01}, "campaign.fap stands without campaign.frames"),
+        ({"frames": 10, "fap": 2.0}, "campaign.fap = 2"),
+        ({"frames": 17_280, "alarms": 1e5}, "campaign.alarms = 100000 of 1728 tests"),
+    ],
+)
+def test_wishes_that_cannot_be(campaign_asked: dict, sentence: str) -> None:
+    def ask() -> None:
+        detect(Study.build({"campaign": campaign_asked}, "test"), None)  # type: ignore[arg-type]
+
+    with pytest.raises(InputError, match=sentence):
+        ask()
+
+
 def test_a_detection_tells_both(engine: Engine) -> None:
     study = Study.build(
         {
             "star": [{"library": "G2V", "magnitude": 7.4}],
             "flare": {"amplitudes": [0.1]},
             "run": {"realisations": 20_000, "fap": 0.01, "statistics": ["matched"]},
-            "campaign": {"frames": 17_280, "step": 1},
+            "campaign": {"frames": 17_280, "step": 1, "fap": 0.01, "alarms": 2},
         },
         "test",
     )
     said = [m for m in detect(study, engine).messages if "campaign" in m]
-    assert len(said) == 1
+    assert len(said) == 3
     assert "17271 tests" in said[0]
+    assert "173 false alarms are expected" in said[0]
     assert "at 0.01 per test" in said[0]
     assert "with the overlap of its stacks" in said[0]
+    assert "`--fap 5.79e-07`" in said[1]
+    assert "`--fap 0.0001158`" in said[2]
     assert Study.build(study.model_dump(), "again") == study

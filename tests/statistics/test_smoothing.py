@@ -8,7 +8,7 @@ from scenes import instrument, star
 from scipy import stats
 from scipy.ndimage import gaussian_filter1d
 
-from mauvecl import Instrument, Source, expect
+from mauvecl import Instrument, Sky, Source, expect
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise.comparison import Comparison
@@ -50,7 +50,7 @@ def test_where_few_centres_do_not_do_every_pixel_is_taken() -> None:
     """A star without any light below 400 nm, nor any sky: one over the smoothed flux jumps."""
     nm = np.arange(170.0, 1150.0, 0.5)
     dark = Source.from_arrays(nm, np.where(nm > 400.0, 1e-11, 0.0)).at_magnitude(7.4)
-    quiet = expect(dark, Instrument.load("mauve"), exposure=50.0)
+    quiet = expect(dark, Instrument.load("mauve"), exposure=50.0, sky=Sky.none())
     used = np.ones(quiet.wavelength_nm.size, bool)
     smoothing = Smoothing.of(quiet, used)
     assert len(smoothing.centres) == used.size
