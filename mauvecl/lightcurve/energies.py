@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
+from mauvecl.host.ranges import FLARE_TEMPERATURES_K
 from mauvecl.host.stars.bands import band as find_band
-from mauvecl.host.stars.flare import TEMPERATURE_RANGE, blackbody
+from mauvecl.host.stars.flare import blackbody
 from mauvecl.lightcurve.shapes import Shape, shape_of
 
 if TYPE_CHECKING:
@@ -79,14 +80,14 @@ class EnergyScale:
             For a radius or temperature that cannot be, or an unknown band.
         """
         _check("radius_rsun", radius_rsun, 1e-4, 1e4)
-        _check("temperature_k", temperature_k, *TEMPERATURE_RANGE)
+        _check("temperature_k", temperature_k, *FLARE_TEMPERATURES_K)
         radius = radius_rsun * SUN_CM
         quiet = in_band(band, temperature_k, weighted)
         star = f"a blackbody of {temperature_k:g} K and {radius_rsun:g} solar radii"
         if flare_k is None:
             name = find_band(band).name
             return cls(name, "band", 4 * np.pi * radius**2 * in_band(band, temperature_k, "energy"), star)
-        _check("flare_k", flare_k, *TEMPERATURE_RANGE)
+        _check("flare_k", flare_k, *FLARE_TEMPERATURES_K)
         area = np.pi * radius**2 * quiet / in_band(band, flare_k, weighted)
         return cls(
             find_band(band).name, "bolometric", area * STEFAN_BOLTZMANN * flare_k**4, f"{star}, flare of {flare_k:g} K"
@@ -127,7 +128,7 @@ class EnergyScale:
         flux = np.interp(wavelength, source.wavelength_nm, source.flux_flam)
         if flare_k is None:
             return cls(name, "band", sphere * _integral(wavelength, response * flux), told)
-        _check("flare_k", flare_k, *TEMPERATURE_RANGE)
+        _check("flare_k", flare_k, *FLARE_TEMPERATURES_K)
         weight = response if weighted == "energy" else response * wavelength
         share = _integral(wavelength, weight * flux) / in_band(band, flare_k, weighted)
         return cls(

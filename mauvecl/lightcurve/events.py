@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
-from mauvecl.host.stars.flare import TEMPERATURE_RANGE
+from mauvecl.host.ranges import FLARE_TEMPERATURES_K
 from mauvecl.lightcurve.energies import EnergyScale, amplitude_of, amplitude_of_peak, equivalent_duration
 from mauvecl.lightcurve.shapes import SHAPES, Shape, shape_of
 
@@ -41,7 +41,7 @@ class Cooling:
     fold_s: float
 
     def __post_init__(self) -> None:
-        low, high = TEMPERATURE_RANGE
+        low, high = FLARE_TEMPERATURES_K
         if not (low <= self.end_k <= self.peak_k <= high and np.isfinite(self.fold_s) and self.fold_s > 0):
             raise InputError(
                 f"a flare that cools from {self.peak_k:g} to {self.end_k:g} K in {self.fold_s:g} s, expected "
@@ -98,7 +98,7 @@ class Event:
         if not 0 <= self.amplitude <= LARGEST_AMPLITUDE:
             raise InputError(f"the amplitude of a flare = {self.amplitude:g}, expected 0 to {LARGEST_AMPLITUDE:g}")
         if not isinstance(self.temperature, Cooling):
-            low, high = TEMPERATURE_RANGE
+            low, high = FLARE_TEMPERATURES_K
             if not low <= self.temperature <= high:
                 raise InputError(f"flare temperature = {self.temperature:g} K, expected {low:g} to {high:g} K")
 

@@ -5,57 +5,20 @@ What they draw is unknown to the observer: templates and variances stay those of
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from mauvecl.host.errors import InputError
 from mauvecl.noise import layout
 from mauvecl.noise.priors import Normal, Prior, Uniform, table_of
+from mauvecl.noise.varied import VARIED, Conditions, Modulated
 
-__all__ = ["NONE", "VARIED", "CosmicRays", "Factors", "Normal", "Prior", "Processes", "Uniform", "Varied"]
+__all__ = ["NONE", "CosmicRays", "Factors", "Normal", "Prior", "Processes", "Uniform"]
 
 Float = NDArray[np.float64]
-Conditions = Mapping[str, float]
-Modulated = Literal["light", "dark", "sky"]
-
-
-@dataclass(frozen=True)
-class Varied:
-    """What a prior may be put on.
-
-    Attributes
-    ----------
-    low, high : float
-        Ends of what it may be.
-    change : callable
-        From an expectation's conditions and values drawn to the factor less one.
-    of : {"light", "dark", "sky"}
-        What the factor is on.
-    """
-
-    low: float
-    high: float
-    change: Callable[[Conditions, Float], Float]
-    of: Modulated = "light"
-
-
-#: The one list of them, in the order of their tables in kernels; `Processes` and the study's section have these names.
-VARIED = {
-    "jitter": Varied(0.0, 0.5, lambda _, lost: -lost),
-    "detector_temperature": Varied(
-        -100.0, 100.0, lambda at, t: np.expm1(at["dark_slope_per_c"] * (t - at["temperature_c"])), "dark"
-    ),
-    "light_loss": Varied(0.0, 0.99, lambda at, lost: (at["light_loss"] - lost) / (1.0 - at["light_loss"])),
-    "pointing_loss": Varied(0.0, 0.99, lambda at, lost: (at["pointing_loss"] - lost) / (1.0 - at["pointing_loss"])),
-    "qe_scale": Varied(0.01, 100.0, lambda _, scale: scale - 1.0),
-    "sky_level": Varied(0.01, 100.0, lambda _, level: level - 1.0, "sky"),
-}
 
 
 @dataclass(frozen=True)
@@ -106,6 +69,8 @@ class CosmicRays:
         ndarray, shape (n,)
             Of 0, 1, 2, ... electrons; what is left out has less than 2**-40.
         """
+        from scipy import special
+
         low, high = (int(e) for e in self.electrons)
         hits = self.rate_per_cm2_s * self.area_cm2 / self.pixels * seconds
         most = 1

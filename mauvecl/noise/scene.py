@@ -15,7 +15,8 @@ from mauvecl.noise.comparison import TEMPLATE, Comparison
 from mauvecl.noise.cumulants import polynomial
 from mauvecl.noise.drawing import Drawing, DrawingWords
 from mauvecl.noise.poisson import AliasTable, table_of
-from mauvecl.noise.processes import Factors, Modulated
+from mauvecl.noise.processes import Factors
+from mauvecl.noise.varied import Modulated
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation

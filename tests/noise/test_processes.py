@@ -15,8 +15,9 @@ from mauvecl.host.errors import InputError
 from mauvecl.noise import layout
 from mauvecl.noise import twin as reference
 from mauvecl.noise.components import components
-from mauvecl.noise.processes import NONE, VARIED, CosmicRays, Normal, Processes, Uniform
+from mauvecl.noise.processes import NONE, CosmicRays, Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare
+from mauvecl.noise.varied import VARIED
 from mauvecl.study.sections import NoiseProcesses
 
 N = 20_000
