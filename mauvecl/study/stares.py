@@ -12,7 +12,8 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.lightcurve.curves import ORBIT_S, Curve, Sinusoid, Table
 from mauvecl.lightcurve.energies import EnergyScale, amplitude_of, amplitude_of_peak
-from mauvecl.lightcurve.events import Cooling, Event
+from mauvecl.lightcurve.events import Cooling, Event, coefficients, temperatures_of
+from mauvecl.lightcurve.observed import Staring
 from mauvecl.lightcurve.shapes import Shape, TableShape, shape_of
 from mauvecl.lightcurve.stare import CHANGING, Stare
 from mauvecl.study.sections import Part
@@ -181,10 +182,10 @@ def stare_of(study: Study) -> Stare:
         For a stare that cannot be, or processes that a stare has in a form of its own.
     """
     processes = study.processes.processes()
-    named = [name for name, _ in processes.modulations] + ["cosmic_rays"] * (processes.cosmic_rays is not None)
-    if named:
+    if processes.modulations:
+        name, _ = processes.modulations[0]
         raise InputError(
-            f"processes.{named[0]} is of single exposures, expected jitters, offsets, drifts or cycles of [stare]"
+            f"processes.{name} is of single exposures, expected jitters, offsets, drifts or cycles of [stare]"
         )
     q, instrument = study.stare, study.load_instrument()
     spreads: dict[str, dict[Changing, float]] = {
@@ -214,6 +215,31 @@ def stare_of(study: Study) -> Stare:
         drifts=spreads["drifts"],
         cycles=spreads["cycles"],
     )
+
+
+def staring_of(study: Study, star: Star) -> tuple[Staring, list[Event]]:
+    """A star of a study, its stare and its flares, and what frames are made of; the flares beside it.
+
+    Raises
+    ------
+    InputError
+        For anything of it that cannot be.
+    """
+    source, stare = star.source(), stare_of(study)
+    events = events_of(study, star, source)
+    kelvin = temperatures_of(events)
+    frames = study.model_copy(
+        update={"observation": study.observation.model_copy(update={"exposure_s": stare.frame_s})}
+    )
+    # A flare that takes the place of photosphere is as linear in its amplitude, but not up to one.
+    unit = 1.0 if study.flare.geometry == "added" else 0.01
+    flares = [
+        frames.model_copy(update={"flare": study.flare.model_copy(update={"temperature_k": float(k)})}) for k in kelvin
+    ]
+    quiet, *flaring = frames.expect([source, *(one.flaring(source, unit) for one in flares)])
+    electrons = [(x.source_electrons - quiet.source_electrons) / unit for x in flaring]
+    spectra = np.reshape(electrons, (kelvin.size, quiet.wavelength_nm.size))
+    return Staring(quiet, stare, spectra, coefficients(events, stare.start_s, stare.frame_s, kelvin)), events
 
 
 def energy_scale(
