@@ -259,6 +259,21 @@ def energy_scale(
     return None
 
 
+def energy_of(
+    study: Study, star: Star, source: Source, event: Event, kind: Literal["bolometric", "band"]
+) -> float | None:
+    """Energy of a flare at a star, erg; None where the star's size and distance are unknown."""
+    if energy_scale(study, star, source, kind, event.hottest_k) is None:
+        return None
+
+    def scale_of(kelvin: float) -> EnergyScale:
+        scale = energy_scale(study, star, source, kind, kelvin)
+        assert scale is not None
+        return scale
+
+    return event.bolometric_energy(scale_of)
+
+
 def events_of(study: Study, star: Star, source: Source) -> list[Event]:
     """A study's flares at one of its stars: its `events`, or one of each energy or amplitude, evenly over the stare.
 
@@ -290,13 +305,14 @@ def _event(study: Study, star: Star, source: Source, text: EventText) -> Event:
     elif text.equivalent_duration_s is not None:
         amplitude = amplitude_of(text.equivalent_duration_s, half, shape)
     elif text.energy_erg is not None:
-        scale = energy_scale(study, star, source, text.energy, kelvin)
-        if scale is None:
+        # Any energy is linear in the amplitude.
+        one = energy_of(study, star, source, Event(text.peak_s, half, 1.0, temperature, shape), text.energy)
+        if one is None:
             raise InputError(
                 f"a flare of {text.energy_erg:g} erg at {source.name} of unknown size, expected the star's distance_pc "
                 "or radius_rsun and effective_temperature_k"
             )
-        amplitude = amplitude_of(scale.equivalent_duration(text.energy_erg), half, shape)
+        amplitude = text.energy_erg / one
     return Event(text.peak_s, half, amplitude, temperature, shape)
 
 
