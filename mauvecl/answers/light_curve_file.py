@@ -82,7 +82,7 @@ def _table(one: StarStare) -> fits.BinTableHDU:
             columns.append((column + suffix, "E", "adu/s", values[:, k]))
     made = [fits.Column(name=n, format=form, unit=unit, array=values) for n, form, unit, values in columns]
     hdu = fits.BinTableHDU.from_columns(made, name="LIGHTCURVE")
-    hdu.header["BANDS"] = (", ".join(light.bands), "FLUX, FLUX_...")
+    hdu.header["BANDS"] = ", ".join(light.bands)
     hdu.header["COMMENT"] = "FLUX: star and sky, bias and known dark taken off. MEAN: the same without noise."
     hdu.header["COMMENT"] = "TIME: middle of the frame, days after MJDREF. QUALITY 1: saturated pixels. 0: none."
     return hdu
