@@ -16,7 +16,7 @@ from mauvecl.device.stares import Stares
 from mauvecl.host.errors import InputError
 from mauvecl.study.stares import stare_of
 from mauvecl.study.study import Study
-from tests.commands import ended, run
+from commands import ended, run
 
 #: A G2V star for five minutes with a gap and a flare.
 SHORT = Study().with_settings(
