@@ -19,13 +19,20 @@ if TYPE_CHECKING:
     from mauvecl.answers.maps import detection_map
     from mauvecl.answers.simulate import simulate
     from mauvecl.answers.snr import snr
+    from mauvecl.answers.stare import stare
     from mauvecl.device.engine import Engine
+    from mauvecl.device.stares import Stares
     from mauvecl.host.errors import InputError
     from mauvecl.host.expectation import Expectation, expect
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.instrument.pixel_map import PixelMap
     from mauvecl.host.sky.zodiacal import Sky
     from mauvecl.host.stars.source import Source
+    from mauvecl.lightcurve.curves import Sinusoid
+    from mauvecl.lightcurve.energies import EnergyScale
+    from mauvecl.lightcurve.events import Cooling, Event
+    from mauvecl.lightcurve.shapes import SHAPES, TableShape
+    from mauvecl.lightcurve.stare import Stare
     from mauvecl.noise.comparison import Comparison
     from mauvecl.noise.priors import Normal, Uniform
     from mauvecl.noise.processes import CosmicRays, Processes
@@ -41,11 +48,15 @@ if TYPE_CHECKING:
 __version__ = VERSION
 __all__ = [
     "PAPER_BUDGETS",
+    "SHAPES",
     "Comparison",
+    "Cooling",
     "CosmicRays",
     "DaskWorkers",
     "Detection",
+    "EnergyScale",
     "Engine",
+    "Event",
     "Expectation",
     "InputError",
     "Instrument",
@@ -56,9 +67,13 @@ __all__ = [
     "PixelMap",
     "Pool",
     "Processes",
+    "Sinusoid",
     "Sky",
     "Source",
+    "Stare",
+    "Stares",
     "Study",
+    "TableShape",
     "Uniform",
     "bulk",
     "departures",
@@ -72,16 +87,20 @@ __all__ = [
     "simulate",
     "smallest_amplitude",
     "snr",
+    "stare",
     "what_matters",
 ]
 
 #: Where each is at home; `bulk` is a module.
 _HOMES = {
     "Comparison": "noise.comparison",
+    "Cooling": "lightcurve.events",
     "CosmicRays": "noise.processes",
     "DaskWorkers": "runs.cluster",
     "Detection": "results.detection",
+    "EnergyScale": "lightcurve.energies",
     "Engine": "device.engine",
+    "Event": "lightcurve.events",
     "Expectation": "host.expectation",
     "InputError": "host.errors",
     "Instrument": "host.instrument.instrument",
@@ -93,9 +112,14 @@ _HOMES = {
     "PixelMap": "host.instrument.pixel_map",
     "Pool": "runs.pool",
     "Processes": "noise.processes",
+    "SHAPES": "lightcurve.shapes",
+    "Sinusoid": "lightcurve.curves",
     "Sky": "host.sky.zodiacal",
     "Source": "host.stars.source",
+    "Stare": "lightcurve.stare",
+    "Stares": "device.stares",
     "Study": "study.study",
+    "TableShape": "lightcurve.shapes",
     "Uniform": "noise.priors",
     "bulk": "store",
     "departures": "results.departures",
@@ -109,6 +133,7 @@ _HOMES = {
     "simulate": "answers.simulate",
     "smallest_amplitude": "answers.limits",
     "snr": "answers.snr",
+    "stare": "answers.stare",
     "what_matters": "answers.assumptions",
 }
 

@@ -16,6 +16,8 @@ from .bounded import read_bytes, shortened
 
 #: Sizes that a number from outside may have, beside 0: products of several stay within double precision.
 SMALLEST, LARGEST = 1e-30, 1e30
+#: The same for energies in erg, of which flares have up to 1e38: keys that end in this.
+ERG, LARGEST_ERG = "_erg", 1e45
 #: Whole numbers of 64 bits, with or without a sign.
 WHOLE = (-(2**63), 2**64 - 1)
 #: Characters of a text, and levels of nesting, that a study or an instrument may have.
@@ -126,13 +128,13 @@ def possible(data: Any, what: str) -> None:
     Raises
     ------
     InputError
-        For a number beyond `SMALLEST` to `LARGEST`, a whole one beyond 64 bits, text that is too long or holds
+        For a number beyond `SMALLEST` to `LARGEST` (energies in erg: `LARGEST_ERG`), a whole one beyond 64 bits, text that is too long or holds
         characters that no file could, or nesting that is too deep; naming its key.
     """
     waiting: list[tuple[str, Any, int]] = [("", data, 0)]
     while waiting:
         key, value, depth = waiting.pop()
-        fault = _fault(value)
+        fault = _fault(value, LARGEST_ERG if any(part.endswith(ERG) for part in key.split(".")) else LARGEST)
         if depth > DEEPEST:
             fault = f"is nested more than {DEEPEST} deep, expected less"
             key = shortened(key, 40)
@@ -147,7 +149,7 @@ def possible(data: Any, what: str) -> None:
             waiting += [(f"{key}.{i}", item, depth + 1) for i, item in enumerate(value)]
 
 
-def _fault(value: Any) -> str | None:
+def _fault(value: Any, largest: float = LARGEST) -> str | None:
     """Why a single value cannot be, or None."""
     if isinstance(value, bool):
         return None
@@ -156,8 +158,8 @@ def _fault(value: Any) -> str | None:
             return f"is a whole number of {value.bit_length()} bits, expected at most 64"
     elif isinstance(value, float):
         # NaN and infinity are for those who know what the value means.
-        if math.isfinite(value) and value and not SMALLEST <= abs(value) <= LARGEST:
-            return f"= {value!r}, expected 0 or a size from {SMALLEST:g} to {LARGEST:g}"
+        if math.isfinite(value) and value and not SMALLEST <= abs(value) <= largest:
+            return f"= {value!r}, expected 0 or a size from {SMALLEST:g} to {largest:g}"
     elif isinstance(value, str | Path):
         text = str(value)
         if len(text) > LONGEST:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from mauvecl.host.plotting import picture
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Callable, Sequence
 
     from astropy.table import Table
 
@@ -75,13 +75,19 @@ class Answer(ABC):
         InputError
             If one cannot be written; what was at its place is still there.
         """
-        from mauvecl.answers.report import make_folder, write_study, write_table
+        from mauvecl.answers.report import make_folder, write_document, write_study, write_table
 
         place = make_folder(Path(folder))
         return [
             *(write_table(table, place / name) for name, table in self.files.items()),
+            *(write_document(content(), place / name) for name, content in self.documents.items()),
             write_study(self.study, place),
         ]
+
+    @property
+    def documents(self) -> dict[str, Callable[[], bytes]]:
+        """Files that are more than a table, by their full names: what makes their content."""
+        return {}
 
     @property
     def files(self) -> dict[str, Table]:

@@ -68,6 +68,12 @@ def write_table(table: Table, path: Path) -> Path:
     return path
 
 
+def write_document(content: bytes, path: Path) -> Path:
+    """A file that is there already as bytes; errors as `write_table`."""
+    write_whole(path, content)
+    return path
+
+
 def write_study(study: Study, folder: Path) -> Path:
     """The study, to be run again as it was; errors as `write_table`."""
     path = folder / "study.toml"

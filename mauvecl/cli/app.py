@@ -17,6 +17,7 @@ from mauvecl.cli.library import app as library
 from mauvecl.cli.limits import detection_map, limit
 from mauvecl.cli.observe import exposure, simulate, snr
 from mauvecl.cli.serve import serve
+from mauvecl.cli.stares import stare
 from mauvecl.host.version import VERSION
 
 app = typer.Typer(
@@ -117,6 +118,7 @@ app.add_typer(library, name="library")
 for verb in (simulate, snr, exposure, detect, gaussian, limit):
     app.command()(verb)
 app.command("map")(detection_map)
+app.command()(stare)
 for verb in (realise, verify, export, serve):
     app.command()(verb)
 

@@ -121,6 +121,14 @@ WithUnknownsFlag = Annotated[
         show_default=False,
     ),
 ]
+StareUnknownsFlag = Annotated[
+    bool | None,
+    typer.Option(
+        "--with-unknowns",
+        help="Draw the documented unknowns of a stare: thermal cycle, pointing jitter, sky, the star's slow change.",
+        show_default=False,
+    ),
+]
 TemplateFlag = Annotated[
     list[float] | None,
     typer.Option(
@@ -167,6 +175,43 @@ AsListFlag = Annotated[
 ]
 OfFlag = Annotated[str | None, typer.Option(help="magnitude, amplitude or exposure [magnitude].", show_default=False)]
 PowerFlag = Annotated[float | None, typer.Option(help="Wanted detection probability [0.9].", show_default=False)]
+DurationFlag = Annotated[
+    float | None, typer.Option("--duration", help="Of the stare, s [5680, an orbit].", show_default=False)
+]
+GapFlag = Annotated[
+    list[str] | None,
+    typer.Option("--gap", help="Nothing is recorded from:to, s, as in 1000:2000; may be repeated.", show_default=False),
+]
+OrbitGapFlag = Annotated[
+    float | None, typer.Option("--orbit-gap", help="Gap at the end of every orbit, s [0].", show_default=False)
+]
+ThermalFlag = Annotated[
+    float | None,
+    typer.Option("--thermal", help="Known thermal cycle of the orbit, +- deg C [0].", show_default=False),
+]
+HalfWidthFlag = Annotated[float | None, typer.Option("--half-width", help="Of the flares, s [60].", show_default=False)]
+ShapeFlag = Annotated[
+    str | None,
+    typer.Option("--shape", help="davenport2014, tovarmendoza2022, fiducial [davenport2014].", show_default=False),
+]
+EnergyFlag = Annotated[
+    list[float] | None,
+    typer.Option(
+        "--energy",
+        help="Bolometric energy of a flare, erg, in place of amplitudes; may be repeated.",
+        show_default=False,
+    ),
+]
+DistanceFlag = Annotated[
+    float | None, typer.Option("--distance", help="Of the star, pc, for energies.", show_default=False)
+]
+RadiusFlag = Annotated[
+    float | None, typer.Option("--radius", help="Of the star, solar radii, for energies.", show_default=False)
+]
+StarTemperatureFlag = Annotated[
+    float | None,
+    typer.Option("--star-temperature", help="Effective temperature of the star, K, for energies.", show_default=False),
+]
 SnrFlag = Annotated[float | None, typer.Option(help="Wanted signal-to-noise ratio.", show_default=False)]
 AtFlag = Annotated[float | None, typer.Option(help="Wavelength, nm.", show_default=False)]
 PerFlag = Annotated[str | None, typer.Option(help="element (10.5 nm) or pixel [element].", show_default=False)]
@@ -258,6 +303,17 @@ def axis_of(text: str, flag: str) -> dict[str, Any]:
     return found | {"log": bool(rest)}
 
 
+def gap_of(text: str) -> tuple[float, float]:
+    """A gap as a word: 1000:2000."""
+    from mauvecl.host.errors import InputError
+
+    try:
+        first, last = (float(word) for word in text.split(":"))
+    except ValueError as error:
+        raise InputError(f"--gap {text!r}, expected two times in s, such as 1000:2000") from error
+    return first, last
+
+
 def _amplitudes_of(path: Path) -> list[float]:
     """Those of a table of flares, each once."""
     from mauvecl.host.stars.flare_table import read_flares
@@ -309,6 +365,22 @@ NUISANCES = {"nuisance": Option(NuisanceFlag), "with_unknowns": Option(WithUnkno
 TEMPLATE = {"template": Option(TemplateFlag, "run", "template_temperatures_k")}
 #: What verbs take that tell an S/N.
 COUNTED = {"signal": Option(SignalFlag, "observation", "signal")}
+STARE = {
+    "duration": Option(DurationFlag, "stare", "duration_s"),
+    "gap": Option(GapFlag, "stare", "gaps", lambda texts: [gap_of(text) for text in texts]),
+    "orbit_gap": Option(OrbitGapFlag, "stare", "orbit_gap_s"),
+    "thermal": Option(ThermalFlag, "stare", "thermal", lambda half: {"amplitude": half}),
+    "half_width": Option(HalfWidthFlag, "stare", "half_width_s"),
+    "shape": Option(ShapeFlag, "stare", "shape"),
+    "energy": Option(EnergyFlag, "stare", "energies_erg"),
+    "with_unknowns": Option(StareUnknownsFlag, "nuisances", "usual"),
+}
+#: How far or large the star is; put together by `_stars`.
+SIZE = {
+    "distance": Option(DistanceFlag),
+    "radius": Option(RadiusFlag),
+    "star_temperature": Option(StarTemperatureFlag),
+}
 SIGNAL = {
     "snr": Option(SnrFlag, "signal", "snr"),
     "at": Option(AtFlag, "signal", "wavelength_nm"),
@@ -501,6 +573,8 @@ def _stars(study: Study, given: dict[str, Any]) -> list[dict[str, Any]] | None:
 
     names, magnitudes = given["star"], given["magnitude"]
     same = {key: given[key] for key in ("band", "magnitude_system", "ebv", "bin_nm") if given[key] is not None}
+    sizes = {"distance_pc": "distance", "radius_rsun": "radius", "effective_temperature_k": "star_temperature"}
+    same |= {key: given[flag] for key, flag in sizes.items() if given.get(flag) is not None}
     of_files = {key: given[key] for key in ("wavelength_unit", "flux_unit", "extend") if given[key] is not None}
     if not (names or magnitudes or same or of_files):
         return None

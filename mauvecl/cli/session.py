@@ -173,6 +173,11 @@ class Session:
 
         self.leave(lambda: write_table(table, self.folder / name))
 
+    def _document(self, name: str, content: Callable[[], bytes]) -> Path:
+        from mauvecl.answers.report import write_document
+
+        return write_document(content(), self.folder / name)
+
     def leave(self, write: Callable[[], Path | Sequence[Path]]) -> None:
         """Have files written; one that cannot be is told at the end, when the answer is out."""
         from mauvecl.host.errors import InputError
@@ -210,6 +215,8 @@ class Session:
         self.say(found.messages)
         for name, table in found.files.items():
             self.write(table, name)
+        for name, content in found.documents.items():
+            self.leave(partial(self._document, name, content))
         if self.draws_pictures:
             from mauvecl.host.plotting import picture
 

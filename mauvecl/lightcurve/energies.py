@@ -8,6 +8,7 @@ each of the three follows from the other two; energy is ED times a number of the
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import TYPE_CHECKING, Literal, Self
 
 import numpy as np
@@ -172,6 +173,7 @@ def amplitude_of_peak(peak: float, shape: Shape | str) -> float:
     return peak / shape_of(shape).peak
 
 
+@lru_cache(1024)
 def in_band(band: str, temperature_k: float, weighted: Weighted = "energy") -> float:
     """A blackbody's surface flux through a band, erg s-1 cm-2, or times nm for photons; the highest response is 1."""
     wavelength, response = _response(band)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Self
 
@@ -18,6 +18,8 @@ Float = NDArray[np.float64]
 
 #: Flare spectra that a stare's frames are made of, at most (`components.MOST_FLARES`); the least for flares that cool.
 MOST_TEMPERATURES, LEAST_STEPS = 8, 3
+#: Temperatures at which the energy of a second is known, where a flare cools.
+SCALE_NODES = 33
 #: Parts of a frame with one temperature each, where a flare cools.
 PARTS = 8
 #: Amplitudes beyond this are no flares: of the largest known, an M dwarf's in the ultraviolet, a few thousand.
@@ -141,7 +143,7 @@ class Event:
         temperature: float | Cooling = 10_000.0,
         shape: Shape | str = "davenport2014",
     ) -> Self:
-        """Of an energy by the star's `EnergyScale`; of a cooling flare a bolometric one holds for the scale's own."""
+        """Of an energy by the star's `EnergyScale`; for one that cools see `bolometric_energy`."""
         return cls.of_equivalent_duration(
             scale.equivalent_duration(energy_erg),
             peak_s=peak_s,
@@ -173,6 +175,26 @@ class Event:
     def energy(self, scale: EnergyScale) -> float:
         """Energy by a star's scale, erg."""
         return scale.energy(self.equivalent_duration_s)
+
+    def bolometric_energy(self, scale_of: Callable[[float], EnergyScale]) -> float:
+        """Bolometric energy, erg, of a flare that may cool.
+
+        Parameters
+        ----------
+        scale_of : callable
+            A star's bolometric scale for flares of a temperature, K.
+        """
+        cooling = self.temperature
+        if not isinstance(cooling, Cooling) or cooling.steady:
+            return self.energy(scale_of(self.hottest_k))
+        nodes = np.geomspace(cooling.end_k, cooling.peak_k, SCALE_NODES)
+        per_s = np.log([scale_of(float(k)).erg_per_s for k in nodes])
+        tau = np.concatenate([np.linspace(-10.0, 10.0, 2001), np.geomspace(10.0, 1000.0, 1001)[1:]])
+        edges = self.half_width_s * tau
+        light = self.form.mean_over(edges, 0.0, self.half_width_s) * np.diff(edges)
+        kelvin = cooling.at((edges[1:] + edges[:-1]) / 2)
+        # Energies of a second are smooth in the temperature: straight in logarithms between the nodes.
+        return float(self.amplitude * light @ np.exp(np.interp(np.log(kelvin), np.log(nodes), per_s)))
 
 
 def temperatures_of(events: Sequence[Event], most: int = MOST_TEMPERATURES) -> Float:

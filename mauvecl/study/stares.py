@@ -12,7 +12,8 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.lightcurve.curves import ORBIT_S, Curve, Sinusoid, Table
 from mauvecl.lightcurve.energies import EnergyScale, amplitude_of, amplitude_of_peak
-from mauvecl.lightcurve.events import Cooling, Event
+from mauvecl.lightcurve.events import Cooling, Event, coefficients, temperatures_of
+from mauvecl.lightcurve.observed import Staring
 from mauvecl.lightcurve.shapes import Shape, TableShape, shape_of
 from mauvecl.lightcurve.stare import CHANGING, Stare
 from mauvecl.study.sections import Part
@@ -181,10 +182,10 @@ def stare_of(study: Study) -> Stare:
         For a stare that cannot be, or processes that a stare has in a form of its own.
     """
     processes = study.processes.processes()
-    named = [name for name, _ in processes.modulations] + ["cosmic_rays"] * (processes.cosmic_rays is not None)
-    if named:
+    if processes.modulations:
+        name, _ = processes.modulations[0]
         raise InputError(
-            f"processes.{named[0]} is of single exposures, expected jitters, offsets, drifts or cycles of [stare]"
+            f"processes.{name} is of single exposures, expected jitters, offsets, drifts or cycles of [stare]"
         )
     q, instrument = study.stare, study.load_instrument()
     spreads: dict[str, dict[Changing, float]] = {
@@ -216,6 +217,31 @@ def stare_of(study: Study) -> Stare:
     )
 
 
+def staring_of(study: Study, star: Star) -> tuple[Staring, list[Event]]:
+    """A star of a study, its stare and its flares, and what frames are made of; the flares beside it.
+
+    Raises
+    ------
+    InputError
+        For anything of it that cannot be.
+    """
+    source, stare = star.source(), stare_of(study)
+    events = events_of(study, star, source)
+    kelvin = temperatures_of(events)
+    frames = study.model_copy(
+        update={"observation": study.observation.model_copy(update={"exposure_s": stare.frame_s})}
+    )
+    # A flare that takes the place of photosphere is as linear in its amplitude, but not up to one.
+    unit = 1.0 if study.flare.geometry == "added" else 0.01
+    flares = [
+        frames.model_copy(update={"flare": study.flare.model_copy(update={"temperature_k": float(k)})}) for k in kelvin
+    ]
+    quiet, *flaring = frames.expect([source, *(one.flaring(source, unit) for one in flares)])
+    electrons = [(x.source_electrons - quiet.source_electrons) / unit for x in flaring]
+    spectra = np.reshape(electrons, (kelvin.size, quiet.wavelength_nm.size))
+    return Staring(quiet, stare, spectra, coefficients(events, stare.start_s, stare.frame_s, kelvin)), events
+
+
 def energy_scale(
     study: Study, star: Star, source: Source, kind: Literal["bolometric", "band"], flare_k: float
 ) -> EnergyScale | None:
@@ -231,6 +257,21 @@ def energy_scale(
     if star.distance_pc is not None:
         return EnergyScale.of_star(source, star.distance_pc, band=study.flare.band, flare_k=hot)
     return None
+
+
+def energy_of(
+    study: Study, star: Star, source: Source, event: Event, kind: Literal["bolometric", "band"]
+) -> float | None:
+    """Energy of a flare at a star, erg; None where the star's size and distance are unknown."""
+    if energy_scale(study, star, source, kind, event.hottest_k) is None:
+        return None
+
+    def scale_of(kelvin: float) -> EnergyScale:
+        scale = energy_scale(study, star, source, kind, kelvin)
+        assert scale is not None
+        return scale
+
+    return event.bolometric_energy(scale_of)
 
 
 def events_of(study: Study, star: Star, source: Source) -> list[Event]:
@@ -264,13 +305,14 @@ def _event(study: Study, star: Star, source: Source, text: EventText) -> Event:
     elif text.equivalent_duration_s is not None:
         amplitude = amplitude_of(text.equivalent_duration_s, half, shape)
     elif text.energy_erg is not None:
-        scale = energy_scale(study, star, source, text.energy, kelvin)
-        if scale is None:
+        # Any energy is linear in the amplitude.
+        one = energy_of(study, star, source, Event(text.peak_s, half, 1.0, temperature, shape), text.energy)
+        if one is None:
             raise InputError(
                 f"a flare of {text.energy_erg:g} erg at {source.name} of unknown size, expected the star's distance_pc "
                 "or radius_rsun and effective_temperature_k"
             )
-        amplitude = amplitude_of(scale.equivalent_duration(text.energy_erg), half, shape)
+        amplitude = text.energy_erg / one
     return Event(text.peak_s, half, amplitude, temperature, shape)
 
 

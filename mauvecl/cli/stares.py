@@ -1,0 +1,65 @@
+"""The verbs that look at a star for hours."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from mauvecl.cli.flags import DRAWS, FLARE, SIZE, STARE, SWEEP, DeviceFlag, takes_study
+
+if TYPE_CHECKING:
+    from mauvecl.answers.stare import StareAnswer
+    from mauvecl.cli.session import Session
+    from mauvecl.study.study import Study
+
+
+@takes_study(FLARE, STARE, SIZE, {"seed": DRAWS["seed"]}, SWEEP, without="exposure", draws=False)
+def stare(
+    study: Study,
+    session: Session,
+    device: DeviceFlag = None,
+) -> None:
+    """One simulated stare: light curves in bands, a spectrum of every frame, and the flares in it.
+
+    Without arguments: the paper's two stars over one orbit, four flares each. The FITS files are read by lightkurve.
+
+    Examples: mauvecl stare --star M3V --magnitude 9 --amplitude 0.5 --half-width 60 --thermal 0.5
+
+    mauvecl stare --star G2V --magnitude 7.4 --distance 14.1 --energy 1e33 --energy 1e34 --orbit-gap 2100
+    """
+    from mauvecl.answers.stare import stare as compute
+    from mauvecl.device.stares import Stares
+
+    found = compute(study, Stares(device))
+    session.answer(found, lambda: _show(found))
+
+
+def _show(found: StareAnswer) -> None:
+    from mauvecl.cli.console import short, show_table
+
+    swept = tuple(axis.quantity for axis in found.study.sweep.axes)
+    show_table(
+        "One stare each",
+        ("star", *swept, "frames", "in frames (s)", "intervals", "light (DN/s)", "noise of a frame", "saturated"),
+        [
+            (one.label, *map(short, one.at.values()), str(row["frames"]), f"{row['observed'].value:g}",
+             str(row["intervals"]), f"{row['flux'].value:.4g}", f"{100 * row['frame_noise']:.3g} %",
+             str(row["saturated_frames"]))
+            for one, row in zip(found.stares, found.table, strict=True)
+        ],
+    )  # fmt: skip
+    events = found.events
+    show_table(
+        "Flares in them; S/N of one who knows all but whether the flare is there",
+        ("star", *swept, "peak at (s)", "half width (s)", "peak", "ED (s)", "bolometric (erg)", "S/N"),
+        [
+            (row["star"], *(short(getattr(row[name], "value", row[name])) for name in swept),
+             f"{row['peak_time'].value:.6g}", f"{row['half_width'].value:g}", f"{100 * row['peak']:.3g} %",
+             f"{row['equivalent_duration'].value:.4g}", _energy(row["energy_bolometric"].value), f"{row['snr']:.3g}")
+            for row in events
+        ],
+    )  # fmt: skip
+
+
+def _energy(erg: float) -> str:
+    """An energy, or nothing where the star's size is unknown."""
+    return f"{erg:.3g}" if erg == erg else ""

@@ -1,0 +1,105 @@
+"""Pictures of stares: light curves in bands, and the dynamic spectrum."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.pictures.style import COLOURS, NULL, STYLE, finished, pyplot
+
+if TYPE_CHECKING:
+    from mauvecl.answers.stare import StarStare
+
+Float = NDArray[np.float64]
+#: Points of a light curve, and rows of a dynamic spectrum, at most: more are means of several frames.
+MOST_POINTS, MOST_ROWS = 4000, 600
+#: Longest time that is shown in seconds, and in minutes, s.
+IN_SECONDS_S, IN_MINUTES_S = 600.0, 4 * 3600.0
+
+
+def light_curves(one: StarStare, path: str | Path | None = None) -> Any:
+    """Light curves in all bands, relative to the quiescent star, with flares marked and gaps left out."""
+    plt = pyplot()
+    stare, light = one.staring.stare, one.light
+    scale, unit = _time(stare.duration_s)
+    level = np.median(light.mean, axis=0)
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(
+            len(light.bands), 1, figsize=(7.2, 1.5 * len(light.bands) + 0.7), sharex=True, squeeze=False
+        )
+        for k, axis in enumerate(axes[:, 0]):
+            colour = "black" if k == 0 else COLOURS[(k - 1) % len(COLOURS)]
+            for part in _runs(stare.numbers):
+                step = -(-part.size // max(1, MOST_POINTS * part.size // stare.n_frames))
+                time, flux, mean = (
+                    _binned(values[part], step) for values in (stare.middle_s, light.flux[:, k], light.mean[:, k])
+                )
+                axis.plot(time / scale, flux / level[k], ".", markersize=2, color=colour, alpha=0.6)
+                axis.plot(time / scale, mean / level[k], color=NULL, linewidth=0.8)
+            for flare in one.flares:
+                axis.axvline(flare.event.peak_s / scale, color=NULL, linewidth=0.5, linestyle=":")
+            axis.set_title(light.bands[k])
+            axis.set_ylabel("relative light")
+        axes[-1, 0].set_xlabel(f"time from the start of the stare ({unit})")
+        figure.suptitle(f"{one.title}: one simulated stare; nominal throughput", fontsize=10)
+        return finished(figure, path)
+
+
+def dynamic_spectrum(one: StarStare, path: str | Path | None = None) -> Any:
+    """Light in every resolution element and frame, as standard deviations from the median over the stare."""
+    plt = pyplot()
+    stare, light = one.staring.stare, one.light
+    scale, unit = _time(stare.duration_s)
+    # Whole stare on a regular grid, gaps empty.
+    step = -(-(int(stare.numbers[-1]) + 1) // MOST_ROWS)
+    rows = stare.numbers // step
+    n_rows = int(rows[-1]) + 1
+    counts = np.bincount(rows, minlength=n_rows)[:, None].astype(np.float64)
+
+    def summed(values: NDArray[Any]) -> Float:
+        return np.array([np.bincount(rows, column, minlength=n_rows) for column in values.T]).T
+
+    centred = light.spectrum - np.median(light.spectrum, axis=0)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        image = summed(centred) / np.sqrt(summed(light.spectrum_sd.astype(np.float64) ** 2))
+    image[counts[:, 0] == 0] = np.nan
+    reach = max(3.0, float(np.nanpercentile(np.abs(image), 99.5)))
+    with plt.rc_context(STYLE):
+        figure, axis = plt.subplots(figsize=(7.2, 3.6))
+        half = (light.element_nm[1] - light.element_nm[0]) / 2 if light.element_nm.size > 1 else 5.0
+        extent = (0.0, n_rows * step * stare.frame_s / scale, light.element_nm[0] - half, light.element_nm[-1] + half)
+        shown = axis.imshow(
+            image.T, origin="lower", aspect="auto", extent=extent, cmap="RdBu_r", vmin=-reach, vmax=reach,
+            interpolation="nearest",
+        )  # fmt: skip
+        axis.set_facecolor("#dddddd")
+        figure.colorbar(shown, label="standard deviations from the median")
+        axis.set(xlabel=f"time from the start of the stare ({unit})", ylabel="wavelength (nm)")
+        axis.set_title(f"{one.title}: dynamic spectrum, {step * stare.frame_s:g} s to a column")
+        return finished(figure, path)
+
+
+def _time(duration_s: float) -> tuple[float, str]:
+    if duration_s <= IN_SECONDS_S:
+        return 1.0, "s"
+    return (
+        (60.0, "min")
+        if duration_s <= IN_MINUTES_S
+        else (3600.0, "h")
+        if duration_s <= 3 * 86_400.0
+        else (86_400.0, "d")
+    )
+
+
+def _runs(numbers: NDArray[np.int64]) -> list[NDArray[np.intp]]:
+    """Frames between gaps."""
+    return np.split(np.arange(numbers.size), np.flatnonzero(np.diff(numbers) > 1) + 1)
+
+
+def _binned(values: Float, step: int) -> Float:
+    """Means of so many values each; the rest at the end is one of its own."""
+    edges = np.arange(0, values.size, max(1, step))
+    return np.asarray(np.add.reduceat(values, edges) / np.diff(np.append(edges, values.size)))

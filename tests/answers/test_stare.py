@@ -1,0 +1,263 @@
+"""One simulated stare: its light, its files, what it refuses."""
+
+from __future__ import annotations
+
+import io
+import tomllib
+
+import numpy as np
+import pytest
+from astropy.io import fits
+from astropy.table import QTable
+
+from mauvecl.answers.stare import StareAnswer, stare
+from mauvecl.device.engine import Engine
+from mauvecl.device.stares import Stares
+from mauvecl.host.errors import InputError
+from mauvecl.study.stares import stare_of
+from mauvecl.study.study import Study
+from commands import ended, run
+
+#: A G2V star for five minutes with a gap and a flare.
+SHORT = Study().with_settings(
+    [
+        'star=[{library="G2V", magnitude=7.4}]',
+        "flare.amplitudes=[0.5]",
+        "stare.duration_s=300",
+        "stare.gaps=[[100, 150]]",
+        "stare.half_width_s=20",
+        "stare.thermal.amplitude=2.0",
+        "stare.thermal.period_s=600",
+    ]
+)
+
+
+@pytest.fixture(scope="module")
+def stares() -> Stares:
+    return Stares()
+
+
+@pytest.fixture(scope="module")
+def found(stares) -> StareAnswer:
+    return stare(SHORT, stares)
+
+
+def test_spectra_summed_over_frames_are_the_engines_exposures(stares):
+    # Frames of a stare have the addresses of an exposure's: the same draws, to the last DN.
+    study = SHORT.with_settings(["stare.gaps=[]", "stare.duration_s=50", "flare.amplitudes=[0]"])
+    study = study.model_copy(update={"stare": study.stare.model_copy(update={"thermal": None, "number": 3})})
+    one = stare(study, stares).stares[0]
+    exposure, *_ = study.with_settings(["observation.exposure_s=50"]).expectations(study.star[0])
+    raw = Engine().realise(exposure, start=3, count=1, seed=study.run.seed, mode="frames")[0]
+    net = raw - 10 * (exposure.bias_dn + exposure.dark_dn)
+    elements = np.bincount(exposure.element, net)
+    np.testing.assert_allclose(5.0 * one.light.spectrum.sum(axis=0), elements, atol=0.05)
+    assert 5.0 * one.light.flux[:, 0].sum() == pytest.approx(net.sum(), abs=0.5)
+    band = (exposure.wavelength_nm >= 300) & (exposure.wavelength_nm < 400)
+    assert 5.0 * one.light.flux[:, 2].sum() == pytest.approx(net[band].sum(), abs=0.1)
+
+
+def test_light_scatters_about_its_mean_by_its_standard_deviation(found):
+    light = found.stares[0].light
+    z = (light.flux - light.mean) / light.sd
+    spectrum = (light.spectrum - light.spectrum_mean) / light.spectrum_sd
+    # 50 frames x 4 bands (the first is their sum), and 50 x 48 elements: beyond these once in 1e6.
+    assert abs(z[:, 1:].mean()) < 4.9 / np.sqrt(z[:, 1:].size)
+    assert abs((spectrum**2).mean() - 1) < 4.9 * np.sqrt(2 / spectrum.size) + 0.01
+    # The dark follows 2 deg C up and down, hundreds of standard deviations that are known and taken off.
+    assert abs(spectrum.mean()) < 4.9 / np.sqrt(spectrum.size)
+
+
+def test_the_mean_is_the_star_and_its_flare(found):
+    one = found.stares[0]
+    event = one.flares[0].event
+    assert (event.peak_s, event.amplitude, event.half_width_s) == (150.0, 0.5, 20.0)
+    edges = np.column_stack([one.staring.stare.start_s, one.staring.stare.start_s + 5.0])
+    rise = 0.5 * event.form.mean_over(edges, 150.0, 20.0)
+    # In any band the light rises with the shape.
+    for k in range(5):
+        mean = one.light.mean[:, k]
+        quiet = mean[0]
+        np.testing.assert_allclose(mean / quiet - 1, rise * (mean.max() / quiet - 1) / rise.max(), atol=1e-9)
+
+
+def test_a_flares_snr_is_that_of_its_frames_and_pixels(found):
+    one = found.stares[0]
+    quiet, flare = one.staring.quiet, one.staring.flare[:, 0]
+    spectrum = quiet.gain_dn_per_electron * one.staring.flare_electrons[0]
+    exact = np.sqrt(sum(a**2 for a in flare) * np.sum(spectrum**2 / quiet.variance_dn2))
+    assert one.flares[0].snr == pytest.approx(exact, rel=1e-12)
+
+
+def test_the_same_stare_again_and_another(stares, found):
+    again = stare(SHORT, stares)
+    np.testing.assert_array_equal(again.stares[0].light.spectrum, found.stares[0].light.spectrum)
+    other = stare(SHORT.with_settings(["stare.number=1"]), stares)
+    assert not np.array_equal(other.stares[0].light.flux, found.stares[0].light.flux)
+    np.testing.assert_array_equal(other.stares[0].light.mean, found.stares[0].light.mean)
+
+
+def test_a_fits_file_as_lightkurve_reads_it(found):
+    with fits.open(io.BytesIO(found.documents["light-curve-1.fits"]())) as hdus:
+        hdus.verify("exception")
+        table, gti = hdus[1], hdus["GTI"]
+        # `lightkurve.read` takes a file for a generic one only where CREATOR or ORIGIN is missing, and needs a time.
+        assert "ORIGIN" not in hdus[0].header
+        assert table.header["MJDREFI"] == 61041
+        assert table.header["TIMESYS"] == "UTC"
+        assert table.columns.names[:6] == ["TIME", "CADENCENO", "QUALITY", "FLUX", "FLUX_ERR", "MEAN"]
+        assert table.columns["TIME"].unit == "d"
+        light = found.stares[0].light
+        np.testing.assert_allclose(table.data["FLUX"], light.flux[:, 0], rtol=1e-6)
+        np.testing.assert_allclose(table.data["FLUX_ERR_300_400"], light.sd[:, 2], rtol=1e-6)
+        np.testing.assert_allclose(table.data["TIME"] * 86_400, found.stares[0].staring.stare.middle_s)
+        assert table.data["CADENCENO"].tolist() == [*range(20), *range(30, 60)]
+        np.testing.assert_allclose(gti.data["START"] * 86_400, [0.0, 150.0])
+        np.testing.assert_allclose(gti.data["STOP"] * 86_400, [100.0, 300.0])
+        assert hdus["SPECTRUM"].data.shape == (50, hdus["WAVELENGTH"].data.size)
+        assert hdus[0].header["OBJECT"] == "G2V V = 7.4"
+
+
+def test_lightkurve_reads_it(found, tmp_path):
+    lightkurve = pytest.importorskip("lightkurve")
+    found.write(tmp_path)
+    curve = lightkurve.read(str(tmp_path / "light-curve-1.fits"))
+    np.testing.assert_allclose(curve.flux.value, found.stares[0].light.flux[:, 0], rtol=1e-6)
+    assert curve.time[0].iso == "2026-01-01 00:00:02.500"
+
+
+def test_the_verb_and_its_files(tmp_path):
+    words = [
+        "stare",
+        "--star",
+        "G2V",
+        "--magnitude",
+        "7.4",
+        "--duration",
+        "600",
+        "--gap",
+        "200:300",
+        "--distance",
+        "14",
+    ]
+    told = run(
+        *words, "--energy", "1e33", "--half-width", "30", "--thermal", "0.5", "-o", "out", folder=tmp_path
+    ).stdout
+    assert "1e+33" in told
+    made = {path.name for path in (tmp_path / "out").iterdir()}
+    assert made == {
+        "stare.ecsv", "events.ecsv", "light-curve-1.ecsv", "light-curve-1.fits", "light-curve-1.png",
+        "dynamic-spectrum-1.png", "study.toml", "run.json",
+    }  # fmt: skip
+    events = QTable.read(tmp_path / "out" / "events.ecsv")
+    assert events["energy_bolometric"].to_value("erg")[0] == pytest.approx(1e33)
+    assert Study.read(tmp_path / "out" / "study.toml") == Study.read(tmp_path / "out" / "events.ecsv")
+    # The study gives the same stare again.
+    assert (tmp_path / "out" / "run.json").read_text().count("nominal") >= 1
+    run("stare", tmp_path / "out" / "study.toml", "-o", "again", "--no-pictures", folder=tmp_path)
+    ours, theirs = (QTable.read(tmp_path / where / "light-curve-1.ecsv") for where in ("out", "again"))
+    np.testing.assert_array_equal(ours["flux"], theirs["flux"])
+
+
+def test_sweeps_over_magnitude_and_temperature(stares):
+    study = SHORT.with_settings(['sweep.axes=[{quantity="magnitude", values=[7, 9]}]'])
+    swept = stare(study, stares)
+    assert swept.table["magnitude"].value.tolist() == [7.0, 9.0]
+    noise = swept.table["frame_noise"]
+    assert noise[1] > 2 * noise[0]
+    hot = stare(SHORT.with_settings(['sweep.axes=[{quantity="flare_temperature", values=[8000, 20000]}]']), stares)
+    assert [one.flares[0].event.hottest_k for one in hot.stares] == [8000.0, 20_000.0]
+
+
+def test_a_saturated_flare_is_told(stares):
+    study = SHORT.with_settings(['star=[{library="G2V", magnitude=2.2}]', "flare.amplitudes=[3]"])
+    cut = stare(study, stares)
+    assert cut.messages[0].startswith("SATURATED: ")
+    assert 0 < cut.table["saturated_frames"][0] < 50
+    assert cut.stares[0].staring.quality.sum() == cut.table["saturated_frames"][0]
+
+
+STUDY = """
+[[star]]
+library = "G2V"
+magnitude = 7.4
+radius_rsun = 1.0
+effective_temperature_k = 5778.0
+
+[stare]
+duration_s = 300
+drifts = { light = 0.01 }
+variability = { file = "slow.txt" }
+
+[[events]]
+peak_s = 100
+half_width_s = 20
+energy_erg = 1e33
+cooling = { end_k = 6000, fold_s = 60 }
+
+[[events]]
+peak_s = 200
+half_width_s = 1
+equivalent_duration_s = 2.0
+shape_file = "own.txt"
+"""
+
+
+def test_a_study_file_with_curves_shapes_and_events(tmp_path, stares):
+    (tmp_path / "slow.txt").write_text("# s, relative\n0 0.0\n300 0.03\n")
+    (tmp_path / "own.txt").write_text("-10 0\n0 4\n30 0\n")
+    (tmp_path / "study.toml").write_text(STUDY)
+    study = Study.read(tmp_path / "study.toml")
+    assert Study.build(tomllib.loads(study.toml()), "again").toml() == study.toml()
+    found = stare(study, stares)
+    np.testing.assert_allclose(stare_of(study).star[[0, -1]], [1 + 0.03 * 2.5 / 300, 1 + 0.03 * 297.5 / 300])
+    first, second = found.stares[0].flares
+    assert first.bolometric_erg == pytest.approx(1e33, rel=1e-9)
+    # Own shape: a triangle of 40 s with a peak of one.
+    assert second.event.equivalent_duration_s == pytest.approx(2.0)
+    assert second.event.peak == pytest.approx(0.1)
+    assert stare_of(study).unknowns[0].name == "light drift"
+
+
+def test_unknowns_of_a_stare_are_drawn_where_asked_for():
+    plain, usual = stare_of(SHORT), stare_of(SHORT.with_settings(["nuisances.usual=true", "stare.offsets.sky=0.05"]))
+    assert not plain.unknowns
+    assert usual.light_jitter == pytest.approx(0.0144, abs=1e-4)
+    spread = {unknown.name: unknown.sd for unknown in usual.unknowns}
+    assert spread == {"sky offset": 0.05, "star drift": 0.01, "temperature sine": 0.5, "temperature cosine": 0.5}
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (["--gap", "10"], "--gap '10', expected two times in s, such as 1000:2000"),
+        (["--gap", "20:10"], "a gap from 20 to 10 s, expected two times, ascending"),
+        (["--duration", "-3"], "stare.duration_s = -3.0: input should be greater than 0"),
+        (["--shape", "gauss"], "flare shape 'gauss' is unknown, expected one of davenport2014"),
+        (["--energy", "1e33"], "a flare of 1e+33 erg at K2.5V of unknown size, expected the star's distance_pc"),
+        (["--set", "stare.bands_nm=[[10,20]]"], "the band of 10 to 20 nm holds no pixel that is used"),
+        (["--set", "stare.thermal.period_s=100"], "a curve has none or several of amplitude, points and file"),
+        (["--set", "stare.jitters.star=0.1"], "a jitter of 'star', expected one of light, sky, temperature"),
+        (["--set", "stare.variability.file='none.txt'"], "none.txt"),
+        (["--set", "processes.jitter.uniform=[0,0.05]"], "processes.jitter is of single exposures"),
+        (
+            ["--set", "events=[{peak_s=1, peak=1, amplitude=1}]"],
+            "an event has amplitude and peak, expected one of them",
+        ),
+        (["--set", "stare.orbit_gap_s=6000"], "stare.orbit_gap_s = 6000 of an orbit of 5678.09 s"),
+    ],
+)
+def test_what_is_refused(words, told, tmp_path):
+    code, _, error = ended("stare", *words, "-o", "out", folder=tmp_path)
+    assert (code, error.count("\n")) == (2, 1), error
+    assert told in error
+
+
+def test_pictures_of_long_stares_and_gaps(stares):
+    study = SHORT.with_settings(["stare.duration_s=12000", "stare.gaps=[]", "stare.orbit_gap_s=2000"])
+    long = stare(study, stares)
+    for name in long.pictures:
+        assert name in ("light-curve-1", "dynamic-spectrum-1")
+    assert long.plot() is not None
+    with pytest.raises(InputError):
+        stare(study.with_settings(["stare.gaps=[[0, 12000]]"]), stares)
