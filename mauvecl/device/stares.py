@@ -125,7 +125,7 @@ class Stares:
 
             def work(tile: Tile, done: int) -> None:
                 launches.give(flares.part(done, tile.wanted))
-                launches.values(tile, out, done)
+                launches.draw(tile, out, done)
 
             self._tiles.over(first, count, out[:, 0].nbytes, work)
         found = np.moveaxis(out[..., : stare.n_frames], 2, 3)
@@ -192,7 +192,7 @@ class StareLaunches(Launches):
         self._cl.enqueue_copy(self._queue, buffer, data)
         return buffer
 
-    def values(self, tile: Tile, out: Floats, row: int) -> None:
+    def draw(self, tile: Tile, out: Floats, row: int) -> None:
         """Statistics of a tile's frames into rows of `out`.
 
         Parameters
