@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +13,13 @@ from mauvecl.device.opened import Device
 from mauvecl.device.tiles import TILE_BYTES, Progress, Tile, Tiles
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.components import Components
+from mauvecl.lightcurve.requests import Arrays, Kept, Method, StaresRequest, joined
 from mauvecl.lightcurve.scene import Flares, StareScene, padded_frames
 from mauvecl.lightcurve.stare import Stare
 from mauvecl.lightcurve.sums import SumTable, check_sums
 from mauvecl.noise.processes import CosmicRays
+from mauvecl.results.requests import Share
 
-Method = Literal["pixels", "cumulants"]
 Floats = NDArray[np.float32]
 
 #: Frames that one work-item follows where sums are drawn.
@@ -38,6 +39,8 @@ class Stares:
         Stares in one launch, for tests; chosen from the device and the work by default. Never changes a result.
     width : int, optional
         Stares or frames in one work-item, for tests: 16 on CPUs, 1 elsewhere. Never changes a result.
+    tiles : Tiles, optional
+        How the work is cut, in place of `progress` and `tile`.
 
     Raises
     ------
@@ -70,9 +73,10 @@ class Stares:
         progress: Progress | None = None,
         tile: int | None = None,
         width: int | None = None,
+        tiles: Tiles | None = None,
     ) -> None:
         self.opened = device if isinstance(device, Device) else Device(device, width=width)
-        self._tiles = Tiles(self.opened, progress=progress, largest=tile)
+        self._tiles = tiles or Tiles(self.opened, progress=progress, largest=tile)
 
     def frames(
         self,
@@ -130,6 +134,49 @@ class Stares:
             self._tiles.over(first, count, out[:, 0].nbytes, work)
         found = np.moveaxis(out[..., : stare.n_frames], 2, 3)
         return found[0] if amplitudes is None else found
+
+    def reduced(self, request: StaresRequest, share: Share | None = None) -> Arrays:
+        """What is kept of a request's stares, or of a share of them, which are drawn and reduced a few at a time.
+
+        Parameters
+        ----------
+        request : StaresRequest
+        share : Share, optional
+
+        Returns
+        -------
+        dict of str to ndarray
+            What the request's reduction gives, joined; of a share with its ``start``, as `StareSums` takes it.
+
+        Raises
+        ------
+        InputError
+            As `frames`.
+        """
+        there = share or Share(0, request.start, request.realisations)
+        _check(there.start, there.count, request.seed, request.method)
+        components, stare, reduction = request.components, request.stare, request.reduction or Kept()
+        how = (request.seed, request.method, request.cosmic_rays)
+        scenarios = slice(None) if request.amplitudes is not None else 0
+        room, parts = np.empty(0, np.float32), list[Arrays]()
+        shape = (components.n_statistics, padded_frames(stare.n_frames))
+        each = len(request.flares.amplitudes) * shape[0] * shape[1]
+        with self._launches(components, stare, request.flares, *how) as launches:
+
+            def work(tile: Tile, done: int) -> None:
+                nonlocal room
+                if room.size < each * tile.wanted:
+                    room = np.empty(each * tile.wanted, np.float32)
+                out = room[: each * tile.wanted].reshape(-1, tile.wanted, *shape)
+                first = there.start + done
+                launches.give(request.flares.part(first - request.start, tile.wanted))
+                launches.draw(tile, out, 0)
+                values = np.moveaxis(out[..., : stare.n_frames], 2, 3)[scenarios]
+                parts.append(dict(reduction(values, first)))
+
+            self._tiles.over(there.start, there.count, 4 * each, work)
+        found = joined(parts, adds=reduction.adds)
+        return found | {"start": np.array(there.start)} if share else found
 
     def _launches(
         self,
