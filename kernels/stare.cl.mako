@@ -40,19 +40,14 @@ INLINE void unknowns_of(const Staring staring, uintv realisation, uint realisati
     }
 }
 
-INLINE Strengths strengths_of(STARE_GIVEN, uint frame, Words x, const floatv *z)
+INLINE Strengths strengths_of(STARE_GIVEN, uint frame, const floatv *jitter, const floatv *z)
 {
     const uint stride = staring->padded_frames;
+% if jittered:
+    floatv moved[4] = {(floatv)0.0f, jitter[0] * staring->light_jitter, jitter[1] * staring->sky_jitter, jitter[2] * staring->temperature_jitter};
+% else:
     floatv moved[4] = {(floatv)0.0f, (floatv)0.0f, (floatv)0.0f, (floatv)0.0f};
-    if (staring->jittered) {
-        const uintv w[4] = {x.a, x.b, x.c, x.d};
-        floatv jitter[4];
-        normal_pair(w, jitter);
-        normal_pair(w + 2, jitter + 2);
-        moved[1] = jitter[0] * staring->light_jitter;
-        moved[2] = jitter[1] * staring->sky_jitter;
-        moved[3] = jitter[2] * staring->temperature_jitter;
-    }
+% endif
     for (uint u = 0; u < staring->unknown_count; u++) {
         const floatv more = OF_FRAME(curves + u * stride);
         for (uint kind = 0; kind < 4u; kind++)

@@ -15,8 +15,13 @@ void stare_pixels(SCENE, STARE, const uint first_low, const uint first_high, con
     unknowns_of(*staring, realisation, first_high, job->seed_low, job->seed_high, unknown);
 % endif
     const Address at = address(realisation, first_high, numbers[frame], job->seed_low, job->seed_high);
-    Words jitter = {(uintv)0u, (uintv)0u, (uintv)0u, (uintv)0u};
-    if (staring->jittered) jitter = words_at(&at, ${streams["stare_frame"]}u, 0u);
+    floatv jitter[4];
+% if jittered:
+    const Words words = words_at(&at, ${streams["stare_frame"]}u, 0u);
+    const uintv w[4] = {words.a, words.b, words.c, words.d};
+    normal_pair(w, jitter);
+    normal_pair(w + 2, jitter + 2);
+% endif
     const Strengths strengths = strengths_of(STARE_PASSED, frame, jitter, unknown);
 % if spectra:
     /* Each stare's flares, or those of all; lanes beyond what is wanted take the nearest. */

@@ -8,6 +8,8 @@
     row = sums + len(pairs) + len(threes) + len(fours)
     at = {key: sums + i for i, key in enumerate(pairs + threes + fours)}
     lights = ["strengths.star", "strengths.sky"] + [f"flare[{j}]" for j in range(spectra)]
+    words = [("stare_frame", 0)] * jittered + [("stare_sums", group) for group in range(-(-sums // 4))]
+    n_words = len(words)
     def name(*key):
         return "".join(str(i) for i in sorted(key, reverse=True))
     def chain(terms):
@@ -33,7 +35,7 @@
 %>\
 __kernel ${attributes}
 void stare_sums(__global const Job *restrict job, STARE, const uint first_low, const uint first_high, const uint frames_each,
-                __global const float *restrict table, __global float *restrict values)
+                __global const float *restrict table, const uint row_count, const uint first_row, __global float *restrict values)
 {
     /* values[scenario][stare][statistic][frame] */
     const uint stare = get_global_id(0), stride = staring->padded_frames, scenario_count = staring->scenario_count;
@@ -46,24 +48,24 @@ void stare_sums(__global const Job *restrict job, STARE, const uint first_low, c
     __global const float *whole = table + ${row * (4 + spectra)}u;
     for (uint frame = begin; frame < end; frame += ${width}u) {
         const uintv number = LOAD(numbers + frame);
-        Words jitter = {(uintv)0u, (uintv)0u, (uintv)0u, (uintv)0u};
-        if (staring->jittered)
-            jitter = philox(realisation, (uintv)first_high, number, (uintv)${streams["stare_frame"] << 24}u, job->seed_low, job->seed_high);
-        const Strengths strengths = strengths_of(STARE_PASSED, frame, jitter, unknown);
-        floatv z[${-(-sums // 4) * 4}];
-% for group in range(-(-sums // 4)):
-        {
-            const Words x = philox(realisation, (uintv)first_high, number, (uintv)${(streams["stare_sums"] << 24) + group}u, job->seed_low, job->seed_high);
-            const uintv w[4] = {x.a, x.b, x.c, x.d};
-            normal_pair(w, z + ${4 * group});
-% if sums > 4 * group + 2:
-            normal_pair(w + 2, z + ${4 * group + 2});
-% endif
-        }
+        /* Normals of the jitters, and of the sums. */
+        floatv z[${4 * n_words}];
+        uintv w[${4 * n_words}];
+        Words x;
+% for place, (stream, group) in enumerate(words):
+        x = philox(realisation, (uintv)first_high, number, (uintv)${(streams[stream] << 24) + group}u, job->seed_low, job->seed_high);
+        w[${4 * place}] = x.a; w[${4 * place + 1}] = x.b; w[${4 * place + 2}] = x.c; w[${4 * place + 3}] = x.d;
 % endfor
+% if n_words % 2 == 0:
+        for (uint i = 0; i < ${4 * n_words}u; i += 8u) four_normal_pairs(w + i, z + i);
+% else:
+        for (uint i = 0; i < ${4 * n_words}u; i += 2u) normal_pair(w + i, z + i);
+% endif
+        const Strengths strengths = strengths_of(STARE_PASSED, frame, z, unknown);
+        const floatv *y = z + ${4 * jittered}u;
         /* What skewness adds to each is a sum of these. */
 % for a, b in pairs:
-        const floatv q${a}${b} = ${f"FMA(z[{a}], z[{a}], (floatv)-1.0f) * 0.16666667f" if a == b else f"z[{a}] * z[{b}] * 0.33333334f"};
+        const floatv q${a}${b} = ${f"FMA(y[{a}], y[{a}], (floatv)-1.0f) * 0.16666667f" if a == b else f"y[{a}] * y[{b}] * 0.33333334f"};
 % endfor
         for (uint k = 0; k < scenario_count; k++) {
 % if spectra:
@@ -108,7 +110,7 @@ void stare_sums(__global const Job *restrict job, STARE, const uint first_low, c
             const floatv s${a}${b}${c} = ${chain([(f"m{c}{i}", f"b{a}{b}_{i}") for i in range(c + 1)])};
 % endfor
 % for a in range(sums):
-            floatv x${a} = z[${a}];
+            floatv x${a} = y[${a}];
 % for b, c in pairs:
             x${a} = FMA(s${name(a, b, c)}, q${b}${c}, x${a});
 % endfor
@@ -118,16 +120,16 @@ void stare_sums(__global const Job *restrict job, STARE, const uint first_low, c
 % for key in combinations_with_replacement(range(a, -1, -1), 4):
                 f = FMA(${" * ".join(f"m{a}{i}" for i in key)}, ${cumulant(at[key], lit=counts)}, f);
 % endfor
-                const floatv zz = z[${a}] * z[${a}];
-                x${a} = FMA(f * z[${a}], FMA(zz, (floatv)0.041666668f, (floatv)-0.125f), x${a});
-                x${a} = FMA(-s${name(a, a, a)} * s${name(a, a, a)} * z[${a}], FMA(zz, (floatv)0.055555556f, (floatv)-0.1388889f), x${a});
+                const floatv zz = y[${a}] * y[${a}];
+                x${a} = FMA(f * y[${a}], FMA(zz, (floatv)0.041666668f, (floatv)-0.125f), x${a});
+                x${a} = FMA(-s${name(a, a, a)} * s${name(a, a, a)} * y[${a}], FMA(zz, (floatv)0.055555556f, (floatv)-0.1388889f), x${a});
             }
 % endif
 % endfor
 % for a in range(sums):
             const floatv u${a} = ${cumulant(a)} + (${chain([(f"l{a}{i}", f"x{i}") for i in range(a + 1)])});
 % endfor
-            __global float *out = values + ((size_t)k * get_global_size(0) + stare) * ${sums}u * stride + frame;
+            __global float *out = values + ((size_t)k * row_count + first_row + stare) * ${sums}u * stride + frame;
 % for a in range(sums):
             STORE(${chain([(f"(floatv)whole[{pairs.index((a, i))}]", f"u{i}") for i in range(a + 1)])}, out + ${a}u * stride);
 % endfor

@@ -4,10 +4,18 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+
 from mauvecl.host.expectation import Expectation, expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.sky.zodiacal import Sky
 from mauvecl.host.stars.source import Source
+from mauvecl.lightcurve.components import Components
+from mauvecl.lightcurve.requests import StaresRequest
+from mauvecl.lightcurve.stare import Stare
+
+#: Of `flaring_stares`: around the boundary of the counter's first word.
+N_STARES, FIRST_STARE = 200, 2**32 - 70
 
 
 def instrument(name: str = "mauve", *, part: bool = False, **changes: Any) -> Instrument:
@@ -31,3 +39,14 @@ def star(
     quiet = Source.from_library(name).at_magnitude(magnitude)
     sources = [quiet, *(quiet.flaring(a) for a in amplitudes)]
     return [expect(s, payload, exposure=exposure, sky=Sky.of_brightness(22.1)) for s in sources]
+
+
+def flaring_stares(method: Any = "cumulants", **more: Any) -> StaresRequest:
+    """Two hundred stares of half a minute, each with flares of its own in two scenarios."""
+    quiet, flare = star(amplitudes=(1.0,), exposure=5.0, payload=instrument(part=True))
+    slope = np.linspace(-1.0, 1.0, quiet.wavelength_nm.size)
+    components = Components.of(quiet, [flare], np.stack([np.ones_like(slope), slope]))
+    stare = Stare.of(30.0, jitters={"light": 0.01}, offsets={"temperature": 0.1}, temperature_c=21.0)
+    rng = np.random.default_rng(1)
+    flares = {"flare": rng.random((N_STARES, 6, 1)), "amplitudes": rng.random((2, N_STARES))}
+    return StaresRequest(components, stare, N_STARES, 5, **({**flares, "start": FIRST_STARE, "method": method} | more))

@@ -12,8 +12,10 @@ from mauvecl.device import program
 from mauvecl.device.forms import ELEMENT_CHUNK, detection_launches, scene_launches
 from mauvecl.device.opened import Device
 from mauvecl.device.program import DeviceError, DeviceRecord, devices
+from mauvecl.device.stares import Stares
 from mauvecl.device.tiles import Progress, Tile, Tiles
 from mauvecl.host.errors import InputError
+from mauvecl.lightcurve.requests import StaresRequest
 from mauvecl.noise.comparison import TEMPLATE, Comparison
 from mauvecl.noise.drawing import Drawing, DrawingWords
 from mauvecl.noise.scene import BATCH, prepare
@@ -217,7 +219,7 @@ class Engine:
 
         Parameters
         ----------
-        request : DetectRequest, SnrRequest or RealiseRequest
+        request : DetectRequest, SnrRequest, RealiseRequest or StaresRequest
         share : Share
             `shards.shares` cuts requests into them.
         out : ndarray, optional
@@ -238,6 +240,9 @@ class Engine:
                 how = request.drawing.words
                 rows = self.realise(x, start=share.start, count=share.count, seed=seed, out=out, **how)
                 return {"rows": rows}
+            case StaresRequest():
+                return Stares(self.opened, tiles=self._tiles).reduced(request, share)
+        raise TypeError(f"{type(request).__name__}, expected a request")
 
     def _snr(self, request: SnrRequest, share: Share) -> Counts:
         self._check(share.start, share.count, request.seed)

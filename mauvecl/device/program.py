@@ -84,6 +84,7 @@ class Variant:
     sums: int = 0
     spectra: int = 0
     unknown_groups: int = 0
+    jittered: bool = False
     counts: bool = False
     fourths: bool = False
     in_time: bool = False

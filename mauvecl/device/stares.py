@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,12 +13,13 @@ from mauvecl.device.opened import Device
 from mauvecl.device.tiles import TILE_BYTES, Progress, Tile, Tiles
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.components import Components
+from mauvecl.lightcurve.requests import Arrays, Kept, Method, StaresRequest, joined
 from mauvecl.lightcurve.scene import Flares, StareScene, padded_frames
 from mauvecl.lightcurve.stare import Stare
 from mauvecl.lightcurve.sums import SumTable, check_sums
 from mauvecl.noise.processes import CosmicRays
+from mauvecl.results.requests import Share
 
-Method = Literal["pixels", "cumulants"]
 Floats = NDArray[np.float32]
 
 #: Frames that one work-item follows where sums are drawn.
@@ -39,6 +39,8 @@ class Stares:
         Stares in one launch, for tests; chosen from the device and the work by default. Never changes a result.
     width : int, optional
         Stares or frames in one work-item, for tests: 16 on CPUs, 1 elsewhere. Never changes a result.
+    tiles : Tiles, optional
+        How the work is cut, in place of `progress` and `tile`.
 
     Raises
     ------
@@ -71,9 +73,10 @@ class Stares:
         progress: Progress | None = None,
         tile: int | None = None,
         width: int | None = None,
+        tiles: Tiles | None = None,
     ) -> None:
         self.opened = device if isinstance(device, Device) else Device(device, width=width)
-        self._tiles = Tiles(self.opened, progress=progress, largest=tile)
+        self._tiles = tiles or Tiles(self.opened, progress=progress, largest=tile)
 
     def frames(
         self,
@@ -120,48 +123,76 @@ class Stares:
         """
         _check(first, count, seed, method)
         flares = Flares.of(components, stare, flare, amplitudes, count)
-        shape = (len(flares.amplitudes), count, components.n_statistics, stare.n_frames)
+        shape = (len(flares.amplitudes), count, components.n_statistics, padded_frames(stare.n_frames))
         out = np.empty(shape, np.float32)
+        with self._launches(components, stare, flares, seed, method, cosmic_rays) as launches:
 
-        def keep(values: Floats, done: int) -> None:
-            out[:, done : done + values.shape[1]] = values
+            def work(tile: Tile, done: int) -> None:
+                launches.give(flares.part(done, tile.wanted))
+                launches.draw(tile, out, done)
 
-        self.over(components, stare, flares, first, count, seed, method, cosmic_rays, keep)
-        found = np.moveaxis(out, 2, 3)
+            self._tiles.over(first, count, out[:, 0].nbytes, work)
+        found = np.moveaxis(out[..., : stare.n_frames], 2, 3)
         return found[0] if amplitudes is None else found
 
-    def over(
+    def reduced(self, request: StaresRequest, share: Share | None = None) -> Arrays:
+        """What is kept of a request's stares, or of a share of them, which are drawn and reduced a few at a time.
+
+        Parameters
+        ----------
+        request : StaresRequest
+        share : Share, optional
+
+        Returns
+        -------
+        dict of str to ndarray
+            What the request's reduction gives, joined; of a share with its ``start``, as `StareSums` takes it.
+
+        Raises
+        ------
+        InputError
+            As `frames`.
+        """
+        there = share or Share(0, request.start, request.realisations)
+        _check(there.start, there.count, request.seed, request.method)
+        components, stare, reduction = request.components, request.stare, request.reduction or Kept()
+        how = (request.seed, request.method, request.cosmic_rays)
+        scenarios = slice(None) if request.amplitudes is not None else 0
+        room, parts = np.empty(0, np.float32), list[Arrays]()
+        shape = (components.n_statistics, padded_frames(stare.n_frames))
+        each = len(request.flares.amplitudes) * shape[0] * shape[1]
+        with self._launches(components, stare, request.flares, *how) as launches:
+
+            def work(tile: Tile, done: int) -> None:
+                nonlocal room
+                if room.size < each * tile.wanted:
+                    room = np.empty(each * tile.wanted, np.float32)
+                out = room[: each * tile.wanted].reshape(-1, tile.wanted, *shape)
+                first = there.start + done
+                launches.give(request.flares.part(first - request.start, tile.wanted))
+                launches.draw(tile, out, 0)
+                values = np.moveaxis(out[..., : stare.n_frames], 2, 3)[scenarios]
+                parts.append(dict(reduction(values, first)))
+
+            self._tiles.over(there.start, there.count, 4 * each, work)
+        found = joined(parts, adds=reduction.adds)
+        return found | {"start": np.array(there.start)} if share else found
+
+    def _launches(
         self,
         components: Components,
         stare: Stare,
         flares: Flares,
-        first: int,
-        count: int,
         seed: int,
         method: Method,
         cosmic_rays: CosmicRays | None,
-        work: Callable[[Floats, int], None],
-    ) -> None:
-        """Draw stares and give them to `work` a few at a time.
-
-        Parameters
-        ----------
-        work : callable
-            Called as ``work(values, done)`` with values of the shape (n_scenario, n, n_statistic, n_frame), valid
-            during the call, of stares ``first + done`` and on.
-        """
+    ) -> StareLaunches:
+        self.opened.check_process()
         scene = StareScene.of(components, stare, cosmic_rays)
         scene.check(flares)
         if method == "cumulants":
             check_sums(scene, flares)
-        each = 4 * len(flares.amplitudes) * components.n_statistics * padded_frames(stare.n_frames)
-        with StareLaunches(self.opened, scene, seed, method) as launches:
-
-            def one(tile: Tile, done: int) -> None:
-                launches.give(flares.part(done, tile.wanted))
-                work(launches.values(tile), done)
-
-            self._tiles.over(first, count, each, one)
+        return StareLaunches(self.opened, scene, seed, method)
 
 
 class StareLaunches(Launches):
@@ -180,10 +211,11 @@ class StareLaunches(Launches):
             unknown_groups=-(-len(stare.kinds) // 4),
             counts=stare.counts,
             fourths=table is not None and table.fourths,
+            jittered=any(stare.stare.jitters.values()),
             in_time=self._in_time,
         )
         super().__init__(device, scene, variant, seed)
-        self._stare = stare
+        self._stare, self._local = stare, (1, 1) if variant.width > 1 else None
         self._known = [*map(self.upload, (stare.numbers, stare.known, stare.curves, stare.kinds))]
         if table is None:
             more = (beyond(stare.mixtures), stare.spectra, stare.weights, stare.constants)
@@ -207,23 +239,35 @@ class StareLaunches(Launches):
         self._cl.enqueue_copy(self._queue, buffer, data)
         return buffer
 
-    def values(self, tile: Tile) -> Floats:
-        """Statistics of a tile's frames, shape (n_scenario, tile.wanted, n_statistic, n_frame)."""
-        return self._by_cumulants(tile) if self._in_time else self._by_pixels(tile)
+    def draw(self, tile: Tile, out: Floats, row: int) -> None:
+        """Statistics of a tile's frames into rows of `out`.
 
-    def _by_pixels(self, tile: Tile) -> Floats:
+        Parameters
+        ----------
+        tile : Tile
+        out : ndarray of float32, shape (n_scenario, n_stare, n_statistic, n_padded_frame)
+        row : int
+            Where the tile's first stare goes.
+        """
+        if self._in_time:
+            self._by_cumulants(tile, out, row)
+        else:
+            self._by_pixels(tile, out[:, row : row + tile.wanted])
+
+    def _by_pixels(self, tile: Tile, out: Floats) -> None:
         """A few frames of all stares at a time."""
         n_frames, each = self._stare.stare.n_frames, self._scenarios * self.variant.sums * tile.size
-        out = np.empty((self._scenarios, tile.wanted, self.variant.sums, n_frames), np.float32)
         block = max(1, TILE_BYTES // (4 * each))
-        kernel = self._device.kernel(("stare", "stare_pixels"), self._room_for_scenarios(), "stare_pixels")
+        # As much room as the scenarios need: powers of two, so that few programs are built.
+        variant = replace(self.variant, scenarios=1 << (self._scenarios - 1).bit_length())
+        kernel = self._device.kernel(("stare", "stare_pixels"), variant, "stare_pixels")
         for begin in range(0, n_frames, block):
             size = min(block, n_frames - begin)
             values = self._room("values", 4 * each * size)
             kernel(
                 self._queue,
                 (tile.size // self.variant.width, size),
-                (1, 1) if self.variant.width > 1 else None,
+                self._local,
                 *self._arguments,
                 *self._flares,
                 *tile.address(),
@@ -236,34 +280,46 @@ class StareLaunches(Launches):
             host = np.empty((size, self._scenarios, self.variant.sums, tile.size), np.float32)
             self._cl.enqueue_copy(self._queue, host, values)
             out[..., begin : begin + size] = host[..., tile.start : tile.stop].transpose(1, 3, 2, 0)
-        return out
 
-    def _by_cumulants(self, tile: Tile) -> Floats:
-        stare = self._stare.stare
-        padded = padded_frames(stare.n_frames)
+    def _by_cumulants(self, tile: Tile, out: Floats, row: int) -> None:
+        """All frames of each stare; a processor's own memory needs no copy."""
+        flags, first = self._cl.mem_flags, tile.first + tile.start
         kernel = self._device.kernel(("stare", "stare_sums"), self.variant, "stare_sums")
-        host = np.empty((self._scenarios, tile.wanted, self.variant.sums, padded), np.float32)
-        values = self._room("values", host.nbytes)
+        shared = self._device.record.kind == "cpu"
+        if shared:
+            values = self._cl.Buffer(self._device.context, flags.WRITE_ONLY | flags.USE_HOST_PTR, hostbuf=out)
+            place = (out.shape[1], row)
+        else:
+            values = self._room("values", out[:, : tile.wanted].nbytes)
+            place = (tile.wanted, 0)
         each = FRAMES_EACH if self.variant.width > 1 else 1
-        first = tile.first + tile.start
-        kernel(
-            self._queue,
-            (tile.wanted, -(-padded // each)),
-            (1, 1) if self.variant.width > 1 else None,
-            self._arguments[0],
-            *self._flares,
-            np.uint32(first & 0xFFFFFFFF),
-            np.uint32(first >> 32),
-            np.uint32(each),
-            *self._own,
-            values,
-        )
-        self._cl.enqueue_copy(self._queue, host, values)
-        return host[..., : stare.n_frames]
-
-    def _room_for_scenarios(self) -> Any:
-        """As much room as the scenarios need: powers of two, so that few programs are built."""
-        return replace(self.variant, scenarios=1 << (self._scenarios - 1).bit_length())
+        try:
+            kernel(
+                self._queue,
+                (tile.wanted, -(-out.shape[3] // each)),
+                self._local,
+                self._arguments[0],
+                *self._flares,
+                np.uint32(first & 0xFFFFFFFF),
+                np.uint32(first >> 32),
+                np.uint32(each),
+                *self._own,
+                *map(np.uint32, place),
+                values,
+            )
+            if shared:
+                mapped, _ = self._cl.enqueue_map_buffer(
+                    self._queue, values, self._cl.map_flags.READ, 0, out.shape, out.dtype
+                )
+                mapped.base.release(self._queue)
+                self._queue.finish()
+            else:
+                host = np.empty((self._scenarios, tile.wanted, *out.shape[2:]), np.float32)
+                self._cl.enqueue_copy(self._queue, host, values)
+                out[:, row : row + tile.wanted] = host
+        finally:
+            if shared:
+                values.release()
 
 
 def _check(first: int, count: int, seed: int, method: str) -> None:

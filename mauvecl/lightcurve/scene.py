@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -86,7 +87,7 @@ class Flares:
         amplitudes = self.amplitudes if self.amplitudes.shape[1] == 1 else self.amplitudes[:, there]
         return Flares(rows, np.ascontiguousarray(amplitudes))
 
-    @property
+    @cached_property
     def most(self) -> Float:
         """The largest coefficient of each spectrum, shape (n_flare,)."""
         return np.asarray(self.rows.max(axis=(0, 2), initial=0.0) * float(self.amplitudes.max()), np.float64)

@@ -70,7 +70,11 @@ class SumTable:
         if (sd == 0).any() or np.linalg.eigvalsh(covariance / np.outer(sd, sd))[0] < 1e-9:
             raise InputError(f"{n} spectral weights of which one is a sum of others, expected independent ones")
         lower = np.linalg.cholesky(covariance)
-        white = Components(components.quiet, components.flare_electrons, np.linalg.solve(lower, components.weights))
+        white = Components(
+            components.quiet,
+            components.flare_electrons,
+            np.asarray(np.linalg.solve(lower, components.weights), np.float64),
+        )
         fourths = _fourths_are_needed(components) or _fourths_are_needed(white)
         columns = []
         for order in range(1, 5 if fourths else 4):
@@ -80,7 +84,7 @@ class SumTable:
                 often = 1
                 if order == 4:
                     often = math.factorial(4) // math.prod(math.factorial(m) for m in Counter(key).values())
-                columns.append(often * np.array([reference[key], *each[(slice(None), *key)]]))
+                columns.append(often * np.array([reference[key], *(component[key] for component in each)]))
         return cls(np.array(columns, np.float32).T.copy(), lower[np.tril_indices(n)].astype(np.float32), fourths)
 
     @property

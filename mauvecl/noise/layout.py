@@ -184,8 +184,8 @@ KNOWN_OF_FRAMES = ("star", "star_less_one", "sky", "sky_less_one", "dark", "dark
 MOVED = ("star", "light", "sky", "temperature")
 #: Frames are padded to a multiple of this.
 FRAME_BLOCK = 16
-#: exp(r) = 1 + r + r^2 q(r): Taylor's coefficients of q, off by less than 4e-9 of exp(r) for |r| <= ln(2) / 2; and ln(2)
-#: in two parts, of which the first has nine bits, so that its multiples are exact.
+#: exp(r) = 1 + r + r^2 q(r): Taylor's coefficients of q, off by less than 2e-8 for |r| <= ln(2) / 2; and ln(2) in two
+#: parts, of which the first has nine bits, so that its multiples are exact.
 EXPONENTIAL = tuple(float(np.float32(1.0 / np.prod(np.arange(1.0, n + 3)))) for n in range(6))
 LN2_PARTS = (0.693359375, -2.1219444e-4)
 LOG2_E = 1.442695

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Any, Self
+from typing import Any, ClassVar, Protocol, Self
 
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise.comparison import TEMPLATE, Comparison
@@ -37,8 +37,10 @@ class Share:
         return f"{self.part}-{self.start}-{self.count}"
 
 
-class _Asked:
+class Asked:
     """What travels to a worker: the question without anything made of it."""
+
+    least: ClassVar[int] = 2**12
 
     @classmethod
     def of(cls, *what: Any, **how: Any) -> Self:
@@ -51,7 +53,7 @@ class _Asked:
 
 
 @dataclass(frozen=True, eq=False)
-class DetectRequest(_Asked):
+class DetectRequest(Asked):
     """What `Engine.detect` takes; parameters as there."""
 
     quiet: Expectation
@@ -98,7 +100,7 @@ class DetectRequest(_Asked):
 
 
 @dataclass(frozen=True, eq=False)
-class SnrRequest(_Asked):
+class SnrRequest(Asked):
     """What `Engine.snr` takes; parameters as there."""
 
     expectation: Expectation
@@ -121,7 +123,7 @@ class SnrRequest(_Asked):
 
 
 @dataclass(frozen=True, eq=False)
-class RealiseRequest(_Asked):
+class RealiseRequest(Asked):
     """What `Engine.realise` takes; parameters as there. One share: callers ask for as much as travels well."""
 
     expectation: Expectation
@@ -131,7 +133,31 @@ class RealiseRequest(_Asked):
     drawing: Drawing = AUTOMATIC
 
 
-#: What is cut into shares: its `work` is about pixels times scenarios of one realisation.
-Request = DetectRequest | SnrRequest
 #: What a worker can be asked.
-Countable = Request | RealiseRequest
+Countable = Asked
+
+
+class Divisible(Protocol):
+    """What is cut into shares.
+
+    Attributes
+    ----------
+    realisations, start : int
+    parts : int
+        Launches of different kind.
+    work : int
+        About pixels times scenarios of one realisation.
+    least : int
+        Realisations of a share, at least: a power of two.
+    """
+
+    @property
+    def realisations(self) -> int: ...
+    @property
+    def start(self) -> int: ...
+    @property
+    def parts(self) -> int: ...
+    @property
+    def work(self) -> int: ...
+    @property
+    def least(self) -> int: ...

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
 from mauvecl.device.tiles import Progress
-from mauvecl.results.requests import Countable, DetectRequest, RealiseRequest, Request, Share, SnrRequest
+from mauvecl.lightcurve.requests import StaresRequest, StareSums
+from mauvecl.results.requests import Countable, DetectRequest, RealiseRequest, Share, SnrRequest
 from mauvecl.results.sums import Arrays, DetectionSums, SnrSums
 from mauvecl.runs.shards import fingerprint, shares
 
@@ -33,6 +34,8 @@ AHEAD = 2
 PREPARED = 1
 
 
+Divided = DetectRequest | SnrRequest | StaresRequest
+Sums = DetectionSums | SnrSums | StareSums
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
 
@@ -269,6 +272,12 @@ class Pool:
         self._add_up(request, sums)
         return sums.answer()
 
+    def stares(self, request: StaresRequest) -> Arrays:
+        """As `Stares.reduced`, of all stares of a request."""
+        sums = StareSums(request)
+        self._add_up(request, sums)
+        return sums.answer()
+
     def realise(
         self, expectation: Expectation, *, count: int, out: NDArray[Any] | None = None, **how: Any
     ) -> NDArray[Any]:
@@ -282,7 +291,7 @@ class Pool:
         out[:] = rows
         return out
 
-    def _add_up(self, request: Request, sums: DetectionSums | SnrSums) -> None:
+    def _add_up(self, request: Divided, sums: Sums) -> None:
         key = fingerprint(request)
         todo = shares(request)
         with self._lock:
@@ -306,7 +315,7 @@ class Pool:
         while waiting:
             self._collect(sums, key, waiting)
 
-    def _collect(self, sums: DetectionSums | SnrSums, key: str, waiting: dict[Future[Arrays], Share]) -> None:
+    def _collect(self, sums: Sums, key: str, waiting: dict[Future[Arrays], Share]) -> None:
         finished, _ = wait(waiting, return_when=FIRST_COMPLETED)
         for future in finished:
             share = waiting.pop(future)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mauvecl.results.requests import Request, Share
+from mauvecl.results.requests import Asked, Divisible, Share
 
 #: What a share holds, and how: raised with every change, so that none of an older form is ever added.
 FORM = 2
@@ -21,10 +21,10 @@ SHARE = 2**34
 MOST = 2**13
 
 
-def shares(request: Request) -> list[Share]:
+def shares(request: Divisible) -> list[Share]:
     """All shares of a request: cut at multiples of a power of two, whatever counts them."""
     wanted = max(SHARE // request.work, request.realisations // MOST)
-    size = 1 << max(wanted.bit_length() - 1, 12)
+    size = 1 << (max(wanted, request.least).bit_length() - 1)
     first, end = request.start, request.start + request.realisations
     cuts = [first, *range(first - first % size + size, end, size), end]
     return [Share(part, a, b - a) for part in range(request.parts) for a, b in itertools.pairwise(cuts)]
@@ -34,7 +34,7 @@ def shares(request: Request) -> list[Share]:
 _TOLD = ("provenance", "messages")
 
 
-def fingerprint(request: Request) -> str:
+def fingerprint(request: Asked) -> str:
     """Sha256 of everything in a request that its answer depends on, to the last bit.
 
     Realisations are left out: the same shares are counted of more of them.

@@ -18,12 +18,15 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from answers import N, same, same_snr, small
+from scenes import flaring_stares
 from typer.testing import CliRunner
 
 from mauvecl.cli.app import app
 from mauvecl.device.engine import DeviceError, Engine
+from mauvecl.device.stares import Stares
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.results.requests import RealiseRequest, Share
@@ -50,6 +53,12 @@ def test_two_processes_give_one_answer(workers: DaskWorkers, engine: Engine, sce
     same_snr(pool.snr(quiet, realisations=N, seed=5), engine.snr(quiet, realisations=N, seed=5))
     assert pool.standing.shares == 16
     assert [device.name for device in pool.devices] == [engine.device.name] * 2
+
+
+def test_stares_by_two_processes(workers: DaskWorkers, engine: Engine) -> None:
+    asked = flaring_stares()
+    found = Pool(workers).stares(asked)
+    np.testing.assert_array_equal(found["values"], Stares(engine.opened).reduced(asked)["values"])
 
 
 def test_a_worker_killed_in_mid_run(workers: DaskWorkers, engine: Engine, scene: list[Expectation]) -> None:

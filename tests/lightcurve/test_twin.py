@@ -1,0 +1,110 @@
+"""Stares on the device against their NumPy twin, bit for bit, and against their own splits."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from scenes import instrument, star
+
+from mauvecl.device.engine import Engine
+from mauvecl.device.stares import Stares
+from mauvecl.host.errors import InputError
+from mauvecl.lightcurve import twin
+from mauvecl.lightcurve.components import Components
+from mauvecl.lightcurve.scene import Flares, StareScene
+from mauvecl.lightcurve.stare import Stare
+from mauvecl.lightcurve.sums import SumTable
+from mauvecl.noise.processes import CosmicRays
+
+SEED = 2**63 + 12345
+#: Around the boundary of the counter's first word.
+FIRST, COUNT = 2**32 - 24, 40
+WOBBLE: dict[str, Any] = {
+    "jitters": {"light": 0.02, "sky": 0.03, "temperature": 0.1},
+    "offsets": {"star": 0.01, "light": 0.02, "sky": 0.05, "temperature": 0.3},
+    "drifts": {"star": 0.02, "temperature": 0.5},
+    "thermal": 0.5,
+    "gaps": [(20.0, 60.0)],
+}
+#: Payload, stare, sums, flare temperatures, scenarios, further words.
+CASES: dict[str, tuple[dict[str, Any], dict[str, Any], int, int, int, dict[str, Any]]] = {
+    "plain": ({}, {}, 1, 0, 0, {}),
+    "all that wobbles": ({}, WOBBLE, 3, 2, 0, {}),
+    "jitter alone": ({}, {"jitters": {"light": 0.03}}, 2, 1, 0, {}),
+    "unknown alone": ({}, {"offsets": {"temperature": 1.0}}, 5, 0, 0, {}),
+    "electrons": ({"name": "mauve-electrons"}, WOBBLE, 2, 1, 3, {}),
+    "cold, fourth cumulants": ({"temperature_c": -20.0, "output_max_nm": 303.0}, WOBBLE, 2, 1, 0, {}),
+    "Poisson photons": ({"photon_noise": "poisson"}, WOBBLE, 3, 1, 0, {}),
+    "cosmic rays": ({}, WOBBLE, 2, 1, 2, {"cosmic_rays": CosmicRays(rate_per_cm2_s=200.0)}),
+}
+
+
+def case(name: str) -> tuple[Components, Stare, Any, Any, dict[str, Any]]:
+    """Components, stare, flares of each stare, amplitudes, further words."""
+    payload, wobble, n_sums, n_flares, n_scenarios, more = CASES[name]
+    options = {"output_min_nm": 300.0, "output_max_nm": 312.0} | payload
+    used = instrument(options.pop("name", "mauve"), **options)
+    quiet, *flares = star(amplitudes=(0.5, 2.0)[:n_flares], exposure=5.0, payload=used)
+    wavelength = quiet.wavelength_nm - quiet.wavelength_nm.mean()
+    weights = np.array([np.cos(k * wavelength / wavelength.max()) + 0.2 for k in range(n_sums)])
+    stare = Stare.of(110.0, temperature_c=used.temperature_c, **wobble)
+    rng = np.random.default_rng(5)
+    flare = rng.uniform(0.0, 2.0, (COUNT, stare.n_frames, n_flares)) if n_flares else None
+    amplitudes = rng.uniform(0.0, 3.0, (n_scenarios, COUNT)) if n_scenarios else None
+    return Components.of(quiet, flares, weights), stare, flare, amplitudes, more
+
+
+@pytest.fixture(scope="module", params=["vectors", pytest.param("scalar", marks=pytest.mark.long)])
+def stares(request: pytest.FixtureRequest, engine: Engine) -> Stares:
+    """As processors draw them, and one stare or frame to a work-item, as a GPU does."""
+    return Stares(engine.opened) if request.param == "vectors" else Stares(width=1)
+
+
+@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("method", ["pixels", "cumulants"])
+def test_stares_are_the_twins(stares: Stares, name: str, method: Any) -> None:
+    components, stare, flare, amplitudes, more = case(name)
+    if more and method == "cumulants":
+        with pytest.raises(InputError, match="cosmic rays with method 'cumulants', expected method 'pixels'"):
+            stares.frames(components, stare, flare, count=COUNT, seed=SEED, method=method, **more)
+        return
+    how: dict[str, Any] = {"seed": SEED, "method": method, "amplitudes": amplitudes, **more}
+    found = stares.frames(components, stare, flare, first=FIRST, count=COUNT, **how)
+    scene = StareScene.of(components, stare, **more)
+    flares = Flares.of(components, stare, flare, amplitudes, COUNT)
+    numbers = np.arange(FIRST, FIRST + COUNT, dtype=np.uint64)
+    frames = range(0, stare.n_frames, 1 if method == "cumulants" else 6)
+    ours = {"pixels": twin.pixels, "cumulants": twin.sums}[method](scene, flares, numbers, frames, SEED)
+    np.testing.assert_array_equal(found[..., list(frames), :], ours if amplitudes is not None else ours[0])
+    assert found.std() > 0
+    assert SumTable.of(components).fourths == ("fourth" in name)
+
+
+@pytest.mark.parametrize("method", ["pixels", "cumulants"])
+def test_a_split_changes_no_bit(engine: Engine, method: Any) -> None:
+    """Whatever the tile, the neighbours or the call: a stare follows from seed and number, a frame from its time."""
+    components, stare, flare, amplitudes, _ = case("electrons")
+    how: dict[str, Any] = {"seed": SEED, "method": method}
+    whole = Stares(engine.opened).frames(
+        components, stare, flare, first=FIRST, count=COUNT, amplitudes=amplitudes, **how
+    )
+    for tile in (None, 16):
+        parts = [
+            Stares(engine.opened, tile=tile).frames(
+                components, stare, flare[a:b], first=FIRST + a, count=b - a, amplitudes=amplitudes[:, a:b], **how
+            )
+            for a, b in ((0, 1), (1, 23), (23, 40))
+        ]
+        np.testing.assert_array_equal(np.concatenate(parts, axis=1), whole)
+    alone = Stares(engine.opened).frames(
+        components, stare, flare * amplitudes[1][:, None, None], first=FIRST, count=COUNT, **how
+    )
+    # The device multiplies in float32 what is multiplied in float64 here: whole DN may differ now and then.
+    np.testing.assert_allclose(alone, whole[1], atol=5.0)
+    # The frames that a gap leaves are those of the stare without it.
+    gapless = Stare.of(110.0, temperature_c=components.quiet.conditions["temperature_c"])
+    gapped = Stare.of(110.0, temperature_c=components.quiet.conditions["temperature_c"], gaps=[(20.0, 60.0)])
+    both = [Stares(engine.opened).frames(components, s, None, count=2, **how) for s in (gapless, gapped)]
+    np.testing.assert_array_equal(both[0][:, gapped.numbers], both[1])

@@ -1,0 +1,130 @@
+"""A run of stares in shares: whoever draws them, whatever is kept of them, they join to the same bits."""
+
+from __future__ import annotations
+
+import pickle
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import pytest
+from answers import small
+from scenes import FIRST_STARE as START
+from scenes import N_STARES as N
+from scenes import flaring_stares as request
+
+from mauvecl.device.engine import Engine
+from mauvecl.device.stares import Stares
+from mauvecl.lightcurve.components import Components
+from mauvecl.lightcurve.stare import Stare
+from mauvecl.runs import shards
+from mauvecl.runs.checkpoint import Checkpoint
+from mauvecl.runs.pool import LocalWorkers, Pool, Stopped
+
+pytestmark = pytest.mark.usefixtures("small_shares")
+
+
+@dataclass(frozen=True)
+class Largest:
+    """The largest value of each stare."""
+
+    adds: ClassVar[bool] = False
+
+    def __call__(self, values: np.ndarray, first: int) -> dict[str, np.ndarray]:
+        largest = values.max(axis=(-2, -1)).reshape(-1, values.shape[-3]).T
+        return {"largest": largest, "number": first + np.arange(len(largest))}
+
+
+@dataclass(frozen=True)
+class Above:
+    """How many frames lie above a level."""
+
+    level: float
+    adds: ClassVar[bool] = True
+
+    def __call__(self, values: np.ndarray, first: int) -> dict[str, np.ndarray]:
+        return {"frames": np.count_nonzero(values > self.level, axis=(-3, -2))}
+
+
+@pytest.mark.parametrize("method", ["pixels", "cumulants"])
+@pytest.mark.parametrize("reduction", [None, Largest(), Above(500.0)])
+def test_shares_join_to_the_same_bits(engine: Engine, method: Any, reduction: Any) -> None:
+    """Two engines of different form, in the form that requests travel in, against one call."""
+    asked = request(method, reduction=reduction)
+    widths = iter((16, 1))
+
+    def make(device: str | None, progress: Any) -> Engine:
+        return Engine(device, progress=progress, width=next(widths))
+
+    workers = LocalWorkers([None, "0"], make=make)
+    pool = Pool(workers)
+    found = pool.stares(pickle.loads(pickle.dumps(asked)))
+    workers.close()
+    assert pool.standing.shares == len(shards.shares(asked)) == 5, "cut at multiples of 64, and where the word ends"
+    whole = Stares(engine.opened).frames(
+        asked.components,
+        asked.stare,
+        asked.flare,
+        amplitudes=asked.amplitudes,
+        first=START,
+        count=N,
+        seed=5,
+        method=method,
+    )
+    if reduction is None:
+        np.testing.assert_array_equal(found["values"], np.moveaxis(whole, 0, 1))
+    else:
+        for name, values in reduction(whole, START).items():
+            np.testing.assert_array_equal(found[name], values)
+    assert (whole[1] != whole[0]).any()
+
+
+def test_a_run_goes_on_where_it_stopped(engine: Engine, tmp_path: Path) -> None:
+    asked, study = request(reduction=Largest()), small()
+
+    class Stopping(LocalWorkers):
+        def __init__(self, shares: int) -> None:
+            super().__init__([None], make=lambda device, progress: engine)
+            self.left = shares
+
+        def submit(self, *given: Any, **more: Any) -> Any:
+            self.left -= 1
+            if self.left < 0:
+                raise Stopped
+            return super().submit(*given, **more)
+
+    with pytest.raises(Stopped), Checkpoint(tmp_path, "inject", study, patience_s=0.0) as kept:
+        Pool(Stopping(3), checkpoint=kept).stares(asked)
+    with Checkpoint(tmp_path, "inject", study, resume=True) as kept:
+        workers = Stopping(99)
+        found = Pool(workers, checkpoint=kept).stares(asked)
+        assert 1 <= kept.found < 5
+        assert kept.found + 99 - workers.left == 5, "none was drawn twice"
+    for name, values in Pool(Stopping(99)).stares(asked).items():
+        np.testing.assert_array_equal(found[name], values)
+
+
+def test_fingerprints_tell_requests_of_stares_apart() -> None:
+    base = request()
+    quiet = base.components.quiet
+    warmer = Stare.of(30.0, jitters={"light": 0.01}, offsets={"temperature": 0.1}, temperature_c=np.nextafter(21.0, 22))
+    others = [
+        replace(base, seed=6),
+        replace(base, method="pixels"),
+        replace(base, stare=warmer),
+        replace(base, stare=Stare.of(30.0, jitters={"light": 0.01}, offsets={"star": 0.1}, temperature_c=21.0)),
+        replace(base, components=Components(quiet, base.components.flare_electrons, 2 * base.components.weights)),
+        replace(base, flare=np.nextafter(base.flare, 9)),
+        replace(base, amplitudes=base.amplitudes[:1]),
+        replace(base, reduction=Largest()),
+        replace(base, reduction=Above(1.0)),
+        replace(base, reduction=Above(2.0)),
+        # Rows belong to stares: from another first one on they mean something else.
+        replace(base, start=START + 64),
+    ]
+    names = [shards.fingerprint(one) for one in (base, *others)]
+    assert len(set(names)) == len(names)
+    assert shards.fingerprint(pickle.loads(pickle.dumps(base))) == names[0]
+    alike = replace(base, flare=None, amplitudes=None)
+    assert shards.fingerprint(replace(alike, start=0, realisations=7)) == shards.fingerprint(alike)
