@@ -149,9 +149,13 @@ class Bank:
         frames = half_width_s / self.frame_s
         if phases is None:
             phases = (0.25, 0.75) if frames < SUB_FRAME else (0.5,)
-        half = self.level.window_s / 2
-        lead = int(np.ceil(max(LEAD * half_width_s, half) / self.frame_s))
-        tail = int(np.ceil(max(TAIL * half_width_s, half) / self.frame_s))
+        lead, tail = self.window(half_width_s)
         edges = np.arange(-lead, tail + 2) * self.frame_s
         shapes = np.array([self.shape.mean_over(edges, p * self.frame_s, half_width_s) for p in phases])
         return Template(half_width_s, -lead, tuple(phases), shapes, max(1, int(frames / ONSETS)))
+
+    def window(self, half_width_s: float) -> tuple[int, int]:
+        """Frames before and after the one of the peak over which the level is taken for what `Level` says."""
+        half = self.level.window_s / 2
+        lead, tail = (max(reach * half_width_s, half) / self.frame_s for reach in (LEAD, TAIL))
+        return int(np.ceil(lead)), int(np.ceil(tail))

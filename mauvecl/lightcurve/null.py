@@ -32,7 +32,7 @@ DAYS: dict[Per, float] = {"day": 1.0, "month": 365.25 / 12, "year": 365.25}
 DAY_S = 86_400.0
 #: Thresholds at which importance sampling is done; between them the logarithm of the number of independent templates is
 #: a parabola.
-LADDER = (4.0, 4.5, 5.0, 5.5, 6.0, 6.5, 7.0, 7.5, 8.0)
+LADDER = (3.0, 3.5, 4.0, 4.5, 5.0, 5.5, 6.0, 6.5, 7.0, 7.5, 8.0)
 #: Draws of importance sampling.
 DRAWS = 400
 #: Largest probability of an alarm in a stare that importance sampling is used for.

@@ -163,15 +163,18 @@ class Search:
 
     def template(self, row: Row, onset: int, direction: int) -> Float:
         """What rho of one template weighs each sum with: rho = sum(template * sums), shape (n_frame, n_sum)."""
+        return np.asarray(self.in_time(row, onset)[:, None] * self.bank.directions[direction])
+
+    def in_time(self, row: Row, onset: int) -> Float:
+        """The same without its direction, shape (n_frame,)."""
         at = self._at - row.peaks[onset] - row.template.first
         inside = (at >= 0) & (at < row.template.time.size)
         at = at[inside]
         shape = row.template.shapes[row.phase][at]
         for (power, series), amplitude in zip(self._terms, row.project[:, onset], strict=True):
             shape = shape - amplitude * row.template.time[at] ** power * self._series[series][self._at[inside]]
-        found = np.zeros((self.stare.n_frames, self.bank.directions.shape[1]))
-        weighted = shape * self._weight[self._at[inside]] / row.per_amplitude[onset]
-        found[inside] = weighted[:, None] * self.bank.directions[direction]
+        found = np.zeros(self.stare.n_frames)
+        found[inside] = shape * self._weight[self._at[inside]] / row.per_amplitude[onset]
         return found
 
     @property
