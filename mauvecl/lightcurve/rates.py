@@ -203,7 +203,7 @@ class RateTable(Rates):
         missing = next((name for name in ("energy", "rate") if name not in table.colnames), None)
         if missing is not None:
             raise InputError(
-                f"table of rates {shortened(path.name)} has no {missing!r}, expected columns energy (erg) and rate (1/day)"
+                f"table of rates {shortened(path.name)} has no column {missing!r}, expected energy and rate"
             )
         columns = []
         for name in ("energy", "rate"):

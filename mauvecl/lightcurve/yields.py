@@ -62,7 +62,7 @@ class Yield:
         means = expected * 10.0 ** (scatter_dex * nodes)
 
         def quantile(share: float) -> int:
-            return smallest(lambda n: float(stats.poisson.cdf(n, means).mean()) >= share, float(means.max()))
+            return smallest(lambda n: float(np.mean(stats.poisson.cdf(n, means))) >= share, float(means.max()))
 
         return cls(expected, quantile(0.025), quantile(0.975), float(-np.expm1(-means).mean()))
 

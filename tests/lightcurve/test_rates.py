@@ -1,4 +1,4 @@
-"""Rates of flares: published relations, AltaiPony's convention, tables, other bands; what a campaign recovers of them."""
+"""Rates of flares: published relations, AltaiPony's convention, tables, other bands; what a campaign recovers."""
 
 from pathlib import Path
 
@@ -87,7 +87,7 @@ def test_own_table(tmp_path: Path) -> None:
     [
         ("energy,rate\n1e31,1\n1e32,2\n", "do not fall"),
         ("energy,rate\n1e32,2\n1e31,1\n", "do not ascend"),
-        ("energy,number\n1e32,2\n", "expected columns energy"),
+        ("energy,number\n1e32,2\n", "expected energy and rate"),
         ("energy,rate\n1e32,a\n1e33,b\n", "no plain numbers"),
         ("energy,rate\n1e32,1\n", "2 at least"),
     ],
@@ -134,7 +134,7 @@ def test_threshold_of_a_search() -> None:
 
 
 def test_gain_of_a_flare_in_a_long_stretch() -> None:
-    """Far from the ends it is sqrt(.72148 t_half / 5 s): TIME.md, section 4; the line that is taken off costs little."""
+    """Far from the ends it is sqrt(.72148 t_half / 5 s): TIME.md, section 4; taking off a line costs little."""
     widths, gain = _gains(shape_of("davenport2014"), 20_000.0, 5.0)
     i = int(np.argmin(np.abs(widths - 60.0)))
     middle = gain[i, 6:18]
@@ -145,10 +145,10 @@ def test_gain_of_a_flare_in_a_long_stretch() -> None:
 
 
 def test_closed_form_beside_white_noise() -> None:
-    """What a bank's matched filter of the right width finds in drawn stretches, against the completeness in closed form.
+    """What a matched filter of the right width finds in drawn stretches, against the completeness in closed form.
 
-    2000 stretches: three standard deviations are 3.4 % at most; five energies miss them all but once in some 70 tests of
-    other seeds; this one is fixed.
+    2000 stretches: three standard deviations are 3.4 % at most; of five energies one misses them once in some 70 tests
+    with other seeds; this one is fixed.
     """
     shape, window, frame, law = shape_of("davenport2014"), 1500.0, 5.0, DurationLaw(scatter_dex=0.0)
     scale = EnergyScale.of_blackbody(1.0, 5778.0, flare_k=10_000.0)
