@@ -37,8 +37,10 @@ class Thermal:
             if not -100 <= getattr(self, name) <= 60:
                 raise InputError(f"{name} = {getattr(self, name)}, expected -100 to 60 deg C")
 
-    def temperature_c(self, sunlight: NDArray[np.float64], step_s: float) -> NDArray[np.float64]:
-        """Temperature at the ends of steps, begun in balance with the mean of what is given, (n,).
+    def temperature_c(
+        self, sunlight: NDArray[np.float64], step_s: float, start_c: float | None = None
+    ) -> NDArray[np.float64]:
+        """Temperature at the ends of steps, (n,).
 
         Parameters
         ----------
@@ -46,12 +48,14 @@ class Thermal:
             Share of the Sun's disk that is seen in each step, 0 to 1.
         step_s : float
             Within a step the sunlight is taken as constant, which makes the steps exact.
+        start_c : float, optional
+            Temperature before the first step; in balance with the mean of the sunlight unless given.
         """
         from scipy.signal import lfilter
 
         end = self.shadow_c + (self.sunlit_c - self.shadow_c) * sunlight
         keep = float(np.exp(-step_s / self.time_constant_s))
-        start = float(end.mean())
+        start = float(end.mean()) if start_c is None else start_c
         found, _ = lfilter([1 - keep], [1, -keep], end, zi=[keep * start])
         return np.asarray(found)
 

@@ -71,7 +71,7 @@ class Moments:
     @cached_property
     def seconds(self) -> NDArray[np.float64]:
         """Middles of the steps since the start, s, (n,)."""
-        found = (np.arange(self.n) + 0.5) * self.step_s
+        found = np.asarray((np.arange(self.n, dtype=np.float64) + 0.5) * float(self.step_s))
         found.setflags(write=False)
         return found
 
@@ -79,7 +79,7 @@ class Moments:
     def julian(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Julian dates, UTC, (n,) each: midnight before the start, and days since."""
         midnight, fraction = self.first
-        return np.full(self.n, midnight), np.asarray(fraction + self.seconds / DAY_S)
+        return np.full(self.n, midnight, np.float64), np.asarray(fraction + self.seconds / DAY_S)
 
     def iso(self, seconds: float, digits: int = 0) -> str:
         """A time since the start as text, UTC."""

@@ -206,7 +206,7 @@ class Track:
     @property
     def beta_deg(self) -> NDArray[np.float64]:
         """Angle of the Sun from the orbit's plane, positive on the side of the angular momentum, (n,)."""
-        return np.degrees(np.arcsin(np.einsum("ni,ni->n", self.normal, self.bodies.sun)))
+        return np.asarray(np.degrees(np.arcsin(np.einsum("ni,ni->n", self.normal, self.bodies.sun))))
 
     @property
     def local_time_h(self) -> NDArray[np.float64]:

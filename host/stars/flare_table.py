@@ -10,8 +10,8 @@ import numpy as np
 
 from ..errors import InputError
 from ..files.bounded import read_bytes, shortened, unpacked
-from ..files.ecsv import check_cells, parse_ecsv
 from ..files.parsed import LARGEST, SMALLEST, as_text, parsing, shown
+from ..files.text_table import text_table
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
@@ -22,8 +22,6 @@ AMPLITUDES = ("ampl_rec", "amplitude", "ampl", "amp", "peak_amplitude", "relativ
 STARTS, STOPS = ("tstart", "start", "t_start", "time_start"), ("tstop", "stop", "t_stop", "time_stop", "end")
 #: More make a study that nobody reads.
 MOST = 500
-#: Characters of a table that is text: astropy tries a score of forms on it.
-MOST_TEXT = 4 * 2**20
 FORMS = "CSV, ECSV or FITS"
 
 
@@ -51,10 +49,7 @@ def read_flares(path: str | Path) -> QTable:
     if content.startswith(b"SIMPLE  ="):
         table = _fits_table(content, named)
     else:
-        text = as_text(content, named)
-        if len(text) > MOST_TEXT:
-            raise InputError(f"{named} has {len(text)} characters, expected at most {MOST_TEXT}")
-        table = parse_ecsv(text, named) if text.startswith("# %ECSV") else _text_table(text, path, named)
+        table = text_table(as_text(content, named), named, path.suffix.lower() == ".csv", FORMS)
     return flares_of(table, shortened(path.name))
 
 
@@ -75,16 +70,6 @@ def _fits_table(content: bytes, named: str) -> Table:
             if isinstance(hdu, fits.BinTableHDU | fits.TableHDU):
                 return Table.read(hdu)
         raise InputError(f"{named} has no table, expected {FORMS}")
-
-
-def _text_table(text: str, path: Path, named: str) -> Table:
-    from astropy.table import Table
-
-    lines = text.splitlines()
-    check_cells(lines, named)
-    with parsing(named, FORMS), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return Table.read([*lines, ""], format="ascii.csv" if path.suffix.lower() == ".csv" else "ascii")
 
 
 def flares_of(table: Table | Any, name: str = "flare table") -> QTable:

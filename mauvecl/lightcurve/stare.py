@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Literal, Self, get_args
+from typing import TYPE_CHECKING, Any, Literal, Self, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ from mauvecl.lightcurve.curves import ORBIT_S, Curve, Sinusoid
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
+    from mauvecl.host.orbit.names import Target
+    from mauvecl.host.orbit.orbit import Orbit
 
 Float = NDArray[np.float64]
 #: What changes from frame to frame: the star's own level without its flares; the throughput for all light, of star,
@@ -213,6 +215,24 @@ class Stare:
             spread.get("temperature", 0.0),
             _unknowns(start, float(frame_s), orbit_s, offsets or {}, drifts or {}, cycles or {}),
         )
+
+    @classmethod
+    def along(cls, orbit: Orbit, target: Target | str, start: str, duration_s: float, **how: Any) -> Stare:
+        """As the orbit gives it: frames while the target is seen, the detector's temperature through sun and shadow.
+
+        Parameters
+        ----------
+        orbit : Orbit
+        target : Target or str
+        start : str
+            ISO 8601, UTC.
+        duration_s : float
+        **how
+            As `along.stare_along`, which also has the rate of particles.
+        """
+        from mauvecl.lightcurve.along import stare_along
+
+        return stare_along(orbit, target, start, duration_s, **how).stare
 
     @property
     def jitters(self) -> dict[Changing, float]:
