@@ -17,7 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.text_table import read_text_table
-from mauvecl.host.stars.flare import TEMPERATURE_RANGE
+from mauvecl.host.ranges import FLARE_TEMPERATURES_K
 from mauvecl.lightcurve.energies import STEFAN_BOLTZMANN, in_band
 
 Float = NDArray[np.float64]
@@ -233,7 +233,7 @@ def band_factor(old: str, new: str, flare_k: float = 10_000.0) -> float:
     InputError
         For an unknown band, or a temperature that no flare has.
     """
-    low, high = TEMPERATURE_RANGE
+    low, high = FLARE_TEMPERATURES_K
     if not low <= flare_k <= high:
         raise InputError(f"flare_k = {flare_k}, expected {low:g} to {high:g} K")
 

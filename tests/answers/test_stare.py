@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import QTable
+from commands import ended, run
 
 from mauvecl.answers.stare import StareAnswer, stare
 from mauvecl.device.engine import Engine
@@ -16,7 +17,6 @@ from mauvecl.device.stares import Stares
 from mauvecl.host.errors import InputError
 from mauvecl.study.stares import stare_of
 from mauvecl.study.study import Study
-from commands import ended, run
 
 #: A G2V star for five minutes with a gap and a flare.
 SHORT = Study().with_settings(
