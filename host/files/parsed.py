@@ -128,8 +128,8 @@ def possible(data: Any, what: str) -> None:
     Raises
     ------
     InputError
-        For a number beyond `SMALLEST` to `LARGEST` (energies in erg: `LARGEST_ERG`), a whole one beyond 64 bits, text that is too long or holds
-        characters that no file could, or nesting that is too deep; naming its key.
+        For a number beyond `SMALLEST` to `LARGEST` (energies in erg: `LARGEST_ERG`), a whole one beyond 64 bits, text
+        that is too long or holds characters that no file could, or nesting that is too deep; naming its key.
     """
     waiting: list[tuple[str, Any, int]] = [("", data, 0)]
     while waiting:
