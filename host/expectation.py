@@ -16,6 +16,7 @@ from scipy import special
 from .errors import InputError
 from .instrument.instrument import Instrument
 from .measured_noise import below_zero
+from .ranges import EXPOSURES, check_exposure
 from .response import Order, electrons_per_second
 from .sky.zodiacal import Sky
 
@@ -28,8 +29,6 @@ Float = NDArray[np.float64]
 
 #: Pixels whose mean is further below saturation, in standard deviations of a frame, never meet it.
 CUT_SIGMA = 8.0
-#: Longest exposure, s.
-DAY_S = 86_400.0
 #: Frames of an exposure, at most: a day of 5 ms each, a thousandth of the payload's.
 MOST_FRAMES = 2**24
 #: What counts as signal: the star's light alone, to which the sky adds noise; or the zodiacal light too, as in the
@@ -479,7 +478,7 @@ def expect(
 
 
 def _seconds(exposure: Any) -> float:
-    expected = "expected a time above 0 and up to one day (86400 s)"
+    expected = EXPOSURES
     value = exposure
     if isinstance(exposure, u.Quantity):
         try:
@@ -492,8 +491,7 @@ def _seconds(exposure: Any) -> float:
         seconds = float(value)
     except (TypeError, ValueError):
         raise InputError(f"exposure = {exposure!r}, {expected}") from None
-    if not 0 < seconds <= DAY_S:
-        raise InputError(f"exposure = {seconds:g} s, {expected}")
+    check_exposure(seconds)
     return seconds
 
 

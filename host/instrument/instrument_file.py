@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import difflib
 from functools import cache
-from importlib import resources
-from importlib.resources.abc import Traversable
 from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
 from ..files.bounded import shortened
-from ..files.parsed import is_file, read_text, toml
+from ..files.parsed import read_text, toml
 from .curve import Curve
 from .instrument import CURVES, LABELS, Instrument
 from .pixel_map import PixelMap
+from .places import find_instrument, shipped
 
 #: Where a value comes from: the paper, a datasheet, a computation, an assumption, or the user.
 TAGS = ("P", "D", "C", "A", "U")
@@ -22,50 +20,20 @@ TAGS = ("P", "D", "C", "A", "U")
 MOST_EXTENDED = 16
 
 
-def shipped() -> tuple[str, ...]:
-    """Names of the instruments that come with the package."""
-    files = resources.files(__package__).joinpath("instruments").iterdir()
-    return tuple(sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml")))
-
-
 def read_instrument(name: str | Path) -> Instrument:
     """Read an instrument by name or path; see `Instrument.load`."""
     # What ships does not change while it is used; a user's own file may.
-    return _shipped(name) if name in shipped() else _built(_find(name, Path()))
+    return _shipped(name) if name in shipped() else _built(find_instrument(name, Path()))
 
 
 @cache
 def _shipped(name: str) -> Instrument:
-    return _built(_find(name, Path()))
+    return _built(find_instrument(name, Path()))
 
 
 def _built(path: Path) -> Instrument:
     values, sources = _read(path, ())
     return Instrument.build({**values, "sources": sources}, path.name)
-
-
-def _find(name: str | Path, folder: Path) -> Path:
-    """The file of a shipped instrument or, failing that, a user's own, relative to `folder`."""
-    if not isinstance(name, str | Path):
-        raise InputError(f"instrument {name!r}, expected a name or the path of a TOML file")
-    names = shipped()
-    if name in names:
-        return _local(resources.files(__package__).joinpath("instruments", f"{name}.toml"))
-    path = folder / name
-    if is_file(path):
-        return path
-    if path.suffix == ".toml":
-        raise InputError(f"instrument file {shortened(str(path))} does not exist, expected a TOML file")
-    near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.0)[0]
-    raise InputError(
-        f"unknown instrument {shortened(str(name))}, expected {' or '.join(names)} (nearest: {near!r}) "
-        "or the path of a TOML file"
-    )
-
-
-def _local(resource: Traversable) -> Path:
-    # setuptools installs real files; a zipped package would need extracting.
-    return Path(str(resource))
 
 
 def _read(path: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], dict[str, str]]:
@@ -78,7 +46,7 @@ def _read(path: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], dict[str,
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}
     if "extends" in content:
-        values, sources = _read(_find(content.pop("extends"), path.parent), (*seen, path.resolve()))
+        values, sources = _read(find_instrument(content.pop("extends"), path.parent), (*seen, path.resolve()))
     for name, entry in content.items():
         if name == "sources":
             raise InputError(

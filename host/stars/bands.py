@@ -71,10 +71,15 @@ def band(name: str) -> Band:
     InputError
         If there is none of that name.
     """
+    return _load(known_band(name))
+
+
+def known_band(name: str) -> str:
+    """A band's own name, by name or alias; errors as `band`."""
     wanted = name.strip().casefold()
     for known, others in ALIASES.items():
         if wanted in (known.casefold(), *(other.casefold() for other in others)):
-            return _load(known)
+            return known
     raise InputError(f"band {name!r} is unknown, expected one of {', '.join(ALIASES)}")
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import difflib
 from functools import cache, lru_cache
 from importlib.resources import files
@@ -25,11 +26,10 @@ def _read(*path: str) -> Table:
 
 @cache
 def _index() -> dict[str, dict[str, str]]:
-    rows: dict[str, dict[str, str]] = {}
-    for row in _read("index.ecsv"):
-        entry = {name: str(row[name]) for name in row.colnames}
-        rows[entry["name"].casefold()] = entry
-    return rows
+    # All text, one row a line: read without astropy, so that a misspelt name is told at once.
+    text = _LIBRARY.joinpath("index.ecsv").read_text(encoding="utf-8")
+    lines = [line for line in text.splitlines() if not line.startswith("#")]
+    return {entry["name"].casefold(): entry for entry in csv.DictReader(lines, delimiter=" ")}
 
 
 @cache

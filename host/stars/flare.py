@@ -8,13 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..ranges import check_amplitude, check_temperature
 from ..remembered import remembered
 from .bands import photons
 
 Geometry = Literal["added", "replaces"]
-
-#: Brightness temperatures that a flare may have, in K.
-TEMPERATURE_RANGE = (1_000.0, 200_000.0)
 
 
 @remembered(32)
@@ -68,9 +66,8 @@ def with_flare(
     InputError
         For an impossible value, or a band that the spectrum does not cover.
     """
-    if not (np.isfinite(amplitude) and amplitude >= 0.0):
-        raise InputError(f"flare amplitude = {amplitude!r}, expected a finite number of at least 0")
-    _check_temperature("flare temperature", temperature_k)
+    check_amplitude(amplitude)
+    check_temperature("flare temperature", temperature_k)
     star = photons(wavelength_nm, flux_flam, band)
     if not star > 0.0:
         raise InputError(f"the star has no light in the band {band}, expected some to measure the flare against")
@@ -82,7 +79,7 @@ def with_flare(
         raise InputError(f"flare geometry = {geometry!r}, expected 'added' or 'replaces'")
     if photosphere_temperature_k is None:
         raise InputError("flare geometry 'replaces' needs a photosphere temperature, expected one in K")
-    _check_temperature("photosphere temperature", photosphere_temperature_k)
+    check_temperature("photosphere temperature", photosphere_temperature_k)
     ratio = hot / photons(wavelength_nm, blackbody(wavelength_nm, photosphere_temperature_k), band)
     if ratio <= 1.0:
         raise InputError(
@@ -96,9 +93,3 @@ def with_flare(
             f"expected at most {ratio - 1.0:.3g}"
         )
     return flux_flam * (1.0 - filling) + filling * ratio * star / hot * body
-
-
-def _check_temperature(what: str, value: float) -> None:
-    low, high = TEMPERATURE_RANGE
-    if not (np.isfinite(value) and low <= value <= high):
-        raise InputError(f"{what} = {value!r} K, expected {low:g} to {high:g} K")

@@ -8,15 +8,12 @@ from __future__ import annotations
 
 import datetime
 import hashlib
-import http.client
 import io
 import os
 import re
 import sys
 import tempfile
 import time
-import urllib.error
-import urllib.request
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
@@ -369,6 +366,10 @@ def _check_address(address: str) -> None:
 
 def _download(url: str, show_progress: bool, most: int | None = None) -> Path:
     """A file of the network, within limits of size and time; FileNotFoundError where the server has none."""
+    # TLS takes a while to load, and most runs fetch nothing.
+    import http.client
+    import urllib.error
+
     most = limit_bytes("MAUVECL_LARGEST_FILE_MIB") if most is None else most
     descriptor, name = tempfile.mkstemp(prefix="mauvecl-fetch-")
     try:
@@ -398,6 +399,8 @@ def _download(url: str, show_progress: bool, most: int | None = None) -> Path:
 
 def _receive(url: str, file: IO[bytes], most: int, show_progress: bool) -> None:
     """Write what a server sends, piece by piece, for it may tell a wrong size or none, and never end."""
+    import urllib.request
+
     from astropy.utils.console import ProgressBarOrSpinner
 
     latest, got = time.monotonic() + LONGEST_S, 0

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
+from ..ranges import check_magnitude
 from ..spectra.ends import (
     SPAN_NM,
     check_flux,
@@ -344,8 +345,7 @@ class Source:
             As `magnitude`, or for a magnitude outside -30 to 40.
         """
         magnitude = _number("magnitude", magnitude, "mag")
-        if not (np.isfinite(magnitude) and -30.0 <= magnitude <= 40.0):
-            raise InputError(f"magnitude = {magnitude!r}, expected -30 to 40")
+        check_magnitude(magnitude)
         factor = 10.0 ** (-0.4 * (magnitude - self.magnitude(band, system)))
         scaled = self._changed(self.flux_flam * factor, f"scaled to {bands.band(band).name} = {magnitude:g}")
         return replace(scaled, scale=bands.scale(band, system), unscaled="")

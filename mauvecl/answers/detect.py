@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -13,7 +14,8 @@ from mauvecl.answers.answer import Answer
 from mauvecl.answers.unknown_cost import cost_lines, marginal_lines, unknown_cost
 from mauvecl.results.campaign import campaign
 from mauvecl.results.departures import departure_table
-from mauvecl.results.detection import Detection, check_fap, countable
+from mauvecl.results.detection import Detection
+from mauvecl.results.fap import check_fap, countable
 from mauvecl.results.paper import PAPER_G2V, WHY, reconstruct
 from mauvecl.runs.pool import Pool, together
 from mauvecl.statistics.distributions import QuadraticForm
@@ -200,7 +202,10 @@ def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
 
     if isinstance(engine, Pool):
         engine.expect(len(prepared) * run.realisations)
-    stars = list(together(engine, answered, prepared))
+    # What is drawn nothing for is computed while the devices count.
+    with ThreadPoolExecutor(1) as beside:
+        paper = beside.submit(_paper, study, [group for *_, group in prepared])
+        stars = list(together(engine, answered, prepared))
     costs = [text for (_, cell, *_), star in zip(prepared, stars, strict=True) for text in _template_costs(cell, star)]
     answer = DetectAnswer(study, stars)
     blinding = [f"{text[:-1]} ({star.title})." for star in stars for text in star.found.messages]
@@ -218,7 +223,7 @@ def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
     ]
     last = [*_few_terms(stars), *marginal_lines(study), *cost_lines(unknown, study)]
     answer.messages = list(dict.fromkeys([*messages, *campaign_told, *costs, *last]))
-    answer.paper = _paper(study, [group for *_, group in prepared])
+    answer.paper = paper.result()
     return answer
 
 

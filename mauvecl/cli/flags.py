@@ -372,7 +372,7 @@ def takes_study(
         _, _, *own = inspect.signature(verb).parameters.values()
 
         def command(study_file: Path | None = None, **values: Any) -> None:
-            from mauvecl.cli.foresight import question_time
+            from mauvecl.cli.foresight import question_time, question_values
             from mauvecl.cli.session import Session
 
             given = {key: values.pop(key, None) for key in options}
@@ -382,6 +382,7 @@ def takes_study(
             if "given" in kinds:
                 values["given"] = given
             study = _study(study_file, given, options, default)
+            question_values(study, detects="fap" in options)
             if draws:
                 question_time(study, **{key: how[key] for key in ("device", "cluster", "insist")})
             with Session(name or verb.__name__, study, **how) as session:

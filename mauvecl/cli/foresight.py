@@ -1,4 +1,4 @@
-"""Questions that would never end, or never fit: told before they begin."""
+"""Questions that cannot be, would never end, or never fit: told before anything large is loaded, or begins."""
 
 from __future__ import annotations
 
@@ -23,6 +23,72 @@ DEVICE_RATE = 100 * CORE_RATE
 CLUSTER_CORES = 1000
 #: The engine's index of realisations has 63 bits: `Engine._check`.
 MOST_REALISATIONS = 2**63 - 1
+
+
+def question_values(study: Study, *, detects: bool) -> None:
+    """Refuse values that no answer can come of, with the sentences of those who would meet them later.
+
+    Parameters
+    ----------
+    study : Study
+    detects : bool
+        Whether flares and thresholds are asked for.
+
+    Raises
+    ------
+    InputError
+        For the first of them.
+    """
+    from mauvecl.host.instrument.places import find_instrument
+    from mauvecl.host.ranges import check_amplitude, check_exposure, check_magnitude, check_temperature
+    from mauvecl.host.stars.bands import known_band
+    from mauvecl.results.fap import check_fap
+    from mauvecl.statistics.names import check_statistic
+
+    for star in study.star:
+        if star.library is not None:
+            _check_library(star.library)
+        elif star.file is not None:
+            _check_file(star.file)
+        if star.magnitude is not None:
+            check_magnitude(star.magnitude)
+        known_band(star.band)
+    find_instrument(study.observation.instrument, Path())
+    check_exposure(study.observation.exposure_s)
+    if not detects:
+        return
+    flare, run = study.flare, study.run
+    for amplitude in flare.amplitudes:
+        check_amplitude(amplitude)
+    check_temperature("flare temperature", flare.temperature_k)
+    known_band(flare.band)
+    for name in run.statistics:
+        check_statistic(name)
+    check_fap(run.fap, run.realisations, run.tails)
+
+
+def _check_library(name: str) -> None:
+    from mauvecl.host.stars import catalogue
+
+    if catalogue.embedded(name) is None:
+        from mauvecl.host.stars import own_stars
+
+        if own_stars.find(name) is None:
+            catalogue.find(name)
+
+
+def _check_file(file: Path) -> None:
+    from mauvecl.host.files.bounded import read_bytes
+    from mauvecl.host.spectra.formats import without_columns
+
+    try:
+        place, _ = without_columns(file)
+        there = place.is_file()
+    except (OSError, ValueError):
+        # What no name can be is told by who reads it.
+        return
+    if not there:
+        read_bytes(place, "spectrum file")
 
 
 def question_time(study: Study, *, device: str | None, cluster: str | None, insist: bool) -> None:

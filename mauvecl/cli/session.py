@@ -121,6 +121,9 @@ class Session:
             stack.enter_context(told_of_interrupts(lambda: self._kept(checkpoint)))
             stack.enter_context(checkpoint)
             self.say(checkpoint.messages)
+            if self.pictures:
+                # Half a second that would be waited for at the end; devices leave one thread idle meanwhile.
+                threading.Thread(target=_load_matplotlib, name="mauvecl-load", daemon=True).start()
             stack.enter_context(self.meter)
             workers = stack.enter_context(working(self.device, self.cluster))
             progress = self.meter if unit == "realisations" else None
@@ -231,6 +234,13 @@ class Session:
         if self.files and not self.quiet:
             names = ", ".join(path.name for path in self.files)
             self.say([f"Wrote {names} to {self.folder}/ in {time.perf_counter() - self.started:.1f} s."])
+
+
+def _load_matplotlib() -> None:
+    from mauvecl.pictures.style import available, pyplot
+
+    if available():
+        pyplot()
 
 
 @contextmanager

@@ -18,15 +18,16 @@ from mauvecl.noise.comparison import TEMPLATE, Comparison
 from mauvecl.noise.drawing import Drawing, DrawingWords
 from mauvecl.noise.scene import BATCH, prepare
 from mauvecl.results.channels import plan_channels
-from mauvecl.results.detection import Detection, Tails
+from mauvecl.results.detection import Detection
+from mauvecl.results.fap import Tails
 from mauvecl.results.hypotheses import Hypotheses
 from mauvecl.results.requests import Countable, DetectRequest, RealiseRequest, Share, SnrRequest
 from mauvecl.results.snr import Counts, SnrResult, elements, observers
 from mauvecl.results.sums import Arrays, DetectionSums, SnrSums, packed_detection, packed_snr
 from mauvecl.results.tally import TailSamples, Tally
 from mauvecl.statistics.linear import Linear
+from mauvecl.statistics.names import USUAL_STATISTICS
 from mauvecl.statistics.nuisances import Nuisances, known
-from mauvecl.statistics.registry import USUAL_STATISTICS
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation

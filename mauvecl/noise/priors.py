@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from mauvecl.host.errors import InputError
 from mauvecl.noise import layout
@@ -69,6 +68,9 @@ class Normal:
         above : ndarray, same shape, optional
             1 - below, where that would lose digits.
         """
+        # Loaded here: a study holds priors long before anything is asked of them.
+        from scipy import special
+
         above = 1.0 - below if above is None else above
         with np.errstate(divide="ignore", over="ignore"):
             low, high = np.log(below), np.log(above)

@@ -12,7 +12,6 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import special
 
 from mauvecl.host.errors import InputError
 from mauvecl.noise import layout
@@ -106,6 +105,8 @@ class CosmicRays:
         ndarray, shape (n,)
             Of 0, 1, 2, ... electrons; what is left out has less than 2**-40.
         """
+        from scipy import special
+
         low, high = (int(e) for e in self.electrons)
         hits = self.rate_per_cm2_s * self.area_cm2 / self.pixels * seconds
         most = 1

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.noise.cumulants import Cumulants
-from mauvecl.results.detection import countable
+from mauvecl.results.fap import countable
 from mauvecl.statistics.distributions import Gaussian, QuadraticForm
 from mauvecl.statistics.intervals import Interval
 from mauvecl.statistics.statistic import LinearStatistic, QuadraticStatistic

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.plotting import picture
 from mauvecl.results.channels import ChannelPlan, Key
+from mauvecl.results.fap import Tails, check_fap, countable
 from mauvecl.results.hypotheses import Hypotheses
 from mauvecl.results.roc import Roc
 from mauvecl.results.tally import Distribution, TailSamples, Tally
@@ -23,37 +23,6 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.results.tails import Tail
-
-#: A threshold needs this many realisations beyond it; a rarer tail is refused, never extrapolated.
-FEWEST_IN_TAIL = 100
-
-#: Thresholds with fewer than `FEWEST_IN_TAIL` beyond them: refused, or by importance sampling.
-Tails = Literal["counted", "sampled"]
-
-
-def countable(fap: float, realisations: int) -> bool:
-    """Whether enough realisations lie beyond the threshold to count them."""
-    return fap * realisations >= FEWEST_IN_TAIL * (1 - 1e-9)
-
-
-def check_fap(fap: float, realisations: int, tails: Tails = "counted") -> None:
-    """Refuse a false-alarm probability that this many realisations cannot settle.
-
-    Raises
-    ------
-    InputError
-        If it is none, or fewer than 100 realisations would lie beyond the threshold and tails are not sampled.
-    """
-    if not 0.0 < fap < 1.0:
-        raise InputError(f"fap = {fap!r}, expected a probability between 0 and 1")
-    if tails not in ("counted", "sampled"):
-        raise InputError(f"tails = {tails!r}, expected 'counted' or 'sampled'")
-    if tails == "counted" and not countable(fap, realisations):
-        raise InputError(
-            f"fap = {fap:g} leaves {fap * realisations:.3g} of {realisations} realisations beyond the threshold, "
-            f"expected at least {FEWEST_IN_TAIL}: ask for {int(np.ceil(FEWEST_IN_TAIL / fap))} realisations, or for "
-            "sampled tails"
-        )
 
 
 @dataclass(eq=False)

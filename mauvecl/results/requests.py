@@ -16,11 +16,11 @@ from mauvecl.noise.comparison import TEMPLATE, Comparison
 from mauvecl.noise.drawing import AUTOMATIC, Drawing, DrawingWords
 from mauvecl.noise.scene import BATCH, Scene, prepare
 from mauvecl.results.channels import ChannelPlan, plan_channels
-from mauvecl.results.detection import Tails
+from mauvecl.results.fap import Tails
 from mauvecl.results.hypotheses import Hypotheses
 from mauvecl.statistics.linear import Linear
+from mauvecl.statistics.names import USUAL_STATISTICS
 from mauvecl.statistics.nuisances import Nuisances, known
-from mauvecl.statistics.registry import USUAL_STATISTICS
 
 
 @dataclass(frozen=True)

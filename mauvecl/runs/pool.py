@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 TRIES = 3
 #: Shares under way for each worker: one in hand and one waiting.
 AHEAD = 2
+#: Items of `together` under way beyond the workers: what one needs is prepared while the devices count others.
+PREPARED = 1
 
 
 Item = TypeVar("Item")
@@ -78,7 +80,7 @@ class Workers(Protocol):
 
 
 class LocalWorkers:
-    """The OpenCL devices of this machine: one in the caller's thread, several in a thread each.
+    """The OpenCL devices of this machine, in a thread each.
 
     Parameters
     ----------
@@ -94,7 +96,7 @@ class LocalWorkers:
         self._stopping = False
         self._engines: list[Engine] = [self._made(place) for place in range(len(devices))]
         self._free = list(range(len(devices)))
-        self._threads = ThreadPoolExecutor(len(devices)) if len(devices) > 1 else None
+        self._threads = ThreadPoolExecutor(len(devices))
         self._lock = threading.Lock()
 
     def _made(self, place: int) -> Engine:
@@ -129,12 +131,8 @@ class LocalWorkers:
         tick: Callable[[int], None],
         out: NDArray[Any] | None = None,
     ) -> Future[Arrays]:
-        """Count a share: at once where there is one device."""
-        if self._threads is not None:
-            return self._threads.submit(self._count, request, share, tick, out)
-        future: Future[Arrays] = Future()
-        future.set_result(self._count(request, share, tick, out))
-        return future
+        """Count a share, as soon as a device is free."""
+        return self._threads.submit(self._count, request, share, tick, out)
 
     def _count(
         self,
@@ -176,8 +174,7 @@ class LocalWorkers:
 
     def close(self) -> None:
         """Let the threads go."""
-        if self._threads is not None:
-            self._threads.shutdown(wait=True, cancel_futures=True)
+        self._threads.shutdown(wait=True, cancel_futures=True)
 
 
 @dataclass(frozen=True)
@@ -340,17 +337,17 @@ class Pool:
 
 
 def together(engine: Engine | Pool, work: Callable[[Item], Answer], items: Iterable[Item]) -> Iterator[Answer]:
-    """What `work` makes of each item, in their order; some at a time where several workers are to be kept busy."""
-    if not isinstance(engine, Pool) or engine.workers.count == 1:
+    """What `work` makes of each item, in their order; by a pool some at a time, so that devices need not wait."""
+    if not isinstance(engine, Pool):
         yield from map(work, items)
         return
     ahead: deque[Future[Answer]] = deque()
-    with ThreadPoolExecutor(engine.workers.count) as threads:
+    with ThreadPoolExecutor(engine.workers.count + PREPARED) as threads:
         try:
             for item in items:
                 ahead.append(threads.submit(work, item))
-                # No more answers wait for their turn than there are workers.
-                if len(ahead) > engine.workers.count:
+                # No more answers wait for their turn than are worked on.
+                if len(ahead) > engine.workers.count + PREPARED:
                     yield ahead.popleft().result()
             while ahead:
                 yield ahead.popleft().result()

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from mauvecl.host.errors import InputError
 from mauvecl.statistics.chi2 import Chi2, Chi2Element, Chi2Pair
 from mauvecl.statistics.linear import Linear, Matched, UvExcess
+from mauvecl.statistics.names import check_statistic
 from mauvecl.statistics.paper import Paper
 from mauvecl.statistics.statistic import Statistic
 
@@ -14,8 +15,6 @@ from mauvecl.statistics.statistic import Statistic
 STATISTICS: dict[str, Statistic] = {
     one.name: one for one in (Chi2(), Chi2Element(), Chi2Pair(), Matched(), UvExcess(), Paper())
 }
-#: Computed where nobody names any.
-USUAL_STATISTICS = ("chi2", "chi2_element", "matched")
 
 
 def chosen(asked: Sequence[str | Linear]) -> dict[str, Statistic]:
@@ -35,8 +34,7 @@ def chosen(asked: Sequence[str | Linear]) -> dict[str, Statistic]:
     own: set[str] = set()
     for one in asked:
         if isinstance(one, str):
-            if one not in STATISTICS:
-                raise InputError(f"statistic {one!r} is unknown, expected one of {', '.join(STATISTICS)}")
+            check_statistic(one)
             named.setdefault(one, STATISTICS[one])
             continue
         if one.name in STATISTICS:

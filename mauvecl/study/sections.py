@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, create_model, field_validator, model_validator
 
 from mauvecl.noise.processes import VARIED
-from mauvecl.statistics.registry import STATISTICS, USUAL_STATISTICS
+from mauvecl.statistics.names import STATISTIC_NAMES, USUAL_STATISTICS
 
 if TYPE_CHECKING:
     from mauvecl.host.sky.zodiacal import Sky
@@ -201,7 +201,7 @@ class Run(Part):
     @field_validator("statistics")
     @classmethod
     def _all(cls, given: tuple[str, ...]) -> tuple[str, ...]:
-        return tuple(STATISTICS) if "all" in given else given
+        return STATISTIC_NAMES if "all" in given else given
 
     @model_validator(mode="after")
     def _comparable(self) -> Self:

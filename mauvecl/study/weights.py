@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,9 @@ from numpy.typing import NDArray
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import LARGEST, SMALLEST, parsing, read_text
-from mauvecl.statistics.linear import Linear
+
+if TYPE_CHECKING:
+    from mauvecl.statistics.linear import Linear
 
 
 def read_weights(name: str, path: Path, wavelength_nm: NDArray[np.float64]) -> Linear:
@@ -29,6 +32,8 @@ def read_weights(name: str, path: Path, wavelength_nm: NDArray[np.float64]) -> L
     InputError
         If the file holds no such columns, a number that cannot be, or no weight for any pixel.
     """
+    from mauvecl.statistics.linear import Linear
+
     what = f"weights {shortened(path.name)} of {shortened(name)}"
     return Linear(name, _read_values(what, "weights", path, wavelength_nm))
 

@@ -1,0 +1,42 @@
+"""Where instruments' files are: those that come with the package, and a user's own."""
+
+from __future__ import annotations
+
+import difflib
+from importlib import resources
+from importlib.resources.abc import Traversable
+from pathlib import Path
+
+from ..errors import InputError
+from ..files.bounded import shortened
+from ..files.parsed import is_file
+
+
+def shipped() -> tuple[str, ...]:
+    """Names of the instruments that come with the package."""
+    files = resources.files(__package__).joinpath("instruments").iterdir()
+    return tuple(sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml")))
+
+
+def find_instrument(name: str | Path, folder: Path) -> Path:
+    """The file of a shipped instrument or, failing that, a user's own, relative to `folder`."""
+    if not isinstance(name, str | Path):
+        raise InputError(f"instrument {name!r}, expected a name or the path of a TOML file")
+    names = shipped()
+    if name in names:
+        return _local(resources.files(__package__).joinpath("instruments", f"{name}.toml"))
+    path = folder / name
+    if is_file(path):
+        return path
+    if path.suffix == ".toml":
+        raise InputError(f"instrument file {shortened(str(path))} does not exist, expected a TOML file")
+    near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.0)[0]
+    raise InputError(
+        f"unknown instrument {shortened(str(name))}, expected {' or '.join(names)} (nearest: {near!r}) "
+        "or the path of a TOML file"
+    )
+
+
+def _local(resource: Traversable) -> Path:
+    # setuptools installs real files; a zipped package would need extracting.
+    return Path(str(resource))
