@@ -9,7 +9,7 @@ from .errors import InputError
 #: Magnitudes of a star.
 MAGNITUDES = (-30.0, 40.0)
 #: Brightness temperatures that a flare may have, in K.
-FLARE_TEMPERATURES_K = (1_000.0, 200_000.0)
+TEMPERATURE_RANGE = (1_000.0, 200_000.0)
 #: Seconds of the longest exposure.
 DAY_S = 86_400.0
 EXPOSURES = "expected a time above 0 and up to one day (86400 s)"
@@ -45,7 +45,7 @@ def check_temperature(what: str, value: float) -> None:
     ------
     InputError
     """
-    low, high = FLARE_TEMPERATURES_K
+    low, high = TEMPERATURE_RANGE
     if not low <= value <= high:
         raise InputError(f"{what} = {value!r} K, expected {low:g} to {high:g} K")
 

@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.stars.bands import band as find_band
-from mauvecl.host.stars.flare import TEMPERATURE_RANGE, blackbody
+from mauvecl.host.ranges import TEMPERATURE_RANGE
+from mauvecl.host.stars.flare import blackbody
 from mauvecl.lightcurve.shapes import Shape, shape_of
 
 if TYPE_CHECKING:

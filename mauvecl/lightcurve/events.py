@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
-from mauvecl.host.stars.flare import TEMPERATURE_RANGE
+from mauvecl.host.ranges import TEMPERATURE_RANGE
 from mauvecl.lightcurve.energies import EnergyScale, amplitude_of, amplitude_of_peak, equivalent_duration
 from mauvecl.lightcurve.shapes import SHAPES, Shape, shape_of
 
