@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
-from mauvecl.host.stars.bands import band as find_band
 from mauvecl.host.ranges import TEMPERATURE_RANGE
+from mauvecl.host.stars.bands import band as find_band
 from mauvecl.host.stars.flare import blackbody
 from mauvecl.lightcurve.shapes import Shape, shape_of
 
