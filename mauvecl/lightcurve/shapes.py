@@ -12,9 +12,8 @@ from functools import cached_property
 from typing import Any, ClassVar
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy import special
-from scipy.optimize import brentq
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
@@ -72,8 +71,8 @@ class Shape(ABC):
         while float(self.at(at - back)) > half:
             back *= 2
         return float(
-            brentq(lambda t: float(self.at(t)) - half, at, at + reach, xtol=1e-13)
-            - brentq(lambda t: float(self.at(t)) - half, at - back, at, xtol=1e-13)
+            scipy.optimize.brentq(lambda t: float(self.at(t)) - half, at, at + reach, xtol=1e-13)
+            - scipy.optimize.brentq(lambda t: float(self.at(t)) - half, at - back, at, xtol=1e-13)
         )
 
     def integral(self, first: ArrayLike, last: ArrayLike) -> Float:
@@ -175,14 +174,14 @@ class TovarMendoza2022(Shape):
         """The Gaussian convolved with one exponential: the scaled erfcx where the plain product would overflow."""
         z = (self.B - tau) / self.C
         u = z + self.C * rate / 2
-        early = np.exp(-(z**2)) * special.erfcx(np.maximum(u, 0.0))
+        early = np.exp(-(z**2)) * scipy.special.erfcx(np.maximum(u, 0.0))
         exponent = rate * (self.B - tau) + (rate * self.C / 2) ** 2
-        late = np.exp(np.where(u > 0, 0.0, exponent)) * special.erfc(np.minimum(u, 0.0))
+        late = np.exp(np.where(u > 0, 0.0, exponent)) * scipy.special.erfc(np.minimum(u, 0.0))
         return np.asarray(np.sqrt(np.pi) / 2 * self.HEIGHT * self.C * np.where(u > 0, early, late))
 
     def _gaussian(self, z: Float) -> Float:
         """The Gaussian's integral beyond z of its widths."""
-        return np.asarray(np.sqrt(np.pi) / 2 * self.HEIGHT * self.C * special.erfc(z))
+        return np.asarray(np.sqrt(np.pi) / 2 * self.HEIGHT * self.C * scipy.special.erfc(z))
 
     def at(self, tau: ArrayLike) -> Float:
         t = np.asarray(tau, np.float64)
@@ -204,13 +203,13 @@ class TovarMendoza2022(Shape):
             gaussian = self.HEIGHT * np.exp(-(((tau - self.B) / self.C) ** 2))
             return float(sum(s * (gaussian - rate * self._part(np.asarray(tau), rate)) for s, rate in self.DECAY))
 
-        return float(brentq(slope, -0.5, 0.5, xtol=1e-15))
+        return float(scipy.optimize.brentq(slope, -0.5, 0.5, xtol=1e-15))
 
     @cached_property
     def square_integral(self) -> float:
         # Correlation of the Gaussian with itself times that of two exponentials, over all lags.
         def lags(rate: float) -> Any:
-            return self.C * np.sqrt(np.pi / 2) * special.erfcx(rate * self.C / np.sqrt(2))
+            return self.C * np.sqrt(np.pi / 2) * scipy.special.erfcx(rate * self.C / np.sqrt(2))
 
         gaussian = self.HEIGHT**2 * self.C * np.sqrt(np.pi / 2)
         pairs = [(f * g, c, d) for f, c in self.DECAY for g, d in self.DECAY]

@@ -85,3 +85,39 @@ def test_quiet_prints_no_progress_and_no_files(tmp_path: Path) -> None:
     assert "detection.ecsv" not in quiet.stdout + quiet.stderr
     assert quiet.stderr == ""
     assert "matched" in quiet.stdout
+
+
+#: Takes a tenth of a second and more to load, and tells nobody that a value cannot be.
+HEAVY = ("astropy", "matplotlib", "pyopencl", "scipy.optimize", "scipy.special", "ssl", "synphot")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--version"],
+        ["detect", "--magnitude", "99"],
+        ["detect", "--amplitude", "-1"],
+        ["detect", "--star", "G22V"],
+        ["detect", "--star", "missing.txt"],
+        ["detect", "--statistic", "chi3"],
+        ["limit", "--exposure", "0"],
+        ["map", "--x", "magnitude"],
+        ["snr", "--instrument", "mauv"],
+        ["gaussian", "--fap", "1e-9"],
+        ["exposure", "missing.toml"],
+        ["realise", "--band", "Q"],
+    ],
+    ids=" ".join,
+)
+def test_nothing_large_is_loaded_for_a_mistake(words: list[str], tmp_path: Path) -> None:
+    """What a user waits for after a typing error is imports, and nothing else: none of those that take long."""
+    code = (
+        "import sys\n"
+        f"sys.argv = ['mauvecl', *{words!r}]\n"
+        "from mauvecl.cli.app import main\n"
+        "try:\n    main()\n"
+        f"finally:\n    print('loaded', *(name for name in {HEAVY!r} if name in sys.modules))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
+    assert done.stdout.splitlines()[-1].split() == ["loaded"], done
+    assert done.returncode == (0 if words == ["--version"] else 2), done
