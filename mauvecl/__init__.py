@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.simulate import simulate
     from mauvecl.answers.snr import snr
     from mauvecl.answers.stare import stare
+    from mauvecl.answers.visible import visible
     from mauvecl.device.engine import Engine
     from mauvecl.device.stares import Stares
     from mauvecl.host.errors import InputError
@@ -88,6 +89,7 @@ __all__ = [
     "smallest_amplitude",
     "snr",
     "stare",
+    "visible",
     "what_matters",
 ]
 
@@ -134,6 +136,7 @@ _HOMES = {
     "smallest_amplitude": "answers.limits",
     "snr": "answers.snr",
     "stare": "answers.stare",
+    "visible": "answers.visible",
     "what_matters": "answers.assumptions",
 }
 

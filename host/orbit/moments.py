@@ -66,7 +66,10 @@ class Moments:
             time = moment_of(self.start)
             day, rest = float(time.utc.jd1), float(time.utc.jd2)
         midnight = np.floor(day - 0.5) + 0.5
-        return float(midnight), (day - midnight) + rest
+        fraction = (day - midnight) + rest
+        # The second part may be half a day, on either side.
+        midnight += np.floor(fraction)
+        return float(midnight), float(fraction - np.floor(fraction))
 
     @cached_property
     def seconds(self) -> NDArray[np.float64]:

@@ -12,6 +12,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import possible, read_text, toml
 from mauvecl.study.nuisances import NuisanceChoice
+from mauvecl.study.orbits import OrbitQuestion, PlanQuestion, find_plan_files, without_usual_plan
 from mauvecl.study.questions import (
     Axis,
     BulkQuestion,
@@ -65,6 +66,8 @@ class Study(Part):
     unknowns: Unknowns = Unknowns()
     stare: StareQuestion = StareQuestion()
     events: tuple[EventText, ...] = ()
+    orbit: OrbitQuestion = OrbitQuestion()
+    plan: PlanQuestion = PlanQuestion()
 
     @model_validator(mode="after")
     def _one_photosphere(self) -> Self:
@@ -103,6 +106,7 @@ class Study(Part):
             if isinstance(one, dict) and isinstance(one.get("file"), str):
                 one["file"] = str(path.parent / one["file"])
         find_curves(data, path.parent)
+        find_plan_files(data, path.parent)
         return cls.build(data, path.name)
 
     @classmethod
@@ -169,6 +173,7 @@ class Study(Part):
                 if "file" in one:
                     one["file"] = str(Path(one["file"]).resolve())
         without_usual(data, self)
+        without_usual_plan(data, self)
         for section in ("processes", "campaign"):
             if not data[section]:
                 del data[section]

@@ -171,6 +171,17 @@ def test_impossible_times(kwargs: dict[str, float | str]) -> None:
         Moments(**({"start": "2027-01-01", "days": 365.0} | kwargs))  # type: ignore[arg-type]
 
 
+@pytest.mark.parametrize("start", ["2027-01-01", "2027-01-01T11:59:59", "2027-01-01T12:00:01", "2027-01-01T23:59:59.5"])
+def test_days_begin_at_midnight(start: str) -> None:
+    """However astropy divides a date into two numbers."""
+    moments = Moments(start, 1.0, 3600.0)
+    midnight, fraction = moments.first
+    assert midnight % 1 == 0.5
+    assert 0 <= fraction < 1
+    assert moments.iso(0.0, 1) == f"{start}T00:00:00.0" if len(start) == 10 else f"{start}.0"[:21]
+    assert np.floor(moments.julian[1][0]) == 0 or start.endswith("59.5")
+
+
 def test_nothing_global_is_left_changed(orbit: Orbit) -> None:
     from astropy.coordinates import solar_system_ephemeris
     from astropy.utils import iers
