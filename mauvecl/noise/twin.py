@@ -290,15 +290,15 @@ def observed(
     exposure: int = 0,
     number: int = 0,
     scenarios: Sequence[int] | None = None,
-) -> NDArray[np.float32]:
-    """DN above the base, summed over the draws, of scenarios; of exposure `number` of several.
+) -> NDArray[np.int64]:
+    """Whole DN above the base, summed over the draws, of scenarios; of exposure `number` of several.
 
     Returns
     -------
-    ndarray of float32, shape (n_scenario, n_padded, n_realisation)
+    ndarray of int64, shape (n_scenario, n_padded, n_realisation)
     """
     chosen = range(len(scene.levels)) if scenarios is None else scenarios
-    total = np.zeros((len(chosen), len(scene.pixels), len(realisation)), np.float32)
+    total = np.zeros((len(chosen), len(scene.pixels), len(realisation)), np.int64)
     for frame in range(number * scene.n_draws, (number + 1) * scene.n_draws):
         first = frame if scene.frames else number * scene.n_frames
         changes = factors(scene, realisation, first, seed, exposure=exposure)
@@ -307,7 +307,8 @@ def observed(
             for i, p in enumerate(range(4 * group, 4 * group + 4)):
                 for row, k in enumerate(chosen):
                     v = analogue(scene, drawn, i, p, k, *changes)
-                    total[row, p] += digitise(v, scene.edges[k, p], clip=scene.clip)
+                    with np.errstate(invalid="ignore"):  # padded pixels
+                        total[row, p] += digitise(v, scene.edges[k, p], clip=scene.clip).astype(np.int64)
     return total
 
 
@@ -334,5 +335,5 @@ def clipped(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray
 def realise(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray[np.int64]:
     """Raw DN of scenario 0 summed over the frames, shape (n_realisation, n_pixel)."""
     above = observed(scene, realisation, seed, scenarios=[0])[0, : scene.n_pixel]
-    raw: NDArray[np.int64] = (above.astype(np.int64) + scene.n_draws * scene.base_dn[0][:, None]).T
+    raw: NDArray[np.int64] = (above + scene.n_draws * scene.base_dn[0][:, None]).T
     return raw

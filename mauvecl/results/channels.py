@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mauvecl.noise.layout import FIXED_STATISTICS
 from mauvecl.results.hypotheses import Hypotheses
 from mauvecl.results.tally import Grid, TailSamples
-from mauvecl.statistics.distributions import Gaussian, QuadraticForm
+from mauvecl.statistics.distributions import Form
 from mauvecl.statistics.paper import Paper
 from mauvecl.statistics.statistic import LinearStatistic, QuadraticStatistic, Statistic
 
@@ -139,7 +139,7 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
     grids: list[Grid] = []
     keys: list[Key] = []
 
-    def add(one: Statistic, role: Role, flare: int, channel: int, shape: QuadraticForm | Gaussian) -> None:
+    def add(one: Statistic, role: Role, flare: int, channel: int, shape: Form) -> None:
         grids.append(Grid(channel, shape.mean, shape.std))
         keys.append((one.name, role, flare))
 

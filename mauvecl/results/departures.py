@@ -12,7 +12,7 @@ from scipy import special
 
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.results.fap import countable
-from mauvecl.statistics.distributions import Gaussian, QuadraticForm
+from mauvecl.statistics.distributions import Form
 from mauvecl.statistics.intervals import Interval
 from mauvecl.statistics.statistic import LinearStatistic, QuadraticStatistic
 
@@ -110,9 +110,9 @@ def departures(found: Detection, fap: float) -> list[Departure]:
         others.append("variances estimated from the counts")
     if scene.cosmic:
         others.append("cosmic rays")
-    if scene.modulations:
+    if scene.modulations and not found.setting.integrates:
         others.append("priors that the template does not know")
-    elif found.nuisances is not None:
+    elif found.nuisances is not None and not scene.modulations:
         others.append("unknowns that are marginalised over and not drawn")
     digital = _digital(found.quiet) if scene.clip else None
     rows = []
@@ -179,7 +179,7 @@ def departure_table(found: Detection, amplitudes: Sequence[float], fap: float) -
     return table
 
 
-def _skewed(found: Detection, statistic: str, template: int, null: QuadraticForm | Gaussian, cut: float) -> float:
+def _skewed(found: Detection, statistic: str, template: int, null: Form, cut: float) -> float:
     """False-alarm probability at a threshold with the noise's third and fourth cumulants."""
     scene, quiet = found.scene, found.quiet
     each = 1 if scene.frames else quiet.n_frames
@@ -197,13 +197,12 @@ def _skewed(found: Detection, statistic: str, template: int, null: QuadraticForm
         z, skew, excess = cut / null.std, weights**3 @ third / sd**3, weights**4 @ fourth / sd**4
         # Edgeworth's series (Abramowitz & Stegun 26.2.48).
         series = skew * (z**2 - 1) / 6 + excess * (z**3 - 3 * z) / 24 + skew**2 * (z**5 - 10 * z**3 + 15 * z) / 72
-        return float(special.ndtr(-z) + np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) * series)
+        return float(null.sf(cut) + np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) * series)
     assert isinstance(one, QuadraticStatistic)
-    assert isinstance(null, QuadraticForm)
     # Each pixel's own square has more variance and more skew than a normal's.
     own = one.own(found.setting, flare)
     second = null.std**2
-    skewed = 8.0 * float(np.sum(null.weight**3))
+    skewed = null.third
     more = own**2 @ fourth, own**3 @ (12.0 * fourth * variance + 10.0 * third**2 + sixth)
     plain, there = (
         _gamma_sf(cut, null.mean, second + part * float(more[0]), skewed + part * float(more[1])) for part in (0.0, 1.0)
@@ -222,7 +221,7 @@ def _moved(found: Detection, statistic: str, template: int, shift: Float, varian
     one, used = found.statistic(statistic), found.scene.used
     share = one.share(found.setting)
     delta, true = np.where(used, (1.0 - (share > 0)) * shift, 0.0), (1.0 + share) * variance
-    return one.form(found.setting, delta, true, found.shape(statistic, template)).sf(cut)
+    return one.as_drawn(found.setting, found.quiet, delta, true, found.shape(statistic, template)).sf(cut)
 
 
 def _digital(x: Expectation) -> tuple[tuple[Float, Float], tuple[Float, Float]]:

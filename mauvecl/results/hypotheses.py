@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
+from mauvecl.noise.drawn import Drawn
 from mauvecl.noise.scene import Scene
-from mauvecl.statistics.distributions import Gaussian, QuadraticForm
+from mauvecl.statistics.distributions import Form
 from mauvecl.statistics.linear import Linear
 from mauvecl.statistics.nuisances import Nuisances
 from mauvecl.statistics.registry import chosen
@@ -50,14 +51,13 @@ class Hypotheses:
     statistics: tuple[str, ...] = field(init=False)
     setting: Setting = field(init=False, repr=False)
     _chosen: dict[str, Statistic] = field(init=False, repr=False)
-    _forms: dict[tuple[str, int | None, int], QuadraticForm | Gaussian] = field(
-        default_factory=dict, init=False, repr=False
-    )
+    _forms: dict[tuple[str, int | None, int], Form] = field(default_factory=dict, init=False, repr=False)
 
     def __post_init__(self) -> None:
         self._chosen = chosen(self.asked)
         self.statistics = tuple(self._chosen)
-        self.setting = Setting(self.quiet, self.scene.used, self.scene.comparison, self.flares, self.nuisances)
+        drawn = Drawn.of(self.scene) if self.nuisances else None
+        self.setting = Setting(self.quiet, self.scene.used, self.scene.comparison, self.flares, self.nuisances, drawn)
         shaped = next((name for name, one in self._chosen.items() if one.shaped), None)
         if shaped is not None and not self.flares:
             raise InputError(f"no flare given, expected at least one for the statistic {shaped!r}")
@@ -113,7 +113,7 @@ class Hypotheses:
             for k in self.blinding
         )
 
-    def closed_form(self, statistic: str, flare: int | None = None, *, template: int = 0) -> QuadraticForm | Gaussian:
+    def closed_form(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Form:
         """A statistic's distribution for Gaussian noise; parameters as for `Detection.distribution`."""
         self._check(statistic, flare, template)
         key = statistic, flare, template
@@ -121,7 +121,7 @@ class Hypotheses:
             self._forms[key] = self._closed_form(statistic, flare, template)
         return self._forms[key]
 
-    def _closed_form(self, statistic: str, flare: int | None, template: int) -> QuadraticForm | Gaussian:
+    def _closed_form(self, statistic: str, flare: int | None, template: int) -> Form:
         observed = self.quiet if flare is None else self.flares[flare]
         looked_for = self.shape(statistic, template if flare is None else flare)
         return self.statistic(statistic).closed_form(self.setting, observed, looked_for)

@@ -174,7 +174,8 @@ class Smoothed:
         return out
 
 
-def _above_template(scene: Scene, above: NDArray[np.float32]) -> NDArray[np.float32]:
+def _above_template(scene: Scene, counts: NDArray[np.int64]) -> NDArray[np.float32]:
+    above = counts.astype(np.float32)
     if scene.frames:
         return np.asarray(above + scene.edges["whole"][:, :, None])
     return np.asarray((above + MAGIC) - scene.levels["shift"][:, :, None])
@@ -210,10 +211,10 @@ def histograms(
         signal, variance = (np.zeros(len(realisation), np.float32) for _ in range(2))
         for p in range(int(element["first"]), int(element["end"])):
             observer = observers[p]
-            net = n[p] + observer["net_offset"]
+            net = n[p].astype(np.float32) + observer["net_offset"]
             signal = signal + net
             variance = variance + fma(np.maximum(net, np.float32(0.0)), observer["gain"], observer["variance"])
-            count("pixel", p, n[p].astype(np.int64) >> int(observer["bin_shift"]))
+            count("pixel", p, n[p] >> int(observer["bin_shift"]))
         signal = signal - element["sky"]
         ratio = np.divide(signal, np.sqrt(variance), out=np.zeros_like(signal), where=variance > 0)
         steps = (ratio - element["centre"]) * element["bins_per_unit"]

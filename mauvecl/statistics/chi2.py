@@ -35,7 +35,14 @@ class Chi2(QuadraticStatistic):
         return setting.nuisances.free if setting.nuisances else 0
 
     def form(
-        self, setting: Setting, delta: Float, true: Float, flare: Expectation | None = None, *, estimated: bool = False
+        self,
+        setting: Setting,
+        delta: Float,
+        true: Float,
+        flare: Expectation | None = None,
+        *,
+        estimated: bool = False,
+        scatter: Float | None = None,
     ) -> QuadraticForm:
         true = true * setting.used
         model = true if estimated else self.variance(setting) * setting.used
@@ -43,18 +50,24 @@ class Chi2(QuadraticStatistic):
         counts = (model > 0) & (true > 0)
         delta, model, true = delta[counts], model[counts], true[counts]
         if setting.nuisances:
-            return self._marginal_form(setting.nuisances, self._spectra(setting)[:, counts], delta, model, true)
+            if scatter is not None:
+                scatter = self._grouped(setting, scatter * setting.used)[:, counts]
+            spectra = self._spectra(setting)[:, counts]
+            return self._marginal_form(setting.nuisances, spectra, delta, model, true, scatter)
         return QuadraticForm(true / model, delta / np.sqrt(true))
 
     @staticmethod
-    def _marginal_form(nuisances: Nuisances, spectra: Float, delta: Float, model: Float, true: Float) -> QuadraticForm:
+    def _marginal_form(
+        nuisances: Nuisances, spectra: Float, delta: Float, model: Float, true: Float, scatter: Float | None
+    ) -> QuadraticForm:
         """Of x^T C^-1 x, x normal of mean delta and of the true variances with the unknowns' own."""
-        if not delta.any() and np.array_equal(model, true):
+        if scatter is None and not delta.any() and np.array_equal(model, true):
             size = delta.size - nuisances.free
             return QuadraticForm(np.ones(size), np.zeros(size))
         scale = np.sqrt(model)
-        rows, drawn = nuisances.rows(model, spectra) * scale, nuisances.finite(spectra) / scale
-        basis, rest = _span(np.vstack([spectra, delta]) / scale, true / model)
+        rows = nuisances.rows(model, spectra) * scale
+        drawn = (nuisances.finite(spectra) if scatter is None else scatter) / scale
+        basis, rest = _span(np.vstack([spectra / scale, drawn, delta / scale]), true / model)
         # In the span: the covariance, and what the statistic multiplies.
         noise = basis.T @ ((true / model)[:, None] * basis) + (drawn @ basis).T @ (drawn @ basis)
         taken, root = rows @ basis, np.linalg.cholesky(noise)

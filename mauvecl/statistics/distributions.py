@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,6 +39,11 @@ class QuadraticForm:
     @property
     def std(self) -> float:
         return float(np.sqrt(np.sum(self.weight**2 * (2.0 + 4.0 * self.shift**2))))
+
+    @property
+    def third(self) -> float:
+        """Third central moment."""
+        return 8.0 * float(np.sum(self.weight**3 * (1.0 + 3.0 * self.shift**2)))
 
     @property
     def effective_terms(self) -> float:
@@ -81,15 +87,17 @@ class QuadraticForm:
     def _near(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Frequencies, and the characteristic function's modulus and phase there, for all values that are near."""
         spacing = 2.0 * np.pi / ((40.0 + NEAR) * self.std)
-        pull = self.shift**2 * self.weight
+        # Equal weights count together: of marginalised statistics most are.
+        weight, member = np.unique(self.weight, return_inverse=True)
+        count, pull = np.bincount(member), np.bincount(member, self.shift**2 * self.weight)
         parts = []
         k = 0.5 + np.arange(256)
         while True:
             u = k * spacing
-            turn = 2.0 * np.outer(u, self.weight)
+            turn = 2.0 * np.outer(u, weight)
             spread = 1.0 + turn**2
-            log_size = -0.25 * np.log(spread).sum(axis=1) - (u[:, None] * turn * pull / spread).sum(axis=1)
-            phase = 0.5 * np.arctan(turn).sum(axis=1) + (u[:, None] * pull / spread).sum(axis=1)
+            log_size = -0.25 * np.log(spread) @ count - (u[:, None] * turn / spread) @ pull
+            phase = 0.5 * np.arctan(turn) @ count + (u[:, None] / spread) @ pull
             parts.append((u, np.exp(log_size) / k, phase))
             k = k + 256
             if log_size[-1] < np.log(1e-15 * k[0]):
@@ -119,6 +127,7 @@ class Gaussian:
 
     mean: float
     std: float
+    third: ClassVar[float] = 0.0
 
     def sf(self, value: float) -> float:
         """Probability of exceeding `value`."""
@@ -127,3 +136,52 @@ class Gaussian:
     def isf(self, probability: float) -> float:
         """The value exceeded with this probability."""
         return float(self.mean - self.std * special.ndtri(probability))
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """One of several distributions, with the same face: what a statistic is where the noise depends on what is drawn.
+
+    Attributes
+    ----------
+    parts : tuple of QuadraticForm or Gaussian
+    shares : ndarray, shape (n,)
+        Probability of each.
+    """
+
+    parts: tuple[QuadraticForm | Gaussian, ...]
+    shares: NDArray[np.float64]
+
+    @cached_property
+    def mean(self) -> float:
+        return float(self.shares @ [part.mean for part in self.parts])
+
+    @cached_property
+    def std(self) -> float:
+        return float(np.sqrt(self.shares @ [part.std**2 + (part.mean - self.mean) ** 2 for part in self.parts]))
+
+    @cached_property
+    def third(self) -> float:
+        """Third central moment."""
+        away = [part.mean - self.mean for part in self.parts]
+        each = [part.third + 3.0 * d * part.std**2 + d**3 for part, d in zip(self.parts, away, strict=True)]
+        return float(self.shares @ each)
+
+    def sf(self, value: float) -> float:
+        """Probability of exceeding `value`."""
+        return float(self.shares @ [part.sf(value) for part in self.parts])
+
+    def isf(self, probability: float) -> float:
+        """The value exceeded with this probability, 0 < probability < 1."""
+        from scipy.optimize import brentq
+
+        low, high = self.mean - self.std, self.mean + self.std
+        while self.sf(low) < probability:
+            low -= self.std
+        while self.sf(high) > probability:
+            high += self.std
+        return float(brentq(lambda x: np.log(self.sf(x) / probability), low, high, xtol=1e-9 * self.std))
+
+
+#: What a closed form is.
+Form = QuadraticForm | Gaussian | Mixture

@@ -6,7 +6,7 @@ of their amplitudes; an amplitude of infinite variance is projected out.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -101,6 +101,11 @@ class Nuisances:
     def free(self) -> int:
         """How many are projected out."""
         return int(np.isinf(self.sd).sum())
+
+    def without(self, names: Collection[str]) -> Nuisances:
+        """The others."""
+        kept = [i for i, name in enumerate(self.names) if name not in names]
+        return Nuisances(tuple(self.names[i] for i in kept), self.spectra[kept], self.sd[kept])
 
     def finite(self, spectra: Float) -> Float:
         """Spectra of those with a prior, times their standard deviations, shape (k_finite, n)."""

@@ -40,7 +40,14 @@ class Paper(QuadraticStatistic):
         return int(setting.used.sum())
 
     def form(
-        self, setting: Setting, delta: Float, true: Float, flare: Expectation | None = None, *, estimated: bool = False
+        self,
+        setting: Setting,
+        delta: Float,
+        true: Float,
+        flare: Expectation | None = None,
+        *,
+        estimated: bool = False,
+        scatter: Float | None = None,
     ) -> QuadraticForm:
         return self.smoothing(setting).form(self.scale(setting, flare), delta, true)
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
 from mauvecl.noise.comparison import TEMPLATE, Comparison
-from mauvecl.statistics.distributions import Gaussian, QuadraticForm
+from mauvecl.noise.drawn import Drawn
+from mauvecl.statistics.distributions import Form, Gaussian, Mixture, QuadraticForm
 from mauvecl.statistics.nuisances import Nuisances, joined
 
 if TYPE_CHECKING:
@@ -38,6 +39,8 @@ class Setting:
         What may be looked for.
     nuisances : Nuisances, optional
         What is marginalised over.
+    drawn : Drawn, optional
+        Factors on light, dark and sky that scatter, which closed forms of marginalised statistics integrate over.
     """
 
     quiet: Expectation
@@ -45,7 +48,13 @@ class Setting:
     comparison: Comparison = TEMPLATE
     flares: Sequence[Expectation] = ()
     nuisances: Nuisances | None = None
+    drawn: Drawn | None = None
     _kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
+
+    @property
+    def integrates(self) -> bool:
+        """Whether closed forms integrate over what is drawn."""
+        return bool(self.nuisances and self.drawn and not self.comparison.exposures)
 
     def remembered(self, name: str, make: Callable[[], T]) -> T:
         """What is dear to make and asked for again."""
@@ -118,9 +127,7 @@ class Statistic(ABC):
                 "expected no unknowns, or another statistic by the model's variances"
             )
 
-    def closed_form(
-        self, setting: Setting, observed: Expectation, flare: Expectation | None = None
-    ) -> QuadraticForm | Gaussian:
+    def closed_form(self, setting: Setting, observed: Expectation, flare: Expectation | None = None) -> Form:
         """The distribution for Gaussian noise (METHODS section 6).
 
         Parameters
@@ -132,11 +139,38 @@ class Statistic(ABC):
 
         Notes
         -----
-        Estimated variances are taken for the true ones, which is what they are on average.
+        Estimated variances are taken for the true ones, which is what they are on average. What is marginalised over
+        scatters as it is drawn, the variances with it; by its Gaussian prior where it is not drawn, or where noisy
+        exposures are subtracted, which share the factors of a realisation.
         """
         delta = np.where(setting.used, observed.recorded_light_dn - setting.quiet.recorded_light_dn, 0.0)
         true = observed.variance_dn2 + self.share(setting) * setting.quiet.variance_dn2
-        return self.form(setting, delta, true, flare, estimated=setting.comparison.estimated)
+        return self.as_drawn(setting, observed, delta, true, flare, estimated=setting.comparison.estimated)
+
+    def as_drawn(
+        self,
+        setting: Setting,
+        observed: Expectation,
+        delta: Float,
+        true: Float,
+        flare: Expectation | None = None,
+        *,
+        estimated: bool = False,
+    ) -> Form:
+        """`form`, integrated over what is drawn where that is marginalised over; parameters as there."""
+        if not setting.integrates:
+            return self.form(setting, delta, true, flare, estimated=estimated)
+        assert setting.nuisances
+        assert setting.drawn
+        nodes, rows = setting.drawn.nodes(observed)
+        # Other unknowns keep their Gaussian priors.
+        others = setting.nuisances.without(setting.drawn.spreads)
+        rows = np.vstack([rows, others.finite(others.spectra)])
+        parts = tuple(
+            self.form(setting, delta + shift * setting.used, true + more, flare, scatter=rows)
+            for _, shift, more in nodes
+        )
+        return parts[0] if len(parts) == 1 else Mixture(parts, np.array([share for share, *_ in nodes]))
 
     @abstractmethod
     def dof(self, setting: Setting) -> int:
@@ -144,7 +178,14 @@ class Statistic(ABC):
 
     @abstractmethod
     def form(
-        self, setting: Setting, delta: Float, true: Float, flare: Expectation | None = None, *, estimated: bool = False
+        self,
+        setting: Setting,
+        delta: Float,
+        true: Float,
+        flare: Expectation | None = None,
+        *,
+        estimated: bool = False,
+        scatter: Float | None = None,
     ) -> QuadraticForm | Gaussian:
         """The distribution for differences that are Gaussian.
 
@@ -156,6 +197,9 @@ class Statistic(ABC):
         flare : Expectation, optional
         estimated : bool
             Whether the statistic divides by the true variances or by the model's.
+        scatter : ndarray, shape (k, n_pixel), optional
+            Standard deviations of normal amplitudes that the differences hold, DN; by default those of the finite priors
+            that are marginalised over.
         """
 
     @abstractmethod
@@ -221,12 +265,21 @@ class LinearStatistic(Statistic):
         return 1
 
     def form(
-        self, setting: Setting, delta: Float, true: Float, flare: Expectation | None = None, *, estimated: bool = False
+        self,
+        setting: Setting,
+        delta: Float,
+        true: Float,
+        flare: Expectation | None = None,
+        *,
+        estimated: bool = False,
+        scatter: Float | None = None,
     ) -> Gaussian:
         weights = self.weights_per_dn(setting, flare)
         mean, variance = float(weights @ delta), float(weights**2 @ true)
-        if setting.nuisances:
-            variance += float(np.sum((setting.nuisances.finite(setting.nuisances.spectra) @ weights) ** 2))
+        if scatter is None and setting.nuisances:
+            scatter = setting.nuisances.finite(setting.nuisances.spectra)
+        if scatter is not None:
+            variance += float(np.sum((scatter @ weights) ** 2))
         spread = float(np.sqrt(variance))
         # By estimated variances a linear statistic comes in its own standard deviations.
         return Gaussian(mean / spread, 1.0) if estimated else Gaussian(mean, spread)

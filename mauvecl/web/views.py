@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.detect import StarDetection
     from mauvecl.host.expectation import Expectation
     from mauvecl.host.stars.source import Source
-    from mauvecl.statistics.distributions import Gaussian, QuadraticForm
+    from mauvecl.statistics.distributions import Form
 
 HEIGHT = 430
 
@@ -179,10 +179,10 @@ class Smooth:
 
     Parameters
     ----------
-    form : QuadraticForm or Gaussian
+    form : Form
     """
 
-    def __init__(self, form: QuadraticForm | Gaussian) -> None:
+    def __init__(self, form: Form) -> None:
         at = np.linspace(form.mean - 5 * form.std, form.mean + 6 * form.std, 14)
         beyond = np.array([form.sf(value) for value in at])
         # Where it is 0 or 1 to the last digit there is nothing to draw.

@@ -17,6 +17,7 @@ from scipy import stats
 
 from mauvecl.device.engine import Engine
 from mauvecl.device.forms import scene_launches
+from mauvecl.device.selftest import toy
 from mauvecl.host.errors import InputError
 from mauvecl.host.instrument.pixel_map import PixelMap
 from mauvecl.noise import twin as reference
@@ -104,6 +105,15 @@ def test_raw_spectra_are_the_twins(any_width: Engine, name: str) -> None:
     for ours, twin in zip((raw, clipped), _raw_twin(name), strict=True):
         np.testing.assert_array_equal(ours, twin)
     assert (raw.dtype == np.uint16) == (quiet.n_frames == 1)
+
+
+def test_raw_sums_beyond_what_float32_holds_are_whole(engine: Engine) -> None:
+    """400 frames that lose up to 48 000 DN each."""
+    how = {"mode": "frames", "processes": Processes(light_loss=Uniform(0.0, 0.9))}
+    quiet = toy(20, 400, light=90_000.0)
+    raw, scene = engine.realise(quiet, count=40, seed=SEED, **how), prepare([quiet], **how)
+    assert np.abs(raw - 400 * scene.base_dn[0]).max() > 2**24
+    np.testing.assert_array_equal(raw, reference.realise(scene, np.arange(40, dtype=np.uint64), SEED))
 
 
 @cache
@@ -284,6 +294,7 @@ from answers import same_counts
 from scenes import star
 from mauvecl.device.forms import scene_launches
 from mauvecl.device.engine import Engine
+from mauvecl.device.selftest import toy
 quiet, *flares = star(amplitudes=(0.081, 0.24))
 found = Engine().detect(quiet, flares, realisations=20_000, seed=3)
 table = found.table(fap=1e-2)

@@ -9,7 +9,7 @@ import pytest
 from scenes import instrument, star
 
 from mauvecl.device.engine import Engine
-from mauvecl.noise.processes import Normal, Processes
+from mauvecl.noise.processes import Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare
 from mauvecl.results import twin
 from mauvecl.results.channels import plan_channels
@@ -65,13 +65,56 @@ def test_false_alarms_and_power_with_the_unknown_drawn(engine: Engine, sd: float
         for fap in (0.1, 0.01):
             cut = marginal.closed_form(name, template=0).isf(fap)
             error = np.sqrt(fap * (1 - fap) / 100_000)
-            # The last term: the closed form is for Gaussian noise, and the dark's response bends within 0.1 deg C.
-            assert abs(marginal.false_alarm_probability(cut, name).value - fap) < 4.5 * error + 0.02 * fap
+            assert abs(marginal.false_alarm_probability(cut, name).value - fap) < 4.5 * error
             naive = plain.false_alarm_probability(plain.closed_form(name, template=0).isf(fap), name).value
             assert naive > 2 * fap
         (power,) = marginal.detection_probability(0.01, name)
         wanted = marginal.closed_form(name, 0).sf(marginal.closed_form(name, template=0).isf(0.01))
-        assert abs(power.value - wanted) < 4.5 * np.sqrt(max(wanted * (1 - wanted), 1e-3) / 100_000) + 0.003
+        assert abs(power.value - wanted) < 4.5 * np.sqrt(max(wanted * (1 - wanted), 1e-3) / 100_000)
+
+
+def _prior(centre: float, sd: float) -> Normal:
+    return Normal(centre, sd, centre - 5 * sd, centre + 5 * sd)
+
+
+#: Star, flares, what is marginalised over, what is drawn: Gaussian priors, and others.
+DRAWN = {
+    "half a degree": (("G2V", 7.4, (0.1, 0.02)), {"dark": 0.5}, Processes(detector_temperature=_prior(21.0, 0.5))),
+    "half a degree, projected out": (
+        ("G2V", 7.4, (0.1, 0.02)), {"dark": FREE}, Processes(detector_temperature=_prior(21.0, 0.5))
+    ),
+    "light of a bright star": (("K3V", 3.7, (0.003, 0.0003)), {"light": 0.02}, Processes(qe_scale=_prior(1.0, 0.02))),
+    "all that is usual": (
+        ("G2V", 7.4, (0.1, 0.02)),
+        {"dark": FREE, "light": FREE, "sky": 0.1, "tilt": FREE},
+        Processes(None, Uniform(0.0, 0.05), _prior(21.0, 0.5), sky_level=_prior(1.0, 0.1)),
+    ),
+    "uniform light": (("K3V", 5.0, (0.01, 0.001)), {"light": 0.09}, Processes(light_loss=Uniform(0.24, 0.44))),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", DRAWN)
+def test_closed_forms_integrate_over_what_is_drawn(engine: Engine, case: str) -> None:
+    """False alarms and detections at the closed forms' thresholds, within 4.5 standard errors and 1e-5.
+
+    Some 20 values in each of five cases, many of them tied: by chance less than one run in 1500 fails.
+    """
+    (name, magnitude, amplitudes), nuisances, processes = DRAWN[case]
+    quiet, *flares = star(name, magnitude, amplitudes=amplitudes)
+    n = 100_000
+    found = engine.detect(quiet, flares, realisations=n, seed=3, nuisances=nuisances, processes=processes)
+    powers = []
+    for statistic in ("chi2", "chi2_element", "matched"):
+        for flare in range(len(flares)):
+            cut = found.closed_form(statistic, template=flare).isf(0.01)
+            alarms = found.false_alarm_probability(cut, statistic, template=flare).value
+            assert abs(alarms - 0.01) < 4.5 * np.sqrt(0.01 * 0.99 / n)
+            power = found.closed_form(statistic, flare).sf(cut)
+            seen = found.distribution(statistic, flare).above(cut) / n
+            assert abs(seen - power) < 4.5 * np.sqrt(power * (1 - power) / n) + 1e-5
+            powers.append(power)
+    # Some of them say something.
+    assert sum(0.05 < power < 0.99 for power in powers) >= 2
 
 
 def test_requests_carry_what_is_unknown(engine: Engine) -> None:
