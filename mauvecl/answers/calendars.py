@@ -29,7 +29,12 @@ class Entry:
 
 def calendar_bytes(entries: Iterable[Entry], name: str) -> bytes:
     """A calendar as the bytes of an .ics file."""
-    lines = ["BEGIN:VCALENDAR", "VERSION:2.0", f"PRODID:-//mauvecl//mauvecl {VERSION}//EN", f"X-WR-CALNAME:{_text(name)}"]
+    lines = [
+        "BEGIN:VCALENDAR",
+        "VERSION:2.0",
+        f"PRODID:-//mauvecl//mauvecl {VERSION}//EN",
+        f"X-WR-CALNAME:{_text(name)}",
+    ]
     for entry in entries:
         unique = hashlib.sha256("\0".join((entry.start, entry.stop, entry.title)).encode()).hexdigest()[:24]
         lines += [

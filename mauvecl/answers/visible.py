@@ -105,7 +105,9 @@ class VisibleAnswer(Answer):
         table["in_shadow"] = [
             float(one.in_shadow_s.sum() / one.length_s.sum()) if one.length_s.size else 0.0 for one in self.windows
         ]
-        table["best_month"] = [names[int(np.argmax(hours[:, k]))] if hours[:, k].any() else "" for k in range(len(self.targets))]
+        table["best_month"] = [
+            names[int(np.argmax(hours[:, k]))] if hours[:, k].any() else "" for k in range(len(self.targets))
+        ]
         away = [self.elongation_deg(k) for k in range(len(self.targets))]
         table["least_elongation"] = [float(one.min()) for one in away] * u.deg
         table["most_elongation"] = [float(one.max()) for one in away] * u.deg
@@ -121,7 +123,10 @@ class VisibleAnswer(Answer):
     def _longest_gap_d(self, k: int) -> float:
         """Days without a window."""
         one = self.windows[k]
-        ends = np.concatenate([[0.0], one.stop_s]), np.concatenate([one.start_s, [self.moments.n * self.moments.step_s]])
+        ends = (
+            np.concatenate([[0.0], one.stop_s]),
+            np.concatenate([one.start_s, [self.moments.n * self.moments.step_s]]),
+        )
         return float(np.max(ends[1] - ends[0])) / DAY_S
 
     @property
@@ -235,7 +240,9 @@ class VisibleAnswer(Answer):
             "assumptions. Stray light is not modelled."
         )
         if not self._writes_windows:
-            found.append(f"There are more than {MOST_WINDOWS} windows: their table is not written, and the calendar has days.")
+            found.append(
+                f"There are more than {MOST_WINDOWS} windows: their table is not written, and the calendar has days."
+            )
         return found
 
     def _reason(self, name: str) -> str:

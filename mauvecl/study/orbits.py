@@ -291,7 +291,9 @@ def read_targets(path: Path) -> list[dict[str, Any]]:
             if not np.ma.is_masked(value) and str(value).strip():
                 one[key] = value.item() if hasattr(value, "item") else value
         if ("ra" in one) != ("dec" in one) or ("ra" in one and "coordinates" in one):
-            raise InputError(f"{named}: row {number} has only one of ra and dec, or coordinates too, expected both or none")
+            raise InputError(
+                f"{named}: row {number} has only one of ra and dec, or coordinates too, expected both or none"
+            )
         if "ra" in one:
             one["coordinates"] = f"{one.pop('ra')} {one.pop('dec')}"
         if "name" in one:
