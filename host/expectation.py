@@ -16,6 +16,7 @@ from scipy import special
 from .errors import InputError
 from .instrument.instrument import Instrument
 from .measured_noise import below_zero
+from .quantities import number
 from .ranges import EXPOSURES, check_exposure
 from .response import Order, electrons_per_second
 from .sky import DEFAULT_SKY
@@ -479,19 +480,7 @@ def expect(
 
 
 def _seconds(exposure: Any) -> float:
-    expected = EXPOSURES
-    value = exposure
-    if isinstance(exposure, u.Quantity):
-        try:
-            value = exposure.to_value(u.s)
-        except u.UnitConversionError:
-            raise InputError(f"exposure = {exposure}, {expected}") from None
-    if isinstance(value, bool | np.bool_ | str) or np.ndim(value) != 0:
-        raise InputError(f"exposure = {exposure!r}, {expected}")
-    try:
-        seconds = float(value)
-    except (TypeError, ValueError):
-        raise InputError(f"exposure = {exposure!r}, {expected}") from None
+    seconds = number("exposure", exposure, "s", expected=EXPOSURES.removeprefix("expected "))
     check_exposure(seconds)
     return seconds
 

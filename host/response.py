@@ -115,7 +115,7 @@ def _landing(instrument: Instrument, order: Order) -> csr_array:
     landing = _line_landing(Line.of(instrument), _knots(instrument, order))
     if order == "physical":
         return landing
-    per_pixel = W_PER_NM_IN_FLAM * instrument.electrons_per_joule_cm2(instrument.wavelength_nm)
+    per_pixel = W_PER_NM_IN_FLAM * instrument.electrons_per_joule_cm2(instrument.wavelength_nm, held=True)
     scaled = landing.copy()
     scaled.data *= np.repeat(per_pixel, np.diff(landing.indptr))
     return scaled
@@ -165,7 +165,7 @@ def _gather(
     at = middle[:, None] + width[:, None] / 2 * abscissa  # (n_cell, CELL_NODES)
     mass = width[:, None] / 2 * weight
     if order == "physical":
-        mass = mass * W_PER_NM_IN_FLAM * instrument.electrons_per_joule_cm2(at)
+        mass = mass * W_PER_NM_IN_FLAM * instrument.electrons_per_joule_cm2(at, held=True)
     span = (wavelength[node + 1] - wavelength[node])[:, None]
     right = (at - wavelength[node][:, None]) / span
     in_panel = (2 * at - (panels[panel] + panels[panel + 1])[:, None]) / np.diff(panels)[panel][:, None]

@@ -6,15 +6,19 @@ import difflib
 import hashlib
 from functools import cached_property
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from ..errors import InputError
+from ..quantities import count, number, numbers
 from .curve import Curve
-from .pixel_map import PixelMap
+from .pixel_map import MOST_PIXELS, PixelMap
+
+if TYPE_CHECKING:
+    import astropy.units as u
 
 #: Energy of a photon times its wavelength, J nm, and the charge of an electron, C (exact SI values).
 HC_J_NM = 6.62607015e-34 * 299_792_458.0 * 1e9
@@ -125,7 +129,7 @@ class Instrument(BaseModel):
     couplings: Count
     light_loss: Loss
 
-    pixels: int = Field(ge=1, le=65536)
+    pixels: int = Field(ge=1, le=MOST_PIXELS)
     pixel_zero_nm: float
     dispersion_nm_per_pixel: Positive
     output_min_nm: Positive
@@ -179,7 +183,8 @@ class Instrument(BaseModel):
         Parameters
         ----------
         **changes
-            Values by name, in the unit of the name; a curve may be a `Curve`, a path or one number.
+            Values by name: Quantities of any fitting unit, or plain in the unit of the name; a curve may be a `Curve`,
+            a path or one number.
 
         Raises
         ------
@@ -187,6 +192,7 @@ class Instrument(BaseModel):
             If a name is unknown or a value out of range.
         """
         marks = {name: "U: set by the user" for name in changes if name not in LABELS}
+        changes = {name: _in_its_unit(name, value) for name, value in changes.items()}
         changed = Instrument.build({**self._values(), **changes}, self.name)
         given = {name: value.source for name in changes if isinstance(value := getattr(changed, name), Curve)}
         own = {name: source for name, source in given.items() if isinstance(changes[name], str | Path)}
@@ -295,12 +301,40 @@ class Instrument(BaseModel):
         """Solid angle of the field of view, arcsec^2."""
         return float(np.pi * self.field_of_view_radius_arcsec**2)
 
-    def efficiency(self, wavelength_nm: ArrayLike) -> Float:
+    @cached_property
+    def curves_nm(self) -> tuple[float, float]:
+        """From where to where, nm, every curve has values; flat ones have them everywhere."""
+        curves = [curve for name in CURVES if len((curve := getattr(self, name)).value) > 1]
+        first = max((curve.wavelength_nm[0] for curve in curves), default=self.output_min_nm)
+        last = min((curve.wavelength_nm[-1] for curve in curves), default=self.output_max_nm)
+        return first, last
+
+    def _within(self, wavelength: ArrayLike | u.Quantity) -> Float:
+        """Wavelengths in nm, refused outside the curves."""
+        low, high = self.curves_nm
+        return numbers("wavelength", wavelength, "nm", low=low, high=high)
+
+    def efficiency(self, wavelength_nm: ArrayLike | u.Quantity) -> Float:
         """Fraction of the light that the optics bring to the detector, quantum efficiency NOT included.
 
-        The paper's equation of the efficiency, times (1 - pointing_loss). Beyond the ends of a curve its end value
-        holds (an assumption). Shape of `wavelength_nm`.
+        The paper's equation of the efficiency, times (1 - pointing_loss).
+
+        Parameters
+        ----------
+        wavelength_nm : Quantity, or array_like in nm
+
+        Returns
+        -------
+        ndarray, shape of `wavelength_nm`
+
+        Raises
+        ------
+        InputError
+            Outside the curves (`curves_nm`).
         """
+        return self._optics(self._within(wavelength_nm))
+
+    def _optics(self, wavelength_nm: Float) -> Float:
         losses = (1 - self.coupling_loss) ** self.couplings * (1 - self.light_loss) * (1 - self.pointing_loss)
         return np.asarray(
             losses
@@ -312,22 +346,48 @@ class Instrument(BaseModel):
             * self.window_efficiency.at(wavelength_nm)
         )
 
-    def quantum_efficiency(self, wavelength_nm: ArrayLike) -> Float:
-        """Electrons per photon that reaches the detector: A/W times the photon's energy over the electron's charge."""
-        photon_j = HC_J_NM / np.asarray(wavelength_nm, np.float64)
-        return np.asarray(self.quantum_efficiency_a_per_w.at(wavelength_nm) * photon_j / ELECTRON_C)
+    def quantum_efficiency(self, wavelength_nm: ArrayLike | u.Quantity) -> Float:
+        """Electrons per photon that reaches the detector: A/W times the photon's energy over the electron's charge.
 
-    def throughput(self, wavelength_nm: ArrayLike) -> Float:
-        """End-to-end fraction, electrons per photon: `efficiency` with the quantum efficiency in it."""
+        Parameters and errors as for `efficiency`.
+        """
+        nm = self._within(wavelength_nm)
+        return np.asarray(self.quantum_efficiency_a_per_w.at(nm) * (HC_J_NM / nm) / ELECTRON_C)
+
+    def throughput(self, wavelength_nm: ArrayLike | u.Quantity) -> Float:
+        """End-to-end fraction, electrons per photon: `efficiency` with the quantum efficiency in it.
+
+        Parameters and errors as for `efficiency`.
+
+        Examples
+        --------
+        >>> import astropy.units as u
+        >>> from mauvecl import Instrument
+        >>> mauve = Instrument.load("mauve")
+        >>> float(mauve.throughput(300).round(3)), float(mauve.throughput(0.3 * u.um).round(3))
+        (0.133, 0.133)
+        """
         return self.efficiency(wavelength_nm) * self.quantum_efficiency(wavelength_nm)
 
-    def effective_area_cm2(self, wavelength_nm: ArrayLike) -> Float:
-        """Collecting area times throughput, cm^2 (electrons per photon per cm^2)."""
+    def effective_area_cm2(self, wavelength_nm: ArrayLike | u.Quantity) -> Float:
+        """Collecting area times throughput, cm^2 (electrons per photon per cm^2).
+
+        Parameters and errors as for `efficiency`.
+        """
         return self.collecting_area_cm2 * self.throughput(wavelength_nm)
 
-    def electrons_per_joule_cm2(self, wavelength_nm: ArrayLike) -> Float:
-        """Electrons per energy at the telescope's entrance, e- / (J cm^-2): area * efficiency * QE[A/W] / e."""
-        per_joule = self.efficiency(wavelength_nm) * self.quantum_efficiency_a_per_w.at(wavelength_nm) / ELECTRON_C
+    def electrons_per_joule_cm2(self, wavelength_nm: ArrayLike | u.Quantity, *, held: bool = False) -> Float:
+        """Electrons per energy at the telescope's entrance, e- / (J cm^-2): area * efficiency * QE[A/W] / e.
+
+        Parameters and errors as for `efficiency`, and
+
+        Parameters
+        ----------
+        held : bool
+            Beyond the ends of a curve its end value holds (an assumption), instead of a refusal.
+        """
+        nm = numbers("wavelength", wavelength_nm, "nm", low=0.0) if held else self._within(wavelength_nm)
+        per_joule = self._optics(nm) * self.quantum_efficiency_a_per_w.at(nm) / ELECTRON_C
         return self.collecting_area_cm2 * per_joule
 
     @cached_property
@@ -345,6 +405,35 @@ class Instrument(BaseModel):
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, Instrument) and self.digest == other.digest
+
+
+#: Ends of names, and the unit that they mean; names without one are fractions, or counts.
+UNITS = {
+    "_dn_per_s": "DN / s",
+    "_per_c": "1 / K",
+    "_nm_per_pixel": "nm / pix",
+    "_a_per_w": "A / W",
+    "_uv_per_electron": "uV / electron",
+    "_cm2": "cm2",
+    "_arcsec": "arcsec",
+    "_nm": "nm",
+    "_dn": "DN",
+    "_v": "V",
+    "_c": "deg_C",
+    "_s": "s",
+}
+
+
+def _in_its_unit(name: str, value: Any) -> Any:
+    """A number or Quantity as a plain number in the unit of its name; anything else as it is."""
+    field = Instrument.model_fields.get(name)
+    kind = None if field is None else field.annotation
+    quantity = hasattr(value, "unit") and not isinstance(value, Curve)
+    if kind is int and (quantity or isinstance(value, float | np.number)):
+        return count(name, value)
+    if quantity or isinstance(value, np.number):
+        return number(name, value, next((unit for end, unit in UNITS.items() if name.endswith(end)), ""))
+    return value
 
 
 #: What only labels an instrument, and measures nothing.

@@ -12,9 +12,12 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from ..files.ecsv import read_ecsv
+from ..quantities import count
 
 Float = NDArray[np.float64]
 
+#: Pixels of an array, at most.
+MOST_PIXELS = 65_536
 #: Columns of a map's file, and their units: factors on the instrument's value, or values in place of it.
 COLUMNS = {
     "response": u.dimensionless_unscaled,
@@ -143,6 +146,7 @@ class PixelMap:
         hot_share, hot_dark : float
             Share of hot pixels, and the factor on their dark.
         """
+        pixels, seed = count("pixels", pixels, low=1, high=MOST_PIXELS), count("seed", seed)
         generator = np.random.default_rng(seed)
         response = np.exp(generator.normal(0.0, response_rms, pixels) - response_rms**2 / 2)
         dark = np.exp(generator.normal(0.0, dark_rms, pixels) - dark_rms**2 / 2)

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import resources
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import astropy.units as u
 import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
+from ..quantities import number
 from .helioecliptic import HelioEcliptic, helioecliptic
 
 if TYPE_CHECKING:
@@ -65,10 +66,9 @@ class Sky:
         InputError
             If it is not a finite number of mag arcsec^-2 between 5 and 35.
         """
-        value = _magnitude(brightness)
         low, high = RANGE_MAG_ARCSEC2
-        if not low <= value <= high:
-            raise InputError(f"sky brightness = {value:g}, expected {low:g} to {high:g} mag/arcsec2")
+        expected = f"a finite number of mag/arcsec2, {low:g} to {high:g}"
+        value = number("sky brightness", brightness, "mag / arcsec2", low=low, high=high, expected=expected)
         return cls(value, f"fixed V = {value:.2f} mag/arcsec2")
 
     @classmethod
@@ -104,20 +104,21 @@ class Sky:
             f"{place.separation_deg:.1f} deg from the Sun ({lookup})",
         )
 
-    def total_magnitude(self, field_of_view_arcsec2: float) -> float | None:
+    def total_magnitude(self, field_of_view_arcsec2: u.Quantity | float) -> float | None:
         """V of the whole field of view: V_zodi - 2.5 log10(area), or None without a sky."""
+        area = number("field of view", field_of_view_arcsec2, "arcsec2", low=1e-6, high=1e12)
         if self.surface_brightness is None:
             return None
-        return float(self.surface_brightness - 2.5 * np.log10(field_of_view_arcsec2))
+        return float(self.surface_brightness - 2.5 * np.log10(area))
 
-    def spectrum(self, field_of_view_arcsec2: float) -> Source | None:
+    def spectrum(self, field_of_view_arcsec2: u.Quantity | float) -> Source | None:
         """Light of the whole field of view: the CALSPEC Sun at the total V, or None without a sky.
 
         The paper scales HD 87646, a G2V star; zodiacal light is scattered sunlight with little reddening.
 
         Parameters
         ----------
-        field_of_view_arcsec2 : float
+        field_of_view_arcsec2 : Quantity or float
             Solid angle, arcsec^2.
         """
         total = self.total_magnitude(field_of_view_arcsec2)
@@ -130,22 +131,6 @@ def _sunlight(magnitude: float) -> Source:
     from ..stars.source import Source
 
     return Source.from_library("Sun").at_magnitude(magnitude)
-
-
-def _magnitude(brightness: Any) -> float:
-    expected = "expected a finite number of mag/arcsec2"
-    if isinstance(brightness, u.Quantity):
-        try:
-            brightness = brightness.to_value(u.mag / u.arcsec**2)
-        except u.UnitConversionError:
-            raise InputError(f"sky brightness = {brightness}, {expected}") from None
-    try:
-        value = float(brightness)
-    except (TypeError, ValueError):
-        raise InputError(f"sky brightness = {brightness!r}, {expected}") from None
-    if isinstance(brightness, bool | str) or not np.isfinite(value):
-        raise InputError(f"sky brightness = {brightness!r}, {expected}")
-    return value
 
 
 @dataclass(frozen=True)

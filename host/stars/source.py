@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
+from ..quantities import number
 from ..ranges import check_magnitude
 from ..spectra.ends import (
     SPAN_NM,
@@ -226,9 +227,7 @@ class Source:
         InputError
             For an impossible width.
         """
-        width = _number("bin", width_nm, "nm")
-        if not 0.01 <= width <= 50.0:
-            raise InputError(f"bin = {width!r} nm, expected 0.01 to 50")
+        width = number("bin", width_nm, "nm", low=0.01, high=50.0)
         first, last = self.wavelength_nm[0], self.wavelength_nm[-1]
         edges = np.append(np.arange(first, last - width / 2, width), last)
         flux = means(self.wavelength_nm, self.flux_flam, edges)
@@ -346,15 +345,22 @@ class Source:
         inside = (self.wavelength_nm >= low) & (self.wavelength_nm <= high)
         return bands.magnitude(self.wavelength_nm[inside], self.flux_flam[inside], band, system)
 
-    def at_magnitude(self, magnitude: float, band: str = "V", system: bands.System = "catalogue") -> Self:
+    def at_magnitude(self, magnitude: u.Quantity | float, band: str = "V", system: bands.System = "catalogue") -> Self:
         """The same star at another magnitude: F 10**(-0.4 (m - m0)) (the paper's equation 1).
+
+        Parameters
+        ----------
+        magnitude : Quantity or float in mag
+        band : str
+        system : {"catalogue", "vega", "ab"}
+            See `magnitude`.
 
         Raises
         ------
         InputError
             As `magnitude`, or for a magnitude outside -30 to 40.
         """
-        magnitude = _number("magnitude", magnitude, "mag")
+        magnitude = number("magnitude", magnitude, "mag")
         check_magnitude(magnitude)
         factor = 10.0 ** (-0.4 * (magnitude - self.magnitude(band, system)))
         scaled = self._changed(self.flux_flam * factor, f"scaled to {bands.band(band).name} = {magnitude:g}")
@@ -362,7 +368,7 @@ class Source:
 
     def flaring(
         self,
-        amplitude: float,
+        amplitude: u.Quantity | float,
         temperature: u.Quantity | float = 10_000.0,
         *,
         band: str = "Kepler",
@@ -373,7 +379,7 @@ class Source:
 
         Parameters
         ----------
-        amplitude : float
+        amplitude : Quantity or float
             Relative rise of the photons in the band: 0.24 is 24 %.
         temperature : Quantity or float in K
         band : str
@@ -386,10 +392,10 @@ class Source:
         InputError
             For an impossible value, or a band that the spectrum does not cover.
         """
-        amplitude, kelvin = _number("flare amplitude", amplitude), _number("temperature", temperature, "K")
+        amplitude, kelvin = number("flare amplitude", amplitude), number("flare temperature", temperature, "K")
         photosphere = self.temperature_k
         if photosphere_temperature is not None:
-            photosphere = _number("photosphere temperature", photosphere_temperature, "K")
+            photosphere = number("photosphere temperature", photosphere_temperature, "K")
         flux = with_flare(
             self.wavelength_nm,
             self.flux_flam,
@@ -404,12 +410,12 @@ class Source:
             title += f" photosphere of {photosphere:g} K"
         return self._changed(flux, title)
 
-    def reddened(self, ebv: float, *, rv: float = 3.1, law: str = "G23") -> Self:
+    def reddened(self, ebv: u.Quantity | float, *, rv: float = 3.1, law: str = "G23") -> Self:
         """The star behind dust (needs the extra ``extinction``).
 
         Parameters
         ----------
-        ebv : float
+        ebv : Quantity or float in mag
             Colour excess E(B-V), 0 to 10 mag.
         rv : float
             A_V / E(B-V).
@@ -429,9 +435,7 @@ class Source:
             ) from error
         import astropy.units as u
 
-        ebv, rv = _number("E(B-V)", ebv, "mag"), _number("R_V", rv)
-        if not (np.isfinite(ebv) and 0.0 <= ebv <= 10.0):
-            raise InputError(f"E(B-V) = {ebv!r}, expected 0 to 10")
+        ebv, rv = number("E(B-V)", ebv, "mag", low=0.0, high=10.0), number("R_V", rv)
         if law not in ("G23", "F19", "CCM89"):
             raise InputError(f"extinction law = {law!r}, expected 'G23', 'F19' or 'CCM89'")
         try:
@@ -449,17 +453,3 @@ class Source:
 
     def _changed(self, flux: NDArray[np.float64], what: str) -> Self:
         return replace(self, flux_flam=flux, history=(*self.history, what))
-
-
-def _number(what: str, value: u.Quantity | float, unit: str = "") -> float:
-    """One number, from a Quantity in the unit or a plain one."""
-    import astropy.units as u
-
-    try:
-        if isinstance(value, str):
-            raise TypeError("text")
-        return float(value.to_value(unit)) if isinstance(value, u.Quantity) else float(value)
-    except (u.UnitConversionError, TypeError, ValueError) as error:
-        shown = str(value) if isinstance(value, u.Quantity) else repr(value)
-        names = {"K": "kelvin", "mag": "magnitudes", "nm": "nm", "": "a number"}
-        raise InputError(f"{what} = {shown}, expected {names[unit]}") from error

@@ -9,12 +9,14 @@ import numpy as np
 
 from mauvecl.answers.answer import Answer
 from mauvecl.host.errors import InputError
+from mauvecl.host.quantities import number
 from mauvecl.study.labels import described, label, told
 from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.sections import Star
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
+    import astropy.units as u
     from astropy.table import QTable, Table
 
     from mauvecl.host.expectation import Expectation
@@ -121,7 +123,7 @@ def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
 
 
 def exposure_for(
-    study: Study, snr: float | None = None, wavelength_nm: float | None = None, *, per: Per | None = None
+    study: Study, snr: float | None = None, wavelength_nm: u.Quantity | float | None = None, *, per: Per | None = None
 ) -> ExposureResult:
     """The fewest frames whose closed-form S/N at a wavelength reaches a wanted one.
 
@@ -129,7 +131,8 @@ def exposure_for(
     ----------
     study : Study
         Its exposure does not matter.
-    snr, wavelength_nm : float, optional
+    snr : float, optional
+    wavelength_nm : Quantity, or float in nm, optional
         In place of those of the study's ``signal``.
     per : {"element", "pixel"}, optional
         A resolution element of 10.5 nm, or one pixel.
@@ -139,6 +142,8 @@ def exposure_for(
     InputError
         For an S/N that no exposure up to 1e7 s reaches, or a wavelength outside the spectrum.
     """
+    if wavelength_nm is not None:
+        wavelength_nm = number("wavelength", wavelength_nm, "nm")
     study = study.with_changes({"signal": {"snr": snr, "wavelength_nm": wavelength_nm, "per": per}}, None, "exposure")
     snr, wavelength_nm, per = study.signal.snr, study.signal.wavelength_nm, study.signal.per
     if snr is None or wavelength_nm is None:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.answer import Answer
 from mauvecl.host.plotting import picture
+from mauvecl.host.quantities import count
 from mauvecl.noise.components import components
 from mauvecl.study.labels import described, label, told
 from mauvecl.study.study import Study
@@ -75,6 +76,7 @@ class SimulateAnswer(Answer):
 
 def simulate(study: Study, *, realisation: int = 0, flaring: bool = False) -> SimulateAnswer:
     """One observation of every star of a study, taken apart; with its flares too where asked."""
+    realisation = count("realisation", realisation)
     observations, everything = [], []
     for star in study.star:
         xs = study.expectations(star) if flaring else study.expect([star.source()])

@@ -23,7 +23,15 @@ from mauvecl.results.channels import plan_channels
 from mauvecl.results.detection import Detection
 from mauvecl.results.fap import Tails
 from mauvecl.results.hypotheses import Hypotheses
-from mauvecl.results.requests import Countable, DetectRequest, RealiseRequest, Share, SnrRequest
+from mauvecl.results.requests import (
+    Countable,
+    DetectRequest,
+    RealiseRequest,
+    Share,
+    SnrRequest,
+    checked,
+    expectation_of,
+)
 from mauvecl.results.snr import Counts, SnrResult, elements, observers
 from mauvecl.results.sums import Arrays, DetectionSums, SnrSums, packed_detection, packed_snr
 from mauvecl.results.tally import TailSamples, Tally
@@ -156,8 +164,8 @@ class Engine:
         raw : ndarray of uint16 or int32, shape (count, n_pixel)
         clipped : ndarray of uint32, shape (count,)
         """
-        self._check(start, count, seed)
-        scene = prepare([expectation], **drawing)
+        start, count, seed = self._checked(start, count, seed)
+        scene = prepare([expectation_of("what is drawn", expectation)], **drawing)
         narrow = scene.n_frames == 1 and expectation.adc_max_dn < 2**16
         shape, dtype = (count, scene.n_pixel), np.dtype(np.uint16 if narrow else np.int32)
         if scene.n_frames * expectation.adc_max_dn >= 2**31:
@@ -211,7 +219,7 @@ class Engine:
         """
         request = SnrRequest(expectation, realisations, seed, start, Drawing(**drawing))
         sums = SnrSums(request)
-        sums.add(0, packed_snr(self._snr(request, Share(0, start, realisations))))
+        sums.add(0, packed_snr(self._snr(request, Share(0, request.start, request.realisations))))
         return sums.answer()
 
     def count(self, request: Countable, share: Share, *, out: NDArray[Any] | None = None) -> Arrays:
@@ -245,7 +253,7 @@ class Engine:
         raise TypeError(f"{type(request).__name__}, expected a request")
 
     def _snr(self, request: SnrRequest, share: Share) -> Counts:
-        self._check(share.start, share.count, request.seed)
+        self.opened.check_process()
         scene, observed = request.scene, elements(request.expectation)
         counts = Counts(scene.n_pixel, len(observed))
         with scene_launches(self.opened, scene, request.seed, chunk=ELEMENT_CHUNK) as launches:
@@ -257,7 +265,7 @@ class Engine:
     def detect(
         self,
         quiet: Expectation,
-        flares: Sequence[Expectation],
+        flares: Sequence[Expectation] | Expectation,
         *,
         realisations: int,
         seed: int,
@@ -274,13 +282,13 @@ class Engine:
         ----------
         quiet : Expectation
             The star without a flare; its mean is the template.
-        flares : sequence of Expectation
+        flares : sequence of Expectation, or one
             The same star, instrument and exposure with flares; without any only the null is drawn.
         realisations : int
             Of each scenario.
         seed : int
             0 to 2**64 - 1.
-        statistics : sequence of str or Linear
+        statistics : sequence of str or Linear, or one
             Names of `statistics.STATISTICS`, and statistics of one's own.
         start : int
             First realisation.
@@ -300,17 +308,18 @@ class Engine:
             For an unknown statistic, scenarios that do not belong together, or an impossible number, seed or mode.
         """
         how = (start, Drawing(**drawing), comparison, tails, nuisances)
-        request = DetectRequest(quiet, tuple(flares), realisations, seed, statistics, *how)
-        sums, total = DetectionSums(request), request.parts * realisations
+        request = DetectRequest(quiet, flares, realisations, seed, statistics, *how)  # type: ignore[arg-type]
+        sums, each = DetectionSums(request), request.realisations
+        total = request.parts * each
         for part in range(request.parts):
-            share = Share(part, start, realisations)
-            sums.add(part, packed_detection(*self._detection(request, share, before=part * realisations, total=total)))
+            share = Share(part, request.start, each)
+            sums.add(part, packed_detection(*self._detection(request, share, before=part * each, total=total)))
         return sums.answer()
 
     def _detection(
         self, request: DetectRequest, share: Share, *, before: int = 0, total: int | None = None
     ) -> tuple[Tally, list[TailSamples | None]]:
-        self._check(share.start, share.count, request.seed)
+        self.opened.check_process()
         plan, scene = request.plans[share.part]
         tally, samples = Tally(plan.grids), plan.tails()
         with detection_launches(self.opened, scene, request.seed, plan, request.hypotheses) as launches:
@@ -329,7 +338,7 @@ class Engine:
     def statistic_values(
         self,
         quiet: Expectation,
-        flares: Sequence[Expectation],
+        flares: Sequence[Expectation] | Expectation,
         *,
         start: int = 0,
         count: int,
@@ -360,11 +369,14 @@ class Engine:
         InputError
             As `detect`, and for more flares than one launch holds.
         """
-        self._check(start, count, seed)
+        start, count, seed = self._checked(start, count, seed)
+        # As a request takes it, flares or one flare.
+        asked_for = DetectRequest(quiet, flares, count, seed, statistics)  # type: ignore[arg-type]
+        flares, statistics = asked_for.flares, asked_for.statistics
         scene = prepare([quiet, *flares], comparison=comparison, **drawing)
         if len(flares) >= BATCH[scene.frames]:
             raise InputError(f"{len(flares)} flares, expected at most {BATCH[scene.frames] - 1} in one launch")
-        asked = Hypotheses(quiet, tuple(flares), statistics, scene, nuisances=known(nuisances, quiet))
+        asked = Hypotheses(quiet, flares, statistics, scene, nuisances=known(nuisances, quiet))
         plan = plan_channels(asked, range(len(flares)), first=True)
         out = np.empty((plan.n_rows, count), np.float32)
 
@@ -377,11 +389,8 @@ class Engine:
             self._tiles.over(start, count, 4 * plan.n_rows, work)
         return out
 
-    def _check(self, start: int, count: int, seed: int) -> None:
+    def _checked(self, start: int, count: int, seed: int) -> tuple[int, int, int]:
+        """Whole numbers, in a process that may draw."""
         self.opened.check_process()
-        if count < 1:
-            raise InputError(f"realisations = {count}, expected at least 1")
-        if not 0 <= start < 2**63 - count:
-            raise InputError(f"start = {start}, expected 0 to 2**63 - 1")
-        if not 0 <= seed < 2**64:
-            raise InputError(f"seed = {seed}, expected 0 to 2**64 - 1")
+        whole = checked(count, seed, start)
+        return whole["start"], whole["realisations"], whole["seed"]

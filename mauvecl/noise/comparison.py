@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Literal, Self
 
 from mauvecl.host.errors import InputError
+from mauvecl.host.quantities import count
 
 Variances = Literal["model", "estimated"]
 
@@ -27,6 +28,9 @@ class Comparison:
 
     exposures: int = 0
     estimated: bool = False
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "exposures", count("exposures", self.exposures, high=MOST_EXPOSURES))
 
     @classmethod
     def of(cls, reference: str = "template", variances: str = "model") -> Self:

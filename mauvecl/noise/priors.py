@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
+from mauvecl.host.quantities import number
 from mauvecl.noise import layout
 
 Float = NDArray[np.float64]
@@ -17,14 +18,24 @@ Float = NDArray[np.float64]
 FURTHEST = 1e5
 
 
+def _make_plain(prior: object, *names: str) -> None:
+    """Values of a prior that came with a unit as plain numbers."""
+    for name in names:
+        value = getattr(prior, name)
+        if hasattr(value, "unit"):
+            unit = "" if value.unit.is_unity() or value.unit.physical_type == "dimensionless" else "deg_C"
+            object.__setattr__(prior, name, number(f"{name} of a prior", value, unit))
+
+
 @dataclass(frozen=True)
 class Uniform:
-    """A prior that is flat between two values."""
+    """A prior that is flat between two values: plain, or Quantities where they are temperatures (kept in deg C)."""
 
     low: float
     high: float
 
     def __post_init__(self) -> None:
+        _make_plain(self, "low", "high")
         if not (np.isfinite(self.low) and np.isfinite(self.high) and self.low <= self.high):
             raise InputError(f"a uniform prior from {self.low:g} to {self.high:g}, expected low <= high, both finite")
 
@@ -38,7 +49,7 @@ class Uniform:
 
 @dataclass(frozen=True)
 class Normal:
-    """A normal prior, cut at `low` and `high`."""
+    """A normal prior, cut at `low` and `high`; values as for `Uniform`, a plain `sd` in deg C."""
 
     mean: float
     sd: float
@@ -46,6 +57,7 @@ class Normal:
     high: float
 
     def __post_init__(self) -> None:
+        _make_plain(self, "mean", "low", "high")
         if not (self.sd > 0 and np.isfinite([self.mean, self.sd, self.low, self.high]).all() and self.low < self.high):
             raise InputError(
                 f"a normal prior of mean {self.mean:g}, sd {self.sd:g}, cut at {self.low:g} and {self.high:g}, "

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
+from mauvecl.host.quantities import count, number
 from mauvecl.noise import layout
 from mauvecl.noise.priors import Normal, Prior, Uniform, table_of
 from mauvecl.noise.varied import VARIED, Conditions, Modulated
@@ -46,6 +47,9 @@ class CosmicRays:
     weights: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
+        object.__setattr__(self, "rate_per_cm2_s", number("cosmic-ray rate", self.rate_per_cm2_s, "1 / (cm2 s)"))
+        object.__setattr__(self, "area_cm2", number("detector area", self.area_cm2, "cm2"))
+        object.__setattr__(self, "pixels", count("pixels", self.pixels, low=1))
         low, high = self.electrons
         if not (0 <= self.rate_per_cm2_s <= 1e6 and 0 < self.area_cm2 < 1e4 and self.pixels > 0):
             raise InputError(
@@ -71,6 +75,7 @@ class CosmicRays:
         """
         from scipy import special
 
+        seconds = number("time", seconds, "s", low=0.0)
         low, high = (int(e) for e in self.electrons)
         hits = self.rate_per_cm2_s * self.area_cm2 / self.pixels * seconds
         most = 1

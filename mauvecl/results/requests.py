@@ -11,7 +11,9 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, ClassVar, Protocol, Self
 
+from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
+from mauvecl.host.quantities import count
 from mauvecl.noise.comparison import TEMPLATE, Comparison
 from mauvecl.noise.drawing import AUTOMATIC, Drawing, DrawingWords
 from mauvecl.noise.scene import BATCH, Scene, prepare
@@ -37,6 +39,37 @@ class Share:
         return f"{self.part}-{self.start}-{self.count}"
 
 
+def expectation_of(what: str, given: Any) -> Expectation:
+    """The expectation that is given, or one sentence for what is none.
+
+    Raises
+    ------
+    InputError
+    """
+    if not isinstance(given, Expectation):
+        kind = type(given).__name__
+        raise InputError(
+            f"{what} is of the type {kind}, expected an Expectation, as `expect(source, instrument)` makes"
+        )
+    return given
+
+
+def checked(realisations: Any, seed: Any, start: Any) -> dict[str, int]:
+    """The numbers of a request, whole.
+
+    Raises
+    ------
+    InputError
+        For what is no whole number, or impossible.
+    """
+    number = count("realisations", realisations, low=1)
+    return {
+        "realisations": number,
+        "seed": count("seed", seed, high=2**64 - 1),
+        "start": count("start", start, high=2**63 - 1 - number),
+    }
+
+
 class Asked:
     """What travels to a worker: the question without anything made of it."""
 
@@ -52,8 +85,21 @@ class Asked:
         return {each.name: getattr(self, each.name) for each in fields(self)}  # type: ignore[arg-type]
 
 
+class _Drawn(Asked):
+    """Realisations of expectations: whatever was given for a number is whole, and an expectation is one."""
+
+    def __post_init__(self) -> None:
+        given = vars(self)
+        for name, value in checked(given["realisations"], given["seed"], given["start"]).items():
+            object.__setattr__(self, name, value)
+        self._check_stars()
+
+    def _check_stars(self) -> None:
+        expectation_of("what is drawn", vars(self)["expectation"])
+
+
 @dataclass(frozen=True, eq=False)
-class DetectRequest(Asked):
+class DetectRequest(_Drawn):
     """What `Engine.detect` takes; parameters as there."""
 
     quiet: Expectation
@@ -67,7 +113,15 @@ class DetectRequest(Asked):
     tails: Tails = "counted"
     nuisances: Nuisances | Mapping[str, float] | None = None
 
-    def __post_init__(self) -> None:
+    def _check_stars(self) -> None:
+        # One flare needs no list of its own.
+        flares = (self.flares,) if isinstance(self.flares, Expectation) else tuple(self.flares)
+        expectation_of("the quiescent star", self.quiet)
+        for number, flare in enumerate(flares):
+            expectation_of(f"flare {number + 1}", flare)
+        object.__setattr__(self, "flares", flares)
+        if isinstance(self.statistics, str | Linear):
+            object.__setattr__(self, "statistics", (self.statistics,))
         object.__setattr__(self, "nuisances", known(self.nuisances, self.quiet))
 
     @cached_property
@@ -100,7 +154,7 @@ class DetectRequest(Asked):
 
 
 @dataclass(frozen=True, eq=False)
-class SnrRequest(Asked):
+class SnrRequest(_Drawn):
     """What `Engine.snr` takes; parameters as there."""
 
     expectation: Expectation
@@ -123,7 +177,7 @@ class SnrRequest(Asked):
 
 
 @dataclass(frozen=True, eq=False)
-class RealiseRequest(Asked):
+class RealiseRequest(_Drawn):
     """What `Engine.realise` takes; parameters as there. One share: callers ask for as much as travels well."""
 
     expectation: Expectation

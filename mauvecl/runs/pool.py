@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
 from mauvecl.device.tiles import Progress
+from mauvecl.host.quantities import count as whole
 from mauvecl.lightcurve.requests import StaresRequest, StareSums
 from mauvecl.results.requests import Countable, DetectRequest, RealiseRequest, Share, SnrRequest
 from mauvecl.results.sums import Arrays, DetectionSums, SnrSums
@@ -233,7 +234,7 @@ class Pool:
 
     def expect(self, realisations: int) -> None:
         """Announce how much will be asked for, so that the time left can be told from the beginning."""
-        self._expected = self._total + realisations
+        self._expected = self._total + whole("realisations", realisations)
 
     def stop(self) -> None:
         """End everything that is under way, in other threads too."""
@@ -258,9 +259,9 @@ class Pool:
         total = max(self._total, self._expected)
         return Standing(self._done + partly, total, self._shares, self._of, self.workers.retries, self._resumed)
 
-    def detect(self, quiet: Expectation, flares: Sequence[Expectation], **how: Any) -> Detection:
+    def detect(self, quiet: Expectation, flares: Sequence[Expectation] | Expectation, **how: Any) -> Detection:
         """As `Engine.detect`, with the same keywords."""
-        request = DetectRequest.of(quiet, tuple(flares), **how)
+        request = DetectRequest.of(quiet, flares, **how)
         sums = DetectionSums(request)
         self._add_up(request, sums)
         return sums.answer()
@@ -283,7 +284,7 @@ class Pool:
     ) -> NDArray[Any]:
         """As `Engine.realise`, with the same keywords, by one worker; several calls at a time keep all of them busy."""
         request = RealiseRequest.of(expectation, count, **how)
-        share = Share(0, request.start, count)
+        share = Share(0, request.start, request.realisations)
         future = self.workers.submit(request, uuid.uuid4().hex, share, lambda done: None, out)
         rows: NDArray[Any] = future.result()["rows"]
         if out is None or rows is out:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
+from mauvecl.host.quantities import count as whole
 from mauvecl.runs.durable import UNFINISHED, alone, write_whole
 from mauvecl.runs.pool import Pool, together
 from mauvecl.store.export import Selection, export
@@ -52,6 +53,7 @@ def draw(
     ndarray of uint16 or int32, shape (count, n_pixel), or (count, n_frame, n_pixel) where frames are kept apart
         Raw DN.
     """
+    start, count = whole("start", start), whole("count", count, low=1)
     how = study.drawing | {"start": start, "count": count, "seed": study.run.seed}
     if scene.frames is None:
         return engine.realise(scene.expectation, out=out, **how)

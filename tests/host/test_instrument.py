@@ -100,7 +100,7 @@ def test_a_changed_copy(mauve: Instrument) -> None:
         ({"temperature_c": "13"}, "temperature_c = '13', expected a valid number"),
         ({"frame_s": 0}, "frame_s = 0, expected greater than 0"),
         ({"light_loss": 1.0}, "light_loss = 1.0, expected less than 1"),
-        ({"pixels": 2048.5}, "pixels = 2048.5, expected a valid integer"),
+        ({"pixels": 2048.5}, "pixels = 2048.5, expected a whole number"),
         ({"dark_unit": "e-"}, "dark_unit = 'e-', expected 'DN' or 'electrons'"),
         ({"grating_efficiency": 1.5}, "grating_efficiency has a value of 1.5, expected a fraction"),
         ({"quantum_efficiency_a_per_w": 0.5}, "electrons per photon, expected at most 1"),

@@ -63,8 +63,7 @@ def brute(instrument: Instrument, wavelength: Float, flux: Float, pixel: int, or
 
     def integrand(x: float) -> float:
         own = x if order == "physical" else centre
-        area = instrument.collecting_area_cm2 * instrument.efficiency(own)
-        amperes = area * instrument.quantum_efficiency_a_per_w.at(own)
+        amperes = instrument.electrons_per_joule_cm2(own, held=True) * CHARGE_C
         share = landing(np.array(centre - x), instrument)
         # erg s^-1 cm^-2 A^-1 is 1e-6 W cm^-2 nm^-1.
         return float(np.interp(x, wavelength, flux) * 1e-6 * share * amperes / CHARGE_C)
@@ -162,7 +161,7 @@ def test_many_nodes_lose_no_flux(mauve: Instrument, order: Order) -> None:
     for pixel in (0, 700, 1642):
         centre = mauve.wavelength_nm[pixel]
         own = at if order == "physical" else centre
-        amperes = mauve.collecting_area_cm2 * mauve.efficiency(own) * mauve.quantum_efficiency_a_per_w.at(own)
+        amperes = mauve.electrons_per_joule_cm2(own, held=True) * CHARGE_C
         near = np.abs(at[:, 0] - centre) < 45
         expected = np.sum((mass * amperes)[near] * landing(centre - at[near], mauve))
         assert rate[pixel] == pytest.approx(expected, rel=1e-9)

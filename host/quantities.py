@@ -1,0 +1,132 @@
+"""Units at the door: numbers, arrays and counts, from Quantities of any fitting unit or plain in the documented one."""
+
+from __future__ import annotations
+
+import operator
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .errors import InputError
+
+#: What a unit is called in a sentence.
+WORDS = {
+    "": "a number",
+    "K": "kelvin",
+    "deg_C": "degrees Celsius",
+    "mag": "magnitudes",
+    "mag / arcsec2": "mag/arcsec2",
+    "s": "seconds",
+}
+
+
+def number(
+    what: str, value: Any, unit: str = "", *, low: float = -np.inf, high: float = np.inf, expected: str = ""
+) -> float:
+    """One finite number in a unit.
+
+    Parameters
+    ----------
+    what : str
+        What it is, for the sentence of an error.
+    value : Quantity or float
+    unit : str
+        As astropy reads it. Wavelengths may come as frequencies or energies, temperatures on any scale.
+    low, high : float
+        Where it may lie.
+    expected : str
+        What the sentence says of it; made of unit and range by default.
+
+    Raises
+    ------
+    InputError
+        If it is no such number, not finite, or outside.
+    """
+    wanted = expected or _expected(unit, low, high)
+    found = _plain(what, value, unit, wanted)
+    if found.ndim:
+        raise InputError(f"{what} = {_shown(value)}, expected {wanted}")
+    if not (np.isfinite(found) and low <= found <= high):
+        raise InputError(f"{what} = {_shown(value)}, expected {wanted}")
+    return float(found)
+
+
+def numbers(
+    what: str, values: Any, unit: str = "", *, low: float = -np.inf, high: float = np.inf
+) -> NDArray[np.float64]:
+    """An array of finite numbers in a unit, of the shape of `values`; parameters and errors as for `number`."""
+    wanted = _expected(unit, low, high)
+    found = _plain(what, values, unit, wanted)
+    bad = ~(np.isfinite(found) & (found >= low) & (found <= high))
+    if bad.any():
+        first = found[np.unravel_index(int(np.argmax(bad)), found.shape)]
+        raise InputError(f"{what} = {first:g}{f' {unit}' if unit else ''}, expected {wanted}")
+    return found
+
+
+def count(what: str, value: Any, *, low: int = 0, high: int = 2**63 - 1) -> int:
+    """A whole number: an int, a float such as 1e5 or a dimensionless Quantity that is one.
+
+    Raises
+    ------
+    InputError
+        If it is none, or outside `low` to `high`.
+    """
+    wanted = f"a whole number from {low} to {high}" if high < 2**63 - 1 else f"a whole number of at least {low}"
+    try:
+        # Whole numbers beyond 2**53 are no floats.
+        found = operator.index(_no_truth(value))
+    except TypeError:
+        plain = number(what, value, expected=wanted)
+        if not plain.is_integer():
+            raise InputError(f"{what} = {_shown(value)}, expected {wanted}") from None
+        found = int(plain)
+    if not low <= found <= high:
+        raise InputError(f"{what} = {found}, expected {wanted}")
+    return found
+
+
+def _plain(what: str, value: Any, unit: str, wanted: str) -> NDArray[np.float64]:
+    try:
+        if hasattr(value, "to_value") and hasattr(value, "unit"):
+            value = _converted(value, unit)
+        if isinstance(value, str | bytes) or np.asarray(value).dtype.kind not in "iuf":
+            raise TypeError("no number")
+        return np.asarray(value, np.float64)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise InputError(f"{what} = {_shown(value)}, expected {wanted}") from error
+
+
+def _converted(value: Any, unit: str) -> Any:
+    import astropy.units as u
+
+    # What detectors count is called DN here and adu elsewhere.
+    equivalent: Any = [(u.adu, u.DN)]
+    wanted = u.Unit(unit)
+    if wanted.is_equivalent(u.nm):
+        equivalent = u.spectral()
+    elif wanted.is_equivalent(u.K) or wanted == u.deg_C:
+        equivalent = u.temperature()
+    try:
+        return value.to_value(wanted, equivalent)
+    except u.UnitsError as error:
+        raise TypeError(str(error)) from error
+
+
+def _no_truth(value: Any) -> Any:
+    if isinstance(value, bool | np.bool_):
+        raise TypeError("true or false is no number")
+    return value
+
+
+def _expected(unit: str, low: float, high: float) -> str:
+    word = WORDS.get(unit, unit)
+    if np.isfinite(low) and np.isfinite(high):
+        return f"{low:g} to {high:g}{f' {unit}' if unit else ''}"
+    return f"{word} of at least {low:g}" if np.isfinite(low) else word
+
+
+def _shown(value: Any) -> str:
+    text = str(value) if hasattr(value, "unit") else repr(value)
+    return text if len(text) <= 60 else f"{text[:57]}..."
