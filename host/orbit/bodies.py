@@ -6,7 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.interpolate import CubicSpline
 
 from ..sky.helioecliptic import offline
 from .earth import Vectors, unit
@@ -41,6 +40,8 @@ class Bodies:
     @classmethod
     def at(cls, moments: Moments) -> Bodies:
         """At the times of a plan."""
+        from scipy.interpolate import CubicSpline
+
         midnight, days = moments.first[0], moments.julian[1]
         with offline():
             from astropy.coordinates import GeocentricTrueEcliptic, SkyCoord, get_body, get_sun

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.answer import Answer
+from mauvecl.answers.exposures import place_of
 from mauvecl.runs.pool import Pool, together
 from mauvecl.study.labels import label, stacked, titled, told
 from mauvecl.study.study import Study
@@ -32,6 +33,7 @@ class StarSnr:
     label: str
     at: Mapping[str, float | str]
     result: SnrResult
+    asked_nm: float | None = None
 
     @property
     def title(self) -> str:
@@ -40,7 +42,9 @@ class StarSnr:
 
     @property
     def shown_nm(self) -> list[float]:
-        """Those of `SHOWN_NM` that the spectrum holds."""
+        """The wavelength asked for, or those of `SHOWN_NM` that the spectrum holds."""
+        if self.asked_nm is not None:
+            return [self.asked_nm]
         first, last = self.result.expectation.wavelength_nm[[0, -1]]
         return [wavelength for wavelength in SHOWN_NM if first <= wavelength <= last]
 
@@ -123,11 +127,14 @@ def snr(study: Study, engine: Engine | Pool) -> SnrAnswer:
         for star in cell.star
         for x in cell.expect([star.source()])
     ]
-    run = study.run
+    run, asked = study.run, study.signal.wavelength_nm
+    if asked is not None:
+        for *_, x in prepared:
+            place_of(x, asked, "element")
 
     def answered(one: tuple[str, Mapping[str, float | str], Expectation]) -> StarSnr:
         name, at, x = one
-        return StarSnr(name, at, engine.snr(x, realisations=run.realisations, seed=run.seed, **study.drawing))
+        return StarSnr(name, at, engine.snr(x, realisations=run.realisations, seed=run.seed, **study.drawing), asked)
 
     if isinstance(engine, Pool):
         engine.expect(len(prepared) * run.realisations)

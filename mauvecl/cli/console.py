@@ -117,11 +117,13 @@ def show(lines: Sequence[str]) -> None:
 
 
 def show_table(title: str, columns: Sequence[str], cells: Sequence[Sequence[Any]]) -> None:
-    """A table; numbers are to be formatted already."""
+    """A table without its empty columns; numbers are to be formatted already."""
     from rich import box
     from rich.console import Console
     from rich.table import Table
 
+    filled = [i for i in range(len(columns)) if not cells or any(str(row[i]) for row in cells)]
+    columns, cells = [columns[i] for i in filled], [[row[i] for i in filled] for row in cells]
     # Names may hold brackets and colons, which are no markup here.
     how: dict[str, Any] = {"highlight": False, "markup": False, "emoji": False}
     console = Console(**how)

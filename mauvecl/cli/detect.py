@@ -49,12 +49,13 @@ def _show_detections(found: DetectAnswer) -> None:
     cells = []
     for row in found.table:
         amplitude, digits = f"{100 * row['amplitude']:g} %", (row["expected"], row["mean"])
+        reduced = "" if math.isnan(row["reduced"]) else f"{row['reduced']:.3f}"
         probability = f"{row['probability']:.4f}", f"[{row['low']:.4f}, {row['high']:.4f}]"
         if row["probability"] != row["probability"]:
             probability = "saturated", ""
         cells.append(
             (row["star"], *(short(row[name]) for name in swept), amplitude, row["statistic"],
-             *(f"{value:.2f}" for value in digits), f"{row['reduced']:.3f}", f"{row['threshold']:.2f}", *probability,
+             *(f"{value:.2f}" for value in digits), reduced, f"{row['threshold']:.2f}", *probability,
              f"{row['closed_form_probability']:.4f}")
         )  # fmt: skip
     show_table(

@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Any, NamedTuple, get_type_hints
 
 import typer
 
+from mauvecl.cli.values import amplitudes_of, as_text, axis_of, frames_of, gap_of, names_of
+
 if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
@@ -84,6 +86,20 @@ FlaresFlag = Annotated[
 ]
 FlareTemperatureFlag = Annotated[float | None, typer.Option(help="Flare temperature, K [10000].", show_default=False)]
 FlareBandFlag = Annotated[str | None, typer.Option(help="Band of the amplitude [Kepler].", show_default=False)]
+GeometryFlag = Annotated[
+    str | None,
+    typer.Option(
+        "--geometry",
+        help="A flare is added to the star, or replaces part of its photosphere [added].",
+        show_default=False,
+    ),
+]
+PhotosphereFlag = Annotated[
+    float | None,
+    typer.Option(
+        "--photosphere-temperature", help="Of the star, K, where a flare replaces some of it.", show_default=False
+    ),
+]
 RealisationsFlag = Annotated[
     int | None, typer.Option("--realisations", "-n", help="Noise realisations [1000000].", show_default=False)
 ]
@@ -93,6 +109,14 @@ StatisticFlag = Annotated[
     typer.Option(
         "--statistic",
         help="chi2, chi2_element, chi2_pair, matched, uv_excess, paper, or all; may be repeated.",
+        show_default=False,
+    ),
+]
+TailsFlag = Annotated[
+    str | None,
+    typer.Option(
+        "--tails",
+        help="Thresholds beyond what is drawn: counted (refused), or sampled with importance [counted].",
         show_default=False,
     ),
 ]
@@ -117,15 +141,7 @@ WithUnknownsFlag = Annotated[
     bool | None,
     typer.Option(
         "--with-unknowns",
-        help="Draw the documented unknowns (detector temperature, throughput, sky) and marginalise over them.",
-        show_default=False,
-    ),
-]
-StareUnknownsFlag = Annotated[
-    bool | None,
-    typer.Option(
-        "--with-unknowns",
-        help="Draw the documented unknowns of a stare: thermal cycle, pointing jitter, sky, the star's slow change.",
+        help="Draw the documented unknowns of this question, and marginalise over them.",
         show_default=False,
     ),
 ]
@@ -221,6 +237,10 @@ UnknownFlag = Annotated[
         "--unknown", help="Average over so many draws of what is unknown of the instrument [0].", show_default=False
     ),
 ]
+KnownFlag = Annotated[
+    list[str] | None,
+    typer.Option("--known", help="What of it is known after all, as in temperature_c,light_loss.", show_default=False),
+]
 XFlag = Annotated[str | None, typer.Option(help="Such as magnitude:4:10:16, or exposure=5,50,600.", show_default=False)]
 YFlag = Annotated[str | None, typer.Option(help="Such as amplitude:0.01:1:16:log.", show_default=False)]
 FramesFlag = Annotated[
@@ -279,48 +299,6 @@ class Option(NamedTuple):
     convert: Callable[[Any], Any] | None = None
 
 
-def axis_of(text: str, flag: str) -> dict[str, Any]:
-    """An axis as a word: magnitude:4:10:16, amplitude:0.01:1:16:log, or exposure=5,50,600."""
-    from mauvecl.host.errors import InputError
-
-    if "=" in text:
-        quantity, _, values = text.partition("=")
-        words = [word.strip() for word in values.split(",")]
-        try:
-            return {"quantity": quantity, "values": words if quantity == "star" else [float(word) for word in words]}
-        except ValueError as error:
-            raise InputError(f"{flag} {text!r}, expected numbers, such as {quantity}=5,50,600") from error
-    parts = text.split(":")
-    try:
-        quantity, start, stop, steps, *rest = parts
-        found = {"quantity": quantity, "start": float(start), "stop": float(stop), "steps": int(steps)}
-    except ValueError as error:
-        raise InputError(
-            f"{flag} {text!r}, expected quantity:start:stop:steps, with :log behind it if wanted, or quantity=a,b,c"
-        ) from error
-    if rest not in ([], ["log"]):
-        raise InputError(f"{flag} {text!r} ends in {':'.join(rest)!r}, expected log or nothing")
-    return found | {"log": bool(rest)}
-
-
-def gap_of(text: str) -> tuple[float, float]:
-    """A gap as a word: 1000:2000."""
-    from mauvecl.host.errors import InputError
-
-    try:
-        first, last = (float(word) for word in text.split(":"))
-    except ValueError as error:
-        raise InputError(f"--gap {text!r}, expected two times in s, such as 1000:2000") from error
-    return first, last
-
-
-def _amplitudes_of(path: Path) -> list[float]:
-    """Those of a table of flares, each once."""
-    from mauvecl.host.stars.flare_table import read_flares
-
-    return sorted({float(value) for value in read_flares(path)["amplitude"]})
-
-
 #: What every verb takes; the first ones are put together by `_stars` and `_sky`.
 OBSERVATION = {
     "star": Option(StarFlag),
@@ -340,18 +318,21 @@ OBSERVATION = {
     "when": Option(TimeFlag),
 }
 FLARE = {
-    "flares": Option(FlaresFlag, "flare", "amplitudes", _amplitudes_of),
+    "flares": Option(FlaresFlag, "flare", "amplitudes", amplitudes_of),
     "amplitude": Option(AmplitudeFlag, "flare", "amplitudes"),
     "flare_temperature": Option(FlareTemperatureFlag, "flare", "temperature_k"),
     "flare_band": Option(FlareBandFlag, "flare", "band"),
+    "geometry": Option(GeometryFlag, "flare", "geometry"),
+    "photosphere_temperature": Option(PhotosphereFlag, "flare", "photosphere_temperature_k"),
 }
 DRAWS = {
     "realisations": Option(RealisationsFlag, "run", "realisations"),
     "seed": Option(SeedFlag, "run", "seed"),
 }
 DETECTION = {
-    "statistic": Option(StatisticFlag, "run", "statistics"),
+    "statistic": Option(StatisticFlag, "run", "statistics", names_of),
     "fap": Option(FapFlag, "run", "fap"),
+    "tails": Option(TailsFlag, "run", "tails"),
     "reference": Option(ReferenceFlag, "run", "reference"),
     "variances": Option(VariancesFlag, "run", "variances"),
 }
@@ -373,7 +354,7 @@ STARE = {
     "half_width": Option(HalfWidthFlag, "stare", "half_width_s"),
     "shape": Option(ShapeFlag, "stare", "shape"),
     "energy": Option(EnergyFlag, "stare", "energies_erg"),
-    "with_unknowns": Option(StareUnknownsFlag, "nuisances", "usual"),
+    "with_unknowns": Option(WithUnknownsFlag, "nuisances", "usual"),
 }
 #: How far or large the star is; put together by `_stars`.
 SIZE = {
@@ -386,32 +367,24 @@ SIGNAL = {
     "at": Option(AtFlag, "signal", "wavelength_nm"),
     "per": Option(PerFlag, "signal", "per"),
 }
+AT = {"at": SIGNAL["at"]}
 LIMIT = {"of": Option(OfFlag, "limit", "of"), "power": Option(PowerFlag, "limit", "power")}
 MAP = {
     "x": Option(XFlag, "map", "x", partial(axis_of, flag="--x")),
     "y": Option(YFlag, "map", "y", partial(axis_of, flag="--y")),
 }
-UNKNOWN = {"unknown": Option(UnknownFlag, "unknowns", "draws")}
+UNKNOWN = {
+    "unknown": Option(UnknownFlag, "unknowns", "draws"),
+    "known": Option(KnownFlag, "unknowns", "known", names_of),
+}
 SWEEP = {
     "sweep": Option(SweepFlag, "sweep", "axes", lambda texts: [axis_of(text, "--sweep") for text in texts]),
     "as_list": Option(AsListFlag, "sweep", "how", lambda wanted: "list" if wanted else None),
 }
 
 
-def _frames_of(text: str) -> str | list[int]:
-    """Which frames are kept, as a word: stack, all, or 0,4,9."""
-    from mauvecl.host.errors import InputError
-
-    if text in ("stack", "all"):
-        return text
-    try:
-        return [int(word) for word in text.split(",")]
-    except ValueError as error:
-        raise InputError(f"--frames {text!r}, expected stack, all, or numbers such as 0,4,9") from error
-
-
 BULK = {
-    "frames": Option(FramesFlag, "bulk", "frames", _frames_of),
+    "frames": Option(FramesFlag, "bulk", "frames", frames_of),
     "components": Option(ComponentsFlag, "bulk", "components"),
 }
 SETTINGS = {"settings": Option(SetFlag)}
@@ -473,6 +446,9 @@ def takes_study(
             from mauvecl.cli.foresight import question_time, question_values
             from mauvecl.cli.session import Session
 
+            for key, (flag, read) in readers.items():
+                if values.get(key) is not None and not isinstance(values[key], int | float):
+                    values[key] = read(values[key], flag)
             given = {key: values.pop(key, None) for key in options}
             if fewer and study_file is None and given["realisations"] is None:
                 given["realisations"] = FEWER
@@ -493,6 +469,14 @@ def takes_study(
             *(p.replace(kind=named, annotation=kinds[p.name]) for p in own if p.name != "given"),
             *(inspect.Parameter(key, named, default=usual, annotation=kind) for key, (kind, usual) in around.items()),
         ]
+        readers = {}
+        for place, parameter in enumerate(parameters):
+            # Numbers come as text: whatever is wrong with one is told in one style.
+            kind, flag, read = as_text(parameter.annotation)
+            if read is not None:
+                readers[parameter.name] = flag or "--" + parameter.name.replace("_", "-"), read
+                default_text = None if parameter.default is None else f"{parameter.default:g}"
+                parameters[place] = parameter.replace(annotation=kind, default=default_text)
         command.__name__, command.__doc__ = verb.__name__, verb.__doc__
         command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         command.__annotations__ = {p.name: p.annotation for p in parameters}

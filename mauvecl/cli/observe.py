@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mauvecl.cli.console import short
-from mauvecl.cli.flags import COUNTED, DRAWS, FLARE, SIGNAL, SWEEP, takes_study
+from mauvecl.cli.flags import AT, COUNTED, DRAWS, FLARE, SIGNAL, SWEEP, takes_study
 
 if TYPE_CHECKING:
     from mauvecl.answers.exposures import ExposureResult
@@ -56,7 +56,7 @@ def _budgets_or_star(given: dict[str, Any]) -> Study:
     return Study() if named else PAPER_BUDGETS
 
 
-@takes_study(DRAWS, COUNTED, SWEEP, fewer=True, default=_budgets_or_star)
+@takes_study(DRAWS, COUNTED, AT, SWEEP, fewer=True, default=_budgets_or_star)
 def snr(
     study: Study,
     session: Session,

@@ -18,6 +18,7 @@ from mauvecl.results.roc import Roc
 from mauvecl.results.tally import Distribution, TailSamples, Tally
 from mauvecl.statistics.detection_interval import detection_interval
 from mauvecl.statistics.intervals import Interval, central_counts, clopper_pearson
+from mauvecl.statistics.statistic import LinearStatistic
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -225,7 +226,9 @@ class Detection(Hypotheses):
                 theory = self.closed_form(statistic, flare)
                 limit = self.closed_form(statistic, template=flare).isf(fap)
                 dof = self.dof(statistic)
-                of_flare, power = (theory.mean, d.mean, d.std, d.mean / dof), theory.sf(limit)
+                # A weighted sum has no degrees of freedom to be divided by.
+                reduced = np.nan if isinstance(self.statistic(statistic), LinearStatistic) else d.mean / dof
+                of_flare, power = (theory.mean, d.mean, d.std, reduced), theory.sf(limit)
                 if flare in self.blinding:
                     of_flare, power = (np.nan,) * 4, np.nan
                 row = (x.name, statistic, dof, *of_flare, cut.value, cut.low, cut.high, p.value, p.low, p.high)
@@ -263,7 +266,7 @@ DESCRIPTIONS = {
     "expected": "closed-form mean with the flare",
     "mean": "simulated mean with the flare",
     "std": "simulated standard deviation with the flare",
-    "reduced": "simulated mean over degrees of freedom",
+    "reduced": "simulated mean over degrees of freedom; none for weighted sums",
     "threshold": "simulated threshold at the false-alarm probability, per test",
     "threshold_low": "its 95 % interval, lower end",
     "threshold_high": "its 95 % interval, upper end",

@@ -127,7 +127,9 @@ def sentence(model: type[BaseModel], error: ValidationError) -> str:
         return f"unknown key {shortened(key)}, {expected}"
     if first["type"] == "value_error":
         return str(first["ctx"]["error"])
-    return f"{key} = {shown(first['input'])}: {first['msg'].lower()}"
+    told = first["msg"].removeprefix("Input should be ")
+    value = f"{key} = {shown(first['input'])}"
+    return f"{value}: {told.lower()}" if told == first["msg"] else f"{value}, expected {told}"
 
 
 def _fields(model: type[BaseModel], path: list[str]) -> Any:

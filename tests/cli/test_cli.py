@@ -398,7 +398,7 @@ BAD = {
     "realisations": (["detect", "-n", "0"], "run.realisations = 0"),
     "magnitudes": (["detect", "-m", "1", "-m", "2", "-m", "3"], "3 magnitudes for 2 stars"),
     "flag": (["detect", "--nonsense"], "nonsense"),
-    "word": (["detect", "-n", "many"], "Invalid value for '--realisations'"),
+    "word": (["detect", "-n", "many"], "--realisations 'many', expected a whole number"),
     "study": (["detect", "no.toml"], "'no.toml' does not exist"),
     "output": (["detect", "-o", "/proc/nothing"], "cannot be written"),
 }

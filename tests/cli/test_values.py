@@ -1,0 +1,57 @@
+"""Flags' values as people write them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from commands import ended
+from typer.main import get_command
+
+from mauvecl.cli.app import app
+from mauvecl.cli.values import count, several
+from mauvecl.cli.values import number as number_of
+from mauvecl.host.errors import InputError
+
+
+@pytest.mark.parametrize(
+    ("text", "value"),
+    [("1e6", 10**6), ("2.5e3", 2500), (" 7 ", 7), ("18446744073709551615", 2**64 - 1), ("-1", -1), ("1E2", 100)],
+)
+def test_counts(text: str, value: int) -> None:
+    assert count(text, "--n") == value
+
+
+@pytest.mark.parametrize("text", ["1.5", "x", "", "1e400", "nan", "inf", "1e-3", "1,000", "0x10", "1e999999999"])
+def test_what_is_no_count(text: str) -> None:
+    with pytest.raises(InputError, match=r"^--n '.*', expected a whole number, such as 1000000 or 1e6$"):
+        count(text, "--n")
+
+
+def test_lists() -> None:
+    assert several(["7,8", "9"], "--m", number_of) == [7.0, 8.0, 9.0]
+    with pytest.raises(InputError, match=r"^--m '', expected a number$"):
+        several(["7,,8"], "--m", number_of)
+
+
+def numeric() -> list[tuple[str, str]]:
+    """Verb and flag of every option that takes a number."""
+    found = []
+    for name, verb in get_command(app).commands.items():  # type: ignore[attr-defined]
+        for option in getattr(verb, "params", ()):
+            metavar: Any = getattr(option, "metavar", None)
+            if metavar and metavar.rstrip(",.") in ("NUMBER", "INTEGER"):
+                found.append((name, max(option.opts, key=len)))
+    return found
+
+
+def test_one_style_for_every_number(tmp_path: Path) -> None:
+    """One sentence with the flag, the value and what was expected, whatever flag has no number behind it."""
+    flags = numeric()
+    assert len(flags) > 60
+    for flag, verb in sorted({flag: verb for verb, flag in flags}.items()):
+        code, out, told = ended(verb, flag, "many", folder=tmp_path)
+        assert (code, out) == (2, ""), (verb, flag)
+        assert told.startswith(f"mauvecl: {flag} 'many', expected a "), told
+        assert told.count("\n") == 1
