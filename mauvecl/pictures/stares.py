@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from mauvecl.pictures.style import COLOURS, NULL, STYLE, finished, pyplot
 
 if TYPE_CHECKING:
-    from mauvecl.answers.stare import StarStare
+    from mauvecl.answers.stare import StareAnswer, StarStare
 
 Float = NDArray[np.float64]
 #: Points of a light curve, and rows of a dynamic spectrum, at most: more are means of several frames.
@@ -45,6 +46,38 @@ def light_curves(one: StarStare, path: str | Path | None = None) -> Any:
             axis.set_ylabel("relative light")
         axes[-1, 0].set_xlabel(f"time from the start of the stare ({unit})")
         figure.suptitle(f"{one.title}: one simulated stare; nominal throughput", fontsize=10)
+        return finished(figure, path)
+
+
+def beside(answers: Sequence[tuple[str, StareAnswer]], band: int = 0, path: str | Path | None = None) -> Any:
+    """One band's light curves of several answers to studies of the same stars: a row to a star, a column to an answer.
+
+    Parameters
+    ----------
+    answers : sequence of (str, StareAnswer)
+        With the title of each.
+    band : int
+        Number of the band, 0 the whole range.
+    path : str or Path, optional
+    """
+    plt = pyplot()
+    rows = len(answers[0][1].stares)
+    with plt.rc_context(STYLE):
+        figure, axes = plt.subplots(
+            rows, len(answers), figsize=(3.7 * len(answers), 1.5 * rows + 0.8), squeeze=False, sharex=True, sharey="row"
+        )
+        for column, (title, answer) in zip(axes.T, answers, strict=True):
+            for axis, one in zip(column, answer.stares, strict=True):
+                light, stare = one.light, one.staring.stare
+                scale, unit = _time(stare.duration_s)
+                level = np.median(light.mean[:, band])
+                axis.plot(stare.middle_s / scale, light.flux[:, band] / level, ".", markersize=1.5, color=COLOURS[0])
+                axis.plot(stare.middle_s / scale, light.mean[:, band] / level, color=NULL, linewidth=0.8)
+                axis.set_title(f"{one.title}, {light.bands[band]}")
+            column[0].set_title(f"{title}\n{column[0].get_title(loc='left')}")
+            column[-1].set_xlabel(f"time ({unit})")
+        for axis in axes[:, 0]:
+            axis.set_ylabel("relative light")
         return finished(figure, path)
 
 
