@@ -32,7 +32,8 @@ void stare_pixels(SCENE, STARE, const uint first_low, const uint first_high, con
         __global const float *from = flares + (size_t)(rows > 1u ? row : 0u) * ${spectra}u * staring->padded_frames + frame;
         for (uint k = 0; k < scenario_count; k++)
             for (uint j = 0; j < ${spectra}u; j++)
-                ((float *)flare[k])[j * ${width}u + i] = from[j * staring->padded_frames] * amplitudes[k * amplitude_rows + (amplitude_rows > 1u ? row : 0u)];
+                ((float *)flare[k])[j * ${width}u + i] = from[j * staring->padded_frames]
+                    * (known[6u * staring->padded_frames + frame] * amplitudes[k * amplitude_rows + (amplitude_rows > 1u ? row : 0u)]);
     }
     for (uint k = 0; k < scenario_count; k++)
         for (uint j = 0; j < ${spectra}u; j++) flare[k][j] = FMA(strengths.light, flare[k][j], flare[k][j]);

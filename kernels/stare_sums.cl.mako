@@ -70,7 +70,7 @@ void stare_sums(__global const Job *restrict job, STARE, const uint first_low, c
         for (uint k = 0; k < scenario_count; k++) {
 % if spectra:
             floatv flare[${spectra}];
-            const float amplitude = amplitudes[k * staring->amplitude_rows + (staring->amplitude_rows > 1u ? stare : 0u)];
+            const floatv amplitude = OF_FRAME(known + 6u * stride) * amplitudes[k * staring->amplitude_rows + (staring->amplitude_rows > 1u ? stare : 0u)];
             __global const float *from = flares + (size_t)(staring->flare_rows > 1u ? stare : 0u) * ${spectra}u * stride;
             for (uint j = 0; j < ${spectra}u; j++) {
                 flare[j] = OF_FRAME(from + j * stride) * amplitude;

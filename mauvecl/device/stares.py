@@ -215,6 +215,7 @@ class StareLaunches(Launches):
             in_time=self._in_time,
         )
         super().__init__(device, scene, variant, seed)
+        self._held: Any = None
         self._stare, self._local = stare, (1, 1) if variant.width > 1 else None
         self._known = [*map(self.upload, (stare.numbers, stare.known, stare.curves, stare.kinds))]
         if table is None:
@@ -223,15 +224,29 @@ class StareLaunches(Launches):
         else:
             self._own = [self.upload(table.packed)]
 
+    def __exit__(self, *_: object) -> None:
+        super().__exit__()
+        if self._held is not None:
+            self._held.release()
+
     def give(self, flares: Flares) -> None:
         """Upload the flares of the stares that are drawn next."""
         self._scenarios = len(flares.amplitudes)
         self._flares = [
             self._fill("staring", self._stare.staring_of(flares)),
             *self._known,
-            self._fill("flares", flares.rows),
+            self._shared(flares.rows) if self._device.record.kind == "cpu" else self._fill("flares", flares.rows),
             self._fill("amplitudes", flares.amplitudes),
         ]
+
+    def _shared(self, array: NDArray[Any]) -> Any:
+        """A processor's own memory, in use until the next flares are given."""
+        if self._held is not None:
+            self._held.release()
+        flags = self._cl.mem_flags
+        self._given = np.ascontiguousarray(array if array.size else np.zeros(1, array.dtype))
+        self._held = self._cl.Buffer(self._device.context, flags.READ_ONLY | flags.USE_HOST_PTR, hostbuf=self._given)
+        return self._held
 
     def _fill(self, name: str, array: NDArray[Any]) -> Any:
         data = np.ascontiguousarray(array if array.size else np.zeros(1, array.dtype))

@@ -29,6 +29,8 @@ Floats = NDArray[np.float32]
 REACH_SIGMA = 7.0
 #: Unknowns of a stare, and scenarios on common draws, of one launch.
 MOST_UNKNOWNS, MOST_SCENARIOS = 32, 16
+#: Largest amplitude of a flare.
+LARGEST = 1e12
 #: Counts further than this from their base are not rounded to whole DN by the device.
 REACH_DN = 2.0**22
 
@@ -40,7 +42,7 @@ class Flares:
     Attributes
     ----------
     rows : ndarray of float32, shape (n_row, n_flare, n_padded_frame)
-        Coefficients of the flare spectra with the known throughput; one row for all stares, or one for each.
+        Amplitude of each flare spectrum in each frame; one row for all stares, or one for each.
     amplitudes : ndarray of float32, shape (n_scenario, n_amplitude_row)
         Factors on them.
     """
@@ -58,7 +60,7 @@ class Flares:
             For shapes that do not fit, or what is negative or not finite.
         """
         n_frames, n_flares = stare.n_frames, components.n_flares
-        given = np.zeros((1, n_frames, n_flares)) if flare is None else np.asarray(flare)
+        given = np.zeros((1, n_frames, n_flares), np.float32) if flare is None else np.asarray(flare)
         if given.ndim == 2:
             given = given[None]
         if given.shape[1:] != (n_frames, n_flares) or given.shape[0] not in (1, count):
@@ -73,11 +75,14 @@ class Flares:
                 f"{MOST_SCENARIOS} scenarios"
             )
         for what, values in (("flare coefficients", given), ("amplitudes", factors)):
-            if not ((values >= 0) & (values <= 1e12)).all():
-                wrong = values[~((values >= 0) & (values <= 1e12))][0]
-                raise InputError(f"{what} of {wrong:g}, expected 0 to 1e12")
-        rows = np.zeros((len(given), n_flares, padded_frames(n_frames)), np.float32)
-        rows[:, :, :n_frames] = np.moveaxis(given, 2, 1) * stare.light
+            # One that is no number is the least and the largest, too.
+            for end in (values.min(initial=0.0), values.max(initial=0.0)):
+                if not 0 <= end <= LARGEST:
+                    raise InputError(f"{what} of {end:g}, expected 0 to {LARGEST:g}")
+        rows, size = np.moveaxis(given, 2, 1), padded_frames(n_frames)
+        if size != n_frames or rows.dtype != np.float32 or not rows.flags.c_contiguous:
+            rows = np.zeros((len(given), n_flares, size), np.float32)
+            rows[:, :, :n_frames] = np.moveaxis(given, 2, 1)
         return cls(rows, factors.astype(np.float32))
 
     def part(self, first: int, count: int) -> Flares:
@@ -105,7 +110,7 @@ class StareScene:
         One quiescent frame, for addresses, rails and cosmic rays.
     numbers : ndarray of uint32, shape (n_padded_frame,)
         Frames as the generator counts them, gaps included.
-    known : ndarray of float32, shape (6, n_padded_frame)
+    known : ndarray of float32, shape (7, n_padded_frame)
         Rows of `layout.KNOWN_OF_FRAMES`.
     curves : ndarray of float32, shape (n_unknown, n_padded_frame)
         Of what is unknown of a stare, times its standard deviation.
@@ -226,7 +231,7 @@ class StareScene:
         low, high = self._ends
         mean = self.components.mean_dn
         darkest = low[0] * mean[0] + low[1] * mean[1]
-        brightest = high[0] * mean[0] + high[1] * mean[1] + high[3] * (flares.most @ mean[3:])
+        brightest = high[0] * mean[0] + high[1] * mean[1] + high[3] * (flares.most @ mean[len(STEADY) :])
         span = float(np.max(brightest / np.maximum(darkest, 1e-30), initial=1.0, where=brightest > 1e-9))
         steps = 1 + int(np.ceil(np.log2(min(span, 2.0**20))))
         for part in np.linspace(0.0, 1.0, steps + 1):
@@ -244,7 +249,7 @@ class StareScene:
             warm = np.exp(sign * REACH_SIGMA * abs(self.staring["dark_slope"]) * spread["temperature"])
             known = (stare.light * stare.star * light * star, stare.light * stare.sky * light * sky)
             dark = stare.dark_factor(self.components.quiet) * warm
-            ends.append(np.array([float(of(values)) for values in (*known, dark, light)]))
+            ends.append(np.array([float(of(values)) for values in (*known, dark, stare.light * light)]))
         return ends[0], ends[1]
 
     @property
@@ -273,7 +278,9 @@ class StareScene:
                 )
         x, mean = self.components.quiet, self.components.mean_dn
         _, high = self._ends
-        reach = high[0] * mean[0] + high[1] * mean[1] + high[2] * mean[2] + high[3] * (flares.most @ mean[3:])
+        reach = (
+            high[0] * mean[0] + high[1] * mean[1] + high[2] * mean[2] + high[3] * (flares.most @ mean[len(STEADY) :])
+        )
         if not (reach < REACH_DN).all():
             pixel = int(np.argmax(~(reach < REACH_DN)))
             raise InputError(
@@ -307,7 +314,8 @@ def _padded(values: NDArray[Any], kind: type) -> NDArray[Any]:
 
 def _known(components: Components, stare: Stare) -> Floats:
     rows = components.coefficients(stare)[:, : len(STEADY)].T
-    return np.asarray(_padded(np.stack([part for row in rows for part in (row, row - 1.0)]), np.float32))
+    changes = [part for row in rows for part in (row, row - 1.0)]
+    return np.asarray(_padded(np.stack([*changes, stare.light]), np.float32))
 
 
 def _apart(name: str) -> str:

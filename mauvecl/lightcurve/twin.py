@@ -47,7 +47,7 @@ def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int) -> dic
         name = layout.MOVED[kind]
         z = four_normals(twin.words_at(numbers, 0, "stare_unknown", u // 4, seed))[u % 4]
         moved[name] = fma(z, scene.curves[u, frame], moved[name])
-    star, star_less_one, sky, sky_less_one, dark, dark_less_one = scene.known[:, frame]
+    star, star_less_one, sky, sky_less_one, dark, dark_less_one = scene.known[:6, frame]
     light = moved["light"]
     return {
         "star": fma(star, together(light, moved["star"]), star_less_one),
@@ -57,9 +57,9 @@ def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int) -> dic
     }
 
 
-def _coefficients(flares: Flares, frame: int, scenario: int, light: Floats) -> list[Floats]:
+def _coefficients(scene: StareScene, flares: Flares, frame: int, scenario: int, light: Floats) -> list[Floats]:
     """Of the flare spectra, shape (n_stare,) each."""
-    given = flares.rows[:, :, frame] * flares.amplitudes[scenario][:, None]
+    given = flares.rows[:, :, frame] * (scene.known[6, frame] * flares.amplitudes[scenario][:, None])
     return [fma(light, f, f) for f in np.broadcast_to(given, (len(light), given.shape[1])).T]
 
 
@@ -78,7 +78,7 @@ def pixels(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable
             drawn = twin.draws(scene.scene, numbers, int(scene.numbers[frame]), group, seed)
             for i, p in enumerate(range(4 * group, 4 * group + 4)):
                 for k in range(len(flares.amplitudes)):
-                    flare = _coefficients(flares, frame, k, met["light"])
+                    flare = _coefficients(scene, flares, frame, k, met["light"])
                     v = _count(scene, p, drawn.z[i], met, flare)
                     if scene.scene.cosmic:
                         v = fma(drawn.cosmic[i], scene.scene.pixels[p]["cosmic_gain"], v)
@@ -134,7 +134,7 @@ def sums(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[i
             z += four_normals(twin.words_at(numbers, int(scene.numbers[frame]), "stare_sums", group, seed))
         rows = []
         for k in range(len(flares.amplitudes)):
-            flare = _coefficients(flares, frame, k, met["light"])
+            flare = _coefficients(scene, flares, frame, k, met["light"])
             rows.append(_sums(scene, table, z, met, flare))
         out.append(rows)
     return np.moveaxis(np.array(out), (0, 1, 2, 3), (2, 0, 3, 1))

@@ -178,8 +178,8 @@ STARING = np.dtype(
     ]
 )
 
-#: Rows of what is known of each frame: a coefficient, and the same less one.
-KNOWN_OF_FRAMES = ("star", "star_less_one", "sky", "sky_less_one", "dark", "dark_less_one")
+#: Rows of what is known of each frame: coefficients, and the same less one; the factor on all light.
+KNOWN_OF_FRAMES = ("star", "star_less_one", "sky", "sky_less_one", "dark", "dark_less_one", "light")
 #: What an unknown of a stare is of: rows of what it moves.
 MOVED = ("star", "light", "sky", "temperature")
 #: Frames are padded to a multiple of this.
