@@ -2,7 +2,8 @@
 
 A fit of least squares from the template that found it, over the level that the search marginalises over (Levenberg
 1944, doi 10.1090/qam/10666; Marquardt 1963, doi 10.1137/0111030); errors from the inverse of the information. Flares
-near the threshold are seen when noise helps them, so that their amplitudes come out too large: the fit does not mend that.
+near the threshold are seen when noise helps them, so that their amplitudes come out too large: the fit does not mend
+that.
 """
 
 from __future__ import annotations
