@@ -20,6 +20,8 @@ Float = NDArray[np.float64]
 #: Half-widths that a search looks for unless told, s: a factor of 1.86 apart, so that flares of 10 to 1800 s lose at
 #: most 1.3 % of S/N.
 HALF_WIDTHS_S = (12.0, 22.0, 42.0, 77.0, 144.0, 267.0, 496.0, 923.0, 1720.0)
+#: Time over which a level is taken for a straight line unless told, s: a third of an orbit; an assumption.
+WINDOW_S = 1800.0
 #: Half-widths of a template before and after its peak that a window holds at least.
 LEAD, TAIL = 5.0, 10.0
 #: Onsets are tried at least so many to a half-width, and in each half of a frame where that is not fine enough.
@@ -47,7 +49,7 @@ class Level:
     offset: bool = True
     slope: bool = True
     cycle: bool = False
-    window_s: float = 1800.0
+    window_s: float = WINDOW_S
 
     def __post_init__(self) -> None:
         if self.slope and not self.offset:

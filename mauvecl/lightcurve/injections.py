@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.components import STEADY
 from mauvecl.lightcurve.search import Search
+from mauvecl.lightcurve.survey import part_of
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.survey import Survey
@@ -78,6 +79,8 @@ class Injections:
         Which of the components' flare spectra.
     half_widths_s : tuple of float
     threshold : float
+    temperature_k : float
+        Of the flare.
     seed : int
     positions : int
         Times of peaks, evenly spread over the recorded frames, at random in each part.
@@ -89,6 +92,7 @@ class Injections:
     flare: int
     half_widths_s: tuple[float, ...]
     threshold: float
+    temperature_k: float
     seed: int
     positions: int
     draws: int
@@ -142,7 +146,7 @@ class Injections:
         first, last = np.searchsorted(stare.start_s, [peak_s - before, peak_s + after])
         part = slice(int(first), int(last))
         curves = None if survey.curves is None else survey.curves[:, part]
-        search = Search(bank, _part(stare, part), curves, survey.variance[part])
+        search = Search(bank, part_of(stare, part), curves, survey.variance[part])
         start = stare.start_s[part]
         edges = np.column_stack([start, start + frame_s])
         mean = stare.light[part] * bank.shape.mean_over(edges, peak_s, width)
@@ -317,6 +321,10 @@ class Drawn:
     own: Single
     light: Single | None
 
+    def first(self, count: int) -> Drawn:
+        """The first draws alone."""
+        return Drawn(self.noise[:, :count], self.own[:, :count], None if self.light is None else self.light[:count])
+
     def within(self, held: NDArray[np.int64], wanted: NDArray[np.int64]) -> Drawn:
         """The same in some of the frames that it holds, which follow each other."""
         first = int(np.searchsorted(held, wanted[0]))
@@ -334,10 +342,3 @@ def _combined(rows: Float, values: Single) -> Single:
     """Sums over the first axis of values (n_sum, n_draw, n_filter), shape (n_row, n_draw, n_filter)."""
     flat = values.reshape(values.shape[0], -1)
     return np.asarray((rows.astype(np.float32) @ flat).reshape(len(rows), *values.shape[1:]))
-
-
-def _part(stare: Any, part: slice) -> Any:
-    """Some frames of a stare, with their own times."""
-    names = ("start_s", "star", "light", "sky", "temperature_c")
-    unknowns = tuple(replace(u, curve=u.curve[part]) for u in stare.unknowns)
-    return replace(stare, unknowns=unknowns, **{name: getattr(stare, name)[part] for name in names})

@@ -32,9 +32,9 @@ DAYS: dict[Per, float] = {"day": 1.0, "month": 365.25 / 12, "year": 365.25}
 DAY_S = 86_400.0
 #: Thresholds at which importance sampling is done; between them the logarithm of the number of independent templates is
 #: a parabola.
-LADDER = (3.0, 3.5, 4.0, 4.5, 5.0, 5.5, 6.0, 6.5, 7.0, 7.5, 8.0)
+LADDER = tuple(float(u) for u in np.arange(3.0, 8.01, 0.25))
 #: Draws of importance sampling.
-DRAWS = 400
+DRAWS = 200
 #: Largest probability of an alarm in a stare that importance sampling is used for.
 MOST_LIKELY = 0.7
 #: Second half of the generator's key: draws of this null are no others.
@@ -119,6 +119,34 @@ def counted(search: Search, draw: Callable[[int, int], NDArray[Any]], count: int
     return Counted(np.sort(np.concatenate(parts)), search.stare.observed_s / DAY_S)
 
 
+def in_a_row(values: NDArray[Any], points: int, sigma: float) -> NDArray[np.bool_]:
+    """Where the common rule alarms: frames that end a run of so many consecutive ones above so many sigma.
+
+    Parameters
+    ----------
+    values : ndarray, shape (..., n_frame)
+        In standard deviations; the first `points` of a longer run end in one alarm.
+    points : int
+    sigma : float
+    """
+    above = values > sigma
+    alarm = np.zeros(above.shape, np.bool_)
+    if above.shape[-1] < points:
+        return alarm
+    windows = np.lib.stride_tricks.sliding_window_view(above, points, axis=-1).all(axis=-1)
+    before = np.concatenate([np.zeros((*above.shape[:-1], 1), np.bool_), windows[..., :-1]], axis=-1)
+    alarm[..., points - 1 :] = windows & ~before
+    return alarm
+
+
+def in_a_row_rate(points: int, sigma: float, frame_s: float) -> float:
+    """False alarms per star-day of `in_a_row` in white noise: runs of at least so many points."""
+    above = float(special.ndtr(-sigma))
+    frames = DAY_S / frame_s
+    # A run begins with the first frame, or after one that is not above.
+    return above**points * (1 + (frames - points) * (1 - above))
+
+
 @dataclass(frozen=True, eq=False)
 class Sampled:
     """The tail of the null for normal noise, by importance sampling.
@@ -137,6 +165,12 @@ class Sampled:
     probability: Float
     error: Float
     days: float
+
+    @property
+    def most_likely(self) -> tuple[float, float, float]:
+        """The lowest threshold that is trusted, with its probability of an alarm in a stare and standard error."""
+        k = int(np.argmax(self._trusted))
+        return float(self.thresholds[k]), float(self.probability[k]), float(self.error[k])
 
     @property
     def _trusted(self) -> NDArray[np.bool_]:

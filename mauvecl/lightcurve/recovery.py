@@ -2,7 +2,8 @@
 
 A fit of least squares from the template that found it, over the level that the search marginalises over (Levenberg
 1944, doi 10.1090/qam/10666; Marquardt 1963, doi 10.1137/0111030); errors from the inverse of the information. Flares
-near the threshold are seen when noise helps them, so that their amplitudes come out too large: the fit does not mend that.
+near the threshold are seen when noise helps them, so that their amplitudes come out too large: the fit does not mend
+that.
 """
 
 from __future__ import annotations
@@ -22,7 +23,9 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 
 #: Steps of a fit, at most, and the change of chi-squared at which it ends.
-STEPS, ENOUGH = 30, 1e-4
+STEPS, ENOUGH = 30, 1e-3
+#: Frames are averaged as long as a half-width holds so many averages.
+FINE = 25
 #: Damping to begin with; divided and multiplied by after a step that was better or worse.
 DAMPING, EASIER, HARDER = 1e-2, 5.0, 4.0
 #: Relative step of the derivatives by differences.
@@ -118,11 +121,12 @@ class Fit:
             np.array(np.broadcast_to(np.asarray(value, np.float64), n))
             for value in (peak_s, np.log(half_width_s), np.log(temperature_k))
         )
-        frame_s = self.bank.frame_s
+        several = max(1, int(np.exp(log_width.min()) / self.bank.frame_s / FINE)) if n else 1
+        sums, start_s, variance, curves = self._averaged(several, sums, start_s, variance, curves)
         weight, level = self._windows(start_s, peak, np.exp(log_width), variance, curves)
         used = weight.any(axis=0)
         weight, level, start_s = weight[:, used], level[:, used], start_s[used]
-        edges = np.column_stack([start_s, start_s + frame_s])
+        edges = np.column_stack([start_s, start_s + several * self.bank.frame_s])
         y = _beside(np.asarray(sums[:, used], np.float64), weight, level)
         response, slope, coolest, hottest = self._response
         log_kelvin = np.clip(log_kelvin, coolest, hottest)
@@ -179,6 +183,22 @@ class Fit:
                 break
         information, _ = self._normal(products, amplitude, response(log_kelvin), slope(log_kelvin))
         return self._told(peak, log_width, log_kelvin, amplitude, gain, information)
+
+    def _averaged(
+        self, several: int, sums: NDArray[Any], start_s: Float, variance: Float | None, curves: Float | None
+    ) -> tuple[NDArray[Any], Float, Float | None, Float | None]:
+        """Averages of so many frames that follow each other; what gaps leave of fewer is left out."""
+        if several == 1:
+            return sums, start_s, variance, curves
+        number = np.rint(start_s / self.bank.frame_s).astype(np.int64)
+        _, first, count = np.unique(number // several, return_index=True, return_counts=True)
+        rows = first[count == several][:, None] + np.arange(several)
+        variance = np.ones(start_s.size) if variance is None else variance
+        mean = np.stack([one[rows].mean(axis=1) for one in sums])
+        return (
+            mean, start_s[rows[:, 0]], variance[rows].mean(axis=1) / several,
+            None if curves is None else curves[:, rows].mean(axis=2),
+        )  # fmt: skip
 
     def _windows(
         self, start_s: Float, peak: Float, width: Float, variance: Float | None, curves: Float | None

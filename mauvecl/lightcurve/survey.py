@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.lightcurve.null import DAY_S
 from mauvecl.lightcurve.search import Search
 
 if TYPE_CHECKING:
@@ -22,6 +23,8 @@ Float = NDArray[np.float64]
 
 #: Share of a curve below which it is the others' sum.
 LEAST_CURVE = 1e-6
+#: Numbers of drawn stares that are held at once.
+NUMBERS = 2**24
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,3 +103,20 @@ class Survey:
     def net(self, sums: NDArray[Any]) -> NDArray[np.float32]:
         """Sums as drawn less what is known, (..., n_frame, n_sum)."""
         return np.asarray(sums - self.known, np.float32)
+
+    @property
+    def batch(self) -> int:
+        """Stares that are drawn at once."""
+        return int(np.clip(NUMBERS // (self.stare.n_frames * self.components.n_statistics), 1, 64))
+
+    def of_days(self, days: float) -> Survey:
+        """The same with the first star-days of the stare alone, where it is longer."""
+        n = int(days * DAY_S / self.stare.frame_s)
+        return self if self.stare.n_frames <= n else replace(self, stare=part_of(self.stare, slice(0, n)))
+
+
+def part_of(stare: Stare, part: slice) -> Stare:
+    """Some frames of a stare, with their own times."""
+    names = ("start_s", "star", "light", "sky", "temperature_c")
+    unknowns = tuple(replace(unknown, curve=unknown.curve[part]) for unknown in stare.unknowns)
+    return replace(stare, unknowns=unknowns, **{name: getattr(stare, name)[part] for name in names})

@@ -22,6 +22,7 @@ from mauvecl.study.questions import (
     SignalQuestion,
     Sweep,
 )
+from mauvecl.study.searches import InjectionQuestion, SearchChoice, without_usual_search
 from mauvecl.study.sections import STAR_KEYS, Flare, NoiseProcesses, Observation, Part, Run, SkyLight, Star, Unknowns
 from mauvecl.study.stares import EventText, StareQuestion, find_curves, without_usual
 from mauvecl.study.study_text import find_files, in_table, put, sentence, study_of, toml_value
@@ -66,6 +67,8 @@ class Study(Part):
     unknowns: Unknowns = Unknowns()
     stare: StareQuestion = StareQuestion()
     events: tuple[EventText, ...] = ()
+    search: SearchChoice = SearchChoice()
+    injections: InjectionQuestion = InjectionQuestion()
     orbit: OrbitQuestion = OrbitQuestion()
     plan: PlanQuestion = PlanQuestion()
 
@@ -173,6 +176,7 @@ class Study(Part):
                 if "file" in one:
                     one["file"] = str(Path(one["file"]).resolve())
         without_usual(data, self)
+        without_usual_search(data, self)
         without_usual_plan(data, self)
         for section in ("processes", "campaign"):
             if not data[section]:

@@ -1,0 +1,89 @@
+"""Pictures of completeness: maps over half-width and size, and curves."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mauvecl.pictures.style import COLOURS, MOST_COLUMNS, STYLE, finished, pyplot
+
+if TYPE_CHECKING:
+    from mauvecl.answers.inject import InjectAnswer
+
+#: What the axes of sizes are called.
+SIZES = {
+    "amplitude": "flare amplitude",
+    "duration": "equivalent duration (s)",
+    "energy": "bolometric energy (erg)",
+    "band_energy": "energy in the band (erg)",
+}
+#: Half-widths with curves of their own, at most.
+MOST_CURVES = 6
+CONTOURS = (0.1, 0.5, 0.9)
+
+
+def _panels(found: InjectAnswer) -> tuple[Any, list[Any], list[Any]]:
+    from mauvecl.answers.inject import MOST_DRAWN
+
+    stars = found.stars[:MOST_DRAWN]
+    columns = min(len(stars), MOST_COLUMNS)
+    rows = -(-len(stars) // columns)
+    figure, axes = pyplot().subplots(rows, columns, figsize=(3.6 * columns + 0.8, 3.2 * rows), squeeze=False)
+    for axis in axes.flat[len(stars) :]:
+        axis.set_visible(False)
+    return figure, stars, list(axes.flat)
+
+
+def _titled(figure: Any, found: InjectAnswer) -> None:
+    choice, flare = found.study.search, found.study.flare
+    figure.suptitle(
+        f"Flares of {flare.temperature_k:g} K, {choice.false_alarms:g} false alarms per star-{choice.per}; nominal "
+        "throughput",
+        fontsize=9,
+    )
+
+
+def maps(found: InjectAnswer, path: str | Path | None) -> Any:
+    """Completeness over half-width and size, one panel per star; the figure where no path is given."""
+    with pyplot().rc_context(STYLE):
+        figure, stars, axes = _panels(found)
+        mesh = None
+        for star, axis in zip(stars, axes, strict=False):
+            x, y, z = np.array(star.found.half_widths_s), star.found.sizes, star.found.completeness.T
+            axis.set(xscale="log", yscale="log", xlabel="half-width (s)", ylabel=SIZES[star.sizes.of], title=star.title)
+            if x.size < 2:
+                # One half-width has no width to be drawn with.
+                axis.plot(star.found.completeness[0], y)
+                axis.set(xscale="linear", xlabel="completeness")
+                continue
+            mesh = axis.pcolormesh(x, y, z, cmap="cividis", vmin=0, vmax=1, shading="nearest")
+            lines = axis.contour(x, y, z, levels=CONTOURS, colors="white", linewidths=1)
+            axis.clabel(lines, fmt=lambda level: f"{100 * level:g} %", fontsize=7)
+        if mesh is not None:
+            figure.colorbar(mesh, ax=axes, label="completeness")
+        _titled(figure, found)
+        return finished(figure, path)
+
+
+def curves(found: InjectAnswer, path: str | Path | None) -> Any:
+    """Completeness over size at some half-widths, with 95 % intervals; the figure where no path is given."""
+    with pyplot().rc_context(STYLE):
+        figure, stars, axes = _panels(found)
+        for star, axis in zip(stars, axes, strict=False):
+            f = star.found
+            picked = np.unique(np.linspace(0, len(f.half_widths_s) - 1, MOST_CURVES).round().astype(int))
+            for k, colour in zip(picked, COLOURS, strict=False):
+                axis.fill_between(
+                    f.sizes, f.completeness_low[k], f.completeness_high[k], color=colour, alpha=0.25, linewidth=0
+                )
+                axis.plot(f.sizes, f.completeness[k], color=colour, label=f"{f.half_widths_s[k]:.3g} s")
+            for power in (0.5, 0.9):
+                axis.axhline(power, color="black", linewidth=0.6, linestyle="--")
+            axis.set(
+                xscale="log", xlabel=SIZES[star.sizes.of], ylabel="completeness", ylim=(-0.02, 1.02), title=star.title
+            )
+        axes[0].legend(title="half-width")
+        _titled(figure, found)
+        return finished(figure, path)
