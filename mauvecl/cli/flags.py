@@ -411,6 +411,7 @@ def takes_study(
     default: Callable[[dict[str, Any]], Study] | None = None,
     draws: bool = True,
     pictures: bool = True,
+    observation: Mapping[str, Option] = OBSERVATION,
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """Let a verb take a study file and flags, and hand it the study and the session that they make.
 
@@ -428,6 +429,8 @@ def takes_study(
         Makes the study where no file is given, from the flags; the paper's question by default.
     draws, pictures : bool
         Whether the verb draws realisations, and pictures.
+    observation : mapping of Option
+        In place of the flags of an observation. Where one is called `targets`, a table may stand for the study file.
 
     Returns
     -------
@@ -435,7 +438,7 @@ def takes_study(
         A decorator for functions whose first parameters are the study and the session. One named `given` receives the
         flags; others are options of its own.
     """
-    options = {n: o for group in (OBSERVATION, *groups, SETTINGS) for n, o in group.items() if n != without}
+    options = {n: o for group in (observation, *groups, SETTINGS) for n, o in group.items() if n != without}
     around = OUTPUT | (PICTURES if pictures else {}) | (WORKERS if draws else {})
 
     def decorate(verb: Callable[..., None]) -> Callable[..., None]:
@@ -450,6 +453,8 @@ def takes_study(
                 if values.get(key) is not None and not isinstance(values[key], int | float):
                     values[key] = read(values[key], flag)
             given = {key: values.pop(key, None) for key in options}
+            if "targets" in options and study_file is not None and study_file.suffix.lower() == ".csv":
+                given["targets"], study_file = study_file, None
             if fewer and study_file is None and given["realisations"] is None:
                 given["realisations"] = FEWER
             how = {key: values.pop(key, usual) for key, (_, usual) in around.items()}
@@ -518,6 +523,8 @@ def _study(
 def _sky(given: dict[str, Any]) -> dict[str, Any]:
     from mauvecl.host.errors import InputError
 
+    if "when" not in given:
+        return {}
     found: dict[str, Any] = {"target": given["target"], "time": given["when"]}
     text = given["sky"]
     if text is not None and text.strip().lower() == "none":
@@ -555,6 +562,8 @@ def _nuisances(study: Study, texts: list[str]) -> dict[str, Any]:
 def _stars(study: Study, given: dict[str, Any]) -> list[dict[str, Any]] | None:
     from mauvecl.host.errors import InputError
 
+    if "star" not in given:
+        return None
     names, magnitudes = given["star"], given["magnitude"]
     same = {key: given[key] for key in ("band", "magnitude_system", "ebv", "bin_nm") if given[key] is not None}
     sizes = {"distance_pc": "distance", "radius_rsun": "radius", "effective_temperature_k": "star_temperature"}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from mauvecl.lightcurve.rates import Rates
     from mauvecl.study.study import Study
 
-Angle = Annotated[float, Field(ge=0, le=180)] | Literal["none"]
+#: A number, or the word for no limit.
+Limit = float | Literal["none"]
 #: Rows of a table of targets, at most: a page each.
 MOST_TARGETS = 500
 
@@ -30,16 +31,26 @@ MOST_TARGETS = 500
 class LimitsText(Part):
     """What must hold for a target to be seen; "none" is no limit. See `host.orbit.visibility.Limits`."""
 
-    earth_limb_deg: Angle = 25.0
-    sun_deg: Angle = 46.0
-    moon_deg: Angle = 25.0
+    earth_limb_deg: Limit = 25.0
+    sun_deg: Limit = 46.0
+    moon_deg: Limit = 25.0
     declination_deg: tuple[float, float] | Literal["none"] = (-46.4, 31.8)
-    normal_cone_deg: Angle = "none"
+    normal_cone_deg: Limit = "none"
     eclipse: Literal["any", "only", "never"] = "any"
-    proton_flux: Annotated[float, Field(gt=0)] | Literal["none"] = 10.0
+    proton_flux: Limit = 10.0
     anomaly: tuple[tuple[float, float], ...] = ()
     shortest_s: Annotated[float, Field(ge=0)] = 0.0
     duty_cycle: Annotated[float, Field(gt=0, le=1)] = 1.0
+
+    @field_validator("earth_limb_deg", "sun_deg", "moon_deg", "normal_cone_deg", "proton_flux", mode="before")
+    @classmethod
+    def _number_or_none(cls, given: Any, info: ValidationInfo) -> Any:
+        if isinstance(given, str) and given.strip().lower() == "none":
+            return "none"
+        try:
+            return float(given)
+        except (TypeError, ValueError):
+            raise ValueError(f"orbit.limits.{info.field_name} = {shown(given)}, expected a number, or none") from None
 
     @model_validator(mode="after")
     def _possible(self) -> Self:

@@ -124,14 +124,17 @@ class Study(Part):
     def with_changes(
         self, changes: dict[str, dict[str, Any]], stars: list[dict[str, Any]] | None, where: str = "command line"
     ) -> Self:
-        """The study with a section's values replaced where they are not None, and with other stars."""
+        """The study with values replaced where they are not None, by sections such as "orbit.limits"; with other stars."""
         data = self.model_dump()
         for section, values in changes.items():
             given = {key: value for key, value in values.items() if value is not None}
             if section == "sky" and given:
                 # A new sky takes the place of the old one whole.
                 data[section] = {}
-            data[section].update(given)
+            place = data
+            for part in section.split("."):
+                place = place[part]
+            place.update(given)
         if stars is not None:
             data["star"] = stars
         return self.build(data, where)

@@ -1,0 +1,124 @@
+"""The verbs that look from the orbit: when targets are seen, and what a campaign would find."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mauvecl.cli.flags import Option, takes_study
+
+if TYPE_CHECKING:
+    from mauvecl.answers.visible import VisibleAnswer
+    from mauvecl.cli.session import Session
+    from mauvecl.study.study import Study
+
+
+def _range(text: str) -> Any:
+    """Two declinations, -46.4:31.8, or none."""
+    from mauvecl.host.errors import InputError
+    from mauvecl.host.files.bounded import shortened
+
+    if text.strip().lower() == "none":
+        return "none"
+    try:
+        low, high = (float(part) for part in text.split(":"))
+    except ValueError as error:
+        raise InputError(f"--declination {shortened(text)}, expected low:high in degrees, or none") from error
+    return (low, high)
+
+
+def _flag(kind: Any, *names: str, text: str) -> Any:
+    return Annotated[kind | None, typer.Option(*names, help=text, show_default=False)]
+
+
+#: Where from, when, and what must hold.
+ORBIT = {
+    "start": Option(_flag(str, "--from", text="First day or time, UTC [2027-01-01]."), "orbit", "start"),
+    "days": Option(_flag(float, "--days", text="How long, days [365]."), "orbit", "days"),
+    "step": Option(_flag(float, "--step", text="Seconds between the times looked at [60]."), "orbit", "step_s"),
+    "tle": Option(
+        _flag(Path, "--tle", text="File of two-line elements, newer than the embedded ones."), "orbit", "tle"
+    ),
+    "orbit": Option(
+        _flag(str, "--orbit", text="tle, mean, or auto: mean far from the elements' epoch [auto]."), "orbit", "kind"
+    ),
+    "simbad": Option(_flag(bool, "--simbad", text="Ask SIMBAD for other names (mauvecl[names])."), "orbit", "simbad"),
+    "earth_limb": Option(
+        _flag(str, "--earth-limb", text="Least angle from the Earth's limb, deg, or none [25]."),
+        "orbit.limits", "earth_limb_deg",
+    ),
+    "sun": Option(
+        _flag(str, "--sun", text="Least angle from the Sun, deg, or none [46]."), "orbit.limits", "sun_deg"
+    ),
+    "moon": Option(
+        _flag(str, "--moon", text="Least angle from the Moon, deg, or none [25]."), "orbit.limits", "moon_deg"
+    ),
+    "declination": Option(
+        _flag(str, "--declination", text="Field of regard, low:high in deg, or none [-46.4:31.8]."),
+        "orbit.limits", "declination_deg", _range,
+    ),
+    "eclipse": Option(
+        _flag(str, "--eclipse", text="any, only (in the Earth's shadow), or never [any]."), "orbit.limits", "eclipse"
+    ),
+    "protons": Option(
+        _flag(str, "--protons", text="Largest flux of protons above 10 MeV, cm^-2 s^-1, or none [10]."),
+        "orbit.limits", "proton_flux",
+    ),
+}  # fmt: skip
+TARGETS = {
+    "target": Option(
+        _flag(list[str], "--target", "-s", text="Name, or coordinates '290.0 -11.2'; may be repeated."),
+        "orbit", "targets",
+    ),
+}  # fmt: skip
+
+
+def _targets_of(path: Path) -> Any:
+    from mauvecl.study.orbits import read_targets
+
+    return read_targets(path)
+
+
+TABLE = {
+    "targets": Option(
+        _flag(Path, "--targets", text="Table of targets (CSV, ECSV): name, and what is known of each."),
+        "plan", "targets", _targets_of,
+    ),
+}  # fmt: skip
+
+
+@takes_study(TARGETS, TABLE, observation=ORBIT, draws=False)
+def visible(study: Study, session: Session) -> None:
+    """When targets can be seen: windows, hours by day and month, the Sun's distance, zodiacal light, a calendar.
+
+    Example: mauvecl visible --target "eps Eri" --target "AU Mic" --from 2027-01-01 --days 365
+    """
+    from mauvecl.answers.visible import visible as compute
+
+    found = compute(study)
+    session.answer(found, lambda: _show_visible(found))
+
+
+def _show_visible(found: VisibleAnswer) -> None:
+    from mauvecl.cli.console import show_table
+
+    table = found.table
+    show_table(
+        f"Seen in {found.moments.days:g} days from {found.moments.iso(0.0)} UTC",
+        ("target", "RA", "dec", "hours", "share", "windows", "median", "longest gap", "least elongation", "best month"),
+        [
+            (str(row["target"]), f"{row['ra'].value:.3f}", f"{row['dec'].value:.3f}", f"{row['hours'].value:.0f}",
+             f"{100 * row['share']:.1f} %", str(row["windows"]), f"{row['median_window'].value:.0f} min",
+             f"{row['longest_gap'].value:.1f} d", f"{row['least_elongation'].value:.0f} deg", str(row["best_month"]))
+            for row in table
+        ],
+    )  # fmt: skip
+    months = found.months
+    if len(found.targets) <= 12:
+        show_table(
+            "Hours of exposure by month",
+            ("target", *(str(name) for name in months["month"])),
+            [(one.name, *(f"{value.value:.0f}" for value in months[one.name])) for one in found.targets],
+        )
