@@ -28,8 +28,8 @@ def serve(
     from mauvecl.host.errors import InputError
     from mauvecl.host.files.bounded import shortened
 
-    if find_spec("panel") is None:
-        raise InputError("Panel is missing, expected it for the page: pip install 'mauvecl[web]'")
+    if find_spec("bokeh") is None or find_spec("tornado") is None:
+        raise InputError("Bokeh is missing, expected it for the page: pip install 'mauvecl[web]'")
     from mauvecl.web.server import serve
 
     try:

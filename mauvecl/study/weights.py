@@ -66,20 +66,31 @@ def read_columns(what: str, kind: str, path: Path) -> NDArray[np.float64]:
     InputError
         If it cannot be read or holds no two columns of numbers.
     """
-    columns = _columns(f"{what} {shortened(path.name)}", what, path)
-    if columns.ndim != 2 or columns.shape[1] != 2:
+    pairs = _columns(f"{what} {shortened(path.name)}", what, path)
+    if pairs.ndim != 2 or pairs.shape[1] != 2:
         raise InputError(f"{what} {shortened(path.name)} has no two columns, expected times and {kind}")
-    return columns
+    return pairs
 
 
 def _columns(what: str, kind: str, path: Path) -> NDArray[np.float64]:
     text = read_text(path, kind)
+    return columns(what, text)
+
+
+def columns(what: str, text: str) -> NDArray[np.float64]:
+    """Numbers of a text's rows, shape (n, 2) where each has two.
+
+    Raises
+    ------
+    InputError
+        If there are no such rows.
+    """
     with parsing(what, "two columns"):
         return np.array([[float(word) for word in row] for line in text.splitlines() if (row := _words(line))])
 
 
 def at_pixels(
-    what: str, kind: str, columns: NDArray[np.float64], wavelength_nm: NDArray[np.float64]
+    what: str, kind: str, rows: NDArray[np.float64], wavelength_nm: NDArray[np.float64]
 ) -> NDArray[np.float64]:
     """Values between rows of wavelengths, nm, and values, straight between them, zero beyond; shape (n_pixel,).
 
@@ -87,7 +98,7 @@ def at_pixels(
     ----------
     what, kind : str
         What holds them and what they are, for messages.
-    columns : ndarray, shape (n, 2)
+    rows : ndarray, shape (n, 2)
     wavelength_nm : ndarray, shape (n_pixel,)
 
     Raises
@@ -95,16 +106,16 @@ def at_pixels(
     InputError
         If there are other columns, a number that cannot be, or nothing for any pixel.
     """
-    if columns.ndim != 2 or columns.shape[1] != 2 or not np.all(np.diff(columns[:, 0]) > 0):
+    if rows.ndim != 2 or rows.shape[1] != 2 or not np.all(np.diff(rows[:, 0]) > 0):
         raise InputError(
-            f"{what} have {columns.shape[1] if columns.ndim == 2 else 'no'} columns, expected ascending wavelengths in "
+            f"{what} have {rows.shape[1] if rows.ndim == 2 else 'no'} columns, expected ascending wavelengths in "
             f"nm and {kind}"
         )
-    sizes = np.abs(columns)
-    bad = ~((columns == 0) | ((sizes >= SMALLEST) & (sizes <= LARGEST)))
+    sizes = np.abs(rows)
+    bad = ~((rows == 0) | ((sizes >= SMALLEST) & (sizes <= LARGEST)))
     if bad.any():
-        raise InputError(f"{what} hold {columns[bad][0]!r}, expected 0 or a size from {SMALLEST:g} to {LARGEST:g}")
-    values = np.interp(wavelength_nm, columns[:, 0], columns[:, 1], left=0.0, right=0.0)
+        raise InputError(f"{what} hold {rows[bad][0]!r}, expected 0 or a size from {SMALLEST:g} to {LARGEST:g}")
+    values = np.interp(wavelength_nm, rows[:, 0], rows[:, 1], left=0.0, right=0.0)
     if not values.any():
         raise InputError(
             f"{what} are 0 at every pixel, expected some of {wavelength_nm.min():.0f}-{wavelength_nm.max():.0f} nm to "

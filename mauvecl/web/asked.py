@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import tempfile
-from pathlib import Path
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import panel as pn
 
 from mauvecl.answers.detect import DetectAnswer, detect
+from mauvecl.answers.limits import limiting_magnitude
 from mauvecl.answers.maps import MapResult, detection_map
 from mauvecl.answers.snr import SnrAnswer, snr
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
-    from mauvecl.answers.limits import LimitResult
     from mauvecl.runs.pool import Pool
 
 #: The map of the page: cells along each axis, and realisations of each.
@@ -44,9 +42,13 @@ def map_around(study: Study, pool: Pool) -> MapResult:
     return detection_map(Study.build(data, "page"), pool)
 
 
-def picture(found: LimitResult | MapResult, alternative: str) -> Any:
-    """An answer's own picture."""
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "picture.png"
-        found.plot(path)
-        return pn.pane.PNG(path.read_bytes(), alt_text=alternative, sizing_mode="scale_width", max_width=900)
+def _detection(study: Study, pool: Pool) -> dict[str, Any]:
+    return dict(zip(("detection", "snr"), detect_and_snr(study, pool), strict=True))
+
+
+#: What may be simulated, by name: what is then found, by name.
+SIMULATED: dict[str, Callable[[Study, Pool], dict[str, Any]]] = {
+    "detection": _detection,
+    "limit": lambda study, pool: {"limit": limiting_magnitude(study, pool)},
+    "map": lambda study, pool: {"map": map_around(study, pool)},
+}

@@ -1,4 +1,4 @@
-"""Who may come to the page: hosts and origins, signed tokens, and so many visitors at a time."""
+"""Who may come to the page: hosts and origins, and so many visitors at a time."""
 
 from __future__ import annotations
 
@@ -8,21 +8,18 @@ import socket
 from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
-from bokeh.util.token import check_token_signature, get_session_id
-from panel.io.server import WSHandler
 from tornado.routing import Matcher, Rule
 from tornado.web import RequestHandler
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
+from mauvecl.web.visitor import Visitor
 
 if TYPE_CHECKING:
-    from bokeh.protocol.message import Message
-    from bokeh.server.tornado import BokehTornado
     from tornado.httputil import HTTPServerRequest
 
 #: Visitors at a time; each holds some megabytes (assumed to be enough for a team).
-MOST_SESSIONS = 100
+MOST_VISITORS = 100
 #: A host as browsers write it: name, IPv4 address or IPv6 address in brackets; and a port.
 HOST = r"(?:[a-z0-9](?:[a-z0-9.-]*[a-z0-9])?|\[[0-9a-f:.]+\])(?::\d{1,5})?"
 
@@ -115,17 +112,21 @@ class Door(Matcher):
 
     Parameters
     ----------
-    application : BokehTornado
     allowed : frozenset of str
         As `hosts` gives them.
     """
 
-    def __init__(self, application: BokehTornado, allowed: frozenset[str]) -> None:
-        self._application, self._allowed = application, allowed
+    def __init__(self, allowed: frozenset[str]) -> None:
+        self._allowed = allowed
+
+    @classmethod
+    def rule(cls, allowed: frozenset[str]) -> Rule:
+        """To stand before all others."""
+        return Rule(cls(allowed), Refused)
 
     def match(self, request: HTTPServerRequest) -> dict[str, Any] | None:
         """Why a request is refused, or None."""
-        found = self._foreign(request) or self._forged(request) or self._too_many(request)
+        found = self._foreign(request) or self._too_many(request)
         return None if found is None else {"target_kwargs": {"status": found[0], "why": found[1]}}
 
     def _foreign(self, request: HTTPServerRequest) -> tuple[int, str] | None:
@@ -135,56 +136,12 @@ class Door(Matcher):
         for given in request.headers.get_list("Origin"):
             if plain(re.sub(r"^https?://", "", given.lower())) not in self._allowed:
                 return 403, "The page is not there for pages of other servers; see `mauvecl serve --allow-origin`."
-        return None
-
-    def _forged(self, request: HTTPServerRequest) -> tuple[int, str] | None:
-        """Sessions are made by the page alone."""
-        if "bokeh-token" in request.arguments or any(
-            name in request.arguments or name in request.headers for name in ("bokeh-session-id", "Bokeh-Session-Id")
-        ):
-            return 403, "The page takes no session from an address."
-        if request.path.endswith("/ws") and self._session(request) is None:
+        if request.path == "/live" and not request.headers.get_list("Origin"):
             return 403, "Expected a connection as the page makes it."
         return None
 
-    def _session(self, request: HTTPServerRequest) -> str | None:
-        """The session that a websocket is for, if its token is one of ours."""
-        words = [word.strip() for word in request.headers.get("Sec-WebSocket-Protocol", "").split(",")]
-        if len(words) != 2 or words[0] != "bokeh":
-            return None
-        a = self._application
-        try:
-            good = check_token_signature(words[1], secret_key=a.secret_key, signed=a.sign_sessions)
-            return str(get_session_id(words[1])) if good else None
-        except Exception:  # a token is JSON in base64, or is not
-            return None
-
     def _too_many(self, request: HTTPServerRequest) -> tuple[int, str] | None:
-        sessions = {session.id for context in self._application.applications.values() for session in context.sessions}
-        if len(sessions) < MOST_SESSIONS or request.path.split("/")[1] in ("static", "favicon.ico"):
-            return None
-        if request.path.endswith("/ws") and self._session(request) in sessions:
-            return None
-        return 503, "Too many visitors are here at the moment; please come again in some minutes."
-
-
-class Socket(WSHandler):
-    """The page's connection; what went wrong inside the server is not told outside."""
-
-    def check_origin(self, origin: str) -> bool:
-        """The door has asked already, and more exactly: IPv6 too."""
-        return True
-
-    async def send_message(self, message: Message[Any]) -> None:
-        """Send, without a traceback."""
-        if message.msgtype == "ERROR":
-            message.content = {"text": "the message could not be handled", "traceback": None}
-        await super().send_message(message)
-
-
-def guard(application: BokehTornado, allowed: frozenset[str]) -> None:
-    """Put the door in front of everything that a server serves."""
-    for rule in application.wildcard_router.rules:
-        if isinstance(rule.target, type) and issubclass(rule.target, WSHandler):
-            rule.target = Socket
-    application.default_router.rules.insert(0, Rule(Door(application, allowed), Refused))
+        """Whether the server is full."""
+        if request.path in ("/", "/live") and len(Visitor.here) >= MOST_VISITORS:
+            return 503, "Too many visitors are here at the moment; please come again in some minutes."
+        return None

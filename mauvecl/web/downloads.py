@@ -1,113 +1,115 @@
-"""What visitors take along: tables, pictures, and the study that gives them again."""
+"""What visitors take along: tables, and the study that gives them again: as a file, a program, a command."""
 
 from __future__ import annotations
 
 import io
+import shlex
 import tempfile
 import zipfile
-from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from pprint import pformat
+from typing import TYPE_CHECKING
 
 from mauvecl.host.errors import InputError
-from mauvecl.web.fields import UPLOADED
 from mauvecl.web.question import STAR_FILE
 
 if TYPE_CHECKING:
-    from astropy.table import Table
-
-    from mauvecl.host.expectation import Expectation
     from mauvecl.study.study import Study
+    from mauvecl.web.closed import Closed
+    from mauvecl.web.question import Question
+    from mauvecl.web.tabs.tab import Found, Tab
+
+PYTHON = """from mauvecl import Engine, Study, detect
+
+study = Study.build(
+    {data},
+    "page",
+)
+found = detect(study, Engine())
+print(found.table)
+"""
 
 
-def study_file(study: Study) -> io.BytesIO:
-    """The study for the command line; an uploaded star beside it, in a zip."""
+def study_file(study: Study, name: str) -> tuple[str, bytes]:
+    """The study for the command line, with the name of its file; an uploaded star beside it, in a zip."""
     file = study.star[0].file
     if file is None:
-        return io.BytesIO(study.toml().encode())
+        return f"{name}.toml", study.toml().encode()
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as archive:
         archive.write(file, STAR_FILE)
         # The file as seen from the study: not where the server has it.
         archive.writestr("study.toml", study.toml().replace(str(file.resolve()), STAR_FILE))
-    out.seek(0)
-    return out
+    return f"{name}.zip", out.getvalue()
 
 
-def as_file(name: str, ending: str, study: Study, quiet: Expectation, found: Mapping[str, Any]) -> io.BytesIO:
-    """A table or a picture.
+def as_file(tab: Tab, name: str, ending: str, closed: Closed, found: Found) -> tuple[str, bytes]:
+    """A table of a tab, or the study that gives it again, with the name of its file.
 
     Parameters
     ----------
+    tab : Tab
     name : str
-        observation, snr, noise-budget, detection, roc, limit or map.
-    ending : {"ecsv", "fits", "png"}
-    study : Study
-    quiet : Expectation
+        Of the tab's `files`.
+    ending : {"ecsv", "fits", "study"}
+    closed : Closed
     found : mapping
         Answers that are simulated, by name.
 
     Raises
     ------
     InputError
-        If it is not computed yet.
+        If there is no such table, or it is not simulated yet.
     """
     from mauvecl.answers.report import write_table
 
+    if name not in tab.files or ending not in ("ecsv", "fits", "study"):
+        raise InputError(f"{tab.title} has no file {name[:40]!r}.{ending[:10]}, expected one of its own")
+    wanted = tab.files[name]
+    if wanted is not None and wanted not in found:
+        raise InputError(f"no {name} is computed yet, expected a simulation first")
+    if ending == "study":
+        return study_file(tab.study(name, closed, found), f"mauvecl-{name}")
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / f"{name}.{ending}"
-        if ending == "png":
-            _draw(name, study, quiet, found, path)
-        else:
-            write_table(_table(name, study, quiet, found), path)
-        return io.BytesIO(path.read_bytes())
+        path = Path(folder) / f"mauvecl-{name}.{ending}"
+        write_table(tab.table(name, closed, found), path)
+        return path.name, path.read_bytes()
 
 
-def _table(name: str, study: Study, quiet: Expectation, found: Mapping[str, Any]) -> Table:
-    tables: dict[str, Callable[[], Table]] = {
-        "noise-budget": quiet.noise_budget,
-        "observation": lambda: _observed(study),
-        "snr": lambda: found["snr"].element if "snr" in found else _closed_snr(quiet),
-    }
-    if "detection" in found:
-        tables |= {"detection": lambda: found["detection"].table, "roc": lambda: found["detection"].roc}
-    tables |= {kind: lambda kind=kind: found[kind].table for kind in ("limit", "map") if kind in found}  # type: ignore[misc]
-    if name not in tables:
-        raise InputError(f"no {name} is computed yet, expected a simulation first")
-    return tables[name]()
+def as_python(question: Question) -> str:
+    """The question as a program."""
+    data = pformat(question.data(), indent=4, width=100, sort_dicts=False)
+    return PYTHON.format(data=data.replace("\n", "\n    "))
 
 
-def _draw(name: str, study: Study, quiet: Expectation, found: Mapping[str, Any], path: Path) -> None:
-    from mauvecl.pictures import answers, plans
-
-    title = study.star[0].library or UPLOADED
-    if name == "observation":
-        answers.observation(title, _observed(study), path)
-    elif name == "noise-budget":
-        plans.noise_budget([(f"{title}, {quiet.exposure_s:g} s", quiet)], path=path)
-    elif name == "snr" and name not in found:
-        answers.signal_to_noise([(title, quiet)], path)
-    elif name == "roc" and "detection" in found:
-        (star,) = found["detection"].stars
-        answers.roc([(one, star.found.roc(one)) for one in star.found.statistics], path)
-    elif name in found:
-        found[name].plot(path)
-    else:
-        raise InputError(f"no {name} is computed yet, expected a simulation first")
-
-
-def _observed(study: Study) -> Table:
-    """One observation with the flare, taken apart."""
-    from mauvecl.answers.simulate import simulate
-
-    return simulate(study, flaring=True).observations[1][2]
-
-
-def _closed_snr(quiet: Expectation) -> Table:
-    """S/N per element where nothing is simulated yet."""
-    from astropy.table import QTable
-
-    table = QTable({"wavelength": quiet.element_wavelength_nm, "expected": quiet.snr_per_element()})
-    table["wavelength"].unit = "nm"
-    table["expected"].info.description = "closed-form S/N per resolution element of 10.5 nm"
-    return table
+def as_command(question: Question) -> str:
+    """The question on the command line; an uploaded spectrum's needs its study."""
+    q = question
+    if q.uploaded is not None or len(q.own_unknown) > 20:
+        return "mauvecl detect study.toml"
+    data = q.data()
+    words = ["mauvecl", "detect", "--star", q.star, "--magnitude", f"{q.magnitude:.15g}", "--band", q.band]
+    words += [
+        "--amplitude",
+        repr(data["flare"]["amplitudes"][0]),
+        "--flare-temperature",
+        f"{q.flare_temperature_k:.15g}",
+    ]
+    words += ["--exposure", f"{q.exposure_s:.15g}", "--instrument", q.instrument]
+    words += ["--temperature", f"{q.temperature_c:.15g}"]
+    words += {
+        "brightness": ["--sky", f"{q.sky_brightness:.15g}"],
+        "target and time": ["--target", q.target, "--time", q.time],
+        "none": ["--sky", "none"],
+    }[q.sky]
+    for name in data["run"]["statistics"]:
+        words += ["--statistic", name]
+    words += ["--fap", f"{q.fap:.15g}", "--realisations", str(q.realisations.number), "--seed", str(q.seed)]
+    if q.unknown == "the usual":
+        words.append("--with-unknowns")
+    if q.own_unknown:
+        points = ", ".join(f"[{nm!r}, {dn!r}]" for nm, dn in q.own_unknown)
+        words += ["--set", f"nuisances.own.own.points=[{points}]"]
+    if q.realisations.tails != "counted":
+        words += ["--set", f"run.tails={q.realisations.tails}"]
+    return shlex.join(words)

@@ -6,7 +6,7 @@ import itertools
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
@@ -14,13 +14,12 @@ from mauvecl.host.stars.bands import ALIASES
 from mauvecl.host.stars.catalogue import embedded, library_table
 from mauvecl.statistics.registry import STATISTICS
 
-UPLOADED = "uploaded star"
-#: Realisations that a visitor may ask for.
-REALISATIONS = (10_000, 100_000, 1_000_000, 4_000_000)
+UPLOADED, UPLOADED_UNKNOWN = "uploaded star", "uploaded spectrum"
+#: Realisations that a visitor may ask for, and with a tail by importance sampling.
+REALISATIONS, SAMPLED = (10_000, 100_000, 1_000_000, 4_000_000), (100_000, 1_000_000)
 #: What is taken for unknown on the page.
 UNKNOWN = ("nothing", "the usual")
 SKIES = ("brightness", "target and time", "none")
-TABS = ("observation", "snr", "noise", "detection", "limit")
 #: What may be simulated on the page.
 SIMULATIONS = ("detection", "limit", "map")
 #: Characters of a field that are looked at.
@@ -73,8 +72,10 @@ def several(text: str) -> tuple[str, ...]:
     return tuple(dict.fromkeys(names))
 
 
-def points(text: str) -> tuple[tuple[float, float], ...]:
-    """A spectrum as pairs of nm and DN of the exposure; none where nothing is entered."""
+def points(text: str) -> tuple[tuple[float, float], ...] | None:
+    """A spectrum as pairs of nm and DN of the exposure; empty where nothing is entered, None for an uploaded one."""
+    if text == UPLOADED_UNKNOWN:
+        return None
     number = Number(-1e30, 1e30)
     pairs = [pair.split() for pair in text.split(",") if text.strip()]
     if any(len(pair) != 2 for pair in pairs):
@@ -83,6 +84,19 @@ def points(text: str) -> tuple[tuple[float, float], ...]:
     if any(low >= high for (low, _), (high, _) in itertools.pairwise(found)):
         raise InputError(f"{shortened(text)} does not ascend in nm, expected pairs of nm and DN that do")
     return found
+
+
+class Draws(NamedTuple):
+    """How many realisations, and whether the tail beyond them is sampled."""
+
+    number: int
+    tails: str
+
+
+def draws(text: str) -> Draws:
+    """From a choice such as "100000" or "100000 sampled"."""
+    number, _, tails = text.partition(" ")
+    return Draws(int(number), tails or "counted")
 
 
 def star_name(text: str) -> str:
@@ -106,6 +120,16 @@ def star_names() -> list[str]:
 
 
 @dataclass(frozen=True)
+class Slider:
+    """How a number is moved: between ends, by a step, or by a factor; whole frames are steps of theirs."""
+
+    low: float
+    high: float
+    step: float
+    log: bool = False
+
+
+@dataclass(frozen=True)
 class Field:
     """One field.
 
@@ -116,36 +140,106 @@ class Field:
         What stands in it at first.
     read : callable
         Text to value; raises InputError with what is accepted.
+    told : str
+        What it means, for who asks.
+    unit : str
+    slider : Slider, optional
     """
 
     label: str
     first: str
     read: Callable[[str], Any]
+    told: str = ""
+    unit: str = ""
+    slider: Slider | None = None
 
 
-#: By name, as links and `Question` have them; the default is the paper's G2V star with a flare of 24 %.
+#: By name, as links and `Question` have them; the default is a flare at the edge of detection.
 FIELDS = {
-    "star": Field("Library star", "G2V", star_name),
-    "magnitude": Field("Magnitude of the star", "7.4", Number(-2, 25)),
-    "band": Field("Band of the magnitude", "V", Choice(tuple(ALIASES))),
-    "exposure_s": Field("Exposure, s; whole frames of 5 s", "50", Number(0.1, 86_400)),
-    "temperature_c": Field("Detector temperature, deg C", "21", Number(-50, 60)),
-    "instrument": Field("Payload", "mauve", Choice(("mauve", "mauve-electrons"))),
-    "sky": Field("Sky", "brightness", Choice(SKIES)),
-    "sky_brightness": Field("Sky brightness, V mag / arcsec2", "22.1", Number(10, 30)),
-    "target": Field("Target: coordinates such as 290.68 +11.12", "", str),
-    "time": Field("Time, UTC, such as 2026-09-01T12:00", "", str),
-    "amplitude_percent": Field("Flare amplitude, %", "24", Number(0.0001, 1e5)),
-    "flare_temperature_k": Field("Flare temperature, K", "10000", Number(1000, 100_000)),
-    "statistic": Field("Detection statistic", "matched", Choice(tuple(STATISTICS))),
-    "fap": Field("False-alarm probability per test", "0.001", Number(1e-6, 0.5)),
-    "realisations": Field("Realisations", "100000", Choice(tuple(map(str, REALISATIONS)), int)),
-    "unknown": Field("Unknown, drawn and marginalised over", UNKNOWN[0], Choice(UNKNOWN)),
-    "own_unknown": Field("Also unknown: DN at nm, such as 200 1, 450 3, 700 1", "", points),
-    "seed": Field("Seed", "1", Number(0, 2**31, whole=True)),
+    "star": Field(
+        "Star", "G2V", star_name,
+        "Whose spectrum: a spectral type of the library, one of its stars by any name (GJ 581, HD 40307), or your own "
+        "file.",
+    ),
+    "magnitude": Field(
+        "Magnitude", "8.5", Number(-2, 25), "How bright the star is without the flare, in the band beside it.",
+        slider=Slider(0, 15, 0.1),
+    ),
+    "band": Field(
+        "Band", "V", Choice(tuple(ALIASES)), "The band of the magnitude. In V, Vega has 0.03, as in catalogues."
+    ),
+    "amplitude_percent": Field(
+        "Flare amplitude", "2", Number(0.0001, 1e5),
+        "By how much the flare at its peak brightens the star in the band of the Kepler satellite. In the ultraviolet "
+        "the rise is many times as large.",
+        "%", Slider(0.01, 1000, 1.25, log=True),
+    ),
+    "exposure_s": Field(
+        "Exposure", "50", Number(0.1, 86_400), "Time on the star; whole frames of 5 s are added up.", "s",
+        Slider(5, 3600, 5),
+    ),
+    "flare_temperature_k": Field(
+        "Flare temperature", "10000", Number(1000, 100_000),
+        "The flare shines as a blackbody of this temperature. The hotter, the more of its light is ultraviolet.", "K",
+        Slider(5000, 30_000, 500),
+    ),
+    "temperature_c": Field(
+        "Detector temperature", "21", Number(-50, 60), "The dark current doubles every few degrees.", "deg C",
+        Slider(-10, 40, 1),
+    ),
+    "instrument": Field(
+        "Payload", "mauve", Choice(("mauve", "mauve-electrons")),
+        "mauve as its paper has it, or with the dark current counted in electrons.",
+    ),
+    "sky": Field("Sky", "brightness", Choice(SKIES), "Zodiacal light behind the star."),
+    "sky_brightness": Field(
+        "Sky brightness", "22.1", Number(10, 30), "Of the zodiacal light, V magnitudes per square arc second.",
+        "mag/arcsec²", Slider(20, 24, 0.1),
+    ),
+    "target": Field("Target", "", str, "Coordinates in degrees such as 290.68 +11.12."),
+    "time": Field("Time, UTC", "", str, "Such as 2026-09-01T12:00."),
+    "statistic": Field(
+        "Detection statistic", "matched", Choice(tuple(STATISTICS)),
+        "; ".join(f"{name}: {one.definition}" for name, one in STATISTICS.items()) + ".",
+    ),
+    "fap": Field(
+        "False-alarm probability", "0.001", Number(1e-6, 0.5),
+        "How often noise alone passes for a flare, per test: it sets the threshold.", "per test",
+        Slider(1e-6, 0.1, 10**0.25, log=True),
+    ),
+    "unknown": Field(
+        "Unknown", UNKNOWN[0], Choice(UNKNOWN),
+        "What differs from exposure to exposure and is not known: the usual are detector temperature, light lost and "
+        "sky. They are drawn, and the statistic is made blind to them.",
+    ),
+    "own_unknown": Field(
+        "Own unknown spectrum", "", points,
+        "Something else of known shape and unknown strength, such as stray light: pairs of nm and DN, as in "
+        "200 1, 450 3, 700 1, or a file of two columns.",
+    ),
+    "realisations": Field(
+        "Realisations", "100000",
+        Choice((*map(str, REALISATIONS), *(f"{count} sampled" for count in SAMPLED)), draws),
+        "How many noisy exposures a simulation draws. At least 100 must lie beyond the threshold; a sampled tail "
+        "(importance sampling) needs fewer.",
+    ),
+    "seed": Field("Seed", "1", Number(0, 2**31, whole=True), "The same seed gives the same noise, to the bit."),
+}  # fmt: skip
+#: Fields that show at once, and the others by what they are about.
+ASKED = ("star", "magnitude", "band", "amplitude_percent", "exposure_s")
+ADVANCED = {
+    "Detection": ("fap", "statistic", "realisations", "seed"),
+    "Flare and detector": ("flare_temperature_k", "temperature_c", "instrument"),
+    "Sky": ("sky", "sky_brightness", "target", "time"),
+    "Unknown": ("unknown", "own_unknown"),
 }
-#: What a link holds beside the question.
-SEEN = {
-    "tab": Field("Tab", TABS[0], Choice(TABS)),
-    "simulated": Field("Simulated", "", several),
+#: Fields that ask for something under one sky only.
+ASKED_UNDER = {"sky_brightness": "brightness", "target": "target and time", "time": "target and time"}
+#: Questions to begin with; the amplitudes of the first two are the paper's smallest, the others are examples (assumed).
+PRESETS: dict[str, dict[str, str]] = {
+    "Edge of detection": {},
+    "Paper: G2V, V = 7.4": {"magnitude": "7.4", "amplitude_percent": "0.76"},
+    "Paper: K3V, V = 3.7": {"star": "K3V", "magnitude": "3.7", "amplitude_percent": "0.76"},
+    "M dwarf": {"star": "GJ 581", "magnitude": "10.6", "amplitude_percent": "10"},
+    "Active G star": {"star": "G8V", "magnitude": "6.5", "amplitude_percent": "0.5", "exposure_s": "100"},
 }

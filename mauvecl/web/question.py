@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 
 from mauvecl.host.errors import InputError
 from mauvecl.study.study import Study
-from mauvecl.web.fields import UPLOADED
+from mauvecl.web.fields import UPLOADED, Draws
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
 
+Points = tuple[tuple[float, float], ...]
 #: Name of an uploaded star's file beside its study.
 STAR_FILE = "star.ecsv"
 
@@ -35,9 +36,9 @@ class Question:
     flare_temperature_k: float
     statistic: str
     fap: float
-    realisations: int
+    realisations: Draws
     unknown: str
-    own_unknown: tuple[tuple[float, float], ...]
+    own_unknown: Points
     seed: int
     uploaded: Source | None = None
 
@@ -54,20 +55,32 @@ class Question:
         InputError
             For values that cannot be together.
         """
+        if self.uploaded is None:
+            return Study.build(self.data(), "page")
+        if folder is None:
+            raise InputError("no folder for the uploaded star")
+        return Study.build(self.data(str(write_spectrum(self.uploaded, folder))), "page")
+
+    def data(self, file: str = STAR_FILE) -> dict[str, Any]:
+        """The question as a study's data.
+
+        Parameters
+        ----------
+        file : str
+            Where an uploaded spectrum is.
+        """
         star: dict[str, Any] = {"magnitude": self.magnitude, "band": self.band}
         if self.uploaded is None:
             star["library"] = self.star
-        elif folder is None:
-            raise InputError("no folder for the uploaded star")
         else:
-            star["file"] = str(write_spectrum(self.uploaded, folder))
+            star["file"] = file
         skies: dict[str, dict[str, Any]] = {
             "brightness": {"surface_brightness": self.sky_brightness},
             "target and time": {"target": self.target, "time": self.time},
             "none": {"none": True},
         }
         own = {"own": {"points": self.own_unknown}} if self.own_unknown else {}
-        data = {
+        return {
             "star": [star],
             "flare": {"amplitudes": [self.amplitude_percent / 100.0], "temperature_k": self.flare_temperature_k},
             "observation": {
@@ -78,13 +91,13 @@ class Question:
             "sky": skies[self.sky],
             "nuisances": {"usual": self.unknown == "the usual", "own": own},
             "run": {
-                "realisations": self.realisations,
+                "realisations": self.realisations.number,
+                "tails": self.realisations.tails,
                 "seed": self.seed,
                 "statistics": list(dict.fromkeys(["chi2", "chi2_element", self.statistic])),
                 "fap": self.fap,
             },
         }
-        return Study.build(data, "page")
 
 
 def write_spectrum(source: Source, folder: Path) -> Path:

@@ -2,24 +2,21 @@
 
 from __future__ import annotations
 
-import gc
-import secrets
 import sys
 import time
 from collections.abc import Sequence
-from functools import partial
 from typing import Any
 
-#: Bytes of one message: an upload in base64, and room; and of a request's body, for the page takes none.
+#: Bytes of one message: an upload, and room; and of a request's body, for the page takes none.
 MESSAGE, BODY = 8 * 2**20, 2**16
-#: Seconds after which a page that nobody uses is let go.
-IDLE_S = 3600
-#: Milliseconds after which a session without a browser is forgotten, and between two looks.
-UNUSED_MS, SWEEP_MS = 30_000, 5000
+#: Seconds after which a page that nobody uses is let go, and between two looks.
+IDLE_S, SWEEP_S = 3600, 5
+#: Seconds between two signs of life on a connection; one that gives none is ended.
+PING_S = 20
 
 
 def make(address: str, port: int, allowed: Sequence[str]) -> Any:
-    """A server that is ready to start.
+    """A server that listens; `start` its loop.
 
     Parameters
     ----------
@@ -29,6 +26,10 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
     allowed : sequence of str
         Origins by which the page may be asked for beside this machine's own.
 
+    Returns
+    -------
+    tornado.httpserver.HTTPServer
+
     Raises
     ------
     InputError
@@ -36,67 +37,65 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
     OSError
         If the port is taken.
     """
-    from mauvecl.web.doors import guard, hosts
+    from mauvecl.web.doors import Door, Refused, hosts
 
     let_in = hosts(address, port, allowed)
-    import panel as pn
-    from tornado.ioloop import PeriodicCallback
+    from tornado.httpserver import HTTPServer
+    from tornado.web import Application
 
-    from mauvecl.web.frame import session
+    from mauvecl.web.served import Asset, Figure, Front
+    from mauvecl.web.visitor import Visitor
 
-    pn.extension()
-    # A function may fill the document itself.
-    pages: Any = {"/": session}
-    server = pn.io.server.get_server(
-        pages,
-        address=address,
-        port=port,
-        title="mauvecl",
-        location=False,
+    application = Application(
+        [
+            (r"/", Front),
+            (r"/live", Visitor),
+            (r"/figures/([a-z]+)/([a-z]+)\.json", Figure),
+            (r"/(favicon\.svg)", Asset),
+            (r"/assets/([a-z0-9.-]+)", Asset),
+        ],
         websocket_max_message_size=MESSAGE,
-        http_server_kwargs={"max_body_size": BODY, "max_buffer_size": MESSAGE},
-        sign_sessions=True,
-        secret_key=secrets.token_bytes(32),
-        unused_session_lifetime_milliseconds=UNUSED_MS,
-        check_unused_sessions_milliseconds=SWEEP_MS,
-        start=False,
+        websocket_ping_interval=PING_S,
+        default_handler_class=Refused,
+        default_handler_args={"status": 404, "why": "There is no such page."},
+        log_function=lambda handler: None,
     )
-    guard(server._tornado, let_in)
-    sweep = PeriodicCallback(lambda: let_go(server), SWEEP_MS)
-    sweep.start()
+    # The door is asked before anything else.
+    application.default_router.rules.insert(0, Door.rule(let_in))
+    server = HTTPServer(application, max_body_size=BODY, max_buffer_size=MESSAGE)
+    server.listen(port, address)
     return server
 
 
-def let_go(server: Any) -> None:
-    """End pages that nobody uses."""
-    from mauvecl.web.frame import PAGES
+def let_go() -> None:
+    """End connections of pages that nobody uses."""
+    from mauvecl.web.visitor import UNUSED, Visitor
 
     now = time.monotonic()
-    for one in list(server.get_sessions()):
-        page = PAGES.get(one.document)
-        if page is not None and one.connection_count and now - page.used > IDLE_S and page.job is None:
-            page.used = now
-            one.document.add_next_tick_callback(partial(setattr, page.bridge, "idle", True))
-            server.io_loop.call_later(1.0, _disconnect, one)
-
-
-def _disconnect(session: Any) -> None:
-    for connection in list(session._subscribed_connections):
-        connection._socket.close(1001, "not used for a long time")
-    session.request_expiration()
+    for one in list(Visitor.here):
+        if now - one.used > IDLE_S and one.job is None:
+            one.close(UNUSED, "not used for a long time")
 
 
 def warm() -> None:
-    """What the first visitor should not wait for: imports, the response matrix, kernels."""
-    from mauvecl.web.frame import layout
-    from mauvecl.web.page import Page
+    """What the first visitor should not wait for: imports, the response matrix, kernels, the page itself."""
+    import gc
+    import tempfile
+    from pathlib import Path
+
+    from mauvecl.web.closed import Closed
+    from mauvecl.web.served import prepare
     from mauvecl.web.state import State
+    from mauvecl.web.tabs import TABS
+    from mauvecl.web.visitor import shown
     from mauvecl.web.work import Job
 
-    study = State().question().study()
-    quiet, _ = study.expectations(study.star[0])
-    Job(lambda pool: pool.realise(quiet, count=1, seed=0)).future.result()
-    layout(Page())
+    with tempfile.TemporaryDirectory() as folder:
+        closed = Closed.of(State().question(), Path(folder))
+    for tab in TABS:
+        shown(tab, closed, {})
+    Job(lambda pool: pool.realise(closed.quiet, count=1, seed=0)).future.result()
+    prepare()
     # What is there now stays; looking through it again would cost each visitor.
     gc.collect()
     gc.freeze()
@@ -120,22 +119,29 @@ def serve(address: str, port: int, *, show: bool = False, allowed: Sequence[str]
     InputError, OSError
         As `make` does.
     """
+    import asyncio
+
     from mauvecl.web.doors import local, netloc
     from mauvecl.web.plain_log import install
 
-    install()
-    server = make(address, port, allowed)
-    warm()
-    if not local(address):
-        print(
-            f"mauvecl: the page has no users and no passwords: whoever reaches {netloc(address, port)} may use it.",
-            file=sys.stderr,
-        )
-    url = f"http://{netloc(address, port)}/"
-    print(f"mauvecl serves at {url}; Ctrl-C ends it.", flush=True)
-    if show:
-        import webbrowser
+    async def run() -> None:
+        from tornado.ioloop import PeriodicCallback
 
-        server.io_loop.call_later(0.1, webbrowser.open, url)
-    server.start()
-    server.io_loop.start()
+        make(address, port, allowed)
+        warm()
+        if not local(address):
+            print(
+                f"mauvecl: the page has no users and no passwords: whoever reaches {netloc(address, port)} may use it.",
+                file=sys.stderr,
+            )
+        url = f"http://{netloc(address, port)}/"
+        print(f"mauvecl serves at {url}; Ctrl-C ends it.", flush=True)
+        PeriodicCallback(let_go, 1000 * SWEEP_S).start()
+        if show:
+            import webbrowser
+
+            webbrowser.open(url)
+        await asyncio.Event().wait()
+
+    install()
+    asyncio.run(run())

@@ -11,14 +11,18 @@ from urllib.parse import parse_qsl, urlencode
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
-from mauvecl.web.fields import FIELDS, MOST_CHARACTERS, SEEN, UPLOADED
-from mauvecl.web.question import Question
+from mauvecl.results.fap import check_fap
+from mauvecl.web.fields import FIELDS, MOST_CHARACTERS, UPLOADED, UPLOADED_UNKNOWN, Choice, Field, several
+from mauvecl.web.question import Points, Question
+from mauvecl.web.tabs import TABS
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
 
 #: Bytes of a link's values that are looked at.
 MOST_LINKED = 4096
+#: What a link holds beside the question.
+SEEN = {"tab": Field("Tab", next(iter(TABS)), Choice(tuple(TABS))), "simulated": Field("Simulated", "", several)}
 
 
 class State:
@@ -34,15 +38,17 @@ class State:
         What the last link held that is no field, in a sentence, or nothing.
     uploaded : Source or None
         The spectrum that stands for the star where "uploaded star" is entered.
+    unknown : tuple of pairs or None
+        Likewise where "uploaded spectrum" is entered for what is unknown.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, uploaded: Source | None = None, unknown: Points | None = None) -> None:
         self._fields = FIELDS | SEEN
         self.entered = {name: field.first for name, field in self._fields.items()}
         self._values = {name: field.read(field.first) for name, field in self._fields.items()}
         self.faults: dict[str, str] = {}
         self.stray = ""
-        self.uploaded: Source | None = None
+        self.uploaded, self.unknown = uploaded, unknown
 
     def enter(self, given: Mapping[str, str]) -> None:
         """Enter text into fields; what is wrong with it is then found in `faults`."""
@@ -53,22 +59,22 @@ class State:
                 if len(text) > MOST_CHARACTERS:
                     raise InputError(f"{shortened(text)} is too long, expected at most {MOST_CHARACTERS} characters")
                 value = self._fields[name].read(text)
-                if value == UPLOADED and self.uploaded is None:
-                    raise InputError("the uploaded star is not here, expected its file again: links do not hold it")
+                if (text == UPLOADED and self.uploaded is None) or (text == UPLOADED_UNKNOWN and self.unknown is None):
+                    raise InputError(f"the {text} is not here, expected its file again: links do not hold it")
                 self._values[name] = value
             except InputError as error:
                 self.faults[name] = str(error)
+        if given.keys() & {"fap", "realisations"}:
+            self._settled()
 
-    def take(self, uploaded: Source) -> None:
-        """An upload is read: it is the star."""
-        self.uploaded = uploaded
-        self.enter({"star": UPLOADED})
-
-    def lack(self, why: str) -> None:
-        """No star is known, for an upload is not read yet or cannot be; the sentence says which."""
-        self.uploaded = None
-        self.entered["star"] = ""
-        self.faults["star"] = why
+    def _settled(self) -> None:
+        """Whether so many realisations can settle such a probability."""
+        if "fap" not in self.faults and self.faults.get("realisations", "fap = ").startswith("fap = "):
+            self.faults.pop("realisations", None)
+            try:
+                check_fap(self._values["fap"], *self._values["realisations"])
+            except InputError as error:
+                self.faults["realisations"] = str(error)
 
     @property
     def asked(self) -> tuple[str, ...]:
@@ -91,12 +97,9 @@ class State:
         if self.faults:
             raise InputError(self.fault)
         values = {name: self._values[name] for name in FIELDS}
+        if values["own_unknown"] is None:
+            values["own_unknown"] = self.unknown
         return Question(**values, uploaded=self.uploaded if values["star"] == UPLOADED else None)
-
-    @property
-    def tab(self) -> str:
-        """The tab in front."""
-        return str(self._values["tab"])
 
     @property
     def simulated(self) -> tuple[str, ...]:
@@ -108,7 +111,7 @@ class State:
     @property
     def link(self) -> str:
         """Everything entered, as the query of an address."""
-        return "?" + urlencode({name: text for name, text in self.entered.items() if text})
+        return "?" + urlencode({name: text for name, text in self.entered.items() if text or self._fields[name].first})
 
     def follow(self, link: str) -> None:
         """Enter what a link holds, and what stands at first where it holds nothing."""

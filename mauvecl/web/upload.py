@@ -4,13 +4,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
+
 from mauvecl.host.errors import InputError
+from mauvecl.host.files.bounded import shortened
 from mauvecl.host.stars.source import Source
+from mauvecl.study.weights import columns
 from mauvecl.web.fields import UPLOADED
 from mauvecl.web.limited import read_limited
+from mauvecl.web.question import Points
 
 #: Bytes of an upload, and points of its spectrum, at most.
 MOST_UPLOADED, MOST_POINTS = 4 * 2**20, 200_000
+
+
+#: Bytes and rows of what is unknown: it goes into every table's study.
+MOST_PAIRS_BYTES, MOST_PAIRS = 2**18, 4000
 
 
 def too_large(size: float) -> str:
@@ -40,3 +49,25 @@ def read_upload(name: str, content: bytes) -> Source:
     if source.wavelength_nm.size > MOST_POINTS:
         raise InputError(f"upload of {source.wavelength_nm.size} points, expected at most {MOST_POINTS}")
     return replace(source, name=UPLOADED, origin="upload")
+
+
+def read_pairs(name: str, content: bytes) -> Points:
+    """A spectrum of something unknown from a visitor: two columns as text, nm and DN of the exposure.
+
+    Raises
+    ------
+    InputError
+        If it is too large or holds no such columns.
+    """
+    if len(content) > MOST_PAIRS_BYTES:
+        raise InputError(f"upload of {len(content) / 1024:.0f} KiB, expected at most {MOST_PAIRS_BYTES // 1024} KiB")
+    try:
+        text = content.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{shortened(name)} is no text, expected two columns, nm and DN") from error
+    found = columns(f"upload {shortened(name)}", text)
+    if found.ndim != 2 or found.shape[1] != 2 or not 2 <= len(found) <= MOST_PAIRS:
+        raise InputError(f"{shortened(name)} has other rows, expected 2 to {MOST_PAIRS} of two numbers, nm and DN")
+    if not np.isfinite(found).all() or (np.diff(found[:, 0]) <= 0).any():
+        raise InputError(f"{shortened(name)} does not ascend in nm, expected rows that do")
+    return tuple((float(nm), float(dn)) for nm, dn in found)

@@ -1,0 +1,96 @@
+// Scenarios that are pinned, side by side, and what was simulated; the browser's tab keeps them.
+
+const MOST = 8
+const KEY = "mauvecl-compare"
+const ROWS = [
+  ["Star", e => e.star], ["Magnitude", e => `${e.band} = ${e.magnitude}`], ["Flare", e => `${e.amplitude_percent} %`],
+  ["Flare temperature", e => `${e.flare_temperature_k} K`], ["Exposure", e => `${e.exposure_s} s`],
+  ["Statistic", e => e.statistic], ["False-alarm probability", e => e.fap], ["Unknown", e => e.unknown],
+]
+
+function element(tag, text, more = {}) {
+  const made = document.createElement(tag)
+  if (text !== null) made.textContent = text
+  Object.assign(made, more)
+  return made
+}
+
+export class Compare {
+  // open(link): show a scenario again.
+  constructor(open) {
+    this.open = open
+    try {
+      this.kept = JSON.parse(sessionStorage.getItem(KEY)) ?? {pinned: [], history: []}
+    } catch {
+      this.kept = {pinned: [], history: []}
+    }
+    this.show()
+  }
+
+  pin(scenario) {
+    this.kept.pinned = [...this.kept.pinned.filter(one => one.link !== scenario.link), scenario].slice(-MOST)
+    this.keep()
+  }
+
+  ran(scenario) {
+    this.kept.history = [scenario, ...this.kept.history.filter(one => one.link !== scenario.link)].slice(0, 20)
+    this.keep()
+  }
+
+  keep() {
+    try {
+      sessionStorage.setItem(KEY, JSON.stringify(this.kept))
+    } catch { /* not kept */ }
+    this.show()
+  }
+
+  button(text, called, act) {
+    const made = element("button", text, {type: "button", className: "plain", onclick: act})
+    made.setAttribute("aria-label", called)
+    return made
+  }
+
+  show() {
+    const {pinned, history} = this.kept
+    const box = document.getElementById("pinned")
+    if (pinned.length) {
+      const table = element("table", null)
+      table.append(element("caption", "Pinned scenarios", {className: "quiet"}))
+      const row = (head, cells) => {
+        const made = element("tr", null)
+        made.append(element("th", head, {scope: "row"}), ...cells)
+        table.append(made)
+      }
+      row("Detected", pinned.map(one => {
+        const cell = element("td", null)
+        cell.append(element("strong", one.shown))
+        return cell
+      }))
+      row("", pinned.map(one => element("td", one.interval)))
+      for (const [head, of] of ROWS) row(head, pinned.map(one => element("td", of(one.entered))))
+      for (const [head] of pinned[0].facts) {
+        row(head, pinned.map(one => element("td", Object.fromEntries(one.facts)[head] ?? "")))
+      }
+      row("", pinned.map((one, k) => {
+        const cell = element("td", null)
+        cell.append(
+          this.button("Open", `Open scenario ${k + 1}`, () => this.open(one.link)),
+          this.button("Remove", `Remove scenario ${k + 1}`, () => {
+            this.kept.pinned = pinned.filter(other => other !== one)
+            this.keep()
+          }),
+        )
+        return cell
+      }))
+      box.replaceChildren(table)
+    } else {
+      box.replaceChildren(element("p", "Nothing is pinned yet: Pin keeps the present question and its answer here."))
+    }
+    document.getElementById("no-history").hidden = history.length > 0
+    document.getElementById("history").replaceChildren(...history.map((one, k) => {
+      const item = element("li", `${one.at}: ${one.shown} (${one.interval}), ${one.words} `)
+      item.append(this.button("Open", `Open run ${history.length - k}`, () => this.open(one.link)))
+      return item
+    }))
+  }
+}

@@ -1,0 +1,208 @@
+// The fields: text that is entered, right or wrong, sliders beside it, the list of stars, files.
+
+const byId = id => document.getElementById(id)
+
+// What a slider's place means, and back; values have as many digits as they need.
+class Scale {
+  constructor({low, high, step, log}) {
+    Object.assign(this, {low, high, step, log})
+    this.count = Math.round(log ? Math.log(high / low) / Math.log(step) : (high - low) / step)
+  }
+
+  value(place) {
+    if (this.log) return String(Number((this.low * this.step ** place).toPrecision(2)))
+    const digits = Math.max(0, -Math.floor(Math.log10(this.step) + 1e-9))
+    return (this.low + place * this.step).toFixed(digits).replace(/\.?0+$/, digits ? "" : "$&")
+  }
+
+  place(value) {
+    const found = this.log ? Math.log(value / this.low) / Math.log(this.step) : (value - this.low) / this.step
+    return Math.min(Math.max(Math.round(found), 0), this.count)
+  }
+}
+
+export class Fields {
+  // changed(last): something was entered; last says whether it is done with. chosen(field, file): a file.
+  constructor(words, changed, chosen) {
+    this.words = words
+    this.changed = changed
+    this.entered = {...words.fields}
+    this.scales = {}
+    for (const name of Object.keys(words.fields)) this.wire(name)
+    for (const button of document.querySelectorAll("[data-choose]")) {
+      const file = document.querySelector(`[data-upload="${button.dataset.choose}"]`)
+      button.addEventListener("click", () => file.click())
+      file.addEventListener("change", () => {
+        if (file.files.length) chosen(button.dataset.choose, file.files[0])
+      })
+    }
+    this.stars = new Stars(byId("f-star"), byId("stars"), words.stars, () => this.take("star", true))
+    this.show()
+  }
+
+  wire(name) {
+    const field = byId(`f-${name}`)
+    const isSelect = field.tagName === "SELECT"
+    if (!isSelect) field.addEventListener("input", () => this.take(name, false))
+    field.addEventListener("change", () => this.take(name, true))
+    const slider = document.querySelector(`[data-slider="${name}"]`)
+    if (!slider) return
+    const scale = this.scales[name] = new Scale(this.words.sliders[name])
+    slider.max = String(scale.count)
+    const move = last => {
+      field.value = scale.value(Number(slider.value))
+      this.take(name, last)
+    }
+    slider.addEventListener("input", () => move(false))
+    slider.addEventListener("change", () => move(true))
+    field.addEventListener("keydown", event => {
+      const step = {ArrowUp: 1, ArrowDown: -1}[event.key]
+      const value = Number(field.value)
+      if (!step || !(Math.abs(value) >= 0)) return
+      event.preventDefault()
+      field.value = scale.value(scale.place(value) + step)
+      this.take(name, true)
+    })
+  }
+
+  take(name, last) {
+    const text = byId(`f-${name}`).value
+    const other = text !== this.entered[name]
+    this.entered[name] = text
+    if (name === "fap" && other) this.possible()
+    if (other || last) this.changed(last, other)
+    this.aside(name)
+  }
+
+  // Enter several at once, as a preset, a link or a click on a picture does.
+  put(given) {
+    Object.assign(this.entered, given)
+    this.possible()
+    this.show()
+  }
+
+  show() {
+    for (const name of Object.keys(this.words.fields)) {
+      const field = byId(`f-${name}`)
+      const text = this.entered[name]
+      if (field.tagName === "SELECT" && ![...field.options].some(o => o.value === text)) {
+        // A choice that a link holds and that does not exist is shown for what it is.
+        field.add(new Option(text, text))
+      }
+      if (field.value !== text) field.value = text
+      this.aside(name)
+    }
+  }
+
+  // What stands beside a field: its slider, and fields that are asked for under one sky only.
+  aside(name) {
+    const slider = document.querySelector(`[data-slider="${name}"]`)
+    if (slider) {
+      const value = Number(this.entered[name])
+      if (this.entered[name].trim() && Number.isFinite(value)) {
+        const place = this.scales[name].place(value)
+        if (slider.value !== String(place)) slider.value = String(place)
+      }
+      slider.setAttribute("aria-valuetext", this.entered[name])
+    }
+    if (name === "sky") {
+      for (const [other, sky] of Object.entries(this.words.under)) {
+        document.querySelector(`[data-field="${other}"]`).hidden = this.entered.sky !== sky
+      }
+    }
+  }
+
+  // Realisations that can settle the false-alarm probability are offered, others are not; one is chosen that can.
+  possible() {
+    const fap = Number(this.entered.fap)
+    const field = byId("f-realisations")
+    const settles = text => text.endsWith("sampled") || Number(text) * fap >= 100 * (1 - 1e-9)
+    for (const option of field.options) option.disabled = fap > 0 && !settles(option.value)
+    if (fap > 0 && !settles(this.entered.realisations)) {
+      const wanted = [...field.options].find(option => !option.disabled)
+      this.entered.realisations = field.value = wanted.value
+    }
+  }
+
+  // The sentences of what is wrong, at their fields; a wrong field is never hidden.
+  tell(faults) {
+    for (const name of Object.keys(this.words.fields)) {
+      const field = byId(`f-${name}`)
+      const told = byId(`w-${name}`)
+      const fault = faults[name] ?? ""
+      if (told.textContent !== fault) told.textContent = fault
+      told.hidden = !fault
+      if (fault) {
+        field.setAttribute("aria-invalid", "true")
+        document.querySelector(`[data-field="${name}"]`)?.removeAttribute("hidden")
+        if (byId("advanced").contains(field)) byId("advanced").open = true
+      } else field.removeAttribute("aria-invalid")
+    }
+  }
+}
+
+// A list under the field of stars that holds those whose names have what is typed.
+class Stars {
+  constructor(field, list, names, chosen) {
+    Object.assign(this, {field, list, names, chosen, at: -1})
+    field.addEventListener("input", () => this.open(field.value))
+    field.addEventListener("focus", () => field.select())
+    field.addEventListener("click", () => { if (list.hidden) this.open("") })
+    field.addEventListener("blur", () => this.close())
+    field.addEventListener("keydown", event => this.key(event))
+    // Before the field loses the focus.
+    list.addEventListener("mousedown", event => {
+      event.preventDefault()
+      if (event.target.role === "option") this.choose(event.target)
+    })
+  }
+
+  open(text) {
+    const wanted = text.trim().toLowerCase()
+    const found = this.names.filter(name => name.toLowerCase().includes(wanted))
+    this.list.replaceChildren(...found.map((name, k) => {
+      const item = document.createElement("li")
+      item.role = "option"
+      item.id = `star-${k}`
+      item.textContent = name
+      item.setAttribute("aria-selected", "false")
+      return item
+    }))
+    this.at = -1
+    this.show(found.length > 0)
+  }
+
+  show(open) {
+    this.list.hidden = !open
+    this.field.setAttribute("aria-expanded", String(open))
+    if (!open) this.field.removeAttribute("aria-activedescendant")
+  }
+
+  close() { this.show(false) }
+
+  key(event) {
+    const step = {ArrowDown: 1, ArrowUp: -1}[event.key]
+    if (step) {
+      event.preventDefault()
+      if (this.list.hidden) this.open("")
+      const items = this.list.children
+      items[this.at]?.setAttribute("aria-selected", "false")
+      this.at = (this.at + step + items.length) % items.length
+      const item = items[this.at]
+      item.setAttribute("aria-selected", "true")
+      item.scrollIntoView({block: "nearest"})
+      this.field.setAttribute("aria-activedescendant", item.id)
+    } else if (event.key === "Enter") {
+      event.preventDefault()
+      const item = this.list.hidden ? null : this.list.children[this.at]
+      if (item) this.choose(item)
+      else { this.close(); this.chosen() }
+    } else if (event.key === "Escape") this.close()
+  }
+
+  choose(item) {
+    this.field.value = item.textContent
+    this.close()
+    this.chosen()
+  }
+}

@@ -1,0 +1,219 @@
+<%doc>The page: all that is the same for everybody. Answers and pictures come later.</%doc>
+<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="description" content="Would the Mauve satellite see this stellar flare, and how sure can one be?">
+<meta name="color-scheme" content="light dark">
+<title>mauvecl: would Mauve see this flare?</title>
+<link rel="icon" type="image/svg+xml" href="favicon.svg">
+<link rel="stylesheet" href="assets/page.css?v=${digest}">
+<script src="assets/theme.js?v=${digest}"></script>
+<script defer src="assets/bokeh.min.js?v=${digest}"></script>
+<script type="module" src="assets/page.js?v=${digest}"></script>
+<script type="application/json" id="words">${words | n}</script>
+</head>
+<body>
+<%def name="help(name, about)">\
+<button type="button" class="help" popovertarget="help-${name}" aria-label="What is ${about}?">?</button>\
+</%def>
+<%def name="meaning(name, about, told)">
+<div class="meaning" id="help-${name}" popover><strong>${about}</strong> ${told}</div>
+</%def>
+<%def name="control(name)">
+<% field = fields.FIELDS[name] %>
+<div class="field" data-field="${name}">
+<div class="head"><label for="f-${name}">${field.label}</label>${help(name, field.label)}${meaning(name, field.label, field.told)}</div>
+% if name == "star":
+<div class="combo">
+<input id="f-star" name="star" type="text" role="combobox" autocomplete="off" spellcheck="false" value="${field.first}"
+ aria-expanded="false" aria-controls="stars" aria-autocomplete="list" aria-describedby="w-star">
+<ul id="stars" role="listbox" aria-label="Stars" hidden></ul>
+</div>
+<div class="file"><button type="button" class="plain" data-choose="star">Use your own spectrum</button>
+<input type="file" data-upload="star" aria-label="Your own spectrum" tabindex="-1" hidden><span class="hint">nm and erg/s/cm²/Å; text, ECSV, VOTable, FITS</span></div>
+% elif name == "own_unknown":
+<input id="f-own_unknown" name="own_unknown" type="text" autocomplete="off" spellcheck="false" placeholder="200 1, 450 3, 700 1" aria-describedby="w-own_unknown">
+<div class="file"><button type="button" class="plain" data-choose="own_unknown">Use a file of nm and DN</button>
+<input type="file" data-upload="own_unknown" aria-label="File of the unknown spectrum" tabindex="-1" hidden></div>
+% elif hasattr(field.read, "options"):
+<select id="f-${name}" name="${name}" aria-describedby="w-${name}">
+% for option in field.read.options:
+<option value="${option}"${" selected" if option == field.first else ""}>${spoken(name, option)}</option>
+% endfor
+</select>
+% else:
+<div class="number"><input id="f-${name}" name="${name}" type="text" value="${field.first}" autocomplete="off" spellcheck="false"
+ ${"inputmode=decimal" if hasattr(field.read, "low") else ""} aria-describedby="w-${name}">
+% if name == "magnitude":
+<label class="aside" for="f-band">in</label>
+<select id="f-band" name="band" aria-describedby="w-band">
+% for option in fields.FIELDS["band"].read.options:
+<option${" selected" if option == fields.FIELDS["band"].first else ""}>${option}</option>
+% endfor
+</select>
+% elif field.unit:
+<span class="unit">${field.unit}</span>
+% endif
+</div>
+% if field.slider:
+<input type="range" data-slider="${name}" aria-label="${field.label}, slider" min="0" max="1" step="1">
+% endif
+% endif
+<p class="wrong" id="w-${name}" hidden></p>
+% if name == "magnitude":
+<p class="wrong" id="w-band" hidden></p>
+% endif
+</div>
+</%def>
+<%def name="spoken(name, option)"><%
+if name == "realisations":
+    count, _, tails = option.partition(" ")
+    option = f"{int(count):,}" + (", sampled tails" if tails else "")
+%>${option}</%def>
+<a class="skip" href="#answer">To the answer</a>
+<header>
+<h1>mauvecl</h1>
+<p class="lead">Would the Mauve satellite see this flare?</p>
+<nav aria-label="About">
+<button type="button" class="plain" id="theme" aria-label="Colours: as the system has them">◐</button>
+<button type="button" class="plain" data-opens="about">About and citation</button>
+</nav>
+</header>
+<main>
+<section id="asked" aria-labelledby="asked-head">
+<h2 id="asked-head" class="quiet">Question</h2>
+<details id="controls" open>
+<summary class="fold">Change the question</summary>
+<form autocomplete="off">
+<div class="field"><div class="head"><label for="preset">Begin with</label></div>
+<select id="preset"><option value="">choose an example</option>
+% for name in fields.PRESETS:
+<option>${name}</option>
+% endfor
+</select></div>
+% for name in fields.ASKED:
+% if name != "band":
+${control(name)}
+% endif
+% endfor
+<details id="advanced"><summary>Advanced</summary>
+% for title, names in fields.ADVANCED.items():
+<fieldset><legend>${title}</legend>
+% for name in names:
+${control(name)}
+% endfor
+</fieldset>
+% endfor
+</details>
+<div class="row">
+<button type="button" id="pin">Pin</button>
+<button type="button" data-opens="export">Take along</button>
+<button type="button" class="plain" id="afresh">Start afresh</button>
+</div>
+</form>
+</details>
+</section>
+<section id="answer" aria-labelledby="answer-head" tabindex="-1">
+<h2 id="answer-head" class="quiet">Answer</h2>
+<div id="card" class="card" aria-busy="true">
+<div class="told" aria-live="polite" aria-atomic="true">
+<p class="chance"><span id="chance">…</span></p>
+<p class="interval" id="interval">the answer is on its way</p>
+<p class="words" id="words-of"></p>
+</div>
+<dl id="facts"></dl>
+<div class="row run">
+<button type="button" id="simulate" class="main" disabled>Simulate</button>
+<button type="button" id="cancel" disabled>Cancel</button>
+<progress id="progress" max="1" value="0" aria-label="Simulation"></progress>
+<span id="status" role="status"></span>
+</div>
+</div>
+<ul id="notices" aria-label="Notices"></ul>
+<div class="tabs">
+<div role="tablist" aria-label="Pictures of the answer">
+% for k, tab in enumerate(tabs.values()):
+<button type="button" role="tab" id="tab-${tab.name}" aria-controls="panel-${tab.name}" aria-selected="${"true" if k == 0 else "false"}" tabindex="${0 if k == 0 else -1}">${tab.title}</button>
+% endfor
+</div>
+% for k, tab in enumerate(tabs.values()):
+<div role="tabpanel" id="panel-${tab.name}" aria-labelledby="tab-${tab.name}"${"" if k == 0 else " hidden"}>
+<p class="about">${tab.about}</p>
+<div class="pictures${" one" if len(tab.pictures) == 1 else ""}">
+% for picture in tab.pictures:
+<figure id="figure-${picture.name}" data-picture="${picture.name}">
+<h3>${picture.title}</h3>
+<ul class="legend" aria-label="Colours of ${picture.title}"></ul>
+<div class="plot" id="plot-${picture.name}" role="img" aria-labelledby="text-${picture.name}"></div>
+<figcaption><p id="text-${picture.name}"></p>
+<div class="tools">
+% for axis in picture.logs:
+<label><input type="checkbox" data-log="${axis.lower()}"${" checked" if axis.isupper() else ""}> log ${axis.lower()}</label>
+% endfor
+% for tag, title in picture.shows.items():
+<label><input type="checkbox" data-show="${tag}"> ${title}</label>
+% endfor
+<button type="button" class="plain" data-reset>Reset zoom</button>
+<button type="button" class="plain" data-save="svg">SVG</button>
+<button type="button" class="plain" data-save="png">PNG</button>
+</div></figcaption>
+</figure>
+% endfor
+</div>
+% if tab.name == "compare":
+<h3>Pinned</h3>
+<div class="wide" id="pinned" tabindex="0" role="region" aria-label="Pinned scenarios"><p>Nothing is pinned yet: Pin keeps the present question and its answer here.</p></div>
+<h3>History</h3>
+<ol id="history" reversed></ol>
+<p id="no-history">Nothing is simulated yet.</p>
+% else:
+<div class="row">
+% for kind, title in tab.simulations.items():
+% if kind != "detection":
+<button type="button" data-simulate="${kind}" class="main" disabled>${title}</button>
+% endif
+% endfor
+% if any(p for p in tab.pictures if p.name in ("excess", "recorded", "telescope", "snr", "budget")):
+<label><input type="checkbox" data-marks="marks" checked> spectral lines</label>
+<label><input type="checkbox" data-marks="more marks"> H alpha</label>
+% endif
+</div>
+<div class="wide rows" tabindex="0" role="region" aria-label="Table of ${tab.title}" hidden></div>
+% if tab.files:
+<div class="row files"><span>Tables:</span>
+% for name in tab.files:
+<button type="button" data-file="${name}" data-ending="ecsv" disabled>${name} (ecsv)</button>
+<button type="button" data-file="${name}" data-ending="fits" disabled>${name} (fits)</button>
+% if name in ("limit", "map"):
+<button type="button" data-file="${name}" data-ending="study" disabled>${name} (study)</button>
+% endif
+% endfor
+</div>
+% endif
+% endif
+</div>
+% endfor
+</div>
+</section>
+</main>
+<footer><p id="nominal">Nominal throughput, pieced together from the paper, datasheets and assumptions: not a flight calibration. Sensible uncertainty: 30 %, and 50 % below 250 nm.</p></footer>
+<dialog id="export" aria-labelledby="export-head">
+<h2 id="export-head">Take this question along</h2>
+<p>The same numbers, to the bit, wherever mauvecl runs.</p>
+<div class="row"><button type="button" class="main" id="study">Study for the command line</button><button type="button" data-copy="address">Copy the link</button></div>
+<h3>Command line</h3><pre id="as-command" tabindex="0"></pre><button type="button" data-copy="as-command">Copy the command</button>
+<h3>Python</h3><pre id="as-python" tabindex="0"></pre><button type="button" data-copy="as-python">Copy the program</button>
+<div class="row"><button type="button" data-closes>Close</button></div>
+</dialog>
+<dialog id="about" aria-labelledby="about-head">
+<h2 id="about-head">About mauvecl ${version}</h2>
+<p>Closed forms follow every change at once; Simulate refines them with noise realisations. Whatever is seen can be taken along and gives the same numbers on the command line.</p>
+<h3>Documentation</h3><p>The folder <code>docs</code> of the project, its page <code>docs/page.md</code> on this page, and <code>mauvecl --help</code>.</p>
+<h3>Citation</h3><p>Please cite mauvecl ${version} (The mauvecl developers: “mauvecl: would the Mauve satellite see this stellar flare?”) and the paper whose instrument model it implements: Saba, A., et al., “MauveSim: the instrument simulator software for the Blue Skies Space Mauve satellite”, RAS Techniques and Instruments. The file <code>CITATION.cff</code> has both.</p>
+<div class="row"><button type="button" data-closes>Close</button></div>
+</dialog>
+<div id="lost" role="alertdialog" aria-labelledby="lost-told" hidden><div><p id="lost-told"></p><button type="button" class="main" id="go-on" hidden>Go on</button></div></div>
+</body>
+</html>

@@ -1,0 +1,534 @@
+// The page: what is entered goes to the server, and nothing is shown that is not the answer to it.
+
+import {Compare} from "./compare.js"
+import {Fields} from "./fields.js"
+import {Live} from "./live.js"
+import {Pictures} from "./pictures.js"
+
+const byId = id => document.getElementById(id)
+const words = JSON.parse(byId("words").textContent)
+//: Milliseconds without a change after which one exposure is drawn.
+const DRAW_MS = 500
+//: Tabs that show a drawn exposure.
+const DRAWN = new Set(["detection", "spectrum"])
+
+class Page {
+  constructor() {
+    this.seen = {...words.seen}
+    this.files = {}
+    this.answer = null
+    this.faults = {}
+    this.lacks = {}
+    this.asking = this.dirty = false
+    this.running = null
+    this.wanted = []
+    this.dismissed = new Set()
+    this.fields = new Fields(words, (last, other) => this.changed(last, other), (field, file) => this.upload(field, file))
+    this.pictures = new Pictures(words, given => this.enter(given), (name, blob) => this.give(name, blob))
+    this.compare = new Compare(link => { this.follow(link); this.changed(true, true) })
+    this.wire()
+    this.follow(window.location.search)
+    this.wanted = this.seen.simulated.split(",").filter(Boolean)
+    this.live = new Live(version => this.back(version), code => this.lost(code))
+  }
+
+  // What is entered, as the query of an address.
+
+  get link() {
+    const first = {...words.fields, ...words.seen}
+    const pairs = Object.entries({...this.fields.entered, ...this.seen})
+    return `?${new URLSearchParams(pairs.filter(([name, text]) => text !== "" || first[name] !== ""))}`
+  }
+
+  // The question alone: what is asked, whatever is seen of it.
+  get question() {
+    return JSON.stringify(this.fields.entered)
+  }
+
+  follow(link) {
+    const given = new URLSearchParams(link)
+    const stray = new URLSearchParams()
+    const entered = {...words.fields}
+    this.seen = {...words.seen}
+    for (const [name, text] of given) {
+      if (name in entered) entered[name] = text
+      else if (name in this.seen) this.seen[name] = text
+      else stray.append(name, text)
+    }
+    this.stray = stray.toString()
+    if (!(this.seen.tab in words.tabs)) {
+      this.stray += `&tab=${encodeURIComponent(this.seen.tab)}`
+      this.seen.tab = words.seen.tab
+    }
+    Object.assign(this.fields.entered, entered)
+    this.fields.show()
+    this.showTab()
+  }
+
+  address(push) {
+    if (this.link === window.location.search) return
+    window.history[push ? "pushState" : "replaceState"]({}, "", window.location.pathname + this.link)
+  }
+
+  // Something was entered: `last` is whether the visitor is done with it, `other` whether it is another question.
+  changed(last, other) {
+    if (other) {
+      this.seen.simulated = ""
+      this.wanted = []
+      this.stop()
+      if (this.fields.entered.star !== words.uploads.star) delete this.lacks.star
+      if (this.fields.entered.own_unknown !== words.uploads.own_unknown) delete this.lacks.own_unknown
+      this.withdraw()
+      this.ask()
+    }
+    // While something is being chosen the address follows; all of it is one step of the history.
+    if (other) {
+      this.address(!this.editing)
+      this.editing = !last
+    } else if (last) this.editing = false
+  }
+
+  enter(given) {
+    this.fields.put(given)
+    this.changed(true, true)
+  }
+
+  // The answer
+
+  // Until there is an answer to these fields there is none.
+  withdraw() {
+    this.answer = null
+    clearTimeout(this.soon)
+    byId("card").setAttribute("aria-busy", "true")
+    for (const part of this.dimmed()) part.classList.add("dim")
+    this.offer()
+  }
+
+  dimmed() {
+    return [byId("card").querySelector(".told"), byId("facts"), ...document.querySelectorAll(".pictures, .rows")]
+  }
+
+  ask() {
+    if (this.asking) {
+      this.dirty = true
+      return
+    }
+    if (!this.live?.open) return
+    const lacks = Object.entries(this.lacks)
+    if (lacks.length) {
+      this.none(this.faults = this.lacks)
+      return
+    }
+    this.asking = true
+    this.dirty = false
+    const question = this.question
+    const n = this.live.ask("answer", {link: this.link + (this.stray ? `&${this.stray}` : ""), tab: this.seen.tab}, told => {
+      if (told.pictures) {
+        this.live.done(n)
+        if (question === this.question) this.draw(told)
+        return
+      }
+      this.asking = false
+      if (this.dirty || question !== this.question) {
+        this.ask()
+        return
+      }
+      this.show(told)
+    })
+  }
+
+  show(told) {
+    this.faults = told.faults
+    this.fields.tell(told.faults)
+    this.notices(told.stray ? [[told.stray, "info"]] : [])
+    if (told.answer) this.tell(told.answer)
+    else this.none(told.faults, told.refused)
+  }
+
+  // There is no answer to what is entered; pictures of an earlier one are dimmed.
+  none(faults, refused) {
+    this.withdraw()
+    this.fields.tell(faults)
+    const why = refused ?? Object.entries(faults).map(([name, why]) => `${this.label(name)}: ${why}`).join("; ")
+    const card = byId("card")
+    card.classList.add("none")
+    card.setAttribute("aria-busy", "false")
+    card.querySelector(".told").classList.remove("dim")
+    byId("chance").textContent = "No answer."
+    byId("interval").textContent = ""
+    byId("words-of").textContent = why
+    this.ended("")
+  }
+
+  label(name) {
+    return document.querySelector(`label[for="f-${name}"]`)?.textContent ?? name
+  }
+
+  tell(answer) {
+    this.answer = answer
+    const card = byId("card")
+    card.classList.remove("none")
+    card.setAttribute("aria-busy", "false")
+    for (const part of [card.querySelector(".told"), byId("facts")]) part.classList.remove("dim")
+    byId("chance").textContent = answer.shown
+    byId("interval").textContent = answer.interval
+    byId("words-of").textContent = answer.words
+    const facts = byId("facts")
+    facts.replaceChildren(...answer.facts.flatMap(([name, value]) => {
+      const head = document.createElement("dt"), body = document.createElement("dd")
+      head.textContent = name
+      body.textContent = value
+      return [head, body]
+    }))
+    this.notices([...this.strays, ...answer.notes])
+    this.seen.simulated = answer.simulated.join(",")
+    this.address(false)
+    document.title = `${answer.shown}: mauvecl`
+    this.offer()
+    this.next()
+  }
+
+  async draw(told) {
+    this.rows(told.tab, told.rows)
+    await this.pictures.put(told.pictures)
+    for (const part of document.querySelectorAll(".pictures, .rows")) part.classList.remove("dim")
+    this.drawnTab = told.tab
+    clearTimeout(this.soon)
+    if (DRAWN.has(told.tab) && !told.draws) this.soon = setTimeout(() => this.drawOne(), DRAW_MS)
+  }
+
+  drawOne() {
+    const question = this.question
+    const n = this.live.ask("draw", {link: this.link, tab: this.seen.tab}, told => {
+      this.live.done(n)
+      if (question === this.question && told.tab === this.seen.tab) this.draw({...told, draws: true})
+    })
+  }
+
+  rows(tab, rows) {
+    const box = document.querySelector(`#panel-${tab} .rows`)
+    if (!box) return
+    box.hidden = rows.length === 0
+    const table = document.createElement("table")
+    rows.forEach((cells, k) => {
+      const row = table.insertRow()
+      for (const text of cells) {
+        const cell = document.createElement(k ? "td" : "th")
+        if (!k) cell.scope = "col"
+        cell.textContent = text
+        row.append(cell)
+      }
+    })
+    box.replaceChildren(table)
+  }
+
+  // Sentences that can be put away; one that was stays away as long as it is the same.
+  notices(told) {
+    this.strays = told.filter(([, kind]) => kind === "info" && told.length === 1 && !this.answer)
+    const box = byId("notices")
+    const shown = told.filter(([text]) => !this.dismissed.has(text))
+    const key = JSON.stringify(shown)
+    if (box.dataset.key === key) return
+    box.dataset.key = key
+    const item = ([text, kind]) => {
+      const made = document.createElement("li"), said = document.createElement("span"), away = document.createElement("button")
+      made.className = kind
+      said.textContent = text
+      away.textContent = "×"
+      away.type = "button"
+      away.className = "plain"
+      away.setAttribute("aria-label", `Put away: ${text.slice(0, 60)}`)
+      away.onclick = () => { this.dismissed.add(text); made.remove() }
+      made.append(said, away)
+      if (kind === "danger") made.setAttribute("role", "alert")
+      return made
+    }
+    const grave = shown.filter(([, kind]) => kind !== "info")
+    const others = shown.filter(([, kind]) => kind === "info")
+    const parts = grave.map(item)
+    if (others.length) {
+      const fold = document.createElement("details"), head = document.createElement("summary"), list = document.createElement("ul")
+      head.textContent = others.length === 1 ? "1 note on this answer" : `${others.length} notes on this answer`
+      list.append(...others.map(item))
+      fold.append(head, list)
+      fold.open = this.unfolded ?? false
+      fold.ontoggle = () => { this.unfolded = fold.open }
+      const whole = document.createElement("li")
+      whole.append(fold)
+      parts.push(whole)
+    }
+    box.replaceChildren(...parts)
+  }
+
+  // What can be asked for now.
+  offer() {
+    const ready = this.answer !== null
+    const busy = this.running !== null
+    const simulated = new Set(this.answer?.simulated ?? [])
+    byId("simulate").disabled = !ready || busy
+    byId("cancel").disabled = !busy
+    byId("pin").disabled = !ready
+    byId("study").disabled = !ready
+    for (const button of document.querySelectorAll("[data-simulate]")) button.disabled = !ready || busy
+    for (const tab of Object.values(words.tabs)) {
+      for (const [name, needs] of Object.entries(tab.files)) {
+        for (const button of document.querySelectorAll(`[data-file="${name}"]`)) {
+          button.disabled = !ready || (needs !== null && !simulated.has(needs))
+        }
+      }
+    }
+  }
+
+  // Simulations
+
+  simulate(kind) {
+    if (this.running !== null || this.answer === null) return
+    const question = this.question
+    byId("status").textContent = "waiting for its turn"
+    const n = this.running = this.live.ask("simulate", {kind, link: this.link}, told => {
+      if (told.ended === undefined) {
+        byId("progress").value = told.progress
+        byId("status").textContent = told.told
+        return
+      }
+      this.live.done(n)
+      this.running = null
+      this.ended(told.ended)
+      this.offer()
+      if (question !== this.question) return
+      if (told.refused) this.notices([[told.refused, "danger"]])
+      else if (told.kind) this.simulated(kind)
+    })
+    this.offer()
+  }
+
+  // The answer again, now with what was simulated.
+  simulated(kind) {
+    this.history = true
+    this.ask()
+  }
+
+  ended(text) {
+    byId("status").textContent = text
+    byId("progress").value = 0
+  }
+
+  next() {
+    if (this.history) {
+      this.history = false
+      this.compare.ran({...this.scenario(), at: new Date().toLocaleTimeString()})
+    }
+    this.wanted = this.wanted.filter(kind => !this.answer.simulated.includes(kind))
+    if (this.wanted.length && this.running === null) this.simulate(this.wanted.shift())
+  }
+
+  stop() {
+    if (this.running !== null) this.live.ask("cancel", {})
+  }
+
+  scenario() {
+    const {shown, interval, facts, words: said} = this.answer
+    return {link: this.link, entered: {...this.fields.entered}, shown, interval, facts, words: said}
+  }
+
+  // Files to the server and from it
+
+  async upload(field, file) {
+    this.fields.put({[field]: ""})
+    delete this.files[field]
+    this.lacks[field] = `${file.name} is being read`
+    this.changed(false, true)
+    this.none(this.lacks)
+    if (file.size > words.most_uploaded) {
+      const MiB = 2 ** 20
+      this.lack(field, `upload of ${(file.size / MiB).toFixed(1)} MiB, expected at most ${words.most_uploaded / MiB} MiB`)
+      return
+    }
+    const content = await file.arrayBuffer()
+    this.send(field, file.name, content)
+  }
+
+  // The browser keeps the file: a server that has lost it gets it again.
+  send(field, name, content) {
+    const serial = this.serial = (this.serial ?? 0) + 1
+    const n = this.live.ask("upload", {field, name}, told => {
+      this.live.done(n)
+      if (serial !== this.serial && field === this.field) return
+      if (told.lacks) {
+        if (field in this.lacks) this.lack(field, told.lacks)
+        return
+      }
+      this.files[field] = {name, content}
+      if (!(field in this.lacks)) return
+      delete this.lacks[field]
+      this.fields.put({[field]: told.entered})
+      this.changed(true, true)
+    })
+    this.field = field
+    this.live.send(content)
+  }
+
+  lack(field, why) {
+    this.lacks[field] = why
+    this.none(this.lacks)
+  }
+
+  give(name, content) {
+    const link = document.createElement("a")
+    link.href = URL.createObjectURL(content instanceof Blob ? content : new Blob([content]))
+    link.download = name
+    link.click()
+    setTimeout(() => URL.revokeObjectURL(link.href), 10_000)
+  }
+
+  take(tab, name, ending, button) {
+    button.disabled = true
+    const n = this.live.ask("file", {link: this.link, tab, name, ending}, (told, content) => {
+      this.live.done(n)
+      this.offer()
+      if (told.refused) this.notices([[told.refused, "danger"]])
+      else this.give(told.file, content)
+    })
+  }
+
+  export() {
+    const n = this.live.ask("export", {link: this.link}, told => {
+      this.live.done(n)
+      byId("as-command").textContent = told.refused ?? told.command
+      byId("as-python").textContent = told.refused ?? told.python
+      byId("export").showModal()
+    })
+  }
+
+  // Tabs
+
+  showTab() {
+    for (const name of Object.keys(words.tabs)) {
+      const front = name === this.seen.tab
+      const tab = byId(`tab-${name}`)
+      tab.setAttribute("aria-selected", String(front))
+      tab.tabIndex = front ? 0 : -1
+      byId(`panel-${name}`).hidden = !front
+    }
+  }
+
+  toTab(name) {
+    if (name === this.seen.tab) return
+    this.seen.tab = name
+    this.showTab()
+    this.address(true)
+    this.editing = false
+    this.ask()
+  }
+
+  // The connection
+
+  back(version) {
+    if (version !== words.version) {
+      window.location.reload()
+      return
+    }
+    byId("lost").hidden = true
+    for (const part of document.body.children) if (part.id !== "lost") part.inert = false
+    this.asking = false
+    // What the server knew of this page is gone with the connection; the browser has it all.
+    const kept = Object.entries(this.files).filter(([field]) => this.fields.entered[field] === words.uploads[field])
+    if (this.answer) this.wanted = this.answer.simulated
+    for (const [field, {name, content}] of kept) {
+      this.lacks[field] = `${name} is being read`
+      this.send(field, name, content)
+    }
+    if (!kept.length) this.ask()
+  }
+
+  lost(code) {
+    const unused = code === words.unused
+    this.running = null
+    this.withdraw()
+    this.ended("")
+    byId("lost-told").textContent = unused
+      ? "This page was not used for a long time, and the server let it go."
+      : "The connection to the server is lost. The page comes back by itself as soon as the server answers."
+    byId("lost").hidden = false
+    for (const part of document.body.children) if (part.id !== "lost") part.inert = true
+    byId("go-on").hidden = !unused
+    if (unused) byId("go-on").focus()
+    else this.live?.again() ?? setTimeout(() => this.live.again(), 0)
+  }
+
+  wire() {
+    byId("simulate").onclick = () => this.simulate("detection")
+    byId("cancel").onclick = () => { this.wanted = []; this.stop() }
+    byId("pin").onclick = () => {
+      this.compare.pin(this.scenario())
+      byId("status").textContent = "Pinned: see the tab Compare."
+    }
+    byId("afresh").onclick = () => this.enter({...words.fields})
+    byId("preset").onchange = event => {
+      const given = words.presets[event.target.value]
+      if (given) this.enter({...words.fields, ...given})
+      event.target.value = ""
+    }
+    byId("study").onclick = event => this.take("", "study", "study", event.target)
+    byId("go-on").onclick = () => this.live.connect()
+    byId("theme").onclick = () => {
+      const next = {system: "light", light: "dark", dark: null}
+      window.chooseTheme(next[document.documentElement.dataset.chosen])
+      const now = document.documentElement.dataset.chosen
+      byId("theme").setAttribute("aria-label", `Colours: ${now === "system" ? "as the system has them" : now}`)
+    }
+    document.querySelector("form").onsubmit = event => event.preventDefault()
+    for (const button of document.querySelectorAll("[data-simulate]")) {
+      button.onclick = () => this.simulate(button.dataset.simulate)
+    }
+    for (const button of document.querySelectorAll("[data-file]")) {
+      const tab = button.closest("[role=tabpanel]").id.replace("panel-", "")
+      button.onclick = () => this.take(tab, button.dataset.file, button.dataset.ending, button)
+    }
+    for (const button of document.querySelectorAll("[data-opens]")) {
+      button.onclick = () => button.dataset.opens === "export" ? this.export() : byId(button.dataset.opens).showModal()
+    }
+    for (const button of document.querySelectorAll("[data-closes]")) {
+      button.onclick = () => button.closest("dialog").close()
+    }
+    for (const button of document.querySelectorAll("[data-copy]")) {
+      button.onclick = async () => {
+        const from = button.dataset.copy
+        await navigator.clipboard.writeText(from === "address" ? window.location.href : byId(from).textContent)
+        const before = button.textContent
+        button.textContent = "Copied"
+        setTimeout(() => { button.textContent = before }, 1500)
+      }
+    }
+    const names = Object.keys(words.tabs)
+    for (const name of names) {
+      byId(`tab-${name}`).onclick = () => this.toTab(name)
+      byId(`tab-${name}`).onkeydown = event => {
+        const at = names.indexOf(name)
+        const next = {
+          ArrowRight: (at + 1) % names.length, ArrowLeft: (at + names.length - 1) % names.length,
+          Home: 0, End: names.length - 1,
+        }[event.key]
+        if (next === undefined) return
+        event.preventDefault()
+        byId(`tab-${names[next]}`).focus()
+        this.toTab(names[next])
+      }
+    }
+    window.addEventListener("popstate", () => {
+      this.follow(window.location.search)
+      this.wanted = this.seen.simulated.split(",").filter(Boolean)
+      this.editing = false
+      this.stop()
+      this.withdraw()
+      this.ask()
+    })
+    // On a phone the answer is first, and what can be changed is folded.
+    const narrow = window.matchMedia("(max-width: 899px)")
+    const fold = () => { byId("controls").open = !narrow.matches }
+    narrow.addEventListener("change", fold)
+    fold()
+  }
+}
+
+window.page = new Page()

@@ -1,0 +1,200 @@
+// The pictures of a tab: empty figures that are fetched once for each theme, and data that come with every answer.
+
+const byId = id => document.getElementById(id)
+const coarse = window.matchMedia("(pointer: coarse)").matches
+
+// Numbers as they are sent: base64 of 32-bit floats.
+function unpacked(column) {
+  if (Array.isArray(column)) return column
+  const bytes = Uint8Array.from(atob(column.f4), c => c.charCodeAt(0))
+  const values = new Float32Array(bytes.buffer)
+  if (column.shape.length === 1) return values
+  const {ndarray} = Bokeh.require("core/util/ndarray")
+  return [ndarray(values, {dtype: "float32", shape: column.shape.slice(1)})]
+}
+
+class Picture {
+  constructor(pictures, {name, sets, logs}) {
+    Object.assign(this, {pictures, name, sets})
+    this.frame = byId(`figure-${name}`)
+    this.logs = new Set(logs.filter(axis => axis !== axis.toLowerCase()).map(axis => axis.toLowerCase()))
+    this.wanted = new Set([""])
+    this.made = null
+    this.drawn = null
+    for (const box of this.frame.querySelectorAll("[data-log]")) {
+      box.addEventListener("change", () => {
+        this.logs[box.checked ? "add" : "delete"](box.dataset.log)
+        this.made = null
+        this.draw()
+      })
+    }
+    for (const box of this.frame.querySelectorAll("[data-show]")) {
+      box.addEventListener("change", () => this.want(box.dataset.show, box.checked))
+    }
+    this.frame.querySelector("[data-reset]").addEventListener("click", () => {
+      for (const range of [this.plot?.x_range, this.plot?.y_range]) range?.reset()
+    })
+    for (const button of this.frame.querySelectorAll("[data-save]")) {
+      button.addEventListener("click", () => this.save(button.dataset.save))
+    }
+  }
+
+  want(tag, wanted) {
+    this.wanted[wanted ? "add" : "delete"](tag)
+    this.reveal()
+  }
+
+  // New data; they are drawn when there is a figure.
+  put(drawn) {
+    this.drawn = drawn
+    this.frame.querySelector("figcaption p").textContent = drawn.text
+    return this.draw()
+  }
+
+  async draw() {
+    const wanted = `${document.documentElement.dataset.theme} ${[...this.logs].sort().join("")}`
+    if (this.made !== wanted) {
+      this.made = wanted
+      await this.make(wanted)
+    }
+    if (this.made === wanted && this.models && this.drawn) this.fill()
+  }
+
+  async make(wanted) {
+    const [theme, logs] = wanted.split(" ")
+    const answer = await fetch(`figures/${theme}/${this.name}.json?log=${logs}&v=${this.pictures.version}`)
+    const {item, legend} = await answer.json()
+    if (this.made !== wanted) return
+    const box = byId(`plot-${this.name}`)
+    this.view?.remove()
+    box.replaceChildren()
+    const views = await Bokeh.embed.embed_item(item, box.id)
+    const [view] = views
+    this.view = view
+    this.plot = view.model
+    this.models = new Map()
+    for (const model of view.model.references()) {
+      if (model.name && model.type !== "GlyphRenderer") this.models.set(model.name, model)
+    }
+    this.legend(legend)
+    if (coarse) for (const tool of this.plot.toolbar.tools) if ("active" in tool) tool.active = tool.type === "HoverTool"
+    const range = this.models.get("wavelength")
+    if (range) this.pictures.link(range)
+    if (this.sets) this.plot.on_event("tap", event => this.pictures.clicked(this.sets, event))
+    this.reveal()
+  }
+
+  fill() {
+    for (const [name, columns] of Object.entries(this.drawn.sources)) {
+      const data = {}
+      for (const [column, values] of Object.entries(columns)) data[column] = unpacked(values)
+      this.models.get(name).data = data
+    }
+    for (const [name, props] of Object.entries(this.drawn.props)) this.models.get(name).setv(props)
+    this.some()
+  }
+
+  // What is asked for shows; so do the marks that all pictures share.
+  reveal() {
+    if (!this.plot) return
+    for (const model of this.plot.references()) {
+      const [tag] = model.tags ?? []
+      if (tag) model.visible = this.wanted.has(tag) || this.pictures.marks.has(tag)
+    }
+    this.some()
+  }
+
+  legend(entries) {
+    const svg = (colour, form) => {
+      const shape = {
+        line: `<path d="M0 5h16" stroke="${colour}" stroke-width="2.5"/>`,
+        dash: `<path d="M0 5h16" stroke="${colour}" stroke-width="2" stroke-dasharray="4 3"/>`,
+        band: `<rect width="16" height="10" fill="${colour}" fill-opacity=".4"/>`,
+        bars: `<rect width="16" height="10" fill="${colour}" fill-opacity=".5"/>`,
+        dot: `<circle cx="8" cy="5" r="4" fill="${colour}"/>`,
+      }[form]
+      return `<svg aria-hidden="true" viewBox="0 0 16 10">${shape}</svg>`
+    }
+    this.frame.querySelector(".legend").replaceChildren(...entries.map(([called, colour, form, show]) => {
+      const item = document.createElement("li")
+      item.innerHTML = svg(colour, form)
+      item.append(called)
+      item.dataset.shows = show
+      item.dataset.called = called
+      return item
+    }))
+    this.some()
+  }
+
+  // The legend holds what is there to be seen.
+  some() {
+    const empty = new Set()
+    for (const renderer of this.plot?.renderers ?? []) {
+      const source = renderer.data_source
+      if (source && renderer.name && source.get_length() === 0) empty.add(renderer.name)
+    }
+    for (const item of this.frame.querySelectorAll(".legend li")) {
+      const {shows, called} = item.dataset
+      item.hidden = empty.has(called) || (shows !== "" && shows !== "if any" && !this.wanted.has(shows))
+    }
+  }
+
+  async save(ending) {
+    if (!this.view) return
+    const blob = await this.view.export(ending).to_blob()
+    this.pictures.give(`mauvecl-${this.name}.${ending}`, blob)
+  }
+}
+
+export class Pictures {
+  // set(given): fields that a click on a picture enters; give(name, blob): a file for the visitor.
+  constructor(words, set, give) {
+    this.version = words.version
+    this.give = give
+    this.set = set
+    this.marks = new Set(["marks"])
+    this.ranges = new Set()
+    this.shown = null
+    this.all = {}
+    for (const tab of Object.values(words.tabs)) {
+      for (const picture of tab.pictures) this.all[picture.name] = new Picture(this, picture)
+    }
+    for (const box of document.querySelectorAll("[data-marks]")) {
+      box.addEventListener("change", () => {
+        this.marks[box.checked ? "add" : "delete"](box.dataset.marks)
+        for (const other of document.querySelectorAll(`[data-marks="${box.dataset.marks}"]`)) other.checked = box.checked
+        for (const picture of Object.values(this.all)) picture.reveal()
+      })
+    }
+    window.addEventListener("mauvecl-theme", () => {
+      for (const picture of Object.values(this.all)) if (picture.made) picture.draw()
+    })
+  }
+
+  put(pictures) {
+    return Promise.all(Object.entries(pictures).map(([name, drawn]) => this.all[name].put(drawn)))
+  }
+
+  // All pictures over wavelengths show the same ones.
+  link(range) {
+    if (this.shown) range.setv(this.shown)
+    this.ranges.add(range)
+    range.change.connect(() => {
+      const {start, end} = range
+      if (this.shown && this.shown.start === start && this.shown.end === end) return
+      this.shown = {start, end}
+      for (const other of this.ranges) if (other !== range) other.setv(this.shown)
+    })
+  }
+
+  // "magnitude=x,amplitude_percent=10^y": which fields a click sets, to three digits.
+  clicked(sets, {x, y}) {
+    const given = {}
+    for (const part of sets.split(",")) {
+      const [name, axis] = part.split("=")
+      const value = {x, y, "10^y": 10 ** y}[axis]
+      given[name] = name === "magnitude" ? value.toFixed(2).replace(/\.?0+$/, "") : String(Number(value.toPrecision(3)))
+    }
+    this.set(given)
+  }
+}

@@ -1,0 +1,54 @@
+"""The answer card: the probability and what it holds for, in words."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from mauvecl.web.closed import Closed, percent
+from mauvecl.web.tabs.tab import Found
+
+#: Part of the sentence that tells what the throughput is; it stands on the page once.
+NOMINAL = "The throughput is nominal"
+
+
+def card(closed: Closed, found: Found) -> dict[str, Any]:
+    """What the card shows of an answer.
+
+    Returns
+    -------
+    dict
+        ``shown``, ``interval`` and ``words``; ``facts``, pairs of names and values; ``notes``, pairs of sentences and
+        kinds; ``simulated``, names of what is simulated.
+    """
+    q, x = closed.question, closed.quiet
+    cut, chance, interval, facts = closed.cut, closed.chance, "in closed form, for Gaussian noise", []
+    if "detection" in found:
+        (row,) = (row for row in found["detection"].table if row["statistic"] == q.statistic)
+        cut, chance = float(row["threshold"]), float(row["probability"])
+        interval = f"{percent(row['low'])} to {percent(row['high'])}, of {q.realisations.number:,} simulated"
+        facts.append(("Closed form", percent(closed.chance)))
+    facts += [
+        ("Threshold", f"{cut:.4g}"),
+        ("Expected with flare", f"{closed.expected:.4g}"),
+        ("Best S/N per pixel", f"{x.snr().max():.3g}"),
+        ("Best S/N per element", f"{x.snr_per_element().max():.3g}"),
+    ]
+    words = (
+        f"chance to detect {closed.words}, by the statistic {q.statistic} at a false-alarm probability of {q.fap:g} "
+        "per test"
+    )
+    notes = [(m, "danger" if m.startswith("SATURATED") else "info") for m in _messages(closed, found)]
+    return {
+        "shown": percent(chance),
+        "value": None if chance != chance else chance,
+        "interval": interval,
+        "words": words,
+        "facts": facts,
+        "notes": notes,
+        "simulated": sorted(name for name in found if name not in ("snr", "draw")),
+    }
+
+
+def _messages(closed: Closed, found: Found) -> list[str]:
+    simulated = found["detection"].messages if "detection" in found else []
+    return [m for m in dict.fromkeys([*simulated, *closed.messages]) if not m.startswith(NOMINAL)]

@@ -1,0 +1,132 @@
+"""What has a closed form: the answer to a question, before anything is drawn."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from mauvecl.answers.unknown_cost import cost_lines, marginal_lines, unknown_cost
+from mauvecl.noise.scene import prepare
+from mauvecl.results.hypotheses import Hypotheses
+from mauvecl.study.labels import told
+from mauvecl.web.smooth import Smooth
+
+if TYPE_CHECKING:
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.stars.source import Source
+    from mauvecl.study.study import Study
+    from mauvecl.web.question import Question
+
+
+@dataclass(frozen=True, eq=False)
+class Closed:
+    """The closed forms of one question.
+
+    Attributes
+    ----------
+    question : Question
+    study : Study
+    light : tuple of Source
+        The star at the telescope, without and with the flare.
+    quiet, flare : Expectation
+    theory : Hypotheses
+    cut : float
+        The threshold.
+    chance : float
+        Probability of detection; NaN where the flare saturates every pixel that counts.
+    """
+
+    question: Question
+    study: Study
+    light: tuple[Source, Source]
+    quiet: Expectation
+    flare: Expectation
+    theory: Hypotheses
+    cut: float
+    chance: float
+
+    @classmethod
+    def of(cls, question: Question, folder: Path) -> Closed:
+        """Answer a question.
+
+        Parameters
+        ----------
+        question : Question
+        folder : Path
+            Where an uploaded spectrum is written for the study to find.
+
+        Raises
+        ------
+        InputError
+            For values that cannot be together.
+        """
+        q, study = question, question.study(folder)
+        # What is uploaded need not be read from its file at every change.
+        star = study.star[0].source() if q.uploaded is None else q.uploaded.at_magnitude(q.magnitude, q.band)
+        light = star, study.flaring(star, study.flare.amplitudes[0])
+        quiet, flare = study.expect(list(light))
+        scene = prepare([quiet, flare], comparison=study.run.comparison())
+        unknown = study.nuisances.marginalised(quiet)
+        theory = Hypotheses(quiet, (flare,), study.run.statistics, scene, nuisances=unknown)
+        cut = theory.closed_form(q.statistic).isf(q.fap)
+        chance = float("nan") if theory.blinding else theory.closed_form(q.statistic, 0).sf(cut)
+        return cls(q, study, light, quiet, flare, theory, cut, chance)
+
+    @cached_property
+    def null(self) -> Smooth:
+        """The statistic without a flare, for pictures."""
+        return Smooth(self.theory.closed_form(self.question.statistic))
+
+    @cached_property
+    def seen(self) -> Smooth:
+        """The statistic with the flare, for pictures."""
+        return Smooth(self.theory.closed_form(self.question.statistic, 0))
+
+    @property
+    def expected(self) -> float:
+        """The statistic's mean with the flare."""
+        return self.theory.closed_form(self.question.statistic, 0).mean
+
+    @cached_property
+    def messages(self) -> list[str]:
+        """What the visitor must be told, worst first."""
+        cost = unknown_cost("this flare", self.quiet, self.flare, self.study)
+        return [*told([self.quiet, self.flare]), *marginal_lines(self.study), *cost_lines([cost], self.study)]
+
+    @property
+    def words(self) -> str:
+        """The question in a sentence's words."""
+        q, x = self.question, self.quiet
+        frames = "one frame" if x.n_frames == 1 else f"{x.n_frames} frames"
+        star = "your own star" if q.uploaded is not None else f"a {q.star} star"
+        return (
+            f"a {q.amplitude_percent:g} % flare ({q.flare_temperature_k:g} K) on {star} of {q.band} = {q.magnitude:g}, "
+            f"in {x.exposure_s:g} s ({frames})"
+        )
+
+    @property
+    def excess(self) -> tuple[np.ndarray, np.ndarray]:
+        """Flare minus quiet in standard deviations of the noise, per pixel and per resolution element."""
+        x = self.quiet
+        rise = np.where(x.saturated, 0.0, self.flare.signal_dn - x.signal_dn)
+        noise2 = np.where(x.saturated, 0.0, x.variance_dn2)
+        pixel = np.divide(rise, np.sqrt(x.variance_dn2))
+        total = x.per_element(noise2)
+        element = np.divide(x.per_element(rise), np.sqrt(total), out=np.zeros(total.size), where=total > 0)
+        return pixel, element
+
+
+def percent(value: float) -> str:
+    """A probability as a visitor reads it: nothing is certain, and nothing impossible."""
+    if value != value:
+        return "no number"
+    if value > 0.9999:
+        return "> 99.99 %"
+    if value < 0.0001:
+        return "< 0.01 %"
+    shown = 100 * value
+    return f"{shown:.2f} %" if shown < 1 or shown > 99 else f"{shown:.1f} %"

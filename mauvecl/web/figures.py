@@ -1,0 +1,210 @@
+"""Figures as the page draws them: one look in a light and a dark theme, the same colour for the same thing."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from typing import Any, Literal
+
+from bokeh.models import DataRange1d, HoverTool, Range1d
+from bokeh.models.annotations import Label, Span
+from bokeh.models.sources import ColumnDataSource
+from bokeh.plotting import figure
+
+#: Wavelengths that are shown, nm.
+SHOWN_NM = (195.0, 705.0)
+#: Spectral lines, nm in vacuum (NIST Atomic Spectra Database, version 5): Mg II h and k, Ca II H and K, H alpha. The
+#: Balmer jump is 4 / R_H, with Rydberg's constant for hydrogen.
+MARKS = {"Mg II": (279.63, 280.35), "Ca II": (393.48, 396.96), "Balmer jump": (364.7,), "H alpha": (656.46,)}
+#: Marks that show only if asked for.
+MORE_MARKS = ("H alpha",)
+
+
+@dataclass(frozen=True)
+class Ink:
+    """The colours of a theme; those of things are Okabe and Ito's, lighter on dark ground."""
+
+    text: str
+    grid: str
+    ground: str
+    star: str
+    flare: str
+    sky: str
+    drawn: str
+    dark: str
+    read: str
+    bias: str
+    total: str
+    threshold: str
+    own: str
+
+    def __getitem__(self, name: str) -> str:
+        return str(getattr(self, name))
+
+
+INKS = {
+    "light": Ink(
+        text="#1b2733", grid="#dde3ea", ground="#ffffff", star="#0072B2", flare="#D55E00", sky="#009E73",
+        drawn="#6b7785", dark="#7b4ea3", read="#B8860B", bias="#A65082", total="#1b2733", threshold="#1b2733",
+        own="#C2185B",
+    ),
+    "dark": Ink(
+        text="#e6ebf1", grid="#34404d", ground="#182029", star="#56B4E9", flare="#FF8C42", sky="#2fc79a",
+        drawn="#9aa7b5", dark="#b99be0", read="#F0C040", bias="#E39BC9", total="#e6ebf1", threshold="#e6ebf1",
+        own="#ff6fa3",
+    ),
+}  # fmt: skip
+
+
+class Canvas:
+    """A figure and the sources that it draws.
+
+    Parameters
+    ----------
+    ink : Ink
+    x, y : str
+        What the axes are called, with units.
+    logs : frozenset of str
+        Which axes are logarithmic.
+    wavelength : bool
+        Whether x is a wavelength: its range is then shared with all such figures, and lines are marked.
+    """
+
+    def __init__(self, ink: Ink, x: str, y: str, logs: frozenset[str], *, wavelength: bool = False, **how: Any) -> None:
+        self.ink = ink
+        ranges: dict[str, Any] = (
+            {"x_range": Range1d(start=SHOWN_NM[0], end=SHOWN_NM[1], bounds=SHOWN_NM)} if wavelength else {}
+        )
+        named = isinstance(how.get("y_range"), list)
+        if "y_range" not in how:
+            # What is not asked for takes no room; before there is anything there is a range all the same.
+            ranges["y_range"] = DataRange1d(only_visible=True, default_span=2.0)
+        plot = figure(
+            x_axis_label=x,
+            y_axis_label=y,
+            x_axis_type="log" if "x" in logs else "linear",
+            y_axis_type="auto" if named else "log" if "y" in logs else "linear",
+            sizing_mode="stretch_both",
+            min_height=60,
+            min_width=60,
+            min_border=2,
+            tools="box_zoom,pan,reset",
+            toolbar_location=None,
+            background_fill_color=None,
+            border_fill_color=None,
+            outline_line_color=None,
+            **(ranges | how),
+        )
+        for axis in (*plot.xaxis, *plot.yaxis):
+            axis.update(
+                axis_label_text_font_style="normal", axis_label_text_font="system-ui", axis_label_text_font_size="12px",
+                axis_label_text_color=ink.text, major_label_text_font="system-ui", major_label_text_font_size="11px",
+                major_label_text_color=ink.text, axis_line_color=ink.text, major_tick_line_color=ink.text,
+                minor_tick_line_color=None,
+            )  # fmt: skip
+        plot.xaxis.name, plot.yaxis.name = "x axis", "y axis"
+        plot.grid.grid_line_color = ink.grid
+        plot.x_range.name, plot.y_range.name = "wavelength" if wavelength else "x range", "y range"
+        self.plot = plot
+        #: What the page says of the picture: names, colours, forms, and by what each is asked for.
+        self.legend: list[tuple[str, str, str, str]] = []
+        if wavelength:
+            self._mark()
+
+    def source(self, name: str, *columns: str) -> ColumnDataSource:
+        """An empty source, by which data come."""
+        return ColumnDataSource({column: [] for column in columns}, name=name)
+
+    def line(self, name: str, called: str, colour: str, *, show: str = "", step: bool = False, **how: Any) -> Any:
+        """A named line of columns x and y."""
+        source = self.source(name, "x", "y")
+        kind: Any = partial(self.plot.step, mode="center") if step else self.plot.line
+        made = kind("x", "y", source=source, color=self.ink[colour], **({"line_width": 1.6} | how))
+        return self._told(made, called, colour, "line", show)
+
+    def band(self, name: str, called: str, colour: str, *, show: str = "", alpha: float = 0.22) -> Any:
+        """A band of columns x, low and high."""
+        source = self.source(name, "x", "low", "high")
+        made = self.plot.varea("x", "low", "high", source=source, fill_color=self.ink[colour], fill_alpha=alpha)
+        return self._told(made, called, colour, "band", show)
+
+    def dots(self, name: str, called: str, colour: str, *, size: float = 5, show: str = "", **how: Any) -> Any:
+        """Dots of columns x and y."""
+        source = self.source(name, "x", "y")
+        made = self.plot.scatter("x", "y", source=source, size=size, color=self.ink[colour], **how)
+        return self._told(made, called, colour, "dot", show)
+
+    def own_point(self, called: str = "your question") -> Any:
+        """The question's own point."""
+        source = self.source("own", "x", "y")
+        made = self.plot.scatter(
+            "x", "y", source=source, size=13, marker="circle", fill_color=self.ink.own, line_color=self.ink.ground,
+            line_width=2,
+        )  # fmt: skip
+        return self._told(made, called, "own", "dot", "")
+
+    def rule(self, name: str, called: str, along: str, colour: str = "threshold", dash: str = "dashed") -> Any:
+        """A straight line through the picture, put where it belongs later."""
+        dimension: Literal["height", "width"] = "height" if along == "x" else "width"
+        span = Span(dimension=dimension, location=None, line_color=self.ink[colour], line_dash=dash, name=name)
+        self.plot.add_layout(span)
+        self.legend.append((called, self.ink[colour], "dash", ""))
+        return span
+
+    def saturated(self) -> None:
+        """Strips where pixels saturate."""
+        made = self.plot.vstrip(
+            "x0", "x1", source=self.source("saturated", "x0", "x1"), fill_color=self.ink.own, fill_alpha=0.18,
+            line_color=None, hatch_pattern="/", hatch_color=self.ink.own, hatch_alpha=0.5,
+        )  # fmt: skip
+        made.name = "saturated"
+        self.legend.append(("saturated", self.ink.own, "band", "if any"))
+
+    def tooltips(self, made: Any, *lines: tuple[str, str], mode: Literal["mouse", "hline", "vline"] = "vline") -> None:
+        """What is told of a point: names, and columns with four significant digits."""
+        columns = [column for _, column in lines]
+        self.plot.add_tools(
+            HoverTool(
+                renderers=[made],
+                mode=mode,
+                point_policy="snap_to_data",
+                line_policy="nearest",
+                tooltips=[(name, f"@{column}{{%.4g}}") for name, column in lines],
+                formatters={f"@{column}": "printf" for column in columns},
+            )
+        )
+
+    def _told(self, made: Any, called: str, colour: str, form: str, show: str) -> Any:
+        """What it is called in the page's own legend, and by what it is asked for."""
+        made.name, made.tags, made.visible = called, [show], not show
+        self.legend.append((called, self.ink[colour], form, show))
+        return made
+
+    def _mark(self) -> None:
+        """Marks of spectral lines."""
+        for name, places in MARKS.items():
+            show = "more marks" if name in MORE_MARKS else "marks"
+            for place in places:
+                self.plot.add_layout(
+                    Span(
+                        dimension="height", location=place, line_color=self.ink.text, line_alpha=0.35, line_width=1,
+                        line_dash="dotted", tags=[show], visible=name not in MORE_MARKS,
+                    )
+                )  # fmt: skip
+            self.plot.add_layout(
+                Label(
+                    x=sum(places) / len(places), y=0, y_units="screen", y_offset=2, x_offset=3, text=name, tags=[show],
+                    visible=name not in MORE_MARKS, text_font="system-ui", text_font_size="10px", angle=1.5708,
+                    text_color=self.ink.text, text_alpha=0.8,
+                )
+            )  # fmt: skip
+
+
+def strips(wavelength_nm: Any, flags: Any) -> dict[str, Any]:
+    """Ends of the stretches of flagged pixels, half a pixel beyond each."""
+    import numpy as np
+
+    padded = np.diff(np.concatenate([[0], np.asarray(flags, int), [0]]))
+    first, last = np.nonzero(padded == 1)[0], np.nonzero(padded == -1)[0] - 1
+    half = 0.5 * np.gradient(wavelength_nm)
+    return {"x0": (wavelength_nm - half)[first], "x1": (wavelength_nm + half)[last]}

@@ -1,0 +1,193 @@
+"""What is sent as it is: the page, its parts, empty figures; each made and packed once."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from tornado.web import RequestHandler
+
+from mauvecl.host.version import VERSION
+
+#: The page asks its own server alone, and runs no code but its own.
+HEADERS = {
+    "Content-Security-Policy": (
+        "default-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' data: blob:; object-src 'none'; "
+        "base-uri 'none'; form-action 'none'; frame-ancestors 'none'"
+    ),
+    "X-Content-Type-Options": "nosniff",
+    "Referrer-Policy": "no-referrer",
+}
+KINDS = {
+    "js": "text/javascript; charset=utf-8",
+    "css": "text/css; charset=utf-8",
+    "svg": "image/svg+xml",
+    "json": "application/json",
+    "html": "text/html; charset=utf-8",
+}
+_FOLDER = Path(__file__).parent / "assets"
+
+
+@cache
+def packed(content: bytes) -> tuple[bytes, str]:
+    """Content with gzip, and its digest."""
+    return gzip.compress(content, 6, mtime=0), hashlib.sha256(content).hexdigest()[:16]
+
+
+@cache
+def asset(name: str) -> bytes | None:
+    """A part of the page; BokehJS comes from its own package."""
+    if name == "bokeh.min.js":
+        import bokeh
+
+        return (Path(bokeh.__file__).parent / "server" / "static" / "js" / name).read_bytes()
+    path = _FOLDER / name
+    return path.read_bytes() if path.suffix[1:] in KINDS and path.is_file() else None
+
+
+@cache
+def front() -> bytes:
+    """The page."""
+    from mako.lookup import TemplateLookup
+
+    from mauvecl.web import fields
+    from mauvecl.web.state import SEEN
+    from mauvecl.web.tabs import TABS
+    from mauvecl.web.upload import MOST_UPLOADED
+    from mauvecl.web.visitor import UNUSED
+
+    words = {
+        "version": VERSION,
+        "fields": {name: field.first for name, field in fields.FIELDS.items()},
+        "sliders": {
+            name: {"low": s.low, "high": s.high, "step": s.step, "log": s.log}
+            for name, field in fields.FIELDS.items()
+            if (s := field.slider) is not None
+        },
+        "stars": [*fields.star_names()],
+        "uploads": {"star": fields.UPLOADED, "own_unknown": fields.UPLOADED_UNKNOWN},
+        "under": fields.ASKED_UNDER,
+        "presets": fields.PRESETS,
+        "seen": {name: field.first for name, field in SEEN.items()},
+        "tabs": {
+            tab.name: {
+                "pictures": [{"name": p.name, "sets": p.sets, "logs": list(p.logs)} for p in tab.pictures],
+                "files": dict(tab.files),
+            }
+            for tab in TABS.values()
+        },
+        "most_uploaded": MOST_UPLOADED,
+        "unused": UNUSED,
+    }
+    lookup = TemplateLookup([str(_FOLDER)], default_filters=["h"], strict_undefined=True)
+    template = lookup.get_template("page.html.mako")
+    text = template.render(
+        fields=fields, tabs=TABS, version=VERSION, words=json.dumps(words).replace("<", "\\u003c"), digest=_digest()
+    )
+    return str(text).encode()
+
+
+def _digest() -> str:
+    """Of all parts, so that browsers keep none that is old."""
+    found = [packed(content)[1] for path in sorted(_FOLDER.iterdir()) if (content := asset(path.name)) is not None]
+    return hashlib.sha256("".join(found).encode()).hexdigest()[:12]
+
+
+@cache
+def figure(theme: str, name: str, logs: str) -> bytes | None:
+    """An empty figure with its legend."""
+    from bokeh.embed import json_item
+
+    from mauvecl.web.figures import INKS
+    from mauvecl.web.tabs import TABS
+
+    picture = next((p for tab in TABS.values() for p in tab.pictures if p.name == name), None)
+    if picture is None or theme not in INKS or not set(logs) <= {axis.lower() for axis in picture.logs}:
+        return None
+    canvas = picture.figure(INKS[theme], frozenset(logs))
+    return json.dumps({"item": json_item(canvas.plot), "legend": canvas.legend}).encode()
+
+
+def prepare() -> None:
+    """Make and pack what every visitor asks for."""
+    from mauvecl.web.tabs import TABS
+
+    packed(front())
+    for path in _FOLDER.iterdir():
+        packed(asset(path.name) or b"")
+    packed(asset("bokeh.min.js") or b"")
+    for tab in TABS.values():
+        for picture in tab.pictures:
+            usual = "".join(axis.lower() for axis in picture.logs if axis.isupper())
+            for theme in ("light", "dark"):
+                packed(figure(theme, picture.name, usual) or b"")
+
+
+class Packed(RequestHandler):
+    """Answers with something made once."""
+
+    def set_default_headers(self) -> None:
+        """On whatever is answered."""
+        self.clear_header("Server")
+        for name, value in HEADERS.items():
+            self.set_header(name, value)
+
+    def give(self, content: bytes | None, kind: str, *, keep: bool = False) -> None:
+        """Send content, or that there is none."""
+        if content is None:
+            self.set_status(404)
+            self.set_header("Content-Type", "text/plain; charset=utf-8")
+            self.finish("There is no such page.\n")
+            return
+        small, digest = packed(content)
+        self.set_header("Content-Type", KINDS[kind])
+        self.set_header("Vary", "Accept-Encoding")
+        # What has its digest in its address never changes.
+        self.set_header("Cache-Control", "public, max-age=31536000, immutable" if keep else "no-cache")
+        self.set_header("Etag", f'"{digest}"')
+        if self.check_etag_header():
+            self.set_status(304)
+            self.finish()
+            return
+        if "gzip" in self.request.headers.get("Accept-Encoding", ""):
+            self.set_header("Content-Encoding", "gzip")
+            content = small
+        self.finish(content)
+
+    def compute_etag(self) -> str | None:
+        """It is set where it is known."""
+        return None
+
+    def write_error(self, status_code: int, **kwargs: Any) -> None:
+        """A sentence, and nothing of what went wrong inside."""
+        self.set_header("Content-Type", "text/plain; charset=utf-8")
+        self.finish(f"The page cannot answer this ({status_code}).\n")
+
+
+class Front(Packed):
+    """The page."""
+
+    def get(self) -> None:
+        """The same for everybody: what a link holds, the page itself enters."""
+        self.give(front(), "html")
+
+
+class Asset(Packed):
+    """A part of the page."""
+
+    def get(self, name: str) -> None:
+        """By its name."""
+        self.give(asset(name), name.rpartition(".")[2], keep="v" in self.request.arguments)
+
+
+class Figure(Packed):
+    """An empty figure."""
+
+    def get(self, theme: str, name: str) -> None:
+        """In a theme, with some axes logarithmic."""
+        logs = "".join(sorted(set(self.get_query_argument("log", ""))))[:2]
+        self.give(figure(theme, name, logs), "json", keep="v" in self.request.arguments)

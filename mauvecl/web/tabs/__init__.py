@@ -1,0 +1,17 @@
+"""The tabs of the page: a file to each; a new one is added here."""
+
+from __future__ import annotations
+
+from mauvecl.web.tabs.compare import Compare
+from mauvecl.web.tabs.detection import Detection
+from mauvecl.web.tabs.limit import Limit
+from mauvecl.web.tabs.noise import Noise
+from mauvecl.web.tabs.signal import Signal
+from mauvecl.web.tabs.spectrum import Spectrum
+from mauvecl.web.tabs.tab import Tab
+from mauvecl.web.tabs.unknowns import Unknown
+
+#: By name, in the order of the page.
+TABS: dict[str, Tab] = {
+    one.name: one for one in (Detection(), Spectrum(), Signal(), Noise(), Limit(), Unknown(), Compare())
+}

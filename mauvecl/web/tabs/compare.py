@@ -1,0 +1,12 @@
+"""Scenarios side by side: what the visitor has pinned and simulated, kept by their own browser."""
+
+from __future__ import annotations
+
+from mauvecl.web.tabs.tab import Tab
+
+
+class Compare(Tab):
+    """Pinned scenarios and the history of runs."""
+
+    name, title = "compare", "Compare"
+    about = "Scenarios that you have pinned, side by side, and what you have simulated; this browser tab keeps them."

@@ -1,0 +1,256 @@
+"""How far one would still see it: detection probability over magnitude, and over magnitude and amplitude."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.statistics.registry import STATISTICS
+from mauvecl.statistics.statistic import LinearStatistic, Setting
+from mauvecl.web.closed import percent
+from mauvecl.web.figures import Canvas
+from mauvecl.web.tabs.tab import Drawn, Found, Picture, Tab
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+    from mauvecl.study.study import Study
+    from mauvecl.web.closed import Closed
+
+Float = NDArray[np.float64]
+
+#: Ends of the pictures: magnitudes, and amplitudes in per cent; they stay, whatever is asked.
+MAGNITUDES, PERCENTS = (2.0, 14.0), (0.1, 100.0)
+#: Columns and rows of a map in closed form where the statistic is a weighted sum, and where it is not.
+STEPS = {True: (33, 19), False: (13, 7)}
+#: Statistics whose closed forms take too long for a curve.
+SLOW = ("paper",)
+LEVELS = (0.1, 0.5, 0.9)
+
+
+def chances(closed: Closed, magnitudes: Float, amplitudes: Float) -> Float:
+    """Detection probabilities in closed form, shape (n_amplitude, n_magnitude): light is linear.
+
+    Parameters
+    ----------
+    closed : Closed
+    magnitudes : ndarray, shape (n_magnitude,)
+    amplitudes : ndarray, shape (n_amplitude,)
+        In units of the question's own.
+    """
+    q, base = closed.question, closed.quiet
+    one, rise = STATISTICS[q.statistic], closed.flare.source_electrons - base.source_electrons
+    found = np.zeros((amplitudes.size, magnitudes.size))
+    for i, magnitude in enumerate(magnitudes):
+        fainter = 10 ** (-0.4 * (magnitude - q.magnitude))
+        quiet = replace(base, source_electrons=fainter * base.source_electrons)
+        used = ~quiet.saturated
+        if not used.any():
+            continue
+        setting = Setting(
+            quiet, used, closed.study.run.comparison(), nuisances=closed.study.nuisances.marginalised(quiet)
+        )
+        cut = None
+        for j, more in enumerate(amplitudes):
+            flare = replace(quiet, source_electrons=fainter * (base.source_electrons + more * rise))
+            shape = flare if one.shaped else None
+            if cut is None or one.shaped:
+                cut = one.closed_form(setting, quiet, shape).isf(q.fap)
+            found[j, i] = one.closed_form(setting, flare, shape).sf(cut)
+    return found
+
+
+def _key(closed: Closed) -> tuple[Any, ...]:
+    """Everything that a map depends on but for its own two axes."""
+    q = closed.question
+    star = q.star if q.uploaded is None else q.uploaded.digest
+    return (
+        star, q.band, q.exposure_s, q.temperature_c, q.instrument, q.sky, q.sky_brightness, q.target, q.time,
+        q.flare_temperature_k, q.statistic, q.fap, q.unknown, q.own_unknown,
+    )  # fmt: skip
+
+
+class _Kept:
+    """A question that is known by what its map depends on."""
+
+    def __init__(self, closed: Closed) -> None:
+        self.closed, self.key = closed, _key(closed)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Kept) and self.key == other.key
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+
+@lru_cache(maxsize=32)
+def _map(kept: _Kept) -> tuple[Float, Float, Float]:
+    """Magnitudes, amplitudes in per cent, and probabilities."""
+    closed = kept.closed
+    columns, rows = STEPS[isinstance(STATISTICS[closed.question.statistic], LinearStatistic)]
+    x, y = np.linspace(*MAGNITUDES, columns), np.geomspace(*PERCENTS, rows)
+    return x, y, chances(closed, x, y / closed.question.amplitude_percent)
+
+
+class Curve(Picture):
+    """Detection probability against the star's magnitude."""
+
+    name, title = "limit", "How faint a star: detection probability of this flare"
+    sets = "magnitude=x"
+
+    def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
+        canvas = Canvas(ink, "magnitude", "detection probability", logs, x_range=MAGNITUDES, y_range=(-0.03, 1.05))
+        told = canvas.line("closed form", "closed form", "flare", line_width=2)
+        canvas.rule("power", "wanted: 90 %", "y")
+        canvas.dots("simulated", "simulated", "drawn", size=8)
+        canvas.own_point()
+        canvas.tooltips(told, ("magnitude", "x"), ("detected", "y"))
+        return canvas
+
+    def drawn(self, closed: Closed, found: Found) -> Drawn:
+        q, power = closed.question, closed.study.limit.power
+        empty: dict[str, Any] = {"x": [], "y": []}
+        sources: dict[str, Any] = {"closed form": empty, "simulated": empty}
+        sources["own"] = {"x": [q.magnitude], "y": [closed.chance]}
+        text = f"The closed form of {q.statistic} takes too long for a curve: simulate it."
+        if q.statistic not in SLOW:
+            x = np.linspace(*MAGNITUDES, 2 * STEPS[isinstance(STATISTICS[q.statistic], LinearStatistic)][0] - 1)
+            y = chances(closed, x, np.ones(1))[0]
+            sources["closed form"] = {"x": x, "y": y}
+            seen = np.nonzero(y >= power)[0]
+            last = int(seen[-1]) if seen.size else -1
+            text = f"{100 * power:g} % of such flares are detected "
+            if last < 0:
+                text += f"at no magnitude from {MAGNITUDES[0]:g} to {MAGNITUDES[1]:g}."
+            elif last == x.size - 1:
+                text += f"at least to {q.band} = {MAGNITUDES[1]:g}."
+            else:
+                part = (y[last] - power) / (y[last] - y[last + 1])
+                text += f"to {q.band} = {x[last] + part * (x[last + 1] - x[last]):.2f}, in closed form."
+        if "limit" in found:
+            limits = [one for one in found["limit"].limits if one.statistic == q.statistic]
+            points = [(p.value, p.probability.value) for one in limits for p in (*one.points, one.check)]
+            sources["simulated"] = dict(zip(("x", "y"), np.array(points).T, strict=True))
+            text += "".join(
+                f" Simulated: {q.band} = {one.value.value:.3f} [{one.value.low:.3f}, {one.value.high:.3f}]."
+                for one in limits
+            )
+        return Drawn(text + " A click chooses a magnitude.", sources, {"power": {"location": power}})
+
+
+class Map(Picture):
+    """Detection probability over magnitude and amplitude."""
+
+    name, title = "map", "How faint a star and how small a flare: detection probability"
+    sets = "magnitude=x,amplitude_percent=10^y"
+
+    def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
+        from bokeh.models import FixedTicker, LinearColorMapper
+        from bokeh.models.annotations import ColorBar
+
+        low, high = np.log10(PERCENTS)
+        canvas = Canvas(ink, "magnitude", "flare amplitude", logs, x_range=MAGNITUDES, y_range=(low, high))
+        plot: Any = canvas.plot
+        mapper = LinearColorMapper(palette="Cividis256", low=0, high=1)
+        plot.image("image", "x", "y", "dw", "dh", source=canvas.source("map", "image", "x", "y", "dw", "dh"),
+                   color_mapper=mapper)  # fmt: skip
+        lines = plot.multi_line(
+            "xs", "ys", source=canvas.source("contours", "xs", "ys"), line_color="#ffffff", line_width=1.4
+        )
+        lines.name = "contours"
+        plot.scatter(
+            "x", "y", source=canvas.source("simulated", "x", "y", "p"), size=10, marker="square",
+            fill_color={"field": "p", "transform": mapper}, line_color="#ffffff",
+        )  # fmt: skip
+        canvas.own_point()
+        plot.yaxis.ticker = FixedTicker(ticks=[-1, 0, 1, 2])
+        plot.yaxis.major_label_overrides = {-1: "0.1 %", 0: "1 %", 1: "10 %", 2: "100 %"}
+        plot.add_layout(
+            ColorBar(
+                color_mapper=mapper, width=10, title="detected", background_fill_color=None,
+                major_label_text_color=ink.text, title_text_color=ink.text, major_tick_line_color=ink.text,
+                title_text_font_style="normal", title_text_font="system-ui", major_label_text_font="system-ui",
+            ),
+            "right",
+        )  # fmt: skip
+        canvas.legend += [("10, 50 and 90 % in closed form", "#b8c0c8", "line", ""),
+                          ("simulated", "#8a8678", "dot", "if any")]  # fmt: skip
+        return canvas
+
+    def drawn(self, closed: Closed, found: Found) -> Drawn:
+        q = closed.question
+        sources: dict[str, Any] = {
+            "own": {"x": [q.magnitude], "y": [np.log10(q.amplitude_percent)]},
+            "simulated": {"x": [], "y": [], "p": []},
+            "map": {"image": [], "x": [], "y": [], "dw": [], "dh": []},
+            "contours": {"xs": [], "ys": []},
+        }
+        text = f"The closed form of {q.statistic} takes too long for a map: simulate it."
+        if q.statistic not in SLOW:
+            x, y, p = _map(_Kept(closed))
+            sources |= {"map": _image(x, np.log10(y), p), "contours": _contours(x, np.log10(y), p)}
+            share = 100 * float(np.mean(p >= 0.5))
+            text = (
+                f"At least half of the flares are detected in {share:.0f} % of the map, which spans {q.band} = "
+                f"{MAGNITUDES[0]:g} to {MAGNITUDES[1]:g} and amplitudes of {PERCENTS[0]:g} to {PERCENTS[1]:g} %."
+            )
+        if "map" in found:
+            got = found["map"]
+            at_x, at_y = np.meshgrid(np.array(got.x, float), np.log10(100 * np.array(got.y, float)))
+            sources["simulated"] = {"x": at_x.ravel(), "y": at_y.ravel(), "p": got.probability[0].ravel()}
+            text += f" {at_x.size} cells are simulated."
+        return Drawn(text + " A click chooses magnitude and amplitude.", sources)
+
+
+def _image(x: Float, y: Float, p: Float) -> dict[str, Any]:
+    """Cells around the points at which probabilities are known, finer by straight lines between."""
+    from scipy.interpolate import RegularGridInterpolator
+
+    fine_x, fine_y = np.linspace(x[0], x[-1], 97), np.linspace(y[0], y[-1], 61)
+    between = RegularGridInterpolator((y, x), p)
+    shown = between(tuple(np.meshgrid(fine_y, fine_x, indexing="ij")))
+    half_x, half_y = 0.5 * (fine_x[1] - fine_x[0]), 0.5 * (fine_y[1] - fine_y[0])
+    return {
+        "image": [shown], "x": [x[0] - half_x], "y": [y[0] - half_y], "dw": [x[-1] - x[0] + 2 * half_x],
+        "dh": [y[-1] - y[0] + 2 * half_y],
+    }  # fmt: skip
+
+
+def _contours(x: Float, y: Float, p: Float) -> dict[str, Any]:
+    from contourpy import contour_generator
+
+    lines: list[Any] = [line for level in LEVELS for line in contour_generator(x, y, p).lines(level)]
+    return {"xs": [line[:, 0].tolist() for line in lines], "ys": [line[:, 1].tolist() for line in lines]}
+
+
+class Limit(Tab):
+    """How far one would still see it."""
+
+    name, title = "limit", "Limit and map"
+    about = "How faint a star and how small a flare one would still see."
+    pictures = (Curve(), Map())
+    simulations = {"limit": "Simulate the limit", "map": "Simulate the map"}  # noqa: RUF012
+    files = {"limit": "limit", "map": "map"}  # noqa: RUF012
+
+    def table(self, name: str, closed: Closed, found: Found) -> Table:
+        return found[name].table
+
+    def rows(self, closed: Closed, found: Found) -> list[list[str]]:
+        if "limit" not in found:
+            return []
+        heads = ["statistic", "limiting magnitude", "95 % interval", "closed form", "simulated again there"]
+        return [heads] + [
+            [
+                one.statistic, f"{one.value.value:.3f}", f"{one.value.low:.3f} to {one.value.high:.3f}",
+                f"{one.closed_form:.3f}", percent(one.check.probability.value),
+            ]
+            for one in found["limit"].limits
+        ]  # fmt: skip
+
+    def study(self, name: str, closed: Closed, found: Found) -> Study:
+        study: Study = found[name].study
+        return study

@@ -1,0 +1,68 @@
+"""Where the noise comes from."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mauvecl.study.labels import label, stacked
+from mauvecl.web.figures import Canvas
+from mauvecl.web.tabs.tab import Drawn, Found, Picture, Tab
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+    from mauvecl.web.closed import Closed
+
+#: Columns of the budget, with what each is called and its colour.
+PARTS = {
+    "source_photon": ("photons of the star", "star"),
+    "zodiacal_photon": ("photons of the sky", "sky"),
+    "dark": ("dark current", "dark"),
+    "read": ("read noise", "read"),
+    "total": ("all together", "total"),
+}
+
+
+class Budget(Picture):
+    """Noise of a pixel by origin."""
+
+    name, title = "budget", "Noise of a pixel by origin"
+    logs = ("Y",)
+
+    def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
+        canvas = Canvas(ink, "wavelength (nm)", "DN rms in the exposure", logs, wavelength=True)
+        for name, (called, colour) in PARTS.items():
+            told = canvas.line(name, called, colour, line_width=2)
+            lines = (("wavelength (nm)", "x"),) if name == "total" else ()
+            canvas.tooltips(told, *lines, (f"{called} (DN)", "y"))
+        return canvas
+
+    def drawn(self, closed: Closed, found: Found) -> Drawn:
+        x, table = closed.quiet, closed.quiet.noise_budget()
+        values = {name: np.asarray(table[name].value) for name in PARTS}
+        # Logarithms show nothing of zero.
+        sources: dict[str, Any] = {
+            name: {"x": x.wavelength_nm, "y": np.where(v > 0, v, np.nan)} for name, v in values.items()
+        }
+        power = {name: float(np.sum(v**2)) for name, v in values.items() if name != "total"}
+        first = max(power, key=lambda name: power[name])
+        share = 100 * power[first] / (sum(power.values()) or 1.0)
+        text = f"Most of the noise's power comes from {PARTS[first][0]}: {share:.0f} % over all pixels."
+        return Drawn(text, sources)
+
+
+class Noise(Tab):
+    """Where the noise comes from."""
+
+    name, title = "noise", "Noise"
+    about = "Where the noise comes from, pixel by pixel, without a flare."
+    pictures = (Budget(),)
+    files = {"noise-budget": None}  # noqa: RUF012
+
+    def table(self, name: str, closed: Closed, found: Found) -> Table:
+        """As `mauvecl snr` writes it; nothing of it is drawn."""
+        study = closed.study
+        parts = [({"star": label(study.star[0], closed.quiet)}, closed.quiet.noise_budget())]
+        return stacked(parts, realisations=study.run.realisations, study=study.text())

@@ -1,0 +1,101 @@
+"""What is recorded: the star and the flare in DN, one drawn exposure, and the light at the telescope."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mauvecl.web.figures import Canvas, strips
+from mauvecl.web.tabs.tab import Drawn, Found, Picture, Tab
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+    from mauvecl.web.closed import Closed
+
+
+class Recorded(Picture):
+    """One exposure with the flare, without its pedestals, and what it is made of."""
+
+    name, title = "recorded", "One exposure, less bias and dark"
+    logs = ("y",)
+    shows = {"pedestals": "Bias and dark"}  # noqa: RUF012
+
+    def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
+        canvas = Canvas(ink, "wavelength (nm)", "DN in the exposure", logs, wavelength=True)
+        canvas.band("spread", "95 % of draws with the flare", "flare")
+        canvas.saturated()
+        canvas.line("drawn", "one drawn exposure", "drawn", line_width=1)
+        canvas.line("sky", "sky", "sky")
+        canvas.line("dark", "dark", "dark", show="pedestals")
+        canvas.line("bias", "bias", "bias", show="pedestals")
+        told = canvas.line("star", "star", "star", line_width=2)
+        flare = canvas.line("flare", "star with flare", "flare", line_width=2)
+        canvas.tooltips(told, ("wavelength (nm)", "x"), ("star (DN)", "y"))
+        canvas.tooltips(flare, ("with flare (DN)", "y"))
+        return canvas
+
+    def drawn(self, closed: Closed, found: Found) -> Drawn:
+        x, y = closed.quiet, closed.flare
+        w, gain = x.wavelength_nm, x.n_frames * x.gain_dn_per_electron
+        sky, spread = gain * x.sky_electrons, 1.96 * np.sqrt(y.variance_dn2)
+        star, flare = gain * x.source_electrons + sky, gain * y.source_electrons + sky
+        pedestal = x.n_frames * (x.dark_dn + x.bias_dn)
+        recorded = y.recorded_dn - pedestal
+        sources: dict[str, Any] = {
+            "star": {"x": w, "y": star},
+            "flare": {"x": w, "y": flare},
+            "sky": {"x": w, "y": sky},
+            "dark": {"x": w, "y": x.n_frames * x.dark_dn},
+            "bias": {"x": w, "y": x.n_frames * x.bias_dn},
+            "spread": {"x": w, "low": recorded - spread, "high": recorded + spread},
+            "drawn": {"x": w, "y": found["draw"] - pedestal} if "draw" in found else {"x": [], "y": []},
+            "saturated": strips(w, x.saturated | y.saturated),
+        }
+        peak = int(np.argmax(flare))
+        text = (
+            f"Star and sky give up to {star.max():.3g} DN in the exposure, with the flare {flare.max():.3g} DN at "
+            f"{w[peak]:.0f} nm; 95 % of draws lie within +-{spread[peak]:.3g} DN there."
+        )
+        return Drawn(text, sources)
+
+
+class Telescope(Picture):
+    """The star's spectrum at the telescope, without and with the flare."""
+
+    name, title = "telescope", "Spectrum at the telescope"
+    logs = ("Y",)
+
+    def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
+        canvas = Canvas(ink, "wavelength (nm)", "flux (erg / s / cm² / Å)", logs, wavelength=True)
+        flare = canvas.line("flare", "star with flare", "flare")
+        star = canvas.line("star", "star", "star")
+        canvas.tooltips(star, ("wavelength (nm)", "x"), ("star", "y"))
+        canvas.tooltips(flare, ("with flare", "y"))
+        return canvas
+
+    def drawn(self, closed: Closed, found: Found) -> Drawn:
+        star, flare = closed.light
+        shown = (star.wavelength_nm >= 190) & (star.wavelength_nm <= 710)
+        w = star.wavelength_nm[shown]
+        # Logarithms show nothing of zero.
+        one, two = (np.where(s.flux_flam > 0, s.flux_flam, np.nan)[shown] for s in (star, flare))
+        rise = np.nanmax(two / one)
+        text = f"The flare multiplies the star's light by up to {rise:.3g} between 190 and 710 nm."
+        return Drawn(text, {"star": {"x": w, "y": one}, "flare": {"x": w, "y": two}})
+
+
+class Spectrum(Tab):
+    """What is recorded."""
+
+    name, title = "spectrum", "Spectrum"
+    about = "What the detector records, and the light that comes to the telescope."
+    pictures = (Recorded(), Telescope())
+    files = {"observation": None}  # noqa: RUF012
+
+    def table(self, name: str, closed: Closed, found: Found) -> Table:
+        """One observation with the flare, taken apart."""
+        from mauvecl.answers.simulate import simulate
+
+        return simulate(closed.study, flaring=True).observations[1][2]

@@ -1,0 +1,102 @@
+"""What all tabs have in common: pictures, what is simulated for them, tables to take along."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, ClassVar
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+    from numpy.typing import ArrayLike
+
+    from mauvecl.study.study import Study
+    from mauvecl.web.closed import Closed
+
+#: Answers that are simulated, by name: of one question.
+Found = Mapping[str, Any]
+
+
+@dataclass
+class Drawn:
+    """What a picture shows of an answer.
+
+    Attributes
+    ----------
+    text : str
+        The picture in words, for who does not see it.
+    sources : dict
+        Columns by the name of the figure's data source.
+    props : dict
+        Properties by the name of the figure's model, such as an axis's label.
+    """
+
+    text: str
+    sources: dict[str, dict[str, ArrayLike | Sequence[str]]] = field(default_factory=dict)
+    props: dict[str, dict[str, Any]] = field(default_factory=dict)
+
+
+class Picture(ABC):
+    """One picture: an empty figure that is made once, and data for it.
+
+    Attributes
+    ----------
+    name : str
+        Within the page.
+    title : str
+    logs : tuple of str
+        Axes, of x and y, that the visitor may have logarithmic, and those that are at first in capitals.
+    shows : dict of str
+        Parts that are hidden until asked for, by tag of their models, with what they are called.
+    sets : str
+        Fields that a click on the picture sets, with the axis that gives each, as in "magnitude=x".
+    """
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    logs: ClassVar[tuple[str, ...]] = ()
+    shows: ClassVar[Mapping[str, str]] = {}
+    sets: ClassVar[str] = ""
+
+    @abstractmethod
+    def figure(self, ink: Any, logs: frozenset[str]) -> Any:
+        """An empty Bokeh figure in a theme's colours, with these axes logarithmic."""
+
+    @abstractmethod
+    def drawn(self, closed: Closed, found: Found) -> Drawn:
+        """Its data."""
+
+
+class Tab(ABC):
+    """One tab.
+
+    Attributes
+    ----------
+    name, title : str
+    about : str
+        What it shows, in a sentence.
+    pictures : tuple of Picture
+    simulations : dict of str
+        What can be simulated here, with what the button is called.
+    """
+
+    name: ClassVar[str]
+    title: ClassVar[str]
+    about: ClassVar[str]
+    pictures: ClassVar[tuple[Picture, ...]] = ()
+    simulations: ClassVar[Mapping[str, str]] = {}
+    #: Tables that can be taken along, with the simulation that each needs, or none.
+    files: ClassVar[Mapping[str, str | None]] = {}
+
+    def table(self, name: str, closed: Closed, found: Found) -> Table:
+        """One of `files`."""
+        raise NotImplementedError
+
+    def rows(self, closed: Closed, found: Found) -> list[list[str]]:
+        """A small table as text, its first row the heads; none where there is nothing to tell."""
+        return []
+
+    def study(self, name: str, closed: Closed, found: Found) -> Study:
+        """The study that gives one of `files` again."""
+        return closed.study

@@ -1,0 +1,103 @@
+"""What it costs not to know all of the instrument."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy import special
+
+from mauvecl.answers.unknown_cost import unknown_cost
+from mauvecl.noise.usual import USUAL
+from mauvecl.study.nuisances import NuisanceChoice
+from mauvecl.web.closed import percent
+from mauvecl.web.figures import Canvas
+from mauvecl.web.tabs.tab import Drawn, Found, Picture, Tab
+
+if TYPE_CHECKING:
+    from mauvecl.web.closed import Closed
+
+#: What is told of one unknown: its name, and the matched S/N plain and marginalised.
+Row = tuple[str, float, float]
+
+
+@lru_cache(maxsize=4)
+def costs(closed: Closed) -> tuple[float, list[Row]]:
+    """The matched S/N of the flare with everything known, and with each unknown alone and together."""
+    choices = {f"{u.nuisance} ({u.marginalised.partition(':')[0]})": {u.nuisance: _spread(u.sd)} for u in USUAL}
+    chosen = {name: NuisanceChoice.model_validate(given) for name, given in choices.items()}
+    chosen["all the usual together"] = NuisanceChoice(usual=True)
+    tilt = NuisanceChoice(tilt="free")
+    chosen["colour of the response (free)"] = tilt
+    if closed.study.nuisances.own:
+        chosen["your own spectrum"] = NuisanceChoice(own=closed.study.nuisances.own)
+    rows, known = list[Row](), 0.0
+    for name, choice in chosen.items():
+        study = closed.study.model_copy(update={"nuisances": choice})
+        cost = unknown_cost(name, closed.quiet, closed.flare, study)
+        known = cost.known or known
+        rows.append((name, cost.plain, cost.marginal))
+    return known, rows
+
+
+def _spread(sd: float) -> float | str:
+    return "free" if np.isinf(sd) else sd
+
+
+def chance(snr: float, fap: float) -> float:
+    """Detection probability of a matched statistic of such an S/N."""
+    return float(special.ndtr(snr + special.ndtri(fap)))
+
+
+class Cost(Picture):
+    """The matched S/N with each unknown: plain, and marginalised."""
+
+    name, title = "cost", "What each unknown costs: the flare's S/N by the matched statistic"
+
+    def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
+        canvas = Canvas(ink, "S/N of the flare (matched statistic)", "", logs, y_range=["nothing"])
+        source = canvas.source("bars", "name", "plain", "marginal", "known")
+        plot: Any = canvas.plot
+        for column, called, colour, width in (
+            ("known", "everything known", "star", 0.85),
+            ("marginal", "marginalised over it", "flare", 0.55),
+            ("plain", "unknown, and not looked for", "drawn", 0.2),
+        ):
+            made = plot.hbar("name", right=column, height=width, source=source, color=ink[colour], alpha=0.75)
+            made.name = called
+            canvas.legend.append((called, ink[colour], "band", ""))
+            canvas.tooltips(made, (called, column), mode="hline")
+        plot.x_range.start = 0
+        return canvas
+
+    def drawn(self, closed: Closed, found: Found) -> Drawn:
+        known, rows = costs(closed)
+        names = [name for name, *_ in rows][::-1]
+        columns: dict[str, Any] = {"name": names}
+        columns["plain"], columns["marginal"] = (np.array([row[k] for row in rows[::-1]]) for k in (1, 2))
+        columns["known"] = np.full(len(rows), known)
+        worst = min(rows, key=lambda row: row[2])
+        text = (
+            f"With everything known the flare has a matched S/N of {known:.3g}; {worst[0]} leaves {worst[2]:.3g} "
+            "of it, the least of these."
+        )
+        return Drawn(text, {"bars": columns}, {"y range": {"factors": names}})
+
+
+class Unknown(Tab):
+    """What it costs not to know all of the instrument."""
+
+    name, title = "unknowns", "Unknowns"
+    about = (
+        "What it costs not to know the detector's temperature, the light lost, or the sky: a statistic that is blind "
+        "to them sees less of the flare; one that ignores them is fooled by them."
+    )
+    pictures = (Cost(),)
+
+    def rows(self, closed: Closed, found: Found) -> list[list[str]]:
+        known, rows = costs(closed)
+        fap = closed.question.fap
+        heads = ["unknown", "S/N, not looked for", "S/N, marginalised", "then detected"]
+        given: list[Row] = [("nothing: everything is known", known, known), *rows]
+        return [heads] + [[n, f"{a:.3g}", f"{b:.3g}", percent(chance(b, fap))] for n, a, b in given]

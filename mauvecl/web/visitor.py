@@ -1,0 +1,349 @@
+"""One visitor: a connection on which the page asks, and the server answers; nothing is kept when it ends."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import json
+import logging
+import tempfile
+import time
+from collections import OrderedDict
+from collections.abc import Callable, Mapping
+from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from tornado.websocket import WebSocketClosedError, WebSocketHandler
+
+from mauvecl.device.program import DeviceError
+from mauvecl.host.errors import InputError
+from mauvecl.host.files.bounded import shortened
+from mauvecl.host.version import VERSION
+from mauvecl.web.asked import SIMULATED
+from mauvecl.web.card import card
+from mauvecl.web.closed import Closed
+from mauvecl.web.downloads import as_command, as_file, as_python, study_file
+from mauvecl.web.fields import UPLOADED, UPLOADED_UNKNOWN
+from mauvecl.web.state import State
+from mauvecl.web.tabs import TABS
+from mauvecl.web.upload import read_pairs, read_upload
+from mauvecl.web.work import Cancelled, Job, reading
+
+if TYPE_CHECKING:
+    from mauvecl.host.stars.source import Source
+    from mauvecl.web.question import Points
+
+log = logging.getLogger(__name__)
+
+#: Seconds between two looks at a simulation.
+LOOK_S = 0.25
+#: Closed forms, pictures and files of all visitors are made by so many threads, beside the event loop.
+_closed_forms = ThreadPoolExecutor(2, thread_name_prefix="mauvecl-closed")
+#: Questions whose simulations a visitor's connection remembers, and files.
+MOST_KEPT = 4
+#: What is told where the page itself is wrong.
+OWN_FAULT = "the page has made a mistake of its own, and there is no answer: please report what was entered"
+#: Why a connection was ended, for the page.
+UNUSED = 4000
+#: Fields that take a file, with what reads it and what then stands in them.
+UPLOADS: dict[str, tuple[Callable[[str, bytes], Any], str]] = {
+    "star": (read_upload, UPLOADED),
+    "own_unknown": (read_pairs, UPLOADED_UNKNOWN),
+}
+
+
+class Visitor(WebSocketHandler):
+    """The connection of one page.
+
+    Messages are JSON: ``ask`` says what is asked, ``n`` numbers it, ``link`` holds the fields. Answers have the same
+    ``n``; of several questions in a row only the last need be answered.
+    """
+
+    #: Everybody who is here.
+    here: set[Visitor] = set()  # noqa: RUF012
+
+    def initialize(self) -> None:
+        """A new connection."""
+        self.used = time.monotonic()
+        self.job: Job | None = None
+        self._drawing: Job | None = None
+        self._next: dict[str, Any] | None = None
+        self._answering = False
+        self._coming: tuple[int, str, str] | None = None
+        self._uploads: dict[str, Any] = {}
+        self._closed: tuple[tuple[Any, ...], Closed] | None = None
+        self._found: OrderedDict[tuple[Any, ...], dict[str, Any]] = OrderedDict()
+        self._files: OrderedDict[tuple[Any, ...], tuple[str, bytes]] = OrderedDict()
+        self._folder = tempfile.TemporaryDirectory(prefix="mauvecl-page-")
+
+    def check_origin(self, origin: str) -> bool:
+        """The door has asked already, and more exactly: IPv6 too."""
+        return True
+
+    def open(self, *args: str, **kwargs: str) -> None:
+        """A visitor has come."""
+        self.here.add(self)
+        self.tell(hello=VERSION)
+
+    def on_close(self) -> None:
+        """The visitor is gone: nothing more is computed for them."""
+        self.here.discard(self)
+        for job in (self.job, self._drawing):
+            if job is not None:
+                job.cancel()
+        self._folder.cleanup()
+
+    def tell(self, content: bytes | None = None, **told: Any) -> None:
+        """Send a message, and bytes behind it."""
+        if self.ws_connection is None:
+            return
+        try:
+            self.write_message(json.dumps(told, allow_nan=False))
+            if content is not None:
+                self.write_message(content, binary=True)
+        except WebSocketClosedError:
+            return
+
+    def on_message(self, message: str | bytes) -> None:
+        """Whatever comes; what is no question of the page's ends the connection."""
+        self.used = time.monotonic()
+        if isinstance(message, bytes):
+            self._content(message)
+            return
+        try:
+            asked = json.loads(message)
+            ask = getattr(self, f"_ask_{asked['ask']}")
+            if not (isinstance(asked.get("n", 0), int) and isinstance(asked.get("link", ""), str)):
+                raise TypeError
+        except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
+            log.warning("a message is no question of the page's: %s", shortened(message))
+            self.close(1003, "expected a question as the page asks it")
+            return
+        ask(asked)
+
+    # Closed forms
+
+    def state(self, link: str) -> State:
+        """What is entered."""
+        state = State(self._uploads.get("star"), self._uploads.get("own_unknown"))
+        state.follow(link)
+        return state
+
+    def _ask_answer(self, asked: dict[str, Any]) -> None:
+        """The answer and the pictures of a tab; a later question takes the place of one that waits."""
+        self._next = asked
+        if not self._answering:
+            self._answering = True
+            asyncio.get_running_loop().create_task(self._answer_all())
+
+    async def _answer_all(self) -> None:
+        try:
+            while self._next is not None and self.ws_connection is not None:
+                asked, self._next = self._next, None
+                await self._answer(asked)
+        finally:
+            self._answering = False
+
+    async def _answer(self, asked: dict[str, Any]) -> None:
+        n, state = asked.get("n", 0), self.state(asked.get("link", ""))
+        told: dict[str, Any] = {"n": n, "stray": state.stray, "faults": state.faults}
+        if state.faults:
+            self.tell(**told)
+            return
+        try:
+            closed = await self._beside(partial(self.closed, state))
+            found = self._found.get(self._key(state), {})
+            self.tell(**told, answer=await self._beside(partial(card, closed, found)))
+            if self._next is None:
+                tab = TABS.get(str(asked.get("tab")), next(iter(TABS.values())))
+                self.tell(n=n, **await self._beside(partial(shown, tab.name, closed, found)))
+        except InputError as error:
+            self.tell(**told, refused=str(error))
+        except Exception:
+            log.exception("no answer")
+            self.tell(**told, refused=OWN_FAULT)
+
+    def closed(self, state: State) -> Closed:
+        """The closed forms of a question; the last one's are remembered."""
+        key = self._key(state)
+        if self._closed is None or self._closed[0] != key:
+            self._closed = key, Closed.of(state.question(), Path(self._folder.name))
+        return self._closed[1]
+
+    def _key(self, state: State) -> tuple[Any, ...]:
+        star: Source | None = self._uploads.get("star")
+        unknown: Points | None = self._uploads.get("own_unknown")
+        return state.asked, None if star is None else star.digest, hash(unknown)
+
+    @staticmethod
+    async def _beside(work: Callable[[], Any]) -> Any:
+        """Do something beside the event loop."""
+        return await asyncio.get_running_loop().run_in_executor(_closed_forms, work)
+
+    # Draws and simulations
+
+    def _ask_draw(self, asked: dict[str, Any]) -> None:
+        """One exposure with the flare."""
+        state = self.state(asked["link"])
+        if state.faults or self._closed is None or self._closed[0] != self._key(state):
+            return
+        closed = self._closed[1]
+        if self._drawing is not None:
+            self._drawing.cancel()
+        how = closed.study.drawing | {"seed": closed.study.run.seed}
+        self._drawing = Job(lambda pool: pool.realise(closed.flare, count=1, **how)[0])
+
+        def came(future: Future[Any]) -> None:
+            if self._closed is None or self._closed[1] is not closed or future.cancelled() or future.exception():
+                return
+            found = self._found.get(self._key(state), {}) | {"draw": future.result()}
+            self.tell(n=asked.get("n", 0), **shown(str(asked.get("tab")), closed, found))
+
+        self._when_done(self._drawing, came)
+
+    def _ask_simulate(self, asked: dict[str, Any]) -> None:
+        """Simulate, tell how far it is, and answer."""
+        asyncio.get_running_loop().create_task(self._simulate(asked))
+
+    async def _simulate(self, asked: dict[str, Any]) -> None:
+        n, kind, state = asked.get("n", 0), asked.get("kind"), self.state(asked.get("link", ""))
+        if self.job is not None or kind not in SIMULATED or state.faults:
+            self.tell(n=n, ended="", refused="there is a simulation already, or nothing to simulate")
+            return
+        key = self._key(state)
+        try:
+            closed = await self._beside(partial(self.closed, state))
+            if self.job is not None:
+                raise InputError("there is a simulation already, expected its end first")
+            job = self.job = Job(partial(SIMULATED[kind], closed.study))
+        except InputError as error:
+            self.tell(n=n, ended="", refused=str(error))
+            return
+        done = asyncio.wrap_future(job.future)
+        try:
+            while not (await asyncio.wait([done], timeout=LOOK_S))[0]:
+                standing = job.standing
+                share = standing.done / standing.total if standing is not None and standing.total else 0.0
+                self.tell(n=n, progress=min(share, 1.0), told=job.told)
+            kept = self._found.setdefault(key, {})
+            kept |= done.result()
+            self._found.move_to_end(key)
+            while len(self._found) > MOST_KEPT:
+                self._found.popitem(last=False)
+            self.tell(n=n, ended=f"Done: {job.told}.", kind=kind)
+        except (Cancelled, CancelledError, asyncio.CancelledError):
+            self.tell(n=n, ended="Cancelled.")
+        except (InputError, DeviceError) as error:
+            self.tell(n=n, ended="", refused=str(error))
+        except Exception:
+            log.exception("a simulation failed")
+            self.tell(n=n, ended="", refused=OWN_FAULT)
+        finally:
+            self.job = None
+
+    def _ask_cancel(self, asked: dict[str, Any]) -> None:
+        if self.job is not None:
+            self.job.cancel()
+
+    def _when_done(self, job: Job, then: Callable[[Future[Any]], None]) -> None:
+        loop = asyncio.get_running_loop()
+        job.future.add_done_callback(lambda future: loop.call_soon_threadsafe(then, future))
+
+    # Files from and to the visitor
+
+    def _ask_upload(self, asked: dict[str, Any]) -> None:
+        """A file comes with the next message."""
+        if asked.get("field") in UPLOADS:
+            self._coming = asked.get("n", 0), asked["field"], str(asked.get("name"))
+
+    def _content(self, content: bytes) -> None:
+        """The file; it is read beside the event loop, and what it is for has nothing until then."""
+        if self._coming is None:
+            self.close(1003, "expected a question as the page asks it")
+            return
+        (n, field, name), self._coming = self._coming, None
+        read, entered = UPLOADS[field]
+        self._uploads.pop(field, None)
+
+        def came(future: Future[Any]) -> None:
+            try:
+                self._uploads[field] = future.result()
+            except InputError as error:
+                self.tell(n=n, field=field, lacks=str(error))
+            except Exception as error:
+                log.exception("an upload failed")
+                self.tell(
+                    n=n, field=field,
+                    lacks=f"upload {shortened(name)} cannot be read ({type(error).__name__}), expected a spectrum",
+                )  # fmt: skip
+            else:
+                self.tell(n=n, field=field, entered=entered)
+
+        loop = asyncio.get_running_loop()
+        future = reading(read, name, content)
+        future.add_done_callback(lambda future: loop.call_soon_threadsafe(came, future))
+
+    def _ask_file(self, asked: dict[str, Any]) -> None:
+        asyncio.get_running_loop().create_task(self._file(asked))
+
+    async def _file(self, asked: dict[str, Any]) -> None:
+        n, state = asked.get("n", 0), self.state(asked.get("link", ""))
+        tab, name, ending = (str(asked.get(word)) for word in ("tab", "name", "ending"))
+        try:
+            file, content = await self._beside(partial(self.file, state, tab, name, ending))
+            self.tell(content, n=n, file=file)
+        except InputError as error:
+            self.tell(n=n, refused=str(error), file="")
+        except Exception:
+            log.exception("a download failed")
+            self.tell(n=n, refused=OWN_FAULT, file="")
+
+    def file(self, state: State, tab: str, name: str, ending: str) -> tuple[str, bytes]:
+        """A table, or a study, of what is asked; the last ones are remembered."""
+        closed, key = self.closed(state), self._key(state)
+        found = self._found.get(key, {})
+        which = key, tab, name, ending, tuple(found)
+        if which not in self._files:
+            made = as_file(TABS[tab], name, ending, closed, found) if tab in TABS else study_file(closed.study, "study")
+            self._files[which] = made
+            while len(self._files) > MOST_KEPT:
+                self._files.popitem(last=False)
+        return self._files[which]
+
+    def _ask_export(self, asked: dict[str, Any]) -> None:
+        """The question in Python and on the command line."""
+        try:
+            question = self.state(asked["link"]).question()
+        except InputError as error:
+            self.tell(n=asked.get("n", 0), refused=str(error))
+            return
+        uploaded = question.uploaded is not None
+        self.tell(
+            n=asked.get("n", 0), python=as_python(question), command=as_command(question), uploaded=uploaded,
+            study="" if uploaded else question.study().toml(),
+        )  # fmt: skip
+
+
+def shown(name: str, closed: Closed, found: Mapping[str, Any]) -> dict[str, Any]:
+    """What a tab shows, as messages hold it."""
+    tab = TABS.get(name, next(iter(TABS.values())))
+    pictures = {}
+    for picture in tab.pictures:
+        drawn = picture.drawn(closed, found)
+        sources = {
+            source: {column: packed(values) for column, values in columns.items()}
+            for source, columns in drawn.sources.items()
+        }
+        pictures[picture.name] = {"text": drawn.text, "sources": sources, "props": drawn.props}
+    return {"tab": tab.name, "pictures": pictures, "rows": tab.rows(closed, found)}
+
+
+def packed(values: Any) -> Any:
+    """Numbers as base64 of little-endian 32-bit floats; anything else as it is."""
+    if len(values) and not isinstance(values[0], (str, list)):
+        array = np.asarray(values, "<f4")
+        return {"f4": base64.b64encode(array.tobytes()).decode(), "shape": list(array.shape)}
+    return list(values)
