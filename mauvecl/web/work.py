@@ -30,10 +30,11 @@ class Cancelled(Exception):  # noqa: N818
 
 
 def _engine(progress: Callable[[int, int], None]) -> Engine:
-    """This thread's engine, which tells this job's progress."""
+    """This thread's engine, which tells this job's progress, from whatever thread counts."""
     if not hasattr(_own, "engine"):
-        _own.engine = Engine(progress=lambda done, total: _own.progress(done, total))
-    _own.progress = progress
+        listener = _own.listener = [progress]
+        _own.engine = Engine(progress=lambda done, total: listener[0](done, total))
+    _own.listener[0] = progress
     engine: Engine = _own.engine
     return engine
 
