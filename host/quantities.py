@@ -20,6 +20,44 @@ WORDS = {
     "s": "seconds",
 }
 
+#: Ends of names, and the unit that they mean, the longest first.
+UNITS = {
+    "_uv_per_electron": "uV / electron",
+    "_nm_per_pixel": "nm / pix",
+    "_per_cm2_s": "1 / (cm2 s)",
+    "_dn_per_s": "DN / s",
+    "_a_per_w": "A / W",
+    "_per_day": "1 / d",
+    "_arcsec2": "arcsec2",
+    "_arcsec": "arcsec",
+    "_per_c": "1 / K",
+    "_rsun": "solRad",
+    "_msun": "solMass",
+    "_cm2": "cm2",
+    "_deg": "deg",
+    "_erg": "erg",
+    "_myr": "Myr",
+    "_nm": "nm",
+    "_dn": "DN",
+    "_pc": "pc",
+    "_v": "V",
+    "_c": "deg_C",
+    "_k": "K",
+    "_s": "s",
+}
+#: Names without such an end that have a unit.
+NAMED = {"magnitude": "mag", "ebv": "mag", "surface_brightness": "mag / arcsec2"}
+
+
+def unit_of(name: str) -> str:
+    """The unit that a name means: 0.3 is ``""``, a fraction, where it means none."""
+    return NAMED.get(name) or next((unit for end, unit in UNITS.items() if name.endswith(end)), "")
+
+
+def is_quantity(value: Any) -> bool:
+    """Whether a value has a unit of astropy's."""
+    return hasattr(value, "to_value") and hasattr(value, "unit")
+
 
 def number(
     what: str, value: Any, unit: str = "", *, low: float = -np.inf, high: float = np.inf, expected: str = ""
@@ -89,7 +127,7 @@ def count(what: str, value: Any, *, low: int = 0, high: int = 2**63 - 1) -> int:
 
 def _plain(what: str, value: Any, unit: str, wanted: str) -> NDArray[np.float64]:
     try:
-        if hasattr(value, "to_value") and hasattr(value, "unit"):
+        if is_quantity(value):
             value = _converted(value, unit)
         if isinstance(value, str | bytes) or np.asarray(value).dtype.kind not in "iuf":
             raise TypeError("no number")
