@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import operator
-from typing import Any
+from collections.abc import Callable
+from functools import wraps
+from inspect import isclass, signature
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
+
+Given = TypeVar("Given", bound=Callable[..., Any])
 
 #: What a unit is called in a sentence.
 WORDS = {
@@ -57,6 +62,46 @@ def unit_of(name: str) -> str:
 def is_quantity(value: Any) -> bool:
     """Whether a value has a unit of astropy's."""
     return hasattr(value, "to_value") and hasattr(value, "unit")
+
+
+def takes_quantities_of(**units: str) -> Callable[[Given], Given]:
+    """Let a function or class take Quantities where its parameters' names mean a unit (`UNITS`).
+
+    Parameters
+    ----------
+    **units : str
+        Of parameters whose names do not tell.
+
+    Notes
+    -----
+    Plain values go through untouched: ranges are the function's own matter. Whole numbers are `count`'s.
+    """
+
+    def decorate(function: Given) -> Given:
+        if isclass(function):
+            # `__init__` of the class itself is not looked up through an instance.
+            setattr(function, "__init__", decorate(function.__init__))  # noqa: B010
+            return function
+        known = signature(function)
+
+        @wraps(function)
+        def taking(*args: Any, **words: Any) -> Any:
+            if not (any(map(is_quantity, args)) or any(map(is_quantity, words.values()))):
+                return function(*args, **words)
+            bound = known.bind(*args, **words)
+            for name, value in bound.arguments.items():
+                if is_quantity(value):
+                    plain = numbers(name, value, units.get(name, unit_of(name)))
+                    bound.arguments[name] = plain if plain.ndim else float(plain)
+            return function(*bound.args, **bound.kwargs)
+
+        return cast(Given, taking)
+
+    return decorate
+
+
+#: The same where all names tell.
+takes_quantities = takes_quantities_of()
 
 
 def number(
