@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 import operator
-from typing import Any
+from collections.abc import Callable
+from functools import wraps
+from inspect import isclass, signature
+from typing import Any, TypeVar, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .errors import InputError
+
+Given = TypeVar("Given", bound=Callable[..., Any])
 
 #: What a unit is called in a sentence.
 WORDS = {
@@ -19,6 +24,84 @@ WORDS = {
     "mag / arcsec2": "mag/arcsec2",
     "s": "seconds",
 }
+
+#: Ends of names, and the unit that they mean, the longest first.
+UNITS = {
+    "_uv_per_electron": "uV / electron",
+    "_nm_per_pixel": "nm / pix",
+    "_per_cm2_s": "1 / (cm2 s)",
+    "_dn_per_s": "DN / s",
+    "_a_per_w": "A / W",
+    "_per_day": "1 / d",
+    "_arcsec2": "arcsec2",
+    "_arcsec": "arcsec",
+    "_per_c": "1 / K",
+    "_rsun": "solRad",
+    "_msun": "solMass",
+    "_cm2": "cm2",
+    "_deg": "deg",
+    "_erg": "erg",
+    "_myr": "Myr",
+    "_nm": "nm",
+    "_dn": "DN",
+    "_pc": "pc",
+    "_v": "V",
+    "_c": "deg_C",
+    "_k": "K",
+    "_s": "s",
+}
+#: Names without such an end that have a unit.
+NAMED = {"magnitude": "mag", "ebv": "mag", "surface_brightness": "mag / arcsec2"}
+
+
+def unit_of(name: str) -> str:
+    """The unit that a name means: 0.3 is ``""``, a fraction, where it means none."""
+    return NAMED.get(name) or next((unit for end, unit in UNITS.items() if name.endswith(end)), "")
+
+
+def is_quantity(value: Any) -> bool:
+    """Whether a value has a unit of astropy's."""
+    return hasattr(value, "to_value") and hasattr(value, "unit")
+
+
+def takes_quantities_of(**units: str) -> Callable[[Given], Given]:
+    """Let a function or class take Quantities where its parameters' names mean a unit (`UNITS`).
+
+    Parameters
+    ----------
+    **units : str
+        Of parameters whose names do not tell.
+
+    Notes
+    -----
+    Plain values go through untouched: ranges are the function's own matter. Whole numbers are `count`'s.
+    """
+
+    def decorate(function: Given) -> Given:
+        if isclass(function):
+            # `__init__` of the class itself is not looked up through an instance.
+            setattr(function, "__init__", decorate(function.__init__))  # noqa: B010
+            return function
+        known = signature(function)
+
+        @wraps(function)
+        def taking(*args: Any, **words: Any) -> Any:
+            if not (any(map(is_quantity, args)) or any(map(is_quantity, words.values()))):
+                return function(*args, **words)
+            bound = known.bind(*args, **words)
+            for name, value in bound.arguments.items():
+                if is_quantity(value):
+                    plain = numbers(name, value, units.get(name, unit_of(name)))
+                    bound.arguments[name] = plain if plain.ndim else float(plain)
+            return function(*bound.args, **bound.kwargs)
+
+        return cast(Given, taking)
+
+    return decorate
+
+
+#: The same where all names tell.
+takes_quantities = takes_quantities_of()
 
 
 def number(
@@ -89,7 +172,7 @@ def count(what: str, value: Any, *, low: int = 0, high: int = 2**63 - 1) -> int:
 
 def _plain(what: str, value: Any, unit: str, wanted: str) -> NDArray[np.float64]:
     try:
-        if hasattr(value, "to_value") and hasattr(value, "unit"):
+        if is_quantity(value):
             value = _converted(value, unit)
         if isinstance(value, str | bytes) or np.asarray(value).dtype.kind not in "iuf":
             raise TypeError("no number")

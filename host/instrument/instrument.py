@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from ..errors import InputError
-from ..quantities import count, number, numbers
+from ..quantities import count, is_quantity, number, numbers, unit_of
 from .curve import Curve
 from .pixel_map import MOST_PIXELS, PixelMap
 
@@ -407,32 +407,15 @@ class Instrument(BaseModel):
         return isinstance(other, Instrument) and self.digest == other.digest
 
 
-#: Ends of names, and the unit that they mean; names without one are fractions, or counts.
-UNITS = {
-    "_dn_per_s": "DN / s",
-    "_per_c": "1 / K",
-    "_nm_per_pixel": "nm / pix",
-    "_a_per_w": "A / W",
-    "_uv_per_electron": "uV / electron",
-    "_cm2": "cm2",
-    "_arcsec": "arcsec",
-    "_nm": "nm",
-    "_dn": "DN",
-    "_v": "V",
-    "_c": "deg_C",
-    "_s": "s",
-}
-
-
 def _in_its_unit(name: str, value: Any) -> Any:
     """A number or Quantity as a plain number in the unit of its name; anything else as it is."""
     field = Instrument.model_fields.get(name)
     kind = None if field is None else field.annotation
-    quantity = hasattr(value, "unit") and not isinstance(value, Curve)
+    quantity = is_quantity(value)
     if kind is int and (quantity or isinstance(value, float | np.number)):
         return count(name, value)
     if quantity or isinstance(value, np.number):
-        return number(name, value, next((unit for end, unit in UNITS.items() if name.endswith(end)), ""))
+        return number(name, value, unit_of(name))
     return value
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
+from mauvecl.host.quantities import takes_quantities
 
 Float = NDArray[np.float64]
 
@@ -16,6 +17,7 @@ Float = NDArray[np.float64]
 ORBIT_S = 86_400.0 / 15.21638735
 
 
+@takes_quantities
 @dataclass(frozen=True)
 class Sinusoid:
     """amplitude * sin(2 pi t / period + phase).

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
+from mauvecl.host.quantities import takes_quantities
 from mauvecl.lightcurve.curves import ORBIT_S, Curve, Sinusoid
 
 if TYPE_CHECKING:
@@ -57,6 +58,7 @@ class StareUnknown:
         _check_spread(self.name, self.of, self.sd)
 
 
+@takes_quantities
 @dataclass(frozen=True, eq=False)
 class Stare:
     """Frames of one star, one after the other with gaps between them; arrays are read-only.
@@ -137,6 +139,7 @@ class Stare:
         return named + [(unknown.name, unknown.curve) for unknown in self.unknowns]
 
     @classmethod
+    @takes_quantities
     def of(
         cls,
         duration_s: float,
@@ -217,6 +220,7 @@ class Stare:
         )
 
     @classmethod
+    @takes_quantities
     def along(cls, orbit: Orbit, target: Target | str, start: str, duration_s: float, **how: Any) -> Stare:
         """As the orbit gives it: frames while the target is seen, the detector's temperature through sun and shadow.
 

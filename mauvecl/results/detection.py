@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.plotting import picture
+from mauvecl.host.quantities import count
 from mauvecl.results.channels import ChannelPlan, Key
 from mauvecl.results.fap import Tails, check_fap, countable
 from mauvecl.results.hypotheses import Hypotheses
@@ -83,7 +84,7 @@ class Detection(Hypotheses):
         self, statistic: str, flare: int | None = None, *, template: int = 0, bins: int = 200
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Edges and counts for pictures; parameters as for `distribution`."""
-        return self.distribution(statistic, flare, template=template).histogram(bins)
+        return self.distribution(statistic, flare, template=template).histogram(count("bins", bins, low=1))
 
     def threshold(self, fap: float = 1e-3, statistic: str = "chi2", *, template: int = 0) -> Interval:
         """The value exceeded with false-alarm probability `fap` in one test.

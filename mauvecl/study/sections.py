@@ -5,8 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, create_model, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, create_model, field_validator, model_validator
 
+from mauvecl.host.quantities import is_quantity, numbers, unit_of
 from mauvecl.host.sky import DEFAULT_SKY
 from mauvecl.noise.varied import VARIED
 from mauvecl.statistics.names import STATISTIC_NAMES, USUAL_STATISTICS
@@ -18,10 +19,29 @@ if TYPE_CHECKING:
     from mauvecl.noise.processes import Prior, Processes
 
 
+def plain(key: str, given: Any) -> Any:
+    """What a study holds of a value: Quantities, times and places are kept as numbers and text."""
+    if is_quantity(given):
+        return numbers(key, given, unit_of(key)).tolist()
+    if isinstance(given, list | tuple) and any(map(is_quantity, given)):
+        return [plain(key, one) for one in given]
+    if hasattr(given, "utc") and hasattr(given, "isot"):
+        return str(given.utc.isot)
+    if hasattr(given, "icrs") and hasattr(given, "to_string"):
+        return str(given.icrs.to_string("decimal", precision=6))
+    return given
+
+
 class Part(BaseModel):
     """A section: frozen, and strict about its keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
+
+    @field_validator("*", mode="before")
+    @classmethod
+    def _in_its_unit(cls, given: Any, info: ValidationInfo) -> Any:
+        """A Quantity as plain numbers in the unit of the key; other objects of astropy's as text."""
+        return plain(info.field_name or "", given)
 
 
 #: What a star from a file has and one of the library has not.

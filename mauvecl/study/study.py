@@ -11,8 +11,10 @@ from pydantic import Field, ValidationError, model_validator
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import possible, read_text, toml
+from mauvecl.host.quantities import number
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.study.orbits import OrbitQuestion, PlanQuestion, find_plan_files, without_usual_plan
+from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.questions import (
     Axis,
     BulkQuestion,
@@ -28,6 +30,8 @@ from mauvecl.study.stares import EventText, StareQuestion, find_curves, without_
 from mauvecl.study.study_text import find_files, in_table, put, sentence, study_of, toml_value
 
 if TYPE_CHECKING:
+    import astropy.units as u
+
     from mauvecl.host.expectation import Expectation
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.source import Source
@@ -212,15 +216,26 @@ class Study(Part):
             update["temperature_c"] = None
         return self.model_copy(update={"observation": o.model_copy(update=update)})
 
-    def at(self, quantity: str, value: float | str) -> Self:
+    def at(self, quantity: str, value: u.Quantity | float | str) -> Self:
         """The study with one quantity at another value, for all its stars.
 
         Parameters
         ----------
         quantity : str
             A key of `QUANTITIES`, or "star" with a library name.
-        value : float or str
+        value : float, Quantity or str
+
+        Raises
+        ------
+        InputError
+            For another quantity, or what is no value of it.
         """
+        if quantity not in QUANTITIES:
+            raise InputError(
+                f"quantity {shortened(str(quantity))!r} is unknown, expected one of {', '.join(QUANTITIES)}"
+            )
+        if quantity != "star":
+            value = number(quantity.replace("_", " "), value, QUANTITIES[quantity].unit)
         change: dict[str, Any]
         if quantity in ("magnitude", "star"):
             another = {"library": value, **dict.fromkeys(STAR_KEYS)}
@@ -230,7 +245,7 @@ class Study(Part):
             change = {"amplitudes": (value,)} if quantity == "amplitude" else {"temperature_k": value}
             return self.model_copy(update={"flare": self.flare.model_copy(update=change)})
         if quantity == "sky":
-            return self.model_copy(update={"sky": SkyLight(surface_brightness=float(value))})
+            return self.model_copy(update={"sky": SkyLight(surface_brightness=value)})
         change = {{"exposure": "exposure_s", "detector_temperature": "temperature_c"}[quantity]: value}
         return self.model_copy(update={"observation": self.observation.model_copy(update=change)})
 

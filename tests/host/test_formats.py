@@ -87,6 +87,6 @@ def test_text_from_other_editors(tmp_path: Path) -> None:
 def test_arguments_that_are_no_number(value: object) -> None:
     star = Source.from_arrays(NM, FLUX)
     for call in (star.at_magnitude, star.flaring, star.reddened, lambda v: star.flaring(0.1, v)):
-        with pytest.raises(InputError, match=r"expected (a number|-30 to 40 mag|0 to 10 mag|kelvin)"):
+        with pytest.raises(InputError, match=r"expected (a number|magnitudes|0 to 10 mag|kelvin)"):
             call(value)
     assert star.at_magnitude(7.4 * u.mag).digest == star.at_magnitude(7.4).digest
