@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from mauvecl.answers.answer import Answer
-from mauvecl.lightcurve.events import Event
-from mauvecl.lightcurve.observed import Light, Staring, seen
+from mauvecl.host.errors import InputError
+from mauvecl.lightcurve.alarms import Alarm, alarms
+from mauvecl.lightcurve.events import Event, coefficients, temperatures_of
+from mauvecl.lightcurve.null import sampled
+from mauvecl.lightcurve.observed import Draw, Light, Staring, seen
 from mauvecl.study.labels import described, label, stacked, titled, told
+from mauvecl.study.searches import surveyed
 from mauvecl.study.stares import energy_of, staring_of
 from mauvecl.study.study import Study
 
@@ -25,6 +29,8 @@ if TYPE_CHECKING:
 
 #: Light curves in text, at most; longer ones are in their FITS files alone.
 MOST_ROWS = 100_000
+#: Star-days of a stare that the threshold's importance sampling looks at, at most.
+SAMPLED_DAYS = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,14 +47,37 @@ class Flaring:
 
 
 @dataclass(frozen=True, eq=False)
+class Searched:
+    """What a search of one stare found, and the threshold that it was searched with.
+
+    Attributes
+    ----------
+    threshold : float
+        By importance sampling of normal noise.
+    alarms : list of Alarm
+        By falling value.
+    bolometric_erg : tuple of float
+        Of each, by its fit; NaN where the star's size is unknown.
+    events : tuple of int
+        The flare put in that each is nearest to, from 1 on, within a half-width and two frames; 0 for none.
+    """
+
+    threshold: float
+    alarms: list[Alarm]
+    bolometric_erg: tuple[float, ...]
+    events: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
 class StarStare:
-    """One star in one cell of the sweep."""
+    """One star in one cell of the sweep; `searched` is a sentence where no search was possible."""
 
     label: str
     at: Mapping[str, float | str]
     staring: Staring
     flares: tuple[Flaring, ...]
     light: Light
+    searched: Searched | str | None = None
 
     @property
     def title(self) -> str:
@@ -86,6 +115,13 @@ class StareAnswer(Answer):
             table["flux"] = [float(np.median(light.mean[:, 0]))] * u.DN / u.s
             table["frame_noise"] = [float(np.median(light.sd[:, 0] / light.mean[:, 0]))]
             table["flares"] = [len(one.flares)]
+            if self.study.stare.search:
+                searched = one.searched
+                told = searched if isinstance(searched, Searched) else None
+                table["threshold"] = [np.nan if told is None else told.threshold]
+                table["threshold"].info.description = "value of the search's statistic from which on it alarms"
+                table["found"] = [-1 if told is None else len(told.alarms)]
+                table["found"].info.description = "flares found; -1: not searched"
             table["saturated_frames"] = [int(np.count_nonzero(one.staring.quality))]
             for name, text in (
                 ("frames", "frames of the stare"),
@@ -128,6 +164,38 @@ class StareAnswer(Answer):
 
         return self._together(rows)
 
+    @property
+    def found(self) -> QTable:
+        """One row per flare that the search found: what it was by a fit, with standard errors, and which was put in."""
+        import astropy.units as u
+        from astropy.table import QTable
+
+        def rows(one: StarStare) -> QTable:
+            searched = one.searched
+            alarms = searched.alarms if isinstance(searched, Searched) else []
+            fits = [alarm.recovered for alarm in alarms]
+            table = QTable()
+            for name, key, unit, text in (
+                ("peak_time", "peak{}_s", u.s, "from the start of the stare"),
+                ("amplitude", "amplitude{}", None, "in the flare's band"),
+                ("half_width", "half_width{}_s", u.s, "t_1/2 of the search's shape"),
+                ("temperature", "temperature{}_k", u.K, "blackbody temperature"),
+                ("equivalent_duration", "equivalent_duration{}_s", u.s, "in the flare's band"),
+            ):
+                for suffix, more in (("", ""), ("_error", "; standard error")):
+                    values = np.array([float(getattr(fit, key.format(suffix))[0]) for fit in fits], np.float64)
+                    table[name + suffix] = values if unit is None else values * unit
+                    table[name + suffix].info.description = text + more
+            of_them = searched if isinstance(searched, Searched) else Searched(np.nan, [], (), ())
+            table["energy_bolometric"] = np.array(of_them.bolometric_erg, np.float64) * u.erg
+            table["value"] = np.array([alarm.rho for alarm in alarms], np.float64)
+            table["event"] = np.array(of_them.events, np.int64)
+            table["value"].info.description = "of the search's statistic: S/N of the template that fits best"
+            table["event"].info.description = "row of the star's flares that it is nearest to, from 1 on; 0: none near"
+            return table
+
+        return self._together(rows)
+
     def light_curve(self, number: int = 0) -> QTable:
         """Frames of one star and cell: time, cadence number, quality, and light in every band."""
         import astropy.units as u
@@ -165,7 +233,8 @@ class StareAnswer(Answer):
             for n, one in enumerate(self.stares, 1)
             if one.staring.stare.n_frames <= MOST_ROWS
         }
-        return {"stare": self.table, "events": self.events} | curves
+        found = {"found": self.found} if self.study.stare.search else {}
+        return {"stare": self.table, "events": self.events} | found | curves
 
     @property
     def documents(self) -> dict[str, Callable[[], bytes]]:
@@ -199,7 +268,10 @@ class StareAnswer(Answer):
     def as_json(self) -> dict[str, Any]:
         from mauvecl.answers.report import rows
 
-        return {"messages": self.messages, "stares": rows(self.table), "events": rows(self.events)}
+        tables = {"stares": self.table, "events": self.events} | (
+            {"found": self.found} if self.study.stare.search else {}
+        )
+        return {"messages": self.messages} | {name: rows(table) for name, table in tables.items()}
 
 
 def stare(study: Study, stares: Stares) -> StareAnswer:
@@ -221,6 +293,7 @@ def stare(study: Study, stares: Stares) -> StareAnswer:
     prepared = [(star, at, cell, *staring_of(cell, star)) for at, cell in study.cells() for star in cell.star]
     found = [_drawn(study, stares, *one) for one in prepared]
     messages = told([staring.quiet for _, _, _, staring, _ in prepared])
+    messages += [one.searched for one in found if isinstance(one.searched, str)]
     for one in found:
         cut = int(np.count_nonzero(one.staring.quality))
         if cut:
@@ -245,12 +318,37 @@ def _drawn(
         )[0]
 
     light = seen(staring, q.bands_nm, draw)
-    return StarStare(label(star, staring.quiet), at, staring, _flares(cell, star, staring, events), light)
+    searched = _searched(cell, star, staring, events, draw) if q.search else None
+    return StarStare(label(star, staring.quiet), at, staring, _flares(cell, star, staring, events), light, searched)
+
+
+def _searched(study: Study, star: Star, staring: Staring, events: list[Event], draw: Draw) -> Searched | str:
+    """What the study's search finds, or why it cannot be made."""
+    try:
+        known = surveyed(study, star)
+        survey = replace(known.survey, components=staring.components(known.templates.weights))
+        tail = sampled(survey.of_days(SAMPLED_DAYS).search, seed=study.run.seed)
+        threshold = tail.threshold(study.search.rate).value
+    except InputError as error:
+        return f"{label(star, staring.quiet)} is not searched: {error}."
+    found = alarms(survey, known.templates, draw(survey.components), threshold)
+    energies, nearest = [], []
+    for alarm in found:
+        fit = alarm.recovered
+        kelvin = float(np.nan_to_num(fit.temperature_k[0], nan=study.flare.temperature_k))
+        event = Event(
+            float(fit.peak_s[0]), float(fit.half_width_s[0]), float(fit.amplitude[0]), kelvin, study.search.shape
+        )
+        energy = energy_of(study, star, known.source, event, "bolometric")
+        energies.append(float("nan") if energy is None else energy)
+        away = [abs(one.peak_s - event.peak_s) for one in events]
+        near = int(np.argmin(away)) if away else -1
+        close = near >= 0 and away[near] <= events[near].half_width_s + 2 * staring.stare.frame_s
+        nearest.append(near + 1 if close else 0)
+    return Searched(threshold, found, tuple(energies), tuple(nearest))
 
 
 def _flares(study: Study, star: Star, staring: Staring, events: list[Event]) -> tuple[Flaring, ...]:
-    from mauvecl.lightcurve.events import coefficients, temperatures_of
-
     source, kelvin, frames = star.source(), temperatures_of(events), staring.stare
     found = []
     for event in events:

@@ -218,6 +218,12 @@ EnergyFlag = Annotated[
         show_default=False,
     ),
 ]
+SearchFlag = Annotated[
+    bool | None,
+    typer.Option(
+        "--search/--no-search", help="Search the stare for flares, as [search] has it [search].", show_default=False
+    ),
+]
 DistanceFlag = Annotated[
     float | None, typer.Option("--distance", help="Of the star, pc, for energies.", show_default=False)
 ]
@@ -354,6 +360,7 @@ STARE = {
     "half_width": Option(HalfWidthFlag, "stare", "half_width_s"),
     "shape": Option(ShapeFlag, "stare", "shape"),
     "energy": Option(EnergyFlag, "stare", "energies_erg"),
+    "search": Option(SearchFlag, "stare", "search"),
     "with_unknowns": Option(WithUnknownsFlag, "nuisances", "usual"),
 }
 #: How far or large the star is; put together by `_stars`.

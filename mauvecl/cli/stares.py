@@ -34,6 +34,7 @@ def stare(
 
 
 def _show(found: StareAnswer) -> None:
+    from mauvecl.answers.stare import Searched
     from mauvecl.cli.console import short, show_table
 
     swept = tuple(axis.quantity for axis in found.study.sweep.axes)
@@ -58,6 +59,28 @@ def _show(found: StareAnswer) -> None:
             for row in events
         ],
     )  # fmt: skip
+    for one in found.stares:
+        if isinstance(one.searched, Searched):
+            show_table(
+                f"Found at {one.title} above {one.searched.threshold:.2f}, {_rate(found)}",
+                ("peak at (s)", "amplitude", "half width (s)", "temperature (K)", "bolometric (erg)", "value", "flare"),
+                [
+                    (f"{a.recovered.peak_s[0]:.6g}",
+                     f"{100 * a.recovered.amplitude[0]:.3g} ± {100 * a.recovered.amplitude_error[0]:.1g} %",
+                     f"{a.recovered.half_width_s[0]:.3g} ± {a.recovered.half_width_error_s[0]:.1g}",
+                     f"{a.recovered.temperature_k[0]:.4g} ± {a.recovered.temperature_error_k[0]:.1g}",
+                     _energy(energy), f"{a.rho:.2f}", str(event) if event else "none")
+                    for a, energy, event in zip(
+                        one.searched.alarms, one.searched.bolometric_erg, one.searched.events, strict=True
+                    )
+                ],
+            )  # fmt: skip
+
+
+def _rate(found: StareAnswer) -> str:
+    """How many false alarms there are at the threshold, in words."""
+    asked = found.study.search
+    return f"{asked.false_alarms:g} false alarms per star-{asked.per}"
 
 
 def _energy(erg: float) -> str:

@@ -270,7 +270,9 @@ def sampled(search: Search, *, seed: int, draws: int = DRAWS) -> Sampled:
         # Its own template exceeds for certain: rounding must not leave it out.
         exceeding = np.zeros(ladder.size, np.int64)
         for _, rho in search.values(both):
-            base, rise = rho[0].ravel(), rho[1].ravel()
+            # Minus infinity where nothing is looked for, in gaps.
+            tried_here = np.isfinite(rho[0])
+            base, rise = rho[0][tried_here], rho[1][tried_here]
             near = base + np.abs(rise) * (wanted[-1] - value) > ladder[0]
             base, rise = base[near], rise[near]
             exceeding += [np.count_nonzero(base + (v - value) * rise > u) for v, u in zip(wanted, ladder, strict=True)]

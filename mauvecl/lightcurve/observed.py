@@ -173,19 +173,15 @@ def seen(staring: Staring, bands_nm: Sequence[tuple[float, float]], draw: Draw) 
     filled = np.flatnonzero(elements.any(axis=1))
     spectrum, spectrum_sd, spectrum_mean = staring.net(elements[filled], draw)
     # Elements hold every pixel once, so that their sum is all there is.
-    flux = [spectrum.sum(axis=1, keepdims=True)]
-    sd = [np.sqrt((spectrum_sd**2).sum(axis=1, keepdims=True))]
-    mean = [spectrum_mean.sum(axis=1, keepdims=True)]
-    for row in rows:
-        # One at a time: bands may overlap, and sums of one launch must not be the same.
-        for kept, found in zip((flux, sd, mean), staring.net(row[None], draw), strict=True):
-            kept.append(found)
+    whole = spectrum.sum(axis=1), np.sqrt((spectrum_sd**2).sum(axis=1)), spectrum_mean.sum(axis=1)
+    parts = staring.net(np.array(rows).reshape(len(rows), used.size), draw) if rows else np.zeros((3, len(whole[0]), 0))
+    flux, sd, mean = (np.column_stack(both) for both in zip(whole, parts, strict=True))
     low, high = quiet.wavelength_nm[[0, -1]]
     return Light(
         (f"{low:.0f}-{high:.0f} nm", *(f"{a:g}-{b:g} nm" for a, b in bands_nm)),
-        np.hstack(flux),
-        np.hstack(sd),
-        np.hstack(mean),
+        flux,
+        sd,
+        mean,
         spectrum.astype(np.float32),
         spectrum_sd.astype(np.float32),
         spectrum_mean.astype(np.float32),

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.answers.stare import Searched
 from mauvecl.pictures.style import COLOURS, NULL, STYLE, finished, pyplot
 
 if TYPE_CHECKING:
@@ -22,7 +23,7 @@ IN_SECONDS_S, IN_MINUTES_S = 600.0, 4 * 3600.0
 
 
 def light_curves(one: StarStare, path: str | Path | None = None) -> Any:
-    """Light curves in all bands, relative to the quiescent star, with flares marked and gaps left out."""
+    """Light curves in all bands, relative to the quiescent star; dotted: flares put in, triangles: found."""
     plt = pyplot()
     stare, light = one.staring.stare, one.light
     scale, unit = _time(stare.duration_s)
@@ -42,6 +43,10 @@ def light_curves(one: StarStare, path: str | Path | None = None) -> Any:
                 axis.plot(time / scale, mean / level[k], color=NULL, linewidth=0.8)
             for flare in one.flares:
                 axis.axvline(flare.event.peak_s / scale, color=NULL, linewidth=0.5, linestyle=":")
+            if isinstance(one.searched, Searched):
+                found = [float(alarm.recovered.peak_s[0]) / scale for alarm in one.searched.alarms]
+                top = [1.0] * len(found)
+                axis.plot(found, top, "v", color=COLOURS[4], markersize=4, transform=axis.get_xaxis_transform())
             axis.set_title(light.bands[k])
             axis.set_ylabel("relative light")
         axes[-1, 0].set_xlabel(f"time from the start of the stare ({unit})")

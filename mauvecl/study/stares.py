@@ -94,6 +94,7 @@ class StareQuestion(Part):
     half_width_s: Annotated[float, Field(gt=0)] = 60.0
     shape: str = "davenport2014"
     energies_erg: tuple[Annotated[float, Field(gt=0)], ...] = ()
+    search: bool = True
     bands_nm: tuple[tuple[float, float], ...] = ((200.0, 300.0), (300.0, 400.0), (400.0, 550.0), (550.0, 700.0))
 
     @model_validator(mode="after")

@@ -26,6 +26,7 @@ SHORT = Study().with_settings(
         "stare.duration_s=300",
         "stare.gaps=[[100, 150]]",
         "stare.half_width_s=20",
+        "stare.search=false",
         "stare.thermal.amplitude=2.0",
         "stare.thermal.period_s=600",
     ]
@@ -126,6 +127,35 @@ def test_lightkurve_reads_it(found, tmp_path):
     assert curve.time[0].iso == "2026-01-01 00:00:02.500"
 
 
+def test_the_search_finds_what_was_put_in_and_nothing_else(stares):
+    """False alarms: one in a star-month; three flares of S/N 8, 32 and 96, and one of 3 that may be missed."""
+    study = Study().with_settings(
+        ['star=[{library="G2V", magnitude=7.4, distance_pc=37}]', "stare.gaps=[[2500, 3000]]"]
+    )
+    answer = stare(study, stares)
+    one, found = answer.stares[0], answer.found
+    assert found["event"].tolist()[:3] == [4, 3, 2]
+    assert (found["value"] >= one.searched.threshold).all()
+    assert set(found["event"]) <= {1, 2, 3, 4}
+    put_in = answer.events[found["event"] - 1]
+    # Within five standard errors: beyond that once in 2e6 for a normal error, of 15 looked at.
+    for name in ("peak_time", "amplitude", "half_width", "equivalent_duration"):
+        away = (found[name] - put_in[name]) / found[name + "_error"]
+        assert (np.abs(np.asarray(away)) < 5).all(), name
+    assert (np.abs((found["temperature"] - put_in["temperature"]) / found["temperature_error"]) < 5).all()
+    ratio = found["energy_bolometric"] / put_in["energy_bolometric"]
+    assert 0.9 < ratio[0] < 1.1
+    assert answer.table["found"][0] == len(found)
+    quiet = stare(study.with_settings(["flare.amplitudes=[0]"]), stares)
+    assert len(quiet.found) == 0
+
+
+def test_a_stare_too_short_for_a_search_is_told(stares):
+    short = stare(SHORT.with_settings(["stare.search=true", "stare.duration_s=10", "stare.gaps=[]"]), stares)
+    assert any("is not searched" in message for message in short.messages)
+    assert short.table["found"][0] == -1
+
+
 def test_the_verb_and_its_files(tmp_path):
     words = [
         "stare",
@@ -140,9 +170,7 @@ def test_the_verb_and_its_files(tmp_path):
         "--distance",
         "14",
     ]
-    told = run(
-        *words, "--energy", "1e33", "--half-width", "30", "--thermal", "0.5", "-o", "out", folder=tmp_path
-    ).stdout
+    told = run(*words, "--energy", "1e33", "--half-width", "30", "--no-search", "-o", "out", folder=tmp_path).stdout
     assert "1e+33" in told
     made = {path.name for path in (tmp_path / "out").iterdir()}
     assert made == {
@@ -186,6 +214,7 @@ effective_temperature_k = 5778.0
 
 [stare]
 duration_s = 300
+search = false
 drifts = { light = 0.01 }
 variability = { file = "slow.txt" }
 

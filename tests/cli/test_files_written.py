@@ -26,6 +26,7 @@ VERBS = {
     "snr": ("snr", *FEW, "-n", "2000"),
     "detect": ("detect", *DRAWN, "--fap", "0.01"),
     "limit": ("limit", *DRAWN, "--amplitude", "0.5", "--fap", "0.01", "--no-pictures"),
+    "stare": ("stare", *FEW[:4], "--duration", "60", "--no-search", "--seed", "1"),
     "map": ("map", *DRAWN, "--fap", "0.01", "--x", "magnitude=6,7", "--y", "amplitude=0.1,0.5", "--no-pictures"),
 }
 
