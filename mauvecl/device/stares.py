@@ -273,6 +273,7 @@ class StareLaunches(Launches):
 
     def _by_pixels(self, tile: Tile, out: Floats) -> None:
         """A few frames of all stares at a time."""
+        tile = tile.narrow(self.variant.width)
         n_frames, each = self._stare.stare.n_frames, self._scenarios * self.variant.sums * tile.size
         block = max(1, TILE_BYTES // (4 * each))
         # As much room as the scenarios need: powers of two, so that few programs are built.
