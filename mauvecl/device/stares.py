@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any, get_args
 
 import numpy as np
@@ -190,7 +191,7 @@ class Stares:
         cosmic_rays: CosmicRays | None,
     ) -> StareLaunches:
         self.opened.check_process()
-        scene = StareScene.of(components, stare, cosmic_rays)
+        scene = _laid_out(components, stare, cosmic_rays)
         scene.check(flares)
         if method == "cumulants":
             check_sums(scene, flares)
@@ -202,7 +203,7 @@ class StareLaunches(Launches):
 
     def __init__(self, device: Device, stare: StareScene, seed: int, method: Method) -> None:
         self._in_time = method == "cumulants"
-        table = SumTable.of(stare.components) if self._in_time else None
+        table = _table_of(stare.components) if self._in_time else None
         scene = stare.scene
         variant = replace(
             device.variant,
@@ -338,6 +339,11 @@ class StareLaunches(Launches):
         finally:
             if shared:
                 values.release()
+
+
+#: Callers ask for a few stares at a time, of the same star.
+_laid_out = lru_cache(maxsize=4)(StareScene.of)
+_table_of = lru_cache(maxsize=4)(SumTable.of)
 
 
 def _check(first: int, count: int, seed: int, method: str) -> None:
