@@ -57,6 +57,57 @@ MUTATIONS = {
         (("mauvecl/statistics/nuisances.py", "np.diag(self.sd**-2.0) + ", "np.diag(0.0 * self.sd**-2.0) + "),),
         "tests/statistics/test_nuisances.py::test_the_sums_subtracted_are_the_inverse_covariance[chi2]",
     ),
+    "sums of stares without their skewness": Mutation(
+        (
+            ("kernels/stare_sums.cl.mako", "x${a} = FMA(s${name(a, b, c)}, q${b}${c}, x${a});", ";"),
+            ("mauvecl/lightcurve/twin.py", "total = fma(of(skew, a, b, d), q, total)", "pass"),
+        ),
+        "tests/lightcurve/test_draws.py::test_sums_by_cumulants_are_distributed_as_by_pixels[cold]",
+    ),
+    "jitter that a stare keeps": Mutation(
+        (
+            ("kernels/stare_sums.cl.mako", "(uintv)first_high, number,", "(uintv)first_high, number & (uintv)0u,"),
+            (
+                "mauvecl/lightcurve/twin.py",
+                'words_at(numbers, int(scene.numbers[frame]), "stare_',
+                'words_at(numbers, 0, "stare_',
+            ),
+        ),
+        "tests/lightcurve/test_draws.py::test_moments_are_those_of_a_recipe[cumulants]",
+    ),
+    "jitter and sums of stares from one stream": Mutation(
+        (("mauvecl/noise/layout.py", '"stare_sums": 18', '"stare_sums": 17'),),
+        "tests/lightcurve/test_draws.py::test_moments_are_those_of_a_recipe[cumulants]",
+    ),
+    "a flare without photon noise": Mutation(
+        (
+            (
+                "kernels/stare_pixels.cl.mako",
+                "FMA(light, (floatv)m->photon_variance, FMA(strengths.dark",
+                "FMA(0.0f * light, (floatv)m->photon_variance, FMA(strengths.dark",
+            ),
+            (
+                "mauvecl/lightcurve/twin.py",
+                'fma(light, m["photon_variance"], fma(',
+                'fma(0 * light, m["photon_variance"], fma(',
+            ),
+        ),
+        "tests/lightcurve/test_draws.py::test_sums_by_cumulants_are_distributed_as_by_pixels[cold]",
+    ),
+    "frames counted without their gaps": Mutation(
+        (
+            (
+                "mauvecl/lightcurve/scene.py",
+                "_padded(stare.numbers, np.uint32)",
+                "_padded(np.arange(stare.n_frames), np.uint32)",
+            ),
+        ),
+        "tests/lightcurve/test_twin.py::test_a_split_changes_no_bit[cumulants]",
+    ),
+    "a share's flares from the first": Mutation(
+        (("mauvecl/device/stares.py", "request.flares.part(first - request.start,", "request.flares.part(done,"),),
+        "tests/runs/test_stares.py::test_shares_join_to_the_same_bits[None-cumulants]",
+    ),
     "a share under another's name": Mutation(
         (("mauvecl/runs/checkpoint.py", 'name.encode() + b"\\0" + body', "body"),),
         "tests/runs/test_pool.py::test_a_share_in_anothers_place",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any, get_args
 
 import numpy as np
@@ -24,6 +25,8 @@ Floats = NDArray[np.float32]
 
 #: Frames that one work-item follows where sums are drawn.
 FRAMES_EACH = 1024
+#: Stares that are reduced are drawn in tiles so many times smaller: they stay in a processor's cache.
+REUSED = 16
 
 
 class Stares:
@@ -174,7 +177,7 @@ class Stares:
                 values = np.moveaxis(out[..., : stare.n_frames], 2, 3)[scenarios]
                 parts.append(dict(reduction(values, first)))
 
-            self._tiles.over(there.start, there.count, 4 * each, work)
+            self._tiles.over(there.start, there.count, 4 * each * REUSED, work)
         found = joined(parts, adds=reduction.adds)
         return found | {"start": np.array(there.start)} if share else found
 
@@ -188,7 +191,7 @@ class Stares:
         cosmic_rays: CosmicRays | None,
     ) -> StareLaunches:
         self.opened.check_process()
-        scene = StareScene.of(components, stare, cosmic_rays)
+        scene = _laid_out(components, stare, cosmic_rays)
         scene.check(flares)
         if method == "cumulants":
             check_sums(scene, flares)
@@ -200,7 +203,7 @@ class StareLaunches(Launches):
 
     def __init__(self, device: Device, stare: StareScene, seed: int, method: Method) -> None:
         self._in_time = method == "cumulants"
-        table = SumTable.of(stare.components) if self._in_time else None
+        table = _table_of(stare.components) if self._in_time else None
         scene = stare.scene
         variant = replace(
             device.variant,
@@ -271,6 +274,7 @@ class StareLaunches(Launches):
 
     def _by_pixels(self, tile: Tile, out: Floats) -> None:
         """A few frames of all stares at a time."""
+        tile = tile.narrow(self.variant.width)
         n_frames, each = self._stare.stare.n_frames, self._scenarios * self.variant.sums * tile.size
         block = max(1, TILE_BYTES // (4 * each))
         # As much room as the scenarios need: powers of two, so that few programs are built.
@@ -335,6 +339,11 @@ class StareLaunches(Launches):
         finally:
             if shared:
                 values.release()
+
+
+#: Callers ask for a few stares at a time, of the same star.
+_laid_out = lru_cache(maxsize=4)(StareScene.of)
+_table_of = lru_cache(maxsize=4)(SumTable.of)
 
 
 def _check(first: int, count: int, seed: int, method: str) -> None:

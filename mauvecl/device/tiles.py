@@ -39,6 +39,11 @@ class Tile:
         """Which of the tile are wanted."""
         return np.uint32(self.start), np.uint32(self.stop)
 
+    def narrow(self, width: int) -> Tile:
+        """The same realisations in as few vectors of a width as hold them."""
+        skip = self.start - self.start % width
+        return Tile(self.first + skip, -(-self.stop // width) * width - skip, self.start - skip, self.stop - skip)
+
     def pieces(self, size: int) -> Iterator[Tile]:
         """The same realisations in tiles of at most so many, a multiple of what a work-item follows."""
         for begin in range(0, self.size, size):

@@ -78,7 +78,7 @@ class StaresRequest(Asked):
     least: ClassVar[int] = 64
 
     def __post_init__(self) -> None:
-        if len(self.flares.rows) > 1 or self.flares.amplitudes.shape[1] > 1:
+        if len(self.flares.given) > 1 or self.flares.amplitudes.shape[1] > 1:
             object.__setattr__(self, "rows_from", self.start)
 
     @cached_property

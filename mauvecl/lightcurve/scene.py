@@ -41,13 +41,13 @@ class Flares:
 
     Attributes
     ----------
-    rows : ndarray of float32, shape (n_row, n_flare, n_padded_frame)
+    given : ndarray, shape (n_row, n_frame, n_flare)
         Amplitude of each flare spectrum in each frame; one row for all stares, or one for each.
     amplitudes : ndarray of float32, shape (n_scenario, n_amplitude_row)
         Factors on them.
     """
 
-    rows: Floats
+    given: NDArray[Any]
     amplitudes: Floats
 
     @classmethod
@@ -74,28 +74,32 @@ class Flares:
                 f"amplitudes have the shape {factors.shape}, expected (n, {count}) or (n, 1) with n of 1 to "
                 f"{MOST_SCENARIOS} scenarios"
             )
-        for what, values in (("flare coefficients", given), ("amplitudes", factors)):
-            # One that is no number is the least and the largest, too.
-            for end in (values.min(initial=0.0), values.max(initial=0.0)):
-                if not 0 <= end <= LARGEST:
-                    raise InputError(f"{what} of {end:g}, expected 0 to {LARGEST:g}")
-        rows, size = np.moveaxis(given, 2, 1), padded_frames(n_frames)
-        if size != n_frames or rows.dtype != np.float32 or not rows.flags.c_contiguous:
-            rows = np.zeros((len(given), n_flares, size), np.float32)
-            rows[:, :, :n_frames] = np.moveaxis(given, 2, 1)
-        return cls(rows, factors.astype(np.float32))
+        # One that is no number is the least, too.
+        ends = [("flare coefficients", given.min(initial=0.0)), ("amplitudes", factors.min(initial=0.0))]
+        ends += [("flare coefficients", most) for most in _largest(given)] + [("amplitudes", factors.max())]
+        for what, end in ends:
+            if not 0 <= end <= LARGEST:
+                raise InputError(f"{what} of {end:g}, expected 0 to {LARGEST:g}")
+        return cls(given, factors.astype(np.float32))
+
+    @cached_property
+    def rows(self) -> Floats:
+        """As kernels read them, shape (n_row, n_flare, n_padded_frame)."""
+        n_row, n_frames, n_flares = self.given.shape
+        rows = np.zeros((n_row, n_flares, padded_frames(n_frames)), np.float32)
+        rows[:, :, :n_frames] = np.moveaxis(self.given, 2, 1)
+        return rows
 
     def part(self, first: int, count: int) -> Flares:
         """Those of some stares."""
         there = slice(first, first + count)
-        rows = self.rows if len(self.rows) == 1 else self.rows[there]
         amplitudes = self.amplitudes if self.amplitudes.shape[1] == 1 else self.amplitudes[:, there]
-        return Flares(rows, np.ascontiguousarray(amplitudes))
+        return Flares(self.given if len(self.given) == 1 else self.given[there], np.ascontiguousarray(amplitudes))
 
     @cached_property
     def most(self) -> Float:
         """The largest coefficient of each spectrum, shape (n_flare,)."""
-        return np.asarray(self.rows.max(axis=(0, 2), initial=0.0) * float(self.amplitudes.max()), np.float64)
+        return np.array(_largest(self.given), np.float64) * float(self.amplitudes.max())
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +213,7 @@ class StareScene:
         """With what belongs to flares, shape (1,)."""
         staring = self.staring.copy()
         staring["scenario_count"], staring["amplitude_rows"] = flares.amplitudes.shape
-        staring["flare_rows"] = len(flares.rows)
+        staring["flare_rows"] = len(flares.given)
         return staring.reshape(1)
 
     def job(self, seed: int) -> NDArray[np.void]:
@@ -304,6 +308,11 @@ def padded_frames(n_frames: int) -> int:
 def unique(n: int, order: int) -> list[tuple[int, ...]]:
     """Places of a symmetric tensor that differ, as kernels number them: (0,), or (0, 0), (1, 0), (1, 1), ..."""
     return sorted(tuple(sorted(key, reverse=True)) for key in itertools.combinations_with_replacement(range(n), order))
+
+
+def _largest(given: NDArray[Any]) -> list[float]:
+    """Of each spectrum; over the last axis alone NumPy is slow."""
+    return [float(given[..., j].max()) for j in range(given.shape[-1])]
 
 
 def _padded(values: NDArray[Any], kind: type) -> NDArray[Any]:
