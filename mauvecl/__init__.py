@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.detect import detect
     from mauvecl.answers.exposures import exposure_for
     from mauvecl.answers.gaussian import gaussian_report
+    from mauvecl.answers.inject import inject
     from mauvecl.answers.limits import limiting_magnitude, shortest_exposure, smallest_amplitude
     from mauvecl.answers.maps import detection_map
     from mauvecl.answers.simulate import simulate
@@ -83,6 +84,7 @@ __all__ = [
     "expect",
     "exposure_for",
     "gaussian_report",
+    "inject",
     "limiting_magnitude",
     "shortest_exposure",
     "simulate",
@@ -130,6 +132,7 @@ _HOMES = {
     "expect": "host.expectation",
     "exposure_for": "answers.exposures",
     "gaussian_report": "answers.gaussian",
+    "inject": "answers.inject",
     "limiting_magnitude": "answers.limits",
     "shortest_exposure": "answers.limits",
     "simulate": "answers.simulate",

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
@@ -12,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
+from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.injected import Fitted, InjectedShares, fitted
 from mauvecl.lightcurve.injections import Injections
 from mauvecl.lightcurve.null import DAY_S, Counted, counted, in_a_row_rate, sampled
@@ -268,6 +271,9 @@ def inject(
     InputError
         For anything in the study that cannot be.
     """
+    idle = next((axis.quantity for axis in study.sweep.axes if axis.quantity in ("amplitude", "exposure")), None)
+    if idle is not None:
+        raise InputError(f"the sweep has the quantity {idle!r}, which injections have none of, expected another")
     cells = [(values, one, star) for values, one in study.cells() for star in one.star]
     q = study.injections
     each = q.count * q.sizes * q.widths
@@ -322,20 +328,15 @@ def _star(
     widths = np.array(injections.half_widths_s)
     amplitudes = np.asarray(sizes.amplitude(values[None], widths[:, None]))
     to_fit = -(-asked.fitted // positions)
-    name = _name(study, star, threshold.value, amplitudes)
-    work = partial(_position, injections, known, amplitudes, to_fit, checkpoint, name)
-    parts: list[Arrays] = []
-    with ThreadPoolExecutor(threads) as pool:
-        for done, part in enumerate(pool.map(work, range(positions)), 1):
-            parts.append(part)
-            told_of(done / positions)
+    work = partial(_position, injections, known, amplitudes, to_fit)
+    parts = _kept(work, positions, _name(study, star, threshold.value, amplitudes), checkpoint, told_of, threads)
     critical = np.stack([part["critical"] for part in parts], axis=1)
     found = InjectedShares(
         injections.half_widths_s, values, amplitudes, sizes.of_amplitude(critical, widths[:, None, None])
     )
     # Where alarms are likely, drawn stares say most of whether the two agree.
-    checked, *likely = tail.most_likely
-    simulated, expected = _checked(drawn, checked, *likely, survey.stare.observed_s / short.stare.observed_s)
+    checked, likely, error = tail.most_likely
+    simulated, expected = _checked(drawn, checked, likely, error, survey.stare.observed_s / short.stare.observed_s)
     return StarCompleteness(
         label(star, known.quiet),
         at,
@@ -351,34 +352,43 @@ def _star(
     )
 
 
-def _position(
-    injections: Injections,
-    known: Surveyed,
-    amplitudes: Float,
-    to_fit: int,
-    checkpoint: Checkpoint | None,
-    name: str,
-    position: int,
-) -> Arrays:
-    """Everything at one peak, kept for a resume."""
-    name = f"{name}-{position}"
-    kept = None if checkpoint is None else checkpoint.get(name)
-    if kept is not None:
-        return kept
+def _position(injections: Injections, known: Surveyed, amplitudes: Float, to_fit: int, position: int) -> Arrays:
+    """Everything at one peak."""
     places = injections.places(position)
     blocks = [injections.critical(places, p, k, n) for p, k, n in injections.blocks() if p == position]
     part: Arrays = {"critical": np.concatenate(blocks, axis=1)}
-    if to_fit:
-        part |= fitted(injections, known.fit, places, position, to_fit, amplitudes)
+    return part | fitted(injections, known.fit, places, position, to_fit, amplitudes) if to_fit else part
+
+
+def _kept(
+    work: Callable[[int], Arrays],
+    positions: int,
+    name: str,
+    checkpoint: Checkpoint | None,
+    told_of: Callable[[float], None],
+    threads: int | None,
+) -> list[Arrays]:
+    """What comes of each position, worked out by some threads or kept from before."""
+    found: dict[int, Arrays] = {}
     if checkpoint is not None:
-        checkpoint.put(name, part)
-    return part
+        kept = {p: checkpoint.get(f"{name}-{p}") for p in range(positions)}
+        found = {p: part for p, part in kept.items() if part is not None}
+    todo = [p for p in range(positions) if p not in found]
+    pool = ThreadPoolExecutor(threads or os.cpu_count())
+    try:
+        for position, part in zip(todo, pool.map(work, todo), strict=True):
+            found[position] = part
+            if checkpoint is not None:
+                checkpoint.put(f"{name}-{position}", part)
+            told_of(len(found) / positions)
+    finally:
+        # What nobody waits for any longer is not begun.
+        pool.shutdown(cancel_futures=True)
+    return [found[position] for position in range(positions)]
 
 
 def _name(study: Study, star: Star, threshold: float, amplitudes: Float) -> str:
     """What shares of one star are kept under."""
-    import hashlib
-
     text = f"{study.toml()}|{star!r}|{threshold.hex()}|".encode() + amplitudes.tobytes()
     return hashlib.sha256(text).hexdigest()[:24]
 

@@ -13,6 +13,7 @@ from mauvecl.cli.boundary import EXIT_CODES, guarded
 from mauvecl.cli.bulk import export, realise, verify
 from mauvecl.cli.detect import detect, gaussian
 from mauvecl.cli.flags import DeviceFlag, JsonFlag, OutputFlag, QuietFlag
+from mauvecl.cli.injections import inject
 from mauvecl.cli.library import app as library
 from mauvecl.cli.limits import detection_map, limit
 from mauvecl.cli.observe import exposure, simulate, snr
@@ -120,6 +121,7 @@ for verb in (simulate, snr, exposure, detect, gaussian, limit):
     app.command()(verb)
 app.command("map")(detection_map)
 app.command()(stare)
+app.command()(inject)
 app.command()(visible)
 for verb in (realise, verify, export, serve):
     app.command()(verb)

@@ -215,19 +215,22 @@ class Fitted:
             filled = np.where(none[:, :, None], 0.0, each[name])
             return np.where(none, np.nan, np.nanquantile(filled, q, axis=2))
 
-        covered = np.where(none[:, :, None], 0.0, each["covered"])
+        peak = [quantile("peak", q) for q in (0.16, 0.5, 0.84)]
         return cls(
-            found.astype(np.float64),
-            *(quantile("energy", q) for q in (0.5, 0.16, 0.84)),
-            *(quantile(name, 0.5) for name in ("amplitude", "half_width")),
-            _quiet_quantile(each["temperature"], none),
-            quantile("peak", 0.5),
-            (quantile("peak", 0.84) - quantile("peak", 0.16)) / 2,
-            np.where(none, np.nan, np.nanmean(covered, axis=2)),
+            fitted=found.astype(np.float64),
+            energy_ratio=quantile("energy", 0.5),
+            energy_ratio_low=quantile("energy", 0.16),
+            energy_ratio_high=quantile("energy", 0.84),
+            amplitude_ratio=quantile("amplitude", 0.5),
+            half_width_ratio=quantile("half_width", 0.5),
+            temperature_ratio=_quiet_median(each["temperature"], none),
+            peak_offset=peak[1],
+            peak_scatter=(peak[2] - peak[0]) / 2,
+            energy_covered=np.where(none, np.nan, np.nanmean(np.where(none[:, :, None], 0.0, each["covered"]), axis=2)),
         )
 
 
-def _quiet_quantile(values: NDArray[Any], none: NDArray[np.bool_]) -> Float:
+def _quiet_median(values: NDArray[Any], none: NDArray[np.bool_]) -> Float:
     """The median, where a temperature is fitted at all."""
     blank = none | ~np.isfinite(values).any(axis=2)
     return np.where(blank, np.nan, np.nanmedian(np.where(blank[:, :, None], 0.0, values), axis=2))

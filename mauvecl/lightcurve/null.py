@@ -129,8 +129,8 @@ def in_a_row(values: NDArray[Any], points: int, sigma: float) -> NDArray[np.bool
     points : int
     sigma : float
     """
-    above = values > sigma
-    alarm = np.zeros(above.shape, np.bool_)
+    above = np.atleast_1d(values > sigma)
+    alarm: NDArray[np.bool_] = np.zeros(above.shape, np.bool_)
     if above.shape[-1] < points:
         return alarm
     windows = np.lib.stride_tricks.sliding_window_view(above, points, axis=-1).all(axis=-1)
