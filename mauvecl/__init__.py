@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.gaussian import gaussian_report
     from mauvecl.answers.limits import limiting_magnitude, shortest_exposure, smallest_amplitude
     from mauvecl.answers.maps import detection_map
+    from mauvecl.answers.plan import plan
     from mauvecl.answers.simulate import simulate
     from mauvecl.answers.snr import snr
     from mauvecl.answers.stare import stare
@@ -84,6 +85,7 @@ __all__ = [
     "exposure_for",
     "gaussian_report",
     "limiting_magnitude",
+    "plan",
     "shortest_exposure",
     "simulate",
     "smallest_amplitude",
@@ -132,6 +134,7 @@ _HOMES = {
     "gaussian_report": "answers.gaussian",
     "limiting_magnitude": "answers.limits",
     "shortest_exposure": "answers.limits",
+    "plan": "answers.plan",
     "simulate": "answers.simulate",
     "smallest_amplitude": "answers.limits",
     "snr": "answers.snr",

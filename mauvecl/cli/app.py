@@ -16,7 +16,7 @@ from mauvecl.cli.flags import DeviceFlag, JsonFlag, OutputFlag, QuietFlag
 from mauvecl.cli.library import app as library
 from mauvecl.cli.limits import detection_map, limit
 from mauvecl.cli.observe import exposure, simulate, snr
-from mauvecl.cli.orbits import visible
+from mauvecl.cli.orbits import plan, visible
 from mauvecl.cli.serve import serve
 from mauvecl.cli.stares import stare
 from mauvecl.host.version import VERSION
@@ -121,6 +121,7 @@ for verb in (simulate, snr, exposure, detect, gaussian, limit):
 app.command("map")(detection_map)
 app.command()(stare)
 app.command()(visible)
+app.command()(plan)
 for verb in (realise, verify, export, serve):
     app.command()(verb)
 
