@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.inject import inject
     from mauvecl.answers.limits import limiting_magnitude, shortest_exposure, smallest_amplitude
     from mauvecl.answers.maps import detection_map
+    from mauvecl.answers.plan import plan
     from mauvecl.answers.simulate import simulate
     from mauvecl.answers.snr import snr
     from mauvecl.answers.stare import stare
@@ -86,6 +87,7 @@ __all__ = [
     "gaussian_report",
     "inject",
     "limiting_magnitude",
+    "plan",
     "shortest_exposure",
     "simulate",
     "smallest_amplitude",
@@ -135,6 +137,7 @@ _HOMES = {
     "inject": "answers.inject",
     "limiting_magnitude": "answers.limits",
     "shortest_exposure": "answers.limits",
+    "plan": "answers.plan",
     "simulate": "answers.simulate",
     "smallest_amplitude": "answers.limits",
     "snr": "answers.snr",

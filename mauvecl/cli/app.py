@@ -17,7 +17,7 @@ from mauvecl.cli.injections import inject
 from mauvecl.cli.library import app as library
 from mauvecl.cli.limits import detection_map, limit
 from mauvecl.cli.observe import exposure, simulate, snr
-from mauvecl.cli.orbits import visible
+from mauvecl.cli.orbits import plan, visible
 from mauvecl.cli.serve import serve
 from mauvecl.cli.stares import stare
 from mauvecl.host.version import VERSION
@@ -123,6 +123,7 @@ app.command("map")(detection_map)
 app.command()(stare)
 app.command()(inject)
 app.command()(visible)
+app.command()(plan)
 for verb in (realise, verify, export, serve):
     app.command()(verb)
 

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mauvecl.cli.flags import Option, takes_study
+from mauvecl.cli.flags import FLARE, OBSERVATION, Option, takes_study
 
 if TYPE_CHECKING:
+    from mauvecl.answers.plan import PlanAnswer
     from mauvecl.answers.visible import VisibleAnswer
     from mauvecl.cli.session import Session
     from mauvecl.study.study import Study
@@ -88,6 +89,18 @@ TABLE = {
     ),
 }  # fmt: skip
 
+PLAN = {
+    "hours": Option(_flag(float, "--hours", text="Of exposure for each target, at most [all]."), "plan", "hours"),
+    "false_alarms": Option(
+        _flag(float, "--false-alarms", text="Of noise, in a day of exposure [0.0333]."), "plan", "false_alarms_per_day"
+    ),
+    "report": Option(_flag(str, "--report", text="pdf or html [pdf]."), "plan", "report"),
+    "instrument": OBSERVATION["instrument"],
+    "temperature": OBSERVATION["temperature"],
+    "flare_temperature": FLARE["flare_temperature"],
+    "flare_band": FLARE["flare_band"],
+}
+
 
 @takes_study(TARGETS, TABLE, observation=ORBIT, draws=False)
 def visible(study: Study, session: Session) -> None:
@@ -122,3 +135,29 @@ def _show_visible(found: VisibleAnswer) -> None:
             ("target", *(str(name) for name in months["month"])),
             [(one.name, *(f"{value.value:.0f}" for value in months[one.name])) for one in found.targets],
         )
+
+
+@takes_study(TABLE, PLAN, observation=ORBIT, draws=False)
+def plan(study: Study, session: Session) -> None:
+    """A campaign: hours, energies from which flares are recovered, flares expected, false alarms; a report.
+
+    The table has a column name, and what is known of each star: ra and dec, V, spectral_type, distance_pc, mass_msun
+    and age_myr, or other rates of flares. Stars of the embedded list need their names only.
+
+    Example: mauvecl plan targets.csv --hours 200 --from 2027-01-01
+    """
+    from mauvecl.answers.plan import plan as compute
+    from mauvecl.pictures.style import available
+
+    if study.plan.report == "pdf" and not available():
+        study = study.with_settings(["plan.report=html"])
+        session.say(["The report is HTML: matplotlib is missing, `pip install 'mauvecl[plot]'` brings it."])
+    found = compute(study)
+    session.answer(found, lambda: _show_plan(found))
+
+
+def _show_plan(found: PlanAnswer) -> None:
+    from mauvecl.answers.plan_text import SUMMARY, heading, summary_rows
+    from mauvecl.cli.console import show_table
+
+    show_table(heading(found), SUMMARY, summary_rows(found))

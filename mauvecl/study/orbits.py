@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
@@ -62,7 +63,8 @@ class LimitsText(Part):
         from mauvecl.host.orbit.visibility import Limits
 
         given = {name: getattr(self, name) for name in type(self).model_fields}
-        return Limits(**{name: None if value == "none" else value for name, value in given.items()})
+        found: dict[str, Any] = {name: None if value == "none" else value for name, value in given.items()}
+        return Limits(**found)
 
 
 class OrbitQuestion(Part):
@@ -92,6 +94,14 @@ class OrbitQuestion(Part):
     targets: tuple[str, ...] = ()
     simbad: bool = False
     limits: LimitsText = LimitsText()
+
+    @field_validator("start", mode="before")
+    @classmethod
+    def _as_text(cls, given: Any) -> Any:
+        """TOML has dates of its own."""
+        if isinstance(given, datetime.datetime) and given.tzinfo is not None:
+            given = given.astimezone(datetime.UTC).replace(tzinfo=None)
+        return given.isoformat() if isinstance(given, datetime.date) else given
 
     def orbit(self) -> Orbit:
         """As the host takes it."""
@@ -169,7 +179,7 @@ class PlanTarget(Part):
         from mauvecl.host.orbit.names import Target
 
         if self.coordinates is None:
-            return Target.of(self.name, simbad=simbad)
+            return Target.of(self.name, name=self.name, simbad=simbad)
         place = Target.of(self.coordinates, name=self.name)
         try:
             known = Target.of(self.name)
@@ -196,8 +206,8 @@ class PlanTarget(Part):
         kind = self.rates or spectral_type.strip()[:1].upper()
         if kind not in ("G", "K", "M", "sunlike"):
             raise InputError(
-                f"no flare rates are known of stars of the type {shortened(spectral_type)} ({self.name}), expected rates, "
-                "mass_msun and age_myr, alpha with rate_per_day and at_erg, or rates_file"
+                f"no flare rates are known of stars of the type {shortened(spectral_type)} ({self.name}), expected "
+                "rates, mass_msun and age_myr, alpha with rate_per_day and at_erg, or rates_file"
             )
         return preset(kind)
 

@@ -128,7 +128,7 @@ class Study(Part):
     def with_changes(
         self, changes: dict[str, dict[str, Any]], stars: list[dict[str, Any]] | None, where: str = "command line"
     ) -> Self:
-        """The study with values replaced where they are not None, by sections such as "orbit.limits"; with other stars."""
+        """The study with values replaced where they are not None, by sections such as "orbit.limits"; other stars."""
         data = self.model_dump()
         for section, values in changes.items():
             given = {key: value for key, value in values.items() if value is not None}

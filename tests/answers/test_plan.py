@@ -1,0 +1,190 @@
+"""Plans: each number of the report is in a table and follows from the others; what is missing is said."""
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from mauvecl import Study, plan
+from mauvecl.answers.plan import PlanAnswer
+from mauvecl.answers.plan_text import SUMMARY, summary_rows, target_lines
+from mauvecl.answers.planned import Looked
+from mauvecl.host.errors import InputError
+from mauvecl.lightcurve.completeness import Completeness
+from mauvecl.lightcurve.rates import davenport2019
+from mauvecl.study.orbits import read_targets
+from mauvecl.study.spectral_types import nearest_spectrum, subtype
+
+TARGETS = """name,ra,dec,V,spectral_type,distance_pc,mass_msun,age_myr
+eps Eri,,,,,,0.82,500
+my star,10.5,-3.0,8.0,K5V,10,0.7,300
+Denebola,,,,,,,
+EK Dra,,,,,,1.0,100
+"""
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
+    path = tmp_path_factory.mktemp("plan") / "targets.csv"
+    path.write_text(TARGETS)
+    return Study().with_changes(
+        {"plan": {"targets": read_targets(path), "hours": 120.0}, "orbit": {"days": 60.0}}, None
+    )
+
+
+@pytest.fixture(scope="module")
+def found(study: Study) -> PlanAnswer:
+    return plan(study)
+
+
+def test_numbers_follow_from_each_other(found: PlanAnswer) -> None:
+    """From the tables alone: hours, rates and shares give the flares, their interval and the false alarms."""
+    table, stars, energies = found.table, found.stars, found.by_energy
+    for k, name in enumerate(table["target"][:2]):
+        mine = energies[energies["target"] == name]
+        energy, share, above = (mine[one].value for one in ("energy", "recovered", "rate_above"))
+        middle = np.interp(np.log10(np.sqrt(energy[1:] * energy[:-1])), np.log10(energy), share)
+        per_day = np.sum((above[:-1] - above[1:]) * middle) + above[-1] * share[-1]
+        assert stars["recovered_per_day"][k] == pytest.approx(per_day, rel=0.01)
+        assert table["expected"][k] == pytest.approx(per_day * table["hours"][k].value / 24, rel=0.01)
+        assert np.interp(np.log10(table["E50"][k].value), np.log10(energy), share) == pytest.approx(0.5, abs=1e-6)
+        assert np.interp(np.log10(table["E90"][k].value), np.log10(energy), share) == pytest.approx(0.9, abs=1e-6)
+        assert table["low"][k] < table["expected"][k] < table["high"][k]
+    assert table["false_alarms"].tolist() == pytest.approx((table["hours"].value / 24 / 30).tolist())
+    assert (table["hours"] <= table["seen"]).all()
+    assert found.seen.table["hours"].value == pytest.approx(table["seen"].value)
+
+
+def test_the_rates_are_those_asked_for(found: PlanAnswer) -> None:
+    law = davenport2019(mass_msun=0.82, age_myr=500).in_band("bolometric", 10_000.0)
+    energies = found.by_energy
+    mine = energies[energies["target"] == "eps Eri"]
+    assert mine["rate_above"].value == pytest.approx(law.per_day_above(mine["energy"].value))
+
+
+def test_each_number_of_the_report_names_its_column(found: PlanAnswer) -> None:
+    tables = found.tables
+    for k in range(len(found.planned)):
+        for what, _, where in target_lines(found, k):
+            for part in where.split(";"):
+                name, _, columns = part.strip().partition(":")
+                assert name in tables, what
+                for column in filter(None, (one.strip() for one in columns.split(","))):
+                    assert column in tables[name].colnames, (what, column)
+    for row, planned in zip(summary_rows(found), found.planned, strict=True):
+        assert len(row) == len(SUMMARY)
+        assert row[0] == planned.name
+
+
+def test_what_is_missing_is_said(found: PlanAnswer) -> None:
+    told = " ".join(found.messages)
+    assert "no flare rates are known of stars of the type 'A3V' (Denebola)" in told
+    assert "EK Dra is never seen" in told
+    table = found.table
+    assert np.isnan(table["expected"][2])
+    assert np.isfinite(table["E50"][2].value)
+    assert table["expected"][3] == 0
+    assert table["at_least_one"][3] == 0
+    assert np.isinf(table["E50"][3].value)
+
+
+def test_report(found: PlanAnswer, study: Study) -> None:
+    """A page for each target beside the summary and the assumptions; every assumption."""
+    content = found.documents["plan.pdf"]()
+    assert len(re.findall(rb"/Type /Page\b", content)) >= len(found.planned) + 2
+    html = plan(study.with_settings(["plan.report=html"])).documents["plan.html"]().decode()
+    for row in found.assumptions:
+        assert str(row["assumption"]) in html
+    for planned in found.planned:
+        assert f"<h2>{planned.name}</h2>" in html
+    assert html.count("data:image/png") == len(found.planned)
+    names = set(found.assumptions["assumption"])
+    assert {"stray light", "duration of flares", "noise of a stare", "throughput", "earth_limb_deg"} <= names
+
+
+def test_markup_in_names_is_text(study: Study) -> None:
+    target = {
+        "name": "<script>$x^2$",
+        "coordinates": "10.5 -3",
+        "spectral_type": "K5V",
+        "magnitude": 8,
+        "distance_pc": 10,
+    }
+    odd = study.with_changes({"plan": {"targets": [target], "report": "html"}, "orbit": {"days": 5.0}}, None)
+    answer = plan(odd)
+    assert "<script>" not in answer.documents["plan.html"]().decode()
+    made = plan(odd.with_settings(["plan.report=pdf"])).documents["plan.pdf"]
+    assert made().startswith(b"%PDF")
+    assert made() == made()
+    assert answer.plot() is not None
+
+
+def test_completeness_as_an_argument(study: Study) -> None:
+    def none_below(_: Study, looked: Looked) -> Completeness:
+        assert looked.window_s > 600
+        edge = np.array([1e30, 1e33 * (1 - 1e-12), 1e33, 1e40])
+        return Completeness(edge, np.array([0.0, 0.0, 1.0, 1.0]), "bolometric", "a step")
+
+    one = study.with_settings(["plan.targets=[{name = 'eps Eri', alpha = 2.0, rate_per_day = 0.5, at_erg = 1e33}]"])
+    answer = plan(one, none_below)
+    assert answer.table["expected"][0] == pytest.approx(0.5 * 5, rel=0.02)
+    mean = answer.table["expected"][0]
+    # Rates of one's own have no scatter: Poisson's alone.
+    assert [answer.table["low"][0], answer.table["high"][0]] == stats.poisson.ppf([0.025, 0.975], mean).tolist()
+
+
+def test_more_light_finds_smaller_flares(study: Study) -> None:
+    two = [
+        {"name": name, "coordinates": "10.5 -3", "spectral_type": "K5V", "magnitude": v, "distance_pc": 10}
+        for name, v in (("near", 6.0), ("far", 9.0))
+    ]
+    # The fainter star is the less luminous one here: per energy its flares stand out as much more.
+    answer = plan(study.with_changes({"plan": {"targets": two}, "orbit": {"days": 10.0}}, None))
+    near, far = answer.stars["signal_per_frame"]
+    assert near > 5 * far
+
+
+def test_types() -> None:
+    assert subtype("M3.5Ve") == 63.5
+    assert subtype("K") == 55
+    assert nearest_spectrum("G2V") == "G2V"
+    assert nearest_spectrum("dM4")[0] == "M"
+    with pytest.raises(InputError, match="from O to M"):
+        subtype("L5")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("name,colour\na,red\n", "colour"),
+        ("nom\na\n", "one called name"),
+        ("name,ra\neps Eri,10\n", "ra and dec"),
+        ("name,alpha\neps Eri,2\n", "expected all of alpha, rate_per_day, at_erg"),
+        ("name,rates,mass_msun,age_myr\neps Eri,K,0.8,500\n", "expected one of them"),
+        ("name\neps Eri\neps Eri\n", "twice"),
+        ("name,ra,dec\nnew,10,5\n", "no spectral_type and no magnitude and no distance_pc"),
+        ("name,mass_msun,age_myr\neps Eri,9,500\n", "mass_msun = 9"),
+        ("name\n", "0 targets"),
+    ],
+)
+def test_tables_that_cannot_be(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "targets.csv").write_text(text)
+
+    def planned() -> None:
+        targets = read_targets(tmp_path / "targets.csv")
+        plan(Study().with_changes({"plan": {"targets": targets}, "orbit": {"days": 1.0}}, None))
+
+    with pytest.raises(InputError, match=words):
+        planned()
+
+
+def test_rates_of_a_file_beside_the_table(tmp_path: Path) -> None:
+    (tmp_path / "ffd.csv").write_text("energy,rate\n1e31,2.0\n1e34,0.001\n")
+    (tmp_path / "targets.csv").write_text("name,rates_file,rates_band\neps Eri,ffd.csv,TESS\n")
+    changes = {"plan": {"targets": read_targets(tmp_path / "targets.csv")}, "orbit": {"days": 2.0}}
+    answer = plan(Study().with_changes(changes, None))
+    assert answer.stars["rates"][0] == "ffd.csv"
+    answer.write(tmp_path / "out")
+    assert Study.read(tmp_path / "out" / "study.toml").plan.targets[0].rates_file == tmp_path / "ffd.csv"

@@ -1,0 +1,145 @@
+"""Visibility as an answer: its tables agree with each other and with the host, its calendar is one."""
+
+import tomllib
+from pathlib import Path
+
+import icalendar
+import numpy as np
+import pytest
+from astropy.table import Table
+
+from mauvecl import Study, visible
+from mauvecl.answers.calendars import Entry, calendar_bytes
+from mauvecl.answers.visible import SEEN_H, VisibleAnswer
+from mauvecl.host.errors import InputError
+from mauvecl.host.sky.zodiacal import Sky
+
+NAMES = ("eps Eri", "AU Mic", "EK Dra")
+
+
+@pytest.fixture(scope="module")
+def study() -> Study:
+    targets = ", ".join(f"'{name}'" for name in NAMES)
+    return Study().with_settings([f"orbit.targets=[{targets}]", "orbit.start=2027-02-10T06:00", "orbit.days=40"])
+
+
+@pytest.fixture(scope="module")
+def found(study: Study) -> VisibleAnswer:
+    return visible(study)
+
+
+def test_tables_agree(found: VisibleAnswer) -> None:
+    table, months, days, windows = found.table, found.months, found.by_day, found.window_table
+    for k, name in enumerate(NAMES):
+        hours = table["hours"][k].value
+        assert months[name].value.sum() == pytest.approx(hours)
+        assert days["hours"][days["target"] == name].value.sum() == pytest.approx(hours)
+        assert windows["length"][windows["target"] == name].value.sum() / 60 == pytest.approx(hours)
+        assert table["share"][k] * 40 * 24 == pytest.approx(hours)
+        assert table["windows"][k] == (windows["target"] == name).sum()
+    assert months["month"].tolist() == ["2027-02", "2027-03"]
+    assert len(days) == 3 * 41  # from six in the morning to six in the morning
+    gaps = found.windows[0].start_s[1:] - found.windows[0].stop_s[:-1]
+    assert table["longest_gap"][0].value * 86_400 >= gaps.max()
+
+
+def test_windows_by_orbit(found: VisibleAnswer) -> None:
+    """About one window an orbit, and a mean orbit's exposure."""
+    table = found.window_table
+    mine = table[table["target"] == "eps Eri"]
+    assert (np.diff(mine["orbit"]) >= 0).all()
+    orbits = 40 * 86_400 / found.study.orbit.orbit().elements.period_s
+    assert found.table["per_orbit"][0].value * orbits / 60 == pytest.approx(found.table["hours"][0].value, rel=0.005)
+
+
+def test_sky_of_a_day(found: VisibleAnswer) -> None:
+    days = found.by_day
+    row = days[(days["target"] == "eps Eri") & (days["day"] == "2027-02-12")][0]
+    sky = Sky.at("53.23269 -9.45826", "2027-02-12T12:00")
+    assert row["zodiacal_light"].value == pytest.approx(sky.surface_brightness, abs=0.01)
+
+
+def test_what_is_told(found: VisibleAnswer) -> None:
+    told = " ".join(found.messages)
+    assert "EK Dra is never seen: the limit of declination alone leaves nothing" in told
+    assert "mean Sun-synchronous" in told
+    assert "Stray light is not modelled" in told
+    assert {"earth_limb_deg", "sun_deg", "moon_deg", "proton_flux"} <= set(found.assumptions["limit"])
+    assert all("assumption" in source for source in found.assumptions["source"])
+
+
+def test_written_and_read_again(found: VisibleAnswer, tmp_path: Path) -> None:
+    names = {path.name for path in found.write(tmp_path)}
+    assert {"visible.ecsv", "months.ecsv", "days.ecsv", "windows.ecsv", "assumptions.ecsv", "visible.ics"} <= names
+    again = Study.read(tmp_path / "visible.ecsv")
+    assert again == found.study
+    assert Table.read(tmp_path / "visible.ecsv")["hours"].tolist() == found.table["hours"].value.tolist()
+
+
+def test_calendar_of_a_far_plan_has_days(found: VisibleAnswer) -> None:
+    events = icalendar.Calendar.from_ical(found.documents["visible.ics"]()).walk("VEVENT")
+    assert {str(event["SUMMARY"]) for event in events} == {"eps Eri", "AU Mic"}
+    for k, name in enumerate(NAMES):
+        seen = (found.visibility.by_day(k) >= SEEN_H).sum()
+        days = sum((e["DTEND"].dt - e["DTSTART"].dt).days for e in events if str(e["SUMMARY"]) == name)
+        assert days == seen
+
+
+def test_calendar_of_a_near_plan_has_windows() -> None:
+    near = Study().with_settings(["orbit.targets=['eps Eri']", "orbit.start=2026-09-20", "orbit.days=2"])
+    answer = visible(near)
+    events = icalendar.Calendar.from_ical(answer.documents["visible.ics"]()).walk("VEVENT")
+    assert len(events) == answer.table["windows"][0] > 20
+    first, windows = events[0], answer.windows[0]
+    assert (first["DTEND"].dt - first["DTSTART"].dt).total_seconds() == windows.length_s[0]
+    assert answer.messages == answer.messages[-1:]  # nothing of the orbit: its elements are a week old
+
+
+def test_calendars_hold_any_text() -> None:
+    """Long names, commas, other alphabets."""
+    entry = Entry("2027-01-01", "2027-01-02", "α Cen; " + "long, " * 30, "two\nlines \\ and more")
+    content = calendar_bytes([entry], "a, b")
+    assert max(map(len, content.split(b"\r\n"))) <= 75
+    event = icalendar.Calendar.from_ical(content).walk("VEVENT")[0]
+    assert str(event["SUMMARY"]) == entry.title
+    assert str(event["DESCRIPTION"]) == entry.text
+    assert content == calendar_bytes([entry], "a, b")
+
+
+def test_pictures(found: VisibleAnswer, study: Study) -> None:
+    figure = found.plot()
+    assert len(figure.axes) >= 4
+    many = study.with_settings([f"orbit.targets=[{', '.join(repr(f'{10 * i} 0') for i in range(8))}]", "orbit.days=5"])
+    assert len(visible(many).plot().axes) == 2
+
+
+def test_dates_as_toml_has_them() -> None:
+    starts = ("orbit.start=2027-01-01", "orbit.start=2027-01-01T06:00:00", "orbit.start=2027-01-01T06:00:00+02:00")
+    found = [Study().with_settings([one]).orbit.moments().iso(0.0) for one in starts]
+    assert found == ["2027-01-01T00:00:00", "2027-01-01T06:00:00", "2027-01-01T04:00:00"]
+
+
+def test_the_study_says_it_all(study: Study) -> None:
+    limits = ["orbit.limits.moon_deg=none", "orbit.limits.anomaly=[[-90, -50], [40, -50], [0, 0]]"]
+    changed = study.with_settings([*limits, "orbit.limits.eclipse=only"])
+    assert Study.build(tomllib.loads(changed.toml()), "text") == changed
+    assert changed.orbit.limits.limits().moon_deg is None
+    assert "orbit" not in tomllib.loads(Study().toml())
+
+
+@pytest.mark.parametrize(
+    ("setting", "words"),
+    [
+        ("orbit.limits.sun_deg=abc", "orbit.limits.sun_deg = 'abc', expected a number, or none"),
+        ("orbit.limits.sun_deg=400", "sun_deg = 400"),
+        ("orbit.targets=['nowhere']", "embedded list"),
+        ("orbit.targets=['eps Eri', 'eps Eri']", "named twice"),
+        ("orbit.targets=[]", "no targets"),
+        ("orbit.start=someday", "expected a UTC time"),
+        ("orbit.tle=/nowhere.tle", "does not exist"),
+        ("orbit.step_s=0.001", "steps"),
+    ],
+)
+def test_what_cannot_be(study: Study, setting: str, words: str) -> None:
+    with pytest.raises(InputError, match=words):
+        visible(study.with_settings([setting]))
