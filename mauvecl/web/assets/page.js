@@ -298,14 +298,15 @@ class Page {
       this.offer()
       if (question !== this.question) return
       if (told.refused) this.notices([[told.refused, "danger"]])
-      else if (told.kind) this.simulated(kind)
+      else if (told.kind) this.simulated()
     })
     this.offer()
   }
 
   // The answer again, now with what was simulated.
-  simulated(kind) {
+  simulated() {
     this.history = true
+    byId("card").setAttribute("aria-busy", "true")
     this.ask()
   }
 
