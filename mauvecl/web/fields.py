@@ -172,7 +172,7 @@ FIELDS = {
         "Flare amplitude", "2", Number(0.0001, 1e5),
         "By how much the flare at its peak brightens the star in the band of the Kepler satellite. In the ultraviolet "
         "the rise is many times as large.",
-        "%", Slider(0.01, 1000, 1.25, log=True),
+        "%", Slider(0.01, 1000, 10**0.1, log=True),
     ),
     "exposure_s": Field(
         "Exposure", "50", Number(0.1, 86_400), "Time on the star; whole frames of 5 s are added up.", "s",
@@ -205,7 +205,7 @@ FIELDS = {
     "fap": Field(
         "False-alarm probability", "0.001", Number(1e-6, 0.5),
         "How often noise alone passes for a flare, per test: it sets the threshold.", "per test",
-        Slider(1e-6, 0.1, 10**0.25, log=True),
+        Slider(1e-6, 0.1, 10**0.1, log=True),
     ),
     "unknown": Field(
         "Unknown", UNKNOWN[0], Choice(UNKNOWN),

@@ -22,7 +22,8 @@ class Scale {
 }
 
 export class Fields {
-  // changed(last): something was entered; last says whether it is done with. chosen(field, file): a file.
+  // changed(name, last, other): a field was used; last says whether it is done with, other whether its text is another.
+  // chosen(field, file): a file.
   constructor(words, changed, chosen) {
     this.words = words
     this.changed = changed
@@ -33,7 +34,10 @@ export class Fields {
       const file = document.querySelector(`[data-upload="${button.dataset.choose}"]`)
       button.addEventListener("click", () => file.click())
       file.addEventListener("change", () => {
-        if (file.files.length) chosen(button.dataset.choose, file.files[0])
+        const [one] = file.files
+        // The same file may be chosen again; its name does not stand beside another star.
+        file.value = ""
+        if (one) chosen(button.dataset.choose, one)
       })
     }
     this.stars = new Stars(byId("f-star"), byId("stars"), words.stars, () => this.take("star", true))
@@ -70,7 +74,7 @@ export class Fields {
     const other = text !== this.entered[name]
     this.entered[name] = text
     if (name === "fap" && other) this.possible()
-    if (other || last) this.changed(last, other)
+    if (other || last) this.changed(name, last, other)
     this.aside(name)
   }
 

@@ -23,7 +23,11 @@ class Page {
     this.running = null
     this.wanted = []
     this.dismissed = new Set()
-    this.fields = new Fields(words, (last, other) => this.changed(last, other), (field, file) => this.upload(field, file))
+    this.fields = new Fields(words, (name, last, other) => {
+      // Whoever enters something else does not wait for a file.
+      if (other) delete this.lacks[name]
+      this.changed(last, other)
+    }, (field, file) => this.upload(field, file))
     this.pictures = new Pictures(words, given => this.enter(given), (name, blob) => this.give(name, blob))
     this.compare = new Compare(link => { this.follow(link); this.changed(true, true) })
     this.wire()
@@ -76,8 +80,6 @@ class Page {
       this.seen.simulated = ""
       this.wanted = []
       this.stop()
-      if (this.fields.entered.star !== words.uploads.star) delete this.lacks.star
-      if (this.fields.entered.own_unknown !== words.uploads.own_unknown) delete this.lacks.own_unknown
       this.withdraw()
       this.ask()
     }
@@ -89,6 +91,7 @@ class Page {
   }
 
   enter(given) {
+    for (const name of Object.keys(given)) delete this.lacks[name]
     this.fields.put(given)
     this.changed(true, true)
   }
@@ -140,7 +143,7 @@ class Page {
   show(told) {
     this.faults = told.faults
     this.fields.tell(told.faults)
-    this.notices(told.stray ? [[told.stray, "info"]] : [])
+    this.notices([...(told.stray ? [[told.stray, "warning"]] : []), ...(told.answer?.notes ?? [])])
     if (told.answer) this.tell(told.answer)
     else this.none(told.faults, told.refused)
   }
@@ -180,7 +183,6 @@ class Page {
       body.textContent = value
       return [head, body]
     }))
-    this.notices([...this.strays, ...answer.notes])
     this.seen.simulated = answer.simulated.join(",")
     this.address(false)
     document.title = `${answer.shown}: mauvecl`
@@ -224,7 +226,6 @@ class Page {
 
   // Sentences that can be put away; one that was stays away as long as it is the same.
   notices(told) {
-    this.strays = told.filter(([, kind]) => kind === "info" && told.length === 1 && !this.answer)
     const box = byId("notices")
     const shown = told.filter(([text]) => !this.dismissed.has(text))
     const key = JSON.stringify(shown)
@@ -297,14 +298,15 @@ class Page {
       this.offer()
       if (question !== this.question) return
       if (told.refused) this.notices([[told.refused, "danger"]])
-      else if (told.kind) this.simulated(kind)
+      else if (told.kind) this.simulated()
     })
     this.offer()
   }
 
   // The answer again, now with what was simulated.
-  simulated(kind) {
+  simulated() {
     this.history = true
+    byId("card").setAttribute("aria-busy", "true")
     this.ask()
   }
 
@@ -453,7 +455,7 @@ class Page {
     for (const part of document.body.children) if (part.id !== "lost") part.inert = true
     byId("go-on").hidden = !unused
     if (unused) byId("go-on").focus()
-    else this.live?.again() ?? setTimeout(() => this.live.again(), 0)
+    else this.live.again()
   }
 
   wire() {
