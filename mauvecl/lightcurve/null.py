@@ -129,7 +129,7 @@ def in_a_row(values: NDArray[Any], points: int, sigma: float) -> NDArray[np.bool
     points : int
     sigma : float
     """
-    above = np.atleast_1d(values > sigma)
+    above: NDArray[np.bool_] = np.atleast_1d(np.greater(values, sigma))
     alarm: NDArray[np.bool_] = np.zeros(above.shape, np.bool_)
     if above.shape[-1] < points:
         return alarm

@@ -198,8 +198,8 @@ class Statistic(ABC):
         estimated : bool
             Whether the statistic divides by the true variances or by the model's.
         scatter : ndarray, shape (k, n_pixel), optional
-            Standard deviations of normal amplitudes that the differences hold, DN; by default those of the finite priors
-            that are marginalised over.
+            Standard deviations of normal amplitudes that the differences hold, DN; by default those of the finite
+            priors that are marginalised over.
         """
 
     @abstractmethod
