@@ -129,11 +129,11 @@ def in_a_row(values: NDArray[Any], points: int, sigma: float) -> NDArray[np.bool
     points : int
     sigma : float
     """
-    above: NDArray[np.bool_] = np.atleast_1d(np.greater(values, sigma))
+    above: NDArray[np.bool_] = np.greater(np.atleast_1d(values), sigma)
     alarm: NDArray[np.bool_] = np.zeros(above.shape, np.bool_)
     if above.shape[-1] < points:
         return alarm
-    windows = np.lib.stride_tricks.sliding_window_view(above, points, axis=-1).all(axis=-1)
+    windows = np.asarray(np.lib.stride_tricks.sliding_window_view(above, points, axis=-1).all(axis=-1))
     before = np.concatenate([np.zeros((*above.shape[:-1], 1), np.bool_), windows[..., :-1]], axis=-1)
     alarm[..., points - 1 :] = windows & ~before
     return alarm
