@@ -398,7 +398,8 @@ def expect(
     exposure : Quantity or float
         Time, or seconds; rounded up to whole frames, which `messages` then tells.
     sky : Sky, Quantity or float, optional
-        A brightness is one in mag arcsec^-2. Zodiacal light of V = 22.1 mag arcsec^-2 by default, as for the command line; `Sky.none()` for none.
+        A brightness is one in mag arcsec^-2; by default that of zodiacal light of V = 22.1 mag arcsec^-2, as for the
+        command line. `Sky.none()` for none.
     order : {"paper", "physical"}
         Whether efficiencies act after the line function or before; see `response_matrix`.
     signal : {"net", "paper"}
