@@ -6,6 +6,7 @@ import html
 from collections.abc import Mapping
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import astropy.units as u
@@ -13,9 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from .content import ByContent
 from .errors import InputError
 from .instrument.instrument import Instrument
 from .measured_noise import below_zero
+from .plotting import picture
 from .quantities import number
 from .ranges import EXPOSURES, check_exposure
 from .response import Order, electrons_per_second
@@ -40,7 +43,7 @@ SIGNALS: tuple[Signal, ...] = get_args(Signal)
 
 
 @dataclass(frozen=True, eq=False)
-class Expectation:
+class Expectation(ByContent):
     """Means and noise per pixel of an exposure of `n_frames` frames; arrays are for ONE frame and read-only.
 
     Attributes
@@ -125,6 +128,10 @@ class Expectation:
             meta=dict(self.provenance),
         )
 
+    def _line(self) -> str:
+        exposure = f"{self.exposure_s:g} s in {self.n_frames} frames of {self.wavelength_nm.size} pixels"
+        return f"{self.name!r} on {self.instrument}, {exposure}"
+
     def _repr_html_(self) -> str:
         told = "".join(f"<br><small>{html.escape(text)}</small>" for text in self.messages)
         name, where = html.escape(self.name), html.escape(self.instrument)
@@ -152,6 +159,31 @@ class Expectation:
                 pixel = int(np.argmax(bad))
                 raise InputError(f"{name} of pixel {pixel} = {values[pixel]:g}, expected 0 to {LARGEST:g}")
         object.__setattr__(self, "provenance", dict(self.provenance))
+
+    @property
+    def table(self) -> QTable:
+        """One row per pixel: wavelength, signal, noise (rms) and S/N of the exposure, with their units."""
+        return self._table(self.wavelength_nm, self.signal_dn, self._noise_dn2, self.snr())
+
+    @property
+    def element_table(self) -> QTable:
+        """The same, one row per resolution element."""
+        signal, variance = self.per_element(self.signal_dn), self.per_element(self._noise_dn2)
+        return self._table(self.element_wavelength_nm, signal, variance, self.snr_per_element())
+
+    def _table(self, wavelength_nm: Float, signal: Float, variance: Float, snr: Float) -> QTable:
+        from astropy.table import QTable
+
+        table = QTable({"wavelength": wavelength_nm * u.nm, "signal": signal * u.DN, "noise": np.sqrt(variance) * u.DN})
+        table["snr"] = snr
+        table["signal"].info.description = "mean signal: the star's" + (" and the sky's" * (self.signal == "paper"))
+        table["noise"].info.description = "standard deviation, without the ADC's rounding"
+        table.meta |= {"name": self.name, "instrument": self.instrument, "exposure_s": self.exposure_s}
+        return table
+
+    def plot(self, path: str | Path | None = None, *, ax: Any = None) -> Any:
+        """Mean signal with its noise against wavelength, saved under a path or drawn in axes; needs matplotlib."""
+        return picture("inputs.expectation", self, path, ax=ax)
 
     @property
     def exposure_s(self) -> float:
@@ -347,11 +379,11 @@ def _ratio(signal: Float, variance: Float) -> Float:
 
 
 def expect(
-    source: Source,
-    instrument: Instrument,
+    source: Source | str,
+    instrument: Instrument | str | Path,
     *,
     exposure: u.Quantity | float,
-    sky: Sky | None = None,
+    sky: Sky | u.Quantity | float | None = None,
     order: Order = "paper",
     signal: Signal = "net",
 ) -> Expectation:
@@ -359,13 +391,15 @@ def expect(
 
     Parameters
     ----------
-    source : Source
-        Zero beyond its own wavelengths.
-    instrument : Instrument
+    source : Source or str
+        Zero beyond its own wavelengths; a name is the library's.
+    instrument : Instrument, str or Path
+        A name or file is what `Instrument.load` takes.
     exposure : Quantity or float
         Time, or seconds; rounded up to whole frames, which `messages` then tells.
-    sky : Sky, optional
-        Zodiacal light of V = 22.1 mag arcsec^-2 by default, as for the command line; `Sky.none()` for none.
+    sky : Sky, Quantity or float, optional
+        A brightness is one in mag arcsec^-2; by default that of zodiacal light of V = 22.1 mag arcsec^-2, as for the
+        command line. `Sky.none()` for none.
     order : {"paper", "physical"}
         Whether efficiencies act after the line function or before; see `response_matrix`.
     signal : {"net", "paper"}
@@ -384,9 +418,9 @@ def expect(
     >>> quiet.n_frames, quiet.exposure_s
     (10, 50.0)
     >>> float(round(quiet.snr().max(), 2)), float(round(quiet.snr_per_element().max(), 1))
-    (8.29, 48.9)
+    (8.21, 48.5)
     """
-    sky = Sky.of_brightness(DEFAULT_SKY) if sky is None else sky
+    source, instrument, sky = _source(source), _instrument(instrument), _sky(sky)
     asked_s = _seconds(exposure)
     # A hair less, so that 0.1 + 0.2 s is three frames of 0.1 s.
     n_frames = max(1, int(np.ceil(asked_s / instrument.frame_s * (1 - 1e-12))))
@@ -477,6 +511,32 @@ def expect(
     if source.scale:
         messages.append(source.scale)
     return replace(plain, messages=tuple(messages))
+
+
+def _source(given: Any) -> Source:
+    from .stars.source import Source
+
+    if isinstance(given, Source):
+        return given
+    if isinstance(given, str):
+        return Source.from_library(given)
+    raise InputError(f"the source is of the type {type(given).__name__}, expected a Source, or a name of the library")
+
+
+def _instrument(given: Any) -> Instrument:
+    if isinstance(given, Instrument):
+        return given
+    if isinstance(given, str | Path):
+        return Instrument.load(given)
+    raise InputError(
+        f"the instrument is of the type {type(given).__name__}, expected an Instrument, or its name or file"
+    )
+
+
+def _sky(given: Any) -> Sky:
+    if isinstance(given, Sky):
+        return given
+    return Sky.of_brightness(DEFAULT_SKY if given is None else given)
 
 
 def _seconds(exposure: Any) -> float:

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+from contextvars import ContextVar
 from importlib import import_module
 from typing import Any
 
+#: Axes of the caller's that a picture is drawn in; None where it has a figure of its own.
+AXES: ContextVar[Any] = ContextVar("axes", default=None)
 
-def picture(name: str, *given: Any) -> Any:
+
+def picture(name: str, *given: Any, ax: Any = None) -> Any:
     """A figure, or the path it was saved under.
 
     Parameters
@@ -15,6 +19,13 @@ def picture(name: str, *given: Any) -> Any:
         Module and function in `mauvecl.pictures`, such as ``"answers.detection"``.
     *given
         What the function takes.
+    ax : matplotlib Axes, optional
+        Drawn into instead, and handed back; a picture of several panels takes their place.
     """
     module, _, function = name.rpartition(".")
-    return getattr(import_module(f"mauvecl.pictures.{module}"), function)(*given)
+    before = AXES.set(ax)
+    try:
+        drawn = getattr(import_module(f"mauvecl.pictures.{module}"), function)(*given)
+    finally:
+        AXES.reset(before)
+    return drawn if ax is None else ax

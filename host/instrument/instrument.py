@@ -19,6 +19,7 @@ from .pixel_map import MOST_PIXELS, PixelMap
 
 if TYPE_CHECKING:
     import astropy.units as u
+    from astropy.table import QTable
 
 #: Energy of a photon times its wavelength, J nm, and the charge of an electron, C (exact SI values).
 HC_J_NM = 6.62607015e-34 * 299_792_458.0 * 1e9
@@ -390,6 +391,17 @@ class Instrument(BaseModel):
         per_joule = self._optics(nm) * self.quantum_efficiency_a_per_w.at(nm) / ELECTRON_C
         return self.collecting_area_cm2 * per_joule
 
+    @property
+    def table(self) -> QTable:
+        """One row per pixel that is read: wavelength, throughput and effective area, with their units."""
+        import astropy.units as u
+        from astropy.table import QTable
+
+        table = QTable({"wavelength": self.wavelength_nm * u.nm, "throughput": self.throughput(self.wavelength_nm)})
+        table["effective_area"] = self.effective_area_cm2(self.wavelength_nm) * u.cm**2
+        table.meta |= {"name": self.name, "notice": self.notice}
+        return table
+
     @cached_property
     def digest(self) -> str:
         """SHA-256 of every value, without names and sources: equal digests measure alike."""
@@ -399,6 +411,12 @@ class Instrument(BaseModel):
             if name not in LABELS
         }
         return hashlib.sha256(repr(sorted(values.items())).encode()).hexdigest()
+
+    def __repr__(self) -> str:
+        low, high, pixels = self.output_min_nm, self.output_max_nm, self.wavelength_nm.size
+        return f"<Instrument {self.name!r}, {pixels} pixels at {low:g}-{high:g} nm, {self.temperature_c:g} deg C>"
+
+    __str__ = __repr__
 
     def __hash__(self) -> int:
         return hash(self.digest)

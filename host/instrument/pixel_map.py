@@ -10,6 +10,7 @@ import astropy.units as u
 import numpy as np
 from numpy.typing import NDArray
 
+from ..content import ByContent
 from ..errors import InputError
 from ..files.ecsv import read_ecsv
 from ..quantities import count
@@ -29,7 +30,7 @@ COLUMNS = {
 
 
 @dataclass(frozen=True, eq=False)
-class PixelMap:
+class PixelMap(ByContent):
     """One value per pixel of the whole array; None leaves the instrument's value.
 
     Attributes
@@ -164,6 +165,9 @@ class PixelMap:
                 table[name] = values
                 table[name].unit = None if unit == u.dimensionless_unscaled else unit
         table.write(path, format="ascii.ecsv", overwrite=True)
+
+    def _line(self) -> str:
+        return f"of {self.size} pixels, {self.source}"
 
     def over(self, name: str, chosen: slice, nominal: float) -> Float:
         """One column over a range of pixels: the instrument's value times the factor, or what stands in its place."""

@@ -12,7 +12,9 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..content import ByContent
 from ..errors import InputError
+from ..plotting import picture
 from ..quantities import number
 from ..ranges import check_magnitude
 from ..spectra.ends import (
@@ -32,13 +34,14 @@ from .flare import Geometry, with_flare
 
 if TYPE_CHECKING:
     import astropy.units as u
+    from astropy.table import QTable
 
 #: V of the brightest star, Sirius (Bessell 1990: -1.46), with room, and of the Sun with room: -26.76 (Willmer 2018).
 BRIGHTEST_V, SUN_V = -2.0, (-27.3, -26.2)
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
+class Source(ByContent):
     """A stellar spectrum at the telescope.
 
     Attributes
@@ -320,6 +323,25 @@ class Source:
             flux=self.flux_flam * flam,
             meta={"name": self.name, "origin": self.origin, "history": list(self.history)},
         )
+
+    @property
+    def table(self) -> QTable:
+        """Wavelength and flux with their units, one row per point."""
+        import astropy.units as u
+        from astropy.table import QTable
+
+        flam = u.erg / (u.s * u.cm**2 * u.AA)
+        table = QTable({"wavelength": self.wavelength_nm * u.nm, "flux": self.flux_flam * flam})
+        table.meta |= {"name": self.name, "origin": self.origin, "history": list(self.history)}
+        return table
+
+    def plot(self, path: str | Path | None = None, *, ax: Any = None) -> Any:
+        """Flux against wavelength, saved under a path or drawn in axes; needs matplotlib."""
+        return picture("inputs.source", self, path, ax=ax)
+
+    def _line(self) -> str:
+        span = f"{self.name!r}, {self.wavelength_nm[0]:.0f}-{self.wavelength_nm[-1]:.0f} nm"
+        return ", ".join([span, *self.history])
 
     def _repr_html_(self) -> str:
         notes = "".join(f"<br><small>{html.escape(text)}</small>" for text in (self.origin, *self.history))

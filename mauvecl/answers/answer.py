@@ -6,6 +6,7 @@ from abc import ABC, abstractmethod
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from mauvecl.host.content import ByContent
 from mauvecl.host.plotting import picture
 
 if TYPE_CHECKING:
@@ -17,7 +18,7 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
 
-class Answer(ABC):
+class Answer(ByContent, ABC):
     """The answer to one question of a study."""
 
     #: Endings of the files of each table; the first table's alone in some answers.
@@ -53,6 +54,9 @@ class Answer(ABC):
         """What is said below the tables."""
         return []
 
+    def _line(self) -> str:
+        return f"to {self.study!r}"
+
     def _repr_html_(self) -> str:
         return str(next(iter(self.tables.values()))._repr_html_())
 
@@ -62,10 +66,10 @@ class Answer(ABC):
 
         return {"messages": list(self.messages), "rows": rows(next(iter(self.tables.values())))}
 
-    def plot(self, path: str | Path | None = None) -> Any:
+    def plot(self, path: str | Path | None = None, *, ax: Any = None) -> Any:
         """The first of its pictures, saved where a path is given; needs matplotlib."""
         name, *given = next(iter(self.pictures.values()))
-        return picture(name, *given, path)
+        return picture(name, *given, path, ax=ax)
 
     def write(self, folder: str | Path) -> list[Path]:
         """Every table, and the study that gives them again.

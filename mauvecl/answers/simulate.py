@@ -68,10 +68,10 @@ class SimulateAnswer(Answer):
     def as_json(self) -> dict[str, Any]:
         return {"messages": self.messages, "observations": self.summary}
 
-    def plot(self, path: str | Path | None = None, *, number: int = 0) -> Any:
+    def plot(self, path: str | Path | None = None, *, number: int = 0, ax: Any = None) -> Any:
         """One of the observations and what it is made of; needs matplotlib."""
         title, _, table = self.observations[number]
-        return picture("answers.observation", title, table, path)
+        return picture("answers.observation", title, table, path, ax=ax)
 
 
 def simulate(study: Study, *, realisation: int = 0, flaring: bool = False) -> SimulateAnswer:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,9 +92,9 @@ class UnknownTable:
     def _repr_html_(self) -> str:
         return str(self.table._repr_html_())
 
-    def plot(self, path: str | Path | None = None) -> object:
+    def plot(self, path: str | Path | None = None, *, ax: Any = None) -> object:
         """Detection probability against amplitude, and the smallest amplitude of each star; needs matplotlib."""
-        return picture("unknowns.unknowns", self, path)
+        return picture("unknowns.unknowns", self, path, ax=ax)
 
 
 def unknown_table(study: Study, unknowns: Mapping[str, NuisanceChoice] = SHOWN) -> UnknownTable:

@@ -56,7 +56,10 @@ ExposureFlag = Annotated[
     float | None, typer.Option("--exposure", "-t", help="Seconds, rounded up to 5 s frames [50].", show_default=False)
 ]
 InstrumentFlag = Annotated[
-    str | None, typer.Option(help="mauve, mauve-electrons, or your own TOML file [mauve].", show_default=False)
+    str | None,
+    typer.Option(
+        help="mauve (as the paper), mauve-electrons (for planning), or your own TOML file [mauve].", show_default=False
+    ),
 ]
 TemperatureFlag = Annotated[float | None, typer.Option(help="Detector temperature, deg C [21].", show_default=False)]
 SkyFlag = Annotated[

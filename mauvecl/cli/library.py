@@ -21,6 +21,8 @@ ReplaceFlag = Annotated[bool, typer.Option("--replace", help="Take the place of 
 def library(context: typer.Context, as_json: JsonFlag = False) -> None:
     """List the embedded spectra and your own; `add`, `fetch` and `remove` change yours.
 
+    Those of the library are kept at V = 0 and need --magnitude, but for the Sun and Vega.
+
     Examples: mauvecl library
 
     mauvecl library add my-star.txt
@@ -39,11 +41,13 @@ def library(context: typer.Context, as_json: JsonFlag = False) -> None:
     from mauvecl.cli.console import show_table
 
     ours = table[table["kept"] == "embedded"]
-    columns = ("name", "also", "type", "star", "UV at 190-210, 240-260, 290-310 nm", "licence")
+    columns = ("name", "also", "type", "star", "K", "UV at 190-210, 240-260, 290-310 nm", "noise below", "licence")
     cells = []
     for row in ours:
-        ratios = ", ".join(part.split()[0] for part in row["uv_quality"].split(": ")[1].split(", "))
-        cells.append(tuple(row[n] for n in ("name", "alias", "spectral_type", "star")) + (ratios, row["licence"]))
+        ratios = ", ".join(part.split()[0] for part in row["uv_quality"].split("; ")[0].split(": ")[1].split(", "))
+        noisy = f"{row['noisy_below_nm']} nm" if row["noisy_below_nm"] else ""
+        first = tuple(row[n] for n in ("name", "alias", "spectral_type", "star", "temperature_k"))
+        cells.append((*first, ratios, noisy, row["licence"]))
     show_table("Embedded spectra (UV: mean flux over that at 540-560 nm); origin, citation: --json", columns, cells)
     yours = table[table["kept"] == "yours"]
     if len(yours):

@@ -11,6 +11,7 @@ import numpy as np
 from mauvecl.pictures.style import COLOURS, NULL, STYLE, finished, pyplot
 
 if TYPE_CHECKING:
+    from mauvecl.host.expectation import Expectation
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.sky.zodiacal import Sky
     from mauvecl.host.stars.source import Source
@@ -26,6 +27,33 @@ OPTICS = {
     "collection_lens_efficiency": "collection lens",
     "window_efficiency": "window",
 }
+
+
+def source(star: Source, path: str | Path | None = None) -> Any:
+    """A spectrum where Mauve sees it."""
+    plt = pyplot()
+    inside = (star.wavelength_nm >= RANGE_NM[0]) & (star.wavelength_nm <= RANGE_NM[1])
+    with plt.rc_context(STYLE):
+        figure, axis = plt.subplots(figsize=(3.6, 2.7))
+        axis.plot(star.wavelength_nm[inside], star.flux_flam[inside], color=COLOURS[0], linewidth=0.8)
+        axis.set(xlabel=WAVELENGTH, ylabel=FLUX, xlim=RANGE_NM, title=", ".join([star.name, *star.history]))
+        return finished(figure, path)
+
+
+def expectation(x: Expectation, path: str | Path | None = None) -> Any:
+    """Mean signal of an exposure, with its noise."""
+    plt = pyplot()
+    table = x.table
+    w, mean, noise = (table[name].value for name in ("wavelength", "signal", "noise"))
+    with plt.rc_context(STYLE):
+        figure, axis = plt.subplots(figsize=(3.6, 2.7))
+        axis.fill_between(
+            w, mean - noise, mean + noise, color=NULL, alpha=0.35, linewidth=0, label="1 sigma of a pixel"
+        )
+        axis.plot(w, mean, color=COLOURS[0], linewidth=0.9, label="mean signal")
+        axis.set(xlabel=WAVELENGTH, ylabel="DN per pixel", xlim=(w[0], w[-1]), title=f"{x.name}, {x.exposure_s:g} s")
+        axis.legend()
+        return finished(figure, path)
 
 
 def magnitudes(source: Source, values: Sequence[float], band: str = "V", path: str | Path | None = None) -> Any:

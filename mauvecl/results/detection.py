@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.content import ByContent
 from mauvecl.host.plotting import picture
 from mauvecl.host.quantities import count
 from mauvecl.results.channels import ChannelPlan, Key
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(eq=False)
-class Detection(Hypotheses):
+class Detection(ByContent, Hypotheses):
     """Null and flare distributions as they were counted; made by `Engine.detect`.
 
     Parameters and attributes are those of `Hypotheses` and these.
@@ -45,9 +46,13 @@ class Detection(Hypotheses):
     realisations: int
     tails: Tails = "counted"
     seed: int = 0
-    _tails: dict[tuple[str, int, float], Tail] = field(default_factory=dict, init=False, repr=False)
+    _tails: dict[tuple[str, int, float], Tail] = field(default_factory=dict, init=False, repr=False, compare=False)
     _found: dict[Key, Distribution] = field(default_factory=dict, init=False, repr=False)
     _samples: dict[Key, TailSamples] = field(default_factory=dict, init=False, repr=False)
+
+    def _line(self) -> str:
+        flares, names = len(self.flares), ", ".join(self.statistics)
+        return f"of {self.quiet.name!r}, {flares} flares by {names}, {self.realisations} realisations"
 
     def collect(self, plan: ChannelPlan, tally: Tally, samples: Sequence[TailSamples | None]) -> None:
         """Take over the distributions and tails of one batch."""
@@ -199,10 +204,10 @@ class Detection(Hypotheses):
         null = self._at(self._null_key(statistic, flare))
         return Roc.of(null, self._at((statistic, "flare_on_null_grid", flare)))
 
-    def plot(self, path: str | Path | None = None, *, fap: float = 1e-3) -> object:
+    def plot(self, path: str | Path | None = None, *, fap: float = 1e-3, ax: Any = None) -> object:
         """Null and flare distributions by every statistic, with thresholds; needs matplotlib."""
         flares = [f"flare {k + 1}" for k in range(len(self.flares))]
-        return picture("answers.detection", [(self.quiet.name, self, flares)], fap, path)
+        return picture("answers.detection", [(self.quiet.name, self, flares)], fap, path, ax=ax)
 
     def table(self, fap: float = 1e-3) -> QTable:
         """One row per flare and statistic: expected and simulated values, threshold and probability.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,9 +73,9 @@ class Roc:
             low, high = sure.low, sure.high
         return cls(np.append(lower[0], upper), above[0], above[1], null.n, Interval(area, low, high))
 
-    def plot(self, path: str | Path | None = None, *, name: str = "") -> object:
+    def plot(self, path: str | Path | None = None, *, name: str = "", ax: Any = None) -> object:
         """Detection probability against false-alarm probability; needs matplotlib."""
-        return picture("answers.roc", [(name, self)], path)
+        return picture("answers.roc", [(name, self)], path, ax=ax)
 
     def table(self, rows: int = 200) -> QTable:
         """Some rows of the curve, both probabilities with their Clopper-Pearson intervals; the area in the meta data.

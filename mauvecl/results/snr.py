@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.content import ByContent
 from mauvecl.host.errors import InputError
 from mauvecl.host.plotting import picture
 from mauvecl.noise import layout
@@ -171,7 +172,7 @@ def signal_to_noise(dn: NDArray[np.integer], observers: NDArray[np.void], sky: n
 
 
 @dataclass(frozen=True, eq=False)
-class SnrResult:
+class SnrResult(ByContent):
     """Distributions of the S/N over realisations.
 
     Attributes
@@ -230,9 +231,12 @@ class SnrResult:
 
         return self._table("element", x.element_wavelength_nm, x.snr_per_element(), snr)
 
-    def plot(self, path: str | Path | None = None) -> object:
+    def plot(self, path: str | Path | None = None, *, ax: Any = None) -> object:
         """S/N per pixel and element, closed form and realisations; needs matplotlib."""
-        return picture("answers.signal_to_noise", [(self.expectation.name, self)], path)
+        return picture("answers.signal_to_noise", [(self.expectation.name, self)], path, ax=ax)
+
+    def _line(self) -> str:
+        return f"of {self.expectation.name!r}, {self.counts.n} realisations"
 
     def _table(
         self,

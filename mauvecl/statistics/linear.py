@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.content import ByContent
 from mauvecl.host.errors import InputError
 from mauvecl.statistics.statistic import Float, LinearStatistic, Setting
 
@@ -63,7 +64,7 @@ class UvExcess(LinearStatistic):
 
 
 @dataclass(frozen=True, eq=False)
-class Linear(LinearStatistic):
+class Linear(ByContent, LinearStatistic):
     """A statistic of one's own: the sum over pixels of weight times (observed - template), DN of the exposure.
 
     Attributes

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.content import ByContent
 from mauvecl.host.errors import InputError
 
 if TYPE_CHECKING:
@@ -32,7 +33,7 @@ NUISANCES = {
 
 
 @dataclass(frozen=True, eq=False)
-class Nuisances:
+class Nuisances(ByContent):
     """Unknown amplitudes of known spectra.
 
     Attributes
@@ -93,6 +94,12 @@ class Nuisances:
             spectra.append(spectrum)
         shape = len(spectra), quiet.wavelength_nm.size
         return cls(tuple(sd), np.array(spectra).reshape(shape), np.array(list(sd.values()), np.float64))
+
+    def _line(self) -> str:
+        return ", ".join(
+            f"{name} +-{sd:g}" if np.isfinite(sd) else f"{name} free"
+            for name, sd in zip(self.names, self.sd, strict=True)
+        )
 
     def __bool__(self) -> bool:
         return bool(self.names)

@@ -196,6 +196,18 @@ class Study(Part):
                 star["file"] = str(Path(star["file"]).resolve())
         return tomli_w.dumps(data)
 
+    def __repr__(self) -> str:
+        o, swept = self.observation, [axis.quantity for axis in self.sweep.axes]
+        stars = [
+            f"{star.library or star.file}" + ("" if star.magnitude is None else f" {star.band} = {star.magnitude:g}")
+            for star in self.star
+        ]
+        over = f", over {', '.join(swept)}" if swept else ""
+        flares = ", ".join(f"{100 * amplitude:g} %" for amplitude in self.flare.amplitudes)
+        return f"<Study of {', '.join(stars)}; flares of {flares}; {o.exposure_s:g} s on {o.instrument}{over}>"
+
+    __str__ = __repr__
+
     def text(self) -> str:
         """The study as answers' tables hold it: stars' files by name and digest, the same wherever they are."""
         return in_table(self.toml(), [star.file for star in self.star])

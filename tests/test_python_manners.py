@@ -1,0 +1,199 @@
+"""Python as astronomers write it: names, one flare, 1e5, equality, text, pickle, pictures in axes of one's own."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable
+from functools import cache
+from typing import Any
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+import mauvecl
+from mauvecl import (
+    Engine,
+    Expectation,
+    Instrument,
+    Linear,
+    Nuisances,
+    PixelMap,
+    Pool,
+    Sky,
+    Source,
+    Study,
+    detect,
+    detection_map,
+    expect,
+    exposure_for,
+    gaussian_report,
+    limiting_magnitude,
+    simulate,
+    snr,
+)
+from mauvecl.host.errors import InputError
+
+
+def study(**settings: object) -> Study:
+    asked = Study.build(
+        {
+            "star": [{"library": "G2V", "magnitude": 7.4}],
+            "flare": {"amplitudes": [0.1, 0.3]},
+            "run": {"realisations": 5000, "fap": 0.05, "statistics": ["matched", "chi2"]},
+            "observation": {"changes": {"output_min_nm": 300.0, "output_max_nm": 322.0}},
+            "map": {
+                "x": {"quantity": "magnitude", "values": [7.0, 8.0]},
+                "y": {"quantity": "amplitude", "values": [0.1, 0.3]},
+            },
+        },
+        "test",
+    )
+    return asked.with_settings([f"{key}={value}" for key, value in settings.items()])
+
+
+ONE = {"run.statistics": "['matched']", "flare.amplitudes": "[0.3]"}
+ANSWERS: dict[str, Callable[[Engine, dict[str, object]], Any]] = {
+    "detect": lambda e, s: detect(study(**s), e),
+    "detection": lambda e, s: detect(study(**s), e).stars[0].found,
+    "snr": lambda e, s: snr(study(**s), e),
+    "snr result": lambda e, s: snr(study(**s), e).stars[0].result,
+    "exposure": lambda e, s: exposure_for(study(**s), 5.0, 310.0),
+    "simulate": lambda e, s: simulate(study(**s)),
+    "limit": lambda e, s: limiting_magnitude(study(**ONE, **s), e),
+    "map": lambda e, s: detection_map(study(**ONE, **s), e),
+    "gaussian": lambda e, s: gaussian_report(study(**{"sweep.axes": "[{quantity='magnitude',values=[7.0]}]"}, **s), e),
+}
+
+
+@cache
+def pair() -> tuple[Expectation, Expectation]:
+    payload = Instrument.load("mauve").with_(output_min_nm=300.0, output_max_nm=322.0)
+    star = Source.from_library("G2V").at_magnitude(7.4)
+    quiet, flare = (expect(s, payload, exposure=50) for s in (star, star.flaring(0.3)))
+    return quiet, flare
+
+
+@pytest.mark.parametrize("name", ANSWERS)
+def test_answers_are_their_content_and_travel(engine: Engine, name: str) -> None:
+    found = ANSWERS[name](engine, {})
+    there = pickle.loads(pickle.dumps(found))
+    assert there == found == ANSWERS[name](engine, {})
+    assert hash(there) == hash(found)
+    assert found != ANSWERS[name](engine, {"run.seed": 2, "star.0.magnitude": 7.2})
+    assert found != "another thing"
+    assert len(repr(found)) < 200
+    assert "\n" not in repr(found)
+
+
+def things() -> dict[str, Callable[[float], Any]]:
+    mauve = Instrument.load("mauve")
+    return {
+        "Source": lambda v: Source.from_library("G2V").at_magnitude(v),
+        "Instrument": lambda v: mauve.with_(temperature_c=v),
+        "Expectation": lambda v: expect(Source.from_library("G2V").at_magnitude(v), mauve, exposure=50),
+        "Sky": Sky.of_brightness,
+        "Study": lambda v: study(**{"star.0.magnitude": v}),
+        "PixelMap": lambda v: PixelMap.made_up(50, seed=int(v)),
+        "Linear": lambda v: Linear("mine", np.full(9, v)),
+        "Nuisances": lambda v: Nuisances(("own",), np.ones((1, 5)), np.array([v])),
+    }
+
+
+@pytest.mark.parametrize("name", things())
+def test_things_are_equal_by_content_and_short(name: str) -> None:
+    make = things()[name]
+    one, same, other = make(7.0), make(7.0), make(9.0)
+    assert one == same
+    assert one != other
+    assert pickle.loads(pickle.dumps(one)) == one
+    if name != "Study":
+        assert len({one, same, other}) == 2
+    assert len(repr(one)) < 160
+    assert "\n" not in repr(one)
+
+
+def test_counts_as_people_write_them(engine: Engine) -> None:
+    quiet, flare = pair()
+    kind: dict[str, Any] = {"seed": 1, "statistics": "matched"}
+    found = engine.detect(quiet, flare, realisations=1e4, **kind)
+    assert found == engine.detect(quiet, [flare], realisations=10_000, seed=1, statistics=("matched",))
+    assert found == Pool().detect(quiet, flare, realisations=np.float64(1e4), **kind)
+    assert engine.snr(quiet, realisations=1e3, seed=1) == Pool().snr(quiet, realisations=1000, seed=1.0)
+    np.testing.assert_array_equal(engine.realise(quiet, count=5.0, seed=1), engine.realise(quiet, count=5, seed=1))
+
+
+@pytest.mark.parametrize(
+    ("ask", "sentence"),
+    [
+        (lambda e, q, f: e.detect("G2V", [f], realisations=100, seed=1), "the quiescent star is of the type str"),
+        (lambda e, q, f: e.detect(q, ["flare"], realisations=100, seed=1), "flare 1 is of the type str"),
+        (lambda e, q, f: e.detect(q, [q, 0.24], realisations=100, seed=1), "flare 2 is of the type float"),
+        (lambda e, q, f: e.snr(Source.from_library("G2V"), realisations=100, seed=1), "is of the type Source"),
+        (lambda e, q, f: e.realise("G2V", count=3, seed=1), "is of the type str, expected an Expectation"),
+        (lambda e, q, f: e.detect(q, f, realisations=1.5, seed=1), "realisations = 1.5, expected a whole number"),
+        (lambda e, q, f: e.detect(q, f, realisations="many", seed=1), "realisations = 'many', expected a whole number"),
+        (lambda e, q, f: Pool().snr("G2V", realisations=10, seed=1), "is of the type str, expected an Expectation"),
+        (lambda e, q, f: expect(7.4, "mauve", exposure=5), "the source is of the type float"),
+        (lambda e, q, f: expect("G2V", "mauve", exposure=5), "expected a magnitude"),
+        (lambda e, q, f: expect("G2V", 3, exposure=5), "the instrument is of the type int"),
+        (lambda e, q, f: expect("G2V", "mauve", exposure=5, sky="dark"), "sky brightness = 'dark'"),
+    ],
+)
+def test_what_cannot_be_is_one_sentence(engine: Engine, ask: Callable[..., Any], sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence) as refused:
+        ask(engine, *pair())
+    assert "\n" not in str(refused.value)
+
+
+def test_names_where_a_star_and_an_instrument_are_expected() -> None:
+    usual = expect(Source.from_library("Vega"), Instrument.load("mauve"), exposure=5, sky=Sky.of_brightness(22.1))
+    assert expect("Vega", "mauve", exposure=5) == usual
+    assert expect("Vega", "mauve", exposure=5 * u.s, sky=22.1) == usual
+
+
+def test_quantities_come_out_with_their_wavelengths() -> None:
+    quiet, _ = pair()
+    for table, snr_of in ((quiet.table, quiet.snr()), (quiet.element_table, quiet.snr_per_element())):
+        assert (table["wavelength"].unit, table["signal"].unit, table["noise"].unit) == (u.nm, u.DN, u.DN)
+        np.testing.assert_allclose((table["signal"] / table["noise"]).value, snr_of)
+    mauve = Instrument.load("mauve").table
+    assert mauve["effective_area"].unit == u.cm**2
+    np.testing.assert_allclose(mauve["effective_area"].value / mauve["throughput"], 122.0)
+    star = Source.from_library("G2V").table
+    again = Source.from_arrays(star["wavelength"], star["flux"])
+    np.testing.assert_allclose(again.flux_flam, Source.from_library("G2V").flux_flam)
+
+
+@pytest.mark.parametrize("name", ["Source", "Expectation", *ANSWERS])
+def test_pictures_go_into_axes_of_ones_own(engine: Engine, name: str) -> None:
+    """Into the second of three axes, whose figure stays the caller's: nothing outside them changes."""
+    import matplotlib.pyplot as plt
+
+    made = ANSWERS[name](engine, {}) if name in ANSWERS else things()[name](7.0)
+    figure, axes = plt.subplots(1, 3, figsize=(15, 6))
+    before = [ax.get_position().bounds for ax in axes]
+    how = {"fap": 0.05} if name == "detection" else {}
+    assert made.plot(ax=axes[1], **how) is axes[1]
+    drawn = [axes[1]] + [ax for part in figure.subfigs for ax in part.axes]
+    assert any(ax.lines or ax.collections or ax.images or ax.patches for ax in drawn)
+    assert not any(ax.lines for ax in (axes[0], axes[2]))
+    assert figure._suptitle is None
+    figure.canvas.draw()
+    # A colour bar takes its room from its own axes.
+    after = [ax.get_position().bounds for ax in axes]
+    assert (after[0], after[2]) == (before[0], before[2])
+    assert plt.fignum_exists(figure.number)
+    plt.close(figure)
+    own = made.plot(**how)
+    assert own.axes
+    # One panel needs no grid, with or without a colour bar.
+    if len(own.axes) > 1 and name != "map":
+        figure = plt.figure()
+        with pytest.raises(InputError, match="not of a grid"):
+            made.plot(ax=figure.add_axes((0, 0, 1, 1)), **how)
+        plt.close(figure)
+
+
+def test_public_names_are_there() -> None:
+    assert all(getattr(mauvecl, name) is not None for name in mauvecl.__all__)
