@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
@@ -10,6 +10,7 @@ import numpy as np
 from mauvecl.answers.answer import Answer
 from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import number
+from mauvecl.host.ranges import DAY_S
 from mauvecl.study.labels import described, label, told
 from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.sections import Star
@@ -140,7 +141,8 @@ def exposure_for(
     Raises
     ------
     InputError
-        For an S/N that no exposure up to 1e7 s reaches, or a wavelength outside the spectrum.
+        For an S/N that no exposure up to 1e7 s reaches, or a wavelength outside the spectrum, if it holds of every
+        star; of some it is told by a message.
     """
     if wavelength_nm is not None:
         wavelength_nm = number("wavelength", wavelength_nm, "nm")
@@ -149,25 +151,36 @@ def exposure_for(
     if snr is None or wavelength_nm is None:
         missing = "S/N" if snr is None else "wavelength"
         raise InputError(f"no wanted {missing}, expected --snr and --at, or snr and wavelength_nm of a study's signal")
-    found, seen = [], []
+    found, failed = [], []
     for star in study.star:
-        answer, x = _one(study, star, snr, wavelength_nm, per)
-        found.append(answer)
-        seen.append(x)
-    return ExposureResult(study, tuple(found), tuple(told(seen)), tuple(seen))
+        try:
+            found.append(_one(study, star, snr, wavelength_nm, per))
+        except InputError as error:
+            # One star's failure does not lose the others'.
+            failed.append(error)
+    if not found:
+        raise failed[0]
+    exposures, seen = zip(*found, strict=True)
+    long = [f"{e.star} needs more than a day: {np.ceil(e.exposure_s / DAY_S):.0f} exposures of a day at most, added up."
+            for e in exposures if e.exposure_s > DAY_S]  # fmt: skip
+    messages = [*(f"NO ANSWER: {error}." for error in failed), *told(list(seen)), *long]
+    return ExposureResult(study, exposures, tuple(messages), seen)
 
 
 def _one(study: Study, star: Star, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposure, Expectation]:
     source, frame_s = star.source(), study.load_instrument().frame_s
 
+    (frame,) = study.at("exposure", frame_s).expect([source])
+
     def after(frames: int) -> Expectation:
-        return study.at("exposure", frames * frame_s).expect([source])[0]
+        # As many frames as it takes: they may fill several exposures.
+        return replace(frame, n_frames=frames)
 
     one = snr_at(after(1), wavelength_nm, per)
     longest = QUANTITIES["exposure"].high
     if not one > 0 or (snr / one) ** 2 * frame_s > longest:
         raise InputError(
-            f"{star.library or star.file} has an S/N of {one:.3g} per {per} at {wavelength_nm:g} nm in one frame, "
+            f"{label(star, frame)} has an S/N of {one:.3g} per {per} at {wavelength_nm:g} nm in one frame, "
             f"expected enough for {snr:g} within {longest:g} s"
         )
     # S/N grows with the root of the frames, to rounding: the neighbours settle it.

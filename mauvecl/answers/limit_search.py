@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.host.errors import InputError
+from mauvecl.host.ranges import DAY_S
 from mauvecl.noise.scene import prepare
 from mauvecl.results.hypotheses import Hypotheses
 from mauvecl.statistics.intervals import Interval
@@ -81,6 +82,9 @@ class LimitSearch:
 
     def pair(self, value: float) -> tuple[Expectation, Expectation]:
         """Without and with the flare."""
+        if self.of == "exposure" and value > DAY_S:
+            # Several exposures added up.
+            return self.scaled(value)
         study = self.study.at(self.of, value)
         quiet, flare = study.expectations(study.star[0])
         return quiet, flare
@@ -160,7 +164,7 @@ class LimitSearch:
                 low, high = sorted((value, nearer))
                 return float(brentq(lambda v: self.theory(v) - self.power, low, high, xtol=1e-6 * abs(high - low)))
             value = nearer
-        raise self._beyond(value, "does not reach")
+        raise self._beyond(easiest, "does not reach")
 
     @cached_property
     def frame_s(self) -> float:
@@ -168,10 +172,16 @@ class LimitSearch:
         return self.study.load_instrument().frame_s
 
     def _beyond(self, value: float, verb: str) -> InputError:
+        star = self.study.star[0]
+        name = f"{star.library or star.file}" + (f" {star.band} = {star.magnitude:g}" if self._bright(star) else "")
+        flare = "" if self.of == "amplitude" else f" with a flare of {100 * self.study.flare.amplitudes[0]:.3g} %"
         return InputError(
-            f"the detection probability of {self.study.star[0].library or self.study.star[0].file} {verb} "
-            f"{self.power:g} at {self.of} = {value:g}, expected a limit between {_span(self.of)}"
+            f"the detection probability of {name}{flare} by {self.statistic} {verb} {self.power:g} at {self.of} = "
+            f"{value:g}, expected a limit between {_span(self.of)}"
         )
+
+    def _bright(self, star: Star) -> bool:
+        return self.of != "magnitude" and star.magnitude is not None
 
     def slope(self, value: float) -> float:
         """Of the closed form's probit, per unit of `_coordinate`, towards easier."""

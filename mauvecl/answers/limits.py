@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -58,6 +58,8 @@ class Limit:
         What saturates at the limit, without the flare and with it.
     cost : Cost, optional
         What it costs there not to know all of the instrument.
+    quiet : Expectation, optional
+        The star there, without the flare.
     """
 
     star: str
@@ -75,13 +77,28 @@ class Limit:
     unknown: Unknown | None = None
     messages: tuple[str, ...] = ()
     cost: Cost | None = None
+    quiet: Expectation | None = field(default=None, compare=False, repr=False)
 
     @property
     def agrees(self) -> bool:
-        """Whether the fresh simulation's interval reaches the wanted power, or passes it by less than its own width."""
+        """Whether the fresh simulation's 95 % interval holds the wanted power."""
         p = self.check.probability
-        reach = p.high - p.low
-        return p.low - reach <= self.power <= p.high + reach or (self.of == "exposure" and p.high >= self.power)
+        return p.low <= self.power <= p.high
+
+    @property
+    def verdict(self) -> str:
+        """What the fresh simulation says of the limit, in a word.
+
+        "agrees" where its interval holds the wanted power; of whole frames "reaches" where it lies above it; "DIFFERS"
+        where it passes it by more than its own width; nothing between, as chance makes of one in six.
+        """
+        p = self.check.probability
+        if self.agrees:
+            return "agrees"
+        if self.of == "exposure" and p.low > self.power:
+            return "reaches"
+        away = max(p.low - self.power, self.power - p.high)
+        return "DIFFERS" if away > p.high - p.low else ""
 
 
 @dataclass(eq=False)
@@ -94,11 +111,14 @@ class LimitResult(Answer):
     limits : list of Limit
     assumptions : QTable, optional
         How far what is assumed of the instrument moves them (`assumptions.what_matters`).
+    failed : tuple of str
+        Why there is no limit of some of the stars, flares or statistics.
     """
 
     study: Study
     limits: list[Limit] = field(default_factory=list)
     assumptions: QTable | None = None
+    failed: tuple[str, ...] = ()
 
     @property
     def table(self) -> QTable:
@@ -167,17 +187,17 @@ class LimitResult(Answer):
 
     @cached_property
     def inputs(self) -> list[Expectation]:
-        """Each star at its own magnitude."""
-        return [self.study.expect([entry.source()])[0] for entry in self.study.star]
+        """Each star at its limits."""
+        return [one.quiet for one in self.limits if one.quiet is not None]
 
     @property
     def messages(self) -> list[str]:
         """What holds at the limits, what is told of the stars, and what is unknown."""
         saturated = dict.fromkeys(text for one in self.limits for text in one.messages)
-        # What is told of a star at its own magnitude need not hold at the limit.
         stars = [text for text in told(self.inputs) if not text.startswith("SATURATED")]
         costs = [one.cost for one in self.limits if one.cost is not None]
-        return [*saturated, *stars, *marginal_lines(self.study), *cost_lines(costs, self.study)]
+        failed = [f"NO LIMIT: {text}." for text in self.failed]
+        return [*failed, *saturated, *stars, *marginal_lines(self.study), *cost_lines(costs, self.study)]
 
     @property
     def pictures(self) -> dict[str, tuple[Any, ...]]:
@@ -238,11 +258,14 @@ def solve(
         at=at or {},
         unknown=question.unknown(theory) if isinstance(question, MarginalLimitSearch) else None,
         messages=tuple(m for m in told([quiet, flare]) if m.startswith("SATURATED")),
+        quiet=quiet,
         cost=unknown_cost(where, quiet, flare, question.study),
     )
 
 
-def limiting_magnitude(study: Study, engine: Engine | Pool | None = None) -> LimitResult:
+def limiting_magnitude(
+    study: Study, engine: Engine | Pool | None = None, *, progress: Callable[[int, int], None] | None = None
+) -> LimitResult:
     """Limits of a study's stars and flares, by every statistic it names.
 
     Parameters
@@ -250,11 +273,13 @@ def limiting_magnitude(study: Study, engine: Engine | Pool | None = None) -> Lim
     study : Study
         Its ``limit`` says of what (magnitude, amplitude or exposure) and at which power.
     engine : Engine or Pool, optional
+    progress : callable, optional
+        Called as ``progress(done, total)`` in limits.
 
     Raises
     ------
     InputError
-        As `solve`.
+        As `solve`, if it holds of every limit; else `LimitResult.failed` tells.
     """
     from mauvecl.device.engine import Engine as Default
     from mauvecl.runs.pool import together
@@ -271,11 +296,24 @@ def limiting_magnitude(study: Study, engine: Engine | Pool | None = None) -> Lim
         for statistic in study.run.statistics
     ]
 
-    def solved(one: tuple[Study, Star, float | None, str, Mapping[str, float | str]]) -> Limit:
+    def solved(one: tuple[Study, Star, float | None, str, Mapping[str, float | str]]) -> Limit | InputError:
         cell, star, amplitude, statistic, at = one
-        return solve(cell, star, amplitude, statistic, engine, at)
+        try:
+            return solve(cell, star, amplitude, statistic, engine, at)
+        except InputError as error:
+            # One star's failure does not lose the others'.
+            return error
 
-    result.limits.extend(together(engine, solved, asked))
+    found: list[Limit | InputError] = []
+    for one in together(engine, solved, asked):
+        found.append(one)
+        if progress is not None:
+            progress(len(found), len(asked))
+    errors = [one for one in found if isinstance(one, InputError)]
+    if len(errors) == len(found):
+        raise errors[0]
+    result.limits.extend(one for one in found if isinstance(one, Limit))
+    result.failed = tuple(dict.fromkeys(map(str, errors)))
     return result
 
 

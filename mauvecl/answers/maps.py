@@ -47,6 +47,8 @@ class MapResult(Answer):
     shares : dict of dict of float
         By statistic, where the map is averaged over what is unknown: the share of the variance of its mean probability
         that each unknown explains, the largest first.
+    quiet : Expectation, optional
+        The star of the first cell.
     """
 
     study: Study
@@ -60,6 +62,7 @@ class MapResult(Answer):
     closed_form: NDArray[np.float64]
     messages: list[str]
     shares: dict[str, dict[str, float]] = field(default_factory=dict)
+    quiet: Expectation | None = None
 
     @property
     def table(self) -> QTable:
@@ -99,8 +102,8 @@ class MapResult(Answer):
 
     @property
     def inputs(self) -> list[Expectation]:
-        """The star without a flare, as the study has it."""
-        return self.study.expect([self.study.star[0].source()])
+        """The star without a flare in the first cell."""
+        return [] if self.quiet is None else [self.quiet]
 
     @property
     def pictures(self) -> dict[str, tuple[Any, ...]]:
@@ -164,6 +167,7 @@ def detection_map(
         statistics=study.run.statistics,
         messages=[*_blinded(found["probability"]), *told(seen), *marginal_lines(study), *_cost(study, x, y)],
         shares=parts,
+        quiet=quiet,
         **found,
     )
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import hashlib
 import io
 import json
 import math
@@ -13,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.host.errors import InputError
+from mauvecl.host.files.parsed import read_text
 from mauvecl.host.version import VERSION
 from mauvecl.runs.durable import write_whole
 
@@ -90,6 +92,7 @@ def write_record(
     pool: Pool | None,
     seconds: float,
     messages: Sequence[str],
+    files: Sequence[Path] | None = None,
 ) -> Path:
     """The run record: what made this answer.
 
@@ -106,6 +109,10 @@ def write_record(
         Wall time.
     messages : sequence of str
         What the reader was told.
+    files : sequence of Path, optional
+        Of a whole answer: what was written beside it. What the record of another run in the folder names, as that run
+        left it, is removed where this one has written nothing of that name: no picture or table of another run stays
+        beside these.
     """
     record: dict[str, Any] = {
         "mauvecl": VERSION,
@@ -128,7 +135,29 @@ def write_record(
         record["shares"] = asdict(pool.standing)
         told = "not run on this device and version: mauvecl selftest"
         record["selftest"] = [last(device) or told for device in pool.devices]
-    return write_json(record, folder / "run.json")
+    stale: list[Path] = []
+    if files is not None:
+        record["files"] = {path.name: _digest(path) for path in files}
+        stale = [path for path in _left_by_another(folder) if path.name not in record["files"]]
+    written = write_json(record, folder / "run.json")
+    for path in stale:
+        path.unlink(missing_ok=True)
+    return written
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _left_by_another(folder: Path) -> list[Path]:
+    """Files that the record in a folder names, as they were written then."""
+    try:
+        named = json.loads(read_text(folder / "run.json", "run record")).get("files", {})
+        files = [(folder / name, digest) for name, digest in named.items() if Path(name).name == name]
+        return [path for path, digest in files if path.is_file() and _digest(path) == digest]
+    except (InputError, OSError, ValueError, AttributeError, RecursionError):
+        # No record, or none of ours.
+        return []
 
 
 def write_json(content: Any, path: Path) -> Path:

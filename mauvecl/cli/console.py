@@ -14,6 +14,8 @@ if TYPE_CHECKING:
 
 #: Work shorter than this shows no progress.
 PATIENCE_S = 2.0
+#: Share of the work from which the time left is told: the first tile's rate says little.
+TOLD_FROM = 0.01
 
 
 class Meter:
@@ -24,7 +26,7 @@ class Meter:
     Attributes
     ----------
     standing : callable, optional
-        Tells how far a pool is: shares done, and counted again.
+        Tells how far a pool is: what it had from a checkpoint, what it counted again.
     """
 
     standing: Callable[[], Standing] | None = None
@@ -32,7 +34,7 @@ class Meter:
     def __init__(self, *, quiet: bool = False, unit: str = "realisations") -> None:
         self._quiet, self._unit = quiet, unit
         self._started = self._shown = time.monotonic()
-        self._last = 0
+        self._last = self._total = 0
         self._bar: Progress | None = None
         self._task: TaskID | None = None
 
@@ -45,11 +47,14 @@ class Meter:
     def __call__(self, done: int, total: int) -> None:
         """Take note of work done, in the meter's unit."""
         now = time.monotonic()
+        if done < self._last and total == self._total:
+            # Threads may tell in another order than they worked.
+            return
         if done <= self._last:
             # The next star's work begins.
             self._stop()
             self._started = self._shown = now
-        self._last = done
+        self._last, self._total = done, total
         if self._quiet or now - self._started < PATIENCE_S:
             return
         if sys.stderr.isatty() or "ipykernel" in sys.modules:
@@ -57,21 +62,28 @@ class Meter:
         elif now - self._shown >= 10.0:
             self._shown = now
             rate = self._rate(done)
-            left = f"{(total - done) / rate:.0f} s left" if rate else "time left unknown"
-            print(f"{done} of {total} {self._unit}, {rate:.3g} a second, {left}{self._shares()}", file=sys.stderr)
+            left = self._left(done, total, rate)
+            print(f"{done} of {total} {self._unit}, {rate:.3g} a second, {left}{self._retries()}", file=sys.stderr)
+
+    def _left(self, done: int, total: int, rate: float) -> str:
+        """Time left, once so much is done that it can be told."""
+        if rate * (time.monotonic() - self._started) < TOLD_FROM * total:
+            return "time left unknown"
+        seconds = (total - done) / rate
+        for unit, size in (("days", 86_400.0), ("hours", 3600.0), ("min", 60.0)):
+            if seconds > 3 * size:
+                return f"{seconds / size:.0f} {unit} left"
+        return f"{seconds:.0f} s left"
 
     def _rate(self, done: int) -> float:
         """Work done a second, without what was taken from a checkpoint."""
         resumed = self.standing().resumed if self.standing is not None and self._unit == "realisations" else 0
         return (done - resumed) / max(time.monotonic() - self._started, 1e-9)
 
-    def _shares(self) -> str:
-        """What a pool tells beside that, where there is more than one share."""
-        if self.standing is None:
-            return ""
-        s = self.standing()
-        told = f", {s.shares} of {s.of} shares" if s.of > 1 else ""
-        return told + (f", {s.retries} counted again" if s.retries else "")
+    def _retries(self) -> str:
+        """What a pool tells beside that, where a device failed."""
+        retries = 0 if self.standing is None else self.standing().retries
+        return f", {retries} shares counted again" if retries else ""
 
     def _draw(self, done: int, total: int) -> None:
         from rich.console import Console
@@ -84,15 +96,15 @@ class Meter:
                 TaskProgressColumn(),
                 TextColumn(f"{{task.fields[rate]}} {self._unit}/s"),
                 TimeRemainingColumn(),
-                TextColumn("left{task.fields[shares]}"),
+                TextColumn("left{task.fields[retries]}"),
                 console=Console(stderr=True),
                 transient=True,
             )
             self._bar.start()
-            self._task = self._bar.add_task("", total=total, rate="", shares="")
+            self._task = self._bar.add_task("", total=total, rate="", retries="")
         assert self._task is not None
         self._bar.update(
-            self._task, completed=done, total=total, rate=f"{self._rate(done):,.0f}", shares=self._shares()
+            self._task, completed=done, total=total, rate=f"{self._rate(done):,.0f}", retries=self._retries()
         )
 
     def _stop(self) -> None:

@@ -32,8 +32,8 @@ def limit(
     """
     from mauvecl.answers.limits import limiting_magnitude
 
-    with session.pool() as engine:
-        found = limiting_magnitude(study, engine)
+    with session.pool(unit="limits") as engine:
+        found = limiting_magnitude(study, engine, progress=session.meter)
     if assumptions:
         from mauvecl.answers.assumptions import what_matters
 
@@ -56,7 +56,7 @@ def _show_limits(found: LimitResult) -> None:
         cells.append(
             (one.star, *at, flare, one.statistic, f"{value.value:{digits}}",
              f"[{value.low:{digits}}, {value.high:{digits}}]", f"{one.closed_form:{digits}}",
-             f"{p.value:.4f}", f"[{p.low:.4f}, {p.high:.4f}]", "agrees" if one.agrees else "DIFFERS")
+             f"{p.value:.4f}", f"[{p.low:.4f}, {p.high:.4f}]", one.verdict)
         )  # fmt: skip
     show_table(
         f"Limit of {asked.of} at a detection probability of {asked.power:g}, false-alarm probability {run.fap:g} per "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -127,13 +128,17 @@ def exposure(
 def _show_exposures(found: ExposureResult) -> None:
     from mauvecl.cli.console import show_table
 
+    def floored(snr: float) -> float:
+        # What falls short must not look as if it did not.
+        return math.floor(1000 * snr) / 1000
+
     wanted = found.study.signal
     show_table(
         f"Exposure for an S/N of {wanted.snr:g} per {wanted.per} at {wanted.wavelength_nm:g} nm "
         "(closed form, whole frames)",
         ("star", "exposure (s)", "frames", "S/N", "a frame less", ""),
         [
-            (e.star, f"{e.exposure_s:g}", str(e.frames), f"{e.snr:.3f}", f"{e.snr_one_frame_less:.3f}",
+            (e.star, f"{e.exposure_s:.10g}", str(e.frames), f"{e.snr:.3f}", f"{floored(e.snr_one_frame_less):.3f}",
              "SATURATED" if e.saturated else "")
             for e in found.exposures
         ],

@@ -197,9 +197,10 @@ class Session:
             self.leave(lambda: write_study(study, self.folder))
         seconds = time.perf_counter() - self.started
         pool = self._pool
-        self.leave(
-            lambda: write_record(self.verb, study, inputs, self.folder, pool=pool, seconds=seconds, messages=messages)
-        )
+        how: dict[str, Any] = {"pool": pool, "seconds": seconds, "messages": messages}
+        # Only a whole answer takes the place of another's.
+        how["files"] = None if self._lost else self.files
+        self.leave(lambda: write_record(self.verb, study, inputs, self.folder, **how))
         if self._pool is not None and not self._lost:
             self._checkpoint.forget()
 
@@ -213,6 +214,17 @@ class Session:
             Prints its tables.
         """
         self.say(found.messages)
+        with told_of_interrupts(self._written):
+            self._leave_all(found)
+        if self.as_json:
+            self.print_json(found.as_json())
+            return
+        show()
+        self.say(found.remarks)
+        self.finish()
+
+    def _leave_all(self, found: Answer) -> None:
+        """Tables, documents and pictures of an answer, then the run's record."""
         for name, table in found.files.items():
             self.write(table, name)
         for name, content in found.documents.items():
@@ -223,12 +235,13 @@ class Session:
             for name, (function, *given) in found.pictures.items():
                 self.leave(partial(picture, function, *given, self.folder / f"{name}.png"))
         self.record(found.study, found.inputs, [*found.messages, *found.remarks])
-        if self.as_json:
-            self.print_json(found.as_json())
-            return
-        show()
-        self.say(found.remarks)
-        self.finish()
+
+    def _written(self) -> str:
+        """What an interruption while files are written leaves."""
+        whole = ", ".join(path.name for path in self.files) or "nothing"
+        kept = None if self._pool is None else self._checkpoint.kept
+        again = "the same command with --resume" if kept else "the same command"
+        return f"{whole} written to {str(self.folder)!r}, each file whole, and {again} writes all of them"
 
     def print_json(self, content: dict[str, Any]) -> None:
         """The answer for machines."""

@@ -65,6 +65,19 @@ class Hypotheses:
             raise InputError(f"every pixel of {self.quiet.name} is saturated, expected a fainter star")
         for one in self._chosen.values():
             one.check(self.setting)
+        if "matched" in self._chosen:
+            self._check_shapes()
+
+    def _check_shapes(self) -> None:
+        """A flare that changes nothing has no shape to look for; one that saturates every pixel is told of."""
+        used = self.scene.used
+        for k, flare in enumerate(self.flares):
+            changes = (flare.recorded_light_dn != self.quiet.recorded_light_dn)[used].any()
+            if not changes and k not in self.blinding:
+                raise InputError(
+                    f"flare {k + 1} of {self.quiet.name} changes no pixel that counts, expected an amplitude above 0 "
+                    "for the statistic 'matched', which looks for its shape"
+                )
 
     def statistic(self, name: str) -> Statistic:
         """One of those computed.

@@ -6,6 +6,8 @@ it. So each draw of the unknown values has its own template and threshold, and a
 
 from __future__ import annotations
 
+import itertools
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -24,6 +26,9 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
 Float = NDArray[np.float64]
+
+#: What no unknown explains by a straight line.
+REST = "the rest"
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,21 +102,42 @@ def average(found: Sequence[Interval]) -> Interval:
 
 
 def shares(draws: DrawnStudies, outcome: Float) -> dict[str, float]:
-    """Share of an outcome's variance that each unknown explains, the largest first, by a linear fit.
+    """Share of an outcome's variance that each unknown explains, the largest first, and the rest; one in all.
+
+    The shares are what each adds to a linear fit, averaged over all orders of adding them (Lindeman, Merenda & Gold
+    1980; Groemping 2007, doi 10.1198/000313007X188252): draws that are few are not quite independent, and single slopes
+    would count twice what two of them share. The rest, last, is what no straight line explains.
 
     Parameters
     ----------
     draws : DrawnStudies
     outcome : ndarray, shape (n_draw,)
     """
-    kept = np.isfinite(outcome)
+    names, kept = draws.names, np.isfinite(outcome)
     x, y = draws.values[kept], outcome[kept]
     if len(y) <= x.shape[1] + 1 or y.std() == 0.0:
-        return dict.fromkeys(draws.names, float("nan"))
+        return dict.fromkeys((*names, REST), float("nan"))
     scaled = (x - x.mean(axis=0)) / x.std(axis=0)
-    slopes, *_ = np.linalg.lstsq(np.column_stack([scaled, np.ones(len(y))]), y, rcond=None)
-    explained = slopes[:-1] ** 2 / y.var()
-    return {draws.names[k]: float(explained[k]) for k in np.argsort(-explained)}
+    explained = {(): 0.0} | {
+        some: _explained(scaled[:, some], y)
+        for size in range(1, len(names) + 1)
+        for some in itertools.combinations(range(len(names)), size)
+    }
+    share = np.zeros(len(names))
+    for some, value in explained.items():
+        for k in set(range(len(names))) - set(some):
+            # So many orders have exactly these before it.
+            weight = 1.0 / (len(names) * math.comb(len(names) - 1, len(some)))
+            share[k] += weight * (explained[tuple(sorted((*some, k)))] - value)
+    found = {names[k]: float(share[k]) for k in np.argsort(-share)}
+    return found | {REST: 1.0 - explained[tuple(range(len(names)))]}
+
+
+def _explained(x: Float, y: Float) -> float:
+    """Share of the variance that a linear fit explains."""
+    straight = np.column_stack([x, np.ones(len(y))])
+    left = y - straight @ np.linalg.lstsq(straight, y, rcond=None)[0]
+    return float(1.0 - left.var() / y.var())
 
 
 def draws_table(draws: DrawnStudies, outcomes: dict[str, Float]) -> QTable:

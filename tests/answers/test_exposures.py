@@ -65,6 +65,22 @@ def test_impossible_wishes_are_a_sentence(snr: float, wavelength: float, per: st
         exposure_for(study(), snr, wavelength, per=per)
 
 
+def test_one_stars_failure_does_not_lose_the_others() -> None:
+    stars = [{"library": "G2V", "magnitude": m} for m in (7.4, 28.0)]
+    found = exposure_for(Study.build({"star": stars}, "test"), 10.0, 300.0)
+    assert [one.star for one in found.exposures] == ["G2V V = 7.4"]
+    assert found.messages[0].startswith("NO ANSWER: G2V V = 28 has an S/N of ")
+
+
+def test_more_than_a_day_is_an_answer() -> None:
+    """An exposure of a day at most is a rule of `expect`; several of them add up."""
+    found = exposure_for(study(14.5), 10.0, 550.0)
+    (answer,) = found.exposures
+    assert answer.exposure_s > 86_400.0
+    assert answer.snr_one_frame_less < 10.0 <= answer.snr
+    assert any("more than a day" in message for message in found.messages)
+
+
 def test_the_answer_is_written_and_drawn(tmp_path: Path) -> None:
     found = exposure_for(study(), 10.0, 300.0)
     assert [path.name for path in found.write(tmp_path)] == ["exposure.ecsv", "study.toml"]

@@ -45,7 +45,8 @@ def test_the_limiting_magnitude_has_the_power_asked_for(engine: Engine, power: f
         assert limit.value.low <= limit.value.value <= limit.value.high
         p = limit.check.probability
         assert p.low - (p.high - p.low) < power < p.high + (p.high - p.low)
-        assert limit.agrees
+        assert limit.agrees == (p.low <= power <= p.high)
+        assert limit.verdict in ("agrees", "")
         assert limit.check.seed != asked.run.seed
         # Far from the rails the closed form is right to the skew of the dark.
         assert abs(limit.value.value - limit.closed_form) < 0.03
@@ -116,10 +117,37 @@ def test_what_cannot_be_reached_is_a_sentence(engine: Engine) -> None:
         limiting_magnitude(study(run=FEW | {"fap": 1e-3}), engine)
 
 
+def test_one_stars_failure_does_not_lose_the_others(engine: Engine) -> None:
+    stars = [{"library": "G2V", "magnitude": m} for m in (25.0, 7.0)]
+    found = shortest_exposure(study(run=FEW, star=stars), engine)
+    assert [one.star for one in found.limits] == ["G2V V = 7"]
+    told = "NO LIMIT: the detection probability of G2V V = 25 with a flare of 24 % by matched does not reach 0.9"
+    assert found.messages[0].startswith(told)
+
+
+def test_a_limit_of_more_than_a_day(engine: Engine) -> None:
+    asked = study(run=FEW, star=[{"library": "G2V", "magnitude": 16.0}])
+    (limit,) = shortest_exposure(asked, engine).limits
+    assert limit.value.value > 86_400.0
+    assert limit.verdict != "DIFFERS"
+
+
+def test_a_flare_without_a_shape_is_a_sentence(engine: Engine) -> None:
+    with pytest.raises(InputError, match=r"flare 1 of G2V changes no pixel that counts, expected an amplitude above 0"):
+        limiting_magnitude(study(run=FEW, flare={"amplitudes": [0.0]}), engine)
+
+
+def test_a_limit_tells_of_saturation(engine: Engine) -> None:
+    bright = study(run=FEW, star=[{"library": "G2V", "magnitude": -1.0}])
+    found = smallest_amplitude(bright, engine)
+    assert found.messages[0].startswith("SATURATED")
+
+
 def test_one_frame_is_the_shortest(engine: Engine) -> None:
     (limit,) = shortest_exposure(study(run=FEW, star=[{"library": "G2V", "magnitude": 5.0}]), engine).limits
     assert limit.value.value == 5.0
-    assert limit.agrees
+    assert limit.verdict == "reaches"
+    assert not limit.agrees
 
 
 def test_what_is_assumed_moves_the_limit_as_physics_says() -> None:

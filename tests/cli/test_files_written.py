@@ -199,3 +199,51 @@ def test_what_cannot_be_put_in_place_leaves_nothing(tmp_path: Path) -> None:
     write_whole(tmp_path / "b", b"con", memoryview(b"tent"), shared=True)
     assert (tmp_path / "b").read_bytes() == b"content"
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a", "b"]
+
+
+def names(folder: Path) -> set[str]:
+    return {path.name for path in folder.iterdir()}
+
+
+def test_nothing_of_another_run_stays_beside_the_new(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Pictures and tables of the run before are removed, what a user changed or put there is not."""
+    out = tmp_path / "out"
+    app(["simulate", "--star", "G2V", "--star", "K3V", "-m", "7", "-t", "5", "-o", str(out)], standalone_mode=False)
+    assert {"observation-2.ecsv", "observation-2.png", "observation-1.png"} <= names(out)
+    (out / "notes.txt").write_text("mine")
+    (out / "observation-2.fits").write_text("changed by hand")
+    app([*VERBS["exposure"], "--no-pictures", "--output", str(out)], standalone_mode=False)
+    assert names(out) == {"exposure.ecsv", "study.toml", "run.json", "notes.txt", "observation-2.fits"}
+
+
+@pytest.mark.parametrize(
+    "record", ["", "[]", '{"files": 3}', '{"files": {"../mine": "x"}}', '{"files": {"a": 1}}']
+)
+def test_a_record_of_another_program_removes_nothing(record: str, tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    out.mkdir()
+    (out / "run.json").write_text(record)
+    (out / "a").write_text("mine")
+    (tmp_path / "mine").write_text("mine")
+    app([*VERBS["exposure"], "--no-pictures", "--output", str(out)], standalone_mode=False)
+    assert (out / "a").read_text() == (tmp_path / "mine").read_text() == "mine"
+
+
+def test_an_interruption_while_tables_are_written_is_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    real = write_whole
+
+    def write(path: Path, *parts: Any) -> None:
+        if path.suffix == ".fits":
+            raise KeyboardInterrupt
+        real(path, *parts)
+
+    monkeypatch.setattr("mauvecl.answers.report.write_whole", write)
+    with pytest.raises(SystemExit) as end:
+        app([*VERBS["simulate"], "--no-pictures", "--output", str(tmp_path / "out")], standalone_mode=False)
+    assert end.value.code == 130
+    assert capsys.readouterr().err == (
+        f"mauvecl: interrupted; observation-1.ecsv written to {str(tmp_path / 'out')!r}, each file whole, and the same "
+        "command writes all of them\n"
+    )

@@ -1,0 +1,78 @@
+"""What the terminal shows while it works: one unit, a rate, and a time left that can be believed."""
+
+from __future__ import annotations
+
+import re
+
+import pytest
+
+from mauvecl.cli import console
+from mauvecl.cli.console import Meter, show_table
+
+
+class Clock:
+    """Seconds that pass when they are told to."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now = 1e6
+        monkeypatch.setattr(console.time, "monotonic", lambda: self.now)
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    return Clock(monkeypatch)
+
+
+def test_no_time_is_left_after_one_of_1e12(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+    """The first tile's rate says little: 1 of 1e12 in 11 s would be 348 thousand years."""
+    with Meter() as meter:
+        for done in (0, 1):
+            meter(done, 10**12)
+            clock.now += 11.0
+        meter(2, 10**12)
+    told = capsys.readouterr().err
+    assert "2 of 1000000000000 realisations" in told
+    assert "time left unknown" in told
+    assert not re.search(r"\d s left", told)
+
+
+@pytest.mark.parametrize(
+    ("done", "left"), [(100, "99 s left"), (20, "9 min left"), (50, "3 min left"), (2, "time left unknown")]
+)
+def test_time_left(done: int, left: str, clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+    with Meter(unit="cells") as meter:
+        meter(0, 1000)
+        clock.now += 11.0
+        meter(done, 1000)
+    assert capsys.readouterr().err.rstrip().endswith(left)
+
+
+def test_threads_may_tell_late(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+    """A smaller number of the same work is old news: the rate goes on from the beginning."""
+    with Meter() as meter:
+        meter(0, 1000)
+        for done in (400, 390, 500):
+            clock.now += 10.0
+            meter(done, 1000)
+    last = capsys.readouterr().err.splitlines()[-1]
+    assert last == "500 of 1000 realisations, 16.7 a second, 30 s left"
+
+
+def test_the_next_stars_work_begins_anew(clock: Clock, capsys: pytest.CaptureFixture[str]) -> None:
+    with Meter() as meter:
+        for total in (1000, 2000):
+            meter(0, total)
+            clock.now += 10.0
+            meter(total // 2, total)
+    assert capsys.readouterr().err.splitlines() == [
+        "500 of 1000 realisations, 50 a second, 10 s left",
+        "1000 of 2000 realisations, 100 a second, 10 s left",
+    ]
+
+
+def test_no_empty_columns(capsys: pytest.CaptureFixture[str]) -> None:
+    show_table("title", ("a", "empty", "b"), [("1", "", "x"), ("2", "", "")])
+    told = capsys.readouterr().out
+    assert "empty" not in told
+    rows = [line.split() for line in told.splitlines() if line.strip(" ─")]
+    assert rows == [["title"], ["a", "b"], ["1", "x"], ["2"]]
