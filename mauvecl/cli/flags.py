@@ -211,7 +211,9 @@ ThermalFlag = Annotated[
 HalfWidthFlag = Annotated[float | None, typer.Option("--half-width", help="Of the flares, s [60].", show_default=False)]
 ShapeFlag = Annotated[
     str | None,
-    typer.Option("--shape", help="davenport2014, tovarmendoza2022, fiducial [davenport2014].", show_default=False),
+    typer.Option(
+        "--shape", help="Of flares: davenport2014, tovarmendoza2022, fiducial [davenport2014].", show_default=False
+    ),
 ]
 EnergyFlag = Annotated[
     list[float] | None,

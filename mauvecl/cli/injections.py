@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mauvecl.cli.flags import DRAWS, FLARE, SIZE, STARE, SWEEP, Option, takes_study
+from mauvecl.cli.flags import DRAWS, FLARE, SIZE, STARE, SWEEP, Option, ShapeFlag, takes_study
 
 if TYPE_CHECKING:
     from mauvecl.answers.inject import InjectAnswer
@@ -23,11 +23,7 @@ SEARCH = {
         "false_alarms",
     ),
     "per": Option(Annotated[str | None, typer.Option(help="day, month or year, of frames [month].")], "search", "per"),
-    "search_shape": Option(
-        Annotated[str | None, typer.Option("--shape", help="Of flares and templates [davenport2014].")],
-        "search",
-        "shape",
-    ),
+    "shape": Option(ShapeFlag, "search", "shape"),
 }
 INJECTIONS = {
     "injections": Option(

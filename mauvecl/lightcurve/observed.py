@@ -91,7 +91,7 @@ class Staring:
         spectra = self._bare.mean_dn[3:, self.used]
         return float(np.sqrt(np.einsum("tk,kl,tl->", flare, spectra / variance @ spectra.T, flare, optimize=True)))
 
-    def net(self, weights: Float, draw: Draw) -> tuple[Float, Float, Float]:
+    def net(self, weights: Float, draw: Draw, kind: type[np.floating[Any]] = np.float64) -> tuple[Any, Any, Any]:
         """Net light in weighted sums of pixels, DN per second: drawn, its standard deviation, and its mean.
 
         Raw counts less bias and the dark at the temperature that is known, and so with the sky.
@@ -101,24 +101,33 @@ class Staring:
         weights : ndarray, shape (n_sum, n_pixel)
             Zero where `used` is not.
         draw : callable
+        kind : type
+            Of what is kept: a few sums at a time are drawn in double precision.
 
         Returns
         -------
-        net, sd, mean : ndarray, shape (n_frame, n_sum)
+        net, sd, mean : ndarray of `kind`, shape (n_frame, n_sum)
             The standard deviation of photons, dark and reading alone: an observer does not know what jitters.
         """
         frame_s, coefficients = self.stare.frame_s, self.coefficients
-        sums, first = [], self._bare.mean_dn @ weights.T
+        net, sd, mean = (np.empty((self.stare.n_frames, len(weights)), kind) for _ in range(3))
         for begin in range(0, len(weights), MOST_STATISTICS):
-            sums.append(np.asarray(draw(self.components(weights[begin : begin + MOST_STATISTICS])), np.float64))
-        drawn = np.concatenate(sums, axis=1)
-        # The sums are of raw counts less the quiescent star's at the expectation's own temperature.
-        drawn += first[0] + first[1] + (1.0 - coefficients[:, 2:3]) * first[2]
+            there = slice(begin, begin + MOST_STATISTICS)
+            rows = weights[there]
+            first = self._bare.mean_dn @ rows.T
+            drawn = np.asarray(draw(self.components(rows)), np.float64)
+            # The sums are of raw counts less the quiescent star's at the expectation's own temperature.
+            net[:, there] = (drawn + first[0] + first[1] + (1.0 - coefficients[:, 2:3]) * first[2]) / frame_s
+            sd[:, there], mean[:, there] = self.expected(rows)
+        return net, sd, mean
+
+    def expected(self, weights: Float) -> tuple[Float, Float]:
+        """Standard deviation and mean of the net light in weighted sums of pixels, DN per second, (n_frame, n_sum)."""
+        frame_s, coefficients = self.stare.frame_s, self.coefficients
         constant, each = self._bare.pixel_cumulants(2)
-        squares = weights.T**2
+        squares, light = weights.T**2, np.delete(self._bare.mean_dn, 2, axis=0) @ weights.T
         sd = np.sqrt(constant @ squares + coefficients @ (each @ squares))
-        light = np.delete(coefficients, 2, axis=1) @ np.delete(first, 2, axis=0)
-        return drawn / frame_s, sd / frame_s, light / frame_s
+        return sd / frame_s, np.delete(coefficients, 2, axis=1) @ light / frame_s
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,9 +180,9 @@ def seen(staring: Staring, bands_nm: Sequence[tuple[float, float]], draw: Draw) 
         rows.append(row)
     elements = used * (quiet.element == np.arange(quiet.element_wavelength_nm.size)[:, None])
     filled = np.flatnonzero(elements.any(axis=1))
-    spectrum, spectrum_sd, spectrum_mean = staring.net(elements[filled], draw)
+    spectrum, spectrum_sd, spectrum_mean = staring.net(elements[filled], draw, np.float32)
     # Elements hold every pixel once, so that their sum is all there is.
-    whole = spectrum.sum(axis=1), np.sqrt((spectrum_sd**2).sum(axis=1)), spectrum_mean.sum(axis=1)
+    whole = spectrum.sum(axis=1, dtype=np.float64), *staring.expected(used[None])
     parts = staring.net(np.array(rows).reshape(len(rows), used.size), draw) if rows else np.zeros((3, len(whole[0]), 0))
     flux, sd, mean = (np.column_stack(both) for both in zip(whole, parts, strict=True))
     low, high = quiet.wavelength_nm[[0, -1]]
@@ -182,8 +191,8 @@ def seen(staring: Staring, bands_nm: Sequence[tuple[float, float]], draw: Draw) 
         flux,
         sd,
         mean,
-        spectrum.astype(np.float32),
-        spectrum_sd.astype(np.float32),
-        spectrum_mean.astype(np.float32),
+        spectrum,
+        spectrum_sd,
+        spectrum_mean,
         quiet.element_wavelength_nm[filled],
     )
