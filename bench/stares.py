@@ -233,18 +233,18 @@ def main() -> None:
     for line in lines:
         wall, own = (float(np.median(x)) for x in (line.seconds, line.own))
         scenarios = 8 if "8 amplitudes" in line.work else 1
-        rates = (line.stares * line.each / wall, line.stares * line.each / own, line.stares * scenarios / wall)
+        rates = (line.stares * line.each / wall, line.stares * line.each / own, line.stares * scenarios / own)
         rows.append((line.work, line.program, line.counted, *(float(f"{rate:.3g}") for rate in rates)))
     if options.altaipony:
         found = altaipony(options.altaipony)
         per_s, own = (float(found["injections"]) / float(found[key]) for key in ("seconds", "own"))
         name = f"AltaiPony {found['version']}"
-        rows.append(("one light curve, injected and searched", name, "frames", per_s * FRAMES, own * FRAMES, per_s))
-    table = Table(rows=rows, names=("work", "program", "counted", "rate", "rate_of_a_core", "injections"))
+        rows.append(("one light curve, injected and searched", name, "frames", per_s * FRAMES, own * FRAMES, own))
+    table = Table(rows=rows, names=("work", "program", "counted", "rate", "rate_of_a_core", "stares_of_a_core"))
     told = {
         "rate": "what is counted, per second: pixels or sums of frames, of each scenario",
         "rate_of_a_core": "the same per second of processor time",
-        "injections": "stares of 200 frames with a flare, per second",
+        "stares_of_a_core": "stares of 200 frames, each with a flare, per second of processor time",
     }
     for column, text in told.items():
         table[column].unit = "1 / s"

@@ -25,8 +25,8 @@ Floats = NDArray[np.float32]
 
 #: Frames that one work-item follows where sums are drawn.
 FRAMES_EACH = 1024
-#: Stares that are reduced are drawn in tiles so many times smaller: they stay in a processor's cache.
-REUSED = 16
+#: Of stares that are drawn and reduced at once.
+REDUCED_BYTES = 4 * 2**20
 
 
 class Stares:
@@ -161,23 +161,28 @@ class Stares:
         components, stare, reduction = request.components, request.stare, request.reduction or Kept()
         how = (request.seed, request.method, request.cosmic_rays)
         scenarios = slice(None) if request.amplitudes is not None else 0
-        room, parts = np.empty(0, np.float32), list[Arrays]()
+        parts = list[Arrays]()
         shape = (components.n_statistics, padded_frames(stare.n_frames))
-        each = len(request.flares.amplitudes) * shape[0] * shape[1]
+        each = 4 * len(request.flares.amplitudes) * shape[0] * shape[1]
+        # Few enough to stay in a processor's cache while they are looked at, and never a vector's worth of months.
+        alone = 1 if request.method == "cumulants" else self.opened.width
+        piece = max(alone, REDUCED_BYTES // each // alone * alone)
+        room = np.empty(each * piece // 4, np.float32)
         with self._launches(components, stare, request.flares, *how) as launches:
 
             def work(tile: Tile, done: int) -> None:
-                nonlocal room
-                if room.size < each * tile.wanted:
-                    room = np.empty(each * tile.wanted, np.float32)
-                out = room[: each * tile.wanted].reshape(-1, tile.wanted, *shape)
-                first = there.start + done
-                launches.give(request.flares.part(first - request.start, tile.wanted))
-                launches.draw(tile, out, 0)
-                values = np.moveaxis(out[..., : stare.n_frames], 2, 3)[scenarios]
-                parts.append(dict(reduction(values, first)))
+                found = []
+                for few in tile.pieces(piece):
+                    out = room[: each * few.wanted // 4].reshape(-1, few.wanted, *shape)
+                    first = few.first + few.start
+                    launches.give(request.flares.part(first - request.start, few.wanted))
+                    launches.draw(few, out, 0)
+                    values = np.moveaxis(out[..., : stare.n_frames], 2, 3)[scenarios]
+                    found.append(dict(reduction(values, first)))
+                # A tile that fails half way is drawn again.
+                parts.extend(found)
 
-            self._tiles.over(there.start, there.count, 4 * each * REUSED, work)
+            self._tiles.over(there.start, there.count, each, work)
         found = joined(parts, adds=reduction.adds)
         return found | {"start": np.array(there.start)} if share else found
 
