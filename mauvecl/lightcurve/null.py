@@ -129,11 +129,11 @@ def in_a_row(values: NDArray[Any], points: int, sigma: float) -> NDArray[np.bool
     points : int
     sigma : float
     """
-    above = np.atleast_1d(values > sigma)
-    alarm: NDArray[np.bool_] = np.zeros(above.shape, np.bool_)
+    above = np.asarray(values > sigma)
+    alarm = np.zeros(above.shape, np.bool_)
     if above.shape[-1] < points:
         return alarm
-    windows = np.lib.stride_tricks.sliding_window_view(above, points, axis=-1).all(axis=-1)
+    windows = np.asarray(np.lib.stride_tricks.sliding_window_view(above, points, axis=-1).all(axis=-1))
     before = np.concatenate([np.zeros((*above.shape[:-1], 1), np.bool_), windows[..., :-1]], axis=-1)
     alarm[..., points - 1 :] = windows & ~before
     return alarm
@@ -167,9 +167,9 @@ class Sampled:
     days: float
 
     @property
-    def most_likely(self) -> tuple[float, float, float]:
-        """The lowest threshold that is trusted, with its probability of an alarm in a stare and standard error."""
-        k = int(np.argmax(self._trusted))
+    def likely(self) -> tuple[float, float, float]:
+        """The threshold that some three stares in ten exceed, with that probability and its standard error."""
+        k = int(np.argmin(np.abs(self.probability - 0.3)))
         return float(self.thresholds[k]), float(self.probability[k]), float(self.error[k])
 
     @property

@@ -60,7 +60,7 @@ def test_half_are_found(day, half_width):
 
 STARE = Stare.of(1400.0, gaps=[(900, 960)], jitters={"light": 0.01})
 LEVEL = Level(window_s=400.0)
-CELLS = [(15.0, 0.035), (15.0, 0.048), (40.0, 0.022), (40.0, 0.03), (90.0, 0.02)]
+CELLS = [(15.0, 0.028), (15.0, 0.036), (40.0, 0.018), (40.0, 0.024), (90.0, 0.016)]
 
 
 @pytest.fixture(scope="module")
