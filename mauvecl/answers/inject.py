@@ -18,6 +18,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.injected import Fitted, InjectedShares, fitted
 from mauvecl.lightcurve.injections import Injections
 from mauvecl.lightcurve.null import DAY_S, Counted, counted, in_a_row_rate, sampled
+from mauvecl.results.requests import Share
 from mauvecl.results.sums import Arrays
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, put_first, stacked, titled, told
@@ -59,7 +60,7 @@ class StarCompleteness:
     sizes : Sizes
     threshold : Interval
     simulated : Interval
-        False alarms per star-day of drawn stares at the value `checked`, where alarms are likely, with 4 standard
+        False alarms per star-day of drawn stares at the value `checked`, which a few in ten exceed, with 4 standard
         errors; NaN where none are drawn.
     asked : float
         What it should be there by importance sampling.
@@ -334,8 +335,8 @@ def _star(
     found = InjectedShares(
         injections.half_widths_s, values, amplitudes, sizes.of_amplitude(critical, widths[:, None, None])
     )
-    # Where alarms are likely, drawn stares say most of whether the two agree.
-    checked, likely, error = tail.most_likely
+    # Where a few stares in ten have an alarm, drawn ones say most of whether the two agree.
+    checked, likely, error = tail.likely
     simulated, expected = _checked(drawn, checked, likely, error, survey.stare.observed_s / short.stare.observed_s)
     return StarCompleteness(
         label(star, known.quiet),
@@ -371,7 +372,7 @@ def _kept(
     """What comes of each position, worked out by some threads or kept from before."""
     found: dict[int, Arrays] = {}
     if checkpoint is not None:
-        kept = {p: checkpoint.get(f"{name}-{p}") for p in range(positions)}
+        kept = {p: checkpoint.get(f"{name}-{Share(0, p, 1).name}") for p in range(positions)}
         found = {p: part for p, part in kept.items() if part is not None}
     todo = [p for p in range(positions) if p not in found]
     pool = ThreadPoolExecutor(threads or os.cpu_count())
@@ -379,7 +380,7 @@ def _kept(
         for position, part in zip(todo, pool.map(work, todo), strict=True):
             found[position] = part
             if checkpoint is not None:
-                checkpoint.put(f"{name}-{position}", part)
+                checkpoint.put(f"{name}-{Share(0, position, 1).name}", part)
             told_of(len(found) / positions)
     finally:
         # What nobody waits for any longer is not begun.
@@ -390,7 +391,7 @@ def _kept(
 def _name(study: Study, star: Star, threshold: float, amplitudes: Float) -> str:
     """What shares of one star are kept under."""
     text = f"{study.toml()}|{star!r}|{threshold.hex()}|".encode() + amplitudes.tobytes()
-    return hashlib.sha256(text).hexdigest()[:24]
+    return hashlib.sha256(text).hexdigest()[:32]
 
 
 def _null(survey: Survey, study: Study, stares: Stares | None) -> Counted | None:

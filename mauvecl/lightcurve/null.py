@@ -129,8 +129,8 @@ def in_a_row(values: NDArray[Any], points: int, sigma: float) -> NDArray[np.bool
     points : int
     sigma : float
     """
-    above: NDArray[np.bool_] = np.greater(np.atleast_1d(values), sigma)
-    alarm: NDArray[np.bool_] = np.zeros(above.shape, np.bool_)
+    above = np.asarray(values > sigma)
+    alarm = np.zeros(above.shape, np.bool_)
     if above.shape[-1] < points:
         return alarm
     windows = np.asarray(np.lib.stride_tricks.sliding_window_view(above, points, axis=-1).all(axis=-1))
@@ -167,9 +167,9 @@ class Sampled:
     days: float
 
     @property
-    def most_likely(self) -> tuple[float, float, float]:
-        """The lowest threshold that is trusted, with its probability of an alarm in a stare and standard error."""
-        k = int(np.argmax(self._trusted))
+    def likely(self) -> tuple[float, float, float]:
+        """The threshold that some three stares in ten exceed, with that probability and its standard error."""
+        k = int(np.argmin(np.abs(self.probability - 0.3)))
         return float(self.thresholds[k]), float(self.probability[k]), float(self.error[k])
 
     @property
@@ -267,15 +267,13 @@ def sampled(search: Search, *, seed: int, draws: int = DRAWS) -> Sampled:
         tail = rng.random()
         wanted = -special.ndtri(tail * special.ndtr(-ladder))
         both = np.stack([noise, move]).astype(np.float32)
-        # Its own template exceeds for certain: rounding must not leave it out.
         exceeding = np.zeros(ladder.size, np.int64)
-        for _, rho in search.values(both):
-            # Minus infinity where nothing is looked for, in gaps.
-            tried_here = np.isfinite(rho[0])
-            base, rise = rho[0][tried_here], rho[1][tried_here]
-            near = base + np.abs(rise) * (wanted[-1] - value) > ladder[0]
+        for row, rho in search.values(both):
+            base, rise = rho[:, :, row.per_amplitude > 0].reshape(2, -1)
+            near = base + np.abs(rise) * np.abs(wanted - value).max() > ladder[0]
             base, rise = base[near], rise[near]
             exceeding += [np.count_nonzero(base + (v - value) * rise > u) for v, u in zip(wanted, ladder, strict=True)]
+        # Its own template exceeds for certain, whatever rounding says.
         shares[draw] = 1.0 / np.maximum(exceeding, 1)
     scale = sizes.sum() * n_direction * special.ndtr(-ladder)
     return Sampled(

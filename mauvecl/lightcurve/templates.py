@@ -29,8 +29,8 @@ TEMPERATURES_K = tuple(float(t) for t in np.geomspace(6_000.0, 30_000.0, 49).rou
 #: Sums of a frame.
 RANK = 3
 #: Angle between neighbouring flares of a bank, in the space of whitened sums: the one between them loses 1 - cos of
-#: half of it, 0.5 % of S/N.
-ANGLE = 0.2
+#: half of it, 0.3 % of S/N.
+ANGLE = 0.15
 #: Share of the largest singular value below which a direction holds nothing but rounding.
 LEAST_SINGULAR = 1e-6
 

@@ -58,13 +58,19 @@ def maps(found: InjectAnswer, path: str | Path | None) -> Any:
                 axis.plot(star.found.completeness[0], y)
                 axis.set(xscale="linear", xlabel="completeness")
                 continue
-            mesh = axis.pcolormesh(x, y, z, cmap="cividis", vmin=0, vmax=1, shading="nearest")
+            mesh = axis.pcolormesh(_edges(x), _edges(y), z, cmap="cividis", vmin=0, vmax=1)
             lines = axis.contour(x, y, z, levels=CONTOURS, colors="white", linewidths=1)
             axis.clabel(lines, fmt=lambda level: f"{100 * level:g} %", fontsize=7)
         if mesh is not None:
             figure.colorbar(mesh, ax=axes, label="completeness")
         _titled(figure, found)
         return finished(figure, path)
+
+
+def _edges(middles: Any) -> Any:
+    """Edges of cells whose middles are evenly spaced in the logarithm, about."""
+    steps = np.sqrt(middles[1:] / middles[:-1])
+    return np.concatenate([[middles[0] / steps[0]], middles[:-1] * steps, [middles[-1] * steps[-1]]])
 
 
 def curves(found: InjectAnswer, path: str | Path | None) -> Any:

@@ -5,15 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from scipy import special
+from searches import DAVENPORT, KNOWN, ONE
 
 from mauvecl.lightcurve.bank import HALF_WIDTHS_S, Bank, Level
 from mauvecl.lightcurve.search import Search
-from mauvecl.lightcurve.shapes import SHAPES
 from mauvecl.lightcurve.stare import Stare
-
-DAVENPORT = SHAPES["davenport2014"]
-ONE = np.ones((1, 1))
-KNOWN = Level(offset=False, slope=False, window_s=0.0)
 
 
 def filtered(search, sums, curves):

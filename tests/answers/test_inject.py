@@ -1,0 +1,162 @@
+"""Completeness answers: what they hold, sweeps and resumes, intervals, what is refused and told."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from commands import run
+
+from mauvecl.answers.inject import inject
+from mauvecl.device.stares import Stares
+from mauvecl.host.errors import InputError
+from mauvecl.lightcurve.injected import InjectedShares
+from mauvecl.runs.checkpoint import Checkpoint
+from mauvecl.statistics.intervals import clopper_pearson
+from mauvecl.study.study import Study
+
+SMALL = {
+    "star": [{"library": "G2V", "magnitude": 7.4, "distance_pc": 14.0}],
+    "stare": {"duration_s": 6000.0, "gaps": [[2000.0, 2600.0]]},
+    "search": {"half_widths_s": [20.0, 60.0, 180.0], "nulls": 30, "per": "day", "false_alarms": 1.0},
+    "injections": {"widths": 3, "half_width_high_s": 200.0, "sizes": 5, "count": 60, "positions": 6, "fitted": 12},
+}
+
+
+def study(**changes):
+    """A small question, some sections changed."""
+    data = {**SMALL, **{k: {**SMALL.get(k, {}), **v} if isinstance(v, dict) else v for k, v in changes.items()}}
+    return Study.build(data, "test")
+
+
+@pytest.fixture(scope="module")
+def stares():
+    return Stares()
+
+
+@pytest.fixture(scope="module")
+def found(stares):
+    return inject(study(), stares)
+
+
+def test_tables(found):
+    (star,) = found.stars
+    cells = found.completeness
+    assert len(cells) == 15
+    assert (cells["completeness_low"] <= cells["completeness"]).all()
+    assert (cells["completeness"] <= cells["completeness_high"]).all()
+    # More energy is found more often, at every half-width: the draws are common.
+    assert (np.diff(star.found.completeness, axis=1) >= 0).all()
+    assert str(cells["size"].unit) == "erg"
+    limits = found.table
+    assert (limits["e50"] < limits["e90"]).all()
+    assert (limits["e50_low"] <= limits["e50"]).all()
+    # Size and amplitude are the same flare.
+    scale = star.sizes.per_unit
+    assert cells["amplitude"] * cells["half_width"].value * scale == pytest.approx(cells["size"].value, rel=1e-12)
+    ratio = star.fitted.energy_ratio[:, -1]
+    assert ratio == pytest.approx(np.ones(3), abs=0.25)
+    row = found.search[0]
+    assert row["threshold_low"] < row["threshold"] < row["threshold_high"]
+    assert row["in_a_row"] == pytest.approx(4.245e-5, rel=1e-3)
+    assert not [m for m in found.messages if m.startswith("FALSE ALARMS")]
+    assert Study.build(__import__("tomllib").loads(found.study.toml()), "text") == found.study
+
+
+def test_files_and_pictures(found, tmp_path):
+    names = {path.name for path in found.write(tmp_path)}
+    assert names == {"limits.ecsv", "completeness.ecsv", "search.ecsv", "study.toml"}
+    assert Study.read(tmp_path / "limits.ecsv") == found.study
+    assert found.plot(tmp_path / "map.png").stat().st_size > 10_000
+
+
+class Stop(Exception):  # noqa: N818
+    """An interruption."""
+
+
+def test_resume_gives_the_same(found, stares, tmp_path):
+    """Some positions kept, the others drawn later: the same to the last bit."""
+
+    def stop(done, total):
+        if done > total / 3:
+            raise Stop
+
+    with pytest.raises(Stop), Checkpoint(tmp_path, "inject", study(), patience_s=0) as checkpoint:
+        inject(study(), stares, checkpoint=checkpoint, progress=stop, threads=1)
+    with Checkpoint(tmp_path, "inject", study(), patience_s=0, resume=True) as checkpoint:
+        again = inject(study(), stares, checkpoint=checkpoint)
+        assert checkpoint.found >= 2
+    assert (again.stars[0].found.critical == found.stars[0].found.critical).all()
+    assert np.array_equal(again.stars[0].fitted.energy_ratio, found.stars[0].fitted.energy_ratio, equal_nan=True)
+
+
+def test_sweep_over_magnitude_and_temperature(stares):
+    """Fainter stars hide larger flares; every cell on common draws, so that each limit moves."""
+    axes = [
+        {"quantity": "magnitude", "values": [6.0, 8.0]},
+        {"quantity": "flare_temperature", "values": [8000.0, 20_000.0]},
+    ]
+    quick = {"count": 30, "positions": 3, "fitted": 0, "widths": 2, "of": "amplitude"}
+    answer = inject(study(sweep={"axes": axes}, injections=quick, search={"nulls": 0}), stares)
+    assert dict(answer.stars[0].at) == {"magnitude": 6.0, "flare_temperature": 8000.0}
+    half = np.array([star.found.limit(0.5, None).value for star in answer.stars]).reshape(2, 2)
+    assert (half[1] > 1.5 * half[0]).all()
+    # Hotter flares of the same amplitude have more ultraviolet light.
+    assert (half[:, 1] < half[:, 0]).all()
+    with pytest.raises(InputError, match="sweep has the quantity 'amplitude'"):
+        inject(study(sweep={"axes": [{"quantity": "amplitude", "values": [0.1]}]}), stares)
+
+
+def test_search_that_leaves_out_a_cycle_is_told(stares):
+    """A thermal cycle that the search does not know: false alarms are not those of normal noise."""
+    quick = {"count": 10, "positions": 2, "fitted": 0, "widths": 2, "sizes": 2}
+    changes = {"stare": {"cycles": {"temperature": 0.5}}, "injections": quick}
+    blind = inject(study(search={"cycle": False}, **changes), stares)
+    assert blind.messages[0].startswith("FALSE ALARMS")
+    known = inject(study(**changes), stares)
+    assert not known.messages[0].startswith("FALSE ALARMS")
+
+
+def test_intervals_widen_where_positions_differ():
+    """Binomial where all positions are alike, of the positions alone where each finds all or nothing."""
+    rng = np.random.default_rng(2)
+    alike = InjectedShares((1.0,), np.array([0.5]), np.ones((1, 1)), rng.random((1, 20, 100)))
+    exact = clopper_pearson(round(alike.completeness[0, 0] * 2000), 2000)
+    assert alike.completeness_high[0, 0] - alike.completeness_low[0, 0] < 1.6 * (exact.high - exact.low)
+    whole = np.repeat(rng.random((1, 20, 1)), 100, axis=2)
+    apart = InjectedShares((1.0,), np.array([0.5]), np.ones((1, 1)), whole)
+    assert apart.completeness_high[0, 0] - apart.completeness_low[0, 0] > 0.35
+    # Quantiles have the same: of 2000 even draws the median is known to 0.022 each way.
+    half = alike.limit(0.5, 0)
+    assert half.low < 0.5 < half.high
+    assert half.high - half.low < 0.08
+    never = InjectedShares((1.0,), np.array([0.5]), np.ones((1, 1)), np.full((1, 4, 5), np.inf))
+    assert never.limit(0.5, 0).value == np.inf
+    assert never.never(0) == 1.0
+
+
+def test_refusals(stares):
+    with pytest.raises(InputError, match="distance_pc"):
+        inject(study(star=[{"library": "G2V", "magnitude": 7.4}], injections={"of": "energy"}), stares)
+    for section, key, value, match in (
+        ("search", "half_widths_s", [20.0, 10.0], "ascending"),
+        ("search", "offset", False, "slope without"),
+        ("injections", "low", -1.0, "greater than 0"),
+        ("injections", "half_width_low_s", 1e4, "above half_width_high_s"),
+        ("search", "per", "week", "day"),
+    ):
+        with pytest.raises(InputError, match=match):
+            study(**{section: {key: value}})
+
+
+@pytest.mark.long
+def test_command(tmp_path):
+    """The verb with flags: its JSON, its files, its record."""
+    words = "inject --star G2V --magnitude 7.4 --duration 4000 --injections 20 --per day --false-alarms 0.5 --json"
+    sets = ["injections.widths=2", "injections.sizes=3", "injections.positions=2", "injections.fitted=2"]
+    sets += ["search.half_widths_s=[20,60]", "search.nulls=10"]
+    done = run(*words.split(), *(x for s in sets for x in ("--set", s)), "--output", tmp_path, folder=tmp_path)
+    rows = json.loads(done.stdout)["rows"]
+    assert {"e50", "e90", "half_width"} <= set(rows[0])
+    assert {"limits.ecsv", "completeness.png", "curves.png", "run.json"} <= {p.name for p in tmp_path.iterdir()}

@@ -1,0 +1,39 @@
+"""What tests of searches share: a star's survey, made once."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+
+from mauvecl import Instrument, Sky, Source, expect
+from mauvecl.lightcurve.bank import Bank, Level
+from mauvecl.lightcurve.components import Components
+from mauvecl.lightcurve.shapes import SHAPES
+from mauvecl.lightcurve.survey import Survey
+from mauvecl.lightcurve.templates import TEMPERATURES_K, Templates, frame_nuisances
+
+DAVENPORT = SHAPES["davenport2014"]
+ONE = np.ones((1, 1))
+KNOWN = Level(offset=False, slope=False, window_s=0.0)
+
+
+@cache
+def spectra(star, magnitude, kelvin=TEMPERATURES_K):
+    """One frame of a quiescent star, and DN that flares of one amplitude add."""
+    source = Source.from_library(star).at_magnitude(magnitude)
+    mauve, sky = Instrument.load("mauve"), Sky.of_brightness(22.1)
+    quiet, *flares = (
+        expect(s, mauve, exposure=5, sky=sky) for s in (source, *(source.flaring(1.0, k) for k in kelvin))
+    )
+    return quiet, np.array([flare.light_dn - quiet.light_dn for flare in flares])
+
+
+def survey(stare, level, widths, *, star="G2V", magnitude=7.4, more=None, kelvin=10_000.0):
+    """A star's survey and templates; the only flare spectrum is of `kelvin`."""
+    quiet, flares = spectra(star, magnitude)
+    _, one = spectra(star, magnitude, (kelvin,))
+    templates = Templates.of(quiet, flares, TEMPERATURES_K, nuisances=frame_nuisances(quiet, stare, more))
+    components = Components(quiet, one / quiet.gain_dn_per_electron, templates.weights)
+    bank = Bank(widths, templates.directions[list(templates.chosen)], DAVENPORT, 5.0, level)
+    return Survey(components, stare, bank), templates

@@ -1,0 +1,169 @@
+"""False alarms: the common rule, the null by counting and by importance sampling, random stares."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy import special
+from searches import DAVENPORT, KNOWN, ONE, survey
+
+from mauvecl.device.stares import Stares
+from mauvecl.host.errors import InputError
+from mauvecl.lightcurve.bank import Bank, Level
+from mauvecl.lightcurve.curves import Sinusoid
+from mauvecl.lightcurve.null import DAYS, Counted, counted, in_a_row, in_a_row_rate, per_day, sampled
+from mauvecl.lightcurve.search import Search
+from mauvecl.lightcurve.stare import Stare
+
+
+class TestInARow:
+    """Three consecutive points above three sigma."""
+
+    def test_rate_of_the_theory(self):
+        assert in_a_row_rate(3, 3.0, 5.0) == pytest.approx(4.245e-5, rel=5e-4)
+
+    def test_rate_is_that_of_the_chain(self):
+        """Runs that begin, by the states of a Markov chain: how many of the last points were above."""
+        above, points, frames = float(special.ndtr(-1.5)), 3, 200
+        state, alarms = np.array([1.0, 0.0, 0.0, 0.0]), 0.0
+        for _ in range(frames):
+            alarms += state[2] * above
+            state = np.array(
+                [state.sum() * (1 - above), state[0] * above, state[1] * above, (state[2] + state[3]) * above]
+            )
+        assert in_a_row_rate(points, 1.5, 86_400 / frames) == pytest.approx(alarms, rel=1e-12)
+
+    def test_alarms_of_noise(self):
+        """As many as the rate says: fails by chance once in 10^4 runs (4 standard errors of a Poisson count)."""
+        noise = np.random.default_rng(4).standard_normal((500, 17280), dtype=np.float32)
+        expected = 500 * in_a_row_rate(3, 2.0, 5.0)
+        assert abs(in_a_row(noise, 3, 2.0).sum() - expected) < 4 * np.sqrt(expected)
+
+    def test_a_long_run_is_one_alarm(self):
+        values = np.array([0, 4, 4, 4, 4, 4, 0, 4, 4, 0, 4, 4, 4.0])
+        assert np.flatnonzero(in_a_row(values, 3, 3.0)).tolist() == [3, 12]
+        assert not in_a_row(values[:2], 3, 3.0).any()
+
+
+def test_rates_per_day_month_and_year():
+    assert per_day(2.0, "day") == 2.0
+    assert per_day(1.0, "month") * 365.25 / 12 == pytest.approx(1.0)
+    assert 1 / per_day(1.0, "year") == DAYS["year"]
+    for false_alarms, per in ((0.0, "day"), (1.0, "week"), (float("nan"), "year")):
+        with pytest.raises(InputError, match="false alarms"):
+            per_day(false_alarms, per)
+
+
+def test_counted_null_by_inversion():
+    """The rate at the threshold of a rate is that rate, within a count."""
+    null = Counted(np.sort(np.random.default_rng(1).gumbel(size=1000)), 0.5)
+    cut = null.threshold(0.3)
+    assert null.rate(cut.value).value == pytest.approx(0.3, rel=0.02)
+    assert cut.low < cut.value < cut.high
+    with pytest.raises(InputError, match="at least 10"):
+        null.threshold(1e-3)
+
+
+@pytest.fixture(scope="module")
+def short():
+    """A search of two sums over a stare with a gap, and its null by importance sampling."""
+    stare = Stare.of(9000.0, gaps=[(4000, 5000)])
+    bank = Bank((20.0, 60.0, 180.0), np.array([[1.0, 0.0], [0.8, 0.6]]), DAVENPORT, 5.0, Level(window_s=900.0))
+    search = Search(bank, stare)
+    return search, sampled(search, seed=2, draws=400)
+
+
+class TestSampled:
+    def test_agrees_with_counting(self, short):
+        """Where both can say. Fails by chance once in 10^3 runs: 4 standard errors at six thresholds."""
+        search, tail = short
+        rng = np.random.default_rng(5)
+        draw = lambda _, n: rng.standard_normal((n, search.stare.n_frames, 2), dtype=np.float32)  # noqa: E731
+        null = counted(search, draw, 2000)
+        for u in (3.5, 3.75, 4.0, 4.25, 4.5, 4.75):
+            k = int(np.flatnonzero(tail.thresholds == u)[0])
+            p = np.mean(null.maxima > u)
+            spread = np.hypot(np.sqrt(p * (1 - p) / 2000), tail.error[k])
+            assert abs(p - tail.probability[k]) < 4 * spread
+
+    def test_errors_are_what_they_say(self, short):
+        """Four halves of the draws scatter by their stated errors (chi-squared of 3: 1e-4 to fail), to the far tail."""
+        search, _ = short
+        logs, errors = zip(*(sampled(search, seed=s, draws=60).log_rate(7.0) for s in range(4)), strict=True)
+        assert np.sum((np.array(logs) - np.mean(logs)) ** 2 / np.array(errors) ** 2) < special.chdtri(3, 1e-4)
+        assert max(errors) < 0.2
+
+    def test_known_answer_of_one_filter(self):
+        """Independent frames: templates shorter than a frame leave P = 1 - (1 - Q)^n."""
+        stare = Stare.of(500.0)
+        search = Search(Bank((0.02,), ONE, DAVENPORT, 5.0, KNOWN), stare)
+        tail = sampled(search, seed=1, draws=50)
+        # Both phases of a template see its one frame: they are the same filter.
+        exact = -np.expm1(100 * np.log1p(-special.ndtr(-tail.thresholds)))
+        kept = tail.thresholds >= 4.5
+        assert tail.probability[kept] == pytest.approx(exact[kept], rel=2e-3)
+
+    def test_threshold_by_inversion(self, short):
+        _, tail = short
+        for rate in (1.0, 1e-2, 1 / DAYS["year"]):
+            cut = tail.threshold(rate)
+            assert tail.rate(cut.value).value == pytest.approx(rate, rel=1e-4)
+            assert 0 < cut.high - cut.value < 0.1
+        with pytest.raises(InputError, match="importance sampling"):
+            tail.threshold(1e-30)
+
+
+def random_stare(rng):
+    """A stare with gaps, drift, jitter, a thermal cycle and variability, all drawn; and how it is searched."""
+    duration = rng.uniform(7000, 11_000)
+    starts = rng.uniform(0, duration, rng.integers(0, 3))
+    known_cycle = bool(rng.integers(2))
+    stare = Stare.of(
+        duration,
+        gaps=[(float(a), float(a + rng.uniform(100, 1500))) for a in starts],
+        thermal=Sinusoid(rng.uniform(0, 0.5)),
+        variability=Sinusoid(rng.uniform(0, 0.01), rng.uniform(2e4, 2e5), rng.uniform(0, 6)),
+        jitters={"light": rng.uniform(0.001, 0.02), "temperature": rng.uniform(0.001, 0.03)},
+        offsets={"sky": 0.1, "light": rng.uniform(0.001, 0.01)},
+        drifts={"star": rng.uniform(0.001, 0.01), "temperature": rng.uniform(0.01, 0.1)},
+        cycles={"temperature": rng.uniform(0.05, 0.3)},
+    )
+    level = Level(cycle=known_cycle, window_s=20_000.0)
+    return stare, level, None if known_cycle else {"dark": np.inf}
+
+
+@pytest.fixture(scope="module")
+def stares():
+    return Stares()
+
+
+@pytest.mark.long
+def test_false_alarms_in_random_stares(stares):
+    """As asked for within 4 standard errors in 50 random stares: once in 10^4 runs it fails by chance.
+
+    The cycle is marginalised in time, or the dark in each frame. The plain statistic, which takes all for known,
+    alarms nearly always.
+    """
+    rng = np.random.default_rng(1805)
+    asked, draws = 0.3, 25
+    alarms, spread, plain = 0, 0.0, []
+    for number in range(50):
+        stare, level, free = random_stare(rng)
+        one, _ = survey(stare, level, (25.0, 80.0, 240.0), more=free)
+        days = stare.observed_s / 86_400
+        tail = sampled(one.search, seed=number, draws=25)
+        cut = tail.threshold(-np.log1p(-asked) / days).value
+        sums = stares.frames(one.components, stare, count=draws, seed=100 + number, method="cumulants")
+        alarms += int(np.sum(one.search.largest(one.net(sums)).maximum > cut))
+        relative = tail.log_rate(cut)[1]
+        spread += draws * asked * (1 - asked) + (draws * -np.log1p(-asked) * (1 - asked) * relative) ** 2
+        if number < 5:
+            bare, _ = survey(Stare.of(stare.duration_s), KNOWN, (25.0, 80.0, 240.0))
+            search = Search(bare.bank, stare)
+            sums = stares.frames(
+                one.components.__class__(one.components.quiet, one.components.flare_electrons, bare.components.weights),
+                stare, count=draws, seed=100 + number, method="cumulants",
+            )  # fmt: skip
+            plain.append(np.mean(search.largest(sums).maximum > cut))
+    assert abs(alarms - 50 * draws * asked) < 4 * np.sqrt(spread)
+    assert np.mean(plain) > 0.95
