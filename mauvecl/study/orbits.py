@@ -242,7 +242,7 @@ class PlanQuestion(Part):
     scatter_dex: Annotated[float, Field(ge=0, le=2)] = 0.3
     shape: str = "davenport2014"
     completeness: Literal["injections", "closed form"] = "injections"
-    injections: Annotated[int, Field(ge=20, le=1_000_000)] = 200
+    injections: Annotated[int, Field(ge=20, le=1_000_000)] = 100
     best_months: Annotated[int, Field(ge=1, le=12)] = 3
     report: Literal["pdf", "html"] = "pdf"
 
