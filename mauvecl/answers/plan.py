@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.answers.answer import Answer
-from mauvecl.answers.planned import CompletenessOf, Planned, closed_form, looked_of, rates_of, sky_behind, star_of
+from mauvecl.answers.planned import NOTHING, CompletenessOf, Planned, closed_form, looked_of, rates_of, star_of
 from mauvecl.answers.visible import VisibleAnswer, visible
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.completeness import DAY_S
@@ -90,8 +90,7 @@ class PlanAnswer(Answer):
         table["spectrum"] = [one.star.library or "" for one in rows]
         table["V"] = [one.star.magnitude or 0.0 for one in rows] * u.mag
         table["distance"] = [one.star.distance_pc or 0.0 for one in rows] * u.pc
-        sky = [sky_behind(self.seen, k) for k in range(len(rows))]
-        table["sky"] = [float("nan") if one is None else one for one in sky] * u.mag / u.arcsec**2
+        table["sky"] = [float("nan") if one.sky is None else one.sky for one in rows] * u.mag / u.arcsec**2
         table["signal_per_frame"] = [one.signal_per_frame for one in rows]
         table["energy_per_second"] = [one.scale.erg_per_s for one in rows] * u.erg / u.s
         table["window"] = [one.window_s / 60 for one in rows] * u.min
@@ -161,7 +160,7 @@ class PlanAnswer(Answer):
                 f"blackbody of {self.study.flare.temperature_k:g} K",
                 "assumption; energies are those of all its light, spread alike in all directions",
             ),
-            ("noise of a stare", "white", "an unknown offset and slope in each stretch; nothing else drifts"),
+            ("noise of a stare", "white", "beside what the study says is unknown of a stare; see completeness"),
             (
                 "false alarms",
                 f"{plan.false_alarms_per_day:.3g} a day of exposure",
@@ -263,15 +262,23 @@ def _measured(one: Planned) -> str:
     return f"published for {low:.2g} to {high:.2g} erg, bolometric; scatter {one.rates.scatter_dex:g} dex (assumption)"
 
 
-def plan(study: Study, completeness: CompletenessOf = closed_form) -> PlanAnswer:
+def plan(
+    study: Study,
+    completeness: CompletenessOf | None = None,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> PlanAnswer:
     """A campaign on a study's targets.
 
     Parameters
     ----------
     study : Study
         Its ``plan`` names the targets, its ``orbit`` when and from where.
-    completeness : callable
-        The share of flares recovered by bolometric energy; in closed form unless given.
+    completeness : callable, optional
+        The share of flares recovered by bolometric energy; as the study's ``plan.completeness`` has it unless given: by
+        injections into drawn noise, or in closed form.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in targets.
 
     Raises
     ------
@@ -282,7 +289,7 @@ def plan(study: Study, completeness: CompletenessOf = closed_form) -> PlanAnswer
     --------
     >>> from mauvecl import Study, plan
     >>> study = Study().with_settings(["plan.targets=[{name = 'eps Eri'}]", "orbit.days=31", "plan.hours=100"])
-    >>> found = plan(study)
+    >>> found = plan(study.with_settings(["plan.completeness='closed form'"]))
     >>> found.table["hours"].value.tolist()
     [100.0]
     """
@@ -293,14 +300,19 @@ def plan(study: Study, completeness: CompletenessOf = closed_form) -> PlanAnswer
     stars = [star_of(study, text) for text in study.plan.targets]
     seen = visible(study)
     names, hours = seen.visibility.by_month()
-    found = []
+    completeness = completeness or _completeness(study)
+    found: list[Planned] = []
     for k, (text, star, target) in enumerate(zip(study.plan.targets, stars, seen.targets, strict=True)):
+        if progress is not None:
+            progress(k, len(stars))
         looked = looked_of(study, text, star, target, seen, k)
         exposed = float(seen.visibility.hours[k])
         observed = exposed if study.plan.hours is None else min(exposed, study.plan.hours)
         order = np.argsort(-hours[:, k], kind="stable")[: study.plan.best_months]
         best = tuple(names[i] for i in sorted(order) if hours[i, k] > 0)
-        share = completeness(study, looked) if looked.window_s > 0 else None
+        share = None
+        if looked.window_s > 0:
+            share = completeness(study, looked) if looked.signal_per_frame > 0 else NOTHING
         rates, why = rates_of(study, text, looked)
         result = None
         if rates is not None:
@@ -308,3 +320,12 @@ def plan(study: Study, completeness: CompletenessOf = closed_form) -> PlanAnswer
             result = Yield.about(0.0, 0.0) if share is None else Yield.of(rates, share, days)
         found.append(Planned(looked, exposed, observed, share, rates, result, best, why))
     return PlanAnswer(study, seen, tuple(found))
+
+
+def _completeness(study: Study) -> CompletenessOf:
+    """That which a study asks for."""
+    if study.plan.completeness == "closed form":
+        return closed_form
+    from mauvecl.answers.planned_injections import injected
+
+    return injected

@@ -43,6 +43,8 @@ class Looked:
         Bolometric.
     window_s : float
         Median length of a stretch; 0 where it is never seen.
+    sky : float or None
+        Zodiacal light behind it, V mag arcsec^-2, as `quiet` has it; the study's sky where it is None.
     """
 
     target: Target
@@ -51,8 +53,11 @@ class Looked:
     signal_per_frame: float
     scale: EnergyScale
     window_s: float
+    sky: float | None = None
 
 
+#: Of a star that saturates every pixel.
+NOTHING = Completeness(np.array([1e24, 1e40]), np.zeros(2), BOLOMETRIC, "every pixel saturates: no flare is recovered")
 #: A target's completeness, of bolometric energies; None for one that is never seen.
 CompletenessOf = Callable[[Study, Looked], Completeness]
 
@@ -106,10 +111,6 @@ class Planned:
 
 def closed_form(study: Study, looked: Looked) -> Completeness:
     """The completeness of a bank of matched filters in white noise; see `Completeness.of_search`."""
-    if looked.signal_per_frame == 0:
-        return Completeness(
-            np.array([1e24, 1e40]), np.zeros(2), BOLOMETRIC, "every pixel saturates: nothing is recovered"
-        )
     return Completeness.of_search(
         looked.signal_per_frame,
         looked.scale,
@@ -170,7 +171,7 @@ def looked_of(study: Study, text: PlanTarget, star: Star, target: Target, seen: 
     scale = EnergyScale.of_star(source, star.distance_pc, band=study.flare.band, flare_k=study.flare.temperature_k)
     lengths = seen.windows[k].length_s
     window = float(np.median(lengths)) if lengths.size else 0.0
-    return Looked(target, star, quiet, frame_signal(quiet, flare, SMALL), scale, window)
+    return Looked(target, star, quiet, frame_signal(quiet, flare, SMALL), scale, window, sky)
 
 
 def sky_behind(seen: VisibleAnswer, k: int) -> float | None:

@@ -94,6 +94,9 @@ PLAN = {
     "false_alarms": Option(
         _flag(float, "--false-alarms", text="Of noise, in a day of exposure [0.0333]."), "plan", "false_alarms_per_day"
     ),
+    "completeness": Option(
+        _flag(str, "--completeness", text="injections, or 'closed form' at once [injections]."), "plan", "completeness"
+    ),
     "report": Option(_flag(str, "--report", text="pdf or html [pdf]."), "plan", "report"),
     "instrument": OBSERVATION["instrument"],
     "temperature": OBSERVATION["temperature"],
@@ -152,7 +155,8 @@ def plan(study: Study, session: Session) -> None:
     if study.plan.report == "pdf" and not available():
         study = study.with_settings(["plan.report=html"])
         session.say(["The report is HTML: matplotlib is missing, `pip install 'mauvecl[plot]'` brings it."])
-    found = compute(study)
+    with session.metered("targets") as meter:
+        found = compute(study, progress=meter)
     session.answer(found, lambda: _show_plan(found))
 
 

@@ -225,6 +225,10 @@ class PlanQuestion(Part):
     half_width_s, at_erg, exponent, scatter_dex : float
         See `lightcurve.completeness.DurationLaw`.
     shape : str
+    completeness : {"injections", "closed form"}
+        By flares put into drawn noise and searched for, or at once, for white noise.
+    injections : int
+        Of each half-width.
     best_months : int
     report : {"pdf", "html"}
     """
@@ -237,6 +241,8 @@ class PlanQuestion(Part):
     exponent: Annotated[float, Field(ge=0, lt=1)] = 0.39
     scatter_dex: Annotated[float, Field(ge=0, le=2)] = 0.3
     shape: str = "davenport2014"
+    completeness: Literal["injections", "closed form"] = "injections"
+    injections: Annotated[int, Field(ge=20, le=1_000_000)] = 100
     best_months: Annotated[int, Field(ge=1, le=12)] = 3
     report: Literal["pdf", "html"] = "pdf"
 

@@ -17,6 +17,8 @@ from mauvecl.lightcurve.rates import davenport2019
 from mauvecl.study.orbits import read_targets
 from mauvecl.study.spectral_types import nearest_spectrum, subtype
 
+#: Injections take ten seconds a target.
+QUICK = {"completeness": "closed form"}
 TARGETS = """name,ra,dec,V,spectral_type,distance_pc,mass_msun,age_myr
 eps Eri,,,,,,0.82,500
 my star,10.5,-3.0,8.0,K5V,10,0.7,300
@@ -30,7 +32,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
     path = tmp_path_factory.mktemp("plan") / "targets.csv"
     path.write_text(TARGETS)
     return Study().with_changes(
-        {"plan": {"targets": read_targets(path), "hours": 120.0}, "orbit": {"days": 60.0}}, None
+        {"plan": QUICK | {"targets": read_targets(path), "hours": 120.0}, "orbit": {"days": 60.0}}, None
     )
 
 
@@ -174,7 +176,7 @@ def test_tables_that_cannot_be(tmp_path: Path, text: str, words: str) -> None:
 
     def planned() -> None:
         targets = read_targets(tmp_path / "targets.csv")
-        plan(Study().with_changes({"plan": {"targets": targets}, "orbit": {"days": 1.0}}, None))
+        plan(Study().with_changes({"plan": QUICK | {"targets": targets}, "orbit": {"days": 1.0}}, None))
 
     with pytest.raises(InputError, match=words):
         planned()
@@ -183,7 +185,7 @@ def test_tables_that_cannot_be(tmp_path: Path, text: str, words: str) -> None:
 def test_rates_of_a_file_beside_the_table(tmp_path: Path) -> None:
     (tmp_path / "ffd.csv").write_text("energy,rate\n1e31,2.0\n1e34,0.001\n")
     (tmp_path / "targets.csv").write_text("name,rates_file,rates_band\neps Eri,ffd.csv,TESS\n")
-    changes = {"plan": {"targets": read_targets(tmp_path / "targets.csv")}, "orbit": {"days": 2.0}}
+    changes = {"plan": QUICK | {"targets": read_targets(tmp_path / "targets.csv")}, "orbit": {"days": 2.0}}
     answer = plan(Study().with_changes(changes, None))
     assert answer.stars["rates"][0] == "ffd.csv"
     answer.write(tmp_path / "out")
