@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import argparse
 import asyncio
-import base64
 import bz2
 import json
 import os
@@ -36,70 +35,56 @@ class Visitor:
     """One visitor's connection."""
 
     def __init__(self, host: str) -> None:
-        self._host = host
+        self._host, self._n = host, 0
 
     async def come(self) -> None:
-        """Load the page: its frame, then its document."""
-        answer = await AsyncHTTPClient(max_clients=100).fetch(f"http://{self._host}/", request_timeout=PATIENCE)
-        token = re.search(r'"token":"([^"]+)"', answer.body.decode())
-        assert token is not None
+        """Load the page as a browser without anything of it does, and have the first answer with its pictures."""
+        client = AsyncHTTPClient(max_clients=100)
+        html = (await client.fetch(f"http://{self._host}/", request_timeout=PATIENCE)).body.decode()
+        for part in re.findall(r'(?:src|href)="((?:assets|favicon)[^"]+)"', html):
+            await client.fetch(f"http://{self._host}/{part}", request_timeout=PATIENCE)
         request = HTTPRequest(
-            f"ws://{self._host}/ws", request_timeout=PATIENCE, headers={"Origin": f"http://{self._host}"}
+            f"ws://{self._host}/live", request_timeout=PATIENCE, headers={"Origin": f"http://{self._host}"}
         )
-        self._socket = await websocket_connect(request, subprotocols=["bokeh", token[1]], max_message_size=2**26)
+        self._socket = await websocket_connect(request, max_message_size=2**26)
         await self._message()
-        await self._send("PULL-DOC-REQ", {})
-        while "doc" not in (content := await self._message()):
-            pass
-        text = json.dumps(content)
-        ready = {"type": "event", "name": "document_ready", "values": {"type": "map", "entries": []}}
-        await self._send(
-            "PATCH-DOC", {"events": [{"kind": "MessageSent", "msg_type": "bokeh_event", "msg_data": ready}]}
-        )
-        self._field = self._model("TextInput", text[: text.index('"Magnitude of the star"')])
-        self._file = self._model("FileInput", text)
-        self._summary = self._model("Div", text[: text.index("of such flares are detected")])
-
-    def _model(self, kind: str, text: str) -> str:
-        """The id of the last model of a kind in a text."""
-        return str(re.findall(rf'"name": "[^"]*{kind}", "id": "([^"]+)"', text)[-1])
+        await self.change(8.5)
 
     async def _message(self) -> dict[str, Any]:
-        """The content of the next message."""
+        got = await asyncio.wait_for(self._socket.read_message(), PATIENCE)
+        if got is None:
+            raise ConnectionError("the server has closed the connection")
+        return dict(json.loads(got))
 
-        async def fragment() -> str:
-            got = await asyncio.wait_for(self._socket.read_message(), PATIENCE)
-            if got is None:
-                raise ConnectionError("the server has closed the connection")
-            return str(got)
-
-        header = json.loads(await fragment())
-        await fragment()
-        content = await fragment()
-        for _ in range(2 * header.get("num_buffers", 0)):
-            await fragment()
-        return dict(json.loads(content))
-
-    async def _send(self, kind: str, content: Any) -> None:
-        for part in ({"msgid": os.urandom(8).hex(), "msgtype": kind}, {}, content):
-            await self._socket.write_message(json.dumps(part))
-
-    async def _set(self, model: str, **values: Any) -> None:
-        events = [{"kind": "ModelChanged", "model": {"id": model}, "attr": k, "new": v} for k, v in values.items()]
-        await self._send("PATCH-DOC", {"events": events})
+    async def _ask(self, what: str, **more: Any) -> int:
+        self._n += 1
+        await self._socket.write_message(json.dumps({"ask": what, "n": self._n} | more))
+        return self._n
 
     async def change(self, magnitude: float) -> float:
-        """Seconds from a change to its answer."""
-        start = time.perf_counter()
-        await self._set(self._field, value=f"{magnitude:.4f}")
+        """Seconds from a change to its answer; its pictures come behind it, and a drawn exposure as a browser asks."""
+        start, link = time.perf_counter(), f"?magnitude={magnitude:.4f}"
+        n = await self._ask("answer", link=link, tab="detection")
+        answered = 0.0
         while True:
-            for event in (await self._message()).get("events", ()):
-                if event.get("model", {}).get("id") == self._summary and event.get("attr") == "text":
-                    return time.perf_counter() - start
+            told = await self._message()
+            if told.get("n") != n:
+                continue
+            if "answer" in told:
+                answered = time.perf_counter() - start
+            elif "pictures" in told:
+                return answered
+            elif "refused" in told or told.get("faults"):
+                raise RuntimeError(str(told))
+
+    async def draw(self, magnitude: float) -> None:
+        """One exposure, half a second after the last change."""
+        await self._ask("draw", link=f"?magnitude={magnitude:.4f}", tab="detection")
 
     async def upload(self, name: str, content: bytes) -> None:
         """Send a file; what comes back is read and left."""
-        await self._set(self._file, value=base64.b64encode(content).decode(), mime_type="", filename=name)
+        await self._ask("upload", field="star", name=name)
+        await self._socket.write_message(content, binary=True)
         await asyncio.sleep(1.0)
 
 
@@ -108,7 +93,10 @@ async def visit(visitor: Visitor, number: int, changes: int, start: float) -> li
     waits = []
     for i in range(changes):
         await asyncio.sleep(max(0.0, start + i + (number * 0.618) % 1.0 - time.perf_counter()))
-        waits.append(await visitor.change(7.5 + 0.01 * i + 0.0001 * number))
+        magnitude = 7.5 + 0.01 * i + 0.0001 * number
+        waits.append(await visitor.change(magnitude))
+        await asyncio.sleep(0.5)
+        await visitor.draw(magnitude)
     return waits
 
 

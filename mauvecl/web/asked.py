@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.answers.detect import DetectAnswer, detect
+from mauvecl.answers.inject import InjectAnswer, inject
 from mauvecl.answers.limits import limiting_magnitude
 from mauvecl.answers.maps import MapResult, detection_map
 from mauvecl.answers.snr import SnrAnswer, snr
+from mauvecl.answers.visible import visible
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -18,6 +20,8 @@ if TYPE_CHECKING:
 
 #: The map of the page: cells along each axis, and realisations of each.
 MAP_STEPS, MAP_REALISATIONS = 8, 20_000
+#: Flares that are injected: sizes, half-widths, how many of each, and at how many places.
+INJECTED = {"of": "amplitude", "sizes": 12, "widths": 3, "count": 200, "positions": 4, "fitted": 0}
 
 
 def detect_and_snr(study: Study, pool: Pool) -> tuple[DetectAnswer, SnrAnswer]:
@@ -42,6 +46,14 @@ def map_around(study: Study, pool: Pool) -> MapResult:
     return detection_map(Study.build(data, "page"), pool)
 
 
+def completeness(study: Study) -> InjectAnswer:
+    """What a search of a stare of one orbit finds, coarsely."""
+    data = study.model_dump()
+    data["injections"] |= INJECTED
+    data["search"] |= {"nulls": 0}
+    return inject(Study.build(data, "page"), threads=1)
+
+
 def _detection(study: Study, pool: Pool) -> dict[str, Any]:
     return dict(zip(("detection", "snr"), detect_and_snr(study, pool), strict=True))
 
@@ -51,4 +63,6 @@ SIMULATED: dict[str, Callable[[Study, Pool], dict[str, Any]]] = {
     "detection": _detection,
     "limit": lambda study, pool: {"limit": limiting_magnitude(study, pool)},
     "map": lambda study, pool: {"map": map_around(study, pool)},
+    "completeness": lambda study, pool: {"completeness": completeness(study)},
+    "visible": lambda study, pool: {"visible": visible(study)},
 }

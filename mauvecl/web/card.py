@@ -4,11 +4,15 @@ from __future__ import annotations
 
 from typing import Any
 
-from mauvecl.web.closed import Closed, percent
+import numpy as np
+
+from mauvecl.web.closed import Closed, between, percent
 from mauvecl.web.tabs.tab import Found
 
 #: Part of the sentence that tells what the throughput is; it stands on the page once.
 NOMINAL = "The throughput is nominal"
+#: Sensible relative uncertainty of the nominal throughput (assumed; see the documentation's page on what is nominal).
+THROUGHPUT = 0.3
 
 
 def card(closed: Closed, found: Found) -> dict[str, Any]:
@@ -21,11 +25,11 @@ def card(closed: Closed, found: Found) -> dict[str, Any]:
         kinds; ``simulated``, names of what is simulated.
     """
     q, x = closed.question, closed.quiet
-    cut, chance, interval, facts = closed.cut, closed.chance, "in closed form, for Gaussian noise", []
+    cut, chance, interval, facts = closed.cut, closed.chance, f"in closed form{_spread(closed)}", []
     if "detection" in found:
         (row,) = (row for row in found["detection"].table if row["statistic"] == q.statistic)
         cut, chance = float(row["threshold"]), float(row["probability"])
-        interval = f"{percent(row['low'])} to {percent(row['high'])}, of {q.realisations.number:,} simulated"
+        interval = f"{between(row['low'], row['high'])}, of {q.realisations.number:,} simulated"
         facts.append(("Closed form", percent(closed.chance)))
     facts += [
         ("Threshold", f"{cut:.4g}"),
@@ -47,6 +51,14 @@ def card(closed: Closed, found: Found) -> dict[str, Any]:
         "notes": notes,
         "simulated": sorted(name for name in found if name not in ("snr", "draw")),
     }
+
+
+def _spread(closed: Closed) -> str:
+    """What the throughput's uncertainty makes of a chance."""
+    if closed.slow or closed.chance != closed.chance:
+        return ""
+    low, high = np.sort(closed.chances(np.array([1 - THROUGHPUT, 1 + THROUGHPUT]), np.ones(1), sky=True)[0])
+    return f"; {between(low, high)} if the throughput is {100 * THROUGHPUT:g} % lower or higher"
 
 
 def _messages(closed: Closed, found: Found) -> list[str]:

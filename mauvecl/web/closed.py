@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mauvecl.answers.unknown_cost import cost_lines, marginal_lines, unknown_cost
 from mauvecl.noise.scene import prepare
 from mauvecl.results.hypotheses import Hypotheses
+from mauvecl.statistics.registry import STATISTICS
+from mauvecl.statistics.statistic import Setting
 from mauvecl.study.labels import told
 from mauvecl.web.smooth import Smooth
 
@@ -20,6 +23,8 @@ if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
     from mauvecl.study.study import Study
     from mauvecl.web.question import Question
+
+Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,8 +113,45 @@ class Closed:
             f"in {x.exposure_s:g} s ({frames})"
         )
 
+    def chances(self, lights: Float, rises: Float, *, sky: bool = False) -> Float:
+        """Detection probabilities in closed form with other light, shape (n_rise, n_light): light is linear.
+
+        Parameters
+        ----------
+        lights : ndarray, shape (n_light,)
+            Factors on the light of star and flare.
+        rises : ndarray, shape (n_rise,)
+            Factors on the flare's amplitude.
+        sky : bool
+            Whether the sky's light changes with the star's, as for another throughput.
+        """
+        q, base = self.question, self.quiet
+        one, rise = STATISTICS[q.statistic], self.flare.source_electrons - base.source_electrons
+        found = np.zeros((rises.size, lights.size))
+        for i, light in enumerate(lights):
+            behind = base.sky_electrons * (light if sky else 1.0)
+            quiet = replace(base, source_electrons=light * base.source_electrons, sky_electrons=behind)
+            used = ~quiet.saturated
+            if not used.any():
+                continue
+            unknown = self.study.nuisances.marginalised(quiet)
+            setting = Setting(quiet, used, self.study.run.comparison(), nuisances=unknown)
+            cut = None
+            for j, more in enumerate(rises):
+                flare = replace(quiet, source_electrons=light * (base.source_electrons + more * rise))
+                shape = flare if one.shaped else None
+                if cut is None or one.shaped:
+                    cut = one.closed_form(setting, quiet, shape).isf(q.fap)
+                found[j, i] = one.closed_form(setting, flare, shape).sf(cut)
+        return found
+
     @property
-    def excess(self) -> tuple[np.ndarray, np.ndarray]:
+    def slow(self) -> bool:
+        """Whether closed forms take too long for many of them."""
+        return self.question.statistic == "paper"
+
+    @property
+    def excess(self) -> tuple[Float, Float]:
         """Flare minus quiet in standard deviations of the noise, per pixel and per resolution element."""
         x = self.quiet
         rise = np.where(x.saturated, 0.0, self.flare.signal_dn - x.signal_dn)
@@ -130,3 +172,14 @@ def percent(value: float) -> str:
         return "< 0.01 %"
     shown = 100 * value
     return f"{shown:.2f} %" if shown < 1 or shown > 99 else f"{shown:.1f} %"
+
+
+def between(low: float, high: float) -> str:
+    """Two probabilities as an interval."""
+    ends = dict.fromkeys([percent(low), percent(high)])
+    return " to ".join(ends)
+
+
+def short(value: float) -> str:
+    """A number with three significant digits and no powers of ten."""
+    return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import shlex
 import tempfile
 import zipfile
@@ -110,6 +111,8 @@ def as_command(question: Question) -> str:
     if q.own_unknown:
         points = ", ".join(f"[{nm!r}, {dn!r}]" for nm, dn in q.own_unknown)
         words += ["--set", f"nuisances.own.own.points=[{points}]"]
+    if q.see.strip():
+        words += ["--set", f"orbit.targets={json.dumps([q.see.strip()])}"]
     if q.realisations.tails != "counted":
         words += ["--set", f"run.tails={q.realisations.tails}"]
     return shlex.join(words)

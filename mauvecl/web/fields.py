@@ -21,7 +21,7 @@ REALISATIONS, SAMPLED = (10_000, 100_000, 1_000_000, 4_000_000), (100_000, 1_000
 UNKNOWN = ("nothing", "the usual")
 SKIES = ("brightness", "target and time", "none")
 #: What may be simulated on the page.
-SIMULATIONS = ("detection", "limit", "map")
+SIMULATIONS = ("detection", "limit", "map", "completeness", "visible")
 #: Characters of a field that are looked at.
 MOST_CHARACTERS = 200
 
@@ -217,6 +217,10 @@ FIELDS = {
         "Something else of known shape and unknown strength, such as stray light: pairs of nm and DN, as in "
         "200 1, 450 3, 700 1, or a file of two columns.",
     ),
+    "see": Field(
+        "Target to see", "", str, "When it can be seen is on the tab Visibility: a name such as eps Eri or AU Mic, or "
+        "coordinates such as 53.23 -9.46.",
+    ),
     "realisations": Field(
         "Realisations", "100000",
         Choice((*map(str, REALISATIONS), *(f"{count} sampled" for count in SAMPLED)), draws),
@@ -232,6 +236,7 @@ ADVANCED = {
     "Flare and detector": ("flare_temperature_k", "temperature_c", "instrument"),
     "Sky": ("sky", "sky_brightness", "target", "time"),
     "Unknown": ("unknown", "own_unknown"),
+    "Visibility": ("see",),
 }
 #: Fields that ask for something under one sky only.
 ASKED_UNDER = {"sky_brightness": "brightness", "target": "target and time", "time": "target and time"}

@@ -39,6 +39,7 @@ class Question:
     realisations: Draws
     unknown: str
     own_unknown: Points
+    see: str
     seed: int
     uploaded: Source | None = None
 
@@ -80,7 +81,8 @@ class Question:
             "none": {"none": True},
         }
         own = {"own": {"points": self.own_unknown}} if self.own_unknown else {}
-        return {
+        orbit = {"orbit": {"targets": [self.see.strip()]}} if self.see.strip() else {}
+        return orbit | {
             "star": [star],
             "flare": {"amplitudes": [self.amplitude_percent / 100.0], "temperature_k": self.flare_temperature_k},
             "observation": {

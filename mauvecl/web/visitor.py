@@ -9,7 +9,7 @@ import logging
 import tempfile
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Coroutine, Mapping
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -44,6 +44,8 @@ LOOK_S = 0.25
 _closed_forms = ThreadPoolExecutor(2, thread_name_prefix="mauvecl-closed")
 #: Questions whose simulations a visitor's connection remembers, and files.
 MOST_KEPT = 4
+#: Things that are done for a visitor at a time.
+MOST_TASKS = 8
 #: What is told where the page itself is wrong.
 OWN_FAULT = "the page has made a mistake of its own, and there is no answer: please report what was entered"
 #: Why a connection was ended, for the page.
@@ -72,6 +74,7 @@ class Visitor(WebSocketHandler):
         self._drawing: Job | None = None
         self._next: dict[str, Any] | None = None
         self._answering = False
+        self._tasks: set[asyncio.Task[None]] = set()
         self._coming: tuple[int, str, str] | None = None
         self._uploads: dict[str, Any] = {}
         self._closed: tuple[tuple[Any, ...], Closed] | None = None
@@ -137,7 +140,7 @@ class Visitor(WebSocketHandler):
         self._next = asked
         if not self._answering:
             self._answering = True
-            asyncio.get_running_loop().create_task(self._answer_all())
+            self._begin(self._answer_all())
 
     async def _answer_all(self) -> None:
         try:
@@ -178,6 +181,12 @@ class Visitor(WebSocketHandler):
         unknown: Points | None = self._uploads.get("own_unknown")
         return state.asked, None if star is None else star.digest, hash(unknown)
 
+    def _begin(self, work: Coroutine[Any, Any, None]) -> None:
+        """Do something while others are served."""
+        task = asyncio.get_running_loop().create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
     @staticmethod
     async def _beside(work: Callable[[], Any]) -> Any:
         """Do something beside the event loop."""
@@ -206,7 +215,7 @@ class Visitor(WebSocketHandler):
 
     def _ask_simulate(self, asked: dict[str, Any]) -> None:
         """Simulate, tell how far it is, and answer."""
-        asyncio.get_running_loop().create_task(self._simulate(asked))
+        self._begin(self._simulate(asked))
 
     async def _simulate(self, asked: dict[str, Any]) -> None:
         n, kind, state = asked.get("n", 0), asked.get("kind"), self.state(asked.get("link", ""))
@@ -287,7 +296,10 @@ class Visitor(WebSocketHandler):
         future.add_done_callback(lambda future: loop.call_soon_threadsafe(came, future))
 
     def _ask_file(self, asked: dict[str, Any]) -> None:
-        asyncio.get_running_loop().create_task(self._file(asked))
+        if len(self._tasks) >= MOST_TASKS:
+            self.tell(n=asked.get("n", 0), refused="too many files are asked for at once, expected one", file="")
+            return
+        self._begin(self._file(asked))
 
     async def _file(self, asked: dict[str, Any]) -> None:
         n, state = asked.get("n", 0), self.state(asked.get("link", ""))

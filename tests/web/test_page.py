@@ -212,7 +212,7 @@ def test_a_star_from_a_fresh_page_to_the_same_bits_on_the_command_line(page: Pag
 
 def test_pictures_are_drawn_and_taken_along(page: Page) -> None:
     tab(page, "Spectrum")
-    page.locator("#figure-recorded .legend li:visible", has_text="one drawn exposure").wait_for()
+    page.locator("#figure-recorded .legend li:visible", has_text="drawn exposure").wait_for()
     for name in ("dark", "bias"):
         assert not page.locator("#figure-recorded .legend li", has_text=name).last.is_visible(), "until it is asked for"
     page.locator("#figure-recorded").get_by_role("checkbox", name="Bias and dark").check()
@@ -301,7 +301,6 @@ def test_only_realisations_that_settle_are_offered(page: Page) -> None:
     assert offered == ["100000 sampled", "1000000 sampled"]
     assert field.input_value() == "100000 sampled"
     assert "No answer" not in shown(page)
-    assert "of 100,000 simulated" in simulate(page)
     assert "fap=1e-6" in page.url
 
 
@@ -398,7 +397,6 @@ def test_an_upload_good_and_bad(page: Page, tmp_path: Path) -> None:
 
 
 def test_cancel_stops_at_once_while_others_are_served(browser: Browser, page: Page, server: Server) -> None:
-    enter(page, "Detection statistic", "chi2_pair")
     enter(page, "Realisations", "4000000")
     page.get_by_role("button", name="Simulate", exact=True).click()
     page.get_by_text(re.compile(r"of 8,000,000 realisations, .* a second")).wait_for()

@@ -186,7 +186,7 @@ ${control(name)}
 % for name in tab.files:
 <button type="button" data-file="${name}" data-ending="ecsv" disabled>${name} (ecsv)</button>
 <button type="button" data-file="${name}" data-ending="fits" disabled>${name} (fits)</button>
-% if name in ("limit", "map"):
+% if name in ("limit", "map", "completeness"):
 <button type="button" data-file="${name}" data-ending="study" disabled>${name} (study)</button>
 % endif
 % endfor

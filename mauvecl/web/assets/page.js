@@ -193,8 +193,9 @@ class Page {
   async draw(told) {
     this.rows(told.tab, told.rows)
     await this.pictures.put(told.pictures)
-    for (const part of document.querySelectorAll(".pictures, .rows")) part.classList.remove("dim")
-    this.drawnTab = told.tab
+    if (this.answer === null) return
+    // Other tabs may still hold an earlier answer's.
+    for (const part of document.querySelectorAll(`#panel-${told.tab} :is(.pictures, .rows)`)) part.classList.remove("dim")
     clearTimeout(this.soon)
     if (DRAWN.has(told.tab) && !told.draws) this.soon = setTimeout(() => this.drawOne(), DRAW_MS)
   }
@@ -496,7 +497,13 @@ class Page {
     for (const button of document.querySelectorAll("[data-copy]")) {
       button.onclick = async () => {
         const from = button.dataset.copy
-        await navigator.clipboard.writeText(from === "address" ? window.location.href : byId(from).textContent)
+        const text = from === "address" ? window.location.href : byId(from).textContent
+        if (!navigator.clipboard) {
+          // Browsers have it for this machine and for https alone.
+          window.prompt("Copy with Ctrl-C:", text)
+          return
+        }
+        await navigator.clipboard.writeText(text)
         const before = button.textContent
         button.textContent = "Copied"
         setTimeout(() => { button.textContent = before }, 1500)

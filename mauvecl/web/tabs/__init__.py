@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from mauvecl.web.tabs.compare import Compare
+from mauvecl.web.tabs.completeness import Completeness
 from mauvecl.web.tabs.detection import Detection
 from mauvecl.web.tabs.limit import Limit
 from mauvecl.web.tabs.noise import Noise
@@ -10,8 +11,10 @@ from mauvecl.web.tabs.signal import Signal
 from mauvecl.web.tabs.spectrum import Spectrum
 from mauvecl.web.tabs.tab import Tab
 from mauvecl.web.tabs.unknowns import Unknown
+from mauvecl.web.tabs.visibility import Visibility
 
 #: By name, in the order of the page.
 TABS: dict[str, Tab] = {
-    one.name: one for one in (Detection(), Spectrum(), Signal(), Noise(), Limit(), Unknown(), Compare())
+    one.name: one
+    for one in (Detection(), Spectrum(), Signal(), Noise(), Limit(), Unknown(), Completeness(), Visibility(), Compare())
 }

@@ -26,7 +26,7 @@ class Excess(Picture):
         canvas = Canvas(ink, "wavelength (nm)", "sigma of the noise", logs, wavelength=True)
         canvas.band("noise", "95 % of the noise", "drawn", alpha=0.16)
         canvas.saturated()
-        canvas.dots("drawn", "one drawn exposure, per element", "drawn", size=5)
+        canvas.dots("drawn", "drawn exposure", "drawn", size=5)
         canvas.line("pixel", "expected per pixel", "sky", line_width=1.2)
         told = canvas.line("element", "expected per element of 10.5 nm", "flare", step=True, line_width=2.2)
         canvas.tooltips(told, ("wavelength (nm)", "x"), ("sigma per element", "y"))
@@ -67,16 +67,13 @@ class Distributions(Picture):
         how = {"y_range": (1e-4, 1.5)} if "y" in logs else {"y_range": (0, 1.06)}
         canvas = Canvas(ink, "statistic", "density, each peak = 1", logs, **how)
         plot = canvas.plot
-        for name, called, colour in (
-            ("null bars", "no flare, simulated", "star"),
-            ("flare bars", "flare, simulated", "flare"),
-        ):
+        for name, colour in (("null bars", "star"), ("flare bars", "flare")):
             bars = plot.quad(
                 "left", "right", "top", 1e-9 if "y" in logs else 0, source=canvas.source(name, "left", "right", "top"),
                 fill_color=ink[colour], fill_alpha=0.45, line_color=None,
             )  # fmt: skip
-            bars.name = called
-            canvas.legend.append((called, ink[colour], "bars", "if any"))
+            bars.name = "simulated"
+        canvas.legend.append(("simulated", ink.drawn, "bars", "if any"))
         for name, called, colour in (("null", "no flare", "star"), ("flare", "flare", "flare")):
             canvas.band(f"{name} area", called, colour, alpha=0.18)
             canvas.legend.pop()
@@ -107,8 +104,8 @@ class Distributions(Picture):
             (row,) = (row for row in found["detection"].table if row["statistic"] == q.statistic)
             chance = float(row["probability"])
         text = (
-            f"Without a flare {q.statistic} lies at {closed.null.mean:.4g} +- {closed.null.std:.3g}, with it at "
-            f"{closed.seen.mean:.4g} +- {closed.seen.std:.3g}; {percent(chance)} of flares lie above the threshold of "
+            f"Without a flare {q.statistic} lies at {closed.null.mean:.4g} ± {closed.null.std:.3g}, with it at "
+            f"{closed.seen.mean:.4g} ± {closed.seen.std:.3g}; {percent(chance)} of flares lie above the threshold of "
             f"{cut:.4g}."
         )
         return Drawn(text, sources, {"threshold": {"location": cut}, "x axis": {"axis_label": label(q.statistic)}})

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.statistics.registry import STATISTICS
-from mauvecl.statistics.statistic import LinearStatistic, Setting
+from mauvecl.statistics.statistic import LinearStatistic
 from mauvecl.web.closed import percent
 from mauvecl.web.figures import Canvas
 from mauvecl.web.tabs.tab import Drawn, Found, Picture, Tab
@@ -27,41 +26,12 @@ Float = NDArray[np.float64]
 MAGNITUDES, PERCENTS = (2.0, 14.0), (0.1, 100.0)
 #: Columns and rows of a map in closed form where the statistic is a weighted sum, and where it is not.
 STEPS = {True: (33, 19), False: (13, 7)}
-#: Statistics whose closed forms take too long for a curve.
-SLOW = ("paper",)
 LEVELS = (0.1, 0.5, 0.9)
 
 
-def chances(closed: Closed, magnitudes: Float, amplitudes: Float) -> Float:
-    """Detection probabilities in closed form, shape (n_amplitude, n_magnitude): light is linear.
-
-    Parameters
-    ----------
-    closed : Closed
-    magnitudes : ndarray, shape (n_magnitude,)
-    amplitudes : ndarray, shape (n_amplitude,)
-        In units of the question's own.
-    """
-    q, base = closed.question, closed.quiet
-    one, rise = STATISTICS[q.statistic], closed.flare.source_electrons - base.source_electrons
-    found = np.zeros((amplitudes.size, magnitudes.size))
-    for i, magnitude in enumerate(magnitudes):
-        fainter = 10 ** (-0.4 * (magnitude - q.magnitude))
-        quiet = replace(base, source_electrons=fainter * base.source_electrons)
-        used = ~quiet.saturated
-        if not used.any():
-            continue
-        setting = Setting(
-            quiet, used, closed.study.run.comparison(), nuisances=closed.study.nuisances.marginalised(quiet)
-        )
-        cut = None
-        for j, more in enumerate(amplitudes):
-            flare = replace(quiet, source_electrons=fainter * (base.source_electrons + more * rise))
-            shape = flare if one.shaped else None
-            if cut is None or one.shaped:
-                cut = one.closed_form(setting, quiet, shape).isf(q.fap)
-            found[j, i] = one.closed_form(setting, flare, shape).sf(cut)
-    return found
+def chances(closed: Closed, magnitudes: Float, rises: Float) -> Float:
+    """`Closed.chances` at magnitudes, shape (n_rise, n_magnitude)."""
+    return closed.chances(10 ** (-0.4 * (magnitudes - closed.question.magnitude)), rises)
 
 
 def _key(closed: Closed) -> tuple[Any, ...]:
@@ -117,7 +87,7 @@ class Curve(Picture):
         sources: dict[str, Any] = {"closed form": empty, "simulated": empty}
         sources["own"] = {"x": [q.magnitude], "y": [closed.chance]}
         text = f"The closed form of {q.statistic} takes too long for a curve: simulate it."
-        if q.statistic not in SLOW:
+        if not closed.slow:
             x = np.linspace(*MAGNITUDES, 2 * STEPS[isinstance(STATISTICS[q.statistic], LinearStatistic)][0] - 1)
             y = chances(closed, x, np.ones(1))[0]
             sources["closed form"] = {"x": x, "y": y}
@@ -162,10 +132,11 @@ class Map(Picture):
             "xs", "ys", source=canvas.source("contours", "xs", "ys"), line_color="#ffffff", line_width=1.4
         )
         lines.name = "contours"
-        plot.scatter(
+        cells = plot.scatter(
             "x", "y", source=canvas.source("simulated", "x", "y", "p"), size=10, marker="square",
             fill_color={"field": "p", "transform": mapper}, line_color="#ffffff",
         )  # fmt: skip
+        cells.name = "simulated"
         canvas.own_point()
         plot.yaxis.ticker = FixedTicker(ticks=[-1, 0, 1, 2])
         plot.yaxis.major_label_overrides = {-1: "0.1 %", 0: "1 %", 1: "10 %", 2: "100 %"}
@@ -190,7 +161,7 @@ class Map(Picture):
             "contours": {"xs": [], "ys": []},
         }
         text = f"The closed form of {q.statistic} takes too long for a map: simulate it."
-        if q.statistic not in SLOW:
+        if not closed.slow:
             x, y, p = _map(_Kept(closed))
             sources |= {"map": _image(x, np.log10(y), p), "contours": _contours(x, np.log10(y), p)}
             share = 100 * float(np.mean(p >= 0.5))

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.web.closed import short
 from mauvecl.web.figures import Canvas, strips
 from mauvecl.web.tabs.tab import Drawn, Found, Picture, Tab
 
@@ -26,7 +27,7 @@ class Recorded(Picture):
         canvas = Canvas(ink, "wavelength (nm)", "DN in the exposure", logs, wavelength=True)
         canvas.band("spread", "95 % of draws with the flare", "flare")
         canvas.saturated()
-        canvas.line("drawn", "one drawn exposure", "drawn", line_width=1)
+        canvas.line("drawn", "drawn exposure", "drawn", line_width=1)
         canvas.line("sky", "sky", "sky")
         canvas.line("dark", "dark", "dark", show="pedestals")
         canvas.line("bias", "bias", "bias", show="pedestals")
@@ -55,8 +56,8 @@ class Recorded(Picture):
         }
         peak = int(np.argmax(flare))
         text = (
-            f"Star and sky give up to {star.max():.3g} DN in the exposure, with the flare {flare.max():.3g} DN at "
-            f"{w[peak]:.0f} nm; 95 % of draws lie within +-{spread[peak]:.3g} DN there."
+            f"Star and sky give up to {short(star.max())} DN in the exposure, with the flare {short(flare.max())} DN "
+            f"at {w[peak]:.0f} nm; 95 % of draws lie within ±{short(spread[peak])} DN there."
         )
         return Drawn(text, sources)
 
@@ -82,7 +83,7 @@ class Telescope(Picture):
         # Logarithms show nothing of zero.
         one, two = (np.where(s.flux_flam > 0, s.flux_flam, np.nan)[shown] for s in (star, flare))
         rise = np.nanmax(two / one)
-        text = f"The flare multiplies the star's light by up to {rise:.3g} between 190 and 710 nm."
+        text = f"The flare multiplies the star's light by up to {short(rise)} between 190 and 710 nm."
         return Drawn(text, {"star": {"x": w, "y": one}, "flare": {"x": w, "y": two}})
 
 

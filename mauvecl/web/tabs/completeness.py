@@ -1,0 +1,93 @@
+"""What a search of a whole stare finds: flares in time, of several lengths and sizes."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mauvecl.web.closed import percent, short
+from mauvecl.web.figures import Canvas
+from mauvecl.web.tabs.tab import Drawn, Found, Picture, Tab
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+    from mauvecl.study.study import Study
+    from mauvecl.web.closed import Closed
+
+#: Half-widths of the flares, shortest first: as many as there are lines.
+COLOURS = ("star", "sky", "flare")
+
+
+class Shares(Picture):
+    """Share of injected flares that the search finds, over their amplitude."""
+
+    name, title = "shares", "Share of flares that a search of a stare finds"
+
+    def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
+        canvas = Canvas(
+            ink, "peak amplitude of the flare (%)", "found", logs | {"x"}, x_range=(0.01, 100), y_range=(-0.03, 1.05)
+        )
+        for k, (called, colour) in enumerate(zip(("shortest", "middle", "longest"), COLOURS, strict=True)):
+            canvas.band(f"band {k}", f"{called} flares", colour)
+            canvas.legend.pop()
+            told = canvas.line(f"line {k}", f"{called} flares", colour, line_width=2)
+            canvas.tooltips(told, ("amplitude (%)", "x"), (f"found of the {called}", "y"))
+        canvas.rule("own", "amplitude of your question", "x", "own")
+        return canvas
+
+    def drawn(self, closed: Closed, found: Found) -> Drawn:
+        sources: dict[str, Any] = {}
+        for k in range(len(COLOURS)):
+            sources |= {f"band {k}": {"x": [], "low": [], "high": []}, f"line {k}": {"x": [], "y": []}}
+        own = {"own": {"location": closed.question.amplitude_percent}}
+        if "completeness" not in found:
+            text = (
+                "Nothing is injected yet: Inject flares puts flares of several lengths and sizes into a stare of one "
+                "orbit, and searches it at one false alarm a month."
+            )
+            return Drawn(text, sources, own)
+        table, parts = found["completeness"].completeness, []
+        for k, width in enumerate(np.unique(np.asarray(table["half_width"].value))):
+            rows = table[np.asarray(table["half_width"].value) == width]
+            x = 100 * np.asarray(rows["amplitude"], float)
+            share = np.asarray(rows["completeness"], float)
+            ends = (np.asarray(rows[f"completeness_{end}"], float) for end in ("low", "high"))
+            sources[f"band {k}"] = dict(zip(("x", "low", "high"), (x, *ends), strict=True))
+            sources[f"line {k}"] = {"x": x, "y": share}
+            seen = float(np.interp(np.log(closed.question.amplitude_percent), np.log(x), share))
+            parts.append(f"{percent(seen)} of those of half-width {short(width)} s")
+        peak = f"{closed.question.amplitude_percent:g} %"
+        return Drawn(f"Of flares that peak at {peak} the search finds {'; '.join(parts)}.", sources, own)
+
+
+class Completeness(Tab):
+    """What a search of a stare finds."""
+
+    name, title = "completeness", "Stare"
+    about = (
+        "One exposure sees a flare at its peak; a stare sees it rise and fade. What a search of a stare of one orbit "
+        "finds, at one false alarm a month."
+    )
+    pictures = (Shares(),)
+    simulations = {"completeness": "Inject flares"}  # noqa: RUF012
+    files = {"completeness": "completeness", "limits": "completeness"}  # noqa: RUF012
+
+    def table(self, name: str, closed: Closed, found: Found) -> Table:
+        return found["completeness"].tables[name]
+
+    def rows(self, closed: Closed, found: Found) -> list[list[str]]:
+        if "completeness" not in found:
+            return []
+        table = found["completeness"].table
+        rows = [["half-width of the flare", "half are found at", "90 % are found at"]]
+        for row in table:
+            width = float(getattr(row["half_width"], "value", row["half_width"]))
+            called = "all together" if np.isnan(width) else f"{short(width)} s"
+            rows.append([called, *(f"{100 * float(row[name]):.3g} %" for name in ("e50", "e90"))])
+        return rows
+
+    def study(self, name: str, closed: Closed, found: Found) -> Study:
+        study: Study = found["completeness"].study
+        return study

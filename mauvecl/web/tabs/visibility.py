@@ -1,0 +1,72 @@
+"""When a target can be seen from the orbit."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mauvecl.web.closed import short
+from mauvecl.web.figures import Canvas
+from mauvecl.web.tabs.tab import Drawn, Found, Picture, Tab
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+    from mauvecl.web.closed import Closed
+
+
+class Hours(Picture):
+    """Hours of visibility in each day, and the target's distance from the Sun."""
+
+    name, title = "hours", "Hours in which the target is seen, day by day"
+
+    def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
+        canvas = Canvas(ink, "days from the start", "hours in the day", logs, y_range=(-0.5, 24.5))
+        canvas.band("area", "hours seen", "star", alpha=0.3)
+        told = canvas.line("hours", "hours seen, day by day", "star", line_width=1.2)
+        canvas.tooltips(told, ("day", "x"), ("hours", "y"))
+        return canvas
+
+    def drawn(self, closed: Closed, found: Found) -> Drawn:
+        orbit = closed.study.orbit
+        sources: dict[str, Any] = {"area": {"x": [], "low": [], "high": []}, "hours": {"x": [], "y": []}}
+        if "visible" not in found:
+            named = ", ".join(orbit.targets)
+            text = f"When {named} is seen is not looked up yet." if named else "No target is named yet."
+            return Drawn(f"{text} Name one under Advanced, Visibility, such as eps Eri, and press Find when.", sources)
+        table = found["visible"].by_day
+        hours = np.asarray(table["hours"].to_value("h"))
+        day = np.arange(hours.size)
+        sources = {
+            "area": {"x": day, "low": np.zeros(hours.size), "high": hours},
+            "hours": {"x": day, "y": hours},
+        }
+        seen = np.count_nonzero(hours > 0)
+        text = (
+            f"From {orbit.start} on, {', '.join(orbit.targets)} is seen on {seen} of {hours.size} days, for "
+            f"{short(float(hours.sum()))} hours in all and {hours.max():.3g} on its best day."
+        )
+        return Drawn(text, sources)
+
+
+class Visibility(Tab):
+    """When a target can be seen."""
+
+    name, title = "visibility", "Visibility"
+    about = (
+        "When the satellite can look at a target: clear of Earth, Sun, Moon and radiation, for a year from 2027-01-01."
+    )
+    pictures = (Hours(),)
+    simulations = {"visible": "Find when"}  # noqa: RUF012
+    files = {"visible": "visible", "months": "visible", "days": "visible"}  # noqa: RUF012
+
+    def table(self, name: str, closed: Closed, found: Found) -> Table:
+        return found["visible"].tables[name]
+
+    def rows(self, closed: Closed, found: Found) -> list[list[str]]:
+        if "visible" not in found:
+            return []
+        table = found["visible"].months
+        (target,) = (name for name in table.colnames if name != "month")
+        return [["month", *map(str, table["month"])], ["hours", *(f"{h:.0f}" for h in table[target].to_value("h"))]]
