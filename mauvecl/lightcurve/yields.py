@@ -64,7 +64,7 @@ class Yield:
         def quantile(share: float) -> int:
             return smallest(lambda n: float(np.mean(stats.poisson.cdf(n, means))) >= share, float(means.max()))
 
-        return cls(expected, quantile(0.025), quantile(0.975), float(-np.expm1(-means).mean()))
+        return cls(expected, quantile(0.025), quantile(0.975), float(np.abs(np.expm1(-means)).mean()))
 
 
 def smallest(reached: Callable[[int], bool], most: float) -> int:
