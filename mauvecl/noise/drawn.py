@@ -1,4 +1,4 @@
-"""What priors draw, as a few nodes with weights: closed forms integrate over them where the engine draws."""
+"""What priors draw, as nodes with weights: closed forms integrate over them where the engine draws."""
 
 from __future__ import annotations
 
@@ -19,11 +19,20 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Nodes of Gauss and Hermite's rule over a prior's normal score.
-NODES = 15
-#: A factor that moves no pixel's variance by more than this share, one standard deviation of it, and that is normal to
-#: `STRAIGHT` of its standard deviation, counts as a normal amplitude of a known spectrum.
-VARIANCE_SHARE, STRAIGHT = 1e-3, 0.01
+#: Nodes of the trapezoidal rule over a prior's normal score, and how far they reach. It converges exponentially for
+#: what is smooth over a step (Trefethen & Weideman 2014, doi 10.1137/130932132).
+NODES, REACH = 281, 7.0
+SCORE = np.linspace(-REACH, REACH, NODES)
+SHARES = np.exp(-(SCORE**2) / 2) / np.exp(-(SCORE**2) / 2).sum()
+#: Every so many of them do for sums of squares, which are wide; a weighted sum may be narrower than a prior by far.
+COARSE = 10
+#: Nodes of Gauss and Hermite's rule for factors beside the first.
+FEW = 7
+#: A factor counts as a normal amplitude of a known spectrum if one standard deviation of it moves no pixel's variance
+#: by more than this share, in weighted sums and in sums of squares, and its values lie this near a straight line of the
+#: score, root mean square in standard deviations.
+VARIANCE_SHARE = {True: 1e-2, False: 1e-3}
+STRAIGHT = 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,11 +61,39 @@ class Spread:
         """Whether the factor is a straight line of a normal score."""
         if self.values.size == 1:
             return True
-        off = self.values - self.mean - self.sd * _score()[0]
+        off = self.values - self.mean - self.sd * SCORE
         return float(np.sqrt(self.shares @ off**2)) <= STRAIGHT * self.sd
 
 
 NOTHING = Spread(np.ones(1), np.ones(1))
+
+
+@dataclass(frozen=True)
+class Node:
+    """One set of factors.
+
+    Attributes
+    ----------
+    share : float
+        Its probability.
+    dark, light, sky : float
+        Factors.
+    scores : dict of str to float
+        Their normal scores.
+    """
+
+    share: float
+    dark: float
+    light: float
+    sky: float
+    scores: dict[str, float]
+
+    def on(self, x: Expectation) -> tuple[Float, Float]:
+        """DN and DN^2 added to means and variances of an exposure, each shape (n_pixel,)."""
+        # The sky's light follows the factors on all light, too.
+        more = (self.light - 1.0) * x.recorded_light_dn + self.light * (self.sky - 1.0) * x.sky_dn
+        dark = (self.dark - 1.0) * x.n_frames
+        return more + dark * x.dark_dn, x.gain_dn_per_electron * more + dark * x.dark_variance_dn2
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,58 +120,58 @@ class Drawn:
         medians = dict(zip(("light", "dark", "sky"), scene.medians, strict=True))
         return cls({name: _together(ones, medians[name]) for name, ones in found.items()}) if found else None
 
-    def nodes(self, x: Expectation) -> tuple[list[tuple[float, Float, Float]], Float]:
+    def nodes(self, x: Expectation, *, weighted: bool) -> tuple[list[Node], Float]:
         """What the factors do to an exposure.
 
         Parameters
         ----------
         x : Expectation
+        weighted : bool
+            For a weighted sum, or for a sum of squares.
 
         Returns
         -------
-        nodes : list of (share, shift, more)
-            Probability of each; DN and DN^2 that it adds to means and variances, each shape (n_pixel,).
+        nodes : list of Node
         rows : ndarray, shape (k, n_pixel)
             Of normal amplitudes beside them: DN of one standard deviation.
         """
         gain, light, sky = x.gain_dn_per_electron, x.recorded_light_dn, x.sky_dn
         dark, dark_variance = x.n_frames * x.dark_dn, x.n_frames * x.dark_variance_dn2
-        moved = {"light": (light, gain * light), "sky": (sky, gain * sky), "dark": (dark, dark_variance)}
+        moved = {"dark": (dark, dark_variance), "light": (light, gain * light), "sky": (sky, gain * sky)}
         grids, rows = [], []
+        every, few = 1 if weighted else COARSE, np.polynomial.hermite_e.hermegauss(FEW)
+        score, share = SCORE[::every], SHARES[::every] / SHARES[::every].sum()
         for name, (part, variance) in moved.items():
             spread = self.spreads.get(name, NOTHING)
-            if spread.normal and (spread.sd * variance <= VARIANCE_SHARE * x.variance_dn2).all():
+            if spread.normal and (spread.sd * variance <= VARIANCE_SHARE[weighted] * x.variance_dn2).all():
                 if spread.sd:
                     rows.append(spread.sd * part)
-                spread = Spread(np.array([spread.mean]), np.ones(1))
-            grids.append(list(zip(spread.shares.tolist(), spread.values.tolist(), strict=True)))
+                grids.append([(1.0, spread.mean, 0.0)])
+                continue
+            values = np.interp(score, SCORE, spread.values)
+            grids.append(list(zip(share.tolist(), values.tolist(), score.tolist(), strict=True)))
+            score, share = few[0], few[1] / few[1].sum()
         nodes = []
-        for (a, lit), (b, grey), (c, warm) in product(*grids):
-            # The sky's light follows the factors on all light, too.
-            more = (lit - 1.0) * light + lit * (grey - 1.0) * sky
-            shift = more + (warm - 1.0) * dark
-            nodes.append((a * b * c, shift, gain * more + (warm - 1.0) * dark_variance))
+        for chosen in product(*grids):
+            shares, (warm, lit, grey), scores = zip(*chosen, strict=True)
+            nodes.append(Node(float(np.prod(shares)), warm, lit, grey, dict(zip(moved, scores, strict=True))))
         return nodes, np.array(rows).reshape(len(rows), light.size)
 
 
-def _score() -> tuple[Float, Float]:
-    """Nodes of a standard normal and their weights."""
-    score, weight = np.polynomial.hermite_e.hermegauss(NODES)
-    return score, weight / weight.sum()
-
-
 def _normal(mean: float, sd: float) -> Spread:
-    score, weight = _score()
-    return Spread(mean + sd * score, weight)
+    return Spread(mean + sd * SCORE, SHARES)
 
 
 def _of_table(table: NDArray[np.float32]) -> Spread:
     """Of a device's table of quantiles: a factor over that at the median."""
-    score, weight = _score()
+    return Spread(1.0 + at_score(table, SCORE), SHARES)
+
+
+def at_score(table: NDArray[np.float32], score: Float) -> Float:
+    """What a device's table of quantiles holds where a standard normal has a value; shape as given."""
     below, above = special.ndtr(score), special.ndtr(-score)
     tail, (low, high) = priors.nodes(), np.split(table.astype(np.float64), 2)
-    values = np.where(below < 0.5, np.interp(below, tail, low), np.interp(above, tail, high))
-    return Spread(1.0 + values, weight)
+    return np.asarray(np.where(below < 0.5, np.interp(below, tail, low), np.interp(above, tail, high)))
 
 
 def _together(ones: list[Spread], median: float) -> Spread:

@@ -169,7 +169,7 @@ class Mixture:
 
     def sf(self, value: float) -> float:
         """Probability of exceeding `value`."""
-        return float(self.shares @ [part.sf(value) for part in self.parts])
+        return min(float(self.shares @ [part.sf(value) for part in self.parts]), 1.0)
 
     def isf(self, probability: float) -> float:
         """The value exceeded with this probability, 0 < probability < 1."""

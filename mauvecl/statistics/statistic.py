@@ -156,21 +156,27 @@ class Statistic(ABC):
         flare: Expectation | None = None,
         *,
         estimated: bool = False,
+        priors: bool = True,
     ) -> Form:
-        """`form`, integrated over what is drawn where that is marginalised over; parameters as there."""
+        """`form`, integrated over what is drawn where that is marginalised over; parameters as there.
+
+        Without `priors` what is marginalised over and not drawn does not scatter.
+        """
         if not setting.integrates:
-            return self.form(setting, delta, true, flare, estimated=estimated)
+            none = np.zeros((0, delta.size))
+            return self.form(setting, delta, true, flare, estimated=estimated, scatter=None if priors else none)
         assert setting.nuisances
         assert setting.drawn
-        nodes, rows = setting.drawn.nodes(observed)
+        nodes, rows = setting.drawn.nodes(observed, weighted=isinstance(self, LinearStatistic))
         # Other unknowns keep their Gaussian priors.
         others = setting.nuisances.without(setting.drawn.spreads)
-        rows = np.vstack([rows, others.finite(others.spectra)])
-        parts = tuple(
-            self.form(setting, delta + shift * setting.used, true + more, flare, scatter=rows)
-            for _, shift, more in nodes
-        )
-        return parts[0] if len(parts) == 1 else Mixture(parts, np.array([share for share, *_ in nodes]))
+        if priors:
+            rows = np.vstack([rows, others.finite(others.spectra)])
+        parts = []
+        for node in nodes:
+            shift, more = node.on(observed)
+            parts.append(self.form(setting, delta + shift * setting.used, true + more, flare, scatter=rows))
+        return parts[0] if len(parts) == 1 else Mixture(tuple(parts), np.array([node.share for node in nodes]))
 
     @abstractmethod
     def dof(self, setting: Setting) -> int:

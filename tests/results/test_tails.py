@@ -10,7 +10,7 @@ from scipy import special
 from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError
 from mauvecl.noise.comparison import Comparison
-from mauvecl.noise.processes import Processes, Uniform
+from mauvecl.noise.processes import Normal, Processes, Uniform
 from mauvecl.results.detection import Detection
 from mauvecl.results.tails import tail
 from mauvecl.statistics.registry import STATISTICS
@@ -18,6 +18,7 @@ from mauvecl.statistics.registry import STATISTICS
 #: A sixth of the pixels: brute force can then afford 3e7 draws, 30 of them beyond a threshold at 1e-6.
 PART = {"output_min_nm": 330.0, "output_max_nm": 360.0}
 N = 30_000_000
+FREE = float("inf")
 
 
 @pytest.fixture(scope="module")
@@ -51,6 +52,37 @@ def test_the_closed_form_where_it_is_exact(engine: Engine, statistic: str, fap: 
     sampled = tail(plain, fap, statistic, seed=5)
     exact = plain.closed_form(statistic).sf(sampled.threshold.value)
     assert abs(exact / fap - 1) < 4 * sampled.relative_error
+
+
+#: What is marginalised over, and what is drawn of it.
+UNKNOWNS = {
+    "not drawn": ({"dark": 0.1}, Processes()),
+    "half a degree": ({"dark": 0.5}, Processes(detector_temperature=Normal(21.0, 0.5, 18.5, 23.5))),
+    "all that is usual": (
+        {"dark": FREE, "light": FREE, "sky": 0.1},
+        Processes(
+            None, Uniform(0.0, 0.05), Normal(21.0, 0.5, 18.5, 23.5), sky_level=Normal(1.0, 0.1, 0.5, 1.5)
+        ),
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("case", UNKNOWNS)
+def test_brute_force_agrees_with_what_is_unknown(engine: Engine, case: str) -> None:
+    """Up to three statistics at two probabilities, each case: |z| < 4.5 with both errors, 16 values, 1e-4 by chance."""
+    nuisances, processes = UNKNOWNS[case]
+    n = 2_000_000
+    quiet, flare = star(amplitudes=(0.1,), payload=instrument(**PART))
+    how = {"nuisances": nuisances, "processes": processes, "tails": "sampled"}
+    names = ("chi2", "chi2_element", "matched") if case != "all that is usual" else ("chi2", "matched")
+    found = engine.detect(quiet, [flare], realisations=n, seed=11, statistics=names, **how)
+    for statistic in names:
+        for fap in (1e-2, 1e-4):
+            sampled = tail(found, fap, statistic, seed=3)
+            beyond, expected = found.distribution(statistic).above(sampled.threshold.value), fap * n
+            error = np.hypot(np.sqrt(expected), sampled.relative_error * expected)
+            assert abs(beyond - expected) < 4.5 * error
+            assert sampled.relative_error <= 0.02
 
 
 @pytest.mark.parametrize("statistic", ["chi2", "matched"])
@@ -113,7 +145,7 @@ def test_a_detection_uses_it_and_says_so(engine: Engine) -> None:
     [
         ({"recipe": "apart"}, "noise drawn apart"),
         ({"mode": "frames"}, "frames drawn one by one"),
-        ({"processes": Processes(jitter=Uniform(0.0, 0.05))}, "with priors"),
+        ({"processes": Processes(jitter=Uniform(0.0, 0.05))}, "with priors that statistics are not marginalised over"),
     ],
 )
 def test_what_cannot_be_tilted_is_refused(engine: Engine, options: dict, sentence: str) -> None:

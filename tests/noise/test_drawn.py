@@ -1,0 +1,83 @@
+"""What priors draw, as nodes: against the priors' own moments, and a mixture against its parts drawn."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scenes import instrument, star
+
+from mauvecl.noise.drawn import Drawn
+from mauvecl.noise.processes import Normal, Processes, Uniform
+from mauvecl.noise.scene import prepare
+from mauvecl.statistics.distributions import Gaussian, Mixture, QuadraticForm
+
+
+def drawn(**priors: Normal | Uniform) -> tuple[Drawn, float]:
+    """Of a few pixels, and by how much the dark follows the temperature."""
+    quiet, *_ = star(payload=instrument(part=True))
+    found = Drawn.of(prepare([quiet], processes=Processes(**priors)))
+    assert found is not None
+    return found, quiet.conditions["dark_slope_per_c"]
+
+
+def test_nothing_drawn_is_nothing() -> None:
+    quiet, *_ = star(payload=instrument(part=True))
+    assert Drawn.of(prepare([quiet])) is None
+
+
+def test_moments_are_the_priors() -> None:
+    """The exponential of a normal temperature, a uniform loss, and the mean of ten frames' jitter; one in float32."""
+    found, slope = drawn(detector_temperature=Normal(21.0, 0.5, 17.0, 25.0))
+    dark, s2 = found.spreads["dark"], (slope * 0.5) ** 2
+    assert dark.mean == pytest.approx(np.exp(s2 / 2), rel=2e-6)
+    assert dark.sd == pytest.approx(np.exp(s2 / 2) * np.sqrt(np.expm1(s2)), rel=2e-4)
+    assert not dark.normal
+    found, _ = drawn(qe_scale=Uniform(0.7, 1.1))
+    light = found.spreads["light"]
+    assert light.mean == pytest.approx(0.9, rel=1e-5)
+    assert light.sd == pytest.approx(0.4 / np.sqrt(12), rel=1e-3)
+    assert not light.normal
+    found, _ = drawn(jitter=Uniform(0.0, 0.05), qe_scale=Normal(1.0, 0.01, 0.9, 1.1))
+    light = found.spreads["light"]
+    assert light.mean == pytest.approx(0.975, rel=1e-5)
+    assert light.sd == pytest.approx(np.hypot(0.05 / np.sqrt(120), 0.975 * 0.01), rel=1e-3)
+    assert light.normal
+
+
+@pytest.mark.parametrize("weighted", [True, False])
+def test_nodes_are_a_distribution(weighted: bool) -> None:
+    """Whatever is drawn: shares of one, and the factors' means."""
+    quiet, *_ = star("K3V", 3.7, payload=instrument(part=True))
+    how = Processes(
+        jitter=Uniform(0.0, 0.05),
+        detector_temperature=Uniform(20.0, 23.0),
+        light_loss=Uniform(0.2, 0.5),
+        sky_level=Normal(1.0, 0.1, 0.5, 1.5),
+    )
+    found = Drawn.of(prepare([quiet], processes=how))
+    assert found is not None
+    nodes, rows = found.nodes(quiet, weighted=weighted)
+    share = np.array([node.share for node in nodes])
+    assert share.sum() == pytest.approx(1.0, abs=1e-12)
+    for name in ("light", "dark", "sky"):
+        assert share @ [getattr(node, name) for node in nodes] == pytest.approx(found.spreads[name].mean, rel=1e-4)
+    # The sky alone is faint enough to be an amplitude.
+    assert rows.shape == (1, quiet.wavelength_nm.size)
+    assert rows[0] == pytest.approx(found.spreads["sky"].sd * quiet.sky_dn)
+
+
+def test_a_mixture_is_its_parts() -> None:
+    """Moments, tails and quantiles of normals and sums of squares drawn by turns: 4.5 standard errors of 4e5 draws."""
+    rng, n = np.random.default_rng(20_261_122), 400_000
+    weight, shift = np.array([0.5, 2.0, 1.0]), np.array([0.3, 1.0, 0.0])
+    found = Mixture((Gaussian(-1.0, 0.5), QuadraticForm(weight, shift)), np.array([0.3, 0.7]))
+    squares = ((rng.normal(size=(n, 3)) + shift) ** 2) @ weight
+    x = np.where(rng.random(n) < 0.3, rng.normal(-1.0, 0.5, n), squares)
+    assert abs(x.mean() - found.mean) < 4.5 * found.std / np.sqrt(n)
+    away = x - found.mean
+    assert abs(np.mean(away**2) - found.std**2) < 4.5 * np.std(away**2) / np.sqrt(n)
+    assert abs(np.mean(away**3) - found.third) < 4.5 * np.std(away**3) / np.sqrt(n)
+    for p in (0.9, 0.5, 0.01, 1e-6):
+        cut = found.isf(p)
+        assert found.sf(cut) == pytest.approx(p, rel=1e-6)
+        assert abs(np.mean(x > cut) - p) < 4.5 * np.sqrt(p * (1 - p) / n) + 1e-5
