@@ -198,6 +198,13 @@ MUTATIONS = {
         ),
         "tests/kernels/test_normal.py::test_a_thousand_million_draws",
     ),
+    "the sky counted as signal": Mutation(
+        (
+            ("kernels/histogram.cl.mako", "        signal -= (floatv)element.sky;\n", ""),
+            ("mauvecl/results/twin.py", '        signal = signal - element["sky"]\n', ""),
+        ),
+        "tests/device/test_engine.py::test_snr_of_each_realisation_takes_the_sky_for_noise",
+    ),
     "carry of the index dropped between launches": Mutation(
         (("mauvecl/device/tiles.py", "np.uint32(self.first >> 32)", "np.uint32(0)"),),
         "tests/noise/test_extremes.py::test_counter_boundaries",

@@ -376,7 +376,9 @@ def test_what_the_disk_has_no_room_for_is_questioned(tmp_path: Path) -> None:
         assert not (tmp_path / "s.zarr").exists()
         from mauvecl.store.form import Store
 
-        study = Study().with_settings(["star=[{library='G2V'}]", "flare.amplitudes=[0.1]", "observation.exposure_s=5"])
+        study = Study().with_settings(
+            ["star=[{library='G2V',magnitude=7}]", "flare.amplitudes=[0.1]", "observation.exposure_s=5"]
+        )
         fits = Store(tmp_path / "s.zarr", study.with_settings([f"run.realisations={most}"]))
         foresight.question_room(fits, insist=False)
         more = Store(tmp_path / "s.zarr", study.with_settings([f"run.realisations={most + 1}"]))

@@ -1,0 +1,91 @@
+"""What a study takes of each star: its photosphere, its magnitude; and that the sky is common to both hypotheses."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from mauvecl.answers.detect import detect
+from mauvecl.cli.app import app
+from mauvecl.device.engine import Engine
+from mauvecl.host.errors import InputError
+from mauvecl.host.stars.source import Source
+from mauvecl.study.study import Study
+
+PART = {"changes": {"output_min_nm": 300.0, "output_max_nm": 330.0}}
+
+
+def study(*stars: dict[str, Any], **flare: Any) -> Study:
+    given = [{"magnitude": 8.0} | star for star in stars]
+    return Study.build({"star": given, "flare": {"amplitudes": [0.1]} | flare, "observation": PART}, "test")
+
+
+def flux(asked: Study, number: int) -> np.ndarray:
+    return asked.flaring(asked.star[number].source(), 0.1).flux_flam
+
+
+def test_each_star_has_its_own_photosphere() -> None:
+    """The library's where nothing is said; a star's own before it; one of the flare's for all."""
+    both = study({"library": "G2V"}, {"library": "M3V"}, geometry="replaces")
+    for number, (name, kelvin) in enumerate((("G2V", 5636.0), ("M3V", 3295.0))):
+        star = Source.from_library(name).at_magnitude(8.0)
+        wanted = star.flaring(0.1, geometry="replaces", photosphere_temperature=kelvin)
+        np.testing.assert_array_equal(flux(both, number), wanted.flux_flam)
+    own = study({"library": "G2V", "effective_temperature_k": 5000.0}, geometry="replaces")
+    one = study({"library": "G2V"}, geometry="replaces", photosphere_temperature_k=5000.0)
+    np.testing.assert_array_equal(flux(own, 0), flux(one, 0))
+    assert not np.array_equal(flux(own, 0), flux(both, 0))
+    assert Study.build(own.model_dump(), "again") == own
+    # Another star in its place brings its own.
+    assert own.at("star", "M3V").star[0].effective_temperature_k is None
+
+
+def test_two_photospheres_of_one_star_are_refused() -> None:
+    with pytest.raises(InputError, match=r"star\.0 has its own beside it"):
+        study(
+            {"library": "G2V", "effective_temperature_k": 5000.0}, geometry="replaces", photosphere_temperature_k=5200.0
+        )
+
+
+def test_the_sky_is_common_to_both_hypotheses(engine: Engine) -> None:
+    """What counts as signal changes no count of a detection; a sky 1000 times brighter makes it harder."""
+    settings = [
+        "run.realisations=20000",
+        "run.fap=0.01",
+        "flare.amplitudes=[0.02]",
+        "run.statistics=['chi2','matched']",
+    ]
+    asked = study({"library": "G2V"}).with_settings(settings)
+    net, paper = (
+        detect(asked.with_settings([f"observation.signal='{word}'"]), engine).stars[0].found
+        for word in ("net", "paper")
+    )
+    for statistic in ("chi2", "matched"):
+        for flare in (None, 0):
+            one, other = (found.distribution(statistic, flare) for found in (net, paper))
+            np.testing.assert_array_equal(one.counts, other.counts)
+    bright = detect(asked.with_settings(["sky.surface_brightness=14.6"]), engine).stars[0].found
+    seen, drowned = (found.detection_probability(0.01, "matched")[0].value for found in (net, bright))
+    assert drowned < seen
+    # Without a flare nothing is seen of it: five standard errors of 200 alarms.
+    assert bright.false_alarm_probability(net.threshold(0.01, "matched").value, "matched").value == pytest.approx(
+        0.01, abs=5 * np.sqrt(2 * 0.01 / 20_000)
+    )
+
+
+@pytest.mark.parametrize("verb", ["snr", "detect", "simulate", "exposure"])
+def test_a_star_without_a_magnitude_is_asked_for_it(verb: str, tmp_path: Any) -> None:
+    words = ["--snr", "10", "--at", "310"] if verb == "exposure" else []
+    done = CliRunner().invoke(app, [verb, "--star", "G2V", *words, "--no-pictures", "-o", str(tmp_path / "out")])
+    told = done.stderr or str(done.exception)
+    assert done.exit_code == 2 or isinstance(done.exception, InputError)
+    assert "the library keeps it at V = 0, expected a magnitude" in told
+
+
+def test_a_limiting_magnitude_needs_none(tmp_path: Any) -> None:
+    words = ["--star", "G2V", "-a", "0.3", "-n", "20000", "--fap", "0.01", "--statistic", "matched", "--no-pictures"]
+    done = CliRunner().invoke(app, ["limit", *words, "-o", str(tmp_path / "out"), "--json"])
+    assert done.exit_code == 0, done.output
