@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import special
 
 from mauvecl.host.errors import InputError
 from mauvecl.statistics.intervals import CONFIDENCE, Interval, central_counts, clopper_pearson
@@ -141,7 +141,7 @@ def in_a_row(values: NDArray[Any], points: int, sigma: float) -> NDArray[np.bool
 
 def in_a_row_rate(points: int, sigma: float, frame_s: float) -> float:
     """False alarms per star-day of `in_a_row` in white noise: runs of at least so many points."""
-    above = float(special.ndtr(-sigma))
+    above = float(scipy.special.ndtr(-sigma))
     frames = DAY_S / frame_s
     # A run begins with the first frame, or after one that is not above.
     return above**points * (1 + (frames - points) * (1 - above))
@@ -181,7 +181,7 @@ class Sampled:
         kept = self._trusted
         u, p = self.thresholds[kept], self.probability[kept]
         relative = self.error[kept] / p / (1 - p)
-        logs = np.log(-np.log1p(-p) / self.days) - special.log_ndtr(-u)
+        logs = np.log(-np.log1p(-p) / self.days) - scipy.special.log_ndtr(-u)
         columns = np.vander(u - u.mean(), min(3, u.size), increasing=True) / relative[:, None]
         # All thresholds share their draws, so that errors move together: none is gained by their number.
         inverse = np.linalg.pinv(columns)
@@ -193,7 +193,7 @@ class Sampled:
         coefficients, _ = self._fit()
         at = (threshold - self.thresholds[kept].mean()) ** np.arange(coefficients.size)
         error = float(np.interp(threshold, self.thresholds, self.error / self.probability))
-        return float(special.log_ndtr(-threshold) + at @ coefficients), error
+        return float(scipy.special.log_ndtr(-threshold) + at @ coefficients), error
 
     def rate(self, threshold: float) -> Interval:
         """False alarms per star-day at a threshold, with 95 %.
@@ -205,7 +205,7 @@ class Sampled:
         """
         self._check(threshold)
         log, error = self.log_rate(threshold)
-        reach = float(special.ndtri(0.5 + CONFIDENCE / 2)) * error
+        reach = float(scipy.special.ndtri(0.5 + CONFIDENCE / 2)) * error
         return Interval(*(float(np.exp(log + d)) for d in (0.0, -reach, reach)))
 
     def threshold(self, rate: float) -> Interval:
@@ -228,7 +228,7 @@ class Sampled:
             )
         value = float(brentq(lambda u: self.log_rate(u)[0] - goal, low, high, xtol=1e-6))
         # The rate falls by a factor exp(-u) for one more in u, about.
-        reach = float(special.ndtri(0.5 + CONFIDENCE / 2)) * self.log_rate(value)[1] / value
+        reach = float(scipy.special.ndtri(0.5 + CONFIDENCE / 2)) * self.log_rate(value)[1] / value
         return Interval(value, value - reach, value + reach)
 
     def _check(self, threshold: float) -> None:
@@ -265,7 +265,7 @@ def sampled(search: Search, *, seed: int, draws: int = DRAWS) -> Sampled:
         # Moving the noise by this, the template's own value moves by one.
         move = weights * spread**2
         tail = rng.random()
-        wanted = -special.ndtri(tail * special.ndtr(-ladder))
+        wanted = -scipy.special.ndtri(tail * scipy.special.ndtr(-ladder))
         both = np.stack([noise, move]).astype(np.float32)
         exceeding = np.zeros(ladder.size, np.int64)
         for row, rho in search.values(both):
@@ -275,7 +275,7 @@ def sampled(search: Search, *, seed: int, draws: int = DRAWS) -> Sampled:
             exceeding += [np.count_nonzero(base + (v - value) * rise > u) for v, u in zip(wanted, ladder, strict=True)]
         # Its own template exceeds for certain, whatever rounding says.
         shares[draw] = 1.0 / np.maximum(exceeding, 1)
-    scale = sizes.sum() * n_direction * special.ndtr(-ladder)
+    scale = sizes.sum() * n_direction * scipy.special.ndtr(-ladder)
     return Sampled(
         ladder, scale * shares.mean(axis=0), scale * shares.std(axis=0, ddof=1) / np.sqrt(draws),
         search.stare.observed_s / DAY_S,

@@ -13,8 +13,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.interpolate import CubicSpline
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.bank import Bank
@@ -88,7 +88,7 @@ class Fit:
             row = self.templates.directions[0]
             ends = float(logs[0]), float(logs[0])
             return (lambda x: np.tile(row, (np.size(x), 1))), (lambda x: np.zeros((np.size(x), row.size))), *ends
-        spline = CubicSpline(logs, self.templates.directions)
+        spline = scipy.interpolate.CubicSpline(logs, self.templates.directions)
         return spline, spline.derivative(), float(logs[0]), float(logs[-1])
 
     def recover(

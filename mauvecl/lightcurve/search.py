@@ -18,8 +18,8 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import fft
 
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.bank import LEAST_SHARE, Bank, Template
@@ -125,7 +125,7 @@ class Search:
         self._series = np.zeros((len(series), self.n_grid))
         self._series[:, self._at] = series
         reach = max(t.shapes.shape[1] for t in bank.templates)
-        self._size = int(fft.next_fast_len(self.n_grid + reach, real=True))
+        self._size = int(scipy.fft.next_fast_len(self.n_grid + reach, real=True))
 
     @cached_property
     def grid(self) -> list[Row]:
@@ -235,7 +235,7 @@ class Search:
         held[:, :, self._at] = self._levelled(sums) * self._weight[self._at]
         used = {series for _, series in self._terms} | {0}
         return [
-            fft.rfft(held * self._series[k].astype(np.float32), self._size) if k in used else held[:0]
+            scipy.fft.rfft(held * self._series[k].astype(np.float32), self._size) if k in used else held[:0]
             for k in range(len(self._series))
         ]
 
@@ -258,8 +258,8 @@ class Search:
         real = np.float32 if spectrum.dtype == np.complex64 else np.float64
         held = np.zeros(self._size, real)
         held[: kernel.size] = kernel
-        other = np.conj(fft.rfft(np.roll(held, template.first)))
-        found: NDArray[Any] = fft.irfft(spectrum * other, self._size)
+        other = np.conj(scipy.fft.rfft(np.roll(held, template.first)))
+        found: NDArray[Any] = scipy.fft.irfft(spectrum * other, self._size)
         return found[..., self._start(template) : self.n_grid : template.stride]
 
     def _start(self, template: Template) -> int:
@@ -275,7 +275,7 @@ class Search:
         def over(a: int, b: int, kernel: Float) -> Float:
             """The weighted correlation of two series' product with a kernel."""
             if (a, b) not in spectra:
-                spectra[a, b] = fft.rfft(self._weight * self._series[a] * self._series[b], self._size)
+                spectra[a, b] = scipy.fft.rfft(self._weight * self._series[a] * self._series[b], self._size)
             return np.asarray(self._correlated(spectra[a, b], kernel, template))
 
         gram = np.zeros((peaks.size, n, n))

@@ -7,8 +7,21 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mauvecl.pictures.style import COLOURS, MOST_COLUMNS, NULL, STYLE, finished, pyplot
+from mauvecl.pictures.style import (
+    COLOURS,
+    COLUMN,
+    MOST_COLUMNS,
+    NULL,
+    STYLE,
+    UNBROKEN,
+    finished,
+    headline,
+    legend_below,
+    plain_numbers,
+    pyplot,
+)
 from mauvecl.statistics.registry import label
 from mauvecl.statistics.statistic import LinearStatistic
 
@@ -33,7 +46,7 @@ def detection(stars: Sequence[Shown], fap: float, path: str | Path | None = None
     rows = -(-len(statistics) // columns)
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(
-            rows * len(stars), columns, figsize=(3.6 * columns, 2.6 * rows * len(stars) + 0.4), squeeze=False
+            rows * len(stars), columns, figsize=(COLUMN * columns, 2.6 * rows * len(stars) + 0.4), squeeze=False
         )
         for k, (title, found, flares) in enumerate(stars):
             panels = axes[k * rows : (k + 1) * rows]
@@ -44,12 +57,12 @@ def detection(stars: Sequence[Shown], fap: float, path: str | Path | None = None
             for axis in panels[:, 0]:
                 axis.set_ylabel(f"{title}\nrealisations, each peak = 1")
         handles, names = axes[0][0].get_legend_handles_labels()
-        figure.legend(handles, names, loc="outside lower center", ncols=len(names))
-        exposures = " and ".join(sorted({f"{found.quiet.exposure_s:g} s" for _, found, _ in stars}))
-        figure.suptitle(
+        legend_below(figure, handles, names)
+        exposures = " and ".join(sorted({f"{found.quiet.exposure_s:g}{UNBROKEN}s" for _, found, _ in stars}))
+        headline(
+            figure,
             f"Detection statistics without a flare and with one, {exposures}, "
             f"{first.realisations:,} realisations each; nominal throughput",
-            fontsize=10,
         )
         return finished(figure, path)
 
@@ -116,35 +129,47 @@ def roc(curves: Sequence[tuple[str, Roc]], path: str | Path | None = None) -> An
 
 
 def spectra(stars: Sequence[Shown], path: str | Path | None = None) -> Any:
-    """Quiescent and flare spectra per second, with one standard deviation of a pixel's noise."""
+    """Mean spectra per second with the noise of a pixel; beneath, what flares add, in sigma of an element's noise."""
     plt = pyplot()
     with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(len(stars), 1, figsize=(7.2, 2.9 * len(stars) + 0.3), squeeze=False, sharex=True)
-        for axis, (title, found, names) in zip(axes[:, 0], stars, strict=True):
-            quiet, flares = found.quiet, found.flares
-            for k in reversed(range(len(flares))):
-                x = flares[k]
-                axis.plot(
-                    x.wavelength_nm,
-                    x.signal_dn / x.exposure_s,
-                    color=COLOURS[k % len(COLOURS)],
-                    label=names[k],
-                )
-            mean, noise = quiet.signal_dn / quiet.exposure_s, np.sqrt(quiet.variance_dn2) / quiet.exposure_s
-            axis.fill_between(
-                quiet.wavelength_nm, mean - noise, mean + noise, color=NULL, alpha=0.35, linewidth=0,
-                label="1 sigma noise of a pixel",
-            )  # fmt: skip
-            axis.plot(quiet.wavelength_nm, mean, color="black", linestyle="--", label="no flare")
-            axis.set_title(f"{title}, {quiet.exposure_s:g} s")
-            axis.set_ylabel("net signal (DN s$^{-1}$ pixel$^{-1}$)")
-            axis.set_xlim(200, 700)
-        axes[0][0].legend(ncols=2)
-        axes[-1][0].set_xlabel("wavelength (nm)")
-        figure.suptitle(
-            "Mean spectra as Mauve would see them; nominal throughput, not a flight calibration", fontsize=10
+        figure, axes = plt.subplots(
+            2, len(stars), figsize=(COLUMN * max(len(stars), 1), 5.0), squeeze=False, sharex=True, height_ratios=(3, 2)
         )
+        for (above, below), (title, found, names) in zip(axes.T, stars, strict=True):
+            quiet, flares = found.quiet, found.flares
+            element, whole = quiet.element_wavelength_nm, _whole(quiet)
+            sigma = np.sqrt(quiet.per_element(quiet.variance_dn2))
+            for k in reversed(range(len(flares))):
+                x, colour = flares[k], COLOURS[k % len(COLOURS)]
+                above.plot(x.wavelength_nm, x.signal_dn / x.exposure_s, color=colour, label=names[k])
+                risen = x.per_element(x.signal_dn - quiet.signal_dn) / sigma
+                below.plot(element[whole], risen[whole], color=colour)
+            mean, noise = quiet.signal_dn / quiet.exposure_s, np.sqrt(quiet.variance_dn2) / quiet.exposure_s
+            above.fill_between(
+                quiet.wavelength_nm, mean - noise, mean + noise, color=NULL, alpha=0.35, linewidth=0,
+                label="1 sigma of a pixel",
+            )  # fmt: skip
+            above.plot(quiet.wavelength_nm, mean, color="black", linestyle="--", label="no flare")
+            above.set_title(f"{title}, {quiet.exposure_s:g} s")
+            below.axhline(1.0, color=NULL, linewidth=0.8, linestyle="--")
+            # A hundredth of a sigma is nothing.
+            below.set_yscale("log")
+            below.set_ylim(bottom=max(below.get_ylim()[0], 0.03))
+            plain_numbers(below)
+            below.set_xlabel("wavelength (nm)")
+            below.set_xlim(200, 700)
+        axes[0][0].set_ylabel("net signal (DN s$^{-1}$ pixel$^{-1}$)")
+        axes[1][0].set_ylabel("flare less quiet\n(sigma per 10.5 nm)")
+        handles, shown = axes[0][0].get_legend_handles_labels()
+        legend_below(figure, handles, shown)
+        headline(figure, "Mean spectra as Mauve would see them; nominal throughput, not a flight calibration")
         return finished(figure, path)
+
+
+def _whole(x: Expectation) -> NDArray[np.bool_]:
+    """Elements with as many pixels as the others have, to one: the last one of the spectrum may be a part."""
+    pixels = np.bincount(x.element, minlength=x.element_wavelength_nm.size)
+    return np.asarray(pixels >= np.median(pixels) - 1)
 
 
 def observation(title: str, table: QTable, path: str | Path | None = None) -> Any:
@@ -168,7 +193,7 @@ def observation(title: str, table: QTable, path: str | Path | None = None) -> An
             axis.set_ylabel("DN")
         axes[-1].set_xlabel("wavelength (nm)")
         axes[-1].set_xlim(200, 700)
-        figure.suptitle(f"{title}: one observation of {table.meta['exposure_s']:g} s; nominal throughput", fontsize=10)
+        headline(figure, f"{title}: one observation of {table.meta['exposure_s']:g} s; nominal throughput")
         return finished(figure, path)
 
 
@@ -185,9 +210,16 @@ def signal_to_noise(stars: Sequence[tuple[str, SnrResult | Expectation]], path: 
                 if isinstance(result, SnrResult)
                 else (result, None, None)
             )
+            whole = _whole(x)
             for axis, what, wavelength, expected, table in (
                 (row[0], "per pixel", x.wavelength_nm, x.snr(), pixel),
-                (row[1], "per 10.5 nm element", x.element_wavelength_nm, x.snr_per_element(), element),
+                (
+                    row[1],
+                    "per 10.5 nm element",
+                    x.element_wavelength_nm[whole],
+                    x.snr_per_element()[whole],
+                    None if element is None else element[whole],
+                ),
             ):
                 for low, high, alpha, text in (("q2.5", "q97.5", 0.25, "95 %"), ("q16", "q84", 0.45, "68 %")):
                     if table is not None:
@@ -197,9 +229,11 @@ def signal_to_noise(stars: Sequence[tuple[str, SnrResult | Expectation]], path: 
                         )  # fmt: skip
                 axis.plot(wavelength, expected, color="black", linewidth=0.9, label="closed form")
                 axis.set_ylabel(f"S/N {what}")
-                axis.set_title(title)
+                axis.set_title(title if f"{x.exposure_s:g} s" in title else f"{title}, {x.exposure_s:g} s")
                 axis.set_xlim(200, 700)
-        axes[0][0].legend()
+        handles, names = axes[0][0].get_legend_handles_labels()
+        legend_below(figure, handles, names)
+        headline(figure, "S/N of one exposure; nominal throughput, not a flight calibration")
         for axis in axes[-1]:
             axis.set_xlabel("wavelength (nm)")
         return finished(figure, path)

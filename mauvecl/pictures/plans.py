@@ -8,7 +8,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.pictures.style import COLOURS, NULL, STYLE, finished, pyplot
+from mauvecl.pictures.style import (
+    COLOURS,
+    COLUMN,
+    NULL,
+    STYLE,
+    UNBROKEN,
+    finished,
+    headline,
+    legend_below,
+    plain_numbers,
+    pyplot,
+)
 from mauvecl.statistics.registry import label
 from mauvecl.study.labels import titled
 from mauvecl.study.quantities import QUANTITIES
@@ -22,14 +33,19 @@ if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
 
 
+#: Contours from the lowest probability on.
+STROKES = (":", "--", "-", "-.")
+
+
 def detection_map(found: MapResult, path: str | Path | None) -> Any:
     """Detection probability over two quantities, one panel per statistic; the figure where no path is given."""
     plt = pyplot()
     question = found.study.map
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(
-            1, len(found.statistics), figsize=(3.6 * len(found.statistics) + 0.8, 3.4), squeeze=False, sharey=True
+            1, len(found.statistics), figsize=(COLUMN * len(found.statistics) + 0.5, 3.4), squeeze=False, sharey=True
         )
+        lines = {}
         x, y = (
             np.arange(len(values)) if isinstance(values[0], str) else np.array(values, float)
             for values in (found.x, found.y)
@@ -37,8 +53,12 @@ def detection_map(found: MapResult, path: str | Path | None) -> Any:
         for axis, statistic, probability in zip(axes[0], found.statistics, found.probability, strict=True):
             mesh = axis.pcolormesh(x, y, probability, cmap="cividis", vmin=0, vmax=1, shading="nearest")
             if min(probability.shape) > 1:
-                lines = axis.contour(x, y, probability, levels=sorted(question.contours), colors="white", linewidths=1)
-                axis.clabel(lines, fmt=lambda level: f"{100 * level:g} %", fontsize=7)
+                # Lines lie close where a map is steep: told apart by their strokes, and by no words among them.
+                levels = sorted(question.contours)
+                strokes = [STROKES[k % len(STROKES)] for k in range(len(levels))]
+                axis.contour(x, y, probability, levels=levels, colors="white", linewidths=2.4)
+                axis.contour(x, y, probability, levels=levels, colors="black", linewidths=1.2, linestyles=strokes)
+                lines = {f"{100 * level:g} %": stroke for level, stroke in zip(levels, strokes, strict=True)}
             for which, values, place in (("x", found.x, x), ("y", found.y, y)):
                 described = getattr(question, which)
                 if isinstance(values[0], str):
@@ -47,10 +67,19 @@ def detection_map(found: MapResult, path: str | Path | None) -> Any:
                     getattr(axis, f"set_{which}scale")("log")
             axis.set_xlabel(QUANTITIES[question.x.quantity].axis)
             axis.set_title(label(statistic))
+            plain_numbers(axis)
         axes[0][0].set_ylabel(QUANTITIES[question.y.quantity].axis)
         figure.colorbar(mesh, ax=list(axes[0]), label="detection probability")
-        figure.suptitle(
-            f"{found.star}, false-alarm probability {found.study.run.fap:g} per test; nominal throughput", fontsize=9
+        if lines:
+            shown = [plt.Line2D([], [], color="black", linewidth=1.2, linestyle=stroke) for stroke in lines.values()]
+            legend_below(figure, shown, [f"detected in {name}" for name in lines])
+        names = {question.x.quantity, question.y.quantity}
+        exposure = "" if "exposure" in names else f", {found.study.observation.exposure_s:g} s"
+        flare = "" if "amplitude" in names else f", flare of {100 * found.study.flare.amplitudes[0]:g} %"
+        headline(
+            figure,
+            f"{found.star}{exposure}{flare}, false-alarm probability {found.study.run.fap:g} per test; nominal "
+            "throughput",
         )
         return finished(figure, path)
 
@@ -60,7 +89,7 @@ def limits(found: LimitResult, path: str | Path | None) -> Any:
     plt = pyplot()
     of, power = found.study.limit.of, found.study.limit.power
     with plt.rc_context(STYLE):
-        figure, axis = plt.subplots(figsize=(6.4, 3.6))
+        figure, axis = plt.subplots(figsize=(COLUMN, 3.0 + 0.17 * len(found.limits)))
         for k, limit in enumerate(found.limits):
             colour, marker = COLOURS[k % len(COLOURS)], "osD^vPX"[k // len(COLOURS) % 7]
             points = sorted((*limit.points, limit.check), key=lambda p: p.value)
@@ -83,11 +112,14 @@ def limits(found: LimitResult, path: str | Path | None) -> Any:
         if of != "magnitude":
             axis.set_xscale("log")
         axis.set(xlabel=QUANTITIES[of].axis, ylabel="detection probability", ylim=(-0.02, 1.02))
-        axis.set_title(
-            f"Limits at a power of {power:g}, false-alarm probability {found.study.run.fap:g} per test\n"
-            "points: simulated, 95 %; lines: Gaussian noise; nominal throughput"
+        plain_numbers(axis)
+        exposure = "" if of == "exposure" else f", {found.study.observation.exposure_s:g}{UNBROKEN}s"
+        headline(
+            figure,
+            f"Limits at a power of {power:g}{exposure}, false-alarm probability {found.study.run.fap:g} per test; "
+            "points: simulated, 95 %; lines: Gaussian noise; nominal throughput",
         )
-        axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
+        legend_below(figure, *axis.get_legend_handles_labels())
         return finished(figure, path)
 
 
@@ -115,7 +147,7 @@ def noise_budget(observed: Sequence[tuple[str, Expectation]], *, each: int = 1, 
     stars = len(observed) // each
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(
-            stars, each, figsize=(3.4 * min(each, 6) + 0.6, 2.3 * stars + 0.5), squeeze=False, sharex=True, sharey="col"
+            stars, each, figsize=(COLUMN * min(each, 6), 2.3 * stars + 0.7), squeeze=False, sharex=True, sharey="col"
         )
         for k, (title, x) in enumerate(observed):
             axis, budget = axes[k % stars][k // stars], x.noise_budget()
@@ -132,8 +164,8 @@ def noise_budget(observed: Sequence[tuple[str, Expectation]], *, each: int = 1, 
         for axis in axes[-1]:
             axis.set_xlabel("wavelength (nm)")
         handles, names = axes[0][0].get_legend_handles_labels()
-        figure.legend(handles, names, loc="outside lower center", ncols=len(names))
-        figure.suptitle("Noise budgets; nominal throughput, not a flight calibration", fontsize=10)
+        legend_below(figure, handles, names)
+        headline(figure, "Noise budgets; nominal throughput, not a flight calibration")
         return finished(figure, path)
 
 
@@ -146,7 +178,9 @@ def snr_sweep(found: SnrAnswer, path: str | Path | None = None) -> Any:
     shown = found.stars[0].shown_nm
     tables = [star.result.element for star in found.stars]
     with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(1, len(shown), figsize=(3.0 * len(shown) + 0.4, 3.2), squeeze=False, sharey=True)
+        figure, axes = plt.subplots(
+            1, len(shown), figsize=(COLUMN if len(shown) == 1 else 2.6 * len(shown), 3.2), squeeze=False, sharey=True
+        )
         for axis, wavelength in zip(axes[0], shown, strict=True):
             lines: dict[str, list[tuple[Any, Any]]] = {}
             for star, table in zip(found.stars, tables, strict=True):
@@ -161,31 +195,36 @@ def snr_sweep(found: SnrAnswer, path: str | Path | None = None) -> Any:
                 axis.fill_between(x, low, high, color=colour, alpha=0.25, linewidth=0)
                 axis.plot(x, [row["expected"] for _, row in points], "o-", color=colour, ms=3, label=name)
             axis.set_yscale("log")
-            axis.set_ylim(bottom=0.1)
             if first == "exposure":
                 axis.set_xscale("log")
             axis.set_title(f"{wavelength:g} nm")
             axis.set_xlabel(QUANTITIES[first].axis)
+        # One scale for all of them, once all are drawn.
+        axes[0][0].set_ylim(bottom=0.1)
+        for axis in axes[0]:
+            plain_numbers(axis)
         axes[0][0].set_ylabel("S/N per 10.5 nm element")
         handles, names = axes[0][0].get_legend_handles_labels()
-        figure.legend(handles, names, loc="outside lower center", ncols=min(len(names), 4))
-        figure.suptitle("S/N: closed form, and 95 % of realisations; nominal throughput", fontsize=10)
+        legend_below(figure, handles, names)
+        headline(figure, "S/N: closed form, and 95 % of realisations; nominal throughput")
         return finished(figure, path)
 
 
 def gaussian(found: GaussianReport, path: str | Path | None) -> Any:
     """How far each promise of the usual formula holds in every cell; the figure where no path is given."""
+    from matplotlib.ticker import MaxNLocator
+
     plt = pyplot()
     cells = found.cells
     # Column, what it is, what is promised, and the least that an axis shows to either side of it.
     panels = (
-        ("snr_off_by", "mean S/N less formula", 0.0, 0.1),
-        ("coverage_low", "share of 1-sigma intervals right", 0.6827, 0.03),
-        ("five_sigma_above", "pixels 5 sigma above, over normal", 1.0, 0.5),
-        ("fap_ratio", "false alarms over promised", 1.0, 0.2),
+        ("snr_off_by", "mean S/N\nless formula", 0.0, 0.1),
+        ("coverage_low", "share of 1-sigma\nintervals right", 0.6827, 0.03),
+        ("five_sigma_above", "pixels 5 sigma above,\nover normal", 1.0, 0.5),
+        ("fap_ratio", "false alarms\nover promised", 1.0, 0.2),
     )
     with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(1, len(panels), figsize=(11.0, 0.28 * len(cells) + 1.4), sharey=True)
+        figure, axes = plt.subplots(1, len(panels), figsize=(2 * COLUMN, 0.22 * len(cells) + 1.5), sharey=True)
         rows = np.arange(len(cells))
         for axis, (column, text, promised, least) in zip(axes, panels, strict=True):
             if column == "coverage_low":
@@ -196,10 +235,11 @@ def gaussian(found: GaussianReport, path: str | Path | None) -> Any:
             low, high = axis.get_xlim()
             axis.set_xlim(min(low, promised - least), max(high, promised + least))
             axis.set_xlabel(text)
+            axis.xaxis.set_major_locator(MaxNLocator(3, prune="both"))
             axis.grid(axis="y", linewidth=0.3)
         axes[0].set_yticks(rows, [titled(s.label, s.at) for s in found.signal.stars])
         axes[0].invert_yaxis()
-        figure.suptitle("The root-of-N formula beside the simulation; grey: as promised", fontsize=10)
+        headline(figure, "The root-of-N formula beside the simulation; grey: as promised; nominal throughput")
         return finished(figure, path)
 
 
@@ -207,7 +247,7 @@ def exposures(found: ExposureResult, path: str | Path | None) -> Any:
     """S/N against exposure for each star, which grows with the root of it; the figure where no path is given."""
     plt = pyplot()
     with plt.rc_context(STYLE):
-        figure, axis = plt.subplots(figsize=(5.2, 3.4))
+        figure, axis = plt.subplots(figsize=(COLUMN, 2.9 + 0.17 * len(found.exposures)))
         for k, e in enumerate(found.exposures):
             colour = COLOURS[k % len(COLOURS)]
             x = np.geomspace(e.exposure_s / e.frames, 4 * e.exposure_s, 50)
@@ -216,6 +256,7 @@ def exposures(found: ExposureResult, path: str | Path | None) -> Any:
         first = found.exposures[0]
         axis.axhline(first.wanted, color=NULL, linestyle="--", linewidth=1)
         axis.set(xscale="log", yscale="log", xlabel="exposure (s)", ylabel=f"S/N per {first.per}")
-        axis.set_title(f"S/N at {first.wavelength_nm:g} nm; dashed: the one wanted; nominal throughput")
-        axis.legend()
+        plain_numbers(axis)
+        headline(figure, f"S/N at {first.wavelength_nm:g} nm; dashed: the one wanted; nominal throughput")
+        legend_below(figure, *axis.get_legend_handles_labels())
         return finished(figure, path)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +18,12 @@ COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7", "#0
 NULL = "#777777"
 #: Panels side by side.
 MOST_COLUMNS = 3
+#: Width of one column of a journal, inches.
+COLUMN = 3.5
+#: A space at which no line ends.
+UNBROKEN = "\N{NO-BREAK SPACE}"
+#: Share of a figure's width that titles and legends may take.
+INSIDE = 0.97
 
 STYLE = {
     "font.size": 9,
@@ -100,10 +107,64 @@ class TitledAxes:
     def __getattr__(self, name: str) -> Any:
         return getattr(self._ax.figure, name)
 
-    def suptitle(self, text: str, **_: Any) -> None:
+    @property
+    def bbox(self) -> Any:
+        """As wide as the axes."""
+        return self._ax.bbox
+
+    def suptitle(self, text: str, **_: Any) -> Any:
         """The axes' own title, where they have none."""
-        if not self._ax.get_title(loc="left"):
-            self._ax.set_title(text)
+        return None if self._ax.get_title(loc="left") else self._ax.set_title(text)
+
+    def legend(self, handles: Sequence[Any], names: Sequence[str], **_: Any) -> Any:
+        """A legend within the axes."""
+        return self._ax.legend(handles, names, loc="best")
+
+
+def headline(figure: Any, text: str, fontsize: float = 9.0) -> None:
+    """A title over all panels, broken into as many lines as the figure's width needs."""
+    title = figure.suptitle(text, fontsize=fontsize)
+    if title is None:
+        return
+    words, lines = text.split(" "), [""]
+    for word in words:
+        title.set_text(f"{lines[-1]} {word}".strip())
+        if lines[-1] and title.get_window_extent(_renderer(figure)).width > INSIDE * figure.bbox.width:
+            lines.append("")
+        lines[-1] = f"{lines[-1]} {word}".strip()
+    title.set_text("\n".join(lines))
+
+
+def legend_below(figure: Any, handles: Sequence[Any], names: Sequence[str]) -> None:
+    """A legend under all panels, in as many columns as fit."""
+    for columns in range(len(names), 0, -1):
+        legend = figure.legend(handles, names, loc="outside lower center", ncols=columns)
+        if columns == 1 or legend.get_window_extent(_renderer(figure)).width <= INSIDE * figure.bbox.width:
+            return
+        legend.remove()
+
+
+def plain_numbers(axis: Any) -> None:
+    """Logarithmic ticks as people write numbers: 0.1, 20, 500; in between only where there are few decades."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    for one in (axis.xaxis, axis.yaxis):
+        if one.get_scale() != "log":
+            continue
+        low, high = sorted(one.get_view_interval())
+        decades = float(np.log10(high / low))
+        one.set_major_locator(LogLocator(subs=(1.0,) if decades > 2 else (1.0, 2.0, 5.0)))
+        if decades < 4:
+            one.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+        one.set_minor_formatter(NullFormatter())
+
+
+def _renderer(figure: Any) -> Any:
+    """What measures text."""
+    from matplotlib.backends.backend_agg import RendererAgg
+
+    size = figure.bbox
+    return RendererAgg(size.width, size.height, figure.dpi)  # type: ignore[no-untyped-call]
 
 
 def finished(figure: Any, path: str | Path | None) -> Any:

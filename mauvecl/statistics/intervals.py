@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy import special
+import scipy
 
 CONFIDENCE = 0.95
 
@@ -29,8 +29,8 @@ def clopper_pearson(successes: int, trials: int, confidence: float = CONFIDENCE)
         Coverage, at least reached whatever the true fraction.
     """
     tail = (1.0 - confidence) / 2.0
-    low = 0.0 if successes == 0 else float(special.betaincinv(successes, trials - successes + 1, tail))
-    high = 1.0 if successes == trials else float(special.betainccinv(successes + 1, trials - successes, tail))
+    low = 0.0 if successes == 0 else float(scipy.special.betaincinv(successes, trials - successes + 1, tail))
+    high = 1.0 if successes == trials else float(scipy.special.betainccinv(successes + 1, trials - successes, tail))
     return Interval(successes / trials, low, high)
 
 
@@ -41,7 +41,7 @@ def central_counts(trials: int, probability: float, confidence: float = CONFIDEN
     """
     bounds = []
     for p in ((1.0 - confidence) / 2.0, (1.0 + confidence) / 2.0):
-        count = int(np.ceil(special.bdtrik(p, trials, probability)))
+        count = int(np.ceil(scipy.special.bdtrik(p, trials, probability)))
         # The inverse is continuous; the count below may do as well.
-        bounds.append(count - 1 if count > 0 and special.bdtr(count - 1, trials, probability) >= p else count)
+        bounds.append(count - 1 if count > 0 and scipy.special.bdtr(count - 1, trials, probability) >= p else count)
     return bounds[0], bounds[1]

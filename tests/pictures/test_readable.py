@@ -1,0 +1,119 @@
+"""Every picture at its own size: what is written lies inside the frame, and labels lie apart."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import matplotlib as mpl
+import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.text import Text
+
+from mauvecl.answers.answer import Answer
+from mauvecl.answers.detect import detect
+from mauvecl.answers.exposures import exposure_for
+from mauvecl.answers.gaussian import gaussian_report
+from mauvecl.answers.limits import limiting_magnitude
+from mauvecl.answers.maps import detection_map
+from mauvecl.answers.simulate import simulate
+from mauvecl.answers.snr import snr
+from mauvecl.device.engine import Engine
+from mauvecl.host.plotting import picture
+from mauvecl.pictures.style import COLUMN
+from mauvecl.study.study import Study
+
+FEW = ("run.realisations=2000", "run.fap=0.1")
+ONE = 'star=[{library="G2V", magnitude=7.4}]'
+BARE = 'star=[{library="G2V"}]'
+TWO = "flare.amplitudes=[0.05, 0.24]"
+ONLY = 'run.statistics=["matched"]'
+GRID = (
+    'map.x={quantity="magnitude", start=6, stop=10, steps=5}',
+    'map.y={quantity="amplitude", start=0.01, stop=1, steps=5, log=true}',
+)
+SWEEP = 'sweep.axes=[{quantity="exposure", values=[5, 50, 600]}, {quantity="magnitude", values=[4, 8]}]'
+#: Answers, and whether their first picture is one of a column's width.
+CASES: dict[str, tuple[Any, tuple[str, ...], bool]] = {
+    "detect, the paper's question": (detect, FEW, False),
+    "detect, one statistic": (detect, (*FEW, ONE, TWO, 'run.statistics=["chi2"]'), True),
+    "detect, every statistic": (detect, (*FEW, ONE, TWO, 'run.statistics=["all"]'), False),
+    "limit": (limiting_magnitude, (*FEW, BARE, TWO), True),
+    "limit of exposure": (limiting_magnitude, (*FEW, ONE, TWO, ONLY, 'limit.of="exposure"'), True),
+    "map": (detection_map, (*FEW, BARE, *GRID), False),
+    "map, one statistic": (detection_map, (*FEW, BARE, *GRID, ONLY), False),
+    "gaussian": (gaussian_report, (*FEW, BARE, SWEEP), False),
+    "snr": (snr, FEW, False),
+    "snr, swept": (snr, (*FEW, ONE, SWEEP), False),
+    "exposure": (lambda study, _: exposure_for(study), ("signal.snr=10", "signal.wavelength_nm=300"), True),
+    "simulate": (lambda study, _: simulate(study, realisation=0, flaring=False), (), False),
+}
+
+
+def drawn(answer: Answer) -> Iterator[tuple[str, Any, Any]]:
+    """Name, figure and renderer of each picture."""
+    with mpl.rc_context():
+        for name, (function, *given) in answer.pictures.items():
+            figure = picture(function, *given, None)
+            canvas = FigureCanvasAgg(figure)
+            canvas.draw()
+            yield name, figure, canvas.get_renderer()  # type: ignore[no-untyped-call]
+
+
+def shown_ticks(axis: Any) -> list[Text]:
+    """Labels of ticks that lie within the view."""
+    low, high = sorted(axis.get_view_interval())
+    margin = 1e-9 * (high - low)
+    ticks = [*axis.get_major_ticks(), *axis.get_minor_ticks()]
+    inside = [tick for tick in ticks if low - margin <= tick.get_loc() <= high + margin]
+    return [tick.label1 for tick in inside if tick.label1.get_visible() and tick.label1.get_text()]
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_everything_is_inside_and_apart(case: str, engine: Engine) -> None:
+    ask, settings, column = CASES[case]
+    answer = ask(Study().with_settings(list(settings)), engine)
+    exposures = {f"{x.exposure_s:g}" for x in answer.inputs}
+    for place, (name, figure, renderer) in enumerate(drawn(answer)):
+        width, height = figure.bbox.width, figure.bbox.height
+        beyond = [
+            label
+            for axis in figure.axes
+            for one in (axis.xaxis, axis.yaxis)
+            for label in one.get_ticklabels(which="both")
+        ]
+        ticks = [label for axis in figure.axes for one in (axis.xaxis, axis.yaxis) for label in shown_ticks(one)]
+        texts = [text for text in figure.findobj(Text) if text.get_visible() and text.get_text().strip()]
+        for text in texts:
+            if text in beyond and text not in ticks:
+                continue
+            x0, y0, x1, y1 = text.get_window_extent(renderer).extents
+            assert min(x0, y0, width - x1, height - y1) > -1, (name, text.get_text())
+        for legend in figure.legends:
+            box = legend.get_window_extent(renderer)
+            assert min(box.x0, width - box.x1) > -1, name
+            for axis in figure.axes:
+                assert not box.overlaps(axis.bbox), name
+        for axis in figure.axes:
+            for one, (low, high) in ((axis.xaxis, (0, 2)), (axis.yaxis, (1, 3))):
+                boxes = sorted(
+                    (label.get_window_extent(renderer).extents for label in shown_ticks(one)), key=lambda b: b[low]
+                )
+                for before, after in pairwise(boxes):
+                    assert before[high] <= after[low] + 0.5, (name, "ticks overlap")
+        if place == 0 and column:
+            assert figure.get_figwidth() <= COLUMN, name
+        words = " ".join(text.get_text() for text in texts).replace("\N{NO-BREAK SPACE}", " ")
+        if not case.startswith("limit of") and answer.pictures[name][0] != "plans.exposures":
+            assert any(f"{value} s" in words or "exposure (s)" in words for value in exposures), (name, words)
+
+
+def test_a_flare_that_is_detected_is_seen(engine: Engine) -> None:
+    """The 5 % flare, hidden in the noise of a pixel, rises to four sigma of an element beneath."""
+    answer = detect(Study().with_settings([*FEW, ONE, "flare.amplitudes=[0.05]", ONLY]), engine)
+    figure = picture(*answer.pictures["spectra"], None)
+    (line,) = [line for line in figure.axes[1].lines if len(line.get_ydata()) > 2]
+    assert 3.0 < max(line.get_ydata()) < 6.0
+    # The last element of the spectrum is a part of one, and is left out.
+    assert line.get_xdata()[-1] < answer.stars[0].found.quiet.element_wavelength_nm[-1]
