@@ -21,6 +21,7 @@ from mauvecl.runs.durable import write_whole
 if TYPE_CHECKING:
     from astropy.table import Table
 
+    from mauvecl.device.opened import Device
     from mauvecl.host.expectation import Expectation
     from mauvecl.runs.pool import Pool
     from mauvecl.study.study import Study
@@ -90,6 +91,7 @@ def write_record(
     folder: Path,
     *,
     pool: Pool | None,
+    opened: Device | None = None,
     seconds: float,
     messages: Sequence[str],
     files: Sequence[Path] | None = None,
@@ -104,7 +106,9 @@ def write_record(
         Their provenance holds the digests of the inputs.
     folder : Path
     pool : Pool, optional
-        Who drew.
+        Who drew,
+    opened : Device, optional
+        or on which device something was drawn without a pool.
     seconds : float
         Wall time.
     messages : sequence of str
@@ -126,15 +130,17 @@ def write_record(
         "python": platform.python_version(),
         "packages": _versions("numpy", "scipy", "astropy", "synphot", "pyopencl"),
     }
-    if pool is not None:
+    if pool is not None or opened is not None:
         # What the self-test found on these devices, if the user has run it.
         from mauvecl.device.selftest import last
 
-        record["devices"] = [asdict(device) for device in pool.devices]
-        record["kernels"] = pool.kernel_digest
-        record["shares"] = asdict(pool.standing)
+        devices = pool.devices if pool is not None else [opened.record] if opened is not None else []
+        record["devices"] = [asdict(device) for device in devices]
+        record["kernels"] = (pool or opened).kernel_digest  # type: ignore[union-attr]
+        if pool is not None:
+            record["shares"] = asdict(pool.standing)
         told = "not run on this device and version: mauvecl selftest"
-        record["selftest"] = [last(device) or told for device in pool.devices]
+        record["selftest"] = [last(device) or told for device in devices]
     stale: list[Path] = []
     if files is not None:
         record["files"] = {path.name: _digest(path) for path in files}

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from mauvecl.answers.answer import Answer
     from mauvecl.cli.console import Meter
+    from mauvecl.device.opened import Device
     from mauvecl.host.expectation import Expectation
     from mauvecl.runs.checkpoint import Checkpoint
     from mauvecl.runs.pool import Pool, Workers
@@ -51,6 +52,8 @@ class Session:
         Seconds after which finished shares are kept on the disk; as `Checkpoint` has it by default.
     insist : bool
         Begin what would never end, or not fit.
+    opened : Device, optional
+        On which something was drawn without a pool, for the record.
     """
 
     verb: str
@@ -67,6 +70,7 @@ class Session:
     insist: bool = False
     files: list[Path] = field(default_factory=list)
     started: float = field(default_factory=time.perf_counter)
+    opened: Device | None = None
     _pool: Pool | None = None
     _lost: list[str] = field(default_factory=list)
     _held: ExitStack = field(default_factory=ExitStack)
@@ -197,7 +201,7 @@ class Session:
             self.leave(lambda: write_study(study, self.folder))
         seconds = time.perf_counter() - self.started
         pool = self._pool
-        how: dict[str, Any] = {"pool": pool, "seconds": seconds, "messages": messages}
+        how: dict[str, Any] = {"pool": pool, "opened": self.opened, "seconds": seconds, "messages": messages}
         # Only a whole answer takes the place of another's.
         how["files"] = None if self._lost else self.files
         self.leave(lambda: write_record(self.verb, study, inputs, self.folder, **how))

@@ -29,7 +29,9 @@ def stare(
     from mauvecl.answers.stare import stare as compute
     from mauvecl.device.stares import Stares
 
-    found = compute(study, Stares(device))
+    stares = Stares(device)
+    session.opened = stares.opened
+    found = compute(study, stares)
     session.answer(found, lambda: _show(found))
 
 

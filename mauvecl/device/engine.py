@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.device import program
 from mauvecl.device.forms import ELEMENT_CHUNK, detection_launches, scene_launches
 from mauvecl.device.opened import Device
 from mauvecl.device.program import DeviceError, DeviceRecord, devices
@@ -109,7 +108,7 @@ class Engine:
     @property
     def kernel_digest(self) -> str:
         """Short sha256 of the kernels rendered so far, for run records."""
-        return program.digest("\n".join(self.opened.programs))
+        return self.opened.kernel_digest
 
     def realise(
         self,

@@ -61,6 +61,11 @@ class Device:
         """The sources built so far."""
         return sorted(self._programs)
 
+    @property
+    def kernel_digest(self) -> str:
+        """Short sha256 of the kernels rendered so far, for run records."""
+        return program.digest("\n".join(self.programs))
+
     def kernel(self, rooms: tuple[str, ...], variant: Variant, name: str) -> Any:
         """A kernel of the built program of some templates; both are made once."""
         source = program.render(rooms, variant)

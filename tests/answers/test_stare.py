@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import tomllib
 
 import numpy as np
@@ -82,6 +83,14 @@ def test_the_mean_is_the_star_and_its_flare(found):
         np.testing.assert_allclose(mean / quiet - 1, rise * (mean.max() / quiet - 1) / rise.max(), atol=1e-9)
 
 
+def test_bands_may_overlap_and_be_many(stares, found):
+    bands = [[200, 300], [200, 300], [250, 450], *([300 + 10 * k, 400 + 10 * k] for k in range(9))]
+    light = stare(SHORT.with_settings([f"stare.bands_nm={bands}"]), stares).stares[0].light
+    assert light.flux.shape == (50, 13)
+    np.testing.assert_array_equal(light.flux[:, 1], light.flux[:, 2])
+    np.testing.assert_allclose(light.flux[:, [1, 4]], found.stares[0].light.flux[:, [1, 2]], atol=0.01)
+
+
 def test_a_flares_snr_is_that_of_its_frames_and_pixels(found):
     one = found.stares[0]
     quiet, flare = one.staring.quiet, one.staring.flare[:, 0]
@@ -146,8 +155,6 @@ def test_the_search_finds_what_was_put_in_and_nothing_else(stares):
     ratio = found["energy_bolometric"] / put_in["energy_bolometric"]
     assert 0.9 < ratio[0] < 1.1
     assert answer.table["found"][0] == len(found)
-    quiet = stare(study.with_settings(["flare.amplitudes=[0]"]), stares)
-    assert len(quiet.found) == 0
 
 
 def test_a_stare_too_short_for_a_search_is_told(stares):
@@ -181,7 +188,9 @@ def test_the_verb_and_its_files(tmp_path):
     assert events["energy_bolometric"].to_value("erg")[0] == pytest.approx(1e33)
     assert Study.read(tmp_path / "out" / "study.toml") == Study.read(tmp_path / "out" / "events.ecsv")
     # The study gives the same stare again.
-    assert (tmp_path / "out" / "run.json").read_text().count("nominal") >= 1
+    record = json.loads((tmp_path / "out" / "run.json").read_text())
+    assert record["devices"][0]["name"]
+    assert record["kernels"]
     run("stare", tmp_path / "out" / "study.toml", "-o", "again", "--no-pictures", folder=tmp_path)
     ours, theirs = (QTable.read(tmp_path / where / "light-curve-1.ecsv") for where in ("out", "again"))
     np.testing.assert_array_equal(ours["flux"], theirs["flux"])
