@@ -216,9 +216,7 @@ def test_nothing_of_another_run_stays_beside_the_new(tmp_path: Path, capsys: pyt
     assert names(out) == {"exposure.ecsv", "study.toml", "run.json", "notes.txt", "observation-2.fits"}
 
 
-@pytest.mark.parametrize(
-    "record", ["", "[]", '{"files": 3}', '{"files": {"../mine": "x"}}', '{"files": {"a": 1}}']
-)
+@pytest.mark.parametrize("record", ["", "[]", '{"files": 3}', '{"files": {"../mine": "x"}}', '{"files": {"a": 1}}'])
 def test_a_record_of_another_program_removes_nothing(record: str, tmp_path: Path) -> None:
     out = tmp_path / "out"
     out.mkdir()
