@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import combinations_with_replacement
+from math import factorial
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -23,6 +25,8 @@ Float = NDArray[np.float64]
 
 #: Share of a curve below which it is the others' sum.
 LEAST_CURVE = 1e-6
+#: S/N over a window from which on what is neglected would raise false alarms.
+SEEN = 0.3
 #: Numbers of drawn stares that are held at once.
 NUMBERS = 2**24
 
@@ -77,13 +81,23 @@ class Survey:
     def curves(self) -> Float | None:
         """Curves of unknown amplitude, shape (n_curve, n_frame): of the stare's unknowns that are no straight line.
 
-        The dark is exponential in the temperature, so that products of two curves of it count as well.
+        The dark is exponential in the temperature, so that products of two and three curves of it count as well, where
+        their dark could be seen in a window.
         """
         if not self.bank.level.cycle:
             return None
         every = [unknown.curve for unknown in self.stare.unknowns]
-        warm = [unknown.curve for unknown in self.stare.unknowns if unknown.of == "temperature"]
-        every += [a * b for k, a in enumerate(warm) for b in warm[k:]]
+        warm = [unknown for unknown in self.stare.unknowns if unknown.of == "temperature"]
+        slope = self.components.quiet.conditions["dark_slope_per_c"]
+        frames = min(self.stare.n_frames, self.bank.level.window_s / self.stare.frame_s)
+        # S/N of a change of the dark by exp(1) over a window.
+        dark = float(np.linalg.norm(self.directions["temperature"], axis=1).max()) / slope * np.sqrt(frames)
+        for order in (2, 3):
+            for some in combinations_with_replacement(warm, order):
+                curve = np.prod([one.curve for one in some], axis=0)
+                amount = np.prod([slope * one.sd for one in some]) / factorial(order)
+                if dark * amount * np.std(curve) > SEEN:
+                    every.append(curve)
         # What is left of each beside a straight line and those before it.
         basis = np.linalg.qr(np.vander(self.stare.start_s / max(self.stare.duration_s, 1.0), 2))[0]
         found: list[Float] = []
