@@ -10,7 +10,7 @@ from mauvecl import Study
 
 
 def test_visible(tmp_path: Path) -> None:
-    words = ("visible", "--look-at", "eps Eri", "--look-at", "AU Mic", "--from", "2026-09-20", "--days", "3")
+    words = ("visible", "--look-at", "eps Eri", "--look-at", "AU Mic", "--start", "2026-09-20", "--days", "3")
     done = run(*words, "--sun", "60", "--moon", "none", folder=tmp_path)
     assert "eps Eri" in done.stdout
     folder = tmp_path / "mauvecl-visible"
