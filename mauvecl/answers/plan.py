@@ -42,7 +42,7 @@ class PlanAnswer(Answer):
     @property
     def false_alarms(self) -> np.ndarray:
         """Expected of each target, (n,)."""
-        return np.array([self.study.plan.false_alarms_per_day * one.hours / 24 for one in self.planned])
+        return np.array([self.study.search.rate * one.hours / 24 for one in self.planned])
 
     @property
     def table(self) -> QTable:
@@ -70,7 +70,7 @@ class PlanAnswer(Answer):
         table.meta |= {
             "start": self.seen.moments.iso(0.0),
             "days": self.seen.moments.days,
-            "false_alarms_per_day": self.study.plan.false_alarms_per_day,
+            "false_alarms_per_day": self.study.search.rate,
             "study": self.study.text(),
         }
         return described(table)
@@ -137,7 +137,7 @@ class PlanAnswer(Answer):
         """Everything that is assumed, with where it is from."""
         from astropy.table import Table
 
-        plan, law = self.study.plan, self.study.plan.law()
+        law = self.study.plan.law()
         orbit = self.study.orbit.orbit()
         rows = list(self.seen.visibility.limits.assumptions)
         rows += [
@@ -154,7 +154,7 @@ class PlanAnswer(Answer):
                 f"t_1/2 = {law.half_width_s:g} s (E / {law.at_erg:g} erg)^{law.exponent:g}, {law.scatter_dex:g} dex",
                 "assumption; exponent of Maehara et al. 2015",
             ),
-            ("shape of flares", plan.shape, "every flare alike, no bursts"),
+            ("shape of flares", self.study.search.shape, "every flare alike, no bursts"),
             (
                 "light of flares",
                 f"blackbody of {self.study.flare.temperature_k:g} K",
@@ -163,7 +163,7 @@ class PlanAnswer(Answer):
             ("noise of a stare", "white", "beside what the study says is unknown of a stare; see completeness"),
             (
                 "false alarms",
-                f"{plan.false_alarms_per_day:.3g} a day of exposure",
+                f"{self.study.search.false_alarms:g} per {self.study.search.per} of exposure",
                 "sets the threshold; of noise, not of cosmic rays that look like flares",
             ),
             (

@@ -115,9 +115,9 @@ def closed_form(study: Study, looked: Looked) -> Completeness:
         looked.signal_per_frame,
         looked.scale,
         window_s=looked.window_s,
-        false_alarms_per_day=study.plan.false_alarms_per_day,
+        false_alarms_per_day=study.search.rate,
         frame_s=looked.quiet.frame_s,
-        shape=study.plan.shape,
+        shape=study.search.shape,
         law=study.plan.law(),
     )
 

@@ -42,7 +42,7 @@ def injected(study: Study, looked: Looked) -> Completeness:
     how = (
         f"{question.injections.count} injections of each of {WIDTHS} half-widths into stretches of "
         f"{looked.window_s / 60:.0f} min, found above {star.threshold.value:.2f} sigma, "
-        f"{study.plan.false_alarms_per_day:.3g} false alarms a day"
+        f"{study.search.false_alarms:g} false alarms per {study.search.per}"
     )
     energy = 10 ** np.arange(24.0, 40.0, 1 / PER_DECADE)
     widths = np.array(star.found.half_widths_s)
@@ -57,9 +57,7 @@ def _question(study: Study, looked: Looked) -> Study:
     stare = study.stare.model_copy(
         update={"duration_s": ORBITS * orbit_s, "orbit_s": orbit_s, "orbit_gap_s": gap, "gaps": ()}
     )
-    search = study.search.model_copy(
-        update={"shape": study.plan.shape, "false_alarms": study.plan.false_alarms_per_day, "per": "day", "nulls": 0}
-    )
+    search = study.search.model_copy(update={"nulls": 0})
     injections = InjectionQuestion(
         of="energy", sizes=2, widths=WIDTHS, half_width_low_s=WIDTH_RANGE_S[0], half_width_high_s=WIDTH_RANGE_S[1],
         count=study.plan.injections, positions=min(POSITIONS, study.plan.injections), fitted=0,

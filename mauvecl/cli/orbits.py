@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mauvecl.cli.flags import FLARE, OBSERVATION, Option, takes_study
+from mauvecl.cli.injections import SEARCH
 
 if TYPE_CHECKING:
     from mauvecl.answers.plan import PlanAnswer
@@ -36,7 +37,7 @@ def _flag(kind: Any, *names: str, text: str) -> Any:
 
 #: Where from, when, and what must hold.
 ORBIT = {
-    "start": Option(_flag(str, "--from", text="First day or time, UTC [2027-01-01]."), "orbit", "start"),
+    "start": Option(_flag(str, "--start", text="First day or time, UTC [2027-01-01]."), "orbit", "start"),
     "days": Option(_flag(float, "--days", text="How long, days [365]."), "orbit", "days"),
     "step": Option(_flag(float, "--step", text="Seconds between the times looked at [60]."), "orbit", "step_s"),
     "tle": Option(
@@ -70,7 +71,7 @@ ORBIT = {
 }  # fmt: skip
 TARGETS = {
     "target": Option(
-        _flag(list[str], "--target", "-s", text="Name, or coordinates '290.0 -11.2'; may be repeated."),
+        _flag(list[str], "--look-at", text="Name, or coordinates '290.0 -11.2'; may be repeated."),
         "orbit", "targets",
     ),
 }  # fmt: skip
@@ -91,9 +92,7 @@ TABLE = {
 
 PLAN = {
     "hours": Option(_flag(float, "--hours", text="Of exposure for each target, at most [all]."), "plan", "hours"),
-    "false_alarms": Option(
-        _flag(float, "--false-alarms", text="Of noise, in a day of exposure [0.0333]."), "plan", "false_alarms_per_day"
-    ),
+    "false_alarms": SEARCH["false_alarms"],
     "completeness": Option(
         _flag(str, "--completeness", text="injections, or 'closed form' at once [injections]."), "plan", "completeness"
     ),
@@ -109,7 +108,7 @@ PLAN = {
 def visible(study: Study, session: Session) -> None:
     """When targets can be seen: windows, hours by day and month, the Sun's distance, zodiacal light, a calendar.
 
-    Example: mauvecl visible --target "eps Eri" --target "AU Mic" --from 2027-01-01 --days 365
+    Example: mauvecl visible --look-at "eps Eri" --look-at "AU Mic" --start 2027-01-01 --days 365
     """
     from mauvecl.answers.visible import visible as compute
 
@@ -147,7 +146,7 @@ def plan(study: Study, session: Session) -> None:
     The table has a column name, and what is known of each star: ra and dec, V, spectral_type, distance_pc, mass_msun
     and age_myr, or other rates of flares. Stars of the embedded list need their names only.
 
-    Example: mauvecl plan targets.csv --hours 200 --from 2027-01-01
+    Example: mauvecl plan targets.csv --hours 200 --start 2027-01-01
     """
     from mauvecl.answers.plan import plan as compute
     from mauvecl.pictures.style import available

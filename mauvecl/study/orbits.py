@@ -213,18 +213,15 @@ class PlanTarget(Part):
 
 
 class PlanQuestion(Part):
-    """A campaign: targets, how long each is observed at most, how the search is cut, how long flares last.
+    """A campaign: targets, how long each is observed at most, how long flares last; `search` says how they are found.
 
     Attributes
     ----------
     targets : tuple of PlanTarget
     hours : float, optional
         Of exposure for each target; all that it is seen unless given.
-    false_alarms_per_day : float
-        Of a day of exposure.
     half_width_s, at_erg, exponent, scatter_dex : float
         See `lightcurve.completeness.DurationLaw`.
-    shape : str
     completeness : {"injections", "closed form"}
         By flares put into drawn noise and searched for, or at once, for white noise.
     injections : int
@@ -235,12 +232,10 @@ class PlanQuestion(Part):
 
     targets: tuple[PlanTarget, ...] = ()
     hours: Annotated[float, Field(gt=0)] | None = None
-    false_alarms_per_day: Annotated[float, Field(gt=0, le=100)] = 1 / 30
     half_width_s: Annotated[float, Field(gt=0)] = 100.0
     at_erg: Annotated[float, Field(gt=0)] = 1e33
     exponent: Annotated[float, Field(ge=0, lt=1)] = 0.39
     scatter_dex: Annotated[float, Field(ge=0, le=2)] = 0.3
-    shape: str = "davenport2014"
     completeness: Literal["injections", "closed form"] = "injections"
     injections: Annotated[int, Field(ge=20, le=1_000_000)] = 100
     best_months: Annotated[int, Field(ge=1, le=12)] = 3
@@ -248,9 +243,6 @@ class PlanQuestion(Part):
 
     @model_validator(mode="after")
     def _some(self) -> Self:
-        from mauvecl.lightcurve.shapes import shape_of
-
-        shape_of(self.shape)
         names = [target.name for target in self.targets]
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
@@ -277,7 +269,7 @@ def targets_of(study: Study) -> list[Target]:
     o = study.orbit
     found = [Target.of(text, simbad=o.simbad) for text in o.targets] or [t.target(o.simbad) for t in study.plan.targets]
     if not found:
-        raise InputError("no targets, expected names or coordinates, such as --target 'eps Eri'")
+        raise InputError("no targets, expected names or coordinates, such as --look-at 'eps Eri'")
     names = [one.name for one in found]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:

@@ -54,7 +54,7 @@ def test_numbers_follow_from_each_other(found: PlanAnswer) -> None:
         assert np.interp(np.log10(table["E50"][k].value), np.log10(energy), share) == pytest.approx(0.5, abs=1e-6)
         assert np.interp(np.log10(table["E90"][k].value), np.log10(energy), share) == pytest.approx(0.9, abs=1e-6)
         assert table["low"][k] < table["expected"][k] < table["high"][k]
-    assert table["false_alarms"].tolist() == pytest.approx((table["hours"].value / 24 / 30).tolist())
+    assert table["false_alarms"].tolist() == pytest.approx((table["hours"].value / 24 / (365.25 / 12)).tolist())
     assert (table["hours"] <= table["seen"]).all()
     assert found.seen.table["hours"].value == pytest.approx(table["seen"].value)
 

@@ -1,0 +1,56 @@
+"""The verbs that look from the orbit, as they are typed."""
+
+import json
+from pathlib import Path
+
+import pytest
+from commands import run
+
+from mauvecl import Study
+
+
+def test_visible(tmp_path: Path) -> None:
+    words = ("visible", "--look-at", "eps Eri", "--look-at", "AU Mic", "--start", "2026-09-20", "--days", "3")
+    done = run(*words, "--sun", "60", "--moon", "none", folder=tmp_path)
+    assert "eps Eri" in done.stdout
+    folder = tmp_path / "mauvecl-visible"
+    names = {path.name for path in folder.iterdir()}
+    assert {"visible.ecsv", "windows.ecsv", "visible.ics", "visible.png", "assumptions.ecsv", "run.json"} <= names
+    study = Study.read(folder / "study.toml")
+    assert (study.orbit.limits.sun_deg, study.orbit.limits.moon_deg, study.orbit.days) == (60.0, "none", 3.0)
+    # What is not said stays as it is.
+    assert study.orbit.limits.earth_limb_deg == 25.0
+    rows = json.loads(run("visible", folder / "study.toml", "--json", folder=tmp_path).stdout)["rows"]
+    assert [row["target"] for row in rows] == ["eps Eri", "AU Mic"]
+
+
+def test_plan(tmp_path: Path) -> None:
+    (tmp_path / "targets.csv").write_text("name,mass_msun,age_myr\neps Eri,0.82,500\nkappa1 Cet,,\n")
+    words = ("--days", "20", "--hours", "50", "--completeness", "closed form", "--report", "html")
+    done = run("plan", "targets.csv", *words, folder=tmp_path)
+    assert "2 targets, 20 days" in done.stdout
+    folder = tmp_path / "mauvecl-plan"
+    assert {"plan.ecsv", "stars.ecsv", "energies.ecsv", "plan.html", "plan.png"} <= {p.name for p in folder.iterdir()}
+    again = run("plan", folder / "plan.ecsv", "--json", "--no-pictures", folder=tmp_path)
+    rows = json.loads(again.stdout)["rows"]
+    assert [row["hours"] for row in rows] == [50.0, 50.0]
+    assert rows[0]["expected"] > 0
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("visible",), "no targets, expected names or coordinates, such as --look-at 'eps Eri'"),
+        (("visible", "--look-at", "Vega", "--sun", "wide"), "'wide', expected a number, or none"),
+        (("visible", "--look-at", "Vega", "--declination", "3"), "--declination '3', expected low:high"),
+        (("visible", "--look-at", "Vega", "--tle", "none.tle"), "orbit file 'none.tle' does not exist"),
+        (("plan",), "the plan has no targets, expected some, such as --targets targets.csv"),
+        (("plan", "missing.csv"), "table of targets 'missing.csv' does not exist"),
+    ],
+)
+def test_faults_are_a_sentence(words: tuple[str, ...], told: str, tmp_path: Path) -> None:
+    done = run(*words, folder=tmp_path, code=2)
+    assert done.stderr.startswith("mauvecl: ")
+    assert told in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert done.stdout == ""
