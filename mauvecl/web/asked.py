@@ -58,11 +58,17 @@ def _detection(study: Study, pool: Pool) -> dict[str, Any]:
     return dict(zip(("detection", "snr"), detect_and_snr(study, pool), strict=True))
 
 
+def _visible(study: Study) -> dict[str, Any]:
+    """The answer with its tables, which are dear to make and looked at again and again."""
+    found = visible(study)
+    return {"visible": found, "seen": {name: getattr(found, name) for name in ("table", "months", "by_day")}}
+
+
 #: What may be simulated, by name: what is then found, by name.
 SIMULATED: dict[str, Callable[[Study, Pool], dict[str, Any]]] = {
     "detection": _detection,
     "limit": lambda study, pool: {"limit": limiting_magnitude(study, pool)},
     "map": lambda study, pool: {"map": map_around(study, pool)},
     "completeness": lambda study, pool: {"completeness": completeness(study)},
-    "visible": lambda study, pool: {"visible": visible(study)},
+    "visible": lambda study, pool: _visible(study),
 }

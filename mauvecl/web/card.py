@@ -49,7 +49,7 @@ def card(closed: Closed, found: Found) -> dict[str, Any]:
         "words": words,
         "facts": facts,
         "notes": notes,
-        "simulated": sorted(name for name in found if name not in ("snr", "draw")),
+        "simulated": sorted(name for name in found if name not in ("snr", "draw", "seen")),
     }
 
 

@@ -84,6 +84,9 @@ class Job:
         s = self.standing
         if s is None or self._started is None:
             return "waiting for its turn"
+        if not s.total:
+            # What is computed without a draw is not counted.
+            return f"{time.monotonic() - self._started:.0f} s"
         rate = s.done / max(time.monotonic() - self._started, 1e-9)
         left = f", {(s.total - s.done) / rate:.0f} s left" if rate and s.total > s.done else ""
         return (

@@ -709,7 +709,7 @@ def test_the_first_load_is_small_and_packed(served: Any) -> None:
     async def work(host: str) -> float:
         _, html = await got(f"http://{host}/")
         parts = re.findall(r'(?:src|href)="((?:assets|favicon)[^"]+)"', html)
-        parts += [f"assets/{name}.js" for name in ("live", "fields", "pictures", "compare")]
+        parts += [f"assets/{name}.js" for name in ("live", "fields", "pictures", "compare", "card")]
         parts += [f"figures/light/{name}.json" for name in ("excess", "distributions", "roc")]
         assert not [part for part in parts if "mathjax" in part]
         total = 0

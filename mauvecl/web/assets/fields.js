@@ -69,6 +69,10 @@ export class Fields {
     })
   }
 
+  label(name) {
+    return document.querySelector(`label[for="f-${name}"]`)?.textContent ?? name
+  }
+
   take(name, last) {
     const text = byId(`f-${name}`).value
     const other = text !== this.entered[name]

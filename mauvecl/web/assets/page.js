@@ -1,5 +1,6 @@
 // The page: what is entered goes to the server, and nothing is shown that is not the answer to it.
 
+import {Card} from "./card.js"
 import {Compare} from "./compare.js"
 import {Fields} from "./fields.js"
 import {Live} from "./live.js"
@@ -22,7 +23,7 @@ class Page {
     this.asking = this.dirty = false
     this.running = null
     this.wanted = []
-    this.dismissed = new Set()
+    this.card = new Card()
     this.fields = new Fields(words, (name, last, other) => {
       // Whoever enters something else does not wait for a file.
       if (other) delete this.lacks[name]
@@ -102,13 +103,25 @@ class Page {
   withdraw() {
     this.answer = null
     clearTimeout(this.soon)
-    byId("card").setAttribute("aria-busy", "true")
-    for (const part of this.dimmed()) part.classList.add("dim")
+    this.card.fade()
     this.offer()
   }
 
-  dimmed() {
-    return [byId("card").querySelector(".told"), byId("facts"), ...document.querySelectorAll(".pictures, .rows")]
+  // There is no answer to what is entered.
+  none(faults, refused) {
+    this.withdraw()
+    this.fields.tell(faults)
+    this.card.none(refused ?? Object.entries(faults).map(([name, why]) => `${this.fields.label(name)}: ${why}`).join("; "))
+  }
+
+  tell(answer) {
+    this.answer = answer
+    this.card.tell(answer)
+    this.seen.simulated = answer.simulated.join(",")
+    this.address(false)
+    document.title = `${answer.shown}: mauvecl`
+    this.offer()
+    this.next()
   }
 
   ask() {
@@ -143,59 +156,16 @@ class Page {
   show(told) {
     this.faults = told.faults
     this.fields.tell(told.faults)
-    this.notices([...(told.stray ? [[told.stray, "warning"]] : []), ...(told.answer?.notes ?? [])])
+    this.card.notices([...(told.stray ? [[told.stray, "warning"]] : []), ...(told.answer?.notes ?? [])])
     if (told.answer) this.tell(told.answer)
     else this.none(told.faults, told.refused)
   }
 
-  // There is no answer to what is entered; pictures of an earlier one are dimmed.
-  none(faults, refused) {
-    this.withdraw()
-    this.fields.tell(faults)
-    const why = refused ?? Object.entries(faults).map(([name, why]) => `${this.label(name)}: ${why}`).join("; ")
-    const card = byId("card")
-    card.classList.add("none")
-    card.setAttribute("aria-busy", "false")
-    card.querySelector(".told").classList.remove("dim")
-    byId("chance").textContent = "No answer."
-    byId("interval").textContent = ""
-    byId("words-of").textContent = why
-    this.ended("")
-  }
-
-  label(name) {
-    return document.querySelector(`label[for="f-${name}"]`)?.textContent ?? name
-  }
-
-  tell(answer) {
-    this.answer = answer
-    const card = byId("card")
-    card.classList.remove("none")
-    card.setAttribute("aria-busy", "false")
-    for (const part of [card.querySelector(".told"), byId("facts")]) part.classList.remove("dim")
-    byId("chance").textContent = answer.shown
-    byId("interval").textContent = answer.interval
-    byId("words-of").textContent = answer.words
-    const facts = byId("facts")
-    facts.replaceChildren(...answer.facts.flatMap(([name, value]) => {
-      const head = document.createElement("dt"), body = document.createElement("dd")
-      head.textContent = name
-      body.textContent = value
-      return [head, body]
-    }))
-    this.seen.simulated = answer.simulated.join(",")
-    this.address(false)
-    document.title = `${answer.shown}: mauvecl`
-    this.offer()
-    this.next()
-  }
-
   async draw(told) {
-    this.rows(told.tab, told.rows)
+    this.card.rows(told.tab, told.rows)
     await this.pictures.put(told.pictures)
     if (this.answer === null) return
-    // Other tabs may still hold an earlier answer's.
-    for (const part of document.querySelectorAll(`#panel-${told.tab} :is(.pictures, .rows)`)) part.classList.remove("dim")
+    this.card.fresh(told.tab)
     clearTimeout(this.soon)
     if (DRAWN.has(told.tab) && !told.draws) this.soon = setTimeout(() => this.drawOne(), DRAW_MS)
   }
@@ -206,60 +176,6 @@ class Page {
       this.live.done(n)
       if (question === this.question && told.tab === this.seen.tab) this.draw({...told, draws: true})
     })
-  }
-
-  rows(tab, rows) {
-    const box = document.querySelector(`#panel-${tab} .rows`)
-    if (!box) return
-    box.hidden = rows.length === 0
-    const table = document.createElement("table")
-    rows.forEach((cells, k) => {
-      const row = table.insertRow()
-      for (const text of cells) {
-        const cell = document.createElement(k ? "td" : "th")
-        if (!k) cell.scope = "col"
-        cell.textContent = text
-        row.append(cell)
-      }
-    })
-    box.replaceChildren(table)
-  }
-
-  // Sentences that can be put away; one that was stays away as long as it is the same.
-  notices(told) {
-    const box = byId("notices")
-    const shown = told.filter(([text]) => !this.dismissed.has(text))
-    const key = JSON.stringify(shown)
-    if (box.dataset.key === key) return
-    box.dataset.key = key
-    const item = ([text, kind]) => {
-      const made = document.createElement("li"), said = document.createElement("span"), away = document.createElement("button")
-      made.className = kind
-      said.textContent = text
-      away.textContent = "×"
-      away.type = "button"
-      away.className = "plain"
-      away.setAttribute("aria-label", `Put away: ${text.slice(0, 60)}`)
-      away.onclick = () => { this.dismissed.add(text); made.remove() }
-      made.append(said, away)
-      if (kind === "danger") made.setAttribute("role", "alert")
-      return made
-    }
-    const grave = shown.filter(([, kind]) => kind !== "info")
-    const others = shown.filter(([, kind]) => kind === "info")
-    const parts = grave.map(item)
-    if (others.length) {
-      const fold = document.createElement("details"), head = document.createElement("summary"), list = document.createElement("ul")
-      head.textContent = others.length === 1 ? "1 note on this answer" : `${others.length} notes on this answer`
-      list.append(...others.map(item))
-      fold.append(head, list)
-      fold.open = this.unfolded ?? false
-      fold.ontoggle = () => { this.unfolded = fold.open }
-      const whole = document.createElement("li")
-      whole.append(fold)
-      parts.push(whole)
-    }
-    box.replaceChildren(...parts)
   }
 
   // What can be asked for now.
@@ -286,19 +202,18 @@ class Page {
   simulate(kind) {
     if (this.running !== null || this.answer === null) return
     const question = this.question
-    byId("status").textContent = "waiting for its turn"
+    this.card.progress(0, "waiting for its turn")
     const n = this.running = this.live.ask("simulate", {kind, link: this.link}, told => {
       if (told.ended === undefined) {
-        byId("progress").value = told.progress
-        byId("status").textContent = told.told
+        this.card.progress(told.progress, told.told)
         return
       }
       this.live.done(n)
       this.running = null
-      this.ended(told.ended)
+      this.card.ended(told.ended)
       this.offer()
       if (question !== this.question) return
-      if (told.refused) this.notices([[told.refused, "danger"]])
+      if (told.refused) this.card.notices([[told.refused, "danger"]])
       else if (told.kind) this.simulated()
     })
     this.offer()
@@ -307,13 +222,8 @@ class Page {
   // The answer again, now with what was simulated.
   simulated() {
     this.history = true
-    byId("card").setAttribute("aria-busy", "true")
+    this.card.busy(true)
     this.ask()
-  }
-
-  ended(text) {
-    byId("status").textContent = text
-    byId("progress").value = 0
   }
 
   next() {
@@ -389,7 +299,7 @@ class Page {
     const n = this.live.ask("file", {link: this.link, tab, name, ending}, (told, content) => {
       this.live.done(n)
       this.offer()
-      if (told.refused) this.notices([[told.refused, "danger"]])
+      if (told.refused) this.card.notices([[told.refused, "danger"]])
       else this.give(told.file, content)
     })
   }
@@ -448,7 +358,7 @@ class Page {
     const unused = code === words.unused
     this.running = null
     this.withdraw()
-    this.ended("")
+    this.card.ended("")
     byId("lost-told").textContent = unused
       ? "This page was not used for a long time, and the server let it go."
       : "The connection to the server is lost. The page comes back by itself as soon as the server answers."
@@ -464,7 +374,7 @@ class Page {
     byId("cancel").onclick = () => { this.wanted = []; this.stop() }
     byId("pin").onclick = () => {
       this.compare.pin(this.scenario())
-      byId("status").textContent = "Pinned: see the tab Compare."
+      this.card.ended("Pinned: see the tab Compare.")
     }
     byId("afresh").onclick = () => this.enter({...words.fields})
     byId("preset").onchange = event => {

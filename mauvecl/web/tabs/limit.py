@@ -69,7 +69,7 @@ def _map(kept: _Kept) -> tuple[Float, Float, Float]:
 class Curve(Picture):
     """Detection probability against the star's magnitude."""
 
-    name, title = "limit", "How faint a star: detection probability of this flare"
+    name, title = "limit", "How faint a star: this flare is detected"
     sets = "magnitude=x"
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
@@ -115,7 +115,7 @@ class Curve(Picture):
 class Map(Picture):
     """Detection probability over magnitude and amplitude."""
 
-    name, title = "map", "How faint a star and how small a flare: detection probability"
+    name, title = "map", "How faint a star, how small a flare"
     sets = "magnitude=x,amplitude_percent=10^y"
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:

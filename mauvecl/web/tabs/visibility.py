@@ -35,7 +35,7 @@ class Hours(Picture):
             named = ", ".join(orbit.targets)
             text = f"When {named} is seen is not looked up yet." if named else "No target is named yet."
             return Drawn(f"{text} Name one under Advanced, Visibility, such as eps Eri, and press Find when.", sources)
-        table = found["visible"].by_day
+        table = found["seen"]["by_day"]
         hours = np.asarray(table["hours"].to_value("h"))
         day = np.arange(hours.size)
         sources = {
@@ -62,11 +62,11 @@ class Visibility(Tab):
     files = {"visible": "visible", "months": "visible", "days": "visible"}  # noqa: RUF012
 
     def table(self, name: str, closed: Closed, found: Found) -> Table:
-        return found["visible"].tables[name]
+        return found["seen"][{"visible": "table", "months": "months", "days": "by_day"}[name]]
 
     def rows(self, closed: Closed, found: Found) -> list[list[str]]:
         if "visible" not in found:
             return []
-        table = found["visible"].months
+        table = found["seen"]["months"]
         (target,) = (name for name in table.colnames if name != "month")
         return [["month", *map(str, table["month"])], ["hours", *(f"{h:.0f}" for h in table[target].to_value("h"))]]
