@@ -58,7 +58,7 @@ void comparison(SCENE, const uint first_low, const uint first_high,
     for (uint start = 0; start < padded; start += CHUNK) {
         __global const Pixel *pixel = pixels + start;
         intv counts[${scenarios}][${chunk}];
-        expose(SCENE_PASSED, &observation, start, 0u, scenario_count, counts, 0);
+        expose(SCENE_PASSED, &observation, start, 0u, scenario_count, counts, 0, 0u);
 % if noisy or single:
         /* The first quiescent exposure, and the sum of all; scenarios with one template share them. */
         floatv first[${chunk}], sum[${chunk}];
@@ -78,7 +78,7 @@ void comparison(SCENE, const uint first_low, const uint first_high,
                 for (uint number = 0; number < ${exposures}; number++) {
                     const Exposure other = another(SCENE_PASSED, observation, REFERENCE, number);
                     intv quiet[1][${chunk}];
-                    expose(SCENE_PASSED, &other, start, seen, seen + 1u, quiet, 0);
+                    expose(SCENE_PASSED, &other, start, seen, seen + 1u, quiet, 0, 0u);
                     for (uint i = 0; i < CHUNK; i++) sum[i] += TO_FLOAT(quiet[0][i]) + (floatv)edges[seen * padded + start + i].whole;
                     if (number == 0u)
                         for (uint i = 0; i < CHUNK; i++) first[i] = sum[i];

@@ -225,14 +225,12 @@ INLINE Exposure observed(SCENE_GIVEN, uintv realisation, uint realisation_high)
 }
 
 /* Draws an exposure of CHUNK pixels from `start` on: whole DN above the base of scenarios `first` to `end` - 1, summed
-   over its draws. Where `cut` is given, draws cut off below and above are counted. */
-INLINE void expose(SCENE_GIVEN, const Exposure *x, uint start, uint first, uint end, intv (*counts)[${chunk}], uintv (*cut)[2])
+   over its draws. Where `cut` is given, draws cut off below and above are added to it, pixels `apart` from each other. */
+INLINE void expose(SCENE_GIVEN, const Exposure *x, uint start, uint first, uint end, intv (*counts)[${chunk}], uintv (*cut)[2], uint apart)
 {
 % if frames:
     for (uint k = first; k < end; k++)
         for (uint i = 0; i < CHUNK; i++) counts[k - first][i] = 0;
-    if (cut)
-        for (uint i = 0; i < CHUNK; i++) cut[i][0] = cut[i][1] = 0u;
 % endif
     for (uint n = 0; n < ${"job->draw_count" if frames else "1u"}; n++) {
         const Shared shared = ${"shared_of(SCENE_PASSED, x, x->number * job->draw_count + n)" if frames else "x->only"};
@@ -246,8 +244,8 @@ INLINE void expose(SCENE_GIVEN, const Exposure *x, uint start, uint first, uint 
                 counts[k - first][i] ${sums} AS_INT(r) - AS_INT((floatv)MAGIC);
 % if clip:
                 if (cut) {
-                    cut[i][0] ${sums} AS_UINT(TO_INT(PASSED(r, v + MAGIC)));
-                    cut[i][1] ${sums} AS_UINT(TO_INT(PASSED(v + MAGIC, r)));
+                    cut[i * apart][0] += AS_UINT(TO_INT(PASSED(r, v + MAGIC)));
+                    cut[i * apart][1] += AS_UINT(TO_INT(PASSED(v + MAGIC, r)));
                 }
 % endif
             }

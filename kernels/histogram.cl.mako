@@ -37,7 +37,10 @@ void histogram(SCENE, const uint first_low, const uint first_high, const uint st
         for (uint start = element.first & ~3u; start < element.end; start += CHUNK) {
             intv n[1][${chunk}];
             uintv cut[${chunk}][2];
-            expose(SCENE_PASSED, &observation, start, 0u, 1u, n, cut);
+% if clip:
+            for (uint i = 0; i < CHUNK; i++) cut[i][0] = cut[i][1] = (uintv)0u;
+% endif
+            expose(SCENE_PASSED, &observation, start, 0u, 1u, n, cut, 1u);
             for (uint i = 0; i < CHUNK; i++) {
                 const uint p = start + i;
                 if (p < element.first || p >= element.end) continue;

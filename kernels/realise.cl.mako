@@ -12,14 +12,10 @@ void realise(SCENE, const uint first_low, const uint first_high, const uint star
     const uint item = get_global_id(0), pixel_count = job->pixel_count;
     const uintv realisation = (uintv)(first_low + item * ${width}u) + LANE_INDEX;
     const Exposure observation = observed(SCENE_PASSED, realisation, first_high);
-    uintv met = 0u;
+    uintv met[1][2] = {{(uintv)0u, (uintv)0u}};
     for (uint start = 0; start < pixel_count; start += CHUNK) {
         intv dn[1][${chunk}];
-        uintv cut[${chunk}][2];
-        expose(SCENE_PASSED, &observation, start, 0u, 1u, dn, cut);
-% if clip:
-        for (uint i = 0; i < CHUNK; i++) met += cut[i][0] + cut[i][1];
-% endif
+        expose(SCENE_PASSED, &observation, start, 0u, 1u, dn, met, 0u);
         /* From pixels of WIDTH realisations to realisations of CHUNK pixels. */
         const uint end = pixel_count - start < CHUNK ? pixel_count - start : CHUNK;
         ${row_type} block[${chunk}][${width}];
@@ -36,7 +32,7 @@ void realise(SCENE, const uint first_low, const uint first_high, const uint star
         }
     }
     uint met_lanes[${width}];
-    STORE(met, met_lanes);
+    STORE(met[0][0] + met[0][1], met_lanes);
     for (uint lane = 0; lane < ${width}u; lane++) {
         const uint row = item * ${width}u + lane;
         if (row >= start_row && row < stop_row) clipped[row - start_row] = met_lanes[lane];

@@ -36,7 +36,7 @@ void statistics(SCENE, const uint first_low, const uint first_high,
         __global const Pixel *pixel = pixels + start;
 % if frames:
         intv counts[${vectors}][${scenarios}][${chunk}];
-        for (uint v = 0; v < ${vectors}u; v++) expose(SCENE_PASSED, observation + v, start, 0u, scenario_count, counts[v], 0);
+        for (uint v = 0; v < ${vectors}u; v++) expose(SCENE_PASSED, observation + v, start, 0u, scenario_count, counts[v], 0, 0u);
 % else:
         Draws drawn[${vectors}];
         for (uint v = 0; v < ${vectors}u; v++) draw(SCENE_PASSED, &observation[v].only.at, 0u, start, drawn + v);

@@ -50,7 +50,7 @@ MUTATIONS = {
         "tests/device/test_marginal.py::test_false_alarms_and_power_with_the_unknown_drawn[0.1]",
     ),
     "a sky that follows no level": Mutation(
-        (("mauvecl/noise/scene.py", "factors.light * factors.sky * share / light", "0.0 * share / light"),),
+        (("mauvecl/noise/pixels.py", "factors.light * factors.sky * share / light", "0.0 * share / light"),),
         "tests/noise/test_processes.py::test_the_sky_follows_its_own_level[level0]",
     ),
     "unknowns marginalised without their prior": Mutation(
@@ -173,7 +173,7 @@ MUTATIONS = {
         "tests/kernels/test_joint_bound.py::test_the_worst_that_is_allowed",
     ),
     "rounding taken for noise everywhere": Mutation(
-        ((CUMULANTS, "return ~shows(found, n * frame)", "return frame > 0"),),
+        ((CUMULANTS, "return ~shows(loss, n * frame)", "return frame > 0"),),
         "tests/noise/test_stacks.py::test_random_stacks_of_quiet_frames",
     ),
     "fifth cumulants of varying dark forgotten": Mutation(
@@ -268,12 +268,20 @@ MUTATIONS = {
         (("mauvecl/noise/layout.py", "REFERENCE = 64", "REFERENCE = 0"),),
         "tests/results/test_detection.py::test_the_null_is_its_closed_form",
     ),
+    "closed forms that follow a temperature by their means alone": Mutation(
+        (("mauvecl/statistics/statistic.py", "true + more, flare", "true, flare"),),
+        "tests/device/test_marginal.py::test_closed_forms_integrate_over_what_is_drawn[half a degree]",
+    ),
+    "moved scores that count like others": Mutation(
+        (("mauvecl/results/tails.py", "np.log(2.0) - np.logaddexp(0.0, ratio)", "np.zeros(BLOCK)"),),
+        "tests/results/test_tails.py::test_brute_force_agrees_with_what_is_unknown[half a degree]",
+    ),
     "shifts forgotten in the closed form's phase": Mutation(
         (
             (
                 "mauvecl/statistics/distributions.py",
-                "phase = 0.5 * np.arctan(turn).sum(axis=1) + (u[:, None] * pull / spread).sum(axis=1)",
-                "phase = 0.5 * np.arctan(turn).sum(axis=1) + 0.0 * u",
+                "phase = 0.5 * np.arctan(turn) @ count + (u[:, None] / spread) @ pull",
+                "phase = 0.5 * np.arctan(turn) @ count + 0.0 * u",
             ),
         ),
         "tests/statistics/test_statistics.py::test_equal_weights_are_a_scaled_non_central_chi_squared",
