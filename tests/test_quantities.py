@@ -42,7 +42,7 @@ UNITS = {
 }
 NAMES = re.compile(
     r"wavelength|_nm$|temperature|_k$|_c$|magnitude$|^ebv$|brightness|exposure|_s$|seconds|duration|realisations|^count$"
-    r"|^start$|seed|frames|pixels|^bins$|realisation|_arcsec2?$|stares$|_pc$|_rsun$|_erg$"
+    r"|^start$|seed|frames|pixels|^bins$|realisation|_arcsec2?$|_pc$|_rsun$|_erg$"
 )
 #: Made by other public functions, which have cases: arrays and numbers are already in the units of their names.
 MADE = ("Expectation", "Source", "Detection", "Sky", "Instrument", "Stare", "TableShape", "EnergyScale")
@@ -58,7 +58,6 @@ REASONS = {
     "TableShape.mean_over.t_half_s": "frames' own arrays",
     "Stares.frames.seed": "as Engine's, on stares that take seconds: tests/device",
     "Stares.frames.count": "as Engine's, on stares that take seconds: tests/device",
-    "stare.stares": "who draws",
     "Engine.statistic_values.seed": "one request with Engine.detect",
     "Engine.statistic_values.start": "one request with Engine.detect",
     "Engine.realise_and_count.seed": "what Engine.realise calls",
