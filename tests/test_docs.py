@@ -134,3 +134,9 @@ def test_notebooks_are_kept_without_their_output() -> None:
     for page in (ROOT / "docs" / "notebooks").glob("*.ipynb"):
         cells = json.loads(page.read_text(encoding="utf-8"))["cells"]
         assert all(not cell.get("outputs") for cell in cells), page.name
+
+
+def test_links_have_words() -> None:
+    """A link without text is filled in when the documentation is built, and is nothing at all in the repository."""
+    empty = re.compile(r"\[\]\([^)]*\)")
+    assert not [str(page) for page in all_pages() if empty.search(page.read_text(encoding="utf-8"))]

@@ -28,6 +28,8 @@ def find_instrument(name: str | Path, folder: Path) -> Path:
     path = folder / name
     if is_file(path):
         return path
+    if path.is_dir():
+        raise InputError(f"instrument {shortened(str(path))} is a folder, expected a name or a TOML file")
     if path.suffix == ".toml":
         raise InputError(f"instrument file {shortened(str(path))} does not exist, expected a TOML file")
     near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.0)[0]

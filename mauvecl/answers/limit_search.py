@@ -139,7 +139,7 @@ class LimitSearch:
         return tuple((v, self.theory(v)) for v in values)
 
     def root(self, near: float | None = None) -> float:
-        """Where the closed form crosses the power, seen from where the flare is hardest to see; or near a value."""
+        """Where the closed form first reaches the power, from faint to bright, small to large; or near a value."""
         from scipy.optimize import brentq
 
         if near is not None and self.of != "exposure":

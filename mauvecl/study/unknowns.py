@@ -1,7 +1,7 @@
 """What is unknown of the instrument, and the same with a flare and without: drawn from priors, and averaged over.
 
-An observer's template and threshold come from the instrument as it is; only the one who writes a proposal does not know
-it. So each draw of the unknown values has its own template and threshold, and a detection probability is the average.
+An observer measures the instrument, and takes template and threshold from it; while a proposal is written it is unknown.
+So each draw of the unknown values has its own template and threshold, and a detection probability is the average.
 """
 
 from __future__ import annotations
