@@ -17,7 +17,7 @@ from mauvecl.lightcurve.null import sampled
 from mauvecl.lightcurve.observed import Draw, Light, Staring, seen
 from mauvecl.study.labels import described, label, stacked, titled, told
 from mauvecl.study.searches import surveyed
-from mauvecl.study.stares import energy_of, staring_of
+from mauvecl.study.stares import check_sweep, energy_of, stare_of, staring_of
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 #: Light curves in text, at most; longer ones are in their FITS files alone.
 MOST_ROWS = 100_000
+#: Frames whose spectra are kept, at most: 115 days, 1.2 GB.
+MOST_SHOWN = 2_000_000
 #: Star-days of a stare that the threshold's importance sampling looks at, at most.
 SAMPLED_DAYS = 2.0
 
@@ -289,6 +291,11 @@ def stare(study: Study, stares: Stares) -> StareAnswer:
     InputError
         For anything in the study that cannot be.
     """
+    check_sweep(study)
+    # What is swept changes no frame.
+    frames = stare_of(study).n_frames
+    if frames > MOST_SHOWN:
+        raise InputError(f"a stare of {frames} frames, each with a spectrum, expected at most {MOST_SHOWN}")
     # Everything is looked at before anything is drawn: bad input shows at once.
     prepared = [(star, at, cell, *staring_of(cell, star)) for at, cell in study.cells() for star in cell.star]
     found = [_drawn(study, stares, *one) for one in prepared]

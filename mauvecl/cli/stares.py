@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mauvecl.cli.flags import DRAWS, FLARE, SIZE, STARE, SWEEP, DeviceFlag, takes_study
 
@@ -16,6 +16,7 @@ if TYPE_CHECKING:
 def stare(
     study: Study,
     session: Session,
+    given: dict[str, Any],
     device: DeviceFlag = None,
 ) -> None:
     """One simulated stare: light curves in bands, a spectrum of every frame, and the flares in it.
@@ -28,6 +29,10 @@ def stare(
     """
     from mauvecl.answers.stare import stare as compute
     from mauvecl.device.stares import Stares
+    from mauvecl.host.errors import InputError
+
+    if given["energy"] and (given["amplitude"] or given["flares"]):
+        raise InputError("--energy is given beside --amplitude or --flares, expected one of them")
 
     stares = Stares(device)
     session.opened = stares.opened

@@ -317,6 +317,31 @@ def _event(study: Study, star: Star, source: Source, text: EventText) -> Event:
     return Event(text.peak_s, half, amplitude, temperature, shape)
 
 
+def check_sweep(study: Study) -> None:
+    """See that what a study sweeps over changes its stares.
+
+    Raises
+    ------
+    InputError
+        For a quantity that does not.
+    """
+    sizes = ("amplitude", "peak", "equivalent_duration_s", "energy_erg")
+    events = study.events
+    fixed = {
+        "exposure": True,
+        "amplitude": bool(study.stare.energies_erg)
+        if not events
+        else all(any(getattr(event, size) is not None for size in sizes) for event in events),
+        "flare_temperature": bool(events) and all(event.temperature_k is not None for event in events),
+    }
+    for axis in study.sweep.axes:
+        if fixed.get(axis.quantity):
+            raise InputError(
+                f"a sweep over {axis.quantity.replace('_', ' ')} changes no flare of this stare, expected a quantity "
+                "that its [stare] and events leave open"
+            )
+
+
 def find_curves(data: dict[str, Any], folder: Path) -> None:
     """Put the folder of a study before the names of its curves' and shapes' files."""
     stare, events = data.get("stare"), data.get("events")

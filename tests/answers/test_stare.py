@@ -282,6 +282,14 @@ def test_unknowns_of_a_stare_are_drawn_where_asked_for():
             ["--set", "events=[{peak_s=1, peak=1, amplitude=1}]"],
             "an event has amplitude and peak, expected one of them",
         ),
+        (["--energy", "1e33", "--amplitude", "0.1"], "--energy is given beside --amplitude or --flares"),
+        (["--duration", "2e7"], "a stare of 4000000 frames, each with a spectrum, expected at most 2000000"),
+        (["--duration", "1e12"], "has 2e+11 frames, expected at most 134217728"),
+        (["--sweep", "exposure=5,50"], "a sweep over exposure changes no flare of this stare"),
+        (
+            ["--sweep", "flare_temperature=6000,9000", "--set", "events=[{peak_s=1, temperature_k=9000}]"],
+            "a sweep over flare temperature changes no flare",
+        ),
         (["--set", "stare.orbit_gap_s=6000"], "stare.orbit_gap_s = 6000 of an orbit of 5678.09 s"),
     ],
 )
