@@ -344,6 +344,8 @@ def tiles(engine: Engine) -> Check:
 
 def run(engine: Engine, told: Callable[[Check], None] = lambda check: None) -> list[Check]:
     """All checks; `told` hears of each as it ends."""
+    from mauvecl.device.selftest_stares import stares
+
     found: list[Check] = []
 
     def note(check: Check) -> None:
@@ -351,7 +353,7 @@ def run(engine: Engine, told: Callable[[Check], None] = lambda check: None) -> l
         told(check)
 
     note(known_answers(engine))
-    for group in (twins, chance, closed_forms):
+    for group in (twins, stares, chance, closed_forms):
         for check in group(engine):
             note(check)
     note(tiles(engine))

@@ -1,0 +1,50 @@
+"""The self-test's checks of stares: both ways of drawing them against the NumPy twin."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from mauvecl.device.engine import Engine
+from mauvecl.device.program import SAME_BITS
+from mauvecl.device.selftest import COUNT, SEED, START, Check, toy
+from mauvecl.device.stares import Stares
+from mauvecl.lightcurve import twin
+from mauvecl.lightcurve.components import Components
+from mauvecl.lightcurve.scene import Flares, StareScene
+from mauvecl.lightcurve.stare import Stare
+from mauvecl.noise.processes import CosmicRays
+
+#: Small stares that run every branch: the payload, what wobbles, how many sums.
+CASES: dict[str, tuple[dict[str, Any], dict[str, Any], int]] = {
+    "stares that wobble": (
+        {"pixels": 8, "unit": "electrons"},
+        {"jitters": {"light": 0.02, "sky": 0.02, "temperature": 0.1}, "offsets": {"star": 0.02, "temperature": 0.2}},
+        3,
+    ),
+    "skewed stares": ({"pixels": 4, "dark": 120.0, "photon_noise": "poisson"}, {}, 1),
+}
+
+
+def stares(engine: Engine) -> Iterator[Check]:
+    """Every frame of a few stares with flares."""
+    index = np.arange(START, START + COUNT, dtype=np.uint64)
+    for name, (payload, wobble, n_sums) in CASES.items():
+        quiet, flare = toy(frames=1, **payload), toy(frames=1, flare=1.0, **payload)
+        components = Components.of(quiet, [flare], np.vander(np.linspace(0.1, 1.0, payload["pixels"]), n_sums).T)
+        stare = Stare.of(100.0, gaps=[(10.0, 40.0)], **wobble)
+        given = np.linspace(0.0, 2.0, COUNT * stare.n_frames).reshape(COUNT, stare.n_frames, 1)
+        flares, frames = Flares.of(components, stare, given, None, COUNT), range(stare.n_frames)
+        for method, slow in (("pixels", twin.pixels), ("cumulants", twin.sums)):
+            rays = CosmicRays(rate_per_cm2_s=300.0) if method == "pixels" else None
+            how: dict[str, Any] = {"seed": SEED, "method": method, "cosmic_rays": rays}
+            ours = Stares(engine.opened).frames(components, stare, given, first=START, count=COUNT, **how)
+            theirs = slow(StareScene.of(components, stare, rays), flares, index, frames, SEED)[0]
+            apart = float(np.max(np.abs(ours - theirs).max(axis=(0, 1)) / theirs.std(axis=(0, 1))))
+            if engine.device.promise == SAME_BITS:
+                passed, text = bool((ours == theirs).all()), f"{ours.size} sums, {apart:.2g} sigma apart"
+            else:
+                passed, text = apart < 0.2, f"weaker promise: {apart:.2g} sigma apart"
+            yield Check(f"same bits as the NumPy twin: {name}, by {method}", passed, text)
