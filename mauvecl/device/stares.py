@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import lru_cache
 from typing import Any, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.device.launches import Launches, beyond
 from mauvecl.device.opened import Device
-from mauvecl.device.tiles import TILE_BYTES, Progress, Tile, Tiles
+from mauvecl.device.stare_launches import StareLaunches
+from mauvecl.device.tiles import Progress, Tile, Tiles
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.components import Components
 from mauvecl.lightcurve.requests import Arrays, Kept, Method, StaresRequest, joined
 from mauvecl.lightcurve.scene import Flares, StareScene, padded_frames
 from mauvecl.lightcurve.stare import Stare
-from mauvecl.lightcurve.sums import SumTable, check_sums
+from mauvecl.lightcurve.sums import check_sums
 from mauvecl.noise.processes import CosmicRays
 from mauvecl.results.requests import Share
 
 Floats = NDArray[np.float32]
 
-#: Frames that one work-item follows where sums are drawn.
-FRAMES_EACH = 1024
 #: Of stares that are drawn and reduced at once.
 REDUCED_BYTES = 4 * 2**20
 
@@ -203,152 +200,8 @@ class Stares:
         return StareLaunches(self.opened, scene, seed, method)
 
 
-class StareLaunches(Launches):
-    """One stare on a device, its buffers released at the end of the `with` block."""
-
-    def __init__(self, device: Device, stare: StareScene, seed: int, method: Method) -> None:
-        self._in_time = method == "cumulants"
-        table = _table_of(stare.components) if self._in_time else None
-        scene = stare.scene
-        variant = replace(
-            device.variant,
-            clip=scene.clip,
-            cosmic=scene.cosmic,
-            sums=stare.components.n_statistics,
-            spectra=stare.components.n_flares,
-            unknown_groups=-(-len(stare.kinds) // 4),
-            counts=stare.counts,
-            fourths=table is not None and table.fourths,
-            jittered=any(stare.stare.jitters.values()),
-            in_time=self._in_time,
-        )
-        super().__init__(device, scene, variant, seed)
-        self._held: Any = None
-        self._stare, self._local = stare, (1, 1) if variant.width > 1 else None
-        self._known = [*map(self.upload, (stare.numbers, stare.known, stare.curves, stare.kinds))]
-        if table is None:
-            more = (beyond(stare.mixtures), stare.spectra, stare.weights, stare.constants)
-            self._own = [*map(self.upload, more)]
-        else:
-            self._own = [self.upload(table.packed)]
-
-    def __exit__(self, *_: object) -> None:
-        super().__exit__()
-        if self._held is not None:
-            self._held.release()
-
-    def give(self, flares: Flares) -> None:
-        """Upload the flares of the stares that are drawn next."""
-        self._scenarios = len(flares.amplitudes)
-        self._flares = [
-            self._fill("staring", self._stare.staring_of(flares)),
-            *self._known,
-            self._shared(flares.rows) if self._device.record.kind == "cpu" else self._fill("flares", flares.rows),
-            self._fill("amplitudes", flares.amplitudes),
-        ]
-
-    def _shared(self, array: NDArray[Any]) -> Any:
-        """A processor's own memory, in use until the next flares are given."""
-        if self._held is not None:
-            self._held.release()
-        flags = self._cl.mem_flags
-        self._given = np.ascontiguousarray(array if array.size else np.zeros(1, array.dtype))
-        self._held = self._cl.Buffer(self._device.context, flags.READ_ONLY | flags.USE_HOST_PTR, hostbuf=self._given)
-        return self._held
-
-    def _fill(self, name: str, array: NDArray[Any]) -> Any:
-        data = np.ascontiguousarray(array if array.size else np.zeros(1, array.dtype))
-        buffer = self._room(name, data.nbytes)
-        self._cl.enqueue_copy(self._queue, buffer, data)
-        return buffer
-
-    def draw(self, tile: Tile, out: Floats, row: int) -> None:
-        """Statistics of a tile's frames into rows of `out`.
-
-        Parameters
-        ----------
-        tile : Tile
-        out : ndarray of float32, shape (n_scenario, n_stare, n_statistic, n_padded_frame)
-        row : int
-            Where the tile's first stare goes.
-        """
-        if self._in_time:
-            self._by_cumulants(tile, out, row)
-        else:
-            self._by_pixels(tile, out[:, row : row + tile.wanted])
-
-    def _by_pixels(self, tile: Tile, out: Floats) -> None:
-        """A few frames of all stares at a time."""
-        tile = tile.narrow(self.variant.width)
-        n_frames, each = self._stare.stare.n_frames, self._scenarios * self.variant.sums * tile.size
-        block = max(1, TILE_BYTES // (4 * each))
-        # As much room as the scenarios need: powers of two, so that few programs are built.
-        variant = replace(self.variant, scenarios=1 << (self._scenarios - 1).bit_length())
-        kernel = self._device.kernel(("stare", "stare_pixels"), variant, "stare_pixels")
-        for begin in range(0, n_frames, block):
-            size = min(block, n_frames - begin)
-            values = self._room("values", 4 * each * size)
-            kernel(
-                self._queue,
-                (tile.size // self.variant.width, size),
-                self._local,
-                *self._arguments,
-                *self._flares,
-                *tile.address(),
-                *tile.rows(),
-                np.uint32(begin),
-                *self._own,
-                np.uint32(tile.size),
-                values,
-            )
-            host = np.empty((size, self._scenarios, self.variant.sums, tile.size), np.float32)
-            self._cl.enqueue_copy(self._queue, host, values)
-            out[..., begin : begin + size] = host[..., tile.start : tile.stop].transpose(1, 3, 2, 0)
-
-    def _by_cumulants(self, tile: Tile, out: Floats, row: int) -> None:
-        """All frames of each stare; a processor's own memory needs no copy."""
-        flags, first = self._cl.mem_flags, tile.first + tile.start
-        kernel = self._device.kernel(("stare", "stare_sums"), self.variant, "stare_sums")
-        shared = self._device.record.kind == "cpu"
-        if shared:
-            values = self._cl.Buffer(self._device.context, flags.WRITE_ONLY | flags.USE_HOST_PTR, hostbuf=out)
-            place = (out.shape[1], row)
-        else:
-            values = self._room("values", out[:, : tile.wanted].nbytes)
-            place = (tile.wanted, 0)
-        each = FRAMES_EACH if self.variant.width > 1 else 1
-        try:
-            kernel(
-                self._queue,
-                (tile.wanted, -(-out.shape[3] // each)),
-                self._local,
-                self._arguments[0],
-                *self._flares,
-                np.uint32(first & 0xFFFFFFFF),
-                np.uint32(first >> 32),
-                np.uint32(each),
-                *self._own,
-                *map(np.uint32, place),
-                values,
-            )
-            if shared:
-                mapped, _ = self._cl.enqueue_map_buffer(
-                    self._queue, values, self._cl.map_flags.READ, 0, out.shape, out.dtype
-                )
-                mapped.base.release(self._queue)
-                self._queue.finish()
-            else:
-                host = np.empty((self._scenarios, tile.wanted, *out.shape[2:]), np.float32)
-                self._cl.enqueue_copy(self._queue, host, values)
-                out[:, row : row + tile.wanted] = host
-        finally:
-            if shared:
-                values.release()
-
-
 #: Callers ask for a few stares at a time, of the same star.
 _laid_out = lru_cache(maxsize=4)(StareScene.of)
-_table_of = lru_cache(maxsize=4)(SumTable.of)
 
 
 def _check(first: int, count: int, seed: int, method: str) -> None:
