@@ -110,14 +110,18 @@ def all_filters(one):
 
 @pytest.mark.long
 def test_completeness_of_five_cells(injected):
-    """Against NumPy alone. Fails by chance once in 10^4 runs: 4 standard errors of two binomials, five times."""
+    """Against NumPy alone, cell by cell and all together. Six times 4 standard errors: fails once in 10^3 runs.
+
+    All together notice flares that come out a sixth too bright.
+    """
     one, _, injections = injected
     rng = np.random.default_rng(9)
-    n = 60
+    n = 100
     places = [injections.places(p) for p in range(60)]
     critical = np.concatenate([injections.critical(x, p, 0, 40) for p, x in enumerate(places)], axis=1)
     filters = all_filters(one)
     scale = np.sqrt(one.variance.mean())
+    off, spread = [], []
     for half_width, amplitude in CELLS:
         peaks = rng.choice(STARE.start_s, n) + 5 * rng.random(n)
         sums = pixel_injection(one, half_width, amplitude, peaks, rng)
@@ -131,8 +135,11 @@ def test_completeness_of_five_cells(injected):
         ours = np.mean(critical[injections.half_widths_s.index(half_width)] <= amplitude)
         theirs = np.mean(np.where(counts, values, -np.inf).max(axis=(1, 2)) >= injections.threshold)
         assert 0.02 < ours < 0.98
-        spread = np.sqrt(ours * (1 - ours) * (1 / n + 1 / 60))
-        assert abs(ours - theirs) < 4 * spread, (half_width, amplitude, ours, theirs)
+        each = np.mean(critical[injections.half_widths_s.index(half_width)].reshape(60, 40) <= amplitude, axis=1)
+        off.append(ours - theirs)
+        spread.append(np.hypot(np.sqrt(ours * (1 - ours) / n), each.std(ddof=1) / np.sqrt(60)))
+    assert (np.abs(off) < 4 * np.array(spread)).all(), off
+    assert abs(np.sum(off)) < 4 * np.linalg.norm(spread), off
 
 
 def test_draws_are_common_and_addressed(injected):
