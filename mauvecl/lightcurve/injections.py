@@ -129,6 +129,11 @@ class Injections:
         values, vectors = np.linalg.eigh(covariance)
         return np.asarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
+    @cached_property
+    def noise(self) -> Single:
+        """Cholesky factors of each frame's covariance, but for light's jitter, shape (n_frame, n_sum, n_sum)."""
+        return np.linalg.cholesky(self.survey.covariance(jittered=("sky", "temperature"))).astype(np.float32)
+
     def places(self, position: int) -> list[Place]:
         """Every half-width at one of the peaks."""
         return [self._place(width, float(self.peaks_s[position])) for width in self.half_widths_s]
@@ -198,7 +203,7 @@ class Injections:
         unknown = rng.standard_normal((count, len(stare.unknowns)))
         noise = rng.standard_normal(shape, np.float32)
         own = rng.standard_normal(shape, np.float32)
-        low = np.linalg.cholesky(survey.covariance(jittered=("sky", "temperature"))[frames]).astype(np.float32)
+        low = self.noise[frames]
         mixed = np.empty_like(noise)
         for k in range(n_sum):
             mixed[k] = sum(noise[j] * low[:, k, j] for j in range(k + 1))

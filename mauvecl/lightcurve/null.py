@@ -32,7 +32,8 @@ DAYS: dict[Per, float] = {"day": 1.0, "month": 365.25 / 12, "year": 365.25}
 DAY_S = 86_400.0
 #: Thresholds at which importance sampling is done; between them the logarithm of the number of independent templates is
 #: a parabola.
-LADDER = tuple(float(u) for u in np.arange(3.0, 8.01, 0.25))
+STEP = 0.25
+LADDER = tuple(float(u) for u in np.arange(3.0, 8.01, STEP))
 #: Draws of importance sampling.
 DRAWS = 200
 #: Largest probability of an alarm in a stare that importance sampling is used for.
@@ -218,7 +219,7 @@ class Sampled:
         """
         from scipy.optimize import brentq
 
-        low, high = float(self.thresholds[self._trusted][0]), float(self.thresholds[-1])
+        low, high = self._ends
         goal = np.log(rate)
         if not self.log_rate(high)[0] <= goal <= self.log_rate(low)[0]:
             ends = [float(np.exp(self.log_rate(u)[0])) for u in (high, low)]
@@ -231,8 +232,13 @@ class Sampled:
         reach = float(scipy.special.ndtri(0.5 + CONFIDENCE / 2)) * self.log_rate(value)[1] / value
         return Interval(value, value - reach, value + reach)
 
+    @property
+    def _ends(self) -> tuple[float, float]:
+        """Thresholds that are answered: one step below the lowest that is trusted, up to the highest."""
+        return float(self.thresholds[self._trusted][0] - STEP), float(self.thresholds[-1])
+
     def _check(self, threshold: float) -> None:
-        low, high = self.thresholds[self._trusted][0], self.thresholds[-1]
+        low, high = self._ends
         if not low <= threshold <= high:
             raise InputError(f"a threshold of {threshold:g}, expected {low:g} to {high:g} for importance sampling")
 

@@ -30,10 +30,10 @@ def day():
 
 @pytest.mark.parametrize("half_width", TABLE)
 def test_half_are_found(day, half_width):
-    """Within 5 % of the table. The median of 2000 amplitudes has an error of 0.5 %: once in 10^9 runs it fails."""
+    """Within 5 % of the table. The median of 1000 amplitudes has an error of 0.7 %: once in 10^6 runs it fails."""
     bank, cut = day
     rng = np.random.default_rng(int(half_width))
-    n, frames = 2000, 400 if half_width < 100 else 900
+    n, frames = 1000, 300 if half_width < 100 else 700
     peaks = 500.0 + 5.0 * rng.random(n)
     flares = DAVENPORT.mean_over(np.arange(frames + 1) * 5.0, peaks[:, None], half_width)
     noise = rng.standard_normal((n, frames))
@@ -58,7 +58,7 @@ def test_half_are_found(day, half_width):
     assert np.median(critical) == pytest.approx(TABLE[half_width][1], rel=0.05)
 
 
-STARE = Stare.of(1400.0, gaps=[(900, 960)], jitters={"light": 0.01})
+STARE = Stare.of(900.0, gaps=[(600, 640)], jitters={"light": 0.01})
 LEVEL = Level(window_s=400.0)
 CELLS = [(15.0, 0.028), (15.0, 0.036), (40.0, 0.018), (40.0, 0.024), (90.0, 0.016)]
 
@@ -67,7 +67,7 @@ CELLS = [(15.0, 0.028), (15.0, 0.036), (40.0, 0.018), (40.0, 0.024), (90.0, 0.01
 def injected():
     """A jittered stare with a gap, a bank of three half-widths, and a threshold."""
     one, templates = survey(STARE, LEVEL, (15.0, 40.0, 110.0))
-    return one, templates, Injections(one, 0, (15.0, 40.0, 90.0), 5.2, 10_000.0, 3, 150, 20)
+    return one, templates, Injections(one, 0, (15.0, 40.0, 90.0), 5.2, 10_000.0, 3, 60, 40)
 
 
 def pixel_injection(one, half_width, amplitude, peaks, rng):
@@ -80,9 +80,8 @@ def pixel_injection(one, half_width, amplitude, peaks, rng):
         level = 1 + 0.01 * rng.standard_normal((STARE.n_frames, 1))
         light = level * (quiet.light_dn + amplitude * course * flare)
         dark = rng.poisson(quiet.dark_dn, (STARE.n_frames, quiet.dark_dn.size))
-        photons = np.sqrt(quiet.gain_dn_per_electron * light) * rng.standard_normal(light.shape, np.float32)
-        read = quiet.read_noise_dn * rng.standard_normal(light.shape, np.float32)
-        raw = np.rint(light + dark + photons + read + quiet.bias_dn)
+        noise = np.sqrt(quiet.gain_dn_per_electron * light + quiet.read_noise_dn**2)
+        raw = np.rint(light + dark + noise * rng.standard_normal(light.shape, np.float32) + quiet.bias_dn)
         rows.append((raw - quiet.mean_raw_dn) @ one.components.weights.T)
     return np.array(rows)
 
@@ -111,14 +110,18 @@ def all_filters(one):
 
 @pytest.mark.long
 def test_completeness_of_five_cells(injected):
-    """Against NumPy alone. Fails by chance once in 10^4 runs: 4 standard errors of two binomials, five times."""
+    """Against NumPy alone, cell by cell and all together. Six times 4 standard errors: fails once in 10^3 runs.
+
+    All together notice flares that come out a sixth too bright.
+    """
     one, _, injections = injected
     rng = np.random.default_rng(9)
-    n = 80
-    places = [injections.places(p) for p in range(150)]
-    critical = np.concatenate([injections.critical(x, p, 0, 20) for p, x in enumerate(places)], axis=1)
+    n = 100
+    places = [injections.places(p) for p in range(60)]
+    critical = np.concatenate([injections.critical(x, p, 0, 40) for p, x in enumerate(places)], axis=1)
     filters = all_filters(one)
     scale = np.sqrt(one.variance.mean())
+    off, spread = [], []
     for half_width, amplitude in CELLS:
         peaks = rng.choice(STARE.start_s, n) + 5 * rng.random(n)
         sums = pixel_injection(one, half_width, amplitude, peaks, rng)
@@ -132,8 +135,11 @@ def test_completeness_of_five_cells(injected):
         ours = np.mean(critical[injections.half_widths_s.index(half_width)] <= amplitude)
         theirs = np.mean(np.where(counts, values, -np.inf).max(axis=(1, 2)) >= injections.threshold)
         assert 0.02 < ours < 0.98
-        spread = np.sqrt(ours * (1 - ours) * (1 / n + 1 / 150))
-        assert abs(ours - theirs) < 4 * spread, (half_width, amplitude, ours, theirs)
+        each = np.mean(critical[injections.half_widths_s.index(half_width)].reshape(60, 40) <= amplitude, axis=1)
+        off.append(ours - theirs)
+        spread.append(np.hypot(np.sqrt(ours * (1 - ours) / n), each.std(ddof=1) / np.sqrt(60)))
+    assert (np.abs(off) < 4 * np.array(spread)).all(), off
+    assert abs(np.sum(off)) < 4 * np.linalg.norm(spread), off
 
 
 def test_draws_are_common_and_addressed(injected):

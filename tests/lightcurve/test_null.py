@@ -145,7 +145,7 @@ def test_false_alarms_in_random_stares(stares):
     alarms nearly always.
     """
     rng = np.random.default_rng(1805)
-    asked, draws = 0.3, 25
+    asked, draws = 0.2, 25
     alarms, spread, plain = 0, 0.0, []
     for number in range(50):
         stare, level, free = random_stare(rng)
