@@ -18,7 +18,7 @@ Float = NDArray[np.float64]
 #: Orbits of a stare: the window over which a search takes the level for a line reaches over its gaps.
 ORBITS = 3
 #: Half-widths injected, and places of their peaks.
-WIDTHS, WIDTH_RANGE_S, POSITIONS = 12, (5.0, 3000.0), 40
+WIDTHS, WIDTH_RANGE_S, POSITIONS = 10, (5.0, 3000.0), 20
 
 
 def injected(study: Study, looked: Looked) -> Completeness:
@@ -37,7 +37,7 @@ def injected(study: Study, looked: Looked) -> Completeness:
     InputError
         As `inject`.
     """
-    question = _question(study, looked)
+    question = question_of(study, looked)
     star = inject(question).stars[0]
     how = (
         f"{question.injections.count} injections of each of {WIDTHS} half-widths into stretches of "
@@ -50,7 +50,7 @@ def injected(study: Study, looked: Looked) -> Completeness:
     return Completeness(energy, share, BOLOMETRIC, how)
 
 
-def _question(study: Study, looked: Looked) -> Study:
+def question_of(study: Study, looked: Looked) -> Study:
     """What is asked of `inject`: the target's star, its sky, its stretches."""
     orbit_s = study.orbit.orbit().elements.period_s
     gap = max(orbit_s - looked.window_s, 0.0)

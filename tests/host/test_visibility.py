@@ -122,6 +122,10 @@ def test_windows_add_up(month: Visibility) -> None:
         assert month.by_orbit(k).sum() / 60 == pytest.approx(total)
         assert (windows.in_shadow_s <= windows.length_s).all()
         assert (windows.start_s[1:] > windows.stop_s[:-1]).all()
+    # Days begin at midnight: the first after 17.5 hours.
+    second = np.floor((month.track.moments.seconds / 3600 - 17.5) / 24) == 0
+    assert month.by_day(0)[1] == pytest.approx(month.seen[second, 0].sum() / 60)
+    assert len(month.by_day(0)) == 41
     # The first of January begins after 11 days and 17.5 hours.
     split = month.track.moments.seconds < (11 * 24 + 17.5) * 3600
     assert hours[0] == pytest.approx(month.seen[split].sum(axis=0) / 60)
