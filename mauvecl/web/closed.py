@@ -11,8 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.unknown_cost import cost_lines, marginal_lines, unknown_cost
-from mauvecl.noise.scene import prepare
-from mauvecl.results.hypotheses import Hypotheses
+from mauvecl.host.errors import InputError
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.statistics.statistic import Setting
 from mauvecl.study.labels import told
@@ -21,6 +20,7 @@ from mauvecl.web.smooth import Smooth
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
     from mauvecl.host.stars.source import Source
+    from mauvecl.statistics.distributions import Form
     from mauvecl.study.study import Study
     from mauvecl.web.question import Question
 
@@ -38,7 +38,8 @@ class Closed:
     light : tuple of Source
         The star at the telescope, without and with the flare.
     quiet, flare : Expectation
-    theory : Hypotheses
+    null_form, seen_form : Form
+        The asked statistic for Gaussian noise, without and with the flare.
     cut : float
         The threshold.
     chance : float
@@ -50,7 +51,8 @@ class Closed:
     light: tuple[Source, Source]
     quiet: Expectation
     flare: Expectation
-    theory: Hypotheses
+    null_form: Form
+    seen_form: Form
     cut: float
     chance: float
 
@@ -74,27 +76,31 @@ class Closed:
         star = study.star[0].source() if q.uploaded is None else q.uploaded.at_magnitude(q.magnitude, q.band)
         light = star, study.flaring(star, study.flare.amplitudes[0])
         quiet, flare = study.expect(list(light))
-        scene = prepare([quiet, flare], comparison=study.run.comparison())
-        unknown = study.nuisances.marginalised(quiet)
-        theory = Hypotheses(quiet, (flare,), study.run.statistics, scene, nuisances=unknown)
-        cut = theory.closed_form(q.statistic).isf(q.fap)
-        chance = float("nan") if theory.blinding else theory.closed_form(q.statistic, 0).sf(cut)
-        return cls(q, study, light, quiet, flare, theory, cut, chance)
+        one, used = STATISTICS[q.statistic], ~quiet.saturated
+        if not used.any():
+            raise InputError(f"every pixel of {quiet.name} is saturated, expected a fainter star")
+        setting = Setting(quiet, used, study.run.comparison(), (flare,), study.nuisances.marginalised(quiet))
+        one.check(setting)
+        shape = flare if one.shaped else None
+        null, seen = (one.closed_form(setting, x, shape) for x in (quiet, flare))
+        cut = null.isf(q.fap)
+        chance = float("nan") if flare.saturated[used].all() else seen.sf(cut)
+        return cls(q, study, light, quiet, flare, null, seen, cut, chance)
 
     @cached_property
     def null(self) -> Smooth:
         """The statistic without a flare, for pictures."""
-        return Smooth(self.theory.closed_form(self.question.statistic))
+        return Smooth(self.null_form)
 
     @cached_property
     def seen(self) -> Smooth:
         """The statistic with the flare, for pictures."""
-        return Smooth(self.theory.closed_form(self.question.statistic, 0))
+        return Smooth(self.seen_form)
 
     @property
     def expected(self) -> float:
         """The statistic's mean with the flare."""
-        return self.theory.closed_form(self.question.statistic, 0).mean
+        return self.seen_form.mean
 
     @cached_property
     def messages(self) -> list[str]:

@@ -39,8 +39,8 @@ def install() -> None:
     handler = logging.StreamHandler()
     handler.setFormatter(Plain())
     logging.basicConfig(level=logging.WARNING, handlers=[handler], force=True)
-    # Bokeh and Panel write their own otherwise.
-    for name in ("bokeh", "panel", "tornado", "param"):
+    # They write their own otherwise.
+    for name in ("bokeh", "tornado"):
         logger = logging.getLogger(name)
         logger.handlers, logger.propagate = [], True
         logger.setLevel(logging.WARNING)

@@ -8,6 +8,8 @@ import numpy as np
 from scipy import special
 from scipy.interpolate import PchipInterpolator
 
+from mauvecl.statistics.distributions import Gaussian
+
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
@@ -23,11 +25,15 @@ class Smooth:
     """
 
     def __init__(self, form: Form) -> None:
+        self.mean, self.std = form.mean, form.std
+        if isinstance(form, Gaussian):
+            self._probit = lambda value: (form.mean - value) / form.std
+            self._inverse = lambda probit: form.mean + form.std * probit
+            return
         at = np.linspace(form.mean - 5 * form.std, form.mean + 6 * form.std, 14)
         beyond = np.array([form.sf(value) for value in at])
         # Where it is 0 or 1 to the last digit there is nothing to draw.
         kept = (beyond > 1e-12) & (beyond < 1 - 1e-12)
-        self.mean, self.std = form.mean, form.std
         self._probit = PchipInterpolator(at[kept], special.ndtri(beyond[kept]), extrapolate=True)
         self._inverse = PchipInterpolator(-special.ndtri(beyond[kept]), at[kept], extrapolate=True)
 

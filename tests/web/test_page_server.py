@@ -35,6 +35,8 @@ from typer.testing import CliRunner
 
 from mauvecl.cli.app import app
 from mauvecl.host.errors import InputError
+from mauvecl.noise.scene import prepare
+from mauvecl.results.hypotheses import Hypotheses
 from mauvecl.study.study import Study
 from mauvecl.web import closed as closed_forms
 from mauvecl.web import doors, server, visitor
@@ -191,6 +193,21 @@ def test_every_picture_finds_all_its_data(closed: Closed, tab: str) -> None:
                     assert sources[name] == set(columns), (picture.name, name)
                 assert drawn.props.keys() <= {m.name for m in models}
                 assert canvas.legend
+
+
+@pytest.mark.parametrize("statistic", ["matched", "chi2", "uv_excess"])
+def test_the_card_is_the_engines_own_closed_form(statistic: str, tmp_path: Path) -> None:
+    """What an answer on the command line is compared with, known without a scene that could be drawn."""
+    state = State()
+    state.enter({"statistic": statistic, "magnitude": "6", "unknown": "the usual"})
+    closed = Closed.of(state.question(), tmp_path)
+    unknown = closed.study.nuisances.marginalised(closed.quiet)
+    scene = prepare([closed.quiet, closed.flare], comparison=closed.study.run.comparison())
+    theory = Hypotheses(closed.quiet, (closed.flare,), (statistic,), scene, nuisances=unknown)
+    assert closed.cut == theory.closed_form(statistic).isf(1e-3)
+    assert closed.chance == theory.closed_form(statistic, 0).sf(closed.cut)
+    at = np.linspace(-3, 3, 7) * closed.null.std + closed.null.mean
+    assert closed.null.sf(at) == pytest.approx([theory.closed_form(statistic).sf(x) for x in at], abs=2e-4)
 
 
 def test_the_map_and_the_curve_are_the_closed_form(closed: Closed) -> None:
@@ -379,7 +396,7 @@ def test_a_fault_of_our_own_leaves_no_answer(served: Any, monkeypatch: pytest.Mo
     async def work(host: str) -> None:
         talk = await Talk.begin(host)
         with monkeypatch.context() as patch:
-            patch.setattr(closed_forms, "prepare", lambda *_, **__: 1 / 0)
+            patch.setattr(closed_forms, "Setting", lambda *_, **__: 1 / 0)
             told = await talk.answer("?magnitude=8")
             assert "answer" not in told
             assert told["refused"] == visitor.OWN_FAULT
