@@ -1,7 +1,8 @@
 """What is unknown of the instrument, and the same with a flare and without: drawn from priors, and averaged over.
 
-An observer measures the instrument, and takes template and threshold from it; while a proposal is written it is unknown.
-So each draw of the unknown values has its own template and threshold, and a detection probability is the average.
+An observer measures the instrument, and takes template and threshold from it; while a proposal is written it is
+unknown. So each draw of the unknown values has its own template and threshold, and a detection probability is the
+average.
 """
 
 from __future__ import annotations
