@@ -280,8 +280,8 @@ MUTATIONS = {
         (
             (
                 "mauvecl/statistics/distributions.py",
-                "phase = 0.5 * np.arctan(turn) @ count + (u[:, None] / spread) @ pull",
-                "phase = 0.5 * np.arctan(turn) @ count + 0.0 * u",
+                "(np.arctan(turn) * count).sum(axis=1) + (u[:, None] * pull / spread).sum(axis=1)",
+                "(np.arctan(turn) * count).sum(axis=1) + 0.0 * u",
             ),
         ),
         "tests/statistics/test_statistics.py::test_equal_weights_are_a_scaled_non_central_chi_squared",

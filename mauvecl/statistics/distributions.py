@@ -87,17 +87,19 @@ class QuadraticForm:
     def _near(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
         """Frequencies, and the characteristic function's modulus and phase there, for all values that are near."""
         spacing = 2.0 * np.pi / ((40.0 + NEAR) * self.std)
-        # Equal weights count together: of marginalised statistics most are.
-        weight, member = np.unique(self.weight, return_inverse=True)
-        count, pull = np.bincount(member), np.bincount(member, self.shift**2 * self.weight)
+        weight, count, pull = self.weight, np.ones(self.weight.size), self.shift**2 * self.weight
+        values, member = np.unique(weight, return_inverse=True)
+        if values.size < weight.size / 2:
+            # Equal weights count together: of marginalised statistics most are.
+            weight, count, pull = values, np.bincount(member).astype(float), np.bincount(member, pull)
         parts = []
         k = 0.5 + np.arange(256)
         while True:
             u = k * spacing
             turn = 2.0 * np.outer(u, weight)
             spread = 1.0 + turn**2
-            log_size = -0.25 * np.log(spread) @ count - (u[:, None] * turn / spread) @ pull
-            phase = 0.5 * np.arctan(turn) @ count + (u[:, None] / spread) @ pull
+            log_size = -0.25 * (np.log(spread) * count).sum(axis=1) - (u[:, None] * turn * pull / spread).sum(axis=1)
+            phase = 0.5 * (np.arctan(turn) * count).sum(axis=1) + (u[:, None] * pull / spread).sum(axis=1)
             parts.append((u, np.exp(log_size) / k, phase))
             k = k + 256
             if log_size[-1] < np.log(1e-15 * k[0]):
