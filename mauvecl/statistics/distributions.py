@@ -91,7 +91,8 @@ class QuadraticForm:
         values, member = np.unique(weight, return_inverse=True)
         if values.size < weight.size / 2:
             # Equal weights count together: of marginalised statistics most are.
-            weight, count, pull = values, np.bincount(member).astype(float), np.bincount(member, pull)
+            weight, count = values, np.bincount(member).astype(np.float64)
+            pull = np.bincount(member, pull).astype(np.float64)
         parts = []
         k = 0.5 + np.arange(256)
         while True:
