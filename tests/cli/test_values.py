@@ -55,3 +55,38 @@ def test_one_style_for_every_number(tmp_path: Path) -> None:
         assert (code, out) == (2, ""), (verb, flag)
         assert told.startswith(f"mauvecl: {flag} 'many', expected a "), told
         assert told.count("\n") == 1
+
+
+@pytest.mark.parametrize(
+    ("words", "sentence"),
+    [
+        (["detect", "--geometry", "beside"], "flare.geometry = 'beside', expected 'added' or 'replaces'"),
+        (["detect", "--tails", "guessed"], "run.tails = 'guessed', expected 'counted' or 'sampled'"),
+        (["limit", "--known", "light_loss,luck"], "unknowns.known names 'luck', expected some of "),
+        (["snr", "--star", "G2V", "-m", "7", "--at", "30"], "wavelength = 30 nm, expected 200.1 to 699.8 nm"),
+        (["detect", "--statistic", "chi2,chi3"], "statistic 'chi3' is unknown, expected one of "),
+        (["detect", "--star", "G2V", "-m", "7,8"], "2 magnitudes for 1 stars, expected one for all or one each"),
+        (["detect", "-n", "1e3", "--fap", "1e-3"], "fap = 0.001 leaves 1 of 1000 realisations beyond"),
+        (["detect", "--instrument", "."], "instrument '.' is a folder, expected a name or a TOML file"),
+        (
+            [
+                "detect",
+                "--star",
+                "G2V",
+                "-m",
+                "7",
+                "-a",
+                "0.1",
+                "--geometry",
+                "replaces",
+                "--photosphere-temperature",
+                "2",
+            ],
+            "photosphere temperature = 2.0 K, expected 1000 to 200000 K",
+        ),
+    ],
+    ids=lambda given: " ".join(given) if isinstance(given, list) else "",
+)
+def test_flags_reach_the_study(words: list[str], sentence: str, tmp_path: Path) -> None:
+    code, _, told = ended(*words, folder=tmp_path)
+    assert (code, sentence in told) == (2, True), told
