@@ -40,14 +40,22 @@ def main() -> None:
     """Print the table and write it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=100_000, help="injections of each cell")
+    parser.add_argument(
+        "--case", choices=CASES, action="append", help="some of them alone, added to the table that is there"
+    )
     parser.add_argument("--device")
     parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results" / "inject.ecsv")
     options = parser.parse_args()
-    table = Table(
-        names=("stare", "cells", "injections", "wall", "processor", "rate"), dtype=(str, int, int, float, float, float)
-    )
+    names = ("stare", "cells", "injections", "wall", "processor", "rate")
+    table = Table(names=names, dtype=("U64", int, int, float, float, float))
+    if options.case and options.output.exists():
+        for row in Table.read(options.output):
+            if row["stare"] not in options.case:
+                table.add_row(tuple(row))
     stares = Stares(options.device)
     for name, case in CASES.items():
+        if options.case and name not in options.case:
+            continue
         study = Study.build({**STAR, **case, "injections": {"count": options.count}}, name)
         wall, used = time.perf_counter(), time.process_time()
         found = inject(study, stares)

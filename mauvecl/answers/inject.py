@@ -156,11 +156,9 @@ class InjectAnswer(Answer):
 
     @property
     def pictures(self) -> dict[str, tuple[Any, ...]]:
-        """Maps of completeness, and curves over size."""
-        return {
-            "completeness": ("injections.maps", self),
-            "curves": ("injections.curves", self),
-        }
+        """Maps of completeness, curves over size, and where flares are fitted a map of the energies recovered."""
+        fitted = {"energies": ("injections.energies", self)} if all(star.fitted for star in self.stars) else {}
+        return {"completeness": ("injections.maps", self), "curves": ("injections.curves", self), **fitted}
 
 
 def _size_column(values: Any, sizes: Sizes) -> Any:

@@ -1,4 +1,4 @@
-"""Pictures of completeness: maps over half-width and size, and curves."""
+"""Pictures of completeness: maps over half-width and size, curves, energies recovered."""
 
 from __future__ import annotations
 
@@ -63,6 +63,23 @@ def maps(found: InjectAnswer, path: str | Path | None) -> Any:
             axis.clabel(lines, fmt=lambda level: f"{100 * level:g} %", fontsize=7)
         if mesh is not None:
             figure.colorbar(mesh, ax=axes, label="completeness")
+        _titled(figure, found)
+        return finished(figure, path)
+
+
+def energies(found: InjectAnswer, path: str | Path | None) -> Any:
+    """Recovered over injected energy of found flares over half-width and size; the figure where no path is given."""
+    with pyplot().rc_context(STYLE):
+        figure, stars, axes = _panels(found)
+        mesh = None
+        for star, axis in zip(stars, axes, strict=False):
+            x, y = np.array(star.found.half_widths_s), star.found.sizes
+            axis.set(xscale="log", yscale="log", xlabel="half-width (s)", ylabel=SIZES[star.sizes.of], title=star.title)
+            if x.size > 1:
+                z = np.log10(star.fitted.energy_ratio.T)
+                mesh = axis.pcolormesh(_edges(x), _edges(y), z, cmap="RdBu_r", vmin=-0.3, vmax=0.3)
+        if mesh is not None:
+            figure.colorbar(mesh, ax=axes, label="recovered over injected energy, median (dex)")
         _titled(figure, found)
         return finished(figure, path)
 

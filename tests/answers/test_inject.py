@@ -159,4 +159,4 @@ def test_command(tmp_path):
     done = run(*words.split(), *(x for s in sets for x in ("--set", s)), "--output", tmp_path, folder=tmp_path)
     rows = json.loads(done.stdout)["rows"]
     assert {"e50", "e90", "half_width"} <= set(rows[0])
-    assert {"limits.ecsv", "completeness.png", "curves.png", "run.json"} <= {p.name for p in tmp_path.iterdir()}
+    assert {"limits.ecsv", "completeness.png", "curves.png", "energies.png", "run.json"} <= {p.name for p in tmp_path.iterdir()}
