@@ -260,6 +260,20 @@ def staring_of(study: Study, star: Star) -> tuple[Staring, list[Event]]:
     return Staring(quiet, stare, spectra, coefficients(events, stare.start_s, stare.frame_s, kelvin)), events
 
 
+def orbit_lines(study: Study) -> list[str]:
+    """What must be told of the orbit that a study's stare is along, if it is."""
+    from mauvecl.host.orbit.moments import DAY_S, Moments
+
+    if not study.stare.along_orbit:
+        return []
+    o = study.orbit
+    moments = Moments(o.start, study.stare.duration_s / DAY_S, study.load_instrument().frame_s)
+    assumed = (
+        "Limits, temperatures and windows of a stare along the orbit are assumptions; stray light is not modelled."
+    )
+    return [*o.orbit().messages(moments), assumed]
+
+
 def energy_scale(
     study: Study, star: Star, source: Source, kind: Literal["bolometric", "band"], flare_k: float
 ) -> EnergyScale | None:
