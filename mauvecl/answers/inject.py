@@ -23,6 +23,7 @@ from mauvecl.results.sums import Arrays
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, put_first, stacked, titled, told
 from mauvecl.study.searches import Sizes, Surveyed, sizes_of, surveyed
+from mauvecl.study.stares import orbit_lines
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -289,6 +290,7 @@ def inject(
     answer.messages = [
         *(text for text in (star.message for star in answer.stars) if text is not None),
         *told(answer.inputs),
+        *orbit_lines(study),
     ]
     return answer
 

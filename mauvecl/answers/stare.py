@@ -17,7 +17,7 @@ from mauvecl.lightcurve.null import sampled
 from mauvecl.lightcurve.observed import Draw, Light, Staring, seen
 from mauvecl.study.labels import described, label, stacked, titled, told
 from mauvecl.study.searches import surveyed
-from mauvecl.study.stares import check_sweep, energy_of, stare_of, staring_of
+from mauvecl.study.stares import check_sweep, energy_of, orbit_lines, stare_of, staring_of
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -299,7 +299,7 @@ def stare(study: Study, stares: Stares) -> StareAnswer:
     # Everything is looked at before anything is drawn: bad input shows at once.
     prepared = [(star, at, cell, *staring_of(cell, star)) for at, cell in study.cells() for star in cell.star]
     found = [_drawn(study, stares, *one) for one in prepared]
-    messages = told([staring.quiet for _, _, _, staring, _ in prepared])
+    messages = told([staring.quiet for _, _, _, staring, _ in prepared]) + orbit_lines(study)
     messages += [one.searched for one in found if isinstance(one.searched, str)]
     for one in found:
         cut = int(np.count_nonzero(one.staring.quality))

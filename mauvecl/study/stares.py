@@ -82,6 +82,7 @@ class StareQuestion(Part):
     gaps: tuple[tuple[float, float], ...] = ()
     orbit_s: Annotated[float, Field(gt=0)] = ORBIT_S
     orbit_gap_s: Annotated[float, Field(ge=0)] = 0.0
+    along_orbit: bool = False
     thermal: CurveText | None = None
     variability: CurveText | None = None
     throughput: CurveText | None = None
@@ -201,21 +202,37 @@ def stare_of(study: Study) -> Stare:
         text: CurveText | None = getattr(q, name)
         return None if text is None else text.curve(name, q.orbit_s)
 
+    what: dict[str, Any] = {name: curve(name) for name in ("variability", "throughput", "sky")} | spreads
+    what["orbit_s"] = q.orbit_s
+    if q.along_orbit:
+        return _along(study, instrument.frame_s, what)
     return Stare.of(
         q.duration_s,
         frame_s=instrument.frame_s,
         gaps=q.all_gaps(),
         temperature_c=instrument.temperature_c,
         thermal=curve("thermal"),
-        variability=curve("variability"),
-        throughput=curve("throughput"),
-        sky=curve("sky"),
-        orbit_s=q.orbit_s,
-        jitters=spreads["jitters"],
-        offsets=spreads["offsets"],
-        drifts=spreads["drifts"],
-        cycles=spreads["cycles"],
+        **what,
     )
+
+
+def _along(study: Study, frame_s: float, what: dict[str, Any]) -> Stare:
+    """The stare as the orbit gives it, at the one target of the study's ``orbit`` from its start on.
+
+    Raises
+    ------
+    InputError
+        If there is not one target, or the study tells gaps or a thermal curve as well.
+    """
+    from mauvecl.study.orbits import targets_of
+
+    q, o = study.stare, study.orbit
+    if q.gaps or q.orbit_gap_s or q.thermal is not None:
+        raise InputError("stare.along_orbit beside gaps or a thermal curve, expected the orbit to give them")
+    targets = targets_of(study)
+    if len(targets) != 1:
+        raise InputError(f"stare.along_orbit with {len(targets)} targets, expected one in orbit.targets")
+    return Stare.along(o.orbit(), targets[0], o.start, q.duration_s, frame_s=frame_s, limits=o.limits.limits(), **what)
 
 
 def staring_of(study: Study, star: Star) -> tuple[Staring, list[Event]]:
@@ -241,6 +258,20 @@ def staring_of(study: Study, star: Star) -> tuple[Staring, list[Event]]:
     electrons = [(x.source_electrons - quiet.source_electrons) / unit for x in flaring]
     spectra = np.reshape(electrons, (kelvin.size, quiet.wavelength_nm.size))
     return Staring(quiet, stare, spectra, coefficients(events, stare.start_s, stare.frame_s, kelvin)), events
+
+
+def orbit_lines(study: Study) -> list[str]:
+    """What must be told of the orbit that a study's stare is along, if it is."""
+    from mauvecl.host.orbit.moments import DAY_S, Moments
+
+    if not study.stare.along_orbit:
+        return []
+    o = study.orbit
+    moments = Moments(o.start, study.stare.duration_s / DAY_S, study.load_instrument().frame_s)
+    assumed = (
+        "Limits, temperatures and windows of a stare along the orbit are assumptions; stray light is not modelled."
+    )
+    return [*o.orbit().messages(moments), assumed]
 
 
 def energy_scale(

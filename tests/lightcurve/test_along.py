@@ -71,6 +71,26 @@ def test_the_constructor_of_stares(orbit: Orbit, night: OrbitStare) -> None:
     assert "along its track" in stare_along(orbit, "eps Eri", "2026-10-20", 7200.0).messages[0]
 
 
+def test_a_studys_stare(orbit: Orbit, night: OrbitStare) -> None:
+    from mauvecl import Study
+    from mauvecl.study.stares import orbit_lines, stare_of
+
+    study = Study().with_settings(
+        ["stare.along_orbit=true", f"stare.duration_s={HOURS * 3600}", "orbit.targets=['eps Eri']",
+         f"orbit.start='{START}'", "stare.offsets.sky=0.1"]
+    )  # fmt: skip
+    found = stare_of(study)
+    assert found.start_s == pytest.approx(night.stare.start_s)
+    assert found.temperature_c == pytest.approx(night.stare.temperature_c)
+    assert [one.name for one in found.unknowns] == ["sky offset"]
+    assert "assumptions" in orbit_lines(study)[-1]
+    assert "mean Sun-synchronous" in orbit_lines(study.with_settings(["orbit.start=2027-06-01"]))[0]
+    assert orbit_lines(Study()) == []
+    for wrong in ("stare.orbit_gap_s=100", "orbit.targets=['eps Eri', 'Vega']"):
+        with pytest.raises(InputError, match="along_orbit"):
+            stare_of(study.with_settings([wrong]))
+
+
 @pytest.mark.parametrize(
     ("target", "how", "words"),
     [
