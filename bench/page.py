@@ -19,7 +19,7 @@ from playwright.sync_api import Browser, Page, sync_playwright
 
 from mauvecl.statistics.registry import STATISTICS
 
-CHANGES = 11
+CHANGES = 7
 #: What is changed, and what from and to; each change is another value between.
 FIELDS = {"amplitude_percent": (1.3, 2.9), "magnitude": (7.5, 9.0)}
 #: Tab in front, and statistic asked for.
@@ -67,7 +67,7 @@ def waits(page: Page, name: str, values: list[str]) -> np.ndarray:
     for value in values:
         rows.append(page.evaluate(WATCH, [name, value]))
         # One exposure is drawn in the background after each change.
-        page.wait_for_timeout(900)
+        page.wait_for_timeout(700)
     return np.array(rows)
 
 
@@ -122,7 +122,7 @@ def main() -> None:
             for tab, statistic in CASES:
                 page.locator(f"#tab-{tab}").click()
                 page.locator("#f-statistic").select_option(statistic)
-                page.wait_for_timeout(2000)
+                page.wait_for_timeout(1000)
                 for name, (low, high) in FIELDS.items():
                     given = [f"{x:.4f}" for x in np.linspace(low, high, CHANGES + 2)]
                     answer, drawn, times = np.median(waits(page, name, given)[2:], axis=0) / (1e3, 1e3, 1)
