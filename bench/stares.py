@@ -28,9 +28,9 @@ from rates import processor
 
 from mauvecl import Instrument, Sky, Source, __version__, expect
 from mauvecl.device.stares import Stares
-from mauvecl.lightcurve.components import Components
-from mauvecl.lightcurve.requests import StaresRequest
-from mauvecl.lightcurve.stare import Stare
+from mauvecl.lightcurve.stares.components import Components
+from mauvecl.lightcurve.stares.requests import StaresRequest
+from mauvecl.lightcurve.stares.stare import Stare
 
 REPEATS, FRAMES = 5, 200
 STARE = Stare.of(

@@ -1,5 +1,5 @@
 ## Frames of stares. What differs from frame to frame and from stare to stare is the strength of a few spectra;
-## see mauvecl/lightcurve/components.py. Lanes are stares where pixels are drawn, and frames where sums are.
+## see mauvecl/lightcurve/stares/components.py. Lanes are stares where pixels are drawn, and frames where sums are.
 #define STARE_POINTERS(r) __global const Staring *r staring, __global const uint *r numbers, __global const float *r known, \
     __global const float *r curves, __global const uint *r kinds, __global const float *r flares, __global const float *r amplitudes
 #define STARE STARE_POINTERS(restrict)

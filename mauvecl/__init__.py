@@ -12,17 +12,17 @@ from mauvecl.host.version import VERSION
 
 if TYPE_CHECKING:
     from mauvecl.answers.assumptions import what_matters
+    from mauvecl.answers.campaigns.plan import plan
+    from mauvecl.answers.campaigns.visible import visible
     from mauvecl.answers.detect import detect
     from mauvecl.answers.exposures import exposure_for
     from mauvecl.answers.gaussian import gaussian_report
     from mauvecl.answers.inject import inject
     from mauvecl.answers.limits import limiting_magnitude, shortest_exposure, smallest_amplitude
     from mauvecl.answers.maps import detection_map
-    from mauvecl.answers.plan import plan
     from mauvecl.answers.simulate import simulate
     from mauvecl.answers.snr import snr
     from mauvecl.answers.stare import stare
-    from mauvecl.answers.visible import visible
     from mauvecl.device.engine import Engine
     from mauvecl.device.stares import Stares
     from mauvecl.host.errors import InputError
@@ -31,11 +31,11 @@ if TYPE_CHECKING:
     from mauvecl.host.instrument.pixel_map import PixelMap
     from mauvecl.host.sky.zodiacal import Sky
     from mauvecl.host.stars.source import Source
-    from mauvecl.lightcurve.curves import Sinusoid
-    from mauvecl.lightcurve.energies import EnergyScale
-    from mauvecl.lightcurve.events import Cooling, Event
-    from mauvecl.lightcurve.shapes import SHAPES, TableShape
-    from mauvecl.lightcurve.stare import Stare
+    from mauvecl.lightcurve.flares.energies import EnergyScale
+    from mauvecl.lightcurve.flares.events import Cooling, Event
+    from mauvecl.lightcurve.flares.shapes import SHAPES, TableShape
+    from mauvecl.lightcurve.stares.curves import Sinusoid
+    from mauvecl.lightcurve.stares.stare import Stare
     from mauvecl.noise.comparison import Comparison
     from mauvecl.noise.priors import Normal, Uniform
     from mauvecl.noise.processes import CosmicRays, Processes
@@ -100,13 +100,13 @@ __all__ = [
 #: Where each is at home; `bulk` is a module.
 _HOMES = {
     "Comparison": "noise.comparison",
-    "Cooling": "lightcurve.events",
+    "Cooling": "lightcurve.flares.events",
     "CosmicRays": "noise.processes",
     "DaskWorkers": "runs.cluster",
     "Detection": "results.detection",
-    "EnergyScale": "lightcurve.energies",
+    "EnergyScale": "lightcurve.flares.energies",
     "Engine": "device.engine",
-    "Event": "lightcurve.events",
+    "Event": "lightcurve.flares.events",
     "Expectation": "host.expectation",
     "InputError": "host.errors",
     "Instrument": "host.instrument.instrument",
@@ -118,14 +118,14 @@ _HOMES = {
     "PixelMap": "host.instrument.pixel_map",
     "Pool": "runs.pool",
     "Processes": "noise.processes",
-    "SHAPES": "lightcurve.shapes",
-    "Sinusoid": "lightcurve.curves",
+    "SHAPES": "lightcurve.flares.shapes",
+    "Sinusoid": "lightcurve.stares.curves",
     "Sky": "host.sky.zodiacal",
     "Source": "host.stars.source",
-    "Stare": "lightcurve.stare",
+    "Stare": "lightcurve.stares.stare",
     "Stares": "device.stares",
     "Study": "study.study",
-    "TableShape": "lightcurve.shapes",
+    "TableShape": "lightcurve.flares.shapes",
     "Uniform": "noise.priors",
     "bulk": "store",
     "departures": "results.departures",
@@ -137,12 +137,12 @@ _HOMES = {
     "inject": "answers.inject",
     "limiting_magnitude": "answers.limits",
     "shortest_exposure": "answers.limits",
-    "plan": "answers.plan",
+    "plan": "answers.campaigns.plan",
     "simulate": "answers.simulate",
     "smallest_amplitude": "answers.limits",
     "snr": "answers.snr",
     "stare": "answers.stare",
-    "visible": "answers.visible",
+    "visible": "answers.campaigns.visible",
     "what_matters": "answers.assumptions",
 }
 

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.injected import Fitted, InjectedShares, fitted
-from mauvecl.lightcurve.injections import Injections
-from mauvecl.lightcurve.null import DAY_S, Counted, counted, in_a_row_rate, sampled
+from mauvecl.lightcurve.search.injected import Fitted, InjectedShares, fitted
+from mauvecl.lightcurve.search.injections import Injections
+from mauvecl.lightcurve.search.null import DAY_S, Counted, counted, in_a_row_rate, sampled
 from mauvecl.results.requests import Share
 from mauvecl.results.sums import Arrays
 from mauvecl.statistics.intervals import Interval
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from mauvecl.device.stares import Stares
     from mauvecl.host.expectation import Expectation
-    from mauvecl.lightcurve.survey import Survey
+    from mauvecl.lightcurve.search.survey import Survey
     from mauvecl.runs.checkpoint import Checkpoint
     from mauvecl.study.sections import Star
 

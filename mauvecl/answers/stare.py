@@ -11,10 +11,10 @@ import numpy as np
 
 from mauvecl.answers.answer import Answer
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.alarms import Alarm, alarms
-from mauvecl.lightcurve.events import Event, coefficients, temperatures_of
-from mauvecl.lightcurve.null import sampled
-from mauvecl.lightcurve.observed import Draw, Light, Staring, seen
+from mauvecl.lightcurve.flares.events import Event, coefficients, temperatures_of
+from mauvecl.lightcurve.search.alarms import Alarm, alarms
+from mauvecl.lightcurve.search.null import sampled
+from mauvecl.lightcurve.stares.observed import Draw, Light, Staring, seen
 from mauvecl.study.labels import described, label, stacked, titled, told
 from mauvecl.study.searches import surveyed
 from mauvecl.study.stares import check_sweep, energy_of, orbit_lines, stare_of, staring_of

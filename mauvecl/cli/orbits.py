@@ -11,8 +11,8 @@ from mauvecl.cli.flags import FLARE, OBSERVATION, Option, takes_study
 from mauvecl.cli.injections import SEARCH
 
 if TYPE_CHECKING:
-    from mauvecl.answers.plan import PlanAnswer
-    from mauvecl.answers.visible import VisibleAnswer
+    from mauvecl.answers.campaigns.plan import PlanAnswer
+    from mauvecl.answers.campaigns.visible import VisibleAnswer
     from mauvecl.cli.session import Session
     from mauvecl.study.study import Study
 
@@ -110,7 +110,7 @@ def visible(study: Study, session: Session) -> None:
 
     Example: mauvecl visible --look-at "eps Eri" --look-at "AU Mic" --start 2027-01-01 --days 365
     """
-    from mauvecl.answers.visible import visible as compute
+    from mauvecl.answers.campaigns.visible import visible as compute
 
     found = compute(study)
     session.answer(found, lambda: _show_visible(found))
@@ -148,7 +148,7 @@ def plan(study: Study, session: Session) -> None:
 
     Example: mauvecl plan targets.csv --hours 200 --start 2027-01-01
     """
-    from mauvecl.answers.plan import plan as compute
+    from mauvecl.answers.campaigns.plan import plan as compute
     from mauvecl.pictures.style import available
 
     if study.plan.report == "pdf" and not available():
@@ -160,7 +160,7 @@ def plan(study: Study, session: Session) -> None:
 
 
 def _show_plan(found: PlanAnswer) -> None:
-    from mauvecl.answers.plan_text import SUMMARY, heading, summary_rows
+    from mauvecl.answers.campaigns.plan_text import SUMMARY, heading, summary_rows
     from mauvecl.cli.console import show_table
 
     show_table(heading(found), SUMMARY, summary_rows(found))

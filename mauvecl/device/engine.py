@@ -14,7 +14,7 @@ from mauvecl.device.program import DeviceError, DeviceRecord, devices
 from mauvecl.device.stares import Stares
 from mauvecl.device.tiles import Progress, Tile, Tiles
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.requests import StaresRequest
+from mauvecl.lightcurve.stares.requests import StaresRequest
 from mauvecl.noise.comparison import TEMPLATE, Comparison
 from mauvecl.noise.drawing import Drawing, DrawingWords
 from mauvecl.noise.scene import BATCH, prepare

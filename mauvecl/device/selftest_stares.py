@@ -11,10 +11,10 @@ from mauvecl.device.engine import Engine
 from mauvecl.device.program import SAME_BITS
 from mauvecl.device.selftest import COUNT, SEED, START, Check, toy
 from mauvecl.device.stares import Stares
-from mauvecl.lightcurve import twin
-from mauvecl.lightcurve.components import Components
-from mauvecl.lightcurve.scene import Flares, StareScene
-from mauvecl.lightcurve.stare import Stare
+from mauvecl.lightcurve.stares import twin
+from mauvecl.lightcurve.stares.components import Components
+from mauvecl.lightcurve.stares.scene import Flares, StareScene
+from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.noise.processes import CosmicRays
 
 #: Small stares that run every branch: the payload, what wobbles, how many sums.

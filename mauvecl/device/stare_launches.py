@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from mauvecl.device.launches import Launches, beyond
 from mauvecl.device.opened import Device
 from mauvecl.device.tiles import TILE_BYTES, Tile
-from mauvecl.lightcurve.requests import Method
-from mauvecl.lightcurve.scene import Flares, StareScene
-from mauvecl.lightcurve.sums import SumTable
+from mauvecl.lightcurve.stares.requests import Method
+from mauvecl.lightcurve.stares.scene import Flares, StareScene
+from mauvecl.lightcurve.stares.sums import SumTable
 
 Floats = NDArray[np.float32]
 

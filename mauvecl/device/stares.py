@@ -12,11 +12,11 @@ from mauvecl.device.opened import Device
 from mauvecl.device.stare_launches import StareLaunches
 from mauvecl.device.tiles import Progress, Tile, Tiles
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.components import Components
-from mauvecl.lightcurve.requests import Arrays, Kept, Method, StaresRequest, joined
-from mauvecl.lightcurve.scene import Flares, StareScene, padded_frames
-from mauvecl.lightcurve.stare import Stare
-from mauvecl.lightcurve.sums import check_sums
+from mauvecl.lightcurve.stares.components import Components
+from mauvecl.lightcurve.stares.requests import Arrays, Kept, Method, StaresRequest, joined
+from mauvecl.lightcurve.stares.scene import Flares, StareScene, padded_frames
+from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.lightcurve.stares.sums import check_sums
 from mauvecl.noise.processes import CosmicRays
 from mauvecl.results.requests import Share
 
@@ -52,8 +52,8 @@ class Stares:
     >>> import numpy as np
     >>> from mauvecl import Instrument, Source, expect
     >>> from mauvecl.device.stares import Stares
-    >>> from mauvecl.lightcurve.components import Components
-    >>> from mauvecl.lightcurve.stare import Stare
+    >>> from mauvecl.lightcurve.stares.components import Components
+    >>> from mauvecl.lightcurve.stares.stare import Stare
     >>> star, mauve = Source.from_library("G2V").at_magnitude(7.4), Instrument.load("mauve")
     >>> quiet, flare = (expect(s, mauve, exposure=5.0) for s in (star, star.flaring(1.0)))
     >>> near_uv = (quiet.wavelength_nm < 360).astype(float)

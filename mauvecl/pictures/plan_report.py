@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.plan_text import SUMMARY, SUMMARY_TABLE, heading, summary_rows, target_lines
+from mauvecl.answers.campaigns.plan_text import SUMMARY, SUMMARY_TABLE, heading, summary_rows, target_lines
 from mauvecl.host.version import VERSION
 from mauvecl.pictures.style import COLOURS, NULL, STYLE, finished, pyplot
 
 if TYPE_CHECKING:
-    from mauvecl.answers.plan import PlanAnswer
+    from mauvecl.answers.campaigns.plan import PlanAnswer
 
 #: A4, inches.
 PAGE = (8.27, 11.69)

@@ -11,7 +11,7 @@ import numpy as np
 from mauvecl.pictures.style import STYLE, finished, pyplot
 
 if TYPE_CHECKING:
-    from mauvecl.answers.visible import VisibleAnswer
+    from mauvecl.answers.campaigns.visible import VisibleAnswer
 
 #: Targets that get a calendar each; more are rows of one picture.
 MOST_CALENDARS = 6

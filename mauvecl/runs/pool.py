@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
 from mauvecl.device.tiles import Progress
 from mauvecl.host.quantities import count as whole
-from mauvecl.lightcurve.requests import StaresRequest, StareSums
+from mauvecl.lightcurve.stares.requests import StaresRequest, StareSums
 from mauvecl.results.requests import Countable, DetectRequest, RealiseRequest, Share, SnrRequest
 from mauvecl.results.sums import Arrays, DetectionSums, SnrSums
 from mauvecl.runs.shards import fingerprint, shares

@@ -19,8 +19,8 @@ if TYPE_CHECKING:
     from mauvecl.host.orbit.names import Target
     from mauvecl.host.orbit.orbit import Orbit
     from mauvecl.host.orbit.visibility import Limits
-    from mauvecl.lightcurve.completeness import DurationLaw
-    from mauvecl.lightcurve.rates import Rates
+    from mauvecl.lightcurve.flares.rates import Rates
+    from mauvecl.lightcurve.search.completeness import DurationLaw
     from mauvecl.study.study import Study
 
 #: A number, or the word for no limit.
@@ -195,7 +195,7 @@ class PlanTarget(Part):
         InputError
             For a type that no preset stands for.
         """
-        from mauvecl.lightcurve.rates import BOLOMETRIC, PowerLaw, RateTable, davenport2019, preset
+        from mauvecl.lightcurve.flares.rates import BOLOMETRIC, PowerLaw, RateTable, davenport2019, preset
 
         if self.mass_msun is not None and self.age_myr is not None:
             return davenport2019(mass_msun=self.mass_msun, age_myr=self.age_myr)
@@ -251,7 +251,7 @@ class PlanQuestion(Part):
 
     def law(self) -> DurationLaw:
         """How long flares last."""
-        from mauvecl.lightcurve.completeness import DurationLaw
+        from mauvecl.lightcurve.search.completeness import DurationLaw
 
         return DurationLaw(self.half_width_s, self.at_erg, self.exponent, self.scatter_dex)
 

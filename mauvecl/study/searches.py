@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.bank import HALF_WIDTHS_S, WINDOW_S, Bank, Level
-from mauvecl.lightcurve.components import Components
-from mauvecl.lightcurve.null import Per, per_day
-from mauvecl.lightcurve.recovery import Fit
-from mauvecl.lightcurve.shapes import shape_of
-from mauvecl.lightcurve.survey import Survey
-from mauvecl.lightcurve.templates import RANK, TEMPERATURES_K, Templates, frame_nuisances
+from mauvecl.lightcurve.flares.shapes import shape_of
+from mauvecl.lightcurve.search.bank import HALF_WIDTHS_S, WINDOW_S, Bank, Level
+from mauvecl.lightcurve.search.null import Per, per_day
+from mauvecl.lightcurve.search.recovery import Fit
+from mauvecl.lightcurve.search.survey import Survey
+from mauvecl.lightcurve.search.templates import RANK, TEMPERATURES_K, Templates, frame_nuisances
+from mauvecl.lightcurve.stares.components import Components
 from mauvecl.study.nuisances import Spread
 from mauvecl.study.sections import Part
 from mauvecl.study.stares import energy_scale, stare_of
@@ -24,7 +24,7 @@ from mauvecl.study.stares import energy_scale, stare_of
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
     from mauvecl.host.stars.source import Source
-    from mauvecl.lightcurve.stare import Stare
+    from mauvecl.lightcurve.stares.stare import Stare
     from mauvecl.study.sections import Star
     from mauvecl.study.study import Study
 

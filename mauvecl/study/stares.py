@@ -10,12 +10,12 @@ from pydantic import Field, model_validator
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
-from mauvecl.lightcurve.curves import ORBIT_S, Curve, Sinusoid, Table
-from mauvecl.lightcurve.energies import EnergyScale, amplitude_of, amplitude_of_peak
-from mauvecl.lightcurve.events import Cooling, Event, coefficients, temperatures_of
-from mauvecl.lightcurve.observed import Staring
-from mauvecl.lightcurve.shapes import Shape, TableShape, shape_of
-from mauvecl.lightcurve.stare import CHANGING, Stare
+from mauvecl.lightcurve.flares.energies import EnergyScale, amplitude_of, amplitude_of_peak
+from mauvecl.lightcurve.flares.events import Cooling, Event, coefficients, temperatures_of
+from mauvecl.lightcurve.flares.shapes import Shape, TableShape, shape_of
+from mauvecl.lightcurve.stares.curves import ORBIT_S, Curve, Sinusoid, Table
+from mauvecl.lightcurve.stares.observed import Staring
+from mauvecl.lightcurve.stares.stare import CHANGING, Stare
 from mauvecl.study.sections import Part
 from mauvecl.study.weights import read_columns
 
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from mauvecl.host.stars.source import Source
-    from mauvecl.lightcurve.stare import Changing
+    from mauvecl.lightcurve.stares.stare import Changing
     from mauvecl.study.sections import Star
     from mauvecl.study.study import Study
 

@@ -11,7 +11,7 @@ from commands import run
 from mauvecl.answers.inject import inject
 from mauvecl.device.stares import Stares
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.injected import InjectedShares
+from mauvecl.lightcurve.search.injected import InjectedShares
 from mauvecl.runs.checkpoint import Checkpoint
 from mauvecl.statistics.intervals import clopper_pearson
 from mauvecl.study.study import Study
@@ -159,4 +159,6 @@ def test_command(tmp_path):
     done = run(*words.split(), *(x for s in sets for x in ("--set", s)), "--output", tmp_path, folder=tmp_path)
     rows = json.loads(done.stdout)["rows"]
     assert {"e50", "e90", "half_width"} <= set(rows[0])
-    assert {"limits.ecsv", "completeness.png", "curves.png", "energies.png", "run.json"} <= {p.name for p in tmp_path.iterdir()}
+    assert {"limits.ecsv", "completeness.png", "curves.png", "energies.png", "run.json"} <= {
+        p.name for p in tmp_path.iterdir()
+    }

@@ -8,12 +8,12 @@ import pytest
 from scipy import stats
 
 from mauvecl import Study, plan
-from mauvecl.answers.plan import PlanAnswer
-from mauvecl.answers.plan_text import SUMMARY, summary_rows, target_lines
-from mauvecl.answers.planned import Looked
+from mauvecl.answers.campaigns.plan import PlanAnswer
+from mauvecl.answers.campaigns.plan_text import SUMMARY, summary_rows, target_lines
+from mauvecl.answers.campaigns.planned import Looked
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.completeness import Completeness
-from mauvecl.lightcurve.rates import davenport2019
+from mauvecl.lightcurve.flares.rates import davenport2019
+from mauvecl.lightcurve.search.completeness import Completeness
 from mauvecl.study.orbits import read_targets
 from mauvecl.study.spectral_types import nearest_spectrum, subtype
 

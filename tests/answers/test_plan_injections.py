@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 
 from mauvecl import Study
+from mauvecl.answers.campaigns.plan import plan
+from mauvecl.answers.campaigns.planned import Looked, closed_form
+from mauvecl.answers.campaigns.planned_injections import found_share, question_of
 from mauvecl.answers.inject import inject
-from mauvecl.answers.plan import plan
-from mauvecl.answers.planned import Looked, closed_form
-from mauvecl.answers.planned_injections import found_share, question_of
-from mauvecl.lightcurve.completeness import Completeness, DurationLaw
-from mauvecl.lightcurve.rates import PowerLaw
-from mauvecl.lightcurve.yields import fit_power_law, recovered_per_day
+from mauvecl.lightcurve.flares.rates import PowerLaw
+from mauvecl.lightcurve.search.completeness import Completeness, DurationLaw
+from mauvecl.lightcurve.search.yields import fit_power_law, recovered_per_day
 
 
 def test_shares_by_hand() -> None:

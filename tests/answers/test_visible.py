@@ -9,8 +9,8 @@ import pytest
 from astropy.table import Table
 
 from mauvecl import Study, visible
-from mauvecl.answers.calendars import Entry, calendar_bytes
-from mauvecl.answers.visible import SEEN_H, VisibleAnswer
+from mauvecl.answers.campaigns.calendars import Entry, calendar_bytes
+from mauvecl.answers.campaigns.visible import SEEN_H, VisibleAnswer
 from mauvecl.host.errors import InputError
 from mauvecl.host.sky.zodiacal import Sky
 

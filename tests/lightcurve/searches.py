@@ -7,11 +7,11 @@ from functools import cache
 import numpy as np
 
 from mauvecl import Instrument, Sky, Source, expect
-from mauvecl.lightcurve.bank import Bank, Level
-from mauvecl.lightcurve.components import Components
-from mauvecl.lightcurve.shapes import SHAPES
-from mauvecl.lightcurve.survey import Survey
-from mauvecl.lightcurve.templates import TEMPERATURES_K, Templates, frame_nuisances
+from mauvecl.lightcurve.flares.shapes import SHAPES
+from mauvecl.lightcurve.search.bank import Bank, Level
+from mauvecl.lightcurve.search.survey import Survey
+from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates, frame_nuisances
+from mauvecl.lightcurve.stares.components import Components
 
 DAVENPORT = SHAPES["davenport2014"]
 ONE = np.ones((1, 1))

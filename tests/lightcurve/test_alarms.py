@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mauvecl.lightcurve.alarms import LEFT_BEHIND, alarms
-from mauvecl.lightcurve.events import Event, coefficients
+from mauvecl.lightcurve.flares.events import Event, coefficients
+from mauvecl.lightcurve.search.alarms import LEFT_BEHIND, alarms
 from mauvecl.study.searches import Surveyed, surveyed
 from mauvecl.study.study import Study
 

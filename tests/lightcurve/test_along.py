@@ -9,8 +9,8 @@ from mauvecl.host.orbit.moments import Moments
 from mauvecl.host.orbit.names import Target
 from mauvecl.host.orbit.orbit import Orbit
 from mauvecl.host.orbit.visibility import Limits, Visibility
-from mauvecl.lightcurve.along import OrbitStare, stare_along
-from mauvecl.lightcurve.stare import Stare
+from mauvecl.lightcurve.stares.along import OrbitStare, stare_along
+from mauvecl.lightcurve.stares.stare import Stare
 
 START, HOURS = "2026-09-20T03:00:00", 8.0
 

@@ -12,8 +12,8 @@ from scipy import special
 from mauvecl.device.engine import Engine
 from mauvecl.device.stares import Stares
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.components import Components
-from mauvecl.lightcurve.stare import Stare
+from mauvecl.lightcurve.stares.components import Components
+from mauvecl.lightcurve.stares.stare import Stare
 
 METHODS = ["pixels", "cumulants"]
 

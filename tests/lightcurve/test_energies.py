@@ -8,10 +8,10 @@ import pytest
 from mauvecl.host.errors import InputError
 from mauvecl.host.stars.bands import band
 from mauvecl.host.stars.source import Source
-from mauvecl.lightcurve import energies
-from mauvecl.lightcurve.energies import EnergyScale, share_within
-from mauvecl.lightcurve.events import Event
-from mauvecl.lightcurve.shapes import SHAPES
+from mauvecl.lightcurve.flares import energies
+from mauvecl.lightcurve.flares.energies import EnergyScale, share_within
+from mauvecl.lightcurve.flares.events import Event
+from mauvecl.lightcurve.flares.shapes import SHAPES
 
 
 @pytest.mark.parametrize(

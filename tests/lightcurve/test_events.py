@@ -7,8 +7,8 @@ import pytest
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.stars.flare import blackbody
-from mauvecl.lightcurve.events import Cooling, Event, coefficients, temperatures_of
-from mauvecl.lightcurve.shapes import SHAPES
+from mauvecl.lightcurve.flares.events import Cooling, Event, coefficients, temperatures_of
+from mauvecl.lightcurve.flares.shapes import SHAPES
 
 START = np.arange(400) * 5.0
 

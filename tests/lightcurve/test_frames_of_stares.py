@@ -7,8 +7,8 @@ import pytest
 from scipy.integrate import quad
 
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.curves import ORBIT_S, Sinusoid, Table
-from mauvecl.lightcurve.stare import Stare, StareUnknown
+from mauvecl.lightcurve.stares.curves import ORBIT_S, Sinusoid, Table
+from mauvecl.lightcurve.stares.stare import Stare, StareUnknown
 
 
 def test_frames_and_gaps():

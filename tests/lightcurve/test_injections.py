@@ -7,12 +7,12 @@ import pytest
 from scipy import special
 from searches import DAVENPORT, KNOWN, ONE, spectra, survey
 
-from mauvecl.lightcurve.bank import Bank, Level
-from mauvecl.lightcurve.injections import OVERLAP, Injections
-from mauvecl.lightcurve.null import in_a_row, in_a_row_rate, sampled
-from mauvecl.lightcurve.recovery import Fit
-from mauvecl.lightcurve.search import Search
-from mauvecl.lightcurve.stare import Stare
+from mauvecl.lightcurve.search.bank import Bank, Level
+from mauvecl.lightcurve.search.injections import OVERLAP, Injections
+from mauvecl.lightcurve.search.null import in_a_row, in_a_row_rate, sampled
+from mauvecl.lightcurve.search.recovery import Fit
+from mauvecl.lightcurve.search.search import Search
+from mauvecl.lightcurve.stares.stare import Stare
 
 #: What a bank's weakest found flares are, in sigma of a frame; half of them are found (C; +-5 %).
 TABLE = {10.0: (7.58, 5.43), 30.0: (4.39, 2.66), 60.0: (3.65, 1.90), 300.0: (2.91, 0.844)}

@@ -7,16 +7,8 @@ import pytest
 from scipy import stats
 
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.completeness import (
-    HALF_WIDTHS_S,
-    Completeness,
-    DurationLaw,
-    _gains,
-    frame_signal,
-    search_threshold,
-)
-from mauvecl.lightcurve.energies import EnergyScale, in_band
-from mauvecl.lightcurve.rates import (
+from mauvecl.lightcurve.flares.energies import EnergyScale, in_band
+from mauvecl.lightcurve.flares.rates import (
     PowerLaw,
     RateTable,
     band_factor,
@@ -25,8 +17,16 @@ from mauvecl.lightcurve.rates import (
     preset,
     sunlike,
 )
-from mauvecl.lightcurve.shapes import shape_of
-from mauvecl.lightcurve.yields import Yield, fit_power_law, recovered_per_day
+from mauvecl.lightcurve.flares.shapes import shape_of
+from mauvecl.lightcurve.search.completeness import (
+    HALF_WIDTHS_S,
+    Completeness,
+    DurationLaw,
+    _gains,
+    frame_signal,
+    search_threshold,
+)
+from mauvecl.lightcurve.search.yields import Yield, fit_power_law, recovered_per_day
 
 
 def test_davenport2019() -> None:

@@ -7,9 +7,9 @@ import pytest
 from scipy import special
 from searches import DAVENPORT, KNOWN, ONE
 
-from mauvecl.lightcurve.bank import HALF_WIDTHS_S, Bank, Level
-from mauvecl.lightcurve.search import Search
-from mauvecl.lightcurve.stare import Stare
+from mauvecl.lightcurve.search.bank import HALF_WIDTHS_S, Bank, Level
+from mauvecl.lightcurve.search.search import Search
+from mauvecl.lightcurve.stares.stare import Stare
 
 
 def filtered(search, sums, curves):

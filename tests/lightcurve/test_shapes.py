@@ -9,7 +9,7 @@ import pytest
 from scipy.integrate import quad
 
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.shapes import SHAPES, Fiducial, TableShape, half_width_of_altaipony, shape_of
+from mauvecl.lightcurve.flares.shapes import SHAPES, Fiducial, TableShape, half_width_of_altaipony, shape_of
 
 #: Where each shape has a kink or a step.
 KINKS = {"davenport2014": [-1.0, 0.0], "tovarmendoza2022": [0.0], "fiducial": [0.0, Fiducial.BOX], "table": [0.0, 1.0]}

@@ -7,8 +7,8 @@ import pytest
 from searches import spectra
 
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.stare import Stare
-from mauvecl.lightcurve.templates import TEMPERATURES_K, Templates, frame_nuisances
+from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates, frame_nuisances
+from mauvecl.lightcurve.stares.stare import Stare
 
 CASES = {
     "known": {},

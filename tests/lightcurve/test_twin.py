@@ -11,11 +11,11 @@ from scenes import instrument, star
 from mauvecl.device.engine import Engine
 from mauvecl.device.stares import Stares
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve import twin
-from mauvecl.lightcurve.components import Components
-from mauvecl.lightcurve.scene import Flares, StareScene
-from mauvecl.lightcurve.stare import Stare
-from mauvecl.lightcurve.sums import SumTable
+from mauvecl.lightcurve.stares import twin
+from mauvecl.lightcurve.stares.components import Components
+from mauvecl.lightcurve.stares.scene import Flares, StareScene
+from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.lightcurve.stares.sums import SumTable
 from mauvecl.noise.processes import CosmicRays
 
 SEED = 2**63 + 12345

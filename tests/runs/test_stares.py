@@ -16,8 +16,8 @@ from scenes import flaring_stares as request
 
 from mauvecl.device.engine import Engine
 from mauvecl.device.stares import Stares
-from mauvecl.lightcurve.components import Components
-from mauvecl.lightcurve.stare import Stare
+from mauvecl.lightcurve.stares.components import Components
+from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.runs import shards
 from mauvecl.runs.checkpoint import Checkpoint
 from mauvecl.runs.pool import LocalWorkers, Pool, Stopped

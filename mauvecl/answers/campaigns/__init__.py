@@ -1,0 +1,1 @@
+"""Answers over a season: when targets are seen, and what a campaign on them would bring."""

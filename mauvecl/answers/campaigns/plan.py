@@ -1,0 +1,339 @@
+"""A campaign: how long each target is seen, which flares are recovered, how many are expected, what alarms falsely."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mauvecl.answers.answer import Answer
+from mauvecl.answers.campaigns.planned import (
+    NOTHING,
+    CompletenessOf,
+    Planned,
+    closed_form,
+    looked_of,
+    rates_of,
+    star_of,
+)
+from mauvecl.answers.campaigns.visible import VisibleAnswer, visible
+from mauvecl.host.errors import InputError
+from mauvecl.lightcurve.search.completeness import DAY_S
+from mauvecl.lightcurve.search.yields import Yield, recovered_per_day
+from mauvecl.study.labels import described, stacked, told
+from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    from astropy.table import QTable, Table
+
+    from mauvecl.host.expectation import Expectation
+
+
+@dataclass(frozen=True, eq=False)
+class PlanAnswer(Answer):
+    """What `plan` answers.
+
+    Attributes
+    ----------
+    study : Study
+    seen : VisibleAnswer
+    planned : tuple of Planned
+    """
+
+    study: Study
+    seen: VisibleAnswer
+    planned: tuple[Planned, ...]
+
+    @property
+    def false_alarms(self) -> np.ndarray:
+        """Expected of each target, (n,)."""
+        return np.array([self.study.search.rate * one.hours / 24 for one in self.planned])
+
+    @property
+    def table(self) -> QTable:
+        """One row per target."""
+        import astropy.units as u
+        from astropy.table import QTable
+
+        rows = self.planned
+        table = QTable()
+        table["target"] = [one.name for one in rows]
+        table["seen"] = [one.seen_h for one in rows] * u.h
+        table["hours"] = [one.hours for one in rows] * u.h
+        table["E50"] = [one.energy_at(0.5) for one in rows] * u.erg
+        table["E90"] = [one.energy_at(0.9) for one in rows] * u.erg
+        nothing = Yield(float("nan"), -1, -1, float("nan"))
+        found = [one.found or nothing for one in rows]
+        table["expected"] = [one.expected for one in found]
+        table["low"] = np.ma.MaskedArray([one.low for one in found], [one.low < 0 for one in found])
+        table["high"] = np.ma.MaskedArray([one.high for one in found], [one.high < 0 for one in found])
+        table["at_least_one"] = [one.at_least_one for one in found]
+        table["false_alarms"] = self.false_alarms
+        table["best_months"] = [" ".join(one.best_months) for one in rows]
+        for name, text in DESCRIPTIONS.items():
+            table[name].info.description = text
+        table.meta |= {
+            "start": self.seen.moments.iso(0.0),
+            "days": self.seen.moments.days,
+            "false_alarms_per_day": self.study.search.rate,
+            "study": self.study.text(),
+        }
+        return described(table)
+
+    @property
+    def stars(self) -> QTable:
+        """What is put in: one row per target."""
+        import astropy.units as u
+        from astropy.table import QTable
+
+        rows = [one.looked for one in self.planned]
+        table = QTable()
+        table["target"] = [one.target.name for one in rows]
+        table["ra"] = [one.target.ra_deg for one in rows] * u.deg
+        table["dec"] = [one.target.dec_deg for one in rows] * u.deg
+        table["spectral_type"] = [one.target.spectral_type or "" for one in rows]
+        table["spectrum"] = [one.star.library or "" for one in rows]
+        table["V"] = [one.star.magnitude or 0.0 for one in rows] * u.mag
+        table["distance"] = [one.star.distance_pc or 0.0 for one in rows] * u.pc
+        table["sky"] = [float("nan") if one.sky is None else one.sky for one in rows] * u.mag / u.arcsec**2
+        table["signal_per_frame"] = [one.signal_per_frame for one in rows]
+        table["energy_per_second"] = [one.scale.erg_per_s for one in rows] * u.erg / u.s
+        table["window"] = [one.window_s / 60 for one in rows] * u.min
+        table["saturated"] = [int(one.quiet.saturated.sum()) for one in rows]
+        table["rates"] = [one.no_rates if one.rates is None else one.rates.source for one in self.planned]
+        table["recovered_per_day"] = [
+            float("nan")
+            if one.rates is None or one.completeness is None
+            else recovered_per_day(one.rates, one.completeness)
+            for one in self.planned
+        ]
+        table["scatter"] = [float("nan") if one.rates is None else one.rates.scatter_dex for one in self.planned]
+        for name, text in STAR_COLUMNS.items():
+            table[name].info.description = text
+        table.meta["study"] = self.study.text()
+        return table
+
+    @property
+    def by_energy(self) -> QTable:
+        """The share recovered and the rate by energy: one row per target and energy, where either changes."""
+        import astropy.units as u
+        from astropy.table import QTable
+
+        parts = []
+        for one in self.planned:
+            if one.completeness is None:
+                continue
+            energy, p = one.completeness.energy_erg, one.completeness.probability
+            first = max(int(np.argmax(p > 0)) - 1, 0)
+            part = slice(first, min(first + 161, energy.size))
+            table = QTable({"energy": energy[part] * u.erg, "recovered": p[part]})
+            rate = np.full(energy[part].size, np.nan) if one.rates is None else one.rates.per_day_above(energy[part])
+            table["rate_above"] = rate / u.day
+            table["energy"].info.description = "bolometric"
+            table["recovered"].info.description = "share of flares of this energy that is recovered"
+            table["rate_above"].info.description = "flares of this energy or more, a day"
+            parts.append(({"target": one.name}, table))
+        if not parts:
+            return QTable({"target": np.array([], "U1"), "energy": np.array([]) * u.erg})
+        return stacked(parts, study=self.study.text())
+
+    @property
+    def assumptions(self) -> Table:
+        """Everything that is assumed, with where it is from."""
+        from astropy.table import Table
+
+        law = self.study.plan.law()
+        orbit = self.study.orbit.orbit()
+        rows = list(self.seen.visibility.limits.assumptions)
+        rows += [
+            ("stray light", "none", "not modelled"),
+            (
+                "orbit",
+                orbit.resolved(self.seen.moments),
+                f"{orbit.elements.source}, epoch {orbit.elements.epoch}; mean is a Sun-synchronous orbit through them",
+            ),
+            ("throughput", self.study.observation.instrument, "nominal, not a flight calibration"),
+            ("sky", "zodiacal light", "median over the days on which a target is seen; table of the MauveSim paper"),
+            (
+                "duration of flares",
+                f"t_1/2 = {law.half_width_s:g} s (E / {law.at_erg:g} erg)^{law.exponent:g}, {law.scatter_dex:g} dex",
+                "assumption; exponent of Maehara et al. 2015",
+            ),
+            ("shape of flares", self.study.search.shape, "every flare alike, no bursts"),
+            (
+                "light of flares",
+                f"blackbody of {self.study.flare.temperature_k:g} K",
+                "assumption; energies are those of all its light, spread alike in all directions",
+            ),
+            ("noise of a stare", "white", "beside what the study says is unknown of a stare; see completeness"),
+            (
+                "false alarms",
+                f"{self.study.search.false_alarms:g} per {self.study.search.per} of exposure",
+                "sets the threshold; of noise, not of cosmic rays that look like flares",
+            ),
+            (
+                "spectra",
+                "library",
+                "the embedded spectrum of the nearest type stands for the star, scaled to its V",
+            ),
+        ]
+        rows += [(f"flare rates of {one.name}", one.rates.source, _measured(one)) for one in self.planned if one.rates]
+        rows += [(f"completeness of {one.name}", "", one.completeness.how) for one in self.planned if one.completeness]
+        return Table(rows=rows, names=("assumption", "value", "source"))
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        """Targets, what is put in, shares and rates by energy, months, days, assumptions."""
+        return {
+            "plan": self.table,
+            "stars": self.stars,
+            "energies": self.by_energy,
+            "months": self.seen.months,
+            "days": self.seen.by_day,
+            "assumptions": self.assumptions,
+        }
+
+    @property
+    def documents(self) -> dict[str, Callable[[], bytes]]:
+        """The report: a table, a page for each target, every assumption."""
+        from mauvecl.answers.campaigns.plan_page import report_html
+        from mauvecl.host.plotting import picture
+
+        if self.study.plan.report == "html":
+            return {"plan.html": lambda: report_html(self)}
+        return {"plan.pdf": lambda: bytes(picture("plan_report.pdf_bytes", self))}
+
+    @cached_property
+    def inputs(self) -> list[Expectation]:
+        """One frame of each star."""
+        return [one.looked.quiet for one in self.planned]
+
+    @property
+    def messages(self) -> list[str]:
+        """What saturates, which targets have no answer and why, what is extrapolated, what is said of visibility."""
+        found = [text for text in told(self.inputs) if text.startswith("SATURATED")]
+        typical = [one.name for one in self.planned if one.rates is not None and "typical" in one.rates.source]
+        if typical:
+            found.append(
+                f"Flare rates of {', '.join(typical)} are those typical of their types at 1 Gyr: mass_msun and "
+                "age_myr, or rates of their own, say more."
+            )
+        for one in self.planned:
+            if one.no_rates:
+                found.append(f"{one.no_rates}; its expected flares are not given.")
+            if one.rates is not None and one.completeness is not None and one.extrapolated:
+                low, high = one.rates.measured_erg
+                found.append(
+                    f"E50 of {one.name}, {one.energy_at(0.5):.2g} erg, lies outside the {low:.2g} to {high:.2g} erg "
+                    "for which its flare rates are published: they are extrapolated."
+                )
+        found += self.seen.messages
+        return list(dict.fromkeys(found))
+
+    @property
+    def pictures(self) -> dict[str, tuple[Any, ...]]:
+        """Expected flares and energies of all targets."""
+        return {"plan": ("plan_report.overview", self), "visible": ("visibility.calendar", self.seen)}
+
+
+#: Columns of the table of targets.
+DESCRIPTIONS = {
+    "seen": "time in which the target is seen",
+    "hours": "of it observed",
+    "E50": "bolometric energy from which on half of the flares are recovered",
+    "E90": "bolometric energy from which on 90 % of the flares are recovered",
+    "expected": "flares recovered, by the rates as they are",
+    "low": "95 % of campaigns recover at least so many: scatter of the rates and Poisson's",
+    "high": "95 % of campaigns recover at most so many",
+    "at_least_one": "probability of recovering any",
+    "false_alarms": "expected of noise",
+    "best_months": "those with most hours",
+}
+STAR_COLUMNS = {
+    "spectrum": "embedded spectrum that stands for the star",
+    "sky": "zodiacal light behind it, median over the days on which it is seen",
+    "signal_per_frame": "S/N of one frame with a flare of amplitude 1",
+    "energy_per_second": "bolometric energy of a second of equivalent duration",
+    "window": "median stretch in which it is seen",
+    "saturated": "pixels left out since they saturate",
+    "recovered_per_day": "flares recovered in a day of exposure",
+    "scatter": "standard deviation of the rate's logarithm, dex",
+}
+
+
+def _measured(one: Planned) -> str:
+    assert one.rates is not None
+    low, high = one.rates.measured_erg
+    return f"published for {low:.2g} to {high:.2g} erg, bolometric; scatter {one.rates.scatter_dex:g} dex (assumption)"
+
+
+def plan(
+    study: Study,
+    completeness: CompletenessOf | None = None,
+    *,
+    progress: Callable[[int, int], None] | None = None,
+) -> PlanAnswer:
+    """A campaign on a study's targets.
+
+    Parameters
+    ----------
+    study : Study
+        Its ``plan`` names the targets, its ``orbit`` when and from where.
+    completeness : callable, optional
+        The share of flares recovered by bolometric energy; as the study's ``plan.completeness`` has it unless given: by
+        injections into drawn noise, or in closed form.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in targets.
+
+    Raises
+    ------
+    InputError
+        If there are no targets, or a target's place, type, magnitude or distance is not known.
+
+    Examples
+    --------
+    >>> from mauvecl import Study, plan
+    >>> study = Study().with_settings(["plan.targets=[{name = 'eps Eri'}]", "orbit.days=31", "plan.hours=100"])
+    >>> found = plan(study.with_settings(["plan.completeness='closed form'"]))
+    >>> found.table["hours"].value.tolist()
+    [100.0]
+    """
+    if not study.plan.targets:
+        raise InputError("the plan has no targets, expected some, such as --targets targets.csv")
+    if study.orbit.targets:
+        raise InputError("both orbit.targets and plan.targets are given, expected the plan's")
+    stars = [star_of(study, text) for text in study.plan.targets]
+    seen = visible(study)
+    names, hours = seen.visibility.by_month()
+    completeness = completeness or _completeness(study)
+    found: list[Planned] = []
+    for k, (text, star, target) in enumerate(zip(study.plan.targets, stars, seen.targets, strict=True)):
+        if progress is not None:
+            progress(k, len(stars))
+        looked = looked_of(study, text, star, target, seen, k)
+        exposed = float(seen.visibility.hours[k])
+        observed = exposed if study.plan.hours is None else min(exposed, study.plan.hours)
+        order = np.argsort(-hours[:, k], kind="stable")[: study.plan.best_months]
+        best = tuple(names[i] for i in sorted(order) if hours[i, k] > 0)
+        share = None
+        if looked.window_s > 0:
+            share = completeness(study, looked) if looked.signal_per_frame > 0 else NOTHING
+        rates, why = rates_of(study, text, looked)
+        result = None
+        if rates is not None:
+            days = observed * 3600 / DAY_S
+            result = Yield.about(0.0, 0.0) if share is None else Yield.of(rates, share, days)
+        found.append(Planned(looked, exposed, observed, share, rates, result, best, why))
+    return PlanAnswer(study, seen, tuple(found))
+
+
+def _completeness(study: Study) -> CompletenessOf:
+    """That which a study asks for."""
+    if study.plan.completeness == "closed form":
+        return closed_form
+    from mauvecl.answers.campaigns.planned_injections import injected
+
+    return injected

@@ -1,0 +1,93 @@
+"""The completeness of a plan's target by injections: flares put into stretches as it is seen, and searched for."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.answers.campaigns.planned import Looked
+from mauvecl.answers.inject import inject
+from mauvecl.lightcurve.flares.rates import BOLOMETRIC
+from mauvecl.lightcurve.search.completeness import PER_DECADE, Completeness, DurationLaw
+from mauvecl.study.searches import InjectionQuestion
+from mauvecl.study.sections import SkyLight
+from mauvecl.study.study import Study
+
+Float = NDArray[np.float64]
+
+#: Orbits of a stare: the window over which a search takes the level for a line reaches over its gaps.
+ORBITS = 3
+#: Half-widths injected, and places of their peaks.
+WIDTHS, WIDTH_RANGE_S, POSITIONS = 10, (5.0, 3000.0), 20
+
+
+def injected(study: Study, looked: Looked) -> Completeness:
+    """The share of injected flares that the study's search finds, by bolometric energy.
+
+    The stare is some orbits with one stretch in each, as long as the target's median; the search, its false alarms and
+    what is unknown of the stare are the study's.
+
+    Parameters
+    ----------
+    study : Study
+    looked : Looked
+
+    Raises
+    ------
+    InputError
+        As `inject`.
+    """
+    question = question_of(study, looked)
+    star = inject(question).stars[0]
+    how = (
+        f"{question.injections.count} injections of each of {WIDTHS} half-widths into stretches of "
+        f"{looked.window_s / 60:.0f} min, found above {star.threshold.value:.2f} sigma, "
+        f"{study.search.false_alarms:g} false alarms per {study.search.per}"
+    )
+    energy = 10 ** np.arange(24.0, 40.0, 1 / PER_DECADE)
+    widths = np.array(star.found.half_widths_s)
+    share = found_share(star.found.critical.reshape(widths.size, -1), widths, energy, study.plan.law())
+    return Completeness(energy, share, BOLOMETRIC, how)
+
+
+def question_of(study: Study, looked: Looked) -> Study:
+    """What is asked of `inject`: the target's star, its sky, its stretches."""
+    orbit_s = study.orbit.orbit().elements.period_s
+    gap = max(orbit_s - looked.window_s, 0.0)
+    stare = study.stare.model_copy(
+        update={"duration_s": ORBITS * orbit_s, "orbit_s": orbit_s, "orbit_gap_s": gap, "gaps": ()}
+    )
+    search = study.search.model_copy(update={"nulls": 0})
+    injections = InjectionQuestion(
+        of="energy", sizes=2, widths=WIDTHS, half_width_low_s=WIDTH_RANGE_S[0], half_width_high_s=WIDTH_RANGE_S[1],
+        count=study.plan.injections, positions=min(POSITIONS, study.plan.injections), fitted=0,
+    )  # fmt: skip
+    sky = study.sky if looked.sky is None else SkyLight(surface_brightness=looked.sky)
+    return study.model_copy(
+        update={"star": (looked.star,), "stare": stare, "search": search, "injections": injections, "sky": sky}
+    )
+
+
+def found_share(critical_erg: Float, half_widths_s: Float, energy_erg: Float, law: DurationLaw) -> Float:
+    """Share found by energy, over the half-widths that flares of an energy have, (n_energy,).
+
+    Parameters
+    ----------
+    critical_erg : ndarray, shape (n_half_width, n_draw)
+        Energy from which on each injection is found; zero where there is an alarm without it, which is left out: false
+        alarms are counted apart.
+    half_widths_s : ndarray, shape (n_half_width,)
+    energy_erg : ndarray, shape (n_energy,)
+    law : DurationLaw
+    """
+    share = np.empty((half_widths_s.size, energy_erg.size))
+    for row, one in zip(share, critical_erg, strict=True):
+        counted = np.sort(one[one > 0])
+        row[:] = np.searchsorted(counted, energy_erg, side="right") / max(counted.size, 1)
+    nodes, weights = np.polynomial.hermite_e.hermegauss(15)
+    half = np.log(law.half_width(energy_erg)[:, None] * 10 ** (law.scatter_dex * nodes))
+    place = np.interp(half, np.log(half_widths_s), np.arange(half_widths_s.size))
+    i = np.minimum(place.astype(int), half_widths_s.size - 2)
+    part, column = place - i, np.arange(energy_erg.size)[:, None]
+    p = (1 - part) * share[i, column] + part * share[i + 1, column]
+    return np.asarray(np.clip(p @ (weights / weights.sum()), 0.0, 1.0))

@@ -1,0 +1,301 @@
+"""When targets can be seen from the orbit: windows, hours by day and month, elongation and zodiacal light."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property, partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.answers.answer import Answer
+from mauvecl.answers.campaigns.calendars import Entry, calendar_bytes
+from mauvecl.host.orbit.bodies import Bodies
+from mauvecl.host.orbit.moments import DAY_S, Moments
+from mauvecl.host.orbit.names import Target
+from mauvecl.host.orbit.season import elongation_deg, zodiacal_light
+from mauvecl.host.orbit.visibility import Visibility, Windows
+from mauvecl.study.labels import described, stacked
+from mauvecl.study.orbits import targets_of
+from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    from astropy.table import QTable, Table
+
+    from mauvecl.host.expectation import Expectation
+
+Float = NDArray[np.float64]
+
+#: Rows of the table of windows beyond which it is not written.
+MOST_WINDOWS = 100_000
+#: Hours of exposure in a day from which a day without single windows counts as one on which the target is seen.
+SEEN_H = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class VisibleAnswer(Answer):
+    """What `visible` answers.
+
+    Attributes
+    ----------
+    study : Study
+    targets : tuple of Target
+    visibility : Visibility
+        Columns in the order of the targets.
+    """
+
+    study: Study
+    targets: tuple[Target, ...]
+    visibility: Visibility
+
+    @property
+    def moments(self) -> Moments:
+        """The times that are looked at."""
+        return self.visibility.track.moments
+
+    @cached_property
+    def days(self) -> list[str]:
+        """Its UTC days, such as "2027-01-31"."""
+        first = np.datetime64(self.moments.iso(0.0)[:10], "D")
+        count = int(np.floor(self.moments.julian[1][-1])) + 1
+        return [str(first + n) for n in range(count)]
+
+    @cached_property
+    def noons(self) -> Bodies:
+        """Sun and Moon at the noon of each day, UTC."""
+        return Bodies.at(Moments(self.days[0], len(self.days), DAY_S))
+
+    def elongation_deg(self, k: int) -> Float:
+        """Angle of a target from the Sun at noon of each day, (n_day,)."""
+        return elongation_deg(self.noons.sun, self.targets[k].direction)
+
+    @cached_property
+    def zodiacal(self) -> Float:
+        """V mag arcsec^-2 behind each target at noon of each day, (n_target, n_day); NaN near the Sun."""
+        return np.array([zodiacal_light(self.noons, one.direction) for one in self.targets])
+
+    @cached_property
+    def windows(self) -> tuple[Windows, ...]:
+        """Those of each target."""
+        return tuple(self.visibility.windows(k) for k in range(len(self.targets)))
+
+    @property
+    def table(self) -> QTable:
+        """One row per target."""
+        import astropy.units as u
+        from astropy.table import QTable
+
+        seen, (names, hours) = self.visibility, self.visibility.by_month()
+        table = QTable()
+        table["target"] = [one.name for one in self.targets]
+        table["ra"] = [one.ra_deg for one in self.targets] * u.deg
+        table["dec"] = [one.dec_deg for one in self.targets] * u.deg
+        table["hours"] = seen.hours * u.h
+        table["share"] = seen.share
+        for name, kept in seen.kept_by.items():
+            table[f"leaves_{name}"] = kept
+            table[f"leaves_{name}"].info.description = f"share of the time that the limit of {name} alone leaves"
+        lengths = [one.length_s / 60 for one in self.windows]
+        table["windows"] = [one.size for one in lengths]
+        table["median_window"] = [float(np.median(one)) if one.size else 0.0 for one in lengths] * u.min
+        table["longest_gap"] = [self._longest_gap_d(k) for k in range(len(self.targets))] * u.day
+        table["per_orbit"] = [float(np.mean(seen.by_orbit(k))) for k in range(len(self.targets))] * u.min
+        table["in_shadow"] = [
+            float(one.in_shadow_s.sum() / one.length_s.sum()) if one.length_s.size else 0.0 for one in self.windows
+        ]
+        table["best_month"] = [
+            names[int(np.argmax(hours[:, k]))] if hours[:, k].any() else "" for k in range(len(self.targets))
+        ]
+        away = [self.elongation_deg(k) for k in range(len(self.targets))]
+        table["least_elongation"] = [float(one.min()) for one in away] * u.deg
+        table["most_elongation"] = [float(one.max()) for one in away] * u.deg
+        light = [one[np.isfinite(one)] for one in self.zodiacal]
+        unit = u.mag / u.arcsec**2
+        table["brightest_sky"] = [float(one.min()) if one.size else np.nan for one in light] * unit
+        table["faintest_sky"] = [float(one.max()) if one.size else np.nan for one in light] * unit
+        for name, text in DESCRIPTIONS.items():
+            table[name].info.description = text
+        table.meta |= {"start": self.moments.iso(0.0), "days": self.moments.days, "study": self.study.text()}
+        return described(table)
+
+    def _longest_gap_d(self, k: int) -> float:
+        """Days without a window."""
+        one = self.windows[k]
+        ends = (
+            np.concatenate([[0.0], one.stop_s]),
+            np.concatenate([one.start_s, [self.moments.n * self.moments.step_s]]),
+        )
+        return float(np.max(ends[1] - ends[0])) / DAY_S
+
+    @property
+    def months(self) -> QTable:
+        """One row per month, one column of hours per target."""
+        import astropy.units as u
+        from astropy.table import QTable
+
+        names, hours = self.visibility.by_month()
+        table = QTable({"month": names})
+        for k, one in enumerate(self.targets):
+            table[one.name] = hours[:, k] * u.h
+        table.meta["study"] = self.study.text()
+        return table
+
+    @property
+    def by_day(self) -> QTable:
+        """One row per target and day."""
+        import astropy.units as u
+        from astropy.table import QTable
+
+        parts = []
+        for k, one in enumerate(self.targets):
+            table = QTable({"day": self.days})
+            table["hours"] = self.visibility.by_day(k) * u.h
+            table["elongation"] = self.elongation_deg(k) * u.deg
+            table["zodiacal_light"] = self.zodiacal[k] * u.mag / u.arcsec**2
+            table["elongation"].info.description = "angle from the Sun at noon"
+            table["zodiacal_light"].info.description = "V at noon; none where the table has none, near the Sun"
+            parts.append(({"target": one.name}, table))
+        return stacked(parts, study=self.study.text())
+
+    @property
+    def window_table(self) -> QTable:
+        """One row per window."""
+        import astropy.units as u
+        from astropy.table import QTable
+
+        moments, z = self.moments, self.visibility.track.of_date_km[:, 2]
+        nodes = moments.seconds[1:][(z[:-1] < 0) & (z[1:] >= 0)]
+        parts = []
+        for one, windows in zip(self.targets, self.windows, strict=True):
+            table = QTable()
+            table["start"] = [moments.iso(float(t)) for t in windows.start_s] or np.array([], "U19")
+            table["stop"] = [moments.iso(float(t)) for t in windows.stop_s] or np.array([], "U19")
+            table["length"] = windows.length_s / 60 * u.min
+            table["in_shadow"] = windows.in_shadow_s / 60 * u.min
+            table["orbit"] = np.searchsorted(nodes, windows.start_s)
+            table["in_shadow"].info.description = "of it, in the Earth's shadow"
+            table["orbit"].info.description = "ascending nodes since the start of the plan"
+            parts.append(({"target": one.name}, table))
+        return stacked(parts, study=self.study.text(), step_s=moments.step_s)
+
+    @property
+    def assumptions(self) -> Table:
+        """Each limit in force, with its value and where its default is from."""
+        from astropy.table import Table
+
+        rows = self.visibility.limits.assumptions
+        return Table(rows=rows, names=("limit", "value", "source"))
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        """Targets, months, days, windows, assumptions."""
+        found = {"visible": self.table, "months": self.months, "days": self.by_day}
+        if self._writes_windows:
+            found["windows"] = self.window_table
+        return found | {"assumptions": self.assumptions}
+
+    @property
+    def _writes_windows(self) -> bool:
+        return sum(one.start_s.size for one in self.windows) <= MOST_WINDOWS
+
+    @property
+    def documents(self) -> dict[str, Callable[[], bytes]]:
+        """The calendar: each window, or where these are not known the days on which a target is seen."""
+        return {"visible.ics": partial(calendar_bytes, self.entries(), "Mauve")}
+
+    def entries(self) -> list[Entry]:
+        """Appointments of the calendar."""
+        moments, found = self.moments, []
+        single = self.study.orbit.orbit().resolved(moments) == "tle" and self._writes_windows
+        for k, one in enumerate(self.targets):
+            if single:
+                windows = self.windows[k]
+                found += [
+                    Entry(moments.iso(float(a)), moments.iso(float(b)), one.name, f"{(b - a) / 60:.0f} min of exposure")
+                    for a, b in zip(windows.start_s, windows.stop_s, strict=True)
+                ]
+                continue
+            hours = self.visibility.by_day(k)
+            edges = np.flatnonzero(np.diff(np.concatenate([[False], hours >= SEEN_H, [False]])))
+            for first, last in zip(edges[::2], edges[1::2], strict=True):
+                mean = f"{hours[first:last].mean():.1f} h of exposure a day"
+                found.append(Entry(self.days[first], self.days[last - 1], one.name, mean))
+        return found
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        """None: nothing is exposed."""
+        return []
+
+    @property
+    def messages(self) -> list[str]:
+        """What the orbit is, what is assumed, what is not modelled, and which targets are never seen."""
+        never = [one.name for one, share in zip(self.targets, self.visibility.share, strict=True) if share == 0]
+        found = [f"{name} is never seen: {self._reason(name)}." for name in never]
+        found += self.study.orbit.orbit().messages(self.moments)
+        found.append(
+            "Mauve's own limits are not public: those used are assumptions, named with their sources in the table of "
+            "assumptions. Stray light is not modelled."
+        )
+        if not self._writes_windows:
+            found.append(
+                f"There are more than {MOST_WINDOWS} windows: their table is not written, and the calendar has days."
+            )
+        return found
+
+    def _reason(self, name: str) -> str:
+        k = [one.name for one in self.targets].index(name)
+        alone = [limit for limit, kept in self.visibility.kept_by.items() if kept[k] == 0]
+        return f"the limit of {alone[0]} alone leaves nothing" if alone else "its limits together leave nothing"
+
+    @property
+    def pictures(self) -> dict[str, tuple[Any, ...]]:
+        """A calendar of hours a day."""
+        return {"visible": ("visibility.calendar", self)}
+
+
+#: Columns of the table of targets.
+DESCRIPTIONS = {
+    "hours": "exposure in the whole time, with the duty cycle",
+    "share": "of the time in which the target is seen",
+    "windows": "stretches in which it is seen",
+    "median_window": "length of a stretch",
+    "longest_gap": "longest time without one",
+    "per_orbit": "exposure in a mean orbit",
+    "in_shadow": "share of the windows in the Earth's shadow",
+    "best_month": "that with most exposure",
+    "least_elongation": "least angle from the Sun",
+    "most_elongation": "largest angle from the Sun",
+    "brightest_sky": "zodiacal light at its brightest, V, where the table has it",
+    "faintest_sky": "zodiacal light at its faintest, V",
+}
+
+
+def visible(study: Study) -> VisibleAnswer:
+    """When a study's targets are seen.
+
+    Parameters
+    ----------
+    study : Study
+        Its ``orbit`` says from where, when, and what must hold.
+
+    Raises
+    ------
+    InputError
+        If there are no targets, or one is unknown; for elements that cannot be followed that far.
+
+    Examples
+    --------
+    >>> from mauvecl import Study, visible
+    >>> study = Study().with_settings(["orbit.targets=['eps Eri']", "orbit.start=2027-01-01", "orbit.days=31"])
+    >>> found = visible(study)
+    >>> found.months["month"].tolist()
+    ['2027-01']
+    """
+    targets = tuple(targets_of(study))
+    o = study.orbit
+    track = o.orbit().track(o.moments())
+    directions = np.array([one.direction for one in targets])
+    return VisibleAnswer(study, targets, Visibility.of(track, directions, o.limits.limits()))

@@ -1,0 +1,294 @@
+"""Flares of a stare: each a shape with an amplitude, a time and a temperature, and what they add to every frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.host.errors import InputError
+from mauvecl.host.quantities import takes_quantities, takes_quantities_of
+from mauvecl.host.ranges import FLARE_TEMPERATURES_K
+from mauvecl.lightcurve.flares.energies import EnergyScale, amplitude_of, amplitude_of_peak, equivalent_duration
+from mauvecl.lightcurve.flares.shapes import SHAPES, Shape, shape_of
+
+Float = NDArray[np.float64]
+
+#: Flare spectra that a stare's frames are made of, at most (`components.MOST_FLARES`); the least for flares that cool.
+MOST_TEMPERATURES, LEAST_STEPS = 8, 3
+#: Temperatures at which the energy of a second is known, where a flare cools.
+SCALE_NODES = 33
+#: Parts of a frame with one temperature each, where a flare cools.
+PARTS = 8
+#: Amplitudes beyond this are no flares: of the largest known, an M dwarf's in the ultraviolet, a few thousand.
+LARGEST_AMPLITUDE = 1e6
+#: Temperatures that differ by less are one.
+SAME_K = 0.5
+
+
+@takes_quantities
+@dataclass(frozen=True)
+class Cooling:
+    """A temperature that falls from the peak on: end + (peak - end) exp(-(t - t_peak) / fold); before it, the peak's.
+
+    Attributes
+    ----------
+    peak_k, end_k : float
+    fold_s : float
+    """
+
+    peak_k: float
+    end_k: float
+    fold_s: float
+
+    def __post_init__(self) -> None:
+        low, high = FLARE_TEMPERATURES_K
+        if not (low <= self.end_k <= self.peak_k <= high and np.isfinite(self.fold_s) and self.fold_s > 0):
+            raise InputError(
+                f"a flare that cools from {self.peak_k:g} to {self.end_k:g} K in {self.fold_s:g} s, expected "
+                f"temperatures from {low:g} to {high:g} K, the end no hotter than the peak, and a time above 0"
+            )
+
+    @takes_quantities
+    def at(self, since_peak_s: Float) -> Float:
+        """Temperature, K, shape of the time."""
+        cooled = np.exp(-np.maximum(since_peak_s, 0.0) / self.fold_s)
+        return np.asarray(self.end_k + (self.peak_k - self.end_k) * cooled)
+
+    @property
+    def steady(self) -> bool:
+        """Whether it is one temperature in truth."""
+        return self.peak_k - self.end_k < SAME_K
+
+
+@takes_quantities_of(temperature="K")
+@dataclass(frozen=True)
+class Event:
+    """One flare.
+
+    Attributes
+    ----------
+    peak_s : float
+        When tau is 0, s from the start of the stare.
+    half_width_s : float
+        t_1/2 of the shape's publication.
+    amplitude : float
+        The factor on the shape: relative rise of the photons in the band in which amplitudes are measured.
+    temperature : float or Cooling
+        K.
+    shape : Shape or str
+
+    Examples
+    --------
+    >>> from mauvecl.lightcurve.flares.events import Event
+    >>> flare = Event.of_peak(0.1, peak_s=600, half_width_s=60, shape="tovarmendoza2022")
+    >>> round(flare.amplitude, 4), round(flare.equivalent_duration_s, 3)
+    (0.1052, 12.888)
+    """
+
+    peak_s: float
+    half_width_s: float
+    amplitude: float
+    temperature: float | Cooling = 10_000.0
+    shape: Shape | str = field(default_factory=lambda: SHAPES["davenport2014"])
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "shape", shape_of(self.shape))
+        if not np.isfinite(self.peak_s):
+            raise InputError(f"a flare peaks at {self.peak_s:g} s, expected a time")
+        if not 0 < self.half_width_s < np.inf:
+            raise InputError(f"the half width of a flare = {self.half_width_s:g} s, expected a time above 0")
+        if not 0 <= self.amplitude <= LARGEST_AMPLITUDE:
+            raise InputError(f"the amplitude of a flare = {self.amplitude:g}, expected 0 to {LARGEST_AMPLITUDE:g}")
+        if not isinstance(self.temperature, Cooling):
+            low, high = FLARE_TEMPERATURES_K
+            if not low <= self.temperature <= high:
+                raise InputError(f"flare temperature = {self.temperature:g} K, expected {low:g} to {high:g} K")
+
+    @classmethod
+    @takes_quantities_of(temperature="K")
+    def of_peak(
+        cls,
+        peak: float,
+        *,
+        peak_s: float,
+        half_width_s: float,
+        temperature: float | Cooling = 10_000.0,
+        shape: Shape | str = "davenport2014",
+    ) -> Self:
+        """Of a highest relative rise, which is not every shape's amplitude."""
+        return cls(peak_s, half_width_s, amplitude_of_peak(peak, shape), temperature, shape)
+
+    @classmethod
+    @takes_quantities_of(temperature="K")
+    def of_equivalent_duration(
+        cls,
+        equivalent_duration_s: float,
+        *,
+        peak_s: float,
+        half_width_s: float,
+        temperature: float | Cooling = 10_000.0,
+        shape: Shape | str = "davenport2014",
+    ) -> Self:
+        """Of an equivalent duration in the band, s."""
+        if not 0 < half_width_s < np.inf:
+            raise InputError(f"the half width of a flare = {half_width_s:g} s, expected a time above 0")
+        return cls(peak_s, half_width_s, amplitude_of(equivalent_duration_s, half_width_s, shape), temperature, shape)
+
+    @classmethod
+    @takes_quantities_of(temperature="K")
+    def of_energy(
+        cls,
+        energy_erg: float,
+        scale: EnergyScale,
+        *,
+        peak_s: float,
+        half_width_s: float,
+        temperature: float | Cooling = 10_000.0,
+        shape: Shape | str = "davenport2014",
+    ) -> Self:
+        """Of an energy by the star's `EnergyScale`; for one that cools see `bolometric_energy`."""
+        return cls.of_equivalent_duration(
+            scale.equivalent_duration(energy_erg),
+            peak_s=peak_s,
+            half_width_s=half_width_s,
+            temperature=temperature,
+            shape=shape,
+        )
+
+    @property
+    def form(self) -> Shape:
+        """Its shape."""
+        return shape_of(self.shape)
+
+    @property
+    def hottest_k(self) -> float:
+        """Its temperature, or that at its peak, K."""
+        return float(self.temperature.peak_k if isinstance(self.temperature, Cooling) else self.temperature)
+
+    @property
+    def peak(self) -> float:
+        """Highest relative rise of the band's photons."""
+        return self.amplitude * self.form.peak
+
+    @property
+    def equivalent_duration_s(self) -> float:
+        """Equivalent duration in the band, s."""
+        return equivalent_duration(self.amplitude, self.half_width_s, self.form)
+
+    def energy(self, scale: EnergyScale) -> float:
+        """Energy by a star's scale, erg."""
+        return scale.energy(self.equivalent_duration_s)
+
+    def bolometric_energy(self, scale_of: Callable[[float], EnergyScale]) -> float:
+        """Bolometric energy, erg, of a flare that may cool.
+
+        Parameters
+        ----------
+        scale_of : callable
+            A star's bolometric scale for flares of a temperature, K.
+        """
+        cooling = self.temperature
+        if not isinstance(cooling, Cooling) or cooling.steady:
+            return self.energy(scale_of(self.hottest_k))
+        nodes = np.geomspace(cooling.end_k, cooling.peak_k, SCALE_NODES)
+        per_s = np.log([scale_of(float(k)).erg_per_s for k in nodes])
+        tau = np.concatenate([np.linspace(-10.0, 10.0, 2001), np.geomspace(10.0, 1000.0, 1001)[1:]])
+        edges = self.half_width_s * tau
+        light = self.form.mean_over(edges, 0.0, self.half_width_s) * np.diff(edges)
+        kelvin = cooling.at((edges[1:] + edges[:-1]) / 2)
+        # Energies of a second are smooth in the temperature: straight in logarithms between the nodes.
+        return float(self.amplitude * light @ np.exp(np.interp(np.log(kelvin), np.log(nodes), per_s)))
+
+
+def temperatures_of(events: Sequence[Event], most: int = MOST_TEMPERATURES) -> Float:
+    """Temperatures whose spectra the events are mixed from, K, ascending, shape (n_temperature,).
+
+    Each constant temperature is one of them; the rest, evenly spaced in 1 / T, span what flares cool through.
+
+    Raises
+    ------
+    InputError
+        If that takes more than `most`.
+    """
+    constant: list[float] = []
+    cooling = []
+    for event in events:
+        if isinstance(event.temperature, Cooling) and not event.temperature.steady:
+            cooling.append(event.temperature)
+        elif all(abs(event.hottest_k - other) >= SAME_K for other in constant):
+            constant.append(event.hottest_k)
+    left = most - len(constant)
+    if left < (LEAST_STEPS if cooling else 0):
+        raise InputError(
+            f"flares of {len(constant)} constant temperatures{' and some that cool' if cooling else ''}, expected at "
+            f"most {most - (LEAST_STEPS if cooling else 0)}"
+        )
+    if cooling:
+        low, high = min(c.end_k for c in cooling), max(c.peak_k for c in cooling)
+        nodes = 1.0 / np.linspace(1.0 / low, 1.0 / high, left)
+        constant += [float(k) for k in nodes if all(abs(k - other) >= SAME_K for other in constant)]
+    return np.sort(np.array(constant))
+
+
+def coefficients(events: Sequence[Event], start_s: Float, frame_s: float, temperatures_k: Float) -> Float:
+    """What the events add to each frame: mean amplitude of each flare spectrum over it.
+
+    A flare of constant temperature is integrated exactly. One that cools is mixed from the spectra of the two
+    neighbouring temperatures, linearly in 1 / T, with one temperature in each of `PARTS` parts of a frame.
+
+    Parameters
+    ----------
+    events : sequence of Event
+    start_s : ndarray, shape (n_frame,)
+    frame_s : float
+    temperatures_k : ndarray, shape (n_temperature,)
+        Ascending: those of `temperatures_of`, or more.
+
+    Returns
+    -------
+    ndarray, shape (n_frame, n_temperature)
+
+    Raises
+    ------
+    InputError
+        If a flare has a temperature outside of them.
+    """
+    found = np.zeros((start_s.size, temperatures_k.size))
+    for event in events:
+        if isinstance(event.temperature, Cooling) and not event.temperature.steady:
+            _add_cooling(found, event, event.temperature, start_s, frame_s, temperatures_k)
+            continue
+        edges = np.column_stack([start_s, start_s + frame_s])
+        mean = event.amplitude * event.form.mean_over(edges, event.peak_s, event.half_width_s)
+        for column, share in _mixed(np.array([event.hottest_k]), temperatures_k):
+            found[:, column] += float(share[0]) * mean
+    return found
+
+
+def _add_cooling(
+    found: Float, event: Event, cooling: Cooling, start_s: Float, frame_s: float, temperatures_k: Float
+) -> None:
+    for part in range(PARTS):
+        start = start_s + part * frame_s / PARTS
+        edges = np.column_stack([start, start + frame_s / PARTS])
+        mean = event.amplitude / PARTS * event.form.mean_over(edges, event.peak_s, event.half_width_s)
+        temperature = cooling.at(start + frame_s / PARTS / 2 - event.peak_s)
+        for column, share in _mixed(temperature, temperatures_k):
+            found[:, column] += share * mean
+
+
+def _mixed(temperature: Float, nodes: Float) -> list[tuple[int, Float]]:
+    """Share of each node in temperatures, linear in 1 / T."""
+    if temperature.min() < nodes[0] - SAME_K or temperature.max() > nodes[-1] + SAME_K:
+        raise InputError(
+            f"a flare of {temperature.min():g} to {temperature.max():g} K, expected temperatures within "
+            f"{nodes[0]:g} to {nodes[-1]:g} K"
+        )
+    inverse = -1.0 / nodes
+    place = np.interp(-1.0 / temperature, inverse, np.arange(nodes.size, dtype=np.float64))
+    shares = [np.maximum(0.0, 1.0 - np.abs(place - column)) for column in range(nodes.size)]
+    return [(column, share) for column, share in enumerate(shares) if share.any()]

@@ -1,0 +1,266 @@
+"""What a found flare was: onset, amplitude, half-width, temperature and equivalent duration, with their errors.
+
+A fit of least squares from the template that found it, over the level that the search marginalises over (Levenberg
+1944, doi 10.1090/qam/10666; Marquardt 1963, doi 10.1137/0111030); errors from the inverse of the information. Flares
+near the threshold are seen when noise helps them, so that their amplitudes come out too large: the fit does not mend
+that.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike, NDArray
+
+if TYPE_CHECKING:
+    from mauvecl.lightcurve.search.bank import Bank
+    from mauvecl.lightcurve.search.templates import Templates
+
+Float = NDArray[np.float64]
+
+#: Steps of a fit, at most, and the change of chi-squared at which it ends.
+STEPS, ENOUGH = 30, 1e-3
+#: Frames are averaged as long as a half-width holds so many averages.
+FINE = 25
+#: Damping to begin with; divided and multiplied by after a step that was better or worse.
+DAMPING, EASIER, HARDER = 1e-2, 5.0, 4.0
+#: Relative step of the derivatives by differences.
+DIFFERENCE = 1e-3
+#: Factor that a half-width may change by in one step.
+LARGEST_STEP = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Recovered:
+    """Flares as a fit has them; arrays of shape (n,), and standard errors beside them.
+
+    Attributes
+    ----------
+    peak_s, peak_error_s : ndarray
+    amplitude, amplitude_error : ndarray
+        Relative rise of the photons in the band, as the templates have it.
+    half_width_s, half_width_error_s : ndarray
+    temperature_k, temperature_error_k : ndarray
+        NaN where only one temperature is known.
+    equivalent_duration_s, equivalent_duration_error_s : ndarray
+        What energies are in proportion to.
+    snr : ndarray
+        Of the fit.
+    """
+
+    peak_s: Float
+    peak_error_s: Float
+    amplitude: Float
+    amplitude_error: Float
+    half_width_s: Float
+    half_width_error_s: Float
+    temperature_k: Float
+    temperature_error_k: Float
+    equivalent_duration_s: Float
+    equivalent_duration_error_s: Float
+    snr: Float
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """How flares are fitted.
+
+    Attributes
+    ----------
+    bank : Bank
+        Of the search that found them: its shape, level and windows.
+    templates : Templates
+        What flares do to the sums of a frame.
+    """
+
+    bank: Bank
+    templates: Templates
+
+    @cached_property
+    def _response(self) -> tuple[Any, Any, float, float]:
+        """The sums of a flare of one amplitude over log temperature, their derivative, and the ends."""
+        logs = np.log(self.templates.temperatures_k)
+        if logs.size == 1:
+            row = self.templates.directions[0]
+            ends = float(logs[0]), float(logs[0])
+            return (lambda x: np.tile(row, (np.size(x), 1))), (lambda x: np.zeros((np.size(x), row.size))), *ends
+        spline = scipy.interpolate.CubicSpline(logs, self.templates.directions)
+        return spline, spline.derivative(), float(logs[0]), float(logs[-1])
+
+    def recover(
+        self,
+        sums: NDArray[Any],
+        start_s: Float,
+        *,
+        peak_s: ArrayLike,
+        half_width_s: ArrayLike,
+        temperature_k: ArrayLike,
+        variance: Float | None = None,
+        curves: Float | None = None,
+    ) -> Recovered:
+        """Fit one flare to each of some light curves.
+
+        Parameters
+        ----------
+        sums : ndarray, shape (n, n_frame, n_sum)
+            Less what is known, of the given variance.
+        start_s : ndarray, shape (n_frame,)
+        peak_s, half_width_s, temperature_k : array_like, shape (n,)
+            Where fits begin: those of the template that found each.
+        variance : ndarray, shape (n_frame,), optional
+            Of each frame's sums; one by default.
+        curves : ndarray, shape (n_curve, n_frame), optional
+            As the search takes them.
+        """
+        n = len(sums)
+        peak, log_width, log_kelvin = (
+            np.array(np.broadcast_to(np.asarray(value, np.float64), n))
+            for value in (peak_s, np.log(half_width_s), np.log(temperature_k))
+        )
+        several = max(1, int(np.exp(log_width.min()) / self.bank.frame_s / FINE)) if n else 1
+        sums, start_s, variance, curves = self._averaged(several, sums, start_s, variance, curves)
+        weight, level = self._windows(start_s, peak, np.exp(log_width), variance, curves)
+        used = weight.any(axis=0)
+        weight, level, start_s = weight[:, used], level[:, used], start_s[used]
+        edges = np.column_stack([start_s, start_s + several * self.bank.frame_s])
+        y = _beside(np.asarray(sums[:, used], np.float64), weight, level)
+        response, slope, coolest, hottest = self._response
+        log_kelvin = np.clip(log_kelvin, coolest, hottest)
+        amplitude = np.full(n, np.nan)
+
+        def looked(peak: Float, log_width: Float) -> tuple[Float, Float]:
+            """Products of the shape and its derivatives with each other, (n, 3, 3), and with the sums, (n, 3, K)."""
+            width = np.exp(log_width)
+            step = DIFFERENCE * width
+            here, later, wider = (
+                self.bank.shape.mean_over(edges, p[:, None], w[:, None])
+                for p, w in ((peak, width), (peak + step, width), (peak, width * np.exp(DIFFERENCE)))
+            )
+            three = _beside(
+                np.stack([here, (later - here) / DIFFERENCE, (wider - here) / DIFFERENCE], 2), weight, level
+            )
+            weighted = three * weight[:, :, None]
+            return np.einsum("nti,ntj->nij", weighted, three), np.einsum("nti,ntk->nik", weighted, y)
+
+        def fitted(products: tuple[Float, Float], log_kelvin: Float) -> tuple[Float, Float]:
+            """The best amplitude, and what chi-squared falls by."""
+            r = response(log_kelvin)
+            along = np.einsum("nk,nk->n", products[1][:, 0], r)
+            power = products[0][:, 0, 0] * np.einsum("nk,nk->n", r, r)
+            best = np.maximum(along / np.maximum(power, 1e-300), 1e-12)
+            return best, 2 * best * along - best**2 * power
+
+        products = looked(peak, log_width)
+        amplitude, gain = fitted(products, log_kelvin)
+        damping = np.full(n, DAMPING)
+        going = np.ones(n, np.bool_)
+        for _ in range(STEPS):
+            information, pull = self._normal(products, amplitude, response(log_kelvin), slope(log_kelvin))
+            diagonal = np.einsum("nii->ni", information)
+            damped = information + (damping[:, None] * diagonal + 1e-12)[:, :, None] * np.eye(4)
+            move = np.linalg.solve(damped, pull[:, :, None])[:, :, 0]
+            move[:, 1:3] = np.clip(move[:, 1:3], -LARGEST_STEP, LARGEST_STEP)
+            move[~going] = 0
+            there = peak + move[:, 1] * np.exp(log_width), log_width + move[:, 2]
+            kelvin = np.clip(log_kelvin + move[:, 3], coolest, hottest)
+            tried = looked(*there)
+            best, found = fitted(tried, kelvin)
+            better = going & (found > gain)
+            small = np.abs(found - gain) < ENOUGH
+            peak, log_width = (np.where(better, a, b) for a, b in zip(there, (peak, log_width), strict=True))
+            log_kelvin, amplitude = np.where(better, kelvin, log_kelvin), np.where(better, best, amplitude)
+            products = tuple(  # type: ignore[assignment]
+                np.where(better[:, None, None], a, b) for a, b in zip(tried, products, strict=True)
+            )
+            gain = np.where(better, found, gain)
+            damping = np.where(better, damping / EASIER, damping * HARDER)
+            going &= ~(small & better) & (damping < 1e6)
+            if not going.any():
+                break
+        information, _ = self._normal(products, amplitude, response(log_kelvin), slope(log_kelvin))
+        return self._told(peak, log_width, log_kelvin, amplitude, gain, information)
+
+    def _averaged(
+        self, several: int, sums: NDArray[Any], start_s: Float, variance: Float | None, curves: Float | None
+    ) -> tuple[NDArray[Any], Float, Float | None, Float | None]:
+        """Averages of so many frames that follow each other; what gaps leave of fewer is left out."""
+        if several == 1:
+            return sums, start_s, variance, curves
+        number = np.rint(start_s / self.bank.frame_s).astype(np.int64)
+        _, first, count = np.unique(number // several, return_index=True, return_counts=True)
+        rows = first[count == several][:, None] + np.arange(several)
+        variance = np.ones(start_s.size) if variance is None else variance
+        mean = np.stack([one[rows].mean(axis=1) for one in sums])
+        return (
+            mean, start_s[rows[:, 0]], variance[rows].mean(axis=1) / several,
+            None if curves is None else curves[:, rows].mean(axis=2),
+        )  # fmt: skip
+
+    def _windows(
+        self, start_s: Float, peak: Float, width: Float, variance: Float | None, curves: Float | None
+    ) -> tuple[Float, Float]:
+        """Weights of frames, zero outside of a flare's window, (n, n_frame); and the level's terms, (n, n_frame, p)."""
+        n, frame_s = peak.size, self.bank.frame_s
+        weight = np.zeros((n, start_s.size))
+        terms = np.zeros((n, start_s.size, len(self.bank.level.powers) + (0 if curves is None else len(curves))))
+        for k in range(n):
+            lead, tail = self.bank.window(float(width[k]))
+            since = (start_s - peak[k]) / frame_s
+            inside = (since >= -lead - 1) & (since <= tail)
+            weight[k, inside] = 1.0 if variance is None else 1.0 / variance[inside]
+            time = since / (lead + tail)
+            rows = [time**power for power in self.bank.level.powers] + list([] if curves is None else curves)
+            for j, row in enumerate(rows):
+                terms[k, :, j] = row
+        if terms.shape[2]:
+            # Orthonormal in each window, so that the level is a sum of products.
+            root = np.sqrt(weight)[:, :, None]
+            basis = np.linalg.qr(root * terms)[0]
+            terms = np.divide(basis, root, out=np.zeros_like(basis), where=root > 0)
+        return weight, terms
+
+    @staticmethod
+    def _normal(products: tuple[Float, Float], amplitude: Float, r: Float, dr: Float) -> tuple[Float, Float]:
+        """The information on log amplitude, peak in half-widths, log half-width, log temperature, and the gradient."""
+        shapes, data = products
+        # Each derivative is a product of one in time and one in the sums.
+        time, sums = np.array([0, 1, 2, 0]), np.stack([r, r, r, dr], axis=1)
+        inner = np.einsum("nik,njk->nij", sums, sums)
+        information = amplitude[:, None, None] ** 2 * shapes[:, time][:, :, time] * inner
+        left = data[:, time] - amplitude[:, None, None] * shapes[:, time, 0][:, :, None] * r[:, None]
+        pull = amplitude[:, None] * np.einsum("nik,nik->ni", left, sums)
+        # What cannot be told stays as it is.
+        blind = np.einsum("nii->ni", information) <= 0
+        information[blind] = 0
+        np.einsum("nii->ni", information)[blind] = 1.0
+        return information, pull
+
+    def _told(
+        self, peak: Float, log_width: Float, log_kelvin: Float, amplitude: Float, gain: Float, information: Float
+    ) -> Recovered:
+        width, kelvin = np.exp(log_width), np.exp(log_kelvin)
+        several = len(self.templates.temperatures_k) > 1
+        if not several:
+            information = information[:, :3, :3]
+        covariance = np.linalg.pinv(information, hermitian=True)
+        error = np.sqrt(np.maximum(np.einsum("nii->ni", covariance), 0.0))
+        both = np.sqrt(np.maximum(covariance[:, 0, 0] + covariance[:, 2, 2] + 2 * covariance[:, 0, 2], 0.0))
+        duration = amplitude * width * self.bank.shape.equivalent_duration
+        none = np.full(peak.size, np.nan)
+        return Recovered(
+            peak, width * error[:, 1], amplitude, amplitude * error[:, 0], width, width * error[:, 2],
+            kelvin if several else none, kelvin * error[:, 3] if several else none,
+            duration, duration * both, np.sqrt(np.maximum(gain, 0.0)),
+        )  # fmt: skip
+
+
+def _beside(values: Float, weight: Float, level: Float) -> Float:
+    """Values (n, n_frame, k) less their weighted projection on orthonormal terms (n, n_frame, p)."""
+    if not level.shape[2]:
+        return values
+    amounts = np.einsum("ntp,ntk->npk", level * weight[:, :, None], values, optimize=True)
+    return np.asarray(values - np.einsum("ntp,npk->ntk", level, amounts, optimize=True))

@@ -1,0 +1,307 @@
+"""The search: a bank of flares as filters in time, exact over gaps, and the largest of what they find.
+
+For sums y of a frame with covariance one, a template s in time and c in the sums, and a level G a of unknown amplitudes
+a inside the window, the statistic is that of generalised least squares,
+
+    rho = c . (s - P G)^T m y / sqrt((s - P G)^T m (s - P G)),   P = (G^T m G)^-1 G^T m s,
+
+with m the inverse variance of a frame, zero in gaps: normal of variance one without a flare, and the S/N of the flare
+with one. All sums over time are correlations, by FFT. (A matched filter, maximised over its templates: Turin 1960, doi
+10.1109/TIT.1960.1057571.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from mauvecl.host.errors import InputError
+from mauvecl.lightcurve.search.bank import LEAST_SHARE, Bank, Template
+
+if TYPE_CHECKING:
+    from mauvecl.lightcurve.stares.stare import Stare
+
+Float = NDArray[np.float64]
+Single = NDArray[np.float32]
+
+#: Numbers that a batch of stares holds in one array, about.
+BATCH = 2**21
+#: Relative weight that keeps curves apart which a window cannot tell apart.
+RIDGE = 1e-11
+
+
+@dataclass(frozen=True, eq=False)
+class Found:
+    """The largest value of each stare, and the template that has it; arrays of shape (n_stare,).
+
+    Attributes
+    ----------
+    maximum : ndarray
+        The largest rho.
+    peak_s : ndarray
+        Time of the template's peak, s from the start of the stare.
+    half_width_s : ndarray
+    temperature : ndarray of int
+        Row of the bank's directions.
+    amplitude : ndarray
+        Peak along that direction, in standard deviations of a frame's sum.
+    """
+
+    maximum: Float
+    peak_s: Float
+    half_width_s: Float
+    temperature: NDArray[np.int64]
+    amplitude: Float
+
+
+@dataclass(frozen=True, eq=False)
+class Row:
+    """One half-width and phase over all onsets; values of rho come from `Search.rows`.
+
+    Attributes
+    ----------
+    template : Template
+    phase : int
+    peaks : ndarray of int
+        Frame of the peak for each onset, counted from the first frame of the stare, gaps included.
+    per_amplitude : ndarray, shape (n_onset,)
+        Mean of rho for a flare of this template with a peak of one; zero where it is not looked for.
+    project : ndarray, shape (n_term, n_onset)
+        P of the module's formula.
+    """
+
+    template: Template
+    phase: int
+    peaks: NDArray[np.int64]
+    per_amplitude: Float
+    project: Float
+
+
+class Search:
+    """A bank on the frames of a stare.
+
+    Parameters
+    ----------
+    bank : Bank
+    stare : Stare
+        Of which only the times of its frames matter.
+    curves : ndarray, shape (n_curve, n_frame), optional
+        Curves whose amplitudes are unknown in each window, where the bank's level has `cycle`: such as the sine and the
+        cosine of the orbit, or the detector's temperature.
+    variance : ndarray, shape (n_frame,), optional
+        Of each frame's sums; one by default.
+
+    Raises
+    ------
+    InputError
+        If the frames are not the bank's, or curves are missing or not asked for.
+    """
+
+    def __init__(self, bank: Bank, stare: Stare, curves: Float | None = None, variance: Float | None = None) -> None:
+        if abs(stare.frame_s - bank.frame_s) > 1e-9 * bank.frame_s:
+            raise InputError(f"a bank for frames of {bank.frame_s:g} s, and a stare with {stare.frame_s:g} s")
+        if bank.level.cycle != (curves is not None and len(curves) > 0):
+            raise InputError("a search takes curves where its level has a cycle, expected both or neither")
+        self.bank, self.stare = bank, stare
+        self._first = int(stare.numbers[0])
+        self._at = stare.numbers - self._first
+        self.n_grid = int(self._at[-1]) + 1
+        self._weight = np.zeros(self.n_grid)
+        self._weight[self._at] = 1.0 if variance is None else 1.0 / variance
+        series = [np.ones(stare.n_frames)]
+        for curve in np.zeros((0, stare.n_frames)) if curves is None else curves:
+            scale = float(np.std(curve))
+            if not scale > 0:
+                raise InputError("a curve of the level does not change over the stare, expected one that does")
+            series.append((curve - np.mean(curve)) / scale)
+        #: Terms of the level: a power of time in the window, and a series in the stare.
+        self._terms = [(power, 0) for power in bank.level.powers] + [(0, 1 + k) for k in range(len(series) - 1)]
+        self._series = np.zeros((len(series), self.n_grid))
+        self._series[:, self._at] = series
+        reach = max(t.shapes.shape[1] for t in bank.templates)
+        self._size = int(scipy.fft.next_fast_len(self.n_grid + reach, real=True))
+
+    @cached_property
+    def grid(self) -> list[Row]:
+        """Every half-width and phase, with what does not depend on data."""
+        return [row for template in self.bank.templates for row in self._rows_of(template)]
+
+    @property
+    def n_filters(self) -> int:
+        """Templates that are tried: half-widths, phases, onsets and temperatures."""
+        return len(self.bank.directions) * int(sum(np.count_nonzero(row.per_amplitude) for row in self.grid))
+
+    def largest(self, sums: NDArray[Any]) -> Found:
+        """The largest value of each stare.
+
+        Parameters
+        ----------
+        sums : ndarray, shape (n_stare, n_frame, n_sum)
+            Of covariance one in each frame without a flare.
+
+        Raises
+        ------
+        InputError
+            For sums of another shape.
+        """
+        sums = self._checked(sums)
+        parts = [self._largest(sums[batch]) for batch in self._batches(len(sums))]
+        return Found(*(np.concatenate([getattr(p, name) for p in parts]) for name in Found.__annotations__))
+
+    def values(self, sums: NDArray[Any]) -> Iterator[tuple[Row, Single]]:
+        """Each row with its values of rho, shape (n_stare, n_temperature, n_onset); minus infinity where none is.
+
+        All stares at once: for few.
+        """
+        yield from self._values(self._checked(sums))
+
+    def template(self, row: Row, onset: int, direction: int) -> Float:
+        """What rho of one template weighs each sum with: rho = sum(template * sums), shape (n_frame, n_sum)."""
+        return np.asarray(self.in_time(row, onset)[:, None] * self.bank.directions[direction])
+
+    def in_time(self, row: Row, onset: int) -> Float:
+        """The same without its direction, shape (n_frame,)."""
+        at = self._at - row.peaks[onset] - row.template.first
+        inside = (at >= 0) & (at < row.template.time.size)
+        at = at[inside]
+        shape = row.template.shapes[row.phase][at]
+        for (power, series), amplitude in zip(self._terms, row.project[:, onset], strict=True):
+            shape = shape - amplitude * row.template.time[at] ** power * self._series[series][self._at[inside]]
+        found = np.zeros(self.stare.n_frames)
+        found[inside] = shape * self._weight[self._at[inside]] / row.per_amplitude[onset]
+        return found
+
+    @property
+    def variance(self) -> Float:
+        """Of each frame's sums, as the search takes it, shape (n_frame,)."""
+        return np.asarray(1.0 / self._weight[self._at])
+
+    def _checked(self, sums: NDArray[Any]) -> NDArray[Any]:
+        expected = (self.stare.n_frames, self.bank.directions.shape[1])
+        if sums.ndim != 3 or sums.shape[1:] != expected:
+            raise InputError(f"sums of the shape {sums.shape}, expected (n_stare, {expected[0]}, {expected[1]})")
+        return sums
+
+    def _batches(self, count: int) -> list[slice]:
+        size = max(1, BATCH // (self._size * self.bank.directions.shape[1]))
+        return [slice(i, i + size) for i in range(0, count, size)]
+
+    def _largest(self, sums: NDArray[Any]) -> Found:
+        n = len(sums)
+        every = np.arange(n)
+        best = np.full(n, -np.inf)
+        peak, width, amplitude = (np.zeros(n) for _ in range(3))
+        temperature = np.zeros(n, np.int64)
+        for row, rho in self._values(sums):
+            which = rho.reshape(n, -1).argmax(axis=1)
+            value = rho.reshape(n, -1)[every, which]
+            better = value > best
+            direction, onset = np.divmod(which[better], rho.shape[2])
+            best[better] = value[better]
+            peak[better] = (self._first + row.peaks[onset] + row.template.phases[row.phase]) * self.bank.frame_s
+            width[better] = row.template.half_width_s
+            temperature[better] = direction
+            amplitude[better] = value[better] / row.per_amplitude[onset]
+        return Found(best, peak, width, temperature, amplitude)
+
+    def _values(self, sums: NDArray[Any]) -> Iterator[tuple[Row, Single]]:
+        spectra = self._spectra(sums)
+        directions = self.bank.directions.astype(np.float32)
+        for template in self.bank.templates:
+            known = self._level(template, spectra)
+            for row in self.grid:
+                if row.template is not template:
+                    continue
+                found = self._correlated(spectra[0], template.shapes[row.phase], template)
+                for projected, term in zip(row.project.astype(np.float32), known, strict=True):
+                    found -= projected * term
+                tried = row.per_amplitude > 0
+                scale = np.divide(1.0, row.per_amplitude, out=np.zeros_like(row.per_amplitude), where=tried)
+                found *= scale.astype(np.float32)
+                rho = np.einsum("tk,skn->stn", directions, found, optimize=True)
+                if not tried.all():
+                    rho[:, :, ~tried] = -np.inf
+                yield row, rho
+
+    def _spectra(self, sums: NDArray[Any]) -> list[NDArray[Any]]:
+        """Fourier transforms of the weighted sums times each series, zero in gaps, (n_stare, n_sum, n_frequency)."""
+        held = np.zeros((len(sums), sums.shape[2], self.n_grid), np.float32)
+        held[:, :, self._at] = self._levelled(sums) * self._weight[self._at]
+        used = {series for _, series in self._terms} | {0}
+        return [
+            scipy.fft.rfft(held * self._series[k].astype(np.float32), self._size) if k in used else held[:0]
+            for k in range(len(self._series))
+        ]
+
+    def _levelled(self, sums: NDArray[Any]) -> NDArray[Any]:
+        """The sums less their level over the whole stare, which every window marginalises over: for precision alone."""
+        y = np.moveaxis(sums, 2, 1)
+        if not self._terms:
+            return y
+        time = (self._at - self._at.mean()) / max(self.n_grid, 1)
+        columns = np.array([time**power * self._series[series][self._at] for power, series in self._terms])
+        level, *_ = np.linalg.lstsq(columns.T, y.reshape(-1, y.shape[2]).T.astype(np.float64), rcond=None)
+        return np.asarray(y - (columns.T @ level).T.reshape(y.shape))
+
+    def _level(self, template: Template, spectra: list[NDArray[Any]]) -> list[Single]:
+        """The data's correlation with each term of the level, shape (n_stare, n_sum, n_onset)."""
+        return [self._correlated(spectra[series], template.time**power, template) for power, series in self._terms]
+
+    def _correlated(self, spectrum: NDArray[Any], kernel: Float, template: Template) -> NDArray[Any]:
+        """sum_t data(t) kernel(t - peak) at the template's onsets, in the precision of the spectrum."""
+        real = np.float32 if spectrum.dtype == np.complex64 else np.float64
+        held = np.zeros(self._size, real)
+        held[: kernel.size] = kernel
+        other = np.conj(scipy.fft.rfft(np.roll(held, template.first)))
+        found: NDArray[Any] = scipy.fft.irfft(spectrum * other, self._size)
+        return found[..., self._start(template) : self.n_grid : template.stride]
+
+    def _start(self, template: Template) -> int:
+        return -self._first % template.stride
+
+    def _rows_of(self, template: Template) -> Iterator[Row]:
+        n = len(self._terms)
+        # Onsets are multiples of the stride from the start of the stare, whatever part of it is looked at.
+        peaks = np.arange(self._start(template), self.n_grid, template.stride)
+        time = template.time
+        spectra: dict[tuple[int, int], Any] = {}
+
+        def over(a: int, b: int, kernel: Float) -> Float:
+            """The weighted correlation of two series' product with a kernel."""
+            if (a, b) not in spectra:
+                spectra[a, b] = scipy.fft.rfft(self._weight * self._series[a] * self._series[b], self._size)
+            return np.asarray(self._correlated(spectra[a, b], kernel, template))
+
+        gram = np.zeros((peaks.size, n, n))
+        for i, (p, a) in enumerate(self._terms):
+            for j, (q, b) in enumerate(self._terms[: i + 1]):
+                gram[:, i, j] = gram[:, j, i] = over(a, b, time ** (p + q))
+        size = np.sqrt(np.maximum(np.einsum("nii->ni", gram), 1e-9))
+        scaled = gram / (size[:, :, None] * size[:, None, :]) + RIDGE * np.eye(n)
+        scaled += np.where(np.einsum("nii->ni", gram) > 1e-9, 0.0, 1.0)[:, :, None] * np.eye(n)
+        for phase, shape in enumerate(template.shapes):
+            power = over(0, 0, shape**2)
+            project = np.zeros((n, peaks.size))
+            left = power
+            if n:
+                shared = np.stack([over(0, a, shape * time**p) for p, a in self._terms], axis=1)
+                found = np.linalg.solve(scaled, (shared / size)[:, :, None])[:, :, 0] / size
+                project = found.T
+                left = power - 2 * np.sum(found * shared, 1) + np.einsum("ni,nij,nj->n", found, gram, found)
+            tried = left >= LEAST_SHARE * self._without_gaps(template, phase)
+            yield Row(template, phase, peaks, np.sqrt(np.where(tried, left, 0.0)), project)
+
+    def _without_gaps(self, template: Template, phase: int) -> float:
+        """A template's power without gaps, its level marginalised by powers of time alone."""
+        shape = template.shapes[phase]
+        columns = np.array([template.time**power for power in self.bank.level.powers])
+        if columns.size:
+            level, *_ = np.linalg.lstsq(columns.T, shape, rcond=None)
+            shape = shape - level @ columns
+        return float(shape @ shape) * float(np.median(self._weight[self._at]))

@@ -1,0 +1,136 @@
+"""A stare, what its frames are made of, and how it is searched: what null, injections and one stare's search share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import combinations_with_replacement
+from math import factorial
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.lightcurve.search.null import DAY_S
+from mauvecl.lightcurve.search.search import Search
+
+if TYPE_CHECKING:
+    from typing import Any
+
+    from mauvecl.lightcurve.search.bank import Bank
+    from mauvecl.lightcurve.stares.components import Components
+    from mauvecl.lightcurve.stares.stare import Changing, Stare
+
+Float = NDArray[np.float64]
+
+#: Share of a curve below which it is the others' sum.
+LEAST_CURVE = 1e-6
+#: S/N over a window from which on what is neglected would raise false alarms.
+SEEN = 0.3
+#: Numbers of drawn stares that are held at once.
+NUMBERS = 2**24
+
+
+@dataclass(frozen=True, eq=False)
+class Survey:
+    """How a star is stared at and searched.
+
+    Attributes
+    ----------
+    components : Components
+        With the weights of `Templates`.
+    stare : Stare
+    bank : Bank
+    """
+
+    components: Components
+    stare: Stare
+    bank: Bank
+
+    @cached_property
+    def coefficients(self) -> Float:
+        """Known strengths of a frame's components without a flare, shape (n_frame, 3 + n_flare)."""
+        return self.components.coefficients(self.stare)
+
+    @cached_property
+    def known(self) -> Float:
+        """Known mean of each frame's sums without a flare, which the observer subtracts, shape (n_frame, n_sum)."""
+        return self.components.means(self.coefficients)
+
+    @cached_property
+    def directions(self) -> dict[Changing, Float]:
+        """What a small change of the star's level, of light, sky or temperature does, each (n_frame, n_sum)."""
+        found: dict[Any, Float] = self.components.directions(self.coefficients)
+        return found
+
+    def covariance(self, *, jittered: tuple[Changing, ...] = ("light", "sky", "temperature")) -> Float:
+        """Of each frame's sums without a flare, some of the stare's jitters included, (n_frame, n_sum, n_sum)."""
+        found = self.components.covariance(self.coefficients)
+        for of in jittered:
+            moved = self.stare.jitters[of] * self.directions[of]
+            found = found + moved[:, :, None] * moved[:, None, :]
+        return found
+
+    @cached_property
+    def variance(self) -> Float:
+        """Of each frame's sums, averaged over them, as the search takes it, shape (n_frame,)."""
+        covariance = self.covariance()
+        return np.asarray(np.einsum("tkk->t", covariance) / covariance.shape[1])
+
+    @cached_property
+    def curves(self) -> Float | None:
+        """Curves of unknown amplitude, shape (n_curve, n_frame): of the stare's unknowns that are no straight line.
+
+        The dark is exponential in the temperature, so that products of two and three curves of it count as well, where
+        their dark could be seen in a window.
+        """
+        if not self.bank.level.cycle:
+            return None
+        every = [unknown.curve for unknown in self.stare.unknowns]
+        warm = [unknown for unknown in self.stare.unknowns if unknown.of == "temperature"]
+        slope = self.components.quiet.conditions["dark_slope_per_c"]
+        frames = min(self.stare.n_frames, self.bank.level.window_s / self.stare.frame_s)
+        # S/N of a change of the dark by exp(1) over a window.
+        dark = float(np.linalg.norm(self.directions["temperature"], axis=1).max()) / slope * np.sqrt(frames)
+        for order in (2, 3):
+            for some in combinations_with_replacement(warm, order):
+                curve = np.prod([one.curve for one in some], axis=0)
+                amount = np.prod([slope * one.sd for one in some]) / factorial(order)
+                if dark * amount * np.std(curve) > SEEN:
+                    every.append(curve)
+        # What is left of each beside a straight line and those before it.
+        basis = np.linalg.qr(np.vander(self.stare.start_s / max(self.stare.duration_s, 1.0), 2))[0]
+        found: list[Float] = []
+        for curve in every:
+            left = curve - basis @ (basis.T @ curve)
+            size = float(np.linalg.norm(left))
+            if size > LEAST_CURVE * float(np.linalg.norm(curve)):
+                found.append(left)
+                basis = np.column_stack([basis, left / size])
+        return np.array(found).reshape(len(found), self.stare.n_frames)
+
+    @cached_property
+    def search(self) -> Search:
+        """The bank on the stare's frames."""
+        return Search(self.bank, self.stare, self.curves, self.variance)
+
+    def net(self, sums: NDArray[Any]) -> NDArray[np.float32]:
+        """Sums as drawn less what is known, (..., n_frame, n_sum)."""
+        return np.asarray(sums - self.known, np.float32)
+
+    @property
+    def batch(self) -> int:
+        """Stares that are drawn at once."""
+        return int(np.clip(NUMBERS // (self.stare.n_frames * self.components.n_statistics), 1, 64))
+
+    def of_days(self, days: float) -> Survey:
+        """The same with the first star-days of the stare alone, where it is longer."""
+        n = int(days * DAY_S / self.stare.frame_s)
+        return self if self.stare.n_frames <= n else replace(self, stare=part_of(self.stare, slice(0, n)))
+
+
+def part_of(stare: Stare, part: slice) -> Stare:
+    """Some frames of a stare, with their own times."""
+    names = ("start_s", "star", "light", "sky", "temperature_c")
+    unknowns = tuple(replace(unknown, curve=unknown.curve[part]) for unknown in stare.unknowns)
+    return replace(stare, unknowns=unknowns, **{name: getattr(stare, name)[part] for name in names})

@@ -1,0 +1,204 @@
+"""How many flares a campaign recovers, and what their energies tell of how often the star flares."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import optimize, stats
+
+from mauvecl.host.errors import InputError
+from mauvecl.lightcurve.flares.rates import PowerLaw, Rates
+from mauvecl.lightcurve.search.completeness import Completeness
+
+Float = NDArray[np.float64]
+
+#: Energies over which rates are summed, per decade.
+PER_DECADE = 100
+#: Nodes over the scatter of a rate.
+NODES = 1000
+#: Exponents among which the likeliest is looked for, and energies of the grid on which flares are summed.
+EXPONENTS, GRID = (1.01, 6.0), 1200
+
+
+@dataclass(frozen=True)
+class Yield:
+    """Flares that a campaign recovers.
+
+    Attributes
+    ----------
+    expected : float
+        Their mean at the rate itself, without its scatter.
+    low, high : int
+        95 % of campaigns lie between: the scatter of the rate and Poisson's.
+    at_least_one : float
+        Probability, over both.
+    """
+
+    expected: float
+    low: int
+    high: int
+    at_least_one: float
+
+    @classmethod
+    def of(cls, rates: Rates, completeness: Completeness, days: float) -> Yield:
+        """By a distribution, the share recovered and the time that is observed; energies of the same band.
+
+        Raises
+        ------
+        InputError
+            For energies of different bands, or a negative time.
+        """
+        expected = recovered_per_day(rates, completeness) * _checked(days)
+        return cls.about(expected, rates.scatter_dex)
+
+    @classmethod
+    def about(cls, expected: float, scatter_dex: float) -> Yield:
+        """By the number expected and the scatter of its logarithm."""
+        # Equal shares of the scatter: a Poisson distribution is narrower than it, and wants them close together.
+        nodes = stats.norm.ppf((np.arange(NODES) + 0.5) / NODES) if scatter_dex > 0 else np.zeros(1)
+        means = expected * 10.0 ** (scatter_dex * nodes)
+
+        def quantile(share: float) -> int:
+            return smallest(lambda n: float(np.mean(stats.poisson.cdf(n, means))) >= share, float(means.max()))
+
+        return cls(expected, quantile(0.025), quantile(0.975), float(np.abs(np.expm1(-means)).mean()))
+
+
+def smallest(reached: Callable[[int], bool], most: float) -> int:
+    """The smallest whole number from 0 for which something that stays true is true."""
+    low, high = -1, int(most + 20 * np.sqrt(most) + 20)
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if reached(middle) else (middle, high)
+    return high
+
+
+def recovered_per_day(rates: Rates, completeness: Completeness) -> float:
+    """Flares a day that are recovered: the rate in each small step of energy times the share there."""
+    if rates.band != completeness.band:
+        raise InputError(f"rates in {rates.band!r} and completeness in {completeness.band!r}, expected one band")
+    low, high = completeness.decades
+    edges = 10 ** np.linspace(low, high, max(2, round((high - low) * PER_DECADE)))
+    above = rates.per_day_above(edges)
+    share = completeness.at(np.sqrt(edges[1:] * edges[:-1]))
+    # Beyond the table the last value holds.
+    return float(np.sum((above[:-1] - above[1:]) * share) + above[-1] * completeness.probability[-1])
+
+
+def _checked(days: float) -> float:
+    if not (np.isfinite(days) and days >= 0):
+        raise InputError(f"days = {days}, expected at least 0")
+    return days
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """A power law fitted to recovered flares.
+
+    Attributes
+    ----------
+    alpha, alpha_sd : float
+    log10_rate, log10_rate_sd : float
+        Of flares of `pivot_erg` or more, a day.
+    pivot_erg : float
+    flares : int
+    """
+
+    alpha: float
+    alpha_sd: float
+    log10_rate: float
+    log10_rate_sd: float
+    pivot_erg: float
+    flares: int
+
+    def law(self, band: str = "Kepler") -> PowerLaw:
+        """As rates."""
+        return PowerLaw.through(self.alpha, self.pivot_erg, 10**self.log10_rate, band=band, source="fitted")
+
+
+def fit_power_law(
+    energy_erg: Float,
+    completeness: Completeness,
+    days: float,
+    *,
+    error_dex: float = 0.0,
+    bias_dex: float = 0.0,
+) -> Fitted:
+    """Exponent and rate of the flares behind those recovered, by maximum likelihood.
+
+    Recovered energies are a Poisson process of density days * dN/dlogE * completeness, blurred by the error of a
+    recovered energy; standard deviations are by the curvature of the likelihood.
+
+    Parameters
+    ----------
+    energy_erg : ndarray, shape (n,)
+        As recovered.
+    completeness : Completeness
+        By true energy.
+    days : float
+        Observed.
+    error_dex, bias_dex : float
+        Normal error of the logarithm of a recovered energy: its standard deviation and mean.
+
+    Raises
+    ------
+    InputError
+        For fewer than 3 flares, energies that cannot be, or no time.
+    """
+    found = np.log10(np.asarray(energy_erg, np.float64))
+    if found.size < 3 or not np.isfinite(found).all():
+        raise InputError(f"{found.size} recovered flares, expected at least 3 with energies above 0")
+    if _checked(days) == 0:
+        raise InputError("days = 0, expected a time that was observed")
+    pivot = float(np.median(found))
+    x = np.linspace(*completeness.decades, GRID)
+    step = float(x[1] - x[0])
+    share = completeness.at(10**x)
+    recovered = found - bias_dex
+    # Where nothing is recovered nothing is to be known of the density, which may be huge there.
+    used = share > 0
+    x, share = x[used], share[used]
+    blur = None
+    if error_dex > 0:
+        blur = stats.norm.pdf(recovered[:, None], x, error_dex) * step
+
+    def seen(alpha: float) -> Float:
+        """Recovered flares a day and dex of true energy, for a rate of one above the pivot."""
+        return np.asarray((alpha - 1) * np.log(10) * 10 ** ((1 - alpha) * (x - pivot)) * share)
+
+    def cost(alpha: float, log10_rate: float | None = None) -> float:
+        """Minus the logarithm of the likelihood; at the best rate for the exponent unless one is given."""
+        flares = seen(alpha)
+        at = np.interp(recovered, x, flares) if blur is None else blur @ flares
+        mean = days * step * flares.sum()
+        rate = found.size / mean if log10_rate is None else 10**log10_rate
+        return float(mean * rate - np.sum(np.log(np.maximum(at, 1e-300))) - found.size * np.log(rate * days))
+
+    alpha = float(optimize.minimize_scalar(cost, bounds=EXPONENTS, method="bounded", options={"xatol": 1e-7}).x)
+    log10_rate = float(np.log10(found.size / (days * step * seen(alpha).sum())))
+    covariance = np.linalg.inv(_curvature(lambda one: cost(one[0], one[1]), np.array([alpha, log10_rate])))
+    return Fitted(
+        alpha=alpha,
+        alpha_sd=float(np.sqrt(covariance[0, 0])),
+        log10_rate=log10_rate,
+        log10_rate_sd=float(np.sqrt(covariance[1, 1])),
+        pivot_erg=10**pivot,
+        flares=int(found.size),
+    )
+
+
+def _curvature(cost: Callable[[Float], float], at: Float) -> Float:
+    """Second derivatives by central differences, (2, 2)."""
+    h = 1e-3
+    found = np.empty((2, 2))
+    steps = h * np.eye(2)
+    for i in range(2):
+        for j in range(2):
+            found[i, j] = (
+                cost(at + steps[i] + steps[j]) - cost(at + steps[i] - steps[j])
+                - cost(at - steps[i] + steps[j]) + cost(at - steps[i] - steps[j])
+            ) / (4 * h * h)  # fmt: skip
+    return found

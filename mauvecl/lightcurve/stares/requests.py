@@ -1,0 +1,129 @@
+"""Stares as a request: cut into shares of stares, drawn and reduced by whoever is free, joined exactly."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, ClassVar, Literal, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.lightcurve.stares.components import Components
+from mauvecl.lightcurve.stares.scene import Flares
+from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.noise.processes import CosmicRays
+from mauvecl.results.requests import Asked
+
+Arrays = dict[str, NDArray[Any]]
+Method = Literal["pixels", "cumulants"]
+
+#: What becomes of a frame of a scenario costs about as much as drawing so many pixels of it: a search by Fourier
+#: transforms.
+REDUCED = 500
+
+
+class Reduction(Protocol):
+    """What is kept of stares: a frozen dataclass, so that it travels and can be told from others.
+
+    Attributes
+    ----------
+    adds : bool
+        Whether what is kept are whole numbers that add up over stares; otherwise arrays are joined along their first
+        axis, with an entry for each stare.
+    """
+
+    adds: bool
+
+    def __call__(self, values: NDArray[np.float32], first: int) -> Mapping[str, NDArray[Any]]:
+        """What is kept of stares `first` and on, each looked at by itself.
+
+        Parameters
+        ----------
+        values : ndarray of float32, shape (n_stare, n_frame, n_statistic)
+            With scenarios one axis more in front; valid during the call.
+        first : int
+        """
+
+
+@dataclass(frozen=True, eq=False)
+class StaresRequest(Asked):
+    """What `Stares.frames` takes, and what is kept of it; flares and amplitudes as there, for all stares asked for.
+
+    Attributes
+    ----------
+    realisations : int
+        Stares.
+    start : int
+        Number of the first.
+    reduction : Reduction, optional
+        By default statistics are kept as they are.
+    """
+
+    components: Components
+    stare: Stare
+    realisations: int
+    seed: int
+    flare: NDArray[Any] | None = None
+    amplitudes: NDArray[Any] | None = None
+    start: int = 0
+    method: Method = "cumulants"
+    cosmic_rays: CosmicRays | None = None
+    reduction: Reduction | None = None
+    #: Where rows of flares and amplitudes are counted from, where they differ from stare to stare.
+    rows_from: int = field(init=False, default=0)
+
+    parts = 1
+    least: ClassVar[int] = 64
+
+    def __post_init__(self) -> None:
+        if len(self.flares.given) > 1 or self.flares.amplitudes.shape[1] > 1:
+            object.__setattr__(self, "rows_from", self.start)
+
+    @cached_property
+    def flares(self) -> Flares:
+        """Of all its stares."""
+        return Flares.of(self.components, self.stare, self.flare, self.amplitudes, self.realisations)
+
+    @property
+    def work(self) -> int:
+        """About as many draws of a pixel as one stare costs."""
+        drawn = (
+            self.components.quiet.wavelength_nm.size if self.method == "pixels" else 4 * self.components.n_statistics
+        )
+        return self.stare.n_frames * (drawn + len(self.flares.amplitudes) * (REDUCED if self.reduction else 0))
+
+
+@dataclass(frozen=True)
+class Kept:
+    """Statistics as they are."""
+
+    adds: ClassVar[bool] = False
+
+    def __call__(self, values: NDArray[np.float32], first: int) -> Arrays:
+        """Rows of ``values``, one to a stare; scenarios come behind."""
+        return {"values": np.moveaxis(values, 0, 1).copy() if values.ndim == 4 else values.copy()}
+
+
+class StareSums:
+    """What has come of a request so far."""
+
+    def __init__(self, request: StaresRequest) -> None:
+        self._adds = (request.reduction or Kept()).adds
+        self._found: dict[int, Arrays] = {}
+
+    def add(self, part: int, share: Arrays) -> None:
+        """Add a share."""
+        rest = dict(share)
+        self._found[int(rest.pop("start"))] = rest
+
+    def answer(self) -> Arrays:
+        """All of it, once all shares have come; stares in their order."""
+        return joined([self._found[start] for start in sorted(self._found)], adds=self._adds)
+
+
+def joined(parts: list[Arrays], *, adds: bool) -> Arrays:
+    """Parts of a request, in order, as one."""
+    together = (lambda arrays: np.sum(arrays, axis=0)) if adds else np.concatenate
+    return {name: np.asarray(together([part[name] for part in parts])) for name in parts[0]}

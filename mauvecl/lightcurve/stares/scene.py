@@ -1,0 +1,334 @@
+"""A stare's components and conditions as the arrays that the kernels and their twin read."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.host.errors import InputError
+from mauvecl.lightcurve.stares.components import MOST_STATISTICS, STEADY, Components
+from mauvecl.noise import layout
+from mauvecl.noise.cumulants import Cumulants, joint_is_exact
+from mauvecl.noise.pixels import padded
+from mauvecl.noise.processes import CosmicRays, Processes
+from mauvecl.noise.scene import Scene, prepare
+
+if TYPE_CHECKING:
+    from mauvecl.lightcurve.stares.stare import Stare
+
+Float = NDArray[np.float64]
+Floats = NDArray[np.float32]
+
+#: Conditions are held against what can be drawn so many standard deviations from what is known of them.
+REACH_SIGMA = 7.0
+#: Unknowns of a stare, and scenarios on common draws, of one launch.
+MOST_UNKNOWNS, MOST_SCENARIOS = 32, 16
+#: Largest amplitude of a flare.
+LARGEST = 1e12
+#: Counts further than this from their base are not rounded to whole DN by the device.
+REACH_DN = 2.0**22
+
+
+@dataclass(frozen=True, eq=False)
+class Flares:
+    """Flares put into stares.
+
+    Attributes
+    ----------
+    given : ndarray, shape (n_row, n_frame, n_flare)
+        Amplitude of each flare spectrum in each frame; one row for all stares, or one for each.
+    amplitudes : ndarray of float32, shape (n_scenario, n_amplitude_row)
+        Factors on them.
+    """
+
+    given: NDArray[Any]
+    amplitudes: Floats
+
+    @classmethod
+    def of(cls, components: Components, stare: Stare, flare: Any, amplitudes: Any, count: int) -> Self:
+        """From what `Stares.frames` takes.
+
+        Raises
+        ------
+        InputError
+            For shapes that do not fit, or what is negative or not finite.
+        """
+        n_frames, n_flares = stare.n_frames, components.n_flares
+        given = np.zeros((1, n_frames, n_flares), np.float32) if flare is None else np.asarray(flare)
+        if given.ndim == 2:
+            given = given[None]
+        if given.shape[1:] != (n_frames, n_flares) or given.shape[0] not in (1, count):
+            raise InputError(
+                f"flare coefficients have the shape {given.shape}, expected ({count}, {n_frames}, {n_flares}), or one "
+                "row for all stares"
+            )
+        factors = np.ones((1, 1)) if amplitudes is None else np.asarray(amplitudes)
+        if factors.ndim != 2 or factors.shape[1] not in (1, count) or not 1 <= len(factors) <= MOST_SCENARIOS:
+            raise InputError(
+                f"amplitudes have the shape {factors.shape}, expected (n, {count}) or (n, 1) with n of 1 to "
+                f"{MOST_SCENARIOS} scenarios"
+            )
+        # One that is no number is the least, too.
+        ends = [("flare coefficients", given.min(initial=0.0)), ("amplitudes", factors.min(initial=0.0))]
+        ends += [("flare coefficients", most) for most in _largest(given)] + [("amplitudes", factors.max())]
+        for what, end in ends:
+            if not 0 <= end <= LARGEST:
+                raise InputError(f"{what} of {end:g}, expected 0 to {LARGEST:g}")
+        return cls(given, factors.astype(np.float32))
+
+    @cached_property
+    def rows(self) -> Floats:
+        """As kernels read them, shape (n_row, n_flare, n_padded_frame)."""
+        n_row, n_frames, n_flares = self.given.shape
+        rows = np.zeros((n_row, n_flares, padded_frames(n_frames)), np.float32)
+        rows[:, :, :n_frames] = np.moveaxis(self.given, 2, 1)
+        return rows
+
+    def part(self, first: int, count: int) -> Flares:
+        """Those of some stares."""
+        there = slice(first, first + count)
+        amplitudes = self.amplitudes if self.amplitudes.shape[1] == 1 else self.amplitudes[:, there]
+        return Flares(self.given if len(self.given) == 1 else self.given[there], np.ascontiguousarray(amplitudes))
+
+    @cached_property
+    def most(self) -> Float:
+        """The largest coefficient of each spectrum, shape (n_flare,)."""
+        return np.array(_largest(self.given), np.float64) * float(self.amplitudes.max())
+
+
+@dataclass(frozen=True, eq=False)
+class StareScene:
+    """What a launch reads of a stare.
+
+    Attributes
+    ----------
+    components, stare
+        What it is made of.
+    scene : Scene
+        One quiescent frame, for addresses, rails and cosmic rays.
+    numbers : ndarray of uint32, shape (n_padded_frame,)
+        Frames as the generator counts them, gaps included.
+    known : ndarray of float32, shape (7, n_padded_frame)
+        Rows of `layout.KNOWN_OF_FRAMES`.
+    curves : ndarray of float32, shape (n_unknown, n_padded_frame)
+        Of what is unknown of a stare, times its standard deviation.
+    kinds : ndarray of uint32, shape (n_unknown,)
+        What each is of: rows of `layout.MOVED`.
+    staring : ndarray of layout.STARING, shape ()
+        Without what belongs to flares.
+    mixtures : ndarray of layout.MIXTURE, shape (n_padded,)
+    spectra : ndarray of float32, shape (n_flare, n_padded)
+        DN of flares of one amplitude.
+    weights : ndarray of float32, shape (n_statistic, n_padded)
+    constants : ndarray of float32, shape (n_statistic,)
+        What each sum lacks because the kernels leave whole DN out.
+    """
+
+    components: Components
+    stare: Stare
+    scene: Scene
+    numbers: NDArray[np.uint32]
+    known: Floats
+    curves: Floats
+    kinds: NDArray[np.uint32]
+    staring: NDArray[np.void]
+    mixtures: NDArray[np.void]
+    spectra: Floats
+    weights: Floats
+    constants: Floats
+
+    @classmethod
+    def of(cls, components: Components, stare: Stare, cosmic_rays: CosmicRays | None = None) -> Self:
+        """Lay out a stare.
+
+        Raises
+        ------
+        InputError
+            If the quiescent frame cannot be drawn jointly, or there are more sums or unknowns than a launch follows.
+        """
+        x, n_pixel = components.quiet, components.quiet.wavelength_nm.size
+        if abs(stare.frame_s - x.frame_s) > 1e-9 * x.frame_s:
+            raise InputError(f"frames of {stare.frame_s:g} s in the stare, expected the instrument's {x.frame_s:g} s")
+        if components.n_statistics > MOST_STATISTICS:
+            raise InputError(f"{components.n_statistics} spectral weights, expected at most {MOST_STATISTICS}")
+        if len(stare.unknowns) > MOST_UNKNOWNS:
+            raise InputError(f"{len(stare.unknowns)} unknowns of a stare, expected at most {MOST_UNKNOWNS}")
+        scene = prepare([x], processes=Processes(cosmic_rays=cosmic_rays))
+        if not scene.joint:
+            raise InputError(_apart(x.name))
+        size = padded(n_pixel)
+        mixtures = np.zeros(size, layout.MIXTURE)
+        mixtures["variance"] = 1.0
+        mixtures["rest"][:n_pixel] = x.mean_raw_dn - scene.base_dn[0]
+        for row, name in enumerate(STEADY):
+            mixtures[name][:n_pixel] = components.mean_dn[row]
+        for order, name in ((2, "variance"), (3, "third"), (4, "fourth"), (5, "fifth")):
+            constant, each = components.pixel_cumulants(order)
+            # The kernels round: none of it here.
+            constant = constant - {2: 1 / 12, 4: -1 / 120}.get(order, 0.0)
+            mixtures[name][:n_pixel] = constant + each[: len(STEADY)].sum(axis=0)
+            mixtures[f"dark_{name}"][:n_pixel] = each[2]
+            mixtures[f"photon_{name}"][:n_pixel] = (
+                x.gain_dn_per_electron ** (order - 1) if order == 2 or x.photon_noise == "poisson" else 0.0
+            )
+        spectra = np.zeros((components.n_flares, size), np.float32)
+        spectra[:, :n_pixel] = components.mean_dn[len(STEADY) :]
+        weights = np.zeros((components.n_statistics, size), np.float32)
+        weights[:, :n_pixel] = components.weights
+        constants = weights[:, :n_pixel].astype(np.float64) @ (scene.base_dn[0] - x.mean_raw_dn)
+        staring = np.zeros((), layout.STARING)
+        staring["frame_count"], staring["padded_frames"] = stare.n_frames, padded_frames(stare.n_frames)
+        staring["unknown_count"], staring["jittered"] = len(stare.unknowns), any(stare.jitters.values())
+        staring["light_jitter"], staring["sky_jitter"] = stare.light_jitter, stare.sky_jitter
+        staring["temperature_jitter"] = stare.temperature_jitter_c
+        staring["dark_slope"] = x.conditions["dark_slope_per_c"]
+        curves = np.reshape([u.sd * u.curve for u in stare.unknowns], (len(stare.unknowns), stare.n_frames))
+        return cls(
+            components,
+            stare,
+            scene,
+            _padded(stare.numbers, np.uint32),
+            _known(components, stare),
+            _padded(curves, np.float32),
+            np.array([layout.MOVED.index(u.of) for u in stare.unknowns], np.uint32),
+            staring,
+            mixtures,
+            spectra,
+            weights,
+            constants.astype(np.float32),
+        )
+
+    @property
+    def counts(self) -> bool:
+        """Whether photons are Poisson counts, with more than a variance."""
+        return self.components.quiet.photon_noise == "poisson"
+
+    def staring_of(self, flares: Flares) -> NDArray[np.void]:
+        """With what belongs to flares, shape (1,)."""
+        staring = self.staring.copy()
+        staring["scenario_count"], staring["amplitude_rows"] = flares.amplitudes.shape
+        staring["flare_rows"] = len(flares.given)
+        return staring.reshape(1)
+
+    def job(self, seed: int) -> NDArray[np.void]:
+        """The frame's job with a seed, shape (1,)."""
+        job = self.scene.job.copy()
+        job["seed_low"], job["seed_high"] = seed & 0xFFFFFFFF, seed >> 32
+        return job.reshape(1)
+
+    def extremes(self, flares: Flares) -> Iterator[tuple[Float, float]]:
+        """Conditions from end to end, neighbours at most a factor of 2 apart.
+
+        Yields
+        ------
+        light : ndarray, shape (n_pixel,)
+            Photons in DN.
+        dark : float
+            Factor on the dark.
+        """
+        low, high = self._ends
+        mean = self.components.mean_dn
+        darkest = low[0] * mean[0] + low[1] * mean[1]
+        brightest = high[0] * mean[0] + high[1] * mean[1] + high[3] * (flares.most @ mean[len(STEADY) :])
+        span = float(np.max(brightest / np.maximum(darkest, 1e-30), initial=1.0, where=brightest > 1e-9))
+        steps = 1 + int(np.ceil(np.log2(min(span, 2.0**20))))
+        for part in np.linspace(0.0, 1.0, steps + 1):
+            light = np.maximum(darkest, 1e-30) ** (1 - part) * np.maximum(brightest, 1e-30) ** part
+            for dark in np.geomspace(low[2], high[2], 2 + int(np.log2(high[2] / low[2]))):
+                yield light, float(dark)
+
+    @property
+    def _ends(self) -> tuple[Float, Float]:
+        """Least and largest factors on star, sky, dark and flares that are met."""
+        stare, spread = self.stare, self._spreads
+        ends = []
+        for sign, of in ((-1.0, np.min), (1.0, np.max)):
+            light, star, sky = (1.0 + sign * REACH_SIGMA * spread[name] for name in ("light", "star", "sky"))
+            warm = np.exp(sign * REACH_SIGMA * abs(self.staring["dark_slope"]) * spread["temperature"])
+            known = (stare.light * stare.star * light * star, stare.light * stare.sky * light * sky)
+            dark = stare.dark_factor(self.components.quiet) * warm
+            ends.append(np.array([float(of(values)) for values in (*known, dark, stare.light * light)]))
+        return ends[0], ends[1]
+
+    @property
+    def _spreads(self) -> dict[str, Float]:
+        """Standard deviation of what is drawn of each frame, shape (n_frame,) each."""
+        found = {of: np.full(self.stare.n_frames, self.stare.jitters.get(of, 0.0) ** 2) for of in layout.MOVED}  # type: ignore[call-overload]
+        for unknown in self.stare.unknowns:
+            found[unknown.of] += (unknown.sd * unknown.curve) ** 2
+        return {of: np.sqrt(variance) for of, variance in found.items()}
+
+    def check(self, flares: Flares) -> None:
+        """Refuse what cannot be drawn.
+
+        Raises
+        ------
+        InputError
+            Where light could be drawn below zero, counts further than the device rounds, or a pixel's noise not from
+            one normal.
+        """
+        spread = self._spreads
+        for of in ("light", "star", "sky"):
+            if (REACH_SIGMA * spread[of] >= 1.0).any():
+                raise InputError(
+                    f"the {of} of a frame scatters by {float(spread[of].max()):.3g}, expected less than "
+                    f"{1 / REACH_SIGMA:.3g}, lest it be drawn below zero"
+                )
+        x, mean = self.components.quiet, self.components.mean_dn
+        _, high = self._ends
+        reach = (
+            high[0] * mean[0] + high[1] * mean[1] + high[2] * mean[2] + high[3] * (flares.most @ mean[len(STEADY) :])
+        )
+        if not (reach < REACH_DN).all():
+            pixel = int(np.argmax(~(reach < REACH_DN)))
+            raise InputError(
+                f"the stare carries pixel {pixel} of {x.name} to {reach[pixel]:.3g} DN in a frame, expected less than "
+                f"{REACH_DN:g}"
+            )
+        one = Cumulants.of(x, 1)
+        for light, dark in self.extremes(flares):
+            photons = light / x.gain_dn_per_electron
+            other = x.read_noise_dn**2 + (0.0 if self.counts else x.gain_dn_per_electron * light)
+            met = replace(one, gaussian=other, photons=photons, dark_dn=dark * one.dark_dn)
+            if not joint_is_exact(met).all():
+                raise InputError(_apart(x.name))
+
+
+def padded_frames(n_frames: int) -> int:
+    """Frames with those that no one asked for."""
+    return -(-n_frames // layout.FRAME_BLOCK) * layout.FRAME_BLOCK
+
+
+def unique(n: int, order: int) -> list[tuple[int, ...]]:
+    """Places of a symmetric tensor that differ, as kernels number them: (0,), or (0, 0), (1, 0), (1, 1), ..."""
+    return sorted(tuple(sorted(key, reverse=True)) for key in itertools.combinations_with_replacement(range(n), order))
+
+
+def _largest(given: NDArray[Any]) -> list[float]:
+    """Of each spectrum; over the last axis alone NumPy is slow."""
+    return [float(given[..., j].max()) for j in range(given.shape[-1])]
+
+
+def _padded(values: NDArray[Any], kind: type) -> NDArray[Any]:
+    """With zeros in frames that no one asked for."""
+    more = padded_frames(values.shape[-1]) - values.shape[-1]
+    return np.pad(values, [(0, 0)] * (values.ndim - 1) + [(0, more)]).astype(kind)
+
+
+def _known(components: Components, stare: Stare) -> Floats:
+    rows = components.coefficients(stare)[:, : len(STEADY)].T
+    changes = [part for row in rows for part in (row, row - 1.0)]
+    return np.asarray(_padded(np.stack([*changes, stare.light]), np.float32))
+
+
+def _apart(name: str) -> str:
+    return (
+        f"the noise of a frame of {name} cannot be drawn jointly under all conditions of the stare, expected Gaussian "
+        "noise of 1.5 Poisson counts and more in each pixel, more where counts are few"
+    )

@@ -1,0 +1,330 @@
+"""A stare at a star: when its frames are, what is known of each, and how far from that it may be. Nothing is drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any, Literal, Self, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.host.errors import InputError
+from mauvecl.host.quantities import takes_quantities
+from mauvecl.lightcurve.stares.curves import ORBIT_S, Curve, Sinusoid
+
+if TYPE_CHECKING:
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.orbit.names import Target
+    from mauvecl.host.orbit.orbit import Orbit
+
+Float = NDArray[np.float64]
+#: What changes from frame to frame: the star's own level without its flares; the throughput for all light, of star,
+#: flare and sky; the sky's brightness; the detector's temperature.
+Changing = Literal["star", "light", "sky", "temperature"]
+CHANGING: tuple[Changing, ...] = get_args(Changing)
+#: Unit of each, for messages and tables.
+CHANGING_UNITS: dict[Changing, str] = {"star": "", "light": "", "sky": "", "temperature": "deg C"}
+#: Frames of a stare, at most: twenty years of 5 s, five bytes of a frame number.
+MOST_FRAMES = 2**27
+#: Relative changes are of a level that is there: a standard deviation beyond this would reach below zero.
+LARGEST_SPREAD = 0.2
+HOUR_S = 3600.0
+
+
+@dataclass(frozen=True, eq=False)
+class StareUnknown:
+    """Something that is not known of a whole stare: a normal amplitude times a known curve.
+
+    Attributes
+    ----------
+    name : str
+    of : {"star", "light", "sky", "temperature"}
+    sd : float
+        Standard deviation of the amplitude; relative, or deg C for the temperature.
+    curve : ndarray, shape (n_frame,)
+        What an amplitude of one does to each frame.
+    """
+
+    name: str
+    of: Changing
+    sd: float
+    curve: Float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "curve", _kept(self.curve))
+        _check_of(self.name, self.of)
+        _check_spread(self.name, self.of, self.sd)
+
+
+@takes_quantities
+@dataclass(frozen=True, eq=False)
+class Stare:
+    """Frames of one star, one after the other with gaps between them; arrays are read-only.
+
+    In frame k of stare i, with standard normal z drawn for the stare and e drawn for the frame,
+
+    - all light, of star, flare and sky, is multiplied by light_k (1 + sum_u sd_u z_iu curve_uk + light_jitter e_ik);
+    - the star's without its flares by star_k (1 + sum_u ...) too, the sky's by sky_k (1 + sum_u ... + sky_jitter e_ik);
+    - the detector's temperature is temperature_c_k + sum_u ... + temperature_jitter_c e_ik.
+
+    Each jitter and each sum has draws of its own.
+
+    Attributes
+    ----------
+    start_s : ndarray, shape (n_frame,)
+        Start of each frame, s from the start of the stare: ascending multiples of `frame_s`; frames in gaps are absent.
+    frame_s : float
+    star, light, sky : ndarray, shape (n_frame,)
+        Known factors on the expectation's star, on all light, and on its sky.
+    temperature_c : ndarray, shape (n_frame,)
+        Known temperature of the detector, deg C.
+    light_jitter, sky_jitter : float
+        Standard deviation from frame to frame, relative.
+    temperature_jitter_c : float
+        The same, deg C.
+    unknowns : tuple of StareUnknown
+        What differs from stare to stare.
+
+    Examples
+    --------
+    >>> from mauvecl.lightcurve.stares.stare import Stare
+    >>> stare = Stare.of(6000, gaps=[(1000, 2000)], thermal=0.5, drifts={"light": 0.01})
+    >>> stare.n_frames, stare.gtis.tolist()
+    (1000, [[0.0, 1000.0], [2000.0, 6000.0]])
+    """
+
+    start_s: Float
+    frame_s: float
+    star: Float
+    light: Float
+    sky: Float
+    temperature_c: Float
+    light_jitter: float = 0.0
+    sky_jitter: float = 0.0
+    temperature_jitter_c: float = 0.0
+    unknowns: tuple[StareUnknown, ...] = ()
+
+    def __post_init__(self) -> None:
+        for name in ("start_s", "star", "light", "sky", "temperature_c"):
+            object.__setattr__(self, name, _kept(getattr(self, name)))
+        if not (np.isfinite(self.frame_s) and self.frame_s > 0):
+            raise InputError(f"frame_s = {self.frame_s:g}, expected a time above 0")
+        n = self.start_s.size
+        if not 1 <= n <= MOST_FRAMES:
+            raise InputError(f"a stare of {n} frames, expected 1 to {MOST_FRAMES}")
+        for name, values in self._per_frame():
+            if values.shape != (n,):
+                raise InputError(f"{name} of the stare has the shape {values.shape}, expected ({n},)")
+            if not np.isfinite(values).all():
+                raise InputError(f"{name} of frame {int(np.argmin(np.isfinite(values)))} is not finite")
+        off = np.abs(self.start_s / self.frame_s - self.numbers)
+        if not (off < 1e-6).all() or self.numbers[0] < 0 or not (np.diff(self.numbers) > 0).all():
+            raise InputError(
+                f"the frames of a stare start at {self.start_s[0]:g} ... {self.start_s[-1]:g} s, expected ascending "
+                f"multiples of {self.frame_s:g} s from 0"
+            )
+        for name, values in (("star", self.star), ("light", self.light), ("sky", self.sky)):
+            if not (values >= 0).all():
+                k = int(np.argmin(values >= 0))
+                raise InputError(f"the factor on the {name} of frame {k} = {values[k]:g}, expected at least 0")
+        for of, sd in self.jitters.items():
+            _check_spread(f"{of} jitter", of, sd, least=0.0)
+        for unknown in self.unknowns:
+            _check_spread(unknown.name, unknown.of, unknown.sd * float(np.abs(unknown.curve).max()), least=0.0)
+
+    def _per_frame(self) -> list[tuple[str, Float]]:
+        named = [(name, getattr(self, name)) for name in ("start_s", "star", "light", "sky", "temperature_c")]
+        return named + [(unknown.name, unknown.curve) for unknown in self.unknowns]
+
+    @classmethod
+    @takes_quantities
+    def of(
+        cls,
+        duration_s: float,
+        *,
+        frame_s: float = 5.0,
+        gaps: Sequence[tuple[float, float]] = (),
+        temperature_c: float = 21.0,
+        thermal: float | Curve | None = None,
+        variability: Curve | None = None,
+        throughput: Curve | None = None,
+        sky: Curve | None = None,
+        orbit_s: float = ORBIT_S,
+        jitters: Mapping[Changing, float] | None = None,
+        offsets: Mapping[Changing, float] | None = None,
+        drifts: Mapping[Changing, float] | None = None,
+        cycles: Mapping[Changing, float] | None = None,
+    ) -> Self:
+        """A stare from what an observer would say of it.
+
+        Parameters
+        ----------
+        duration_s : float
+            From the first frame to the end of the last; rounded up to whole frames.
+        frame_s : float
+        gaps : sequence of (float, float)
+            Times between which nothing is recorded, s; a frame that a gap touches is lost.
+        temperature_c : float
+            Of the detector, about which `thermal` runs; the payload's by default.
+        thermal : float, Sinusoid or Table, optional
+            deg C on top of it: the half amplitude of a sinusoid of the orbit, or a curve.
+        variability : Sinusoid or Table, optional
+            The star's own, relative: 0.01 is 1 % brighter.
+        throughput, sky : Sinusoid or Table, optional
+            What is known of how all light, and the sky's brightness, change; relative.
+        orbit_s : float
+            Period of `thermal` and `cycles`.
+        jitters : mapping of {"light", "sky", "temperature"} to float, optional
+            Standard deviation from frame to frame.
+        offsets, drifts, cycles : mapping of {"star", "light", "sky", "temperature"} to float, optional
+            Standard deviations, over stares, of an unknown level; of an unknown change in an hour, zero in the middle;
+            and of the sine and the cosine of an unknown cycle of the orbit.
+
+        Raises
+        ------
+        InputError
+            For a length, gap or spread that cannot be, or nothing left between the gaps.
+        """
+        if not (np.isfinite(duration_s) and duration_s > 0 and np.isfinite(frame_s) and frame_s > 0):
+            raise InputError(f"a stare of {duration_s:g} s in frames of {frame_s:g} s, expected times above 0")
+        count = np.ceil(duration_s / frame_s * (1 - 1e-12))
+        if count > MOST_FRAMES:
+            raise InputError(f"a stare of {duration_s:g} s has {count:g} frames, expected at most {MOST_FRAMES}")
+        if not (np.isfinite(orbit_s) and orbit_s > 0):
+            raise InputError(f"orbit_s = {orbit_s:g}, expected a period above 0")
+        start: Float = np.arange(max(1, int(count)), dtype=np.float64) * float(frame_s)
+        start = start[_outside(gaps, start, float(frame_s))]
+        if not start.size:
+            raise InputError(f"the gaps leave no frame of a stare of {duration_s:g} s, expected some")
+
+        def over_frames(curve: Curve | None) -> Float:
+            return np.zeros(start.size) if curve is None else curve.mean_over(start, float(frame_s))
+
+        spread = dict(jitters or {})
+        other = next((name for name in spread if name not in ("light", "sky", "temperature")), None)
+        if other is not None:
+            raise InputError(f"a jitter of {other!r}, expected one of light, sky, temperature")
+        return cls(
+            start,
+            float(frame_s),
+            1.0 + over_frames(variability),
+            1.0 + over_frames(throughput),
+            1.0 + over_frames(sky),
+            temperature_c + over_frames(Sinusoid(thermal, orbit_s) if isinstance(thermal, int | float) else thermal),
+            spread.get("light", 0.0),
+            spread.get("sky", 0.0),
+            spread.get("temperature", 0.0),
+            _unknowns(start, float(frame_s), orbit_s, offsets or {}, drifts or {}, cycles or {}),
+        )
+
+    @classmethod
+    @takes_quantities
+    def along(cls, orbit: Orbit, target: Target | str, start: str, duration_s: float, **how: Any) -> Stare:
+        """As the orbit gives it: frames while the target is seen, the detector's temperature through sun and shadow.
+
+        Parameters
+        ----------
+        orbit : Orbit
+        target : Target or str
+        start : str
+            ISO 8601, UTC.
+        duration_s : float
+        **how
+            As `along.stare_along`, which also has the rate of particles.
+        """
+        from mauvecl.lightcurve.stares.along import stare_along
+
+        return stare_along(orbit, target, start, duration_s, **how).stare
+
+    @property
+    def jitters(self) -> dict[Changing, float]:
+        """Standard deviations from frame to frame."""
+        return {"light": self.light_jitter, "sky": self.sky_jitter, "temperature": self.temperature_jitter_c}
+
+    @property
+    def n_frames(self) -> int:
+        """Frames that are there."""
+        return self.start_s.size
+
+    @cached_property
+    def numbers(self) -> NDArray[np.int64]:
+        """Number of each frame counted from the start of the stare, gaps included, shape (n_frame,)."""
+        return np.rint(self.start_s / self.frame_s).astype(np.int64)
+
+    @property
+    def middle_s(self) -> Float:
+        """Middle of each frame, s, shape (n_frame,)."""
+        return np.asarray(self.start_s + self.frame_s / 2)
+
+    @property
+    def duration_s(self) -> float:
+        """From 0 to the end of the last frame, s."""
+        return float(self.start_s[-1] + self.frame_s)
+
+    @property
+    def observed_s(self) -> float:
+        """Time in frames, s."""
+        return self.n_frames * self.frame_s
+
+    @cached_property
+    def gtis(self) -> Float:
+        """Good time intervals: start and end of each run of frames without a gap, s, shape (n, 2)."""
+        breaks = np.flatnonzero(np.diff(self.numbers) > 1)
+        first = np.concatenate([[0], breaks + 1])
+        last = np.concatenate([breaks, [self.n_frames - 1]])
+        return np.column_stack([self.start_s[first], self.start_s[last] + self.frame_s])
+
+    def dark_factor(self, quiet: Expectation) -> Float:
+        """Known factor on an expectation's dark in each frame, by the instrument's law, shape (n_frame,)."""
+        slope, at = quiet.conditions["dark_slope_per_c"], quiet.conditions["temperature_c"]
+        return np.asarray(np.exp(slope * (self.temperature_c - at)))
+
+
+def _outside(gaps: Sequence[tuple[float, float]], start: Float, frame_s: float) -> NDArray[np.bool_]:
+    """Which frames no gap touches."""
+    # A hair, so that a gap that ends where a frame starts leaves it.
+    kept, hair = np.ones(start.size, np.bool_), 1e-9 * frame_s
+    for first, last in gaps:
+        if not (np.isfinite([first, last]).all() and first < last):
+            raise InputError(f"a gap from {first:g} to {last:g} s, expected two times, ascending")
+        kept &= (start + frame_s <= first + hair) | (start >= last - hair)
+    return kept
+
+
+def _unknowns(
+    start: Float,
+    frame_s: float,
+    orbit_s: float,
+    offsets: Mapping[Changing, float],
+    drifts: Mapping[Changing, float],
+    cycles: Mapping[Changing, float],
+) -> tuple[StareUnknown, ...]:
+    middle = (start[0] + start[-1] + frame_s) / 2
+    hours = (start + frame_s / 2 - middle) / HOUR_S
+    sine, cosine = (Sinusoid(1.0, orbit_s, phase).mean_over(start, frame_s) for phase in (0.0, np.pi / 2))
+    found = [StareUnknown(f"{of} offset", of, sd, np.ones(start.size)) for of, sd in offsets.items()]
+    found += [StareUnknown(f"{of} drift", of, sd, hours) for of, sd in drifts.items()]
+    for of, sd in cycles.items():
+        found += [StareUnknown(f"{of} sine", of, sd, sine), StareUnknown(f"{of} cosine", of, sd, cosine)]
+    return tuple(found)
+
+
+def _kept(values: Float) -> Float:
+    kept = np.array(values, np.float64)
+    kept.setflags(write=False)
+    return kept
+
+
+def _check_of(name: str, of: str) -> None:
+    if of not in CHANGING:
+        raise InputError(f"the unknown {name!r} is of {of!r}, expected one of {', '.join(CHANGING)}")
+
+
+def _check_spread(name: str, of: Changing, sd: float, least: float = 1e-300) -> None:
+    most = 100.0 if of == "temperature" else LARGEST_SPREAD
+    if not least <= sd <= most:
+        unit = CHANGING_UNITS[of]
+        above = "0" if least == 0 else "above 0"
+        raise InputError(f"the {name} has the standard deviation {sd:g}, expected {above} to {most:g} {unit}".rstrip())

@@ -1,0 +1,159 @@
+"""A frame's weighted sums without its pixels: their joint cumulants as the table that kernel and twin read.
+
+The cumulants of independent counts add up, so those of the sums are exact. From them a frame is drawn as the sums'
+Cholesky factor times normals, each with a quadratic in all of them that gives every third cumulant its value, and
+where it could be noticed a cubic of its own (Cornish & Fisher 1938, doi 10.2307/1400905, in several dimensions).
+"""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from dataclasses import dataclass
+from typing import Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.host.errors import InputError
+from mauvecl.lightcurve.stares.components import STEADY, Components
+from mauvecl.lightcurve.stares.scene import Flares, StareScene, unique
+from mauvecl.noise.cumulants import expansion_error
+
+Float = NDArray[np.float64]
+Floats = NDArray[np.float32]
+
+#: What is left out of a sum's distribution would show in Pearson's test, at five sigma, after so many frames by the
+#: estimate here: sixteen thousand star-years of 5 s.
+FRAMES_TO_NOTICE = 1e11
+#: Classes of that test: standard deviations that hold all but 1e-14.
+CLASSES = 15.3
+#: A pixel's mean stays so many standard deviations away from zero and saturation.
+RAIL_SIGMA = 8.0
+#: DN^2 that a frame of a pixel must scatter: with less its rounding is no noise of variance 1/12.
+LEAST_VARIANCE = 1.0
+
+
+@dataclass(frozen=True, eq=False)
+class SumTable:
+    """Cumulants of sums that are independent and of variance one at coefficients of one.
+
+    Attributes
+    ----------
+    rows : ndarray of float32, shape (4 + n_flare, n)
+        Of everything at coefficients of one, then of star, sky, dark and flares by themselves: means (those of the
+        first are 0), then what differs of the second, third and, where needed, fourth cumulants, in the order of
+        `scene.unique`; fourth ones times how often they occur.
+    whole : ndarray of float32, shape (n_statistic * (n_statistic + 1) / 2,)
+        The lower triangle that turns them into the statistics.
+    fourths : bool
+        Whether fourth cumulants are needed.
+    """
+
+    rows: Floats
+    whole: Floats
+    fourths: bool
+
+    @classmethod
+    def of(cls, components: Components) -> Self:
+        """The table of some weights.
+
+        Raises
+        ------
+        InputError
+            For weights that depend on each other, or so few counts that their distribution could be noticed.
+        """
+        n = components.n_statistics
+        constant, each = components.sum_cumulants(2)
+        covariance = constant + each[: len(STEADY)].sum(axis=0)
+        sd = np.sqrt(np.diag(covariance))
+        if (sd == 0).any() or np.linalg.eigvalsh(covariance / np.outer(sd, sd))[0] < 1e-9:
+            raise InputError(f"{n} spectral weights of which one is a sum of others, expected independent ones")
+        lower = np.linalg.cholesky(covariance)
+        white = Components(
+            components.quiet,
+            components.flare_electrons,
+            np.asarray(np.linalg.solve(lower, components.weights), np.float64),
+        )
+        fourths = _fourths_are_needed(components) or _fourths_are_needed(white)
+        columns = []
+        for order in range(1, 5 if fourths else 4):
+            constant, each = white.sum_cumulants(order)
+            reference = constant + (0.0 if order == 1 else each[: len(STEADY)].sum(axis=0))
+            for key in unique(n, order):
+                often = 1
+                if order == 4:
+                    often = math.factorial(4) // math.prod(math.factorial(m) for m in Counter(key).values())
+                columns.append(often * np.array([reference[key], *(component[key] for component in each)]))
+        return cls(np.array(columns, np.float32).T.copy(), lower[np.tril_indices(n)].astype(np.float32), fourths)
+
+    @property
+    def packed(self) -> Floats:
+        """What the kernel reads."""
+        return np.concatenate([self.rows.ravel(), self.whole])
+
+
+def check_sums(scene: StareScene, flares: Flares) -> None:
+    """Refuse what cumulants do not describe: rails, noiseless pixels, rare large hits.
+
+    Raises
+    ------
+    InputError
+    """
+    if scene.scene.cosmic:
+        raise InputError("cosmic rays with method 'cumulants', expected method 'pixels': they are rare and large")
+    x = scene.components.quiet
+    used = (scene.components.weights != 0).any(axis=0)
+    for light, dark in scene.extremes(flares):
+        mean = x.bias_dn + light + dark * x.dark_dn
+        variance = x.read_noise_dn**2 + x.gain_dn_per_electron * light + dark * x.dark_variance_dn2
+        sd = np.sqrt(variance)
+        near = used & ((mean - RAIL_SIGMA * sd < 0.0) | (mean + RAIL_SIGMA * sd > x.highest_dn))
+        if near.any():
+            pixel = int(np.argmax(near))
+            raise InputError(
+                f"pixel {pixel} of {x.name} comes within {RAIL_SIGMA:g} sigma of zero or saturation and has a weight, "
+                "expected method 'pixels', which clips, or weight 0 there"
+            )
+        if (used & (variance < LEAST_VARIANCE)).any():
+            pixel = int(np.argmax(used & (variance < LEAST_VARIANCE)))
+            raise InputError(
+                f"pixel {pixel} of {x.name} scatters by {sd[pixel]:.2g} DN, too little for its rounding to be noise, "
+                "expected method 'pixels'"
+            )
+
+
+def _over_sd(components: Components) -> list[Float]:
+    """Third to seventh cumulants of each sum over powers of its standard deviation, shape (n_statistic,) each."""
+    x, w = components.quiet, components.weights
+    photons, dark = components.mean_dn[:2].sum(axis=0), components.mean_dn[2]
+    sd = np.sqrt(np.sum(w**2 * (x.unsaturated_variance_dn2), axis=1))
+    found = []
+    for order in range(3, 8):
+        cumulant = x.dark_step_dn ** (order - 1) * dark
+        if x.photon_noise == "poisson":
+            cumulant = cumulant + x.gain_dn_per_electron ** (order - 1) * photons
+        found.append(np.sum(w**order * cumulant, axis=1) / sd**order)
+    return found
+
+
+def _fourths_are_needed(components: Components) -> bool:
+    """Whether leaving out what follows the third cumulants could be noticed.
+
+    Raises
+    ------
+    InputError
+        If leaving out what follows the fourth could.
+    """
+    shapes = _over_sd(components)
+    least = 5.0 * np.sqrt(2.0 * CLASSES) / FRAMES_TO_NOTICE
+    beyond = expansion_error(shapes, fourth_power=False)
+    if (beyond > least).any():
+        row = int(np.argmax(beyond))
+        raise InputError(
+            f"the sum with spectral weight {row} has a skewness of {abs(shapes[0][row]):.2g} in a frame of "
+            f"{components.quiet.name}, too much for method 'cumulants', expected method 'pixels'"
+        )
+    g3, g4 = shapes[0], shapes[1]
+    cubic, linear = g4 / 24 - g3**2 / 18, g3**2 * (5 / 36 - 6 / 36)
+    return bool((24 * cubic**2 + 2 * linear**2 > least).any())
