@@ -163,7 +163,10 @@ class _Tilt:
         tilt = one.tilt(setting, flare)
         nothing = np.zeros(setting.used.size)
         # What is marginalised over and not drawn does not scatter.
-        null = one.as_drawn(setting, found.quiet, nothing, one.variance(setting), flare, priors=False)
+        estimated = setting.comparison.estimated
+        null = one.as_drawn(
+            setting, found.quiet, nothing, one.variance(setting), flare, estimated=estimated, priors=False
+        )
         goal = null.isf(fap)
         parts, chance, scores = null.parts if isinstance(null, Mixture) else (null,), np.ones(1), {}
         if isinstance(null, Mixture):

@@ -13,6 +13,7 @@ from mauvecl.noise.comparison import Comparison
 from mauvecl.noise.processes import Normal, Processes, Uniform
 from mauvecl.results.detection import Detection
 from mauvecl.results.tails import tail
+from mauvecl.statistics.linear import Linear
 from mauvecl.statistics.registry import STATISTICS
 
 #: A sixth of the pixels: brute force can then afford 3e7 draws, 30 of them beyond a threshold at 1e-6.
@@ -172,6 +173,18 @@ def test_brute_force_agrees_whatever_is_compared(engine: Engine, statistic: str,
     beyond = found.false_alarm_probability(sampled.threshold.value, statistic).value * n
     error = np.hypot(np.sqrt(fap * n), sampled.relative_error * fap * n)
     assert abs(beyond - fap * n) < 4.5 * error
+
+
+def test_a_sum_in_dn_is_tilted_in_its_own_unit_by_estimated_variances(engine: Engine) -> None:
+    """Weights of one DN each: |z| < 4.5 with both errors, 1e-5 by chance."""
+    quiet, _ = star(amplitudes=(0.1,), payload=instrument(**PART))
+    own = Linear("own", np.ones(quiet.wavelength_nm.size))
+    n, fap = 400_000, 1e-3
+    how = {"comparison": Comparison(0, estimated=True), "tails": "sampled"}
+    found = engine.detect(quiet, [], realisations=n, seed=11, statistics=(own,), **how)
+    sampled = tail(found, fap, "own", seed=3)
+    beyond = found.distribution("own").above(sampled.threshold.value)
+    assert abs(beyond - fap * n) < 4.5 * np.hypot(np.sqrt(fap * n), sampled.relative_error * fap * n)
 
 
 def test_too_many_exposures_are_refused(engine: Engine) -> None:
