@@ -22,7 +22,9 @@ SEARCH = {
         "search",
         "false_alarms",
     ),
-    "per": Option(Annotated[str | None, typer.Option(help="day, month or year, of frames [month].")], "search", "per"),
+    "alarms_per": Option(
+        Annotated[str | None, typer.Option(help="day, month or year, of frames [month].")], "search", "per"
+    ),
     "shape": Option(ShapeFlag, "search", "shape"),
 }
 INJECTIONS = {
@@ -75,7 +77,7 @@ def inject(study: Study, session: Session) -> None:
 
     Flares are injected into drawn stares and searched for with a bank of filters. A stare of a day unless told.
 
-    Examples: mauvecl inject --star G2V --magnitude 7.4 --distance 14.1 --false-alarms 1 --per month
+    Examples: mauvecl inject --star G2V --magnitude 7.4 --distance 14.1 --false-alarms 1 --alarms-per month
 
     mauvecl inject --star M3V --magnitude 9 --orbit-gap 2100 --with-unknowns --sweep flare_temperature=7000,10000,15000
     """
@@ -95,7 +97,7 @@ def _show(found: InjectAnswer) -> None:
     choice = found.study.search
     swept = tuple(axis.quantity for axis in found.study.sweep.axes)
     show_table(
-        f"The search: {choice.false_alarms:g} false alarms per star-{choice.per} of frames",
+        f"The search: {choice.false_alarms:g} false alarm{"" if choice.false_alarms == 1 else "s"} per star-{choice.per} of frames",
         ("star", *swept, "threshold", "[95 %]", "templates", "sums of a frame", "alarms/day at", "sampled", "drawn"),
         [
             (one.label, *map(short, one.at.values()), f"{one.threshold.value:.3f}",

@@ -153,7 +153,9 @@ def test_refusals(stares):
 @pytest.mark.long
 def test_command(tmp_path):
     """The verb with flags: its JSON, its files, its record."""
-    words = "inject --star G2V --magnitude 7.4 --duration 4000 --injections 20 --per day --false-alarms 0.5 --json"
+    words = (
+        "inject --star G2V --magnitude 7.4 --duration 4000 --injections 20 --alarms-per day --false-alarms 0.5 --json"
+    )
     sets = ["injections.widths=2", "injections.sizes=3", "injections.positions=2", "injections.fitted=2"]
     sets += ["search.half_widths_s=[20,60]", "search.nulls=10"]
     done = run(*words.split(), *(x for s in sets for x in ("--set", s)), "--output", tmp_path, folder=tmp_path)
