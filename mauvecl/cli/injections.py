@@ -95,9 +95,10 @@ def _show(found: InjectAnswer) -> None:
     from mauvecl.cli.console import short, show_table
 
     choice = found.study.search
+    alarms = "false alarm" if choice.false_alarms == 1 else "false alarms"
     swept = tuple(axis.quantity for axis in found.study.sweep.axes)
     show_table(
-        f"The search: {choice.false_alarms:g} false alarm{"" if choice.false_alarms == 1 else "s"} per star-{choice.per} of frames",
+        f"The search: {choice.false_alarms:g} {alarms} per star-{choice.per} of frames",
         ("star", *swept, "threshold", "[95 %]", "templates", "sums of a frame", "alarms/day at", "sampled", "drawn"),
         [
             (one.label, *map(short, one.at.values()), f"{one.threshold.value:.3f}",
