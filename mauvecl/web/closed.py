@@ -15,6 +15,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.statistics.statistic import Setting
 from mauvecl.study.labels import told
+from mauvecl.web.fields import star_words
 from mauvecl.web.smooth import Smooth
 
 if TYPE_CHECKING:
@@ -113,7 +114,7 @@ class Closed:
         """The question in a sentence's words."""
         q, x = self.question, self.quiet
         frames = "one frame" if x.n_frames == 1 else f"{x.n_frames} frames"
-        star = "your own star" if q.uploaded is not None else f"a {q.star} star"
+        star = "your own star" if q.uploaded is not None else star_words(q.star)
         return (
             f"a {q.amplitude_percent:g} % flare ({q.flare_temperature_k:g} K) on {star} of {q.band} = {q.magnitude:g}, "
             f"in {x.exposure_s:g} s ({frames})"

@@ -6,6 +6,7 @@ import itertools
 import re
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, NamedTuple
 
 from mauvecl.host.errors import InputError
@@ -100,12 +101,12 @@ def draws(text: str) -> Draws:
 
 
 def star_name(text: str) -> str:
-    """The library's name of a star, found by any of its names in any case; a server's own kept stars are not here."""
+    """The library's name of a star, found by any of its names in any case and spacing; not a star kept on a server."""
     if text == UPLOADED:
         return UPLOADED
     if not text.strip():
         raise InputError("no star is chosen, expected a name of the library, or an upload")
-    entry = embedded(text)
+    entry = embedded(_spaced().get(_key(text), text))
     if entry is None:
         raise InputError(f"{shortened(text)} is not in the library, expected a name such as G2V, HD 40307 or Vega")
     return entry["name"]
@@ -117,6 +118,26 @@ def star_names() -> list[str]:
     names = [str(row[column]) for row in rows for column in ("name", "alias", "star")]
     # A collection's name in front of a type says nothing that the type does not.
     return [name for name in dict.fromkeys(names) if name and not name.startswith("Pickles ")]
+
+
+def _key(name: str) -> str:
+    return "".join(name.split()).casefold()
+
+
+@cache
+def _spaced() -> dict[str, str]:
+    """Names as the library spells them: GJ581, gj 581 and GJ  581 are one star."""
+    return {_key(name): name for name in star_names()}
+
+
+def star_words(name: str) -> str:
+    """A star of the library in a sentence: its type, and the star whose spectrum it is."""
+    entry = embedded(name)
+    star = name if entry is None else entry["star"]
+    if star == name:
+        return f"a star like {'the ' if name == 'Sun' else ''}{name}"
+    article = "an" if name[0] in "AFM" else "a"
+    return f"{article} {name} star" + ("" if star.startswith("Pickles ") else f" (spectrum of {star})")
 
 
 @dataclass(frozen=True)

@@ -120,7 +120,7 @@ class Canvas:
         source = self.source(name, "x", "y")
         kind: Any = partial(self.plot.step, mode="center") if step else self.plot.line
         made = kind("x", "y", source=source, color=self.ink[colour], **({"line_width": 1.6} | how))
-        return self._told(made, called, colour, "line", show)
+        return self._told(made, called, colour, "dash" if "line_dash" in how else "line", show)
 
     def band(self, name: str, called: str, colour: str, *, show: str = "", alpha: float = 0.22) -> Any:
         """A band of columns x, low and high."""

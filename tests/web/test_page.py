@@ -254,6 +254,8 @@ def test_a_click_on_the_map_sets_the_question(page: Page) -> None:
 
 def test_no_answer_beside_a_field_that_is_wrong(page: Page) -> None:
     before = shown(page)
+    place = "document.querySelector('#plot-excess').getBoundingClientRect().y + scrollY"
+    top = page.evaluate(place)
     for label, wrong, right, told in (
         ("Magnitude", "99", "8.5", "'99' is out of range, expected a number from -2 to 25"),
         ("Magnitude", "7,4", "8.5", "'7,4' is not a number"),
@@ -262,6 +264,8 @@ def test_no_answer_beside_a_field_that_is_wrong(page: Page) -> None:
     ):
         enter(page, label, wrong)
         answerless(page)
+        assert page.title() == "No answer: mauvecl", "the browser's tab tells no answer either"
+        assert page.evaluate(place) == top, "nothing jumps"
         field = page.get_by_label(label, exact=True)
         assert field.input_value() == wrong, "what was entered stays there"
         assert field.get_attribute("aria-invalid") == "true"
@@ -572,12 +576,12 @@ def test_a_lost_connection_blocks_says_so_and_comes_back(browser: Browser, serve
     np.savetxt(tmp_path / "star.txt", np.transpose([wavelength, np.full(400, 1e-12)]))
     page.locator("[data-upload=star]").set_input_files(tmp_path / "star.txt")
     until(page, lambda: "your own star" in shown(page))
-    before = shown(page)
+    before = simulate(page)
     server.kill()
     page.get_by_text("The connection to the server is lost").wait_for()
     assert page.evaluate("[...document.body.children].every(e => e.inert || e.id === 'lost')")
     server.start()
     page.get_by_text("The connection to the server is lost").wait_for(state="hidden")
-    until(page, lambda: shown(page) == before)  # the upload too: the browser has kept it
+    until(page, lambda: shown(page) == before)  # the upload too: the browser has kept it, and what was simulated
     assert page.get_by_label("Magnitude", exact=True).input_value() == "9"
     page.context.close()

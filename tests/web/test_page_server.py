@@ -43,7 +43,7 @@ from mauvecl.web import doors, server, visitor
 from mauvecl.web.asked import SIMULATED
 from mauvecl.web.closed import Closed, percent
 from mauvecl.web.downloads import as_command, as_python
-from mauvecl.web.fields import FIELDS, PRESETS, UPLOADED_UNKNOWN, star_names
+from mauvecl.web.fields import FIELDS, PRESETS, UPLOADED_UNKNOWN, star_names, star_words
 from mauvecl.web.figures import INKS
 from mauvecl.web.plain_log import Plain
 from mauvecl.web.state import State
@@ -89,6 +89,8 @@ def test_stars_by_any_name_they_have() -> None:
     for given, library in (
         ("GJ 581", "M3V"),
         ("hd 40307", "K2.5V"),
+        ("GJ581", "M3V"),
+        ("  hd  40307 ", "K2.5V"),
         ("K3V", "K2.5V"),
         ("m3v", "M3V"),
         ("vega", "Vega"),
@@ -101,6 +103,17 @@ def test_stars_by_any_name_they_have() -> None:
         assert not state.faults, name
     state.enter({"star": "Proxima"})
     assert "Proxima" in state.faults["star"]
+
+
+def test_stars_in_words() -> None:
+    assert [star_words(name) for name in ("G2V", "M3V", "A0V", "K2.5V", "Sun", "Vega")] == [
+        "a G2V star",
+        "an M3V star (spectrum of GJ 581)",
+        "an A0V star",
+        "a K2.5V star (spectrum of HD 40307)",
+        "a star like the Sun",
+        "a star like Vega",
+    ]
 
 
 def test_a_link_is_what_was_entered_right_or_wrong() -> None:
@@ -224,6 +237,16 @@ def test_the_excess_is_the_matched_statistics_own(closed: Closed) -> None:
     """Squares of the excess per pixel add up to the matched S/N, squared."""
     pixel, _ = closed.excess
     assert np.sqrt(np.sum(pixel**2)) == pytest.approx(closed.expected, rel=1e-9)
+
+
+def test_the_trade_claims_no_half_beyond_its_axis(closed: Closed, tmp_path: Path) -> None:
+    """Where more than half are detected at the least false-alarm probability shown, half of them are below it."""
+    trade = next(picture for picture in TABS["detection"].pictures if picture.name == "roc")
+    half = float(re.findall(r"half of them at (\S+)\. A", trade.drawn(closed, {}).text)[0])
+    assert closed.seen.sf(closed.null.isf(np.array([half])))[0] == pytest.approx(0.5, abs=0.02)
+    bright = State()
+    bright.enter({"magnitude": "7.4"})
+    assert "half of them still below 1e-06" in trade.drawn(Closed.of(bright.question(), tmp_path), {}).text
 
 
 WIDE = (

@@ -31,6 +31,7 @@ export class Card {
 
   tell(answer) {
     this.box.classList.remove("none")
+    this.box.style.minHeight = ""
     for (const part of [this.told, byId("facts")]) part.classList.remove("dim")
     byId("chance").textContent = answer.shown
     byId("interval").textContent = answer.interval
@@ -40,6 +41,8 @@ export class Card {
   }
 
   none(why) {
+    // What is below stays where it is.
+    this.box.style.minHeight = `${this.box.offsetHeight}px`
     this.box.classList.add("none")
     this.told.classList.remove("dim")
     byId("chance").textContent = "No answer."
@@ -49,13 +52,14 @@ export class Card {
     this.busy(false)
   }
 
-  progress(share, told) {
+  progress(share, told, idle = false) {
     byId("progress").value = share
+    byId("progress").classList.toggle("idle", idle)
     byId("status").textContent = told
   }
 
   ended(text) {
-    this.progress(0, text)
+    this.progress(0, text, true)
   }
 
   // The small table of a tab.

@@ -177,7 +177,8 @@ class Stars {
       return item
     }))
     this.at = -1
-    this.show(found.length > 0)
+    // A name that is whole needs no list over the fields below it.
+    this.show(found.length > 0 && !(found.length === 1 && found[0].toLowerCase() === wanted))
   }
 
   show(open) {

@@ -127,7 +127,7 @@ ${control(name)}
 <div class="row run">
 <button type="button" id="simulate" class="main" disabled>Simulate</button>
 <button type="button" id="cancel" disabled>Cancel</button>
-<progress id="progress" max="1" value="0" aria-label="Simulation"></progress>
+<progress id="progress" class="idle" max="1" value="0" aria-label="Simulation"></progress>
 <span id="status" role="status"></span>
 </div>
 </div>
@@ -135,7 +135,7 @@ ${control(name)}
 <div class="tabs">
 <div role="tablist" aria-label="Pictures of the answer">
 % for k, tab in enumerate(tabs.values()):
-<button type="button" role="tab" id="tab-${tab.name}" aria-controls="panel-${tab.name}" aria-selected="${"true" if k == 0 else "false"}" tabindex="${0 if k == 0 else -1}">${tab.title}</button>
+<button type="button" role="tab" id="tab-${tab.name}" aria-controls="panel-${tab.name}" aria-selected="${"true" if k == 0 else "false"}" tabindex="${0 if k == 0 else -1}" data-title="${tab.title}">${tab.title}</button>
 % endfor
 </div>
 % for k, tab in enumerate(tabs.values()):
@@ -190,6 +190,9 @@ ${control(name)}
 <button type="button" data-file="${name}" data-ending="study" disabled>${name} (study)</button>
 % endif
 % endfor
+% if any(tab.files.values()):
+<span class="hint" data-needs="${" ".join(dict.fromkeys(filter(None, tab.files.values())))}"></span>
+% endif
 </div>
 % endif
 % endif

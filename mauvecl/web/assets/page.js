@@ -33,7 +33,6 @@ class Page {
     this.compare = new Compare(link => { this.follow(link); this.changed(true, true) })
     this.wire()
     this.follow(window.location.search)
-    this.wanted = this.seen.simulated.split(",").filter(Boolean)
     this.live = new Live(version => this.back(version), code => this.lost(code))
   }
 
@@ -110,6 +109,7 @@ class Page {
   // There is no answer to what is entered.
   none(faults, refused) {
     this.withdraw()
+    document.title = "No answer: mauvecl"
     this.fields.tell(faults)
     this.card.none(refused ?? Object.entries(faults).map(([name, why]) => `${this.fields.label(name)}: ${why}`).join("; "))
   }
@@ -156,7 +156,9 @@ class Page {
   show(told) {
     this.faults = told.faults
     this.fields.tell(told.faults)
-    this.card.notices([...(told.stray ? [[told.stray, "warning"]] : []), ...(told.answer?.notes ?? [])])
+    // Without an answer the notes of the last one keep their room, unseen: nothing jumps while a number is typed.
+    const stray = told.stray ? [[told.stray, "stray"]] : []
+    if (told.answer || told.stray) this.card.notices([...stray, ...(told.answer?.notes ?? [])])
     if (told.answer) this.tell(told.answer)
     else this.none(told.faults, told.refused)
   }
@@ -194,6 +196,11 @@ class Page {
           button.disabled = !ready || (needs !== null && !simulated.has(needs))
         }
       }
+    }
+    for (const hint of document.querySelectorAll("[data-needs]")) {
+      const lacking = hint.dataset.needs.split(" ").filter(kind => !simulated.has(kind))
+      const buttons = lacking.map(kind => document.querySelector(`[data-simulate="${kind}"]`) ?? byId("simulate"))
+      hint.textContent = lacking.length ? `after ${buttons.map(button => button.textContent).join(", ")}` : ""
     }
   }
 
@@ -274,6 +281,11 @@ class Page {
       this.files[field] = {name, content}
       if (!(field in this.lacks)) return
       delete this.lacks[field]
+      if (this.fields.entered[field] === told.entered) {
+        // Sent again: the same question, and what was simulated for it.
+        this.ask()
+        return
+      }
       this.fields.put({[field]: told.entered})
       this.changed(true, true)
     })
@@ -346,7 +358,7 @@ class Page {
     this.asking = false
     // What the server knew of this page is gone with the connection; the browser has it all.
     const kept = Object.entries(this.files).filter(([field]) => this.fields.entered[field] === words.uploads[field])
-    if (this.answer) this.wanted = this.answer.simulated
+    this.wanted = this.seen.simulated.split(",").filter(Boolean)
     for (const [field, {name, content}] of kept) {
       this.lacks[field] = `${name} is being read`
       this.send(field, name, content)

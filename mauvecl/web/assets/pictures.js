@@ -111,6 +111,7 @@ class Picture {
         dash: `<path d="M0 5h16" stroke="${colour}" stroke-width="2" stroke-dasharray="4 3"/>`,
         band: `<rect width="16" height="10" fill="${colour}" fill-opacity=".4"/>`,
         bars: `<rect width="16" height="10" fill="${colour}" fill-opacity=".5"/>`,
+        bar: `<rect width="16" height="10" fill="${colour}"/>`,
         dot: `<circle cx="8" cy="5" r="4" fill="${colour}"/>`,
       }[form]
       return `<svg aria-hidden="true" viewBox="0 0 16 10">${shape}</svg>`

@@ -142,10 +142,11 @@ class Trade(Picture):
             seen = np.asarray(curve["fap"], float) > 0
             columns = {"x": "fap", "low": "probability_low", "high": "probability_high"}
             sources["simulated"] = {to: np.asarray(curve[name], float)[seen] for to, name in columns.items()}
-        half = faps[min(int(np.searchsorted(chances, 0.5)), faps.size - 1)]
+        half = int(np.searchsorted(chances, 0.5))
+        where = "half of them at " if half else "half of them still below "
         text = (
-            f"At a false-alarm probability of {q.fap:g} {percent(closed.chance)} are detected; half of them at "
-            f"{half:.2g}. A click chooses another false-alarm probability."
+            f"At a false-alarm probability of {q.fap:g} {percent(closed.chance)} are detected; {where}"
+            f"{faps[min(half, faps.size - 1)]:.2g}. A click chooses another false-alarm probability."
         )
         return Drawn(text, sources)
 

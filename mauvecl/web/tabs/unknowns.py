@@ -64,9 +64,9 @@ class Cost(Picture):
             ("marginal", "marginalised over it", "flare", 0.55),
             ("plain", "unknown, and not looked for", "drawn", 0.2),
         ):
-            made = plot.hbar("name", right=column, height=width, source=source, color=ink[colour], alpha=0.75)
+            made = plot.hbar("name", right=column, height=width, source=source, color=ink[colour])
             made.name = called
-            canvas.legend.append((called, ink[colour], "band", ""))
+            canvas.legend.append((called, ink[colour], "bar", ""))
             canvas.tooltips(made, (called, column), mode="hline")
         plot.x_range.start = 0
         return canvas
