@@ -169,9 +169,10 @@ def test_signal_to_noise_is_that_of_sorting(width: int, number: int) -> None:
     engine = Engine(width=width)
     found = engine.snr(quiet, realisations=n, seed=3, processes=processes)
     raw = engine.realise(quiet, count=n, seed=3, processes=processes).astype(float)
-    net = raw - quiet.n_frames * (quiet.bias_dn + quiet.dark_dn)
+    light = raw - quiet.n_frames * (quiet.bias_dn + quiet.dark_dn)
+    net = light - quiet.sky_dn
     known = quiet.n_frames * (quiet.read_noise_dn**2 + quiet.dark_variance_dn2)
-    noise2 = np.maximum(net, 0.0) * quiet.gain_dn_per_electron + known
+    noise2 = np.maximum(light, 0.0) * quiet.gain_dn_per_electron + known
     per_pixel = net / np.sqrt(noise2)
     per_element = np.array(
         [quiet.per_element(x) / np.sqrt(quiet.per_element(y)) for x, y in zip(net, noise2, strict=True)]

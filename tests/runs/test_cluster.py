@@ -21,7 +21,7 @@ from typing import Any
 import numpy as np
 import pytest
 from answers import N, same, same_snr, small
-from scenes import flaring_stares
+from scenes import flaring_stares, instrument, star
 from typer.testing import CliRunner
 
 from mauvecl.cli.app import app
@@ -122,12 +122,13 @@ def test_raw_spectra_by_two_processes(workers: DaskWorkers, tmp_path: Path, engi
     assert bulk.verify(tmp_path / "s.zarr", engine, redraw=True) == []
 
 
-def test_a_mistake_on_a_worker_is_a_sentence(workers: DaskWorkers, scene: list[Expectation]) -> None:
+def test_a_mistake_on_a_worker_is_a_sentence(workers: DaskWorkers) -> None:
     """An error that another try would not mend is not tried again."""
     before = workers.retries
 
-    impossible = RealiseRequest(scene[0], 10, seed=-1)
-    with pytest.raises(DeviceError, match=r"cluster local:2 failed at realisations 0 to 9: seed = -1, expected"):
+    (bright,) = star(magnitude=-0.7, payload=instrument(part=True))
+    impossible = RealiseRequest.of(bright, 10, seed=1, mode="stacked")
+    with pytest.raises(DeviceError, match=r"failed at realisations 0 to 9: mode = 'stacked' cannot clip"):
         workers.submit(impossible, "key", Share(0, 0, 10), lambda done: None).result()
     assert workers.retries == before
 
@@ -193,6 +194,8 @@ def test_an_interrupted_cluster_ends_in_order(stop: signal.Signals, tmp_path: Pa
         "G2V",
         "--star",
         "K3V",
+        "-m",
+        "7.4,3.7",
         "--statistic",
         "chi2",
         "-n",
