@@ -297,12 +297,22 @@ def _settle_frames(question: LimitSearch, start: float) -> Interval:
         return known[frames]
 
     def fewest(which: str) -> int:
-        frames = max(round(start / frame_s), 1)
-        while getattr(at(frames), which) < question.power:
-            frames += 1
-        while frames > 1 and getattr(at(frames - 1), which) >= question.power:
-            frames -= 1
-        return frames
+        """Where it is crossed near the start: steps that double until it lies between, then halving."""
+
+        def reaches(frames: int) -> bool:
+            return frames > 0 and getattr(at(frames), which) >= question.power
+
+        many = max(round(start / frame_s), 1)
+        few, step = many - 1, 1
+        while not reaches(many):
+            few, many, step = many, many + step, 2 * step
+        step = 1
+        while reaches(few):
+            few, many, step = max(few - step, 0), few, 2 * step
+        while many - few > 1:
+            middle = (few + many) // 2
+            few, many = (few, middle) if reaches(middle) else (middle, many)
+        return many
 
     value, low, high = (fewest(which) * frame_s for which in ("value", "high", "low"))
     return Interval(value, low, high)

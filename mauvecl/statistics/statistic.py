@@ -252,6 +252,13 @@ class LinearStatistic(Statistic):
         Plain weights w look for the spectrum V w. Marginalised they are C^-1 V w (generalised least squares), which for
         the matched filter is C^-1 delta.
         """
+        # The flare is kept with them, so that no other has its identity.
+        made = setting.remembered(
+            f"weights of {self.name} for {id(flare)}", lambda: (flare, self._weights_per_dn(setting, flare))
+        )
+        return made[1]
+
+    def _weights_per_dn(self, setting: Setting, flare: Expectation | None) -> Float:
         weights = self.plain_weights(setting, flare)
         if not setting.nuisances:
             return weights

@@ -14,6 +14,7 @@ from mauvecl.answers.limit_search import LimitSearch
 from mauvecl.answers.limits import limiting_magnitude, shortest_exposure, smallest_amplitude
 from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError
+from mauvecl.statistics.intervals import Interval
 from mauvecl.study.study import Study
 
 STATISTICS = ("chi2", "chi2_element", "matched", "uv_excess")
@@ -125,11 +126,20 @@ def test_one_stars_failure_does_not_lose_the_others(engine: Engine) -> None:
     assert found.messages[0].startswith(told)
 
 
-def test_a_limit_of_more_than_a_day(engine: Engine) -> None:
+def test_a_limit_of_more_than_a_day(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of some 1e5 frames, which are halved and not walked through."""
+    asks, simulated = [], LimitSearch.simulated
+
+    def counted(self: LimitSearch, value: float, seed: int) -> Interval:
+        asks.append(value)
+        return simulated(self, value, seed)
+
+    monkeypatch.setattr(LimitSearch, "simulated", counted)
     asked = study(run=FEW, star=[{"library": "G2V", "magnitude": 16.0}])
     (limit,) = shortest_exposure(asked, engine).limits
     assert limit.value.value > 86_400.0
     assert limit.verdict != "DIFFERS"
+    assert len(asks) < 100
 
 
 def test_a_flare_without_a_shape_is_a_sentence(engine: Engine) -> None:

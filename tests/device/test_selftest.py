@@ -67,9 +67,7 @@ def few_cases(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("weakness", [unfused, rough_roots])
 def test_the_weaker_promise_is_kept_and_marked(monkeypatch: pytest.MonkeyPatch, weakness: Callable[[str], str]) -> None:
-    """Every case without fused multiply-adds, which is the device that exists; some with rough roots."""
-    if weakness is rough_roots:
-        few_cases(monkeypatch)
+    few_cases(monkeypatch)
     rendered_otherwise(monkeypatch, weakness)
     weak = Engine()
     strict = list(selftest.twins(weak))
