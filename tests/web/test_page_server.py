@@ -105,6 +105,16 @@ def test_stars_by_any_name_they_have() -> None:
     assert "Proxima" in state.faults["star"]
 
 
+@pytest.mark.parametrize("text", ["", "  ", "eps Eri", "AU Mic", "53.23 -9.46", "19h22m00s -11d12m00s"])
+def test_a_target_to_see_is_a_name_or_coordinates(text: str) -> None:
+    state = State()
+    state.enter({"see": text})
+    assert not state.faults
+    for wrong in ("no such star", "400 95", "12,5 3"):
+        state.enter({"see": wrong})
+        assert "expected a name such as eps Eri" in state.faults["see"], wrong
+
+
 def test_stars_in_words() -> None:
     assert [star_words(name) for name in ("G2V", "M3V", "A0V", "K2.5V", "Sun", "Vega")] == [
         "a G2V star",
