@@ -115,6 +115,26 @@ def test_a_target_to_see_is_a_name_or_coordinates(text: str) -> None:
         assert "expected a name such as eps Eri" in state.faults["see"], wrong
 
 
+def test_target_and_time_are_asked_for_where_the_sky_is_theirs() -> None:
+    state = State()
+    state.enter({"target": "bogus", "time": "tomorrow"})
+    assert not state.faults, "nobody asks for them"
+    state.enter({"sky": "target and time"})
+    assert state.faults.keys() == {"target", "time"}
+    assert "'bogus', expected right ascension" in state.faults["target"]
+    assert "'tomorrow', expected a UTC time" in state.faults["time"]
+    state.enter({"target": "290.68 +11.12"})
+    assert state.faults.keys() == {"time"}
+    state.enter({"time": ""})
+    assert "expected a UTC time" in state.faults["time"]
+    state.enter({"time": "2026-09-01T12:00"})
+    assert state.question().target == "290.68 +11.12"
+    state.enter({"time": "x" * 10_000})
+    assert "is too long" in state.faults["time"]
+    state.enter({"sky": "none", "time": ""})
+    assert not state.faults
+
+
 def test_stars_in_words() -> None:
     assert [star_words(name) for name in ("G2V", "M3V", "A0V", "K2.5V", "Sun", "Vega")] == [
         "a G2V star",
