@@ -112,6 +112,21 @@ def star_name(text: str) -> str:
     return entry["name"]
 
 
+def seen_target(text: str) -> str:
+    """What to look at: nothing, a name of the embedded list, or coordinates."""
+    from mauvecl.host.orbit.names import Target
+
+    try:
+        if text.strip():
+            Target.of(text)
+    except InputError as error:
+        raise InputError(
+            f"{shortened(text)} is neither a target of the list nor coordinates, expected a name such as eps Eri or "
+            "AU Mic, or coordinates such as 53.23 -9.46"
+        ) from error
+    return text
+
+
 def star_names() -> list[str]:
     """Every name of every embedded star, once."""
     rows = [row for row in library_table() if row["kept"] == "embedded"]
@@ -239,8 +254,9 @@ FIELDS = {
         "200 1, 450 3, 700 1, or a file of two columns.",
     ),
     "see": Field(
-        "Target to see", "", str, "When it can be seen is on the tab Visibility: a name such as eps Eri or AU Mic, or "
-        "coordinates such as 53.23 -9.46.",
+        "Target to see", "", seen_target,
+        "When it can be seen is on the tab Visibility: a name such as eps Eri or AU Mic, or coordinates such as "
+        "53.23 -9.46.",
     ),
     "realisations": Field(
         "Realisations", "100000",

@@ -5,8 +5,8 @@ Nothing here knows how the page looks; whatever shows it enters text here, and s
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any
 from urllib.parse import parse_qsl, urlencode
 
 from mauvecl.host.errors import InputError
@@ -66,6 +66,8 @@ class State:
                 self.faults[name] = str(error)
         if given.keys() & {"fap", "realisations"}:
             self._settled()
+        if given.keys() & {"sky", "target", "time"}:
+            self._placed()
 
     def _settled(self) -> None:
         """Whether so many realisations can settle such a probability."""
@@ -75,6 +77,23 @@ class State:
                 check_fap(self._values["fap"], *self._values["realisations"])
             except InputError as error:
                 self.faults["realisations"] = str(error)
+
+    def _placed(self) -> None:
+        """Whether target and time can be read, where the sky is theirs."""
+        from mauvecl.host.sky.helioecliptic import moment_of, offline, position_of
+
+        read: tuple[tuple[str, Callable[[str], Any]], ...] = (("target", position_of), ("time", moment_of))
+        for name, understood in read:
+            if not self.faults.get(name, name).startswith(name):
+                continue
+            self.faults.pop(name, None)
+            if self.entered["sky"] != "target and time":
+                continue
+            try:
+                with offline():
+                    understood(self.entered[name])
+            except InputError as error:
+                self.faults[name] = str(error)
 
     @property
     def asked(self) -> tuple[str, ...]:

@@ -105,6 +105,36 @@ def test_stars_by_any_name_they_have() -> None:
     assert "Proxima" in state.faults["star"]
 
 
+@pytest.mark.parametrize("text", ["", "  ", "eps Eri", "AU Mic", "53.23 -9.46", "19h22m00s -11d12m00s"])
+def test_a_target_to_see_is_a_name_or_coordinates(text: str) -> None:
+    state = State()
+    state.enter({"see": text})
+    assert not state.faults
+    for wrong in ("no such star", "400 95", "12,5 3"):
+        state.enter({"see": wrong})
+        assert "expected a name such as eps Eri" in state.faults["see"], wrong
+
+
+def test_target_and_time_are_asked_for_where_the_sky_is_theirs() -> None:
+    state = State()
+    state.enter({"target": "bogus", "time": "tomorrow"})
+    assert not state.faults, "nobody asks for them"
+    state.enter({"sky": "target and time"})
+    assert state.faults.keys() == {"target", "time"}
+    assert "'bogus', expected right ascension" in state.faults["target"]
+    assert "'tomorrow', expected a UTC time" in state.faults["time"]
+    state.enter({"target": "290.68 +11.12"})
+    assert state.faults.keys() == {"time"}
+    state.enter({"time": ""})
+    assert "expected a UTC time" in state.faults["time"]
+    state.enter({"time": "2026-09-01T12:00"})
+    assert state.question().target == "290.68 +11.12"
+    state.enter({"time": "x" * 10_000})
+    assert "is too long" in state.faults["time"]
+    state.enter({"sky": "none", "time": ""})
+    assert not state.faults
+
+
 def test_stars_in_words() -> None:
     assert [star_words(name) for name in ("G2V", "M3V", "A0V", "K2.5V", "Sun", "Vega")] == [
         "a G2V star",

@@ -189,7 +189,10 @@ class Page {
     byId("cancel").disabled = !busy
     byId("pin").disabled = !ready
     byId("study").disabled = !ready
-    for (const button of document.querySelectorAll("[data-simulate]")) button.disabled = !ready || busy
+    for (const button of document.querySelectorAll("[data-simulate]")) {
+      const lacks = button.dataset.simulate === "visible" && !this.fields.entered.see.trim()
+      button.disabled = !ready || busy || lacks
+    }
     for (const tab of Object.values(words.tabs)) {
       for (const [name, needs] of Object.entries(tab.files)) {
         for (const button of document.querySelectorAll(`[data-file="${name}"]`)) {

@@ -22,7 +22,7 @@ class Hours(Picture):
     name, title = "hours", "Hours in which the target is seen, day by day"
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
-        canvas = Canvas(ink, "days from the start", "hours in the day", logs, y_range=(-0.5, 24.5))
+        canvas = Canvas(ink, "days from the start", "hours in the day", logs, x_range=(0, 365), y_range=(-0.5, 24.5))
         canvas.band("area", "hours seen", "star", alpha=0.3)
         told = canvas.line("hours", "hours seen, day by day", "star", line_width=1.2)
         canvas.tooltips(told, ("day", "x"), ("hours", "y"))
@@ -33,8 +33,10 @@ class Hours(Picture):
         sources: dict[str, Any] = {"area": {"x": [], "low": [], "high": []}, "hours": {"x": [], "y": []}}
         if "visible" not in found:
             named = ", ".join(orbit.targets)
-            text = f"When {named} is seen is not looked up yet." if named else "No target is named yet."
-            return Drawn(f"{text} Name one under Advanced, Visibility, such as eps Eri, and press Find when.", sources)
+            if named:
+                return Drawn(f"When {named} is seen is not looked up yet: press Find when.", sources)
+            text = "No target is named yet. Name one under Advanced, Visibility, such as eps Eri, and press Find when."
+            return Drawn(text, sources)
         table = found["seen"]["by_day"]
         hours = np.asarray(table["hours"].to_value("h"))
         day = np.arange(hours.size)
