@@ -13,9 +13,10 @@ from scipy import special
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.ranges import DAY_S
-from mauvecl.noise.scene import prepare
-from mauvecl.results.hypotheses import Hypotheses
+from mauvecl.results.hypotheses import check_shape
 from mauvecl.statistics.intervals import Interval
+from mauvecl.statistics.registry import STATISTICS
+from mauvecl.statistics.statistic import Setting
 from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.sections import Star
 from mauvecl.study.study import Study
@@ -108,13 +109,18 @@ class LimitSearch:
     def theory(self, value: float) -> float:
         """Detection probability for Gaussian noise; 0 where no pixel is left unsaturated."""
         quiet, flare = self.scaled(value)
-        scene = prepare([quiet, flare], comparison=self.study.run.comparison())
-        if not scene.used.any():
+        # Nothing is drawn: the statistic's setting alone, without the arrays of a scene.
+        used = ~quiet.saturated
+        if not used.any():
             return 0.0
         unknown = self.study.nuisances.marginalised(quiet)
-        theory = Hypotheses(quiet, (flare,), (self.statistic,), scene, nuisances=unknown)
-        limit = theory.closed_form(self.statistic).isf(self.fap)
-        return theory.closed_form(self.statistic, 0).sf(limit)
+        one = STATISTICS[self.statistic]
+        setting = Setting(quiet, used, self.study.run.comparison(), (flare,), unknown)
+        one.check(setting)
+        shape = flare if one.shaped else None
+        if one.shaped and not flare.saturated[used].all():
+            check_shape(quiet, flare, used)
+        return one.closed_form(setting, flare, shape).sf(one.closed_form(setting, quiet, shape).isf(self.fap))
 
     def simulated(self, value: float, seed: int) -> Interval:
         """Detection probability with its interval, by the engine."""

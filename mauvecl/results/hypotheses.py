@@ -70,14 +70,9 @@ class Hypotheses:
 
     def _check_shapes(self) -> None:
         """A flare that changes nothing has no shape to look for; one that saturates every pixel is told of."""
-        used = self.scene.used
         for k, flare in enumerate(self.flares):
-            changes = (flare.recorded_light_dn != self.quiet.recorded_light_dn)[used].any()
-            if not changes and k not in self.blinding:
-                raise InputError(
-                    f"flare {k + 1} of {self.quiet.name} changes no pixel that counts, expected an amplitude above 0 "
-                    "for the statistic 'matched', which looks for its shape"
-                )
+            if k not in self.blinding:
+                check_shape(self.quiet, flare, self.scene.used, k)
 
     def statistic(self, name: str) -> Statistic:
         """One of those computed.
@@ -148,3 +143,17 @@ class Hypotheses:
             flare = template
         if flare is not None and not 0 <= flare < len(self.flares):
             raise InputError(f"flare = {flare}, expected 0 to {len(self.flares) - 1}")
+
+
+def check_shape(quiet: Expectation, flare: Expectation, used: NDArray[np.bool_], number: int = 0) -> None:
+    """Refuse a flare that changes no pixel that counts: it has no shape to look for.
+
+    Raises
+    ------
+    InputError
+    """
+    if not (flare.recorded_light_dn != quiet.recorded_light_dn)[used].any():
+        raise InputError(
+            f"flare {number + 1} of {quiet.name} changes no pixel that counts, expected an amplitude above 0 for the "
+            "statistic 'matched', which looks for its shape"
+        )
