@@ -9,6 +9,7 @@ import contextlib
 import hashlib
 import os
 import shutil
+import sys
 import warnings
 from dataclasses import asdict, dataclass
 from functools import cache
@@ -299,7 +300,10 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
         options.append("-cl-fp32-correctly-rounded-divide-sqrt")
     kept = kernel_cache()
     # A store shared by several machines holds what each processor can run; names such as "AMD EPYC" do not tell.
-    target = (device.name, device.version, device.driver_version, processor.level(processor.flags()))
+    # PoCL tells its programs apart by the place of its own libraries too: what another installation has compiled would
+    # be brought back and compiled again at every start.
+    level = processor.level(processor.flags())
+    target = (device.name, device.version, device.driver_version, level, sys.prefix)
     key = hashlib.sha256("\0".join((source, *options, *target)).encode()).hexdigest()[:32]
     restored = kept.restore(key)
     try:

@@ -16,7 +16,9 @@ from pathlib import Path
 import pytest
 
 from mauvecl.device import kernel_cache
+from mauvecl.device.engine import Engine
 from mauvecl.device.kernel_cache import KernelCache
+from mauvecl.device.program import build
 
 #: Two kernels on the toy scene; tells whether they came from the store.
 RUN = """
@@ -298,3 +300,14 @@ def test_the_store_keeps_to_its_size(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert sorted(path.name for path in cache.store.iterdir()) == ["key2", "key3"]
     manifest = json.loads((cache.store / "key3" / "manifest.json").read_text())
     assert manifest["folder"] == "AA/program3"
+
+
+def test_each_installation_has_kernels_of_its_own(monkeypatch: pytest.MonkeyPatch, engine: Engine) -> None:
+    """PoCL knows its programs by where its libraries are: another installation's would be compiled at every start."""
+    keys: list[str] = []
+    restore = KernelCache.restore
+    monkeypatch.setattr(KernelCache, "restore", lambda cache, key: keys.append(key) or restore(cache, key))
+    for place in ("one", "other", "one"):
+        monkeypatch.setattr(sys, "prefix", place)
+        build(engine.opened.context, "kernel void f(global int *a) { a[0] = 1; }")
+    assert keys[0] == keys[2] != keys[1]
