@@ -18,6 +18,8 @@ from .bounded import read_bytes, shortened
 SMALLEST, LARGEST = 1e-30, 1e30
 #: The same for energies in erg, of which flares have up to 1e38: keys that end in this.
 ERG, LARGEST_ERG = "_erg", 1e45
+#: Keys that hold energies too, whose names do not say so.
+ENERGIES = ("injections.low", "injections.high")
 #: Whole numbers of 64 bits, with or without a sign.
 WHOLE = (-(2**63), 2**64 - 1)
 #: Characters of a text, and levels of nesting, that a study or an instrument may have.
@@ -134,7 +136,8 @@ def possible(data: Any, what: str) -> None:
     waiting: list[tuple[str, Any, int]] = [("", data, 0)]
     while waiting:
         key, value, depth = waiting.pop()
-        fault = _fault(value, LARGEST_ERG if any(part.endswith(ERG) for part in key.split(".")) else LARGEST)
+        energy = key in ENERGIES or any(part.endswith(ERG) for part in key.split("."))
+        fault = _fault(value, LARGEST_ERG if energy else LARGEST)
         if depth > DEEPEST:
             fault = f"is nested more than {DEEPEST} deep, expected less"
             key = shortened(key, 40)

@@ -164,3 +164,11 @@ def test_command(tmp_path):
     assert {"limits.ecsv", "completeness.png", "curves.png", "energies.png", "run.json"} <= {
         p.name for p in tmp_path.iterdir()
     }
+
+
+def test_sizes_may_be_energies():
+    """In erg, which are beyond what other numbers may be."""
+    asked = Study().with_settings(["injections.low=1e33", "injections.high=1e35"])
+    assert (asked.injections.low, asked.injections.high) == (1e33, 1e35)
+    with pytest.raises(InputError, match=r"injections\.high = 1e\+50"):
+        Study().with_settings(["injections.high=1e50"])
