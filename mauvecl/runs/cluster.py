@@ -299,9 +299,11 @@ LOGS = ("distributed", *(f"distributed.{part}" for part in ("client", "nanny", "
 
 
 def dask_setup(worker: Any) -> None:
-    """Dask calls this on each worker of this machine: Ctrl-C reaches it too, but only the run itself acts upon it."""
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Dask calls this on each worker of this machine: it leaves the run's process group, so that Ctrl-C stays there.
+
+    To ignore the signal would not do: LLVM sets handlers of its own while PoCL builds, and the linker would be struck.
+    """
+    os.setpgid(0, 0)
 
 
 _engine: Engine | None = None
