@@ -107,11 +107,11 @@ void comparison(SCENE, const uint first_low, const uint first_high,
             }
 % endif
             for (uint i = 0; i < CHUNK; i++) {
-                x[i] = ${"FMA(sum[i], (floatv)-job->reference_share, t[i])" if noisy else "t[i]"};
+                x[i] = ${"FMA(sum[i], (floatv)-job->reference_weight, t[i])" if noisy else "t[i]"};
 % if estimated:
                 variance[i] = variance_of(t[i], estimate + i);
 % if noisy:
-                variance[i] += job->reference_share * variance_of(sum[i] * job->reference_share, estimate + i);
+                variance[i] += job->reference_weight * variance_of(sum[i] * job->reference_weight, estimate + i);
 % endif
                 x[i] += estimate[i].fraction;
 % endif

@@ -10,7 +10,7 @@ from mauvecl.results.detection import Detection
 from mauvecl.results.snr import Counts, SnrResult
 from mauvecl.study.study import Study
 
-#: Realisations: several shares, the last a short one.
+#: Realisations: several shards, the last a short one.
 N = 30_000
 
 

@@ -104,19 +104,19 @@ MUTATIONS = {
         ),
         "tests/lightcurve/test_twin.py::test_a_split_changes_no_bit[cumulants]",
     ),
-    "a share's flares from the first": Mutation(
+    "a shard's flares from the first": Mutation(
         (("mauvecl/device/stares.py", "request.flares.part(first - request.start,", "request.flares.part(done,"),),
-        "tests/runs/test_stares.py::test_shares_join_to_the_same_bits[None-cumulants]",
+        "tests/runs/test_stares.py::test_shards_join_to_the_same_bits[None-cumulants]",
     ),
-    "a share under another's name": Mutation(
+    "a shard under another's name": Mutation(
         (("mauvecl/runs/checkpoint.py", 'name.encode() + b"\\0" + body', "body"),),
-        "tests/runs/test_pool.py::test_a_share_in_anothers_place",
+        "tests/runs/test_pool.py::test_a_shard_in_anothers_place",
     ),
     "foreign chunks unseen": Mutation(
         (("mauvecl/store/bulk.py", 'return "good" if digest(data) == known else "foreign"', 'return "good"'),),
         "tests/store/test_bulk.py::test_faults_are_found_and_repaired_to_the_bit",
     ),
-    "half a failed share kept": Mutation(
+    "half a failed shard kept": Mutation(
         (
             (
                 "mauvecl/device/engine.py",
@@ -261,7 +261,7 @@ MUTATIONS = {
         "tests/noise/test_saturation.py::test_closed_forms_are_those_of_what_is_drawn",
     ),
     "noise of what is subtracted forgotten": Mutation(
-        (("mauvecl/noise/scene.py", "return 1.0 + comparison.share", "return 1.0"),),
+        (("mauvecl/noise/scene.py", "return 1.0 + comparison.added_variance", "return 1.0"),),
         "tests/results/test_tails.py::test_brute_force_agrees_whatever_is_compared",
     ),
     "quiescent exposures with the observed draws": Mutation(

@@ -18,7 +18,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.search.injected import Fitted, InjectedShares, fitted
 from mauvecl.lightcurve.search.injections import Injections
 from mauvecl.lightcurve.search.null import DAY_S, Counted, counted, in_a_row_rate, sampled
-from mauvecl.results.requests import Share
+from mauvecl.results.requests import Shard
 from mauvecl.results.sums import Arrays
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, put_first, stacked, titled, told
@@ -372,7 +372,7 @@ def _kept(
     """What comes of each position, worked out by some threads or kept from before."""
     found: dict[int, Arrays] = {}
     if checkpoint is not None:
-        kept = {p: checkpoint.get(f"{name}-{Share(0, p, 1).name}") for p in range(positions)}
+        kept = {p: checkpoint.get(f"{name}-{Shard(0, p, 1).name}") for p in range(positions)}
         found = {p: part for p, part in kept.items() if part is not None}
     todo = [p for p in range(positions) if p not in found]
     pool = ThreadPoolExecutor(threads or os.cpu_count())
@@ -380,7 +380,7 @@ def _kept(
         for position, part in zip(todo, pool.map(work, todo), strict=True):
             found[position] = part
             if checkpoint is not None:
-                checkpoint.put(f"{name}-{Share(0, position, 1).name}", part)
+                checkpoint.put(f"{name}-{Shard(0, position, 1).name}", part)
             told_of(len(found) / positions)
     finally:
         # What nobody waits for any longer is not begun.
@@ -389,7 +389,7 @@ def _kept(
 
 
 def _name(study: Study, star: Star, threshold: float, amplitudes: Float) -> str:
-    """What shares of one star are kept under."""
+    """What shards of one star are kept under."""
     text = f"{study.toml()}|{star!r}|{threshold.hex()}|".encode() + amplitudes.tobytes()
     return hashlib.sha256(text).hexdigest()[:32]
 

@@ -295,7 +295,7 @@ KeepAfterFlag = Annotated[
     typer.Option(
         "--keep-after",
         min=0.0,
-        help="Seconds after which finished shares are kept on the disk [20].",
+        help="Seconds after which finished parts of the work are kept on the disk [20].",
         show_default=False,
     ),
 ]

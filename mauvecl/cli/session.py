@@ -49,7 +49,7 @@ class Session:
     resume, restart : bool
         What is to become of an unfinished run that is there.
     keep_after : float, optional
-        Seconds after which finished shares are kept on the disk; as `Checkpoint` has it by default.
+        Seconds after which finished parts of the work are kept on the disk; as `Checkpoint` has it by default.
     insist : bool
         Begin what would never end, or not fit.
     opened : Device, optional
@@ -150,8 +150,8 @@ class Session:
         kept = checkpoint.kept
         if not kept:
             return "nothing was written, and nothing is half written"
-        shares = f"{kept} share{'s' if kept > 1 else ''} of the work"
-        return f"{shares} kept in {str(checkpoint.folder)!r}, and the same command with --resume goes on from there"
+        parts = f"{kept} part{'s' if kept > 1 else ''} of the work"
+        return f"{parts} kept in {str(checkpoint.folder)!r}, and the same command with --resume goes on from there"
 
     def say(self, lines: Sequence[str]) -> None:
         """Tell the reader, unless standard output is for JSON alone."""

@@ -52,8 +52,8 @@ class Comparison:
         return cls(_exposures(reference), variances == "estimated")
 
     @property
-    def share(self) -> float:
-        """Variance of what is subtracted, as a share of one exposure's."""
+    def added_variance(self) -> float:
+        """Variance of what is subtracted, in that of one exposure."""
         return 1.0 / self.exposures if self.exposures else 0.0
 
     @property

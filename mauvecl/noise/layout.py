@@ -51,7 +51,7 @@ JOB = np.dtype(
         ("cosmic_bits", "u4"),
         ("cosmic_low", "i4"),
         ("reference_count", "u4"),
-        ("reference_share", "f4"),
+        ("reference_weight", "f4"),
         ("pair_scale", "f4"),
     ]
 )

@@ -303,7 +303,7 @@ class _PerScenario:
 
 def noisier(comparison: Comparison) -> float:
     """By how much what is subtracted adds its noise to the null's variance."""
-    return 1.0 + comparison.share
+    return 1.0 + comparison.added_variance
 
 
 def _job(
@@ -321,7 +321,7 @@ def _job(
     job["pixel_count"], job["padded_count"], job["scenario_count"] = n_pixel, pixels.padded(n_pixel), len(scenarios)
     job["draw_count"], job["frame_count"] = quiet.n_frames if choice.frames else 1, quiet.n_frames
     job["first_frame"], job["first_group"] = drawing.first_frame, first_group
-    job["reference_count"], job["reference_share"] = comparison.exposures, comparison.share
+    job["reference_count"], job["reference_weight"] = comparison.exposures, comparison.added_variance
     job["pair_scale"] = noisier(comparison) / 2.0
     rays = drawing.processes.cosmic_rays
     if rays is not None:

@@ -186,9 +186,9 @@ def _skewed(found: Detection, statistic: str, template: int, null: Form, cut: fl
     c, draws = Cumulants.of(quiet, each), quiet.n_frames // each
     one, flare = found.statistic(statistic), found.shape(statistic, template)
     # Of the difference from the mean of some exposures.
-    share = one.share(found.setting)
+    added = one.added_variance(found.setting)
     third, fourth, sixth = (
-        draws * (c.photon_cumulant(r) + c.dark_cumulant(r)) * (1.0 + (-1.0) ** r * share ** (r - 1)) for r in (3, 4, 6)
+        draws * (c.photon_cumulant(r) + c.dark_cumulant(r)) * (1.0 + (-1.0) ** r * added ** (r - 1)) for r in (3, 4, 6)
     )
     variance = one.variance(found.setting)
     if isinstance(one, LinearStatistic):
@@ -219,8 +219,8 @@ def _gamma_sf(value: float, mean: float, variance: float, third: float) -> float
 def _moved(found: Detection, statistic: str, template: int, shift: Float, variance: Float, cut: float) -> float:
     """False-alarm probability at a threshold if the exposure's counts had another mean and variance, per pixel."""
     one, used = found.statistic(statistic), found.scene.used
-    share = one.share(found.setting)
-    delta, true = np.where(used, (1.0 - (share > 0)) * shift, 0.0), (1.0 + share) * variance
+    added = one.added_variance(found.setting)
+    delta, true = np.where(used, (1.0 - (added > 0)) * shift, 0.0), (1.0 + added) * variance
     return one.as_drawn(found.setting, found.quiet, delta, true, found.shape(statistic, template)).sf(cut)
 
 
@@ -242,9 +242,9 @@ def _digital(x: Expectation) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
             # Whole numbers around the mean, the outermost taking all that lies beyond.
             dn = np.arange(np.floor(m - 9 * s) - 1, np.ceil(m + 9 * s) + 2)
             below = special.ndtr((dn[:-1] + 0.5 - m) / s) if s > 0 else (dn[:-1] + 0.5 >= m).astype(float)
-            share = np.diff(below, prepend=0.0, append=1.0)
+            chance = np.diff(below, prepend=0.0, append=1.0)
             seen = np.clip(dn, low, high)
-            centre = float(share @ seen)
-            shift[p], variance[p] = centre - recorded[p], share @ (seen - centre) ** 2
+            centre = float(chance @ seen)
+            shift[p], variance[p] = centre - recorded[p], chance @ (seen - centre) ** 2
         found.append((x.n_frames * shift, x.n_frames * variance))
     return found[0], found[1]

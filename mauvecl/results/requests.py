@@ -1,7 +1,7 @@
 """What is asked of an engine, as data: no answer, no counts. A worker anywhere makes the same of it.
 
-A share is a range of realisations of one part of a request. What is counted of it holds whole numbers, and extremes
-with their realisations, so that shares may be counted in any order, on any device, and twice; `sums` adds them up.
+A shard is a range of realisations of one part of a request. What is counted of it holds whole numbers, and extremes
+with their realisations, so that shards may be counted in any order, on any device, and twice; `sums` adds them up.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from mauvecl.statistics.nuisances import Nuisances, known
 
 
 @dataclass(frozen=True)
-class Share:
+class Shard:
     """Realisations start to start + count - 1 of one part of a request."""
 
     part: int
@@ -178,7 +178,7 @@ class SnrRequest(_Drawn):
 
 @dataclass(frozen=True, eq=False)
 class RealiseRequest(_Drawn):
-    """What `Engine.realise` takes; parameters as there. One share: callers ask for as much as travels well."""
+    """What `Engine.realise` takes; parameters as there. One shard: callers ask for as much as travels well."""
 
     expectation: Expectation
     realisations: int
@@ -192,7 +192,7 @@ Countable = Asked
 
 
 class Divisible(Protocol):
-    """What is cut into shares.
+    """What is cut into shards.
 
     Attributes
     ----------
@@ -202,7 +202,7 @@ class Divisible(Protocol):
     work : int
         About pixels times scenarios of one realisation.
     least : int
-        Realisations of a share, at least: a power of two.
+        Realisations of a shard, at least: a power of two.
     """
 
     @property

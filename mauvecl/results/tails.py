@@ -172,7 +172,7 @@ class _Tilt:
         if isinstance(null, Mixture):
             assert setting.drawn
             # Which factors an alarm has: Bayes's theorem.
-            chance = null.shares * [part.sf(goal) for part in parts]
+            chance = null.weights * [part.sf(goal) for part in parts]
             chance = chance / chance.sum()
             nodes = setting.drawn.nodes(found.quiet, weighted=tilt.square is None)[0]
             for name in nodes[0].scores:
@@ -218,11 +218,11 @@ def _stretch(square: Float, goal: float) -> Float:
 
     most = float(square.max())
 
-    def excess(share: float) -> float:
-        return float(np.sum(square / (1.0 - share * square / most))) - goal
+    def excess(x: float) -> float:
+        return float(np.sum(square / (1.0 - x * square / most))) - goal
 
-    share = 0.0 if excess(0.0) >= 0 else float(brentq(excess, 0.0, 1.0 - 1e-12))
-    return np.asarray(1.0 / np.sqrt(1.0 - share * square / most))
+    x = 0.0 if excess(0.0) >= 0 else float(brentq(excess, 0.0, 1.0 - 1e-12))
+    return np.asarray(1.0 / np.sqrt(1.0 - x * square / most))
 
 
 def _tilted(
@@ -239,28 +239,28 @@ def _block(found: Detection, statistic: str, template: int, tilt: _Tilt, seed: i
     one = found.statistic(statistic)
     exposures = 1 if one.paired else scene.comparison.exposures
     z, *others = (_normals(scene.n_pixel, seed, block, exposure) for exposure in range(1 + exposures))
-    share = one.share(found.setting)
+    added = one.added_variance(found.setting)
     # Only the difference is tilted; what it does not see stays as drawn.
-    root = np.sqrt(1.0 + share)
-    difference = (z - share * sum(others)) / root
+    root = np.sqrt(1.0 + added)
+    difference = (z - added * sum(others)) / root
     move, logs = tilt.moved(difference)
     if scene.modulations:
         factors, more = _factors(scene, tilt.scores, seed, block)
         excess, logs = _responding(scene, z + move / root, factors), logs + more
     else:
         excess = _excess(scene, z + move / root)
-    subtracted = [_excess(scene, other - share * move / root) for other in others]
-    mean = share * np.sum(subtracted, axis=0) if subtracted else np.zeros_like(excess)
+    subtracted = [_excess(scene, other - added * move / root) for other in others]
+    mean = added * np.sum(subtracted, axis=0) if subtracted else np.zeros_like(excess)
     return _value(found, statistic, template, excess, mean), logs
 
 
 def _value(found: Detection, statistic: str, template: int, excess: Float, mean: Float) -> Float:
     """The statistic of each draw, from observed less template and subtracted less template, DN, (n, n_pixel)."""
     scene, one = found.scene, found.statistic(statistic)
-    x, share = excess - mean, one.share(found.setting)
+    x, added = excess - mean, one.added_variance(found.setting)
     variance = np.broadcast_to(one.variance(found.setting), x.shape)
     if scene.comparison.estimated:
-        variance = _estimated(scene, excess) + share * _estimated(scene, mean)
+        variance = _estimated(scene, excess) + added * _estimated(scene, mean)
     return one.values(found.setting, x, variance, found.shape(statistic, template))
 
 
@@ -311,15 +311,11 @@ def _responding(scene: Scene, z: Float, factors: dict[str, Float]) -> Float:
     light, dark = more + 1.0, warmer + 1.0
     variance = light * r["light_variance"] + dark * r["dark_variance"] + r["other_variance"]
     third, fourth, fifth = (light * r[f"light_{k}"] + dark * r[f"dark_{k}"] for k in ("third", "fourth", "fifth"))
-    sd, share = np.sqrt(variance), third / variance
-    v = (
-        z * sd
-        + share * (z**2 - 1) / 6
-        + (fourth * (z**3 - 3 * z) / 24 - third * share * (2 * z**3 - 5 * z) / 36) / sd**3
-    )
+    sd, skew = np.sqrt(variance), third / variance
+    v = z * sd + skew * (z**2 - 1) / 6 + (fourth * (z**3 - 3 * z) / 24 - third * skew * (2 * z**3 - 5 * z) / 36) / sd**3
     if scene.quartic:
-        even = fifth * (z**4 - 6 * z**2 + 3) / 120 - share * fourth * (z**4 - 5 * z**2 + 2) / 24
-        v += (even + share**2 * third * (12 * z**4 - 53 * z**2 + 17) / 324) / variance**2
+        even = fifth * (z**4 - 6 * z**2 + 3) / 120 - skew * fourth * (z**4 - 5 * z**2 + 2) / 24
+        v += (even + skew**2 * third * (12 * z**4 - 53 * z**2 + 17) / 324) / variance**2
     return _counted(scene, v + scene.levels["c0"][0, :n] + more * r["light"] + warmer * r["dark"])
 
 

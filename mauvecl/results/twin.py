@@ -50,7 +50,7 @@ def statistics(
     weights, linear_end, pixels_end = plan.weights, plan.linear_end, plan.pixels_end
     constants = scene.constants(weights, linear_end, pixels_end)
     estimated, exposures = scene.comparison.estimated, scene.comparison.exposures
-    share, scale = scene.job["reference_share"], scene.job["pair_scale"]
+    weight, scale = scene.job["reference_weight"], scene.job["pair_scale"]
     out = np.zeros((fixed * n_scenario + len(weights), len(realisation)), np.float32)
     x = _above_template(scene, observed(scene, realisation, seed))
     drawn = max(exposures, 1) if exposures or pair or smoothed is not None else 0
@@ -67,12 +67,12 @@ def statistics(
         variance: Floats = np.zeros_like(raw)
         if exposures:
             total = np.sum([other[t] for other in others], axis=0, dtype=np.float32)
-            y = fma(total, -share, raw)
+            y = fma(total, -weight, raw)
         if estimated:
             estimate = scene.estimates[k]
             variance = _variance(raw, estimate)
             if exposures:
-                variance = np.add(variance, share * _variance(total * share, estimate), dtype=np.float32)
+                variance = np.add(variance, weight * _variance(total * weight, estimate), dtype=np.float32)
             y = np.add(y, estimate["fraction"][:, None], dtype=np.float32)
         parts = [np.zeros(len(realisation), np.float32) for _ in range(4)]
         for p, pixel in enumerate(scene.pixels):

@@ -1,4 +1,4 @@
-"""Stares as a request: cut into shares of stares, drawn and reduced by whoever is free, joined exactly."""
+"""Stares as a request: cut into shards of stares, drawn and reduced by whoever is free, joined exactly."""
 
 from __future__ import annotations
 
@@ -113,13 +113,13 @@ class StareSums:
         self._adds = (request.reduction or Kept()).adds
         self._found: dict[int, Arrays] = {}
 
-    def add(self, part: int, share: Arrays) -> None:
-        """Add a share."""
-        rest = dict(share)
+    def add(self, part: int, shard: Arrays) -> None:
+        """Add a shard."""
+        rest = dict(shard)
         self._found[int(rest.pop("start"))] = rest
 
     def answer(self) -> Arrays:
-        """All of it, once all shares have come; stares in their order."""
+        """All of it, once all shards have come; stares in their order."""
         return joined([self._found[start] for start in sorted(self._found)], adds=self._adds)
 
 

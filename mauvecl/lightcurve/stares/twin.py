@@ -103,14 +103,14 @@ def _count(scene: StareScene, p: int, z: Floats, met: dict[str, Floats], flare: 
         fourth = fma(light, m["photon_fourth"], fourth)
         fifth = fma(light, m["photon_fifth"], fifth)
     zz, sd, each = z * z, np.sqrt(variance), one / variance
-    share = third * each
+    skew = third * each
     curve = fourth * fma(zz, np.float32(0.041666668), np.float32(-0.125))
-    curve = curve - third * share * fma(zz, np.float32(0.055555556), np.float32(-0.1388889))
+    curve = curve - third * skew * fma(zz, np.float32(0.055555556), np.float32(-0.1388889))
     even = fifth * _quartic(zz, 0.008333334, -0.05, 0.025)
-    even = even - share * fourth * _quartic(zz, 0.041666668, -0.20833333, 0.083333336)
-    even = even + share * share * third * _quartic(zz, 0.037037037, -0.16358025, 0.052469134)
+    even = even - skew * fourth * _quartic(zz, 0.041666668, -0.20833333, 0.083333336)
+    even = even + skew * skew * third * _quartic(zz, 0.037037037, -0.16358025, 0.052469134)
     straight = fma(curve * each, sd * each, sd)
-    v = fma(z, straight, fma(share, fma(zz, np.float32(0.16666667), np.float32(-0.16666667)), m["rest"]))
+    v = fma(z, straight, fma(skew, fma(zz, np.float32(0.16666667), np.float32(-0.16666667)), m["rest"]))
     return np.asarray(fma(even * each, each, v) + fma(dark, m["dark"], light))
 
 

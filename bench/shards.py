@@ -1,9 +1,9 @@
-"""What it costs to cut work into shares, on one machine and on Dask workers, and what that means for a thousand cores.
+"""What it costs to cut work into shards, on one machine and on Dask workers, and what that means for a thousand cores.
 
-    python bench/shares.py [--shares N] [--repeats K] [--output bench/results/shares.ecsv]
+    python bench/shards.py [--shards N] [--repeats K] [--output bench/results/shards.ecsv]
 
 In turn, several times, of which the best counts: one request by an engine; the same by a pool with one device and a
-checkpoint; and by two Dask processes of one thread each. Then the parts of a share's overhead, one by one, and a plan
+checkpoint; and by two Dask processes of one thread each. Then the parts of a shard's overhead, one by one, and a plan
 for 1e15 pixel-realisations made of them.
 """
 
@@ -23,12 +23,12 @@ import numpy as np
 from astropy.table import Table
 
 from mauvecl.device.engine import Engine
-from mauvecl.results.requests import DetectRequest, Share
+from mauvecl.results.requests import DetectRequest, Shard
 from mauvecl.results.sums import DetectionSums
 from mauvecl.runs.checkpoint import Checkpoint
 from mauvecl.runs.cluster import DaskWorkers
 from mauvecl.runs.pool import LocalWorkers, Pool
-from mauvecl.runs.shards import fingerprint, shares
+from mauvecl.runs.shards import fingerprint, shards
 from mauvecl.study.sections import Run
 from mauvecl.study.study import Study
 
@@ -49,16 +49,16 @@ def timed(work: Callable[[], Any], repeats: int = 5) -> tuple[float, Any]:
 def main() -> None:
     """Print the table and write it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--shares", type=int, default=8, help="an even number")
+    parser.add_argument("--shards", type=int, default=8, help="an even number")
     parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results" / "shares.ecsv")
+    parser.add_argument("--output", type=Path, default=Path(__file__).parent / "results" / "shards.ecsv")
     given = parser.parse_args()
     study = Study().model_copy(update={"star": Study().star[1:], "run": Run()})
     quiet, *flares = study.expectations(study.star[0])
     how = (study.run.statistics,)
     one = DetectRequest(quiet, tuple(flares), 1 << 40, 1, *how)
-    size = shares(DetectRequest(quiet, tuple(flares), 1 << 30, 1, *how))[0].count
-    n = given.shares * size
+    size = shards(DetectRequest(quiet, tuple(flares), 1 << 30, 1, *how))[0].count
+    n = given.shards * size
     draws = n * one.work
 
     engine = Engine()
@@ -81,51 +81,51 @@ def main() -> None:
         base = best["engine, 2 threads"]
         rows += [(f"{name} / engine", f"{rate / base:.3f}") for name, rate in best.items() if rate != base]
 
-        # The parts of one share's overhead.
+        # The parts of one shard's overhead.
         request = DetectRequest(quiet, tuple(flares), n, 1, *how)
-        fixed = timed(lambda: engine.count(request, Share(0, 0, 64)))[0]
+        fixed = timed(lambda: engine.count(request, Shard(0, 0, 64)))[0]
         prepared = timed(lambda: pickle.loads(pickle.dumps(request)).plans)[0]
-        share = engine.count(request, Share(0, 0, size))
+        shard = engine.count(request, Shard(0, 0, size))
         bare = timed(lambda: engine.detect(quiet, flares, realisations=size, seed=1))[0]
-        packing, sent = timed(lambda: pickle.dumps(share))
+        packing, sent = timed(lambda: pickle.dumps(shard))
         sums = DetectionSums(request)
         adding = timed(lambda: sums.add(0, pickle.loads(sent)))[0]
         body = io.BytesIO()
-        np.savez(body, **share)
+        np.savez(body, **shard)
         key = fingerprint(request)
-        keeping = timed(lambda: kept.put(f"{key}-bench", share))[0]
-        # What Dask itself takes: a task that does nothing, as many as shares would be.
+        keeping = timed(lambda: kept.put(f"{key}-bench", shard))[0]
+        # What Dask itself takes: a task that does nothing, as many as shards would be.
         client = workers._client
         tasks = 500
         asking = timed(lambda: client.gather([client.submit(abs, k, pure=False) for k in range(tasks)]), 3)[0] / tasks
         client_s = adding + keeping + asking
         rows += [
-            ("realisations of a share", f"{size}"),
-            ("pixel-realisations of a share", f"{size * one.work:.2e}"),
-            ("share on 2 threads (s)", f"{bare:.2f}"),
+            ("realisations of a shard", f"{size}"),
+            ("pixel-realisations of a shard", f"{size * one.work:.2e}"),
+            ("shard on 2 threads (s)", f"{bare:.2f}"),
             ("request prepared, once a worker (s)", f"{prepared:.3f}"),
-            ("launches, buffers and packing of a share of 64 realisations (s)", f"{fixed:.3f}"),
-            ("share pickled (s)", f"{packing:.4f}"),
-            ("share added (s)", f"{max(adding, 0.0):.4f}"),
-            ("share kept on the disk (s)", f"{keeping:.3f}"),
+            ("launches, buffers and packing of a shard of 64 realisations (s)", f"{fixed:.3f}"),
+            ("shard pickled (s)", f"{packing:.4f}"),
+            ("shard added (s)", f"{max(adding, 0.0):.4f}"),
+            ("shard kept on the disk (s)", f"{keeping:.3f}"),
             ("Dask, a task (s)", f"{asking:.4f}"),
-            ("all of these / share on 2 threads", f"{(fixed + packing + client_s) / bare:.3f}"),
+            ("all of these / shard on 2 threads", f"{(fixed + packing + client_s) / bare:.3f}"),
             ("request as a message (MB)", f"{len(pickle.dumps(request)) / 1e6:.2f}"),
-            ("share as a message (MB)", f"{len(sent) / 1e6:.2f}"),
-            ("share on the disk (MB)", f"{len(body.getvalue()) / 1e6:.2f}"),
+            ("shard as a message (MB)", f"{len(sent) / 1e6:.2f}"),
+            ("shard on the disk (MB)", f"{len(body.getvalue()) / 1e6:.2f}"),
         ]
-    # The plan: by the clustered rate of a core here, with the shares that a request of that size is cut into.
+    # The plan: by the clustered rate of a core here, with the shards that a request of that size is cut into.
     core = best["2 Dask processes of 1 thread"] / 2
-    large = shares(DetectRequest(quiet, tuple(flares), int(PLAN / one.work), 1, *how))
+    large = shards(DetectRequest(quiet, tuple(flares), int(PLAN / one.work), 1, *how))
     count, each = len(large), large[0].count * one.work
     seconds = PLAN / (core * CORES)
     rows += [
         (f"plan: {PLAN:g} pixel-realisations on {CORES} cores (s)", f"{seconds:.0f}"),
-        ("plan: shares", f"{count}"),
-        ("plan: seconds of a core for one share", f"{each / core:.1f}"),
-        ("plan: shares a second", f"{count / seconds:.1f}"),
+        ("plan: shards", f"{count}"),
+        ("plan: seconds of a core for one shard", f"{each / core:.1f}"),
+        ("plan: shards a second", f"{count / seconds:.1f}"),
         ("plan: of the client's time, adding, keeping and asking", f"{count * client_s / seconds:.2f}"),
-        ("plan: cores idle while the last shares end, at most", f"{CORES / count:.2f}"),
+        ("plan: cores idle while the last shards end, at most", f"{CORES / count:.2f}"),
         ("plan: to the client (MB/s)", f"{count * len(sent) / 1e6 / seconds:.1f}"),
         ("plan: files kept (GB)", f"{count * len(body.getvalue()) / 1e9:.1f}"),
     ]
