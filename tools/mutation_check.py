@@ -250,12 +250,12 @@ MUTATIONS = {
         (("host/expectation.py", "min(self.saturation_dn, float(self.adc_max_dn))", "float(self.adc_max_dn)"),),
         "tests/noise/test_saturation.py::test_closed_forms_are_those_of_what_is_drawn",
     ),
-    "template of what is not recorded": Mutation(
+    "reference of what is not recorded": Mutation(
         (
             (
                 "mauvecl/noise/scene.py",
-                "mean_sum = template.recorded_dn",
-                "mean_sum = template.n_frames * template.mean_raw_dn",
+                "mean_sum = reference.recorded_dn",
+                "mean_sum = reference.n_frames * reference.mean_raw_dn",
             ),
         ),
         "tests/noise/test_saturation.py::test_closed_forms_are_those_of_what_is_drawn",

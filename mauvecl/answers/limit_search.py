@@ -212,7 +212,7 @@ class MarginalLimitSearch(LimitSearch):
         return float(np.mean([one.theory(value) for one in self.each]))
 
     def simulated(self, value: float, seed: int) -> Interval:
-        """Mean over the draws of the unknown, each with its own template and threshold."""
+        """Mean over the draws of the unknown, each with its own reference and threshold."""
         found = average([one.simulated(value, seed) for one in self.each])
         self.points.append(Point(value, found, seed))
         return found

@@ -125,7 +125,7 @@ TailsFlag = Annotated[
 ]
 ReferenceFlag = Annotated[
     str | None,
-    typer.Option(help="Compared with: template, exposure (noisy), or stack:N of them [template].", show_default=False),
+    typer.Option(help="Compared with: expectation, exposure (noisy), or stack:N [expectation].", show_default=False),
 ]
 VariancesFlag = Annotated[
     str | None,

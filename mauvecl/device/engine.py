@@ -15,7 +15,7 @@ from mauvecl.device.stares import Stares
 from mauvecl.device.tiles import Progress, Tile, Tiles
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.stares.requests import StaresRequest
-from mauvecl.noise.comparison import TEMPLATE, Comparison
+from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.drawing import Drawing, DrawingWords
 from mauvecl.noise.scene import BATCH, prepare
 from mauvecl.results.channels import plan_channels
@@ -270,7 +270,7 @@ class Engine:
         seed: int,
         statistics: Sequence[str | Linear] = USUAL_STATISTICS,
         start: int = 0,
-        comparison: Comparison = TEMPLATE,
+        comparison: Comparison = NOISE_FREE,
         tails: Tails = "counted",
         nuisances: Nuisances | Mapping[str, float] | None = None,
         **drawing: Unpack[DrawingWords],
@@ -280,7 +280,7 @@ class Engine:
         Parameters
         ----------
         quiet : Expectation
-            The star without a flare; its mean is the template.
+            The star without a flare; its mean is the reference.
         flares : sequence of Expectation, or one
             The same star, instrument and exposure with flares; without any only the null is drawn.
         realisations : int
@@ -294,7 +294,7 @@ class Engine:
         mode, recipe, processes, first_frame
             See `Drawing`.
         comparison : Comparison
-            What is subtracted, and by whose variances; the template and the model's by default.
+            What is subtracted, and by whose variances; its expectation and the model's variances by default.
         tails : {"counted", "sampled"}
             Thresholds beyond what is drawn: refused, or by importance sampling (`tails.tail`).
         nuisances : Nuisances or mapping of str to float, optional
@@ -343,7 +343,7 @@ class Engine:
         count: int,
         seed: int,
         statistics: Sequence[str | Linear] = USUAL_STATISTICS,
-        comparison: Comparison = TEMPLATE,
+        comparison: Comparison = NOISE_FREE,
         nuisances: Nuisances | Mapping[str, float] | None = None,
         **drawing: Unpack[DrawingWords],
     ) -> NDArray[np.float32]:

@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 MOST_COUNTED = 2**25
 #: Raw spectra looked at together on the host.
 PIECE = 4096
-#: Kernels of a detection, the first where more is compared than the template.
+#: Kernels of a detection, the first where more is compared than the expectation.
 COMPARED, DETECTION = ("sums", "comparison", "tally", "marginal"), ("sums", "statistics", "tally", "marginal")
 #: Work-items to an element or channel of a histogram, on a device of many.
 ITEMS = 1024
@@ -243,7 +243,7 @@ class Launches:
         """
         scene = self._scene
         more = map(self.upload, (beyond(scene.estimates), bands, finished, scales, scale_end))
-        self._weighing = [self.upload(scene.templates), *self._weighing, *more, np.uint32(scales.shape[1])]
+        self._weighing = [self.upload(scene.references), *self._weighing, *more, np.uint32(scales.shape[1])]
         self._rows += len(scales)
 
     def statistics(self, tile: Tile) -> None:

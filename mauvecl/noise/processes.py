@@ -1,6 +1,6 @@
 """Optional noise processes, each with a stream of its own, all off unless asked for.
 
-What they draw is unknown to the observer: templates and variances stay those of the expectation.
+What they draw is unknown to the observer: references and variances stay those of the expectation.
 """
 
 from __future__ import annotations

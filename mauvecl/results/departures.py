@@ -111,7 +111,7 @@ def departures(found: Detection, fap: float) -> list[Departure]:
     if scene.cosmic:
         others.append("cosmic rays")
     if scene.modulations and not found.setting.integrates:
-        others.append("priors that the template does not know")
+        others.append("priors that the reference does not know")
     elif found.nuisances is not None and not scene.modulations:
         others.append("unknowns that are marginalised over and not drawn")
     digital = _digital(found.quiet) if scene.clip else None

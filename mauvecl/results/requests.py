@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Protocol, Self
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.host.quantities import count
-from mauvecl.noise.comparison import TEMPLATE, Comparison
+from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.drawing import AUTOMATIC, Drawing, DrawingWords
 from mauvecl.noise.scene import BATCH, Scene, prepare
 from mauvecl.results.channels import ChannelPlan, plan_channels
@@ -109,7 +109,7 @@ class DetectRequest(_Drawn):
     statistics: Sequence[str | Linear] = USUAL_STATISTICS
     start: int = 0
     drawing: Drawing = AUTOMATIC
-    comparison: Comparison = TEMPLATE
+    comparison: Comparison = NOISE_FREE
     tails: Tails = "counted"
     nuisances: Nuisances | Mapping[str, float] | None = None
 

@@ -255,7 +255,7 @@ def _block(found: Detection, statistic: str, template: int, tilt: _Tilt, seed: i
 
 
 def _value(found: Detection, statistic: str, template: int, excess: Float, mean: Float) -> Float:
-    """The statistic of each draw, from observed less template and subtracted less template, DN, (n, n_pixel)."""
+    """The statistic of each draw, from observed less reference and subtracted less reference, DN, (n, n_pixel)."""
     scene, one = found.scene, found.statistic(statistic)
     x, added = excess - mean, one.added_variance(found.setting)
     variance = np.broadcast_to(one.variance(found.setting), x.shape)
@@ -320,7 +320,7 @@ def _responding(scene: Scene, z: Float, factors: dict[str, Float]) -> Float:
 
 
 def _excess(scene: Scene, z: Float) -> Float:
-    """Observed less template, DN, for the quiescent scenario."""
+    """Observed less reference, DN, for the quiescent scenario."""
     n = scene.n_pixel
     level = scene.levels[0, :n]
     drawn = level["c4"].astype(np.float64) if scene.quartic else np.zeros(n)
@@ -330,7 +330,7 @@ def _excess(scene: Scene, z: Float) -> Float:
 
 
 def _counted(scene: Scene, drawn: Float) -> Float:
-    """What the ADC makes of counts above the base, less the template."""
+    """What the ADC makes of counts above the base, less the reference."""
     n, edge = scene.n_pixel, scene.edges[0, : scene.n_pixel]
     counts = np.rint(drawn)
     if scene.clip:

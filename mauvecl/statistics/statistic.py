@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
-from mauvecl.noise.comparison import TEMPLATE, Comparison
+from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.drawn import Drawn
 from mauvecl.statistics.distributions import Form, Gaussian, Mixture, QuadraticForm
 from mauvecl.statistics.nuisances import Nuisances, joined
@@ -30,7 +30,7 @@ class Setting:
     Attributes
     ----------
     quiet : Expectation
-        The star without a flare: the template, and the model of the variances.
+        The star without a flare: the reference, and the model of the variances.
     used : ndarray of bool, shape (n_pixel,)
         Pixels that count.
     comparison : Comparison
@@ -45,7 +45,7 @@ class Setting:
 
     quiet: Expectation
     used: NDArray[np.bool_]
-    comparison: Comparison = TEMPLATE
+    comparison: Comparison = NOISE_FREE
     flares: Sequence[Expectation] = ()
     nuisances: Nuisances | None = None
     drawn: Drawn | None = None

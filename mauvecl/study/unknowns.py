@@ -1,7 +1,7 @@
 """What is unknown of the instrument, and the same with a flare and without: drawn from priors, and averaged over.
 
-An observer measures the instrument, and takes template and threshold from it; while a proposal is written it is
-unknown. So each draw of the unknown values has its own template and threshold, and a detection probability is the
+An observer measures the instrument, and takes reference and threshold from it; while a proposal is written it is
+unknown. So each draw of the unknown values has its own reference and threshold, and a detection probability is the
 average.
 """
 
