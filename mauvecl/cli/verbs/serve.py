@@ -9,11 +9,14 @@ import typer
 
 
 def serve(
-    address: Annotated[str, typer.Option(help="Who may come: 127.0.0.1 is this machine alone.")] = "127.0.0.1",
+    address: Annotated[
+        str, typer.Option(metavar="TEXT", help="Who may come: 127.0.0.1 is this machine alone.")
+    ] = "127.0.0.1",
     port: Annotated[int, typer.Option(min=1, max=65535, help="Port.")] = 5006,
     allow_origin: Annotated[
         list[str] | None,
         typer.Option(
+            metavar="TEXT",
             help="An address that visitors' browsers show, such as https://mauve.example.org; needed where --address "
             "lets in other machines. May be repeated.",
             show_default=False,
@@ -21,7 +24,7 @@ def serve(
     ] = None,
     show: Annotated[bool, typer.Option("--show", help="Open a browser.")] = False,
 ) -> None:
-    """A page in your browser: controls, closed forms at once, simulations, downloads.
+    """A page in your browser: questions, answers, downloads.
 
     Example: mauvecl serve --show
     """

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mauvecl.cli.flags import BULK, DRAWS, FLARE, SWEEP, DeviceFlag, JsonFlag, QuietFlag, takes_study
+from mauvecl.cli.flags import BULK, DRAWS, FLARE, SWEEP, DeviceFlag, JsonFlag, QuietFlag
+from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
     from mauvecl.cli.session import Session
@@ -18,16 +19,25 @@ if TYPE_CHECKING:
 
 StoreArgument = Annotated[Path, typer.Argument(help="Store that `mauvecl realise` wrote.")]
 RowsFlag = Annotated[
-    str | None, typer.Option(help="Realisations, as in 1000:2000, the last not included.", show_default=False)
+    str | None,
+    typer.Option(metavar="TEXT", help="Realisations, as in 1000:2000, the last not included.", show_default=False),
 ]
 
 
-@takes_study(FLARE, DRAWS, SWEEP, BULK, fewer=True, pictures=False)
+@takes_study(
+    FLARE,
+    DRAWS,
+    SWEEP,
+    BULK,
+    fewer=True,
+    pictures=False,
+    writes="mauvecl-frames.zarr; also NAME.fits, .h5, .hdf5",
+)
 def realise(study: Study, session: Session) -> None:
-    """Raw spectra in bulk: a Zarr store, or a FITS or HDF5 file of fewer than 4 GiB.
+    """Raw spectra in bulk: a Zarr store, or one FITS or HDF5 file.
 
-    An array per star and flare, a row per realisation, with calibration, units and the study. What was written stays:
-    --resume draws what is missing.
+    One file holds fewer than 4 GiB. An array per star and flare, a row per realisation, with calibration, units and
+    the study. What was written stays: --resume draws what is missing.
 
     Examples: mauvecl realise study.toml -n 1000000 --output frames.zarr
 
@@ -105,7 +115,9 @@ def verify(
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Is a store as it was written? Finds flipped bytes, missing and foreign chunks, and repairs them.
+    """Whether a store is as it was written; can repair it.
+
+    Finds flipped bytes, missing and foreign chunks.
 
     Exit code 1 if anything is wrong and not repaired.
 
@@ -119,16 +131,16 @@ def verify(
 
     engine = Engine(device) if repair or redraw else None
     with Meter(quiet=quiet or as_json, unit="chunks") as meter:
-        found = bulk.verify(store, engine, repair=repair, redraw=redraw, rows=_rows_of(rows), progress=meter)
-    left = sum(not fault.mended for fault in found)
+        faults = bulk.verify(store, engine, repair=repair, redraw=redraw, rows=_rows_of(rows), progress=meter)
+    left = sum(not fault.mended for fault in faults)
     if as_json:
-        print(json.dumps([asdict(fault) for fault in found], indent=2))
+        print(json.dumps([asdict(fault) for fault in faults], indent=2))
     else:
-        if found:
-            cells = [(fault.key, fault.state, "repaired" if fault.mended else "") for fault in found]
+        if faults:
+            cells = [(fault.key, fault.state, "repaired" if fault.mended else "") for fault in faults]
             show_table(f"Not as it was written: {store}", ("file", "what", ""), cells)
         told = "with what was written" if not redraw else "with what the engine draws"
-        show([f"{len(found) - left} repaired, {left} left as found." if found else f"Everything agrees {told}."])
+        show([f"{len(faults) - left} repaired, {left} left as found." if faults else f"Everything agrees {told}."])
     if left:
         raise typer.Exit(1)
 
@@ -138,7 +150,9 @@ def export(
     file: Annotated[Path, typer.Argument(help="Ending in .fits, .h5 or .hdf5.")],
     array: Annotated[
         list[str] | None,
-        typer.Option("--array", help="Such as star-1/flare-2; may be repeated [all].", show_default=False),
+        typer.Option(
+            "--array", metavar="TEXT", help="Such as star-1/flare-2; may be repeated [all].", show_default=False
+        ),
     ] = None,
     rows: RowsFlag = None,
     replace: Annotated[bool, typer.Option("--replace", help="Take the place of what has that name.")] = False,

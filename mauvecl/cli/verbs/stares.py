@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from mauvecl.cli.flags import DRAWS, FLARE, SIZE, STARE, SWEEP, DeviceFlag, takes_study
+from mauvecl.cli.flags import DRAWS, FLARE, SIZE, STARE, SWEEP, DeviceFlag
+from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
     from mauvecl.answers.stare import StareAnswer
@@ -19,7 +20,7 @@ def stare(
     given: dict[str, Any],
     device: DeviceFlag = None,
 ) -> None:
-    """One simulated stare: light curves in bands, a spectrum of every frame, and the flares in it.
+    """One simulated stare: light curves, spectra, flares, a search.
 
     Without arguments: the paper's two stars over one orbit, four flares each. The FITS files are read by lightkurve.
 
@@ -36,15 +37,15 @@ def stare(
 
     stares = Stares(device)
     session.opened = stares.opened
-    found = compute(study, stares)
-    session.answer(found, lambda: _show(found))
+    answer = compute(study, stares)
+    session.answer(answer, lambda: _show(answer))
 
 
-def _show(found: StareAnswer) -> None:
+def _show(answer: StareAnswer) -> None:
     from mauvecl.answers.stare import Searched
     from mauvecl.cli.console import short, show_table
 
-    swept = tuple(axis.quantity for axis in found.study.sweep.axes)
+    swept = tuple(axis.quantity for axis in answer.study.sweep.axes)
     show_table(
         "One stare each",
         ("star", *swept, "frames", "in frames (s)", "intervals", "light (DN/s)", "noise of a frame", "saturated"),
@@ -52,10 +53,10 @@ def _show(found: StareAnswer) -> None:
             (one.label, *map(short, one.at.values()), str(row["frames"]), f"{row['observed'].value:g}",
              str(row["intervals"]), f"{row['flux'].value:.4g}", f"{100 * row['frame_noise']:.3g} %",
              str(row["saturated_frames"]))
-            for one, row in zip(found.stares, found.table, strict=True)
+            for one, row in zip(answer.stares, answer.table, strict=True)
         ],
     )  # fmt: skip
-    events = found.events
+    events = answer.events
     show_table(
         "Flares in them; S/N of one who knows all but whether the flare is there",
         ("star", *swept, "peak at (s)", "half width (s)", "peak", "ED (s)", "bolometric (erg)", "S/N"),
@@ -66,10 +67,10 @@ def _show(found: StareAnswer) -> None:
             for row in events
         ],
     )  # fmt: skip
-    for one in found.stares:
+    for one in answer.stares:
         if isinstance(one.searched, Searched):
             show_table(
-                f"Found at {one.title} above {one.searched.threshold:.2f}, {_rate(found)}",
+                f"Found at {one.title} above {one.searched.threshold:.2f}, {_rate(answer)}",
                 ("peak at (s)", "amplitude", "half width (s)", "temperature (K)", "bolometric (erg)", "value", "flare"),
                 [
                     (f"{a.recovered.peak_s[0]:.6g}",
@@ -84,9 +85,9 @@ def _show(found: StareAnswer) -> None:
             )  # fmt: skip
 
 
-def _rate(found: StareAnswer) -> str:
+def _rate(answer: StareAnswer) -> str:
     """How many false alarms there are at the threshold, in words."""
-    asked = found.study.search
+    asked = answer.study.search
     return f"{asked.false_alarms:g} false alarms per star-{asked.per}"
 
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from mauvecl.cli.console import short
-from mauvecl.cli.flags import DETECTION, DRAWS, FLARE, LIMIT, MAP, NUISANCES, SWEEP, UNKNOWN, takes_study
+from mauvecl.cli.flags import DETECTION, DRAWS, FLARE, LIMIT, MAP, NUISANCES, SWEEP, UNKNOWN
+from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
     from mauvecl.answers.limits import Limit, LimitResult
@@ -24,7 +25,9 @@ def limit(
         bool, typer.Option("--assumptions", help="Also: how far what is assumed of the instrument moves it.")
     ] = False,
 ) -> None:
-    """The limiting magnitude of a flare, its smallest amplitude, or the shortest exposure that shows it.
+    """Limiting magnitude, smallest amplitude or shortest exposure.
+
+    Of a star or flare that is seen with a wanted probability.
 
     Starts from the closed form, settles it by simulation, and simulates the answer again with a fresh seed.
 
@@ -33,23 +36,23 @@ def limit(
     from mauvecl.answers.limits import limiting_magnitude
 
     with session.pool(unit="limits") as engine:
-        found = limiting_magnitude(study, engine, progress=session.meter)
+        answer = limiting_magnitude(study, engine, progress=session.meter)
     if assumptions:
         from mauvecl.answers.assumptions import what_matters
 
-        found.assumptions = what_matters(study)
-    session.answer(found, lambda: _show_limits(found))
+        answer.assumptions = what_matters(study)
+    session.answer(answer, lambda: _show_limits(answer))
 
 
-def _show_limits(found: LimitResult) -> None:
+def _show_limits(answer: LimitResult) -> None:
     from mauvecl.cli.console import show_table
 
-    study = found.study
+    study = answer.study
     asked, run = study.limit, study.run
     swept = [axis.quantity for axis in study.sweep.axes if axis.quantity != "amplitude"]
     cells = []
     digits = ".3f" if asked.of == "magnitude" else ".4g"
-    for one in found.limits:
+    for one in answer.limits:
         p, value = one.check.probability, one.value
         flare = "" if asked.of == "amplitude" else f"{100 * one.amplitude:g} %"
         at = [short(v) for k, v in one.at.items() if k != "amplitude"]
@@ -69,16 +72,16 @@ def _show_limits(found: LimitResult) -> None:
             f"Averaged over {study.unknowns.draws} draws of what is unknown of the instrument: the limits of each, and "
             "what explains their scatter",
             ("star", *swept, "flare", "statistic", "95 % of limits", "matters most, share of the variance"),
-            [(*row[: 3 + len(swept)], *_unknown(one, digits)) for row, one in zip(cells, found.limits, strict=True)],
+            [(*row[: 3 + len(swept)], *_unknown(one, digits)) for row, one in zip(cells, answer.limits, strict=True)],
         )
-    if found.assumptions is not None:
+    if answer.assumptions is not None:
         show_table(
             f"What is assumed, and how far it moves the closed-form limit of {asked.of}, the largest first",
             ("star", "flare", "statistic", "assumption", "from", "to", "limit from", "to", "moves by"),
             [
                 (m["star"], f"{100 * m['amplitude']:g} %", m["statistic"], m["assumption"], m["low_end"], m["high_end"],
                  f"{m['at_low_end']:.3f}", f"{m['at_high_end']:.3f}", f"{m['span']:.3f}")
-                for m in found.assumptions
+                for m in answer.assumptions
             ],
         )  # fmt: skip
 
@@ -106,28 +109,28 @@ def detection_map(
     from mauvecl.answers.maps import detection_map as compute
 
     with session.pool(unit="cells") as engine:
-        found = compute(study, engine, progress=session.meter)
-    session.answer(found, lambda: _show_map(found))
+        answer = compute(study, engine, progress=session.meter)
+    session.answer(answer, lambda: _show_map(answer))
 
 
-def _show_map(found: MapResult) -> None:
+def _show_map(answer: MapResult) -> None:
     """The map as tables of percentages, one per statistic."""
     from mauvecl.cli.console import show, show_table
 
-    study = found.study
+    study = answer.study
 
     def text(value: float | str) -> str:
         return value if isinstance(value, str) else f"{value:.3g}"
 
-    for statistic, parts in found.shares.items():
+    for statistic, parts in answer.shares.items():
         told = ", ".join(f"{name} {100 * share:.0f} %" for name, share in list(parts.items())[:3])
         draws = f"{study.unknowns.draws} draws of what is unknown"
         show([f"{statistic}, averaged over {draws}: its scatter is from {told}."])
     corner = f"{study.map.y.quantity}, {study.map.x.quantity}"
-    for statistic, probability in zip(found.statistics, found.probability, strict=True):
-        rows = [(text(y), *(f"{100 * p:.0f}" for p in row)) for y, row in zip(found.y, probability, strict=True)]
+    for statistic, probability in zip(answer.statistics, answer.probability, strict=True):
+        rows = [(text(y), *(f"{100 * p:.0f}" for p in row)) for y, row in zip(answer.y, probability, strict=True)]
         show_table(
-            f"{found.star}: detection probability in percent, {statistic}, fap {study.run.fap:g} per test",
-            (corner, *(text(x) for x in found.x)),
+            f"{answer.star}: detection probability in percent, {statistic}, fap {study.run.fap:g} per test",
+            (corner, *(text(x) for x in answer.x)),
             rows,
         )

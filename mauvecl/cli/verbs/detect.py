@@ -6,7 +6,8 @@ import math
 from typing import TYPE_CHECKING
 
 from mauvecl.cli.console import short
-from mauvecl.cli.flags import CAMPAIGN, COUNTED, DETECTION, DRAWS, FLARE, NUISANCES, SWEEP, TEMPLATE, takes_study
+from mauvecl.cli.flags import CAMPAIGN, COUNTED, DETECTION, DRAWS, FLARE, NUISANCES, SWEEP, TEMPLATE
+from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -22,7 +23,7 @@ def detect(
     study: Study,
     session: Session,
 ) -> None:
-    """Would these flares be seen? Thresholds, detection probabilities, distributions.
+    """Whether these flares would be seen: thresholds, probabilities.
 
     Without arguments: the paper's K3V star of V = 3.7 and G2V star of V = 7.4 with flares of 0.76, 2, 8.1 and 24 %,
     50 s, one million realisations.
@@ -32,22 +33,22 @@ def detect(
     from mauvecl.answers.detect import detect as compute
 
     with session.pool() as engine:
-        found = compute(study, engine)
-    session.answer(found, lambda: _show_detections(found))
+        answer = compute(study, engine)
+    session.answer(answer, lambda: _show_detections(answer))
 
 
-def _show_detections(found: DetectAnswer) -> None:
+def _show_detections(answer: DetectAnswer) -> None:
     from mauvecl.cli.console import show_table
 
-    study = found.study
+    study = answer.study
     run = study.run
     exposures = " and ".join(
-        dict.fromkeys(f"{x.exposure_s:g} s ({x.n_frames} frames)" for x in (s.found.quiet for s in found.stars))
+        dict.fromkeys(f"{x.exposure_s:g} s ({x.n_frames} frames)" for x in (s.found.quiet for s in answer.stars))
     )
     swept = [axis.quantity for axis in study.sweep.axes if axis.quantity != "amplitude"]
     columns = ("flare", "statistic", "expected", "simulated", "reduced", "threshold", "detected", "", "closed form")
     cells = []
-    for row in found.table:
+    for row in answer.table:
         amplitude, digits = f"{100 * row['amplitude']:g} %", (row["expected"], row["mean"])
         reduced = "" if math.isnan(row["reduced"]) else f"{row['reduced']:.3f}"
         probability = f"{row['probability']:.4f}", f"[{row['low']:.4f}, {row['high']:.4f}]"
@@ -64,7 +65,7 @@ def _show_detections(found: DetectAnswer) -> None:
         ("star", *swept, *columns),
         cells,
     )
-    _show_departures(found.departures, run.fap)
+    _show_departures(answer.departures, run.fap)
 
 
 def _show_departures(table: QTable, fap: float) -> None:
@@ -96,7 +97,9 @@ def gaussian(
     study: Study,
     session: Session,
 ) -> None:
-    """Where the usual root-of-N formula is wrong: its S/N, its intervals, its false alarms.
+    """Where the usual root-of-N formula is wrong.
+
+    Its S/N, its intervals and its false alarms, beside those of realisations.
 
     Without a sweep: magnitudes from 4 to 12, exposures of 5, 50 and 600 s.
 
@@ -105,15 +108,15 @@ def gaussian(
     from mauvecl.answers.gaussian import gaussian_report
 
     with session.pool() as engine:
-        found = gaussian_report(study, engine)
-    session.answer(found, lambda: _show_promises(found))
+        answer = gaussian_report(study, engine)
+    session.answer(answer, lambda: _show_promises(answer))
 
 
-def _show_promises(found: GaussianReport) -> None:
+def _show_promises(answer: GaussianReport) -> None:
     from mauvecl.cli.console import show_table
 
-    study = found.study
-    swept = [axis.quantity for axis in found.study.sweep.axes]
+    study = answer.study
+    swept = [axis.quantity for axis in answer.study.sweep.axes]
     show_table(
         f"The root-of-N formula beside {study.run.realisations:,} realisations; promised: no difference in S/N, "
         f"68.3 % of 1-sigma intervals, as many 5-sigma pixels and false alarms ({study.run.fap:g}) as normal noise has",
@@ -126,6 +129,6 @@ def _show_promises(found: GaussianReport) -> None:
              f"{row['five_sigma_above']:.2f}, {row['five_sigma_below']:.2f}",
              f"{row['fap_ratio']:.3f}",
              row["statistic"], row["why"], f"{row['probability_off_by']:+.4f}")
-            for row in found.cells
+            for row in answer.cells
         ],
     )  # fmt: skip

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
-import typer
-
-from mauvecl.cli.flags import DRAWS, FLARE, SIZE, STARE, SWEEP, Option, ShapeFlag, takes_study
+from mauvecl.cli.flags import DRAWS, FLARE, SHAPES, SIZE, STARE, SWEEP, flag, group
+from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
     from mauvecl.answers.inject import InjectAnswer
@@ -16,42 +15,26 @@ if TYPE_CHECKING:
 #: Length of the stare where nobody tells, s.
 DAY_S = 86_400.0
 
-SEARCH = {
-    "false_alarms": Option(
-        Annotated[float | None, typer.Option(help="Of the search, per star-day, -month or -year [1].")],
-        "search",
-        "false_alarms",
+SEARCH = group(
+    flag(float, "--false-alarms", "Of the search, per star-day, -month or -year [1].", "search.false_alarms"),
+    flag(str, "--alarms-per", "day, month or year, of frames [month].", "search.per"),
+    flag(str, "--shape", SHAPES, "search.shape"),
+)
+INJECTIONS = group(
+    flag(int, "--injections -n", "Of each size and half-width [2000].", "injections.count"),
+    flag(
+        str,
+        "--size",
+        "amplitude, duration, energy or band_energy [energy if the star's size is known, else amplitude].",
+        "injections.of",
     ),
-    "alarms_per": Option(
-        Annotated[str | None, typer.Option(help="day, month or year, of frames [month].")], "search", "per"
-    ),
-    "shape": Option(ShapeFlag, "search", "shape"),
-}
-INJECTIONS = {
-    "injections": Option(
-        Annotated[int | None, typer.Option("--injections", "-n", help="Of each size and half-width [2000].")],
-        "injections",
-        "count",
-    ),
-    "size": Option(
-        Annotated[
-            str | None,
-            typer.Option(
-                help="amplitude, duration, energy or band_energy [energy if the star's size is known, else amplitude]."
-            ),
-        ],
-        "injections",
-        "of",
-    ),
-    "smallest": Option(
-        Annotated[float | None, typer.Option(help="Smallest size [0.3 of what is found].")], "injections", "low"
-    ),
-    "largest": Option(
-        Annotated[float | None, typer.Option(help="Largest size [3 times what is found].")], "injections", "high"
-    ),
-}
+    flag(float, "--smallest", "Smallest size [0.3 of what is found].", "injections.low"),
+    flag(float, "--largest", "Largest size [3 times what is found].", "injections.high"),
+)
 #: What it takes of a stare: not the flares in it.
-LOOKED = {name: STARE[name] for name in ("duration", "gap", "orbit_gap", "thermal", "with_unknowns")}
+LOOKED = {name: STARE[name] for name in ("gap", "orbit_gap", "thermal", "with_unknowns")} | group(
+    flag(float, "--duration", f"Of the stare, s [{DAY_S:.0f}, a day; or the study's].", "stare.duration_s")
+)
 
 
 def _day(_: dict[str, Any]) -> Study:
@@ -73,7 +56,9 @@ def _day(_: dict[str, Any]) -> Study:
     default=_day,
 )
 def inject(study: Study, session: Session) -> None:
-    """Which flares a search would find: completeness over energy (or amplitude) and half-width, false alarms, errors.
+    """Which flares a search would find: completeness, false alarms.
+
+    Over energy (or amplitude) and half-width, with the errors of what is recovered.
 
     Flares are injected into drawn stares and searched for with a bank of filters. A stare of a day unless told.
 
@@ -87,16 +72,16 @@ def inject(study: Study, session: Session) -> None:
     with session.pool(unit="injections") as pool:
         first = pool.workers.first
         stares = Stares() if first is None else Stares(first.opened)
-        found = compute(study, stares, checkpoint=pool.checkpoint, progress=session.meter)
-    session.answer(found, lambda: _show(found))
+        answer = compute(study, stares, checkpoint=pool.checkpoint, progress=session.meter)
+    session.answer(answer, lambda: _show(answer))
 
 
-def _show(found: InjectAnswer) -> None:
+def _show(answer: InjectAnswer) -> None:
     from mauvecl.cli.console import short, show_table
 
-    choice = found.study.search
+    choice = answer.study.search
     alarms = "false alarm" if choice.false_alarms == 1 else "false alarms"
-    swept = tuple(axis.quantity for axis in found.study.sweep.axes)
+    swept = tuple(axis.quantity for axis in answer.study.sweep.axes)
     show_table(
         f"The search: {choice.false_alarms:g} {alarms} per star-{choice.per} of frames",
         ("star", *swept, "threshold", "[95 %]", "templates", "sums of a frame", "alarms/day at", "sampled", "drawn"),
@@ -105,11 +90,11 @@ def _show(found: InjectAnswer) -> None:
              f"[{one.threshold.low:.3f}, {one.threshold.high:.3f}]", str(one.surveyed.survey.search.n_filters),
              str(one.surveyed.survey.components.n_statistics), f"{one.checked:.2f}", f"{one.asked:.3g}",
              f"{one.simulated.value:.3g}")
-            for one in found.stars
+            for one in answer.stars
         ],
     )  # fmt: skip
-    for one in found.stars:
-        table = found.table[found.table["star"] == one.label]
+    for one in answer.stars:
+        table = answer.table[answer.table["star"] == one.label]
         for name, value in one.at.items():
             column = table[name]
             table = table[getattr(column, "value", column) == value]

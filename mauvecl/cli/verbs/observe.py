@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from mauvecl.cli.console import short
-from mauvecl.cli.flags import AT, COUNTED, DRAWS, FLARE, SIGNAL, SWEEP, takes_study
+from mauvecl.cli.flags import AT, COUNTED, DRAWS, FLARE, SIGNAL, SWEEP
+from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
     from mauvecl.answers.exposures import ExposureResult
@@ -25,17 +26,19 @@ def simulate(
     given: dict[str, Any],
     realisation: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Which realisation to show.")] = 0,
 ) -> None:
-    """One observation and what it is made of: star, sky, photon noise, dark, bias, read noise.
+    """One observation, and what it is made of.
+
+    Star, sky, photon noise, dark, bias, read noise, and the closed-form S/N.
 
     Example: mauvecl simulate --star G2V --magnitude 7.4 --exposure 50 --amplitude 0.24
     """
     from mauvecl.answers.simulate import simulate as compute
 
-    found = compute(study, realisation=realisation, flaring=bool(given["amplitude"]))
-    session.answer(found, lambda: _show_observations(found))
+    answer = compute(study, realisation=realisation, flaring=bool(given["amplitude"]))
+    session.answer(answer, lambda: _show_observations(answer))
 
 
-def _show_observations(found: SimulateAnswer) -> None:
+def _show_observations(answer: SimulateAnswer) -> None:
     from mauvecl.cli.console import show_table
 
     show_table(
@@ -44,7 +47,7 @@ def _show_observations(found: SimulateAnswer) -> None:
         [
             (s["observation"], str(s["frames"]), f"{s['peak_nm']:.1f}", f"{s['peak_dn']:.0f}", f"{s['snr_pixel']:.2f}",
              f"{s['snr_element']:.1f}", str(s["saturated_pixels"]))
-            for s in found.summary
+            for s in answer.summary
         ],
     )  # fmt: skip
 
@@ -62,7 +65,9 @@ def snr(
     study: Study,
     session: Session,
 ) -> None:
-    """Distributions of the signal-to-noise ratio per pixel and per resolution element, and noise budgets.
+    """Signal-to-noise ratios: their distributions, and noise budgets.
+
+    Of each pixel and of each resolution element (10.5 nm).
 
     The signal is the star's alone: the sky is subtracted, and its photons are noise (`--signal paper`: signal as well).
 
@@ -75,17 +80,17 @@ def snr(
     from mauvecl.answers.snr import snr as compute
 
     with session.pool() as engine:
-        found = compute(study, engine)
-    session.answer(found, lambda: _show_snr(found))
+        answer = compute(study, engine)
+    session.answer(answer, lambda: _show_snr(answer))
 
 
-def _show_snr(found: SnrAnswer) -> None:
+def _show_snr(answer: SnrAnswer) -> None:
     """S/N and noise at some wavelengths; all of them are in the files."""
     from mauvecl.answers.exposures import place_of
     from mauvecl.cli.console import show_table
 
     cells, budgets = [], []
-    for star in found.stars:
+    for star in answer.stars:
         x, table = star.result.expectation, star.result.element
         budget = x.noise_budget()
         name = (star.label, *map(short, star.at.values()))
@@ -97,7 +102,7 @@ def _show_snr(found: SnrAnswer) -> None:
             )  # fmt: skip
             parts = ("source_photon", "zodiacal_photon", "dark", "read", "total")
             budgets.append((*name, f"{wavelength:g}", *(f"{noise[part].value:.2f}" for part in parts)))
-    swept = tuple(axis.quantity for axis in found.study.sweep.axes)
+    swept = tuple(axis.quantity for axis in answer.study.sweep.axes)
     show_table(
         "S/N per 10.5 nm element; all of them in the files",
         ("star", *swept, "nm", "closed form", "mean", "std", "2.5 %", "50 %", "97.5 %"),
@@ -115,24 +120,26 @@ def exposure(
     study: Study,
     session: Session,
 ) -> None:
-    """The shortest exposure with a wanted S/N at a wavelength, by the closed form; `mauvecl snr` goes the other way.
+    """The shortest exposure with a wanted S/N at a wavelength.
+
+    By the closed form, in whole frames; `mauvecl snr` goes the other way.
 
     Example: mauvecl exposure --snr 10 --at 300 --star G2V --magnitude 7.4
     """
     from mauvecl.answers.exposures import exposure_for
 
-    found = exposure_for(study)
-    session.answer(found, lambda: _show_exposures(found))
+    answer = exposure_for(study)
+    session.answer(answer, lambda: _show_exposures(answer))
 
 
-def _show_exposures(found: ExposureResult) -> None:
+def _show_exposures(answer: ExposureResult) -> None:
     from mauvecl.cli.console import show_table
 
     def floored(snr: float) -> float:
         # What falls short must not look as if it did not.
         return math.floor(1000 * snr) / 1000
 
-    wanted = found.study.signal
+    wanted = answer.study.signal
     show_table(
         f"Exposure for an S/N of {wanted.snr:g} per {wanted.per} at {wanted.wavelength_nm:g} nm "
         "(closed form, whole frames)",
@@ -140,6 +147,6 @@ def _show_exposures(found: ExposureResult) -> None:
         [
             (e.star, f"{e.exposure_s:.10g}", str(e.frames), f"{e.snr:.3f}", f"{floored(e.snr_one_frame_less):.3f}",
              "SATURATED" if e.saturated else "")
-            for e in found.exposures
+            for e in answer.exposures
         ],
     )  # fmt: skip

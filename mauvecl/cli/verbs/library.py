@@ -19,7 +19,9 @@ ReplaceFlag = Annotated[bool, typer.Option("--replace", help="Take the place of 
 
 @app.callback()
 def library(context: typer.Context, as_json: JsonFlag = False) -> None:
-    """List the embedded spectra and your own; `add`, `fetch` and `remove` change yours.
+    """The embedded spectra and your own.
+
+    `add`, `fetch` and `remove` change yours.
 
     Those of the library are kept at V = 0 and need --magnitude, but for the Sun and Vega.
 
@@ -59,7 +61,9 @@ def library(context: typer.Context, as_json: JsonFlag = False) -> None:
 @app.command()
 def add(
     files: Annotated[list[Path], typer.Argument(help="Text, ECSV, VOTable or FITS; FILE[COLUMN] names a column.")],
-    name: Annotated[str | None, typer.Option(help="For one file: another name.", show_default=False)] = None,
+    name: Annotated[
+        str | None, typer.Option(metavar="TEXT", help="For one file: another name.", show_default=False)
+    ] = None,
     replace: ReplaceFlag = False,
     wavelength_unit: WavelengthUnitFlag = None,
     flux_unit: FluxUnitFlag = None,
@@ -86,7 +90,8 @@ def fetch(
         list[str], typer.Argument(help="Stars, such as ngsl:HD 37202; in calspec, ngsl or lowlib, or in any of them.")
     ],
     base: Annotated[
-        str | None, typer.Option("--from", help="Another address of the collection: a mirror.", show_default=False)
+        str | None,
+        typer.Option("--from", metavar="TEXT", help="Another address of the collection: a mirror.", show_default=False),
     ] = None,
     replace: ReplaceFlag = False,
     extend: ExtendFlag = None,
