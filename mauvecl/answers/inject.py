@@ -63,6 +63,8 @@ class StarCompleteness:
     asked : float
         What it should be there by importance sampling.
     checked : float
+    saturates : float
+        Amplitude from which on flares saturate a used pixel, which injections leave out.
     in_a_row : float
         False alarms per star-day of the common rule in white noise.
     injected : Injected
@@ -77,6 +79,7 @@ class StarCompleteness:
     simulated: Interval
     asked: float
     checked: float
+    saturates: float
     in_a_row: float
     injected: Injected
     fitted: Fitted | None
@@ -87,16 +90,22 @@ class StarCompleteness:
         return titled(self.label, self.at)
 
     @property
-    def message(self) -> str | None:
-        """Where drawn stares alarm more or less often than normal noise."""
-        if np.isnan(self.simulated.value) or self.simulated.low <= self.asked <= self.simulated.high:
-            return None
-        return (
-            f"FALSE ALARMS of {self.title} are not those of normal noise: {self.simulated.value:.3g} per star-day at "
-            f"{self.checked:.2f} in drawn stares, {self.asked:.3g} by importance sampling: the search does not "
-            "marginalise over what changes in the stare (see [search] frame, cycle, window_s), or set search.null = "
-            '"counted".'
-        )
+    def messages(self) -> list[str]:
+        """Where drawn stares alarm more or less often than normal noise, and where flares saturate."""
+        found = []
+        if not np.isnan(self.simulated.value) and not self.simulated.low <= self.asked <= self.simulated.high:
+            found.append(
+                f"FALSE ALARMS of {self.title} are not those of normal noise: {self.simulated.value:.3g} per star-day "
+                f"at {self.checked:.2f} in drawn stares, {self.asked:.3g} by importance sampling: the search does not "
+                "marginalise over what changes in the stare (see [search] frame, cycle, window_s), or set "
+                'search.null = "counted".'
+            )
+        if self.injected.amplitudes.max() > self.saturates:
+            found.append(
+                f"SATURATED: flares of {self.title} with an amplitude above {self.saturates:.3g} saturate a pixel, "
+                "which injections leave out."
+            )
+        return found
 
 
 @dataclass(eq=False)
@@ -280,7 +289,7 @@ def inject(
         answer.stars.append(_star(one, star, values, engine, told_of))
     told_of(1.0)
     answer.messages = [
-        *(text for text in (star.message for star in answer.stars) if text is not None),
+        *(text for star in answer.stars for text in star.messages),
         *told(answer.inputs),
         *orbit_lines(study),
     ]
@@ -333,6 +342,7 @@ def _star(
         simulated,
         expected,
         checked,
+        injections.saturates,
         in_a_row_rate(choice.points, choice.sigma, survey.stare.frame_s),
         Injected(injections.half_widths_s, values, amplitudes, sizes.of_amplitude(critical, widths[:, None, None])),
         Fitted.of(parts) if refit.count else None,

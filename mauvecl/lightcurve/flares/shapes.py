@@ -152,8 +152,8 @@ class Davenport2014(Shape):
 
     def _risen(self, t: Float) -> Float:
         """The rise's integral up to some tau, by Horner's rule: what a search spends its time in."""
-        clipped, (*rest, last) = np.clip(t, -1.0, 0.0), self.RISEN.coef
-        total = last
+        clipped, (*rest, last) = np.clip(t, -1.0, 0.0), self.RISEN.coef.astype(np.float64)
+        total = np.asarray(last)
         for coefficient in reversed(rest):
             total = coefficient + total * clipped
         return np.asarray(total)

@@ -32,7 +32,8 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 Single = NDArray[np.float32]
 
-#: Stares that are looked at at once; fewer are filled up, so that products of matrices have the same bits.
+#: Stares that are looked at at once, each in the row that its number gives it: in another row a product of matrices may
+#: round otherwise.
 BLOCK = 64
 #: Second half of the key of the generator that places peaks.
 INJECT_KEY = 0x696E6A65
@@ -95,6 +96,14 @@ class Injections:
         unit[:3] = 1.0
         unit[len(STEADY) + self.flare] = 1.0
         return self.survey.components.means(unit)
+
+    @property
+    def saturates(self) -> float:
+        """Amplitude at which the mean of a used pixel reaches saturation in a frame at the flare's peak."""
+        components, light = self.survey.components, float(self.survey.stare.light.max())
+        flare = light * components.mean_dn[len(STEADY) + self.flare] * (components.weights != 0).any(axis=0)
+        room = components.quiet.highest_dn - components.quiet.mean_raw_dn
+        return float(np.min(room[flare > 0] / flare[flare > 0], initial=np.inf))
 
     @cached_property
     def photons(self) -> Float:
@@ -211,32 +220,33 @@ class Injecting:
         Infinite if no template fits into what is observed; zero where there is an alarm without it.
         """
         critical = np.full((len(values), len(self.places)), np.inf, np.float32)
-        for begin in range(0, len(values), BLOCK):
-            part = slice(begin, begin + BLOCK)
-            drawn = self.drawn(values[part], glow[part], BLOCK)
-            for row, place in zip(critical[part].T, self.places, strict=True):
+        for begin in range(-(first % BLOCK), len(values), BLOCK):
+            part = slice(max(begin, 0), begin + BLOCK)
+            drawn = self.drawn(values[part], glow[part], part.start - begin, BLOCK)
+            for column, place in zip(critical[part].T, self.places, strict=True):
                 if len(place.filters):
-                    row[:] = self._critical(place, self.values(place, drawn))[: row.size]
+                    column[:] = self._critical(place, self.values(place, drawn))[drawn.rows]
         found: dict[str, NDArray[Any]] = {"critical": critical}
         if self.refit is not None:
             # One stare at a time: a fit knows nothing of what is fitted beside it.
             these = range(min(len(values), max(0, self.start + self.refit.count - first)))
-            each = [self._fitted(self.drawn(values[k : k + 1], glow[k : k + 1], 1), self.refit) for k in these]
+            each = [self._fitted(self.drawn(values[k : k + 1], glow[k : k + 1]), self.refit) for k in these]
             none = np.zeros((0, *self.refit.amplitudes.shape), np.float32)
             found |= {name: np.array([one[name] for one in each]) if each else none for name in KEPT}
         return found
 
-    def drawn(self, values: Single, glow: Single, block: int) -> Drawn:
-        """A few stares, filled up to a block."""
+    def drawn(self, values: Single, glow: Single, row: int = 0, block: int = 0) -> Drawn:
+        """A few stares, from a row of a block on that is filled up with zeros."""
         n, n_frame, n_sum = values.shape
+        rows, block = slice(row, row + n), max(block, row + n)
         noise, own = np.zeros((2, n_sum, block, n_frame), np.float32)
-        np.subtract(np.moveaxis(values, 2, 0), self.known.T[:, None], out=noise[:, :n])
-        own[:, :n] = np.moveaxis(glow[:, :, :n_sum], 2, 0)
+        np.subtract(np.moveaxis(values, 2, 0), self.known.T[:, None], out=noise[:, rows])
+        own[:, rows] = np.moveaxis(glow[:, :, :n_sum], 2, 0)
         if not glow[:, :, n_sum].any():
-            return Drawn(n, noise, own, None)
+            return Drawn(rows, noise, own, None)
         light = np.zeros((block, n_frame), np.float32)
-        light[:n] = glow[:, :, n_sum]
-        return Drawn(n, noise, own, light)
+        light[rows] = glow[:, :, n_sum]
+        return Drawn(rows, noise, own, light)
 
     def values(self, place: Place, drawn: Drawn) -> tuple[Single, Single, Single]:
         """a, b and c of the module's formula, shapes (n_temperature, n_draw or 1, n_filter)."""
@@ -266,9 +276,9 @@ class Injecting:
         value, temperature, template : ndarray
         """
         a, b, c = self.values(place, drawn)
-        values = np.array([a + x * b + np.sqrt(x) * c for x in amplitudes.astype(np.float32)])[:, :, : drawn.count]
-        values[:, ~place.counts[:, None].repeat(drawn.count, axis=1)] = -np.inf
-        flat = np.moveaxis(values, 2, 1).reshape(len(amplitudes), drawn.count, -1)
+        values = np.array([a + x * b + np.sqrt(x) * c for x in amplitudes.astype(np.float32)])
+        values[:, ~place.counts[:, None].repeat(a.shape[1], axis=1)] = -np.inf
+        flat = np.moveaxis(values, 2, 1).reshape(len(amplitudes), a.shape[1], -1)
         which = flat.argmax(axis=2)
         largest = np.take_along_axis(flat, which[:, :, None], axis=2)[:, :, 0]
         temperature, template = np.divmod(which, a.shape[2])
@@ -276,12 +286,12 @@ class Injecting:
 
     def sums(self, place: Place, drawn: Drawn, amplitudes: Float) -> Single:
         """Frames with the flare, less what is known of them, shape (n_amplitude, n_draw, n_frame, n_sum)."""
-        here, n = place.frames, drawn.count
-        mean = np.atleast_2d(place.mean if drawn.light is None else place.mean * (1 + drawn.light[:n, here]))
+        here = place.frames
+        mean = np.atleast_2d(place.mean if drawn.light is None else place.mean * (1 + drawn.light[:, here]))
         glow = np.sqrt(np.maximum(place.mean, 0))
-        own = np.einsum("kj,jmt->mtk", self.photons.astype(np.float32), drawn.own[:, :n, here] * glow)
+        own = np.einsum("kj,jmt->mtk", self.photons.astype(np.float32), drawn.own[:, :, here] * glow)
         rise = mean[:, :, None] * self.response.astype(np.float32)
-        noise = np.moveaxis(drawn.noise[:, :n, here], 0, 2)
+        noise = np.moveaxis(drawn.noise[:, :, here], 0, 2)
         return np.asarray([noise + x * rise + np.sqrt(x) * own for x in amplitudes.astype(np.float32)])
 
     def _critical(self, place: Place, values: tuple[Single, Single, Single]) -> Single:
@@ -329,8 +339,8 @@ class Drawn:
 
     Attributes
     ----------
-    count : int
-        Stares; what follows is filled up with zeros.
+    rows : slice
+        Those that are stares; others are zero.
     noise : ndarray of float32, shape (n_sum, n_draw, n_frame)
         The sums without a flare, less what is known of them.
     own : ndarray of float32, shape (n_sum, n_draw, n_frame)
@@ -339,7 +349,7 @@ class Drawn:
         Relative change of all light, where there is any.
     """
 
-    count: int
+    rows: slice
     noise: Single
     own: Single
     light: Single | None
