@@ -21,6 +21,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.statistics.intervals import CONFIDENCE, Interval, central_counts, clopper_pearson
 
 if TYPE_CHECKING:
+    from mauvecl.lightcurve.search.conditions import Conditions
     from mauvecl.lightcurve.search.search import Search
 
 Float = NDArray[np.float64]
@@ -169,6 +170,23 @@ class Sampled:
         # All thresholds share their draws, so that errors move together: none is gained by their number.
         inverse = np.linalg.pinv(columns)
         return inverse @ (logs / relative), inverse @ inverse.T
+
+    def under(self, conditions: Conditions) -> Sampled:
+        """The same where the noise is not what the search takes it for."""
+        if conditions.known:
+            return self
+        kept = self._trusted
+        coefficients, _ = self._fit()
+        probability, error = np.zeros((2, self.thresholds.size))
+        for k, threshold in enumerate(self.thresholds):
+            u = threshold / conditions.scales
+            parabola = np.polynomial.polynomial.polyval(u - self.thresholds[kept].mean(), coefficients)
+            rate = np.exp(scipy.special.log_ndtr(-u) + parabola).mean(axis=1)
+            each = -np.expm1(-self.days * rate)
+            probability[k] = conditions.weights @ each
+            spread = np.sqrt(np.sum((conditions.weights * (each - probability[k])) ** 2))
+            error[k] = np.hypot(spread, probability[k] * self.error[k] / self.probability[k])
+        return Sampled(self.thresholds, probability, error, self.days)
 
     def log_rate(self, threshold: float) -> tuple[float, float]:
         """The logarithm of false alarms per star-day, and its standard error."""
