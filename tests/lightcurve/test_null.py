@@ -149,7 +149,7 @@ def test_false_alarms_in_random_stares(stares):
     alarms, spread, plain = 0, 0.0, []
     for number in range(50):
         stare, level, free = random_stare(rng)
-        one, _ = survey(stare, level, (25.0, 80.0, 240.0), more=free)
+        one, _ = survey(stare, level, (25.0, 120.0), more=free)
         days = stare.observed_s / 86_400
         tail = sampled(one.search, seed=number, draws=25).under(Conditions.of(one, number))
         cut = tail.threshold(-np.log1p(-asked) / days).value
@@ -158,7 +158,7 @@ def test_false_alarms_in_random_stares(stares):
         relative = tail.log_rate(cut)[1]
         spread += draws * asked * (1 - asked) + (draws * -np.log1p(-asked) * (1 - asked) * relative) ** 2
         if number < 5:
-            bare, _ = survey(Stare.of(stare.duration_s), KNOWN, (25.0, 80.0, 240.0))
+            bare, _ = survey(Stare.of(stare.duration_s), KNOWN, (25.0, 120.0))
             search = Search(bare.bank, stare)
             sums = stares.frames(
                 one.components.__class__(one.components.quiet, one.components.flare_electrons, bare.components.weights),

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 
 #: Draws of what is unknown, and times of the stare at which they are looked at.
-DRAWS, POINTS = 1000, 24
+DRAWS, POINTS = 500, 16
 #: Half of the draws are so many times as far out.
 FARTHER = 1.5
 #: Second half of the generator's key.
