@@ -23,7 +23,7 @@ import numpy as np
 from astropy.table import Table
 
 from mauvecl.device.engine import Engine
-from mauvecl.results.requests import DetectRequest, Shard
+from mauvecl.results.requests.requests import DetectRequest, Shard
 from mauvecl.results.sums import DetectionSums
 from mauvecl.runs.checkpoint import Checkpoint
 from mauvecl.runs.cluster import DaskWorkers

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mauvecl.results.detection import Detection
+from mauvecl.results.detection.detection import Detection
 from mauvecl.results.snr import Counts, SnrResult
 from mauvecl.study.study import Study
 

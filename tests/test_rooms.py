@@ -13,9 +13,9 @@ ROOT = Path(__file__).parent.parent
 #: Who must not import whom: up, up for types alone, up inside the host, and OpenCL outside the device's room.
 FORBIDDEN = {
     "noise/layout.py": ("import mauvecl.study.study", "mauvecl.noise.layout -> mauvecl.study.study"),
-    "results/roc.py": (
+    "results/detection/roc.py": (
         "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from mauvecl.cli.app import main",
-        "mauvecl.results.roc -> mauvecl.cli.app",
+        "mauvecl.results.detection.roc -> mauvecl.cli.app",
     ),
     "host/files/bounded.py": (
         "from mauvecl.host.stars.source import Source",

@@ -13,8 +13,8 @@ from mauvecl.device.tiles import Tile
 from mauvecl.noise import layout
 from mauvecl.noise.pixels import PIXEL_BLOCK
 from mauvecl.noise.scene import Scene
+from mauvecl.results.counts.tally import Grid, Tally
 from mauvecl.results.snr import Counts
-from mauvecl.results.tally import Grid, Tally
 
 if TYPE_CHECKING:
     from mauvecl.device.program import Variant

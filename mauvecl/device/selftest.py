@@ -24,10 +24,10 @@ from mauvecl.noise.comparison import Comparison
 from mauvecl.noise.processes import CosmicRays, Processes, Uniform
 from mauvecl.noise.scene import Scene, prepare
 from mauvecl.results import twin as sums_twin
-from mauvecl.results.channels import ChannelPlan, plan_channels
-from mauvecl.results.hypotheses import Hypotheses
+from mauvecl.results.counts.tally import Tally
+from mauvecl.results.requests.channels import ChannelPlan, plan_channels
+from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.results.snr import Counts, elements, observers
-from mauvecl.results.tally import Tally
 from mauvecl.statistics.nuisances import known
 from mauvecl.statistics.registry import STATISTICS
 

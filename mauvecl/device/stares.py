@@ -18,7 +18,7 @@ from mauvecl.lightcurve.stares.scene import Flares, StareScene, padded_frames
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.lightcurve.stares.sums import check_sums
 from mauvecl.noise.processes import CosmicRays
-from mauvecl.results.requests import Shard
+from mauvecl.results.requests.requests import Shard
 
 Floats = NDArray[np.float32]
 

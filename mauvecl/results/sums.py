@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.results.detection import Detection
-from mauvecl.results.far import FarCounts
-from mauvecl.results.requests import DetectRequest, SnrRequest
+from mauvecl.results.counts.far import FarCounts
+from mauvecl.results.counts.tally import TailSamples, Tally
+from mauvecl.results.detection.detection import Detection
+from mauvecl.results.requests.requests import DetectRequest, SnrRequest
 from mauvecl.results.snr import Counts, SnrResult, elements, observers
-from mauvecl.results.tally import TailSamples, Tally
 
 Arrays = dict[str, NDArray[Any]]
 

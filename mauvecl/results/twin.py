@@ -15,8 +15,8 @@ from mauvecl.results.snr import Counts
 from mauvecl.statistics.paper import Paper
 
 if TYPE_CHECKING:
-    from mauvecl.results.channels import ChannelPlan
-    from mauvecl.results.hypotheses import Hypotheses
+    from mauvecl.results.requests.channels import ChannelPlan
+    from mauvecl.results.requests.hypotheses import Hypotheses
 
 
 def statistics(

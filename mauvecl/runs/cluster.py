@@ -22,7 +22,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import is_file, json_data, read_text
 from mauvecl.host.version import VERSION
-from mauvecl.results.requests import Countable, Shard
+from mauvecl.results.requests.requests import Countable, Shard
 from mauvecl.results.sums import Arrays
 from mauvecl.runs.pool import Stopped
 

@@ -17,13 +17,13 @@ from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
 from mauvecl.device.tiles import Progress
 from mauvecl.host.quantities import count as whole
 from mauvecl.lightcurve.stares.requests import StaresRequest, StareSums
-from mauvecl.results.requests import Countable, DetectRequest, RealiseRequest, Shard, SnrRequest
+from mauvecl.results.requests.requests import Countable, DetectRequest, RealiseRequest, Shard, SnrRequest
 from mauvecl.results.sums import Arrays, DetectionSums, SnrSums
 from mauvecl.runs.shards import fingerprint, shards
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
-    from mauvecl.results.detection import Detection
+    from mauvecl.results.detection.detection import Detection
     from mauvecl.results.snr import SnrResult
     from mauvecl.runs.checkpoint import Checkpoint
 

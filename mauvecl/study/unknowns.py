@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.host.errors import InputError
-from mauvecl.results.fap import FEWEST_IN_TAIL
+from mauvecl.results.requests.fap import FEWEST_IN_TAIL
 from mauvecl.statistics.intervals import CONFIDENCE, Interval
 
 if TYPE_CHECKING:

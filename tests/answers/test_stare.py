@@ -12,7 +12,7 @@ from astropy.io import fits
 from astropy.table import QTable
 from commands import ended, run
 
-from mauvecl.answers.stare import StareAnswer, stare
+from mauvecl.answers.stares.stare import StareAnswer, stare
 from mauvecl.device.engine import Engine
 from mauvecl.device.stares import Stares
 from mauvecl.host.errors import InputError

@@ -15,8 +15,8 @@ from astropy.io import fits
 from astropy.table import QTable
 from commands import run, started
 
-from mauvecl.answers.detect import detect
-from mauvecl.answers.simulate import simulate
+from mauvecl.answers.detection.detect import detect
+from mauvecl.answers.signal.simulate import simulate
 from mauvecl.device.engine import Engine
 from mauvecl.noise.processes import CosmicRays, Normal, Processes, Uniform
 from mauvecl.statistics.registry import STATISTICS

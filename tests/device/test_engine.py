@@ -25,10 +25,10 @@ from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.processes import CosmicRays, Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare
 from mauvecl.results import twin as reference_sums
-from mauvecl.results.channels import ChannelPlan, plan_channels
-from mauvecl.results.requests import DetectRequest
+from mauvecl.results.counts.tally import Tally
+from mauvecl.results.requests.channels import ChannelPlan, plan_channels
+from mauvecl.results.requests.requests import DetectRequest
 from mauvecl.results.snr import elements, observers
-from mauvecl.results.tally import Tally
 from mauvecl.statistics.registry import STATISTICS
 
 RAYS = CosmicRays(rate_per_cm2_s=200.0)

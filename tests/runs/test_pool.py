@@ -18,18 +18,18 @@ import pytest
 from answers import N, same, same_snr, small
 from scenes import instrument, star
 
-from mauvecl.answers.detect import detect
-from mauvecl.answers.limits import limiting_magnitude
-from mauvecl.answers.maps import detection_map
-from mauvecl.answers.snr import snr
+from mauvecl.answers.detection.detect import detect
+from mauvecl.answers.detection.maps import detection_map
+from mauvecl.answers.limits.limits import limiting_magnitude
+from mauvecl.answers.signal.snr import snr
 from mauvecl.device.engine import DeviceError, Engine
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise.comparison import Comparison
 from mauvecl.noise.drawing import Drawing
 from mauvecl.noise.processes import Processes, Uniform
-from mauvecl.results.detection import Detection
-from mauvecl.results.requests import DetectRequest, Shard, SnrRequest
+from mauvecl.results.detection.detection import Detection
+from mauvecl.results.requests.requests import DetectRequest, Shard, SnrRequest
 from mauvecl.results.sums import Arrays
 from mauvecl.runs import shards
 from mauvecl.runs.checkpoint import Checkpoint, _digest_of

@@ -8,7 +8,7 @@ from mauvecl.cli.flags import DRAWS, FLARE, SIZE, STARE, SWEEP, DeviceFlag
 from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
-    from mauvecl.answers.stare import StareAnswer
+    from mauvecl.answers.stares.stare import StareAnswer
     from mauvecl.cli.session import Session
     from mauvecl.study.study import Study
 
@@ -28,7 +28,7 @@ def stare(
 
     mauvecl stare --star G2V --magnitude 7.4 --distance 14.1 --energy 1e33 --energy 1e34 --orbit-gap 2100
     """
-    from mauvecl.answers.stare import stare as compute
+    from mauvecl.answers.stares.stare import stare as compute
     from mauvecl.device.stares import Stares
     from mauvecl.host.errors import InputError
 
@@ -42,7 +42,7 @@ def stare(
 
 
 def _show(answer: StareAnswer) -> None:
-    from mauvecl.answers.stare import Searched
+    from mauvecl.answers.stares.stare import Searched
     from mauvecl.cli.console import short, show_table
 
     swept = tuple(axis.quantity for axis in answer.study.sweep.axes)

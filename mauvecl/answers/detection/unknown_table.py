@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.answers.unknown_cost import Cost, unknown_cost
+from mauvecl.answers.detection.unknown_cost import Cost, unknown_cost
 from mauvecl.host.plotting import picture
 from mauvecl.study.labels import described, label
 from mauvecl.study.nuisances import NuisanceChoice

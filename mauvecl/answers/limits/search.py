@@ -13,7 +13,7 @@ from scipy import special
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.ranges import DAY_S
-from mauvecl.results.hypotheses import check_shape
+from mauvecl.results.requests.hypotheses import check_shape
 from mauvecl.statistics.intervals import Interval
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.statistics.statistic import Setting

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from mauvecl.answers.limit_search import LimitSearch
+from mauvecl.answers.limits.search import LimitSearch
 from mauvecl.noise.processes import Uniform
 from mauvecl.study.labels import described
 from mauvecl.study.sections import Star, Unknowns

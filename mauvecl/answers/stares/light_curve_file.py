@@ -16,7 +16,7 @@ from mauvecl.host.version import VERSION
 if TYPE_CHECKING:
     from astropy.io import fits
 
-    from mauvecl.answers.stare import StareAnswer, StarStare
+    from mauvecl.answers.stares.stare import StareAnswer, StarStare
 
 DAY_S = 86_400.0
 #: Start of a stare whose study names no time: 2026-01-01, MJD. Any would do.

@@ -89,7 +89,7 @@ def per_test(wanted: float, frames: int, stack: int = 1, *, step: int | None = N
 
     Examples
     --------
-    >>> from mauvecl.results.campaign import campaign, per_test
+    >>> from mauvecl.results.detection.campaign import campaign, per_test
     >>> one = per_test(0.01, 17_280)
     >>> f"{one.at_least:.3g} {one.independent:.3g}"
     '5.79e-07 5.82e-07'
@@ -140,7 +140,7 @@ def campaign(fap: float, frames: int, stack: int = 1, *, step: int | None = None
 
     Examples
     --------
-    >>> from mauvecl.results.campaign import campaign
+    >>> from mauvecl.results.detection.campaign import campaign
     >>> day = campaign(1e-5, 17_280)
     >>> day.tests, round(day.at_most, 4), round(day.independent, 4)
     (17280, 0.1728, 0.1587)

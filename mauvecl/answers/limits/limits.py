@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.answers.answer import Answer
-from mauvecl.answers.limit_search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle
-from mauvecl.answers.unknown_cost import Cost, cost_lines, marginal_lines, unknown_cost
+from mauvecl.answers.detection.unknown_cost import Cost, cost_lines, marginal_lines, unknown_cost
+from mauvecl.answers.limits.search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle
 from mauvecl.host.errors import InputError
-from mauvecl.results.fap import check_fap
+from mauvecl.results.requests.fap import check_fap
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, stacked, told
 from mauvecl.study.quantities import UNITS

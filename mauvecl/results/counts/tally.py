@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
 from mauvecl.noise import layout
-from mauvecl.results.far import UNIT_BITS, Far, FarCounts, is_above
+from mauvecl.results.counts.far import UNIT_BITS, Far, FarCounts, is_above
 from mauvecl.statistics.intervals import Interval, central_counts
 
 

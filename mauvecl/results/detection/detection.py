@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 from mauvecl.host.content import ByContent
 from mauvecl.host.plotting import picture
 from mauvecl.host.quantities import count
-from mauvecl.results.channels import ChannelPlan, Key
-from mauvecl.results.fap import Tails, check_fap, countable
-from mauvecl.results.hypotheses import Hypotheses
-from mauvecl.results.roc import Roc
-from mauvecl.results.tally import Distribution, TailSamples, Tally
+from mauvecl.results.counts.tally import Distribution, TailSamples, Tally
+from mauvecl.results.detection.roc import Roc
+from mauvecl.results.requests.channels import ChannelPlan, Key
+from mauvecl.results.requests.fap import Tails, check_fap, countable
+from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.statistics.detection_interval import detection_interval
 from mauvecl.statistics.intervals import Interval, central_counts, clopper_pearson
 from mauvecl.statistics.statistic import LinearStatistic
@@ -25,7 +25,7 @@ from mauvecl.statistics.statistic import LinearStatistic
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-    from mauvecl.results.tails import Tail
+    from mauvecl.results.detection.tails import Tail
 
 
 @dataclass(eq=False)
@@ -124,7 +124,7 @@ class Detection(ByContent, Hypotheses):
             return None
         key = (statistic, self._null(statistic, template), fap)
         if key not in self._tails:
-            from mauvecl.results.tails import tail
+            from mauvecl.results.detection.tails import tail
 
             self._tails[key] = tail(self, fap, statistic, template=template, seed=self.seed)
         return self._tails[key]

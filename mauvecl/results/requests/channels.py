@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.noise.layout import FIXED_STATISTICS
-from mauvecl.results.hypotheses import Hypotheses
-from mauvecl.results.tally import Grid, TailSamples
+from mauvecl.results.counts.tally import Grid, TailSamples
+from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.statistics.distributions import Form
 from mauvecl.statistics.paper import Paper
 from mauvecl.statistics.statistic import LinearStatistic, QuadraticStatistic, Statistic

@@ -23,7 +23,7 @@ from mauvecl.statistics.intervals import CONFIDENCE, Interval
 
 if TYPE_CHECKING:
     from mauvecl.noise.scene import Scene
-    from mauvecl.results.detection import Detection
+    from mauvecl.results.detection.detection import Detection
 
 Float = NDArray[np.float64]
 

@@ -241,7 +241,7 @@ class StareAnswer(Answer):
     @property
     def documents(self) -> dict[str, Callable[[], bytes]]:
         """A FITS file of each star and cell: light curve, good time intervals, dynamic spectrum."""
-        from mauvecl.answers.light_curve_file import light_curve_file
+        from mauvecl.answers.stares.light_curve_file import light_curve_file
 
         return {f"light-curve-{n}.fits": partial(light_curve_file, self, n - 1) for n in range(1, len(self.stares) + 1)}
 

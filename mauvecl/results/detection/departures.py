@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.noise.cumulants import Cumulants
-from mauvecl.results.fap import countable
+from mauvecl.results.requests.fap import countable
 from mauvecl.statistics.distributions import Form
 from mauvecl.statistics.intervals import Interval
 from mauvecl.statistics.statistic import LinearStatistic, QuadraticStatistic
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.host.expectation import Expectation
-    from mauvecl.results.detection import Detection
+    from mauvecl.results.detection.detection import Detection
 
 Float = NDArray[np.float64]
 

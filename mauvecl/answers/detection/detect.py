@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.answers.answer import Answer
-from mauvecl.answers.unknown_cost import cost_lines, marginal_lines, unknown_cost
+from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
 from mauvecl.host.errors import InputError
-from mauvecl.results.campaign import campaign, per_test
-from mauvecl.results.departures import departure_table
-from mauvecl.results.detection import Detection
-from mauvecl.results.fap import check_fap, countable
-from mauvecl.results.paper import PAPER_G2V, WHY, reconstruct
+from mauvecl.results.detection.campaign import campaign, per_test
+from mauvecl.results.detection.departures import departure_table
+from mauvecl.results.detection.detection import Detection
+from mauvecl.results.detection.paper import PAPER_G2V, WHY, reconstruct
+from mauvecl.results.requests.fap import check_fap, countable
 from mauvecl.runs.pool import Pool, together
 from mauvecl.statistics.distributions import QuadraticForm
 from mauvecl.statistics.linear import Linear, Matched

@@ -17,9 +17,9 @@ from mauvecl.host.quantities import count
 from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.drawing import AUTOMATIC, Drawing, DrawingWords
 from mauvecl.noise.scene import BATCH, Scene, prepare
-from mauvecl.results.channels import ChannelPlan, plan_channels
-from mauvecl.results.fap import Tails
-from mauvecl.results.hypotheses import Hypotheses
+from mauvecl.results.requests.channels import ChannelPlan, plan_channels
+from mauvecl.results.requests.fap import Tails
+from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.statistics.linear import Linear
 from mauvecl.statistics.names import USUAL_STATISTICS
 from mauvecl.statistics.nuisances import Nuisances, known

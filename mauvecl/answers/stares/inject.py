@@ -18,7 +18,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.search.injected import Fitted, InjectedShares, fitted
 from mauvecl.lightcurve.search.injections import Injections
 from mauvecl.lightcurve.search.null import DAY_S, Counted, counted, in_a_row_rate, sampled
-from mauvecl.results.requests import Shard
+from mauvecl.results.requests.requests import Shard
 from mauvecl.results.sums import Arrays
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, put_first, stacked, titled, told

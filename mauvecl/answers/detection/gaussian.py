@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.answers.answer import Answer
-from mauvecl.answers.detect import DetectAnswer, detect
-from mauvecl.answers.snr import SnrAnswer, snr
+from mauvecl.answers.detection.detect import DetectAnswer, detect
+from mauvecl.answers.signal.snr import SnrAnswer, snr
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.results.snr import steps_of
 from mauvecl.study.labels import described

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.answer import Answer
-from mauvecl.answers.exposures import place_of
+from mauvecl.answers.signal.exposures import place_of
 from mauvecl.runs.pool import Pool, together
 from mauvecl.study.labels import label, stacked, titled, told
 from mauvecl.study.study import Study

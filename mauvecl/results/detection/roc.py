@@ -16,7 +16,7 @@ from mauvecl.statistics.intervals import CONFIDENCE, Interval, clopper_pearson
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-    from mauvecl.results.tally import Distribution
+    from mauvecl.results.counts.tally import Distribution
 
 Float = NDArray[np.float64]
 

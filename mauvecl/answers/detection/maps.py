@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
-from mauvecl.answers.unknown_cost import cost_lines, marginal_lines, unknown_cost
-from mauvecl.results.fap import check_fap
+from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
+from mauvecl.results.requests.fap import check_fap
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, told
 from mauvecl.study.quantities import UNITS
