@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.noise import priors
+from mauvecl.noise.prior_tables import nodes
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -170,7 +170,7 @@ def _of_table(table: NDArray[np.float32]) -> Spread:
 def at_score(table: NDArray[np.float32], score: Float) -> Float:
     """What a device's table of quantiles holds where a standard normal has a value; shape as given."""
     below, above = special.ndtr(score), special.ndtr(-score)
-    tail, (low, high) = priors.nodes(), np.split(table.astype(np.float64), 2)
+    tail, (low, high) = nodes(), np.split(table.astype(np.float64), 2)
     return np.asarray(np.where(below < 0.5, np.interp(below, tail, low), np.interp(above, tail, high)))
 
 

@@ -16,7 +16,8 @@ if TYPE_CHECKING:
     from mauvecl.host.sky.zodiacal import Sky
     from mauvecl.host.stars.source import Source
     from mauvecl.noise.comparison import Comparison
-    from mauvecl.noise.processes import Prior, Processes
+    from mauvecl.noise.priors import Prior
+    from mauvecl.noise.processes import CosmicRays, Processes
 
 
 def plain(key: str, given: Any) -> Any:
@@ -171,7 +172,7 @@ class PriorText(Part):
 
     def prior(self) -> Prior:
         """As the engine takes it."""
-        from mauvecl.noise.processes import Normal, Uniform
+        from mauvecl.noise.priors import Normal, Uniform
 
         if self.normal is not None and self.between is not None:
             return Normal(*self.normal, *self.between)
@@ -186,6 +187,17 @@ class Rays(Part):
     electrons: tuple[float, float] = (500.0, 1000.0)
     weights: tuple[float, ...] | None = None
 
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        self.rays()
+        return self
+
+    def rays(self) -> CosmicRays:
+        """As the engine takes them."""
+        from mauvecl.noise.processes import CosmicRays
+
+        return CosmicRays(**self.model_dump())
+
 
 #: The rays, and one key for each thing that a prior may be put on.
 _keys: Any = {"cosmic_rays": (Rays | None, None)} | dict.fromkeys(VARIED, (PriorText | None, None))
@@ -194,16 +206,11 @@ _keys: Any = {"cosmic_rays": (Rays | None, None)} | dict.fromkeys(VARIED, (Prior
 class NoiseProcesses(create_model("_Priors", __base__=Part, **_keys)):  # type: ignore[misc]
     """Optional noise processes, all off unless named; see `processes.VARIED` and `processes.CosmicRays`."""
 
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
-        self.processes()
-        return self
-
     def processes(self) -> Processes:
         """As the engine takes them."""
-        from mauvecl.noise.processes import CosmicRays, Processes
+        from mauvecl.noise.processes import Processes
 
-        rays = None if self.cosmic_rays is None else CosmicRays(**self.cosmic_rays.model_dump())
+        rays = None if self.cosmic_rays is None else self.cosmic_rays.rays()
         given = {name: getattr(self, name) for name in VARIED}
         return Processes(rays, **{name: None if text is None else text.prior() for name, text in given.items()})
 

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
-from mauvecl.host.stars.bands import ALIASES
+from mauvecl.host.stars.band_names import ALIASES
 from mauvecl.host.stars.catalogue import embedded, library_table
 from mauvecl.statistics.registry import STATISTICS
 

@@ -12,7 +12,8 @@ from numpy.typing import NDArray
 from mauvecl.host.errors import InputError
 from mauvecl.noise.usual import USUAL
 from mauvecl.statistics.linear import Matched
-from mauvecl.statistics.nuisances import NUISANCES, Nuisances, joined
+from mauvecl.statistics.names import NUISANCES
+from mauvecl.statistics.nuisances import Nuisances, joined
 from mauvecl.statistics.statistic import Setting
 from mauvecl.study.nuisances import NuisanceChoice
 

@@ -22,9 +22,9 @@ from mauvecl.results.requests.requests import Shard
 from mauvecl.results.sums import Arrays
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, put_first, stacked, titled, told
-from mauvecl.study.searches import Sizes, Surveyed, sizes_of, surveyed
-from mauvecl.study.stares import orbit_lines
+from mauvecl.study.staring import orbit_lines
 from mauvecl.study.study import Study
+from mauvecl.study.surveys import Sizes, Surveyed, sizes_of, surveyed
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table

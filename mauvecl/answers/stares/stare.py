@@ -16,9 +16,10 @@ from mauvecl.lightcurve.search.alarms import Alarm, alarms
 from mauvecl.lightcurve.search.null import sampled
 from mauvecl.lightcurve.stares.observed import Draw, Light, Staring, seen
 from mauvecl.study.labels import described, label, stacked, titled, told
-from mauvecl.study.searches import surveyed
-from mauvecl.study.stares import check_sweep, energy_of, orbit_lines, stare_of, staring_of
+from mauvecl.study.stares import check_sweep
+from mauvecl.study.staring import energy_of, orbit_lines, stare_of, staring_of
 from mauvecl.study.study import Study
+from mauvecl.study.surveys import surveyed
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
