@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, create_model, field_validator, model_validator
+from pydantic import Field, ValidationInfo, create_model, field_validator, model_validator
 
 from mauvecl.host.quantities import is_quantity, numbers, unit_of
+from mauvecl.host.records import Record
 from mauvecl.host.sky import DEFAULT_SKY
 from mauvecl.noise.varied import VARIED
 from mauvecl.statistics.names import STATISTIC_NAMES, USUAL_STATISTICS
@@ -33,10 +34,8 @@ def plain(key: str, given: Any) -> Any:
     return given
 
 
-class Part(BaseModel):
-    """A section: frozen, and strict about its keys."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
+class Part(Record):
+    """A section of a study."""
 
     @field_validator("*", mode="before")
     @classmethod
