@@ -165,6 +165,7 @@ class Stares:
         alone = 1 if request.method == "cumulants" else self.opened.width
         piece = max(alone, REDUCED_BYTES // each // alone * alone)
         room = np.empty(each * piece // 4, np.float32)
+        beside = np.empty((1, piece, shape[0] + 1, shape[1]) if request.glow else 0, np.float32)
         with self._launches(components, stare, request.flares, *how) as launches:
 
             def work(tile: Tile, done: int) -> None:
@@ -175,7 +176,11 @@ class Stares:
                     launches.give(request.flares.part(first - request.start, few.wanted))
                     launches.draw(few, out, 0)
                     values = np.moveaxis(out[..., : stare.n_frames], 2, 3)[scenarios]
-                    found.append(dict(reduction(values, first)))
+                    more = []
+                    if request.glow:
+                        launches.glow(few, beside, 0)
+                        more = [np.moveaxis(beside[0, : few.wanted, :, : stare.n_frames], 1, 2)]
+                    found.append(dict(reduction(values, first, *more)))
                 # A tile that fails half way is drawn again.
                 parts.extend(found)
 

@@ -29,6 +29,7 @@ STREAMS = {
     "stare_unknown": 16,
     "stare_frame": 17,
     "stare_sums": 18,
+    "stare_glow": 19,
 }
 #: Added to the stream for the draws of a reference exposure.
 REFERENCE = 64

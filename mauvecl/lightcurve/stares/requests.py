@@ -31,12 +31,12 @@ class Reduction(Protocol):
     ----------
     adds : bool
         Whether what is kept are whole numbers that add up over stares; otherwise arrays are joined along their first
-        axis, with an entry for each stare.
+        axis, stares in their order.
     """
 
     adds: bool
 
-    def __call__(self, values: NDArray[np.float32], first: int) -> Mapping[str, NDArray[Any]]:
+    def __call__(self, values: NDArray[np.float32], first: int, *glow: NDArray[np.float32]) -> Mapping[str, NDArray[Any]]:
         """What is kept of stares `first` and on, each looked at by itself.
 
         Parameters
@@ -44,6 +44,8 @@ class Reduction(Protocol):
         values : ndarray of float32, shape (n_stare, n_frame, n_statistic)
             With scenarios one axis more in front; valid during the call.
         first : int
+        *glow : ndarray of float32, shape (n_stare, n_frame, n_statistic + 1)
+            Where the request has `glow`.
         """
 
 
@@ -59,6 +61,9 @@ class StaresRequest(Asked):
         Number of the first.
     reduction : Reduction, optional
         By default statistics are kept as they are.
+    glow : bool
+        Whether the reduction also takes what flares put into the frames need: a normal for each statistic, for their
+        own photons, and the factor on all light as drawn, less one.
     """
 
     components: Components
@@ -71,6 +76,7 @@ class StaresRequest(Asked):
     method: Method = "cumulants"
     cosmic_rays: CosmicRays | None = None
     reduction: Reduction | None = None
+    glow: bool = False
     #: Where rows of flares and amplitudes are counted from, where they differ from stare to stare.
     rows_from: int = field(init=False, default=0)
 

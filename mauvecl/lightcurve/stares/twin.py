@@ -57,6 +57,22 @@ def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int) -> dic
     }
 
 
+def glow(scene: StareScene, numbers: Numbers, frames: Iterable[int], seed: int) -> Floats:
+    """Beside the statistics of frames: a normal for each, for a flare's own photons; the factor on all light less one.
+
+    Returns
+    -------
+    ndarray of float32, shape (n_stare, n_frame, n_statistic + 1)
+    """
+    out = []
+    for frame in frames:
+        z: list[Floats] = []
+        for group in range(-(-len(scene.weights) // 4)):
+            z += four_normals(twin.words_at(numbers, int(scene.numbers[frame]), "stare_glow", group, seed))
+        out.append([*z[: len(scene.weights)], strengths(scene, numbers, frame, seed)["light"]])
+    return np.moveaxis(np.array(out), (0, 1, 2), (1, 2, 0))
+
+
 def _coefficients(scene: StareScene, flares: Flares, frame: int, scenario: int, light: Floats) -> list[Floats]:
     """Of the flare spectra, shape (n_stare,) each."""
     given = flares.rows[:, :, frame] * (scene.known[6, frame] * flares.amplitudes[scenario][:, None])
