@@ -19,7 +19,7 @@ from mauvecl.lightcurve.stares.scene import Flares, StareScene
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.lightcurve.stares.sums import SumTable
 from mauvecl.noise.processes import CosmicRays
-from mauvecl.results.requests import Share
+from mauvecl.results.requests.requests import Shard
 
 SEED = 2**63 + 12345
 #: Around the boundary of the counter's first word.
@@ -136,5 +136,5 @@ def test_what_flares_need_is_the_twins(stares: Stares, name: str, method: Any) -
     np.testing.assert_array_equal(found["glow"], twin.glow(StareScene.of(components, stare), numbers, frames, SEED))
     whole = stares.frames(components, stare, first=FIRST, count=COUNT, seed=SEED, method=method)
     np.testing.assert_array_equal(found["values"], whole)
-    part = stares.reduced(asked, Share(0, FIRST + 5, 21))
+    part = stares.reduced(asked, Shard(0, FIRST + 5, 21))
     np.testing.assert_array_equal(part["glow"], found["glow"][5:26])

@@ -36,7 +36,9 @@ class Reduction(Protocol):
 
     adds: bool
 
-    def __call__(self, values: NDArray[np.float32], first: int, *glow: NDArray[np.float32]) -> Mapping[str, NDArray[Any]]:
+    def __call__(
+        self, values: NDArray[np.float32], first: int, *glow: NDArray[np.float32]
+    ) -> Mapping[str, NDArray[Any]]:
         """What is kept of stares `first` and on, each looked at by itself.
 
         Parameters
