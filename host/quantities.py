@@ -133,13 +133,13 @@ def number(
     """
     wanted = expected or _expected(unit, low, high)
     if type(value) is float:
-        found = value
+        plain = value
     else:
         one = _plain(what, value, unit, wanted)
-        found = float(one) if not one.ndim else math.nan
-    if not (math.isfinite(found) and low <= found <= high):
+        plain = float(one) if not one.ndim else math.nan
+    if not (math.isfinite(plain) and low <= plain <= high):
         raise InputError(f"{what} = {_shown(value)}, expected {wanted}")
-    return found
+    return plain
 
 
 def numbers(
@@ -149,12 +149,12 @@ def numbers(
     import numpy as np
 
     wanted = _expected(unit, low, high)
-    found = _plain(what, values, unit, wanted)
-    bad = ~(np.isfinite(found) & (found >= low) & (found <= high))
+    plain = _plain(what, values, unit, wanted)
+    bad = ~(np.isfinite(plain) & (plain >= low) & (plain <= high))
     if bad.any():
-        first = found[np.unravel_index(int(np.argmax(bad)), found.shape)]
+        first = plain[np.unravel_index(int(np.argmax(bad)), plain.shape)]
         raise InputError(f"{what} = {first:g}{f' {unit}' if unit else ''}, expected {wanted}")
-    return found
+    return plain
 
 
 def count(what: str, value: Any, *, low: int = 0, high: int = 2**63 - 1) -> int:
@@ -168,15 +168,15 @@ def count(what: str, value: Any, *, low: int = 0, high: int = 2**63 - 1) -> int:
     wanted = f"a whole number from {low} to {high}" if high < 2**63 - 1 else f"a whole number of at least {low}"
     try:
         # Whole numbers beyond 2**53 are no floats.
-        found = operator.index(_no_truth(value))
+        whole = operator.index(_no_truth(value))
     except TypeError:
         plain = number(what, value, expected=wanted)
         if not plain.is_integer():
             raise InputError(f"{what} = {_shown(value)}, expected {wanted}") from None
-        found = int(plain)
-    if not low <= found <= high:
-        raise InputError(f"{what} = {found}, expected {wanted}")
-    return found
+        whole = int(plain)
+    if not low <= whole <= high:
+        raise InputError(f"{what} = {whole}, expected {wanted}")
+    return whole
 
 
 def _plain(what: str, value: Any, unit: str, wanted: str) -> NDArray[np.float64]:

@@ -170,11 +170,9 @@ class Source(ByContent):
         InputError
             If the file is missing, unreadable or holds no usable spectrum.
         """
-        found = read_spectrum(Path(path), wavelength_unit=wavelength_unit, flux_unit=flux_unit)
-        star = cls._made(
-            found.wavelength_nm, found.flux_flam, found.name, found.origin, found.notes, found.told, extend
-        )
-        unscaled = found.unscaled or star._too_bright()
+        read = read_spectrum(Path(path), wavelength_unit=wavelength_unit, flux_unit=flux_unit)
+        star = cls._made(read.wavelength_nm, read.flux_flam, read.name, read.origin, read.notes, read.told, extend)
+        unscaled = read.unscaled or star._too_bright()
         return replace(star, unscaled=unscaled) if unscaled else star
 
     @classmethod

@@ -84,15 +84,15 @@ class Launches:
 
     def _room(self, name: str, size: int) -> Any:
         """A buffer of at least so many bytes, kept from launch to launch."""
-        found = self._named.get(name)
-        if found is None or found.size < size:
-            if found is not None:
-                self._buffers.remove(found)
-                found.release()
-            found = self._cl.Buffer(self._device.context, self._cl.mem_flags.READ_WRITE, size)
-            self._named[name] = found
-            self._buffers.append(found)
-        return found
+        buffer = self._named.get(name)
+        if buffer is None or buffer.size < size:
+            if buffer is not None:
+                self._buffers.remove(buffer)
+                buffer.release()
+            buffer = self._cl.Buffer(self._device.context, self._cl.mem_flags.READ_WRITE, size)
+            self._named[name] = buffer
+            self._buffers.append(buffer)
+        return buffer
 
     def _launch(self, name: str, items: tuple[int, ...], *arguments: Any) -> None:
         if name not in self._kernels:
@@ -304,11 +304,11 @@ class Launches:
             return
         self._cl.enqueue_copy(self._queue, self._named["outside"], np.zeros_like(outside))
         for index in np.flatnonzero(outside):
-            found = tally.add_far(int(index), self.channel(tile, tally.grids[index].channel))
-            if found != outside[index]:
+            outlying = tally.add_far(int(index), self.channel(tile, tally.grids[index].channel))
+            if outlying != outside[index]:
                 raise DeviceError(
                     f"{self._device.name} has {outside[index]} values outside a histogram where the host has "
-                    f"{found}, expected the same arithmetic"
+                    f"{outlying}, expected the same arithmetic"
                 )
 
     def flush(self, tally: Tally) -> None:

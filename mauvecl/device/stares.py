@@ -132,8 +132,8 @@ class Stares:
                 launches.draw(tile, out, done)
 
             self._tiles.over(first, count, out[:, 0].nbytes, work)
-        found = np.moveaxis(out[..., : stare.n_frames], 2, 3)
-        return found[0] if amplitudes is None else found
+        frames = np.moveaxis(out[..., : stare.n_frames], 2, 3)
+        return frames[0] if amplitudes is None else frames
 
     def reduced(self, request: StaresRequest, shard: Shard | None = None) -> Arrays:
         """What is kept of a request's stares, or of a shard of them, which are drawn and reduced a few at a time.
@@ -169,7 +169,7 @@ class Stares:
         with self._launches(components, stare, request.flares, *how) as launches:
 
             def work(tile: Tile, done: int) -> None:
-                found = []
+                reduced = []
                 for few in tile.pieces(piece):
                     out = room[: each * few.wanted // 4].reshape(-1, few.wanted, *shape)
                     first = few.first + few.start
@@ -180,13 +180,13 @@ class Stares:
                     if request.glow:
                         launches.glow(few, beside, 0)
                         more = [np.moveaxis(beside[0, : few.wanted, :, : stare.n_frames], 1, 2)]
-                    found.append(dict(reduction(values, first, *more)))
+                    reduced.append(dict(reduction(values, first, *more)))
                 # A tile that fails half way is drawn again.
-                parts.extend(found)
+                parts.extend(reduced)
 
             self._tiles.over(there.start, there.count, each, work)
-        found = joined(parts, adds=reduction.adds)
-        return found | {"start": np.array(there.start)} if shard else found
+        kept = joined(parts, adds=reduction.adds)
+        return kept | {"start": np.array(there.start)} if shard else kept
 
     def _launches(
         self,

@@ -111,14 +111,14 @@ class Drawn:
     @classmethod
     def of(cls, scene: Scene) -> Drawn | None:
         """Of a scene; None where nothing is drawn."""
-        found: dict[str, list[Spread]] = {}
+        spreads: dict[str, list[Spread]] = {}
         for (name, factor), table in zip(scene.modulations, scene.priors, strict=True):
             one = _of_table(table)
             if name == "jitter" and scene.n_frames > 1:
                 one = _normal(one.mean, one.sd / np.sqrt(scene.n_frames))
-            found.setdefault(factor, []).append(one)
+            spreads.setdefault(factor, []).append(one)
         medians = dict(zip(("light", "dark", "sky"), scene.medians, strict=True))
-        return cls({name: _together(ones, medians[name]) for name, ones in found.items()}) if found else None
+        return cls({name: _together(ones, medians[name]) for name, ones in spreads.items()}) if spreads else None
 
     def nodes(self, x: Expectation, *, weighted: bool) -> tuple[list[Node], Float]:
         """What the factors do to an exposure.

@@ -265,12 +265,12 @@ class SnrResult(ByContent):
             for i, (c, e) in enumerate(zip(cumulative, edges, strict=True))
         ])  # fmt: skip
         for i in spread_out:
-            filled, found = self.counts.filled(kind, i)
+            filled, held = self.counts.filled(kind, i)
             middle = snr(i, filled + 0.5)
-            mean[i] = found @ middle / self.counts.n
-            std[i] = np.sqrt(found @ (middle - mean[i]) ** 2 / self.counts.n)
+            mean[i] = held @ middle / self.counts.n
+            std[i] = np.sqrt(held @ (middle - mean[i]) ** 2 / self.counts.n)
             ends = np.column_stack([snr(i, filled), snr(i, filled + 1)]).ravel()
-            quantiles[i] = np.interp(np.array(PERCENTAGES) / 100, steps_of(found) / self.counts.n, ends)
+            quantiles[i] = np.interp(np.array(PERCENTAGES) / 100, steps_of(held) / self.counts.n, ends)
         table = QTable()
         table["wavelength"] = wavelength_nm * u.nm
         table["expected"] = expected

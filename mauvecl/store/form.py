@@ -181,12 +181,12 @@ class Store:
         InputError
             If there is none.
         """
-        found = next((scene for scene in self.scenes if scene.path == path), None)
-        if found is None:
+        known = next((scene for scene in self.scenes if scene.path == path), None)
+        if known is None:
             raise InputError(
                 f"no array {path!r} in {self.path.name}, expected one of {', '.join(s.path for s in self.scenes)}"
             )
-        return found
+        return known
 
     @property
     def rows(self) -> int:

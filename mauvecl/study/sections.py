@@ -83,18 +83,20 @@ class Star(Part):
         from mauvecl.host.stars.source import Source
 
         if self.library is not None:
-            found = Source.from_library(self.library)
+            source = Source.from_library(self.library)
         else:
-            found = Source.read(
+            source = Source.read(
                 self.file or "", wavelength_unit=self.wavelength_unit, flux_unit=self.flux_unit, extend=self.extend
             )
         if self.effective_temperature_k is not None:
-            found = replace(found, temperature_k=self.effective_temperature_k)
+            source = replace(source, temperature_k=self.effective_temperature_k)
         if self.bin_nm is not None:
-            found = found.binned(self.bin_nm)
+            source = source.binned(self.bin_nm)
         if self.ebv is not None:
-            found = found.reddened(self.ebv)
-        return found if self.magnitude is None else found.at_magnitude(self.magnitude, self.band, self.magnitude_system)
+            source = source.reddened(self.ebv)
+        if self.magnitude is None:
+            return source
+        return source.at_magnitude(self.magnitude, self.band, self.magnitude_system)
 
 
 class Flare(Part):

@@ -86,7 +86,7 @@ def test_resume_gives_the_same(found, stares, tmp_path):
         inject(study(), stares, checkpoint=checkpoint, progress=stop, threads=1)
     with Checkpoint(tmp_path, "inject", study(), patience_s=0, resume=True) as checkpoint:
         again = inject(study(), stares, checkpoint=checkpoint)
-        assert checkpoint.found >= 2
+        assert checkpoint.resumed >= 2
     assert (again.stars[0].found.critical == found.stars[0].found.critical).all()
     assert np.array_equal(again.stars[0].fitted.energy_ratio, found.stars[0].fitted.energy_ratio, equal_nan=True)
 

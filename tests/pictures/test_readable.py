@@ -116,4 +116,4 @@ def test_a_flare_that_is_detected_is_seen(engine: Engine) -> None:
     (line,) = [line for line in figure.axes[1].lines if len(line.get_ydata()) > 2]
     assert 3.0 < max(line.get_ydata()) < 6.0
     # The last element of the spectrum is a part of one, and is left out.
-    assert line.get_xdata()[-1] < answer.stars[0].found.quiet.element_wavelength_nm[-1]
+    assert line.get_xdata()[-1] < answer.stars[0].detection.quiet.element_wavelength_nm[-1]

@@ -148,9 +148,9 @@ def detection_map(
                 progress(number * cells + done, len(studies) * cells)
 
         maps.append(_map(one, x, y, engine, seen, told_of))
-    found, parts = maps[0], {}
+    values, parts = maps[0], {}
     if unknown is not None:
-        found = _averaged(maps)
+        values = _averaged(maps)
         for s, statistic in enumerate(study.run.statistics):
             means = [float(np.nanmean(one["probability"][s])) for one in maps]
             parts[statistic] = shares(unknown, np.array(means))
@@ -165,10 +165,10 @@ def detection_map(
         x=x,
         y=y,
         statistics=study.run.statistics,
-        messages=[*_blinded(found["probability"]), *told(seen), *marginal_lines(study), *_cost(study, x, y)],
+        messages=[*_blinded(values["probability"]), *told(seen), *marginal_lines(study), *_cost(study, x, y)],
         shares=parts,
         quiet=quiet,
-        **found,
+        **values,
     )
 
 
@@ -208,12 +208,12 @@ def _map(
     from mauvecl.runs.pool import together
 
     shape = (len(study.run.statistics), len(y), len(x))
-    found = {name: np.full(shape, np.nan) for name in ("probability", "low", "high", "closed_form")}
+    values = {name: np.full(shape, np.nan) for name in ("probability", "low", "high", "closed_form")}
 
     def filled(cells: list[tuple[int, int]]) -> tuple[Expectation, int]:
         quiet, flares = _expectations(study, [(x[i], y[j]) for i, j in cells])
         if not quiet.saturated.all():
-            _fill(found, cells, study, quiet, flares, engine)
+            _fill(values, cells, study, quiet, flares, engine)
         return quiet, len(cells)
 
     done = 0
@@ -221,17 +221,17 @@ def _map(
         seen.append(quiet)
         done += count
         told_of(done)
-    return found
+    return values
 
 
 def _averaged(maps: list[Arrays]) -> Arrays:
     """The mean over draws of the unknown, with its interval; NaN where a draw has none."""
-    found = {name: np.mean([one[name] for one in maps], axis=0) for name in ("probability", "closed_form")}
-    found |= {name: np.full_like(found["probability"], np.nan) for name in ("low", "high")}
-    for at in zip(*np.nonzero(np.isfinite(found["probability"])), strict=True):
+    values = {name: np.mean([one[name] for one in maps], axis=0) for name in ("probability", "closed_form")}
+    values |= {name: np.full_like(values["probability"], np.nan) for name in ("low", "high")}
+    for at in zip(*np.nonzero(np.isfinite(values["probability"])), strict=True):
         p = average([Interval(*(float(one[name][at]) for name in ("probability", "low", "high"))) for one in maps])
-        found["low"][at], found["high"][at] = p.low, p.high
-    return found
+        values["low"][at], values["high"][at] = p.low, p.high
+    return values
 
 
 def _groups(study: Study, x: tuple[float | str, ...], y: tuple[float | str, ...]) -> list[list[tuple[int, int]]]:
@@ -257,7 +257,7 @@ def _expectations(study: Study, cells: list[tuple[float | str, float | str]]) ->
 
 
 def _fill(
-    found: dict[str, NDArray[np.float64]],
+    values: dict[str, NDArray[np.float64]],
     cells: list[tuple[int, int]],
     study: Study,
     quiet: Expectation,
@@ -270,7 +270,7 @@ def _fill(
         probabilities = result.detection_probability(run.fap, statistic)
         for k, ((i, j), p) in enumerate(zip(cells, probabilities, strict=True)):
             at = (s, j, i)
-            found["probability"][at], found["low"][at], found["high"][at] = p.value, p.low, p.high
+            values["probability"][at], values["low"][at], values["high"][at] = p.value, p.low, p.high
             limit = result.closed_form(statistic, template=k).isf(run.fap)
             if k not in result.blinding:
-                found["closed_form"][at] = result.closed_form(statistic, k).sf(limit)
+                values["closed_form"][at] = result.closed_form(statistic, k).sf(limit)

@@ -58,8 +58,8 @@ class UnknownTable:
         -----
         S/N grows with the amplitude; the flare's own photon noise is left out.
         """
-        (amplitude, found), *_ = ((a, c) for (name, a), c in self.costs.items() if name == star)
-        cost = next(iter(found.values())) if unknown is None else found[unknown]
+        (amplitude, costs), *_ = ((a, c) for (name, a), c in self.costs.items() if name == star)
+        cost = next(iter(costs.values())) if unknown is None else costs[unknown]
         snr = cost.known if unknown is None else cost.marginal
         needed = special.ndtri(self.study.limit.power) - special.ndtri(self.study.run.fap)
         return float(amplitude * needed / snr) if snr > 0 else float("inf")
@@ -71,8 +71,8 @@ class UnknownTable:
 
         rows = [
             (star, amplitude, unknown, c.known, c.plain, c.marginal, self.smallest(star, unknown))
-            for (star, amplitude), found in self.costs.items()
-            for unknown, c in found.items()
+            for (star, amplitude), costs in self.costs.items()
+            for unknown, c in costs.items()
         ]
         table = QTable(rows=rows, names=("star", "amplitude", "unknown", "known", "plain", "marginalised", "smallest"))
         for name, text in (

@@ -41,17 +41,17 @@ NAMES = {
 
 def assumptions(nominal: Instrument) -> tuple[Assumption, ...]:
     """The uncertain values of the payload and their ranges, those of a study's `Unknowns` to one standard deviation."""
-    found = []
+    rows = []
     for name, prior in Unknowns().priors().items():
         ends = (prior.low, prior.high) if isinstance(prior, Uniform) else (prior.mean - prior.sd, prior.mean + prior.sd)
         # The quantum efficiency scales all light alike, as the area does.
         key, scale = ("collecting_area_cm2", nominal.collecting_area_cm2) if name == "qe_scale" else (name, 1.0)
         low, high = ({key: scale * float(f"{end:.12g}")} for end in ends)
-        found.append(Assumption(NAMES[name], (f"{ends[0]:g}", f"{ends[1]:g}"), (low, high)))
+        rows.append(Assumption(NAMES[name], (f"{ends[0]:g}", f"{ends[1]:g}"), (low, high)))
     dark = Assumption(
         "dark counts are Poisson in", ("DN", "electrons"), ({"dark_unit": "DN"}, {"dark_unit": "electrons"})
     )
-    return (*found, dark)
+    return (*rows, dark)
 
 
 @dataclass(frozen=True)
@@ -119,13 +119,13 @@ def what_matters(study: Study) -> QTable:
 def _moves(study: Study, star: Star, amplitude: float | None, statistic: str) -> list[Moved]:
     question = LimitSearch(study, star, amplitude, statistic)
     nominal = question.root()
-    found = []
+    moves = []
     for assumption in assumptions(study.load_instrument()):
         ends = [
             LimitSearch(study.with_instrument(change), star, amplitude, statistic).root(near=nominal)
             for change in assumption.changes
         ]
-        found.append(
+        moves.append(
             Moved(
                 star=star.library or str(star.file),
                 amplitude=float("nan") if amplitude is None else amplitude,
@@ -135,4 +135,4 @@ def _moves(study: Study, star: Star, amplitude: float | None, statistic: str) ->
                 at_ends=(ends[0], ends[1]),
             )
         )
-    return found
+    return moves

@@ -304,15 +304,15 @@ def limiting_magnitude(
             # One star's failure does not lose the others'.
             return error
 
-    found: list[Limit | InputError] = []
+    outcomes: list[Limit | InputError] = []
     for one in together(engine, solved, asked):
-        found.append(one)
+        outcomes.append(one)
         if progress is not None:
-            progress(len(found), len(asked))
-    errors = [one for one in found if isinstance(one, InputError)]
-    if len(errors) == len(found):
+            progress(len(outcomes), len(asked))
+    errors = [one for one in outcomes if isinstance(one, InputError)]
+    if len(errors) == len(outcomes):
         raise errors[0]
-    result.limits.extend(one for one in found if isinstance(one, Limit))
+    result.limits.extend(one for one in outcomes if isinstance(one, Limit))
     result.failed = tuple(dict.fromkeys(map(str, errors)))
     return result
 

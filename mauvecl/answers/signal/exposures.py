@@ -151,16 +151,16 @@ def exposure_for(
     if snr is None or wavelength_nm is None:
         missing = "S/N" if snr is None else "wavelength"
         raise InputError(f"no wanted {missing}, expected --snr and --at, or snr and wavelength_nm of a study's signal")
-    found, failed = [], []
+    answered, failed = [], []
     for star in study.star:
         try:
-            found.append(_one(study, star, snr, wavelength_nm, per))
+            answered.append(_one(study, star, snr, wavelength_nm, per))
         except InputError as error:
             # One star's failure does not lose the others'.
             failed.append(error)
-    if not found:
+    if not answered:
         raise failed[0]
-    exposures, seen = zip(*found, strict=True)
+    exposures, seen = zip(*answered, strict=True)
     long = [f"{e.star} needs more than a day: {np.ceil(e.exposure_s / DAY_S):.0f} exposures of a day at most, added up."
             for e in exposures if e.exposure_s > DAY_S]  # fmt: skip
     messages = [*(f"NO ANSWER: {error}." for error in failed), *told(list(seen)), *long]

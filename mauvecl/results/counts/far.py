@@ -194,6 +194,6 @@ class Far:
         self.second += other.second
         self.undefined += other.undefined
 
-    def found(self) -> FarCounts:
+    def frozen(self) -> FarCounts:
         """All of it."""
         return FarCounts(self.bins.keys, self.bins.counts, self.first, self.second, self.undefined)
