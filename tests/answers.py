@@ -16,9 +16,9 @@ N = 30_000
 
 def same(ours: Detection, theirs: Detection) -> None:
     """Every count, sum and extreme, to the bit."""
-    assert ours._found.keys() == theirs._found.keys()
-    for key, found in ours._found.items():
-        other = theirs._found[key]
+    assert ours._distributions.keys() == theirs._distributions.keys()
+    for key, found in ours._distributions.items():
+        other = theirs._distributions[key]
         np.testing.assert_array_equal(found.counts, other.counts)
         assert (found.first, found.second, found.n) == (other.first, other.second, other.n)
         assert found.far.equals(other.far)

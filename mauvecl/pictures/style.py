@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from mauvecl.host.errors import InputError
+from mauvecl.host.files.whole import write_whole
 from mauvecl.host.plotting import AXES
-from mauvecl.runs.durable import write_whole
 
 #: Okabe and Ito's colours, which colour-blind readers can tell apart (jfly.uni-koeln.de/color).
 COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7", "#000000")

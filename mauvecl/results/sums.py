@@ -64,10 +64,7 @@ class DetectionSums:
     def answer(self) -> Detection:
         """The answer, once all shards have come."""
         asked = self._request
-        h = asked.hypotheses
-        detection = Detection(
-            h.quiet, h.flares, h.asked, h.scene, asked.realisations, asked.tails, asked.seed, nuisances=h.nuisances
-        )
+        detection = Detection.of(asked.hypotheses, asked.realisations, asked.tails, asked.seed)
         for (plan, _), (tally, samples) in zip(asked.plans, self._sums, strict=True):
             detection.collect(plan, tally, samples)
         return detection

@@ -27,8 +27,9 @@ import numpy as np
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import read_bytes
 from mauvecl.host.files.parsed import json_data, read_text
+from mauvecl.host.files.whole import UNFINISHED, write_whole
 from mauvecl.host.version import VERSION
-from mauvecl.runs.durable import UNFINISHED, alone, differing_keys, write_whole
+from mauvecl.runs.durable import alone, differing_keys
 from mauvecl.runs.shards import FORM
 
 if TYPE_CHECKING:

@@ -14,8 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
+from mauvecl.host.files.whole import UNFINISHED, write_whole
 from mauvecl.host.quantities import count as whole
-from mauvecl.runs.durable import UNFINISHED, alone, write_whole
+from mauvecl.runs.durable import alone
 from mauvecl.runs.pool import Pool, together
 from mauvecl.store.export import Selection, export
 from mauvecl.store.form import CRC_BYTES, Chunk, Store, StoredScene, crc, digest

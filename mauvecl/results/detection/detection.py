@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -47,8 +47,16 @@ class Detection(ByContent, Hypotheses):
     tails: Tails = "counted"
     seed: int = 0
     _tails: dict[tuple[str, int, float], Tail] = field(default_factory=dict, init=False, repr=False, compare=False)
-    _found: dict[Key, Distribution] = field(default_factory=dict, init=False, repr=False)
+    _distributions: dict[Key, Distribution] = field(default_factory=dict, init=False, repr=False)
     _samples: dict[Key, TailSamples] = field(default_factory=dict, init=False, repr=False)
+
+    @classmethod
+    def of(cls, hypotheses: Hypotheses, realisations: int, tails: Tails, seed: int) -> Self:
+        """Of hypotheses as they are: nothing is prepared again, and closed forms that one computes the other has."""
+        made = object.__new__(cls)
+        counts: dict[str, Any] = {"_tails": {}, "_distributions": {}, "_samples": {}}
+        vars(made).update(vars(hypotheses) | counts, realisations=realisations, tails=tails, seed=seed)
+        return made
 
     def _line(self) -> str:
         flares, names = len(self.flares), ", ".join(self.statistics)
@@ -57,7 +65,7 @@ class Detection(ByContent, Hypotheses):
     def collect(self, plan: ChannelPlan, tally: Tally, samples: Sequence[TailSamples | None]) -> None:
         """Take over the distributions and tails of one batch."""
         for index, (key, kept) in enumerate(zip(plan.keys, samples, strict=True)):
-            self._found[key] = tally.distribution(index)
+            self._distributions[key] = tally.distribution(index)
             if kept is not None:
                 self._samples[key] = kept
 
@@ -80,7 +88,7 @@ class Detection(ByContent, Hypotheses):
     def _at(self, key: Key) -> Distribution:
         """What was counted; InputError where it has values that are no finite numbers."""
         statistic, role, flare = key
-        counted = self._found[key]
+        counted = self._distributions[key]
         of = "without a flare" if role == "null" else f"with flare {flare + 1}"
         counted.refuse_undefined(f"statistic {statistic!r} {of}")
         return counted
