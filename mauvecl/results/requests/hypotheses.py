@@ -51,7 +51,7 @@ class Hypotheses:
     statistics: tuple[str, ...] = field(init=False)
     setting: Setting = field(init=False, repr=False)
     _chosen: dict[str, Statistic] = field(init=False, repr=False)
-    _forms: dict[tuple[str, int | None, int], Form] = field(default_factory=dict, init=False, repr=False)
+    _forms: dict[tuple[str, int | None, int], Form] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         self._chosen = chosen(self.asked)
