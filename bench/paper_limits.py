@@ -14,7 +14,7 @@ from pathlib import Path
 from astropy.table import vstack
 
 from mauvecl import Study, limiting_magnitude
-from mauvecl.answers.assumptions import what_matters
+from mauvecl.answers.limits.assumptions import what_matters
 from mauvecl.statistics.registry import STATISTICS
 
 KEPT = ("amplitude", "exposure", "statistic", "magnitude", "low", "high", "closed_form", "check")

@@ -1,17 +1,22 @@
-"""Units at the door: numbers, arrays and counts, from Quantities of any fitting unit or plain in the documented one."""
+"""Units at the door: numbers, arrays and counts, from Quantities of any fitting unit or plain in the documented one.
+
+What checks a plain number loads no numpy: a wrong one is told at once.
+"""
 
 from __future__ import annotations
 
+import math
 import operator
 from collections.abc import Callable
 from functools import wraps
 from inspect import isclass, signature
-from typing import Any, TypeVar, cast
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any, TypeVar, cast
 
 from .errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 Given = TypeVar("Given", bound=Callable[..., Any])
 
@@ -105,7 +110,7 @@ takes_quantities = takes_quantities_of()
 
 
 def number(
-    what: str, value: Any, unit: str = "", *, low: float = -np.inf, high: float = np.inf, expected: str = ""
+    what: str, value: Any, unit: str = "", *, low: float = -math.inf, high: float = math.inf, expected: str = ""
 ) -> float:
     """One finite number in a unit.
 
@@ -127,18 +132,22 @@ def number(
         If it is no such number, not finite, or outside.
     """
     wanted = expected or _expected(unit, low, high)
-    found = _plain(what, value, unit, wanted)
-    if found.ndim:
+    if type(value) is float:
+        found = value
+    else:
+        one = _plain(what, value, unit, wanted)
+        found = float(one) if not one.ndim else math.nan
+    if not (math.isfinite(found) and low <= found <= high):
         raise InputError(f"{what} = {_shown(value)}, expected {wanted}")
-    if not (np.isfinite(found) and low <= found <= high):
-        raise InputError(f"{what} = {_shown(value)}, expected {wanted}")
-    return float(found)
+    return found
 
 
 def numbers(
-    what: str, values: Any, unit: str = "", *, low: float = -np.inf, high: float = np.inf
+    what: str, values: Any, unit: str = "", *, low: float = -math.inf, high: float = math.inf
 ) -> NDArray[np.float64]:
     """An array of finite numbers in a unit, of the shape of `values`; parameters and errors as for `number`."""
+    import numpy as np
+
     wanted = _expected(unit, low, high)
     found = _plain(what, values, unit, wanted)
     bad = ~(np.isfinite(found) & (found >= low) & (found <= high))
@@ -171,6 +180,8 @@ def count(what: str, value: Any, *, low: int = 0, high: int = 2**63 - 1) -> int:
 
 
 def _plain(what: str, value: Any, unit: str, wanted: str) -> NDArray[np.float64]:
+    import numpy as np
+
     try:
         if is_quantity(value):
             value = _converted(value, unit)
@@ -198,16 +209,16 @@ def _converted(value: Any, unit: str) -> Any:
 
 
 def _no_truth(value: Any) -> Any:
-    if isinstance(value, bool | np.bool_):
+    if isinstance(value, bool):
         raise TypeError("true or false is no number")
     return value
 
 
 def _expected(unit: str, low: float, high: float) -> str:
     word = WORDS.get(unit, unit)
-    if np.isfinite(low) and np.isfinite(high):
+    if math.isfinite(low) and math.isfinite(high):
         return f"{low:g} to {high:g}{f' {unit}' if unit else ''}"
-    return f"{word} of at least {low:g}" if np.isfinite(low) else word
+    return f"{word} of at least {low:g}" if math.isfinite(low) else word
 
 
 def _shown(value: Any) -> str:

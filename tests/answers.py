@@ -6,11 +6,11 @@ from typing import Any
 
 import numpy as np
 
-from mauvecl.results.detection import Detection
+from mauvecl.results.detection.detection import Detection
 from mauvecl.results.snr import Counts, SnrResult
 from mauvecl.study.study import Study
 
-#: Realisations: several shares, the last a short one.
+#: Realisations: several shards, the last a short one.
 N = 30_000
 
 

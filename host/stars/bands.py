@@ -12,20 +12,9 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..files.bounded import shortened
 from ..remembered import remembered
+from .band_names import known_band
 from .catalogue import band_table, find, spectrum_table
 
-#: Band names and what else they answer to.
-ALIASES = {
-    "B": ("Johnson B",),
-    "V": ("Johnson V",),
-    "Kepler": ("Kp", "Kepler Kp"),
-    "TESS": ("T",),
-    "Gaia G": ("G", "Gaia DR2 G"),
-    "Gaia BP": ("BP", "Gaia DR2 BP"),
-    "Gaia RP": ("RP", "Gaia DR2 RP"),
-    "GALEX NUV": ("NUV",),
-    "GALEX NUV Vega": ("NUV Vega",),
-}
 #: What a magnitude may mean: what catalogues print in the band, Vega at zero in every band, or AB.
 System = Literal["catalogue", "vega", "ab"]
 SYSTEMS: tuple[System, ...] = get_args(System)
@@ -76,15 +65,6 @@ def band(name: str) -> Band:
         If there is none of that name.
     """
     return _load(known_band(name))
-
-
-def known_band(name: str) -> str:
-    """A band's own name, by name or alias; errors as `band`."""
-    wanted = name.strip().casefold()
-    for known, others in ALIASES.items():
-        if wanted in (known.casefold(), *(other.casefold() for other in others)):
-            return known
-    raise InputError(f"band {name!r} is unknown, expected one of {', '.join(ALIASES)}")
 
 
 @cache

@@ -138,7 +138,7 @@ def write_record(
         record["devices"] = [asdict(device) for device in devices]
         record["kernels"] = (pool or opened).kernel_digest  # type: ignore[union-attr]
         if pool is not None:
-            record["shares"] = asdict(pool.standing)
+            record["shards"] = asdict(pool.standing)
         told = "not run on this device and version: mauvecl selftest"
         record["selftest"] = [last(device) or told for device in devices]
     stale: list[Path] = []

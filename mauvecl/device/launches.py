@@ -13,8 +13,8 @@ from mauvecl.device.tiles import Tile
 from mauvecl.noise import layout
 from mauvecl.noise.pixels import PIXEL_BLOCK
 from mauvecl.noise.scene import Scene
+from mauvecl.results.counts.tally import Grid, Tally
 from mauvecl.results.snr import Counts
-from mauvecl.results.tally import Grid, Tally
 
 if TYPE_CHECKING:
     from mauvecl.device.program import Variant
@@ -23,10 +23,10 @@ if TYPE_CHECKING:
 MOST_COUNTED = 2**25
 #: Raw spectra looked at together on the host.
 PIECE = 4096
-#: Kernels of a detection, the first where more is compared than the template.
+#: Kernels of a detection, the first where more is compared than the expectation.
 COMPARED, DETECTION = ("sums", "comparison", "tally", "marginal"), ("sums", "statistics", "tally", "marginal")
 #: Work-items to an element or channel of a histogram, on a device of many.
-SHARES = 1024
+ITEMS = 1024
 
 
 class Launches:
@@ -156,7 +156,7 @@ class Launches:
     def histogram(self, tile: Tile, counts: Counts) -> None:
         """Count each pixel's DN and each element's S/N of a tile on the device."""
         width = self.variant.width
-        items = (self._n_element,) if width > 1 else (self._n_element, min(tile.wanted, SHARES))
+        items = (self._n_element,) if width > 1 else (self._n_element, min(tile.wanted, ITEMS))
         self._launch(
             "histogram",
             items,
@@ -243,7 +243,7 @@ class Launches:
         """
         scene = self._scene
         more = map(self.upload, (beyond(scene.estimates), bands, finished, scales, scale_end))
-        self._weighing = [self.upload(scene.templates), *self._weighing, *more, np.uint32(scales.shape[1])]
+        self._weighing = [self.upload(scene.references), *self._weighing, *more, np.uint32(scales.shape[1])]
         self._rows += len(scales)
 
     def statistics(self, tile: Tile) -> None:
@@ -272,16 +272,16 @@ class Launches:
     def tally(self, tile: Tile, tally: Tally) -> None:
         """Add a tile's channels to the histograms and integer sums on the device."""
         count = len(tally.grids)
-        shares = 1 if self.variant.width > 1 else SHARES
+        items = 1 if self.variant.width > 1 else ITEMS
         if "grids" not in self._named:
             self._named["grids"] = self.upload(Grid.pack(tally.grids))
             self._named["histogram"] = self.upload(np.zeros((count, layout.BINS), np.uint32))
-            self._named["sums"] = self.upload(np.zeros((count, shares, 2), np.int64))
+            self._named["sums"] = self.upload(np.zeros((count, items, 2), np.int64))
             self._named["outside"] = self.upload(np.zeros(count, np.uint32))
         named = self._named
         self._launch(
             "tally",
-            (count,) if shares == 1 else (count, shares),
+            (count,) if items == 1 else (count, items),
             *tile.rows(),
             np.uint32(tile.size),
             named["values"],

@@ -60,7 +60,7 @@ class DeviceRecord:
 
 @dataclass(frozen=True)
 class Variant:
-    """What the templates are rendered for; no value of a study is among it."""
+    """What kernels are rendered for; no value of a study is among it."""
 
     width: int
     vector_forms: bool
@@ -92,7 +92,7 @@ class Variant:
 
     @property
     def compared(self) -> bool:
-        """Whether more is compared than the template by the model's variances."""
+        """Whether more is compared than the expectation by the model's variances."""
         return self.pair or self.noisy or self.estimated or self.slots > 0
 
 
@@ -221,12 +221,12 @@ def choose_device(wanted: str | None) -> tuple[Any, DeviceRecord]:
 
 @cache
 def render(rooms: tuple[str, ...], variant: Variant) -> str:
-    """The OpenCL C source of these templates, after the shared ones.
+    """The OpenCL C source of these files, after the shared ones.
 
     Parameters
     ----------
     rooms : tuple of str
-        Template names without their ending, such as ``("statistics",)``.
+        Names of kernel sources without their ending, such as ``("statistics",)``.
     variant : Variant
         Widths and switches.
     """
@@ -259,7 +259,7 @@ def render(rooms: tuple[str, ...], variant: Variant) -> str:
     structs = layout.c_structs()
 
     def make() -> str:
-        parts = (str(_template(text).render(**values)) for text in texts)
+        parts = (str(_parsed(text).render(**values)) for text in texts)
         return "\n".join((f"/* mauvecl {VERSION} */", structs, *parts))
 
     # Rendering takes longer than starting a kernel that is built already.
@@ -267,7 +267,7 @@ def render(rooms: tuple[str, ...], variant: Variant) -> str:
 
 
 @cache
-def _template(text: str) -> Any:
+def _parsed(text: str) -> Any:
     # Heavy to import.
     from mako.template import Template
 

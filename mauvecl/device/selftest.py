@@ -19,16 +19,15 @@ from mauvecl.device.probes import Probes
 from mauvecl.device.program import SAME_BITS
 from mauvecl.host.expectation import Expectation
 from mauvecl.host.version import VERSION
-from mauvecl.noise import layout
-from mauvecl.noise import twin as reference
+from mauvecl.noise import layout, twin
 from mauvecl.noise.comparison import Comparison
 from mauvecl.noise.processes import CosmicRays, Processes, Uniform
 from mauvecl.noise.scene import Scene, prepare
-from mauvecl.results import twin as reference_sums
-from mauvecl.results.channels import ChannelPlan, plan_channels
-from mauvecl.results.hypotheses import Hypotheses
+from mauvecl.results import twin as sums_twin
+from mauvecl.results.counts.tally import Tally
+from mauvecl.results.requests.channels import ChannelPlan, plan_channels
+from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.results.snr import Counts, elements, observers
-from mauvecl.results.tally import Tally
 from mauvecl.statistics.nuisances import known
 from mauvecl.statistics.registry import STATISTICS
 
@@ -127,7 +126,7 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
         },
     ),
 }
-#: Statistics that the fast kernel knows, where nothing but the template is compared.
+#: Statistics that the fast kernel knows, where nothing but the expectation is compared.
 FAST = tuple(name for name, one in STATISTICS.items() if not one.paired)
 #: Across the boundary of the counter's first word.
 START, COUNT, SEED = 2**40 - 13, 40, 2**63 + 20_261_121
@@ -161,12 +160,12 @@ def twin_digests(name: str) -> dict[str, str]:
     quiet, flare = toy(**options), toy(flare=0.3, **options)
     scene, index = prepare([quiet], **_laid_out(how)), np.arange(START, START + COUNT, dtype=np.uint64)
     both = prepare([quiet, flare], **_laid_out(how))
-    raw = reference.realise(scene, index, SEED)
-    clipped = reference.clipped(scene, index, SEED)
-    seen = reference_sums.histograms(scene, observers(quiet, scene), elements(quiet), index, SEED)
+    raw = twin.realise(scene, index, SEED)
+    clipped = twin.clipped(scene, index, SEED)
+    seen = sums_twin.histograms(scene, observers(quiet, scene), elements(quiet), index, SEED)
     values, plan = _statistics(name, both)
     tally = Tally(plan.grids[plan.keys.index(("chi2", "null", 0)) :][:1])
-    counts, sums, _ = reference_sums.tally(values, tally.packed)
+    counts, sums, _ = sums_twin.tally(values, tally.packed)
     tally.add(counts, sums, COUNT)
     tally.add_far(0, values[tally.grids[0].channel])
     null = tally.distribution(0)
@@ -187,10 +186,10 @@ def _statistics(name: str, scene: Scene) -> tuple[NDArray[np.float32], ChannelPl
     found = Hypotheses(quiet, (flare,), _asked(how), scene, nuisances=unknown)
     plan = plan_channels(found, range(1), first=True)
     index = np.arange(START, START + COUNT, dtype=np.uint64)
-    smoothed = reference_sums.Smoothed.of(found, plan) if len(plan.scales) else None
+    smoothed = sums_twin.Smoothed.of(found, plan) if len(plan.scales) else None
     paired = "chi2_pair" in _asked(how)
-    sums = reference_sums.statistics(scene, index, SEED, plan, pair=paired, smoothed=smoothed)
-    return reference_sums.marginalise(sums, plan.subtractions), plan
+    sums = sums_twin.statistics(scene, index, SEED, plan, pair=paired, smoothed=smoothed)
+    return sums_twin.marginalise(sums, plan.subtractions), plan
 
 
 def _drawing(how: dict[str, Any]) -> dict[str, Any]:
@@ -238,8 +237,8 @@ def known_answers(engine: Engine) -> Check:
 def twins(engine: Engine) -> Iterator[Check]:
     """Every branch of every kernel against the twin."""
     for name in CASES:
-        ours, twin = digests(engine, name), twin_digests(name)
-        differ = [part for part in ours if ours[part] != twin[part]]
+        ours, slow = digests(engine, name), twin_digests(name)
+        differ = [part for part in ours if ours[part] != slow[part]]
         if not differ:
             passed, text = True, "digests " + " ".join(ours.values())
         elif engine.device.promise == SAME_BITS:
@@ -255,11 +254,11 @@ def _nearly(engine: Engine, name: str) -> tuple[bool, str]:
     quiet, flare = toy(**options), toy(flare=0.3, **options)
     index = np.arange(START, START + COUNT, dtype=np.uint64)
     raw = engine.realise(quiet, start=START, count=COUNT, seed=SEED, **_drawing(how)).astype(np.int64)
-    off = np.abs(raw - reference.realise(prepare([quiet], **_laid_out(how)), index, SEED))
+    off = np.abs(raw - twin.realise(prepare([quiet], **_laid_out(how)), index, SEED))
     share = float(np.mean(off > 0))
     ours = engine.statistic_values(quiet, [flare], start=START, count=COUNT, seed=SEED, statistics=_asked(how), **how)
-    twin = _statistics(name, prepare([quiet, flare], **_laid_out(how)))[0]
-    apart = float(np.max(np.abs(ours - twin).max(axis=1) / np.maximum(twin.std(axis=1), 1e-3)))
+    slow = _statistics(name, prepare([quiet, flare], **_laid_out(how)))[0]
+    apart = float(np.max(np.abs(ours - slow).max(axis=1) / np.maximum(slow.std(axis=1), 1e-3)))
     return (
         bool(off.max() <= 1 and share < 1e-2 and apart < 0.2),
         f"weaker promise: {share:.2g} of counts off, by {off.max()} DN at most; statistics by {apart:.2g} sigma",

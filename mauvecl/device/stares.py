@@ -18,7 +18,7 @@ from mauvecl.lightcurve.stares.scene import Flares, StareScene, padded_frames
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.lightcurve.stares.sums import check_sums
 from mauvecl.noise.processes import CosmicRays
-from mauvecl.results.requests import Share
+from mauvecl.results.requests.requests import Shard
 
 Floats = NDArray[np.float32]
 
@@ -135,25 +135,25 @@ class Stares:
         found = np.moveaxis(out[..., : stare.n_frames], 2, 3)
         return found[0] if amplitudes is None else found
 
-    def reduced(self, request: StaresRequest, share: Share | None = None) -> Arrays:
-        """What is kept of a request's stares, or of a share of them, which are drawn and reduced a few at a time.
+    def reduced(self, request: StaresRequest, shard: Shard | None = None) -> Arrays:
+        """What is kept of a request's stares, or of a shard of them, which are drawn and reduced a few at a time.
 
         Parameters
         ----------
         request : StaresRequest
-        share : Share, optional
+        shard : Shard, optional
 
         Returns
         -------
         dict of str to ndarray
-            What the request's reduction gives, joined; of a share with its ``start``, as `StareSums` takes it.
+            What the request's reduction gives, joined; of a shard with its ``start``, as `StareSums` takes it.
 
         Raises
         ------
         InputError
             As `frames`.
         """
-        there = share or Share(0, request.start, request.realisations)
+        there = shard or Shard(0, request.start, request.realisations)
         _check(there.start, there.count, request.seed, request.method)
         components, stare, reduction = request.components, request.stare, request.reduction or Kept()
         how = (request.seed, request.method, request.cosmic_rays)
@@ -165,6 +165,7 @@ class Stares:
         alone = 1 if request.method == "cumulants" else self.opened.width
         piece = max(alone, REDUCED_BYTES // each // alone * alone)
         room = np.empty(each * piece // 4, np.float32)
+        beside = np.empty((1, piece, shape[0] + 1, shape[1]) if request.glow else 0, np.float32)
         with self._launches(components, stare, request.flares, *how) as launches:
 
             def work(tile: Tile, done: int) -> None:
@@ -175,13 +176,17 @@ class Stares:
                     launches.give(request.flares.part(first - request.start, few.wanted))
                     launches.draw(few, out, 0)
                     values = np.moveaxis(out[..., : stare.n_frames], 2, 3)[scenarios]
-                    found.append(dict(reduction(values, first)))
+                    more = []
+                    if request.glow:
+                        launches.glow(few, beside, 0)
+                        more = [np.moveaxis(beside[0, : few.wanted, :, : stare.n_frames], 1, 2)]
+                    found.append(dict(reduction(values, first, *more)))
                 # A tile that fails half way is drawn again.
                 parts.extend(found)
 
             self._tiles.over(there.start, there.count, each, work)
         found = joined(parts, adds=reduction.adds)
-        return found | {"start": np.array(there.start)} if share else found
+        return found | {"start": np.array(there.start)} if shard else found
 
     def _launches(
         self,

@@ -21,7 +21,7 @@ class Comparison:
     Attributes
     ----------
     exposures : int
-        Noisy quiescent exposures whose mean is subtracted; 0 for the noise-free template.
+        Noisy quiescent exposures whose mean is subtracted; 0 for their expectation, which has no noise.
     estimated : bool
         Variances from the counts themselves, as an observer must, or from the model.
     """
@@ -33,13 +33,13 @@ class Comparison:
         object.__setattr__(self, "exposures", count("exposures", self.exposures, high=MOST_EXPOSURES))
 
     @classmethod
-    def of(cls, reference: str = "template", variances: str = "model") -> Self:
+    def of(cls, reference: str = "expectation", variances: str = "model") -> Self:
         """From words.
 
         Parameters
         ----------
         reference : str
-            ``"template"``, ``"exposure"`` or ``"stack:n"`` with n of 1 and more exposures.
+            ``"expectation"``, ``"exposure"`` or ``"stack:n"`` with n of 1 and more exposures.
         variances : {"model", "estimated"}
 
         Raises
@@ -52,26 +52,27 @@ class Comparison:
         return cls(_exposures(reference), variances == "estimated")
 
     @property
-    def share(self) -> float:
-        """Variance of what is subtracted, as a share of one exposure's."""
+    def added_variance(self) -> float:
+        """Variance of what is subtracted, in that of one exposure."""
         return 1.0 / self.exposures if self.exposures else 0.0
 
     @property
     def plain(self) -> bool:
-        """Whether nothing but the template and the model's variances is needed."""
+        """Whether nothing but the expectation and the model's variances is needed."""
         return not (self.exposures or self.estimated)
 
 
 def _exposures(reference: str) -> int:
     word, colon, number = reference.partition(":")
-    if not colon and word in ("template", "exposure"):
+    # Studies of older versions say "template".
+    if not colon and word in ("expectation", "template", "exposure"):
         return int(word == "exposure")
     if word == "stack" and number.isdecimal() and 1 <= int(number) <= MOST_EXPOSURES:
         return int(number)
     raise InputError(
-        f"reference = {reference!r}, expected 'template', 'exposure' or 'stack:n' with n from 1 to {MOST_EXPOSURES}"
+        f"reference = {reference!r}, expected 'expectation', 'exposure' or 'stack:n' with n from 1 to {MOST_EXPOSURES}"
     )
 
 
-#: The noise-free template and the model's variances.
-TEMPLATE = Comparison()
+#: The expectation, and the model's variances.
+NOISE_FREE = Comparison()

@@ -1,6 +1,6 @@
 """Optional noise processes, each with a stream of its own, all off unless asked for.
 
-What they draw is unknown to the observer: templates and variances stay those of the expectation.
+What they draw is unknown to the observer: references and variances stay those of the expectation.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import count, number
 from mauvecl.noise import layout
-from mauvecl.noise.priors import Normal, Prior, Uniform, table_of
+from mauvecl.noise.prior_tables import table_of
+from mauvecl.noise.priors import Normal, Prior, Uniform
 from mauvecl.noise.varied import VARIED, Conditions, Modulated
 
 __all__ = ["NONE", "CosmicRays", "Factors", "Normal", "Prior", "Processes", "Uniform"]
@@ -165,7 +166,7 @@ class Factors:
     Attributes
     ----------
     tables : ndarray of float32, shape (n_modulation, 2 * layout.PRIOR_NODES)
-        See `priors.table_of`.
+        See `prior_tables.table_of`.
     light, dark, sky : float
         Factors of priors at their medians, which the tables are relative to.
     light_ends, dark_ends, sky_ends : tuple of float, shape (2,)

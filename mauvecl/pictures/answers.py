@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.host.expectation import Expectation
-    from mauvecl.results.detection import Detection
-    from mauvecl.results.roc import Roc
+    from mauvecl.results.detection.detection import Detection
+    from mauvecl.results.detection.roc import Roc
     from mauvecl.results.snr import SnrResult
 
 #: A star: title, findings, and its flares' names.

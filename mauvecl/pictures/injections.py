@@ -10,7 +10,7 @@ import numpy as np
 from mauvecl.pictures.style import COLOURS, MOST_COLUMNS, STYLE, finished, pyplot
 
 if TYPE_CHECKING:
-    from mauvecl.answers.inject import InjectAnswer
+    from mauvecl.answers.stares.inject import InjectAnswer
 
 #: What the axes of sizes are called.
 SIZES = {
@@ -25,7 +25,7 @@ CONTOURS = (0.1, 0.5, 0.9)
 
 
 def _panels(found: InjectAnswer) -> tuple[Any, list[Any], list[Any]]:
-    from mauvecl.answers.inject import MOST_DRAWN
+    from mauvecl.answers.stares.inject import MOST_DRAWN
 
     stars = found.stars[:MOST_DRAWN]
     columns = min(len(stars), MOST_COLUMNS)

@@ -25,11 +25,11 @@ from mauvecl.study.labels import titled
 from mauvecl.study.quantities import QUANTITIES
 
 if TYPE_CHECKING:
-    from mauvecl.answers.exposures import ExposureResult
-    from mauvecl.answers.gaussian import GaussianReport
-    from mauvecl.answers.limits import LimitResult
-    from mauvecl.answers.maps import MapResult
-    from mauvecl.answers.snr import SnrAnswer
+    from mauvecl.answers.detection.gaussian import GaussianReport
+    from mauvecl.answers.detection.maps import MapResult
+    from mauvecl.answers.limits.limits import LimitResult
+    from mauvecl.answers.signal.exposures import ExposureResult
+    from mauvecl.answers.signal.snr import SnrAnswer
     from mauvecl.host.expectation import Expectation
 
 
@@ -171,7 +171,7 @@ def noise_budget(observed: Sequence[tuple[str, Expectation]], *, each: int = 1, 
 
 def snr_sweep(found: SnrAnswer, path: str | Path | None = None) -> Any:
     """S/N of some elements against what is swept first, a line for each value of the rest."""
-    from mauvecl.answers.exposures import place_of
+    from mauvecl.answers.signal.exposures import place_of
 
     plt = pyplot()
     first = found.study.sweep.axes[0].quantity

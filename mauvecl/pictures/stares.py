@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.stare import Searched
+from mauvecl.answers.stares.stare import Searched
 from mauvecl.pictures.style import COLOURS, NULL, STYLE, finished, pyplot
 
 if TYPE_CHECKING:
-    from mauvecl.answers.stare import StareAnswer, StarStare
+    from mauvecl.answers.stares.stare import StareAnswer, StarStare
 
 Float = NDArray[np.float64]
 #: Points of a light curve, and rows of a dynamic spectrum, at most: more are means of several frames.

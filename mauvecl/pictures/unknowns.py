@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.unknown_table import power
+from mauvecl.answers.detection.unknown_table import power
 from mauvecl.pictures.style import COLOURS, STYLE, finished, pyplot
 from mauvecl.study.quantities import QUANTITIES
 
 if TYPE_CHECKING:
-    from mauvecl.answers.unknown_table import UnknownTable
+    from mauvecl.answers.detection.unknown_table import UnknownTable
 
 
 def unknowns(found: UnknownTable, path: str | Path | None = None) -> Any:

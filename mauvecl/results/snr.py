@@ -16,7 +16,7 @@ from mauvecl.host.plotting import picture
 from mauvecl.noise import layout
 from mauvecl.noise.scene import Scene
 from mauvecl.noise.twin import Floats, fma
-from mauvecl.results.far import Sparse
+from mauvecl.results.counts.far import Sparse
 
 if TYPE_CHECKING:
     from astropy.table import QTable

@@ -65,13 +65,13 @@ class UvExcess(LinearStatistic):
 
 @dataclass(frozen=True, eq=False)
 class Linear(ByContent, LinearStatistic):
-    """A statistic of one's own: the sum over pixels of weight times (observed - template), DN of the exposure.
+    """A statistic of one's own: the sum over pixels of weight times (observed - reference), DN of the exposure.
 
     Attributes
     ----------
     name : str
     weights : ndarray, shape (n_pixel,)
-        Per DN; pixels that a template saturates are left out.
+        Per DN; pixels that a reference saturates are left out.
     """
 
     name: str

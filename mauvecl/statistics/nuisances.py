@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from mauvecl.host.content import ByContent
 from mauvecl.host.errors import InputError
+from mauvecl.statistics.names import NUISANCES
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -23,13 +24,6 @@ Float = NDArray[np.float64]
 
 #: Half of the output's range, over which `tilt` counts, and its middle, nm.
 TILT_NM, MIDDLE_NM = 250.0, 450.0
-#: Spectra of the unknowns that a setting brings along, and the unit of their amplitudes.
-NUISANCES = {
-    "dark": "detector temperature, deg C",
-    "light": "throughput, pointing or the star's own level, relative",
-    "sky": "brightness of the sky, relative",
-    "tilt": "colour of the response, relative at 200 and 700 nm",
-}
 
 
 @dataclass(frozen=True, eq=False)

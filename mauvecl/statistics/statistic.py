@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
-from mauvecl.noise.comparison import TEMPLATE, Comparison
+from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.drawn import Drawn
 from mauvecl.statistics.distributions import Form, Gaussian, Mixture, QuadraticForm
 from mauvecl.statistics.nuisances import Nuisances, joined
@@ -30,7 +30,7 @@ class Setting:
     Attributes
     ----------
     quiet : Expectation
-        The star without a flare: the template, and the model of the variances.
+        The star without a flare: the reference, and the model of the variances.
     used : ndarray of bool, shape (n_pixel,)
         Pixels that count.
     comparison : Comparison
@@ -45,7 +45,7 @@ class Setting:
 
     quiet: Expectation
     used: NDArray[np.bool_]
-    comparison: Comparison = TEMPLATE
+    comparison: Comparison = NOISE_FREE
     flares: Sequence[Expectation] = ()
     nuisances: Nuisances | None = None
     drawn: Drawn | None = None
@@ -126,13 +126,13 @@ class Statistic(ABC):
     #: Whether it can be marginalised over what is unknown.
     marginal: ClassVar[bool] = True
 
-    def share(self, setting: Setting) -> float:
-        """Variance of what is subtracted, as a share of one exposure's."""
-        return 1.0 if self.paired else setting.comparison.share
+    def added_variance(self, setting: Setting) -> float:
+        """Variance of what is subtracted, in that of one exposure."""
+        return 1.0 if self.paired else setting.comparison.added_variance
 
     def variance(self, setting: Setting) -> Float:
         """Of a pixel's difference without a flare, DN^2, shape (n_pixel,)."""
-        return np.asarray((1.0 + self.share(setting)) * setting.quiet.variance_dn2)
+        return np.asarray((1.0 + self.added_variance(setting)) * setting.quiet.variance_dn2)
 
     def check(self, setting: Setting) -> None:
         """Refuse a setting in which the statistic says nothing.
@@ -165,7 +165,7 @@ class Statistic(ABC):
         exposures are subtracted, which share the factors of a realisation.
         """
         delta = np.where(setting.used, observed.recorded_light_dn - setting.quiet.recorded_light_dn, 0.0)
-        true = observed.variance_dn2 + self.share(setting) * setting.quiet.variance_dn2
+        true = observed.variance_dn2 + self.added_variance(setting) * setting.quiet.variance_dn2
         return self.as_drawn(setting, observed, delta, true, flare, estimated=setting.comparison.estimated)
 
     def odds(self, setting: Setting, flare: Expectation, fap: float) -> Odds:
@@ -208,7 +208,7 @@ class Statistic(ABC):
         for node in nodes:
             shift, more = node.on(observed)
             parts.append(self.form(setting, delta + shift * setting.used, true + more, flare, scatter=rows))
-        return parts[0] if len(parts) == 1 else Mixture(tuple(parts), np.array([node.share for node in nodes]))
+        return parts[0] if len(parts) == 1 else Mixture(tuple(parts), np.array([node.probability for node in nodes]))
 
     @abstractmethod
     def dof(self, setting: Setting) -> int:

@@ -12,6 +12,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import possible, read_text, toml
 from mauvecl.host.quantities import number
+from mauvecl.host.records import sentence
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.study.orbits import OrbitQuestion, PlanQuestion, find_plan_files, without_usual_plan
 from mauvecl.study.quantities import QUANTITIES
@@ -27,7 +28,7 @@ from mauvecl.study.questions import (
 from mauvecl.study.searches import InjectionQuestion, SearchChoice, without_usual_search
 from mauvecl.study.sections import STAR_KEYS, Flare, NoiseProcesses, Observation, Part, Run, SkyLight, Star, Unknowns
 from mauvecl.study.stares import EventText, StareQuestion, find_curves, without_usual
-from mauvecl.study.study_text import find_files, in_table, put, sentence, study_of, toml_value
+from mauvecl.study.study_text import find_files, in_table, put, study_of, toml_value
 
 if TYPE_CHECKING:
     import astropy.units as u

@@ -1,7 +1,7 @@
 """What is unknown of the instrument, and the same with a flare and without: drawn from priors, and averaged over.
 
-An observer measures the instrument, and takes template and threshold from it; while a proposal is written it is
-unknown. So each draw of the unknown values has its own template and threshold, and a detection probability is the
+An observer measures the instrument, and takes reference and threshold from it; while a proposal is written it is
+unknown. So each draw of the unknown values has its own reference and threshold, and a detection probability is the
 average.
 """
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.host.errors import InputError
-from mauvecl.results.fap import FEWEST_IN_TAIL
+from mauvecl.results.requests.fap import FEWEST_IN_TAIL
 from mauvecl.statistics.intervals import CONFIDENCE, Interval
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ class DrawnStudies:
     names : tuple of str
     values : ndarray, shape (n_draw, n_name)
     studies : tuple of Study
-        The study on each draw's instrument, nothing unknown any more, with its share of the realisations.
+        The study on each draw's instrument, nothing unknown any more, with its part of the realisations.
     """
 
     names: tuple[str, ...]
@@ -64,7 +64,7 @@ def drawn(study: Study) -> DrawnStudies:
     even = sequence.random(asked.draws)
     values = np.column_stack([prior.quantile(even[:, k]) for k, prior in enumerate(priors.values())])
     area = study.load_instrument().collecting_area_cm2
-    run = study.run.model_copy(update={"realisations": share_of_realisations(study)})
+    run = study.run.model_copy(update={"realisations": realisations_each(study)})
     certain = study.model_copy(update={"unknowns": type(asked)(), "run": run})
     studies = []
     for row in values:
@@ -81,7 +81,7 @@ def drawn(study: Study) -> DrawnStudies:
     return DrawnStudies(tuple(priors), values, tuple(studies))
 
 
-def share_of_realisations(study: Study) -> int:
+def realisations_each(study: Study) -> int:
     """Realisations for each draw: as many in all as asked for, but enough to count each draw's threshold."""
     run = study.run
     fewest = int(np.ceil(FEWEST_IN_TAIL / run.fap)) if run.tails == "counted" else 1000

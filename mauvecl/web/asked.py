@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.answers.campaigns.visible import visible
-from mauvecl.answers.detect import DetectAnswer, detect
-from mauvecl.answers.inject import InjectAnswer, inject
-from mauvecl.answers.limits import limiting_magnitude
-from mauvecl.answers.maps import MapResult, detection_map
-from mauvecl.answers.snr import SnrAnswer, snr
+from mauvecl.answers.detection.detect import DetectAnswer, detect
+from mauvecl.answers.detection.maps import MapResult, detection_map
+from mauvecl.answers.limits.limits import limiting_magnitude
+from mauvecl.answers.signal.snr import SnrAnswer, snr
+from mauvecl.answers.stares.inject import InjectAnswer, inject
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.unknown_cost import cost_lines, marginal_lines, unknown_cost
+from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
 from mauvecl.host.errors import InputError
 from mauvecl.statistics.distributions import Gaussian, Mixture
 from mauvecl.statistics.registry import STATISTICS

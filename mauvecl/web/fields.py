@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
-from mauvecl.host.stars.bands import ALIASES
+from mauvecl.host.stars.band_names import ALIASES
 from mauvecl.host.stars.catalogue import embedded, library_table
 from mauvecl.statistics.registry import STATISTICS
 
@@ -229,8 +229,8 @@ FIELDS = {
     ),
     "signal": Field(
         "Counted as signal", "net", Choice(("net", "paper")),
-        "In the S/N: the light of the star alone (net), or that of the sky too, as in the MauveSim paper. Detection does "
-        "not depend on it.",
+        "In the S/N: the light of the star alone (net), or that of the sky too, as in the MauveSim paper. It changes no "
+        "detection.",
     ),
     "sky": Field("Sky", "brightness", Choice(SKIES), "Zodiacal light behind the star."),
     "sky_brightness": Field(

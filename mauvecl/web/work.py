@@ -91,6 +91,6 @@ class Job:
         left = f", {(s.total - s.done) / rate:.0f} s left" if rate and s.total > s.done else ""
         return (
             f"{s.done:,} of {s.total:,} realisations, {rate:,.0f} a second{left}"
-            + (f", {s.shares} of {s.of} shares" if s.of > 1 else "")
+            + (f", {s.shards} of {s.of} parts" if s.of > 1 else "")
             + (f", {s.retries} counted again" if s.retries else "")
         )

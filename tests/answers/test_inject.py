@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from commands import run
 
-from mauvecl.answers.inject import inject
+from mauvecl.answers.stares.inject import inject
 from mauvecl.device.stares import Stares
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.search.injected import InjectedShares

@@ -7,7 +7,7 @@ from mauvecl import Study
 from mauvecl.answers.campaigns.plan import plan
 from mauvecl.answers.campaigns.planned import Looked, closed_form
 from mauvecl.answers.campaigns.planned_injections import found_share, question_of
-from mauvecl.answers.inject import inject
+from mauvecl.answers.stares.inject import inject
 from mauvecl.lightcurve.flares.rates import PowerLaw
 from mauvecl.lightcurve.search.completeness import Completeness, DurationLaw
 from mauvecl.lightcurve.search.yields import fit_power_law, recovered_per_day

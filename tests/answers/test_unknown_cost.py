@@ -13,11 +13,11 @@ import pytest
 from commands import ended, run
 from scenes import instrument
 
-from mauvecl.answers.detect import detect
-from mauvecl.answers.limits import limiting_magnitude
-from mauvecl.answers.maps import detection_map
-from mauvecl.answers.unknown_cost import cost_lines, marginal_lines, unknown_cost
-from mauvecl.answers.unknown_table import power, unknown_table
+from mauvecl.answers.detection.detect import detect
+from mauvecl.answers.detection.maps import detection_map
+from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
+from mauvecl.answers.detection.unknown_table import power, unknown_table
+from mauvecl.answers.limits.limits import limiting_magnitude
 from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import expect

@@ -15,8 +15,8 @@ from astropy.io import fits
 from astropy.table import QTable
 from commands import run, started
 
-from mauvecl.answers.detect import detect
-from mauvecl.answers.simulate import simulate
+from mauvecl.answers.detection.detect import detect
+from mauvecl.answers.signal.simulate import simulate
 from mauvecl.device.engine import Engine
 from mauvecl.noise.processes import CosmicRays, Normal, Processes, Uniform
 from mauvecl.statistics.registry import STATISTICS
@@ -392,7 +392,7 @@ BAD = {
     "instrument": (["detect", "--instrument", "hubble"], "hubble"),
     "device": (["detect", "--device", "abacus"], "'abacus' is not here, expected one of"),
     "statistic": (["detect", "--statistic", "chi3"], "'chi3' is unknown"),
-    "reference": (["detect", "--reference", "stack"], "reference = 'stack', expected 'template', 'exposure' or"),
+    "reference": (["detect", "--reference", "stack"], "reference = 'stack', expected 'expectation', 'exposure' or"),
     "variances": (["detect", "--variances", "guessed"], "run.variances = 'guessed'"),
     "rare fap": (["detect", "--fap", "1e-6", "-n", "1000", "--star", "G2V"], "ask for 100000000 realisations"),
     "realisations": (["detect", "-n", "0"], "run.realisations = 0"),
@@ -436,11 +436,11 @@ def test_bad_studies_are_a_sentence(text: str, sentence: str, tmp_path: Path) ->
     assert len(done.stderr.splitlines()) == 1
 
 
-#: The command line with small shares, so that a run of a second has several; shares change no answer.
-SMALL_SHARES = [
+#: The command line with small shards, so that a run of a second has several; shards change no answer.
+SMALL_SHARDS = [
     sys.executable,
     "-c",
-    "import mauvecl.runs.shards as s; s.SHARE = 2**29; from mauvecl.cli.app import main; main()",
+    "import mauvecl.runs.shards as s; s.SHARD = 2**29; from mauvecl.cli.app import main; main()",
 ]
 LONG = (
     "detect",
@@ -470,10 +470,10 @@ def never_stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
 def test_stopped_and_resumed_as_if_never_stopped(stop: signal.Signals, tmp_path: Path, never_stopped: Path) -> None:
     """Ctrl-C, the end of a batch job, kill -9: a second run goes on, and writes the same tables."""
-    command = [*SMALL_SHARES, *LONG, "--keep-after", "0"]
+    command = [*SMALL_SHARDS, *LONG, "--keep-after", "0"]
     process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    shares = tmp_path / "out" / "checkpoint"
-    while not list(shares.glob("[!.]*.npz")):
+    shards = tmp_path / "out" / "checkpoint"
+    while not list(shards.glob("[!.]*.npz")):
         time.sleep(0.005)
         assert process.poll() is None
     process.send_signal(stop)
@@ -482,11 +482,11 @@ def test_stopped_and_resumed_as_if_never_stopped(stop: signal.Signals, tmp_path:
     assert "Traceback" not in errors
     if stop != signal.SIGKILL:
         assert "kept in 'out/checkpoint', and the same command with --resume goes on from there" in errors
-    kept = sum(int(p.stem.split("-")[-1]) for p in shares.glob("[!.]*.npz"))
-    done = subprocess.run([*SMALL_SHARES, *LONG, "--resume"], cwd=tmp_path, capture_output=True, text=True)
+    kept = sum(int(p.stem.split("-")[-1]) for p in shards.glob("[!.]*.npz"))
+    done = subprocess.run([*SMALL_SHARDS, *LONG, "--resume"], cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert json.loads((tmp_path / "out" / "run.json").read_text())["shares"]["resumed"] == kept > 0
-    assert not shares.exists()
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["shards"]["resumed"] == kept > 0
+    assert not shards.exists()
     for name in ("detection.ecsv", "tails.ecsv", "roc.ecsv", "departures.ecsv"):
         assert (tmp_path / "out" / name).read_bytes() == (never_stopped / name).read_bytes()
 

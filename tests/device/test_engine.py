@@ -21,14 +21,14 @@ from mauvecl.device.selftest import toy
 from mauvecl.host.errors import InputError
 from mauvecl.host.instrument.pixel_map import PixelMap
 from mauvecl.noise import twin as reference
-from mauvecl.noise.comparison import TEMPLATE, Comparison
+from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.processes import CosmicRays, Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare
 from mauvecl.results import twin as reference_sums
-from mauvecl.results.channels import ChannelPlan, plan_channels
-from mauvecl.results.requests import DetectRequest
+from mauvecl.results.counts.tally import Tally
+from mauvecl.results.requests.channels import ChannelPlan, plan_channels
+from mauvecl.results.requests.requests import DetectRequest
 from mauvecl.results.snr import elements, observers
-from mauvecl.results.tally import Tally
 from mauvecl.statistics.registry import STATISTICS
 
 RAYS = CosmicRays(rate_per_cm2_s=200.0)
@@ -146,7 +146,7 @@ def test_every_statistic_is_the_twins(any_width: Engine, name: str) -> None:
         pytest.skip("without noise there is no statistic")
     kind = {"start": START, "seed": SEED, **how}
     found = any_width.detect(quiet, flares, realisations=INDEX.size, statistics=tuple(STATISTICS), **kind)
-    plan, values = _twin(name, TEMPLATE)
+    plan, values = _twin(name, NOISE_FREE)
     fast = ("chi2", "chi2_element", "matched", "uv_excess")
     alone = any_width.statistic_values(quiet, flares, count=INDEX.size, statistics=fast, **kind)
     same = [row for row in range(len(alone)) if row % 3 != 2 or row >= 9]

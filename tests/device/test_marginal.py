@@ -12,8 +12,8 @@ from mauvecl.device.engine import Engine
 from mauvecl.noise.processes import Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare
 from mauvecl.results import twin
-from mauvecl.results.channels import plan_channels
-from mauvecl.results.detection import Detection
+from mauvecl.results.detection.detection import Detection
+from mauvecl.results.requests.channels import plan_channels
 from mauvecl.statistics.linear import Linear
 from mauvecl.statistics.nuisances import Nuisances
 
@@ -118,7 +118,7 @@ def test_closed_forms_integrate_over_what_is_drawn(engine: Engine, case: str) ->
 
 
 def test_requests_carry_what_is_unknown(engine: Engine) -> None:
-    from mauvecl.results.requests import DetectRequest
+    from mauvecl.results.requests.requests import DetectRequest
     from mauvecl.runs.shards import fingerprint
 
     quiet, flare = star(amplitudes=(0.24,))

@@ -380,8 +380,8 @@ def test_extended_by_another_star(sun: Source) -> None:
     short = (sun.wavelength_nm[kept], 1e-3 * sun.flux_flam[kept])
     with pytest.raises(InputError, match="expected at least 200-700 nm: --extend"):
         Source.from_arrays(*short)
-    for template in ("G2V", Source.from_library("G2V")):
-        star = Source.from_arrays(*short, name="short", extend=template)
+    for extension in ("G2V", Source.from_library("G2V")):
+        star = Source.from_arrays(*short, name="short", extend=extension)
         assert sum("it is continued by G2V, scaled by" in text for text in star.told) == 2
         np.testing.assert_allclose(
             expect(star.at_magnitude(7.4), mauve, exposure=5).source_electrons,

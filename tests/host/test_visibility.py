@@ -8,12 +8,13 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.orbit import constraints as must
 from mauvecl.host.orbit.conditions import Particles, Thermal
 from mauvecl.host.orbit.earth import direction, unit
+from mauvecl.host.orbit.limits import Limits
 from mauvecl.host.orbit.moments import Moments
 from mauvecl.host.orbit.names import Target
 from mauvecl.host.orbit.orbit import Orbit, circular
 from mauvecl.host.orbit.radiation import proton_map
 from mauvecl.host.orbit.season import elongation_deg, zodiacal_light
-from mauvecl.host.orbit.visibility import Limits, Visibility
+from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.host.sky.helioecliptic import helioecliptic, offline
 from mauvecl.host.sky.zodiacal import zodiacal_brightness
 

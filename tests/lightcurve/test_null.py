@@ -10,10 +10,11 @@ from searches import DAVENPORT, KNOWN, ONE, survey
 from mauvecl.device.stares import Stares
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.search.bank import Bank, Level
-from mauvecl.lightcurve.search.null import DAYS, Counted, counted, in_a_row, in_a_row_rate, per_day, sampled
+from mauvecl.lightcurve.search.null import Counted, counted, in_a_row, in_a_row_rate, sampled
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.stares.curves import Sinusoid
 from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.lightcurve.usual import DAYS, per_day
 
 
 class TestInARow:

@@ -12,13 +12,13 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 
 from mauvecl.answers.answer import Answer
-from mauvecl.answers.detect import detect
-from mauvecl.answers.exposures import exposure_for
-from mauvecl.answers.gaussian import gaussian_report
-from mauvecl.answers.limits import limiting_magnitude
-from mauvecl.answers.maps import detection_map
-from mauvecl.answers.simulate import simulate
-from mauvecl.answers.snr import snr
+from mauvecl.answers.detection.detect import detect
+from mauvecl.answers.detection.gaussian import gaussian_report
+from mauvecl.answers.detection.maps import detection_map
+from mauvecl.answers.limits.limits import limiting_magnitude
+from mauvecl.answers.signal.exposures import exposure_for
+from mauvecl.answers.signal.simulate import simulate
+from mauvecl.answers.signal.snr import snr
 from mauvecl.device.engine import Engine
 from mauvecl.host.plotting import picture
 from mauvecl.pictures.style import COLUMN

@@ -12,8 +12,8 @@ from scipy import stats
 from mauvecl.host.errors import InputError
 from mauvecl.noise import layout
 from mauvecl.results import twin as reference_sums
-from mauvecl.results.roc import Roc
-from mauvecl.results.tally import Distribution, Grid, Tally
+from mauvecl.results.counts.tally import Distribution, Grid, Tally
+from mauvecl.results.detection.roc import Roc
 
 
 def distribution(values: np.ndarray, grid: Grid) -> Distribution:

@@ -96,10 +96,10 @@ def test_the_sum_is_a_generalised_chi_squared() -> None:
         assert stats.kstwo.sf(np.abs(ours - theirs).max(), values.size) > 1e-6
 
 
-@pytest.mark.parametrize("words", [("stack",), ("stack:0",), ("mean",), ("exposure:2",), ("template", "guessed")])
+@pytest.mark.parametrize("words", [("stack",), ("stack:0",), ("mean",), ("exposure:2",), ("expectation", "guessed")])
 def test_words_that_are_none(words: tuple[str, ...]) -> None:
     with pytest.raises(InputError, match="expected"):
         Comparison.of(*words)
     assert Comparison.of("stack:5", "estimated") == Comparison(5, True)
-    assert Comparison.of("exposure").share == 1.0
+    assert Comparison.of("exposure").added_variance == 1.0
     assert Comparison.of().plain

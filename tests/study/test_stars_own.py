@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from mauvecl.answers.detect import detect
+from mauvecl.answers.detection.detect import detect
 from mauvecl.cli.app import app
 from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError

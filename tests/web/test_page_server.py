@@ -37,7 +37,7 @@ from typer.testing import CliRunner
 from mauvecl.cli.app import app
 from mauvecl.host.errors import InputError
 from mauvecl.noise.scene import prepare
-from mauvecl.results.hypotheses import Hypotheses
+from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.study.study import Study
 from mauvecl.web import closed as closed_forms

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.campaigns.planned import Looked
-from mauvecl.answers.inject import inject
+from mauvecl.answers.stares.inject import inject
 from mauvecl.lightcurve.flares.rates import BOLOMETRIC
 from mauvecl.lightcurve.search.completeness import PER_DECADE, Completeness, DurationLaw
 from mauvecl.study.searches import InjectionQuestion

@@ -17,6 +17,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
+from mauvecl.lightcurve.usual import check_shape
 
 Float = NDArray[np.float64]
 
@@ -347,9 +348,8 @@ def shape_of(given: Shape | str) -> Shape:
     """
     if isinstance(given, Shape):
         return given
-    if given not in SHAPES:
-        raise InputError(f"flare shape {shortened(str(given))} is unknown, expected one of {', '.join(SHAPES)}")
-    return SHAPES[given]
+    check_shape(str(given))
+    return SHAPES[str(given)]
 
 
 def half_width_of_altaipony(duration: float, shape: Shape | str) -> float:

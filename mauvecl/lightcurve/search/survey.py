@@ -19,7 +19,8 @@ if TYPE_CHECKING:
 
     from mauvecl.lightcurve.search.bank import Bank
     from mauvecl.lightcurve.stares.components import Components
-    from mauvecl.lightcurve.stares.stare import Changing, Stare
+    from mauvecl.lightcurve.stares.stare import Stare
+    from mauvecl.lightcurve.usual import Changing
 
 Float = NDArray[np.float64]
 

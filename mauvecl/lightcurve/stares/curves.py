@@ -9,12 +9,9 @@ from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import takes_quantities
+from mauvecl.lightcurve.usual import ORBIT_S
 
 Float = NDArray[np.float64]
-
-#: Period of the flown orbit, s: 94.635 min, from the mean motion of 15.21638735 revolutions a day in the public
-#: elements of NORAD 66756, epoch 2026 day 257.
-ORBIT_S = 86_400.0 / 15.21638735
 
 
 @takes_quantities

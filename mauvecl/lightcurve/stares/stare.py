@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, Self, get_args
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import takes_quantities
-from mauvecl.lightcurve.stares.curves import ORBIT_S, Curve, Sinusoid
+from mauvecl.lightcurve.stares.curves import Curve, Sinusoid
+from mauvecl.lightcurve.usual import CHANGING, ORBIT_S, Changing
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -20,10 +21,6 @@ if TYPE_CHECKING:
     from mauvecl.host.orbit.orbit import Orbit
 
 Float = NDArray[np.float64]
-#: What changes from frame to frame: the star's own level without its flares; the throughput for all light, of star,
-#: flare and sky; the sky's brightness; the detector's temperature.
-Changing = Literal["star", "light", "sky", "temperature"]
-CHANGING: tuple[Changing, ...] = get_args(Changing)
 #: Unit of each, for messages and tables.
 CHANGING_UNITS: dict[Changing, str] = {"star": "", "light": "", "sky": "", "temperature": "deg C"}
 #: Frames of a stare, at most: twenty years of 5 s, five bytes of a frame number.

@@ -97,6 +97,6 @@ class Spectrum(Tab):
 
     def table(self, name: str, closed: Closed, found: Found) -> Table:
         """One observation with the flare, taken apart."""
-        from mauvecl.answers.simulate import simulate
+        from mauvecl.answers.signal.simulate import simulate
 
         return simulate(closed.study, flaring=True).observations[1][2]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import special
 
-from mauvecl.answers.unknown_cost import spoken, unknown_cost
+from mauvecl.answers.detection.unknown_cost import spoken, unknown_cost
 from mauvecl.noise.usual import USUAL
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.web.closed import percent
