@@ -82,6 +82,27 @@ class Tilt:
     per_sigma: float = 1.0
 
 
+@dataclass(frozen=True, eq=False)
+class Odds:
+    """What a statistic makes of one flare, for Gaussian noise.
+
+    Attributes
+    ----------
+    null, seen : Form
+        Its distribution without and with the flare.
+    threshold : float
+    """
+
+    null: Form
+    seen: Form
+    threshold: float
+
+    @property
+    def probability(self) -> float:
+        """Of detection."""
+        return self.seen.sf(self.threshold)
+
+
 class Statistic(ABC):
     """One detection statistic; it holds no data, so that one object serves every detection.
 
@@ -146,6 +167,17 @@ class Statistic(ABC):
         delta = np.where(setting.used, observed.recorded_light_dn - setting.quiet.recorded_light_dn, 0.0)
         true = observed.variance_dn2 + self.added_variance(setting) * setting.quiet.variance_dn2
         return self.as_drawn(setting, observed, delta, true, flare, estimated=setting.comparison.estimated)
+
+    def odds(self, setting: Setting, flare: Expectation, fap: float) -> Odds:
+        """Closed forms without and with a flare, and the threshold of a false-alarm probability between them."""
+        shape = flare if self.shaped else None
+
+        def cut() -> tuple[Form, float]:
+            null = self.closed_form(setting, setting.quiet, shape)
+            return null, null.isf(fap)
+
+        null, threshold = cut() if self.shaped else setting.remembered(f"cut of {self.name} at {fap!r}", cut)
+        return Odds(null, self.closed_form(setting, flare, shape), threshold)
 
     def as_drawn(
         self,

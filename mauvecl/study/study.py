@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.source import Source
     from mauvecl.noise.processes import Prior
+    from mauvecl.statistics.statistic import Setting
 
 #: The paper's two stars.
 PAPER_STARS = (Star(library="K3V", magnitude=3.7), Star(library="G2V", magnitude=7.4))
@@ -307,6 +308,15 @@ class Study(Part):
         how = {"realisations": run.realisations, "statistics": run.statistics, "tails": run.tails}
         marginal = {"nuisances": self.nuisances.marginalised(quiet)}
         return self.drawing | how | marginal | {"comparison": run.comparison()}
+
+    def setting(self, quiet: Expectation, *flares: Expectation) -> Setting:
+        """What statistics look at, for closed forms: nothing is laid out for a draw."""
+        from mauvecl.noise.drawn import Drawn
+        from mauvecl.statistics.statistic import Setting
+
+        unknown = self.nuisances.marginalised(quiet)
+        drawn = Drawn.by(self.drawing["processes"], quiet) if unknown else None
+        return Setting(quiet, ~quiet.saturated, self.run.comparison(), flares, unknown, drawn)
 
     def expectations(self, star: Star) -> list[Expectation]:
         """A star without a flare, then with each of the flares."""

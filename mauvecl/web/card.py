@@ -25,7 +25,7 @@ def card(closed: Closed, found: Found) -> dict[str, Any]:
         kinds; ``simulated``, names of what is simulated.
     """
     q, x = closed.question, closed.quiet
-    cut, chance, interval, facts = closed.cut, closed.chance, f"in closed form{_spread(closed)}", []
+    cut, chance, interval, facts = closed.odds.threshold, closed.chance, f"in closed form{_spread(closed)}", []
     if "detection" in found:
         (row,) = (row for row in found["detection"].table if row["statistic"] == q.statistic)
         cut, chance = float(row["threshold"]), float(row["probability"])
@@ -33,7 +33,7 @@ def card(closed: Closed, found: Found) -> dict[str, Any]:
         facts.append(("Closed form", percent(closed.chance)))
     facts += [
         ("Threshold", f"{cut:.4g}"),
-        ("Expected with flare", f"{closed.expected:.4g}"),
+        ("Expected with flare", f"{closed.odds.seen.mean:.4g}"),
         ("Best S/N per pixel", f"{x.snr().max():.3g}"),
         ("Best S/N per element", f"{x.snr_per_element().max():.3g}"),
     ]
@@ -57,8 +57,8 @@ def _spread(closed: Closed) -> str:
     """What the throughput's uncertainty makes of a chance."""
     if closed.slow or closed.chance != closed.chance:
         return ""
-    low, high = np.sort(closed.chances(np.array([1 - THROUGHPUT, 1 + THROUGHPUT]), np.ones(1), sky=True)[0])
-    return f"; {between(low, high)} if the throughput is {100 * THROUGHPUT:g} % lower or higher"
+    ends = [odds.probability for much in (-1, 1) for odds in closed.at(1 + much * THROUGHPUT, np.ones(1), sky=True)]
+    return f"; {between(min(ends), max(ends))} if the throughput is {100 * THROUGHPUT:g} % lower or higher"
 
 
 def _messages(closed: Closed, found: Found) -> list[str]:

@@ -113,6 +113,8 @@ def as_command(question: Question) -> str:
         words += ["--set", f"nuisances.own.own.points=[{points}]"]
     if q.see.strip():
         words += ["--set", f"orbit.targets={json.dumps([q.see.strip()])}"]
+    if q.signal != "net":
+        words += ["--set", f"observation.signal={q.signal}"]
     if q.realisations.tails != "counted":
         words += ["--set", f"run.tails={q.realisations.tails}"]
     return shlex.join(words)

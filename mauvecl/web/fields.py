@@ -227,6 +227,11 @@ FIELDS = {
         "Payload", "mauve", Choice(("mauve", "mauve-electrons")),
         "mauve as its paper has it, or with the dark current counted in electrons.",
     ),
+    "signal": Field(
+        "Counted as signal", "net", Choice(("net", "paper")),
+        "In the S/N: the light of the star alone (net), or that of the sky too, as in the MauveSim paper. It changes no "
+        "detection.",
+    ),
     "sky": Field("Sky", "brightness", Choice(SKIES), "Zodiacal light behind the star."),
     "sky_brightness": Field(
         "Sky brightness", "22.1", Number(10, 30), "Of the zodiacal light, V magnitudes per square arc second.",
@@ -271,7 +276,7 @@ ASKED = ("star", "magnitude", "band", "amplitude_percent", "exposure_s")
 ADVANCED = {
     "Detection": ("fap", "statistic", "realisations", "seed"),
     "Flare and detector": ("flare_temperature_k", "temperature_c", "instrument"),
-    "Sky": ("sky", "sky_brightness", "target", "time"),
+    "Sky": ("sky", "sky_brightness", "target", "time", "signal"),
     "Unknown": ("unknown", "own_unknown"),
     "Visibility": ("see",),
 }

@@ -75,7 +75,7 @@ def test_every_answer_says_what_unknowns_cost(engine: Engine) -> None:
         plain, other = (ask(s, engine) for s in (small, marginal))
         for answer in (plain, other):
             assert len([m for m in answer.messages if m.startswith("What unknowns cost")]) == 1
-        assert any("marginalised over dark +-0.1 deg C" in m for m in other.messages)
+        assert any("marginalised over the dark level (+-0.1 deg C)" in m for m in other.messages)
         assert "[nuisances]" in other.table.meta["study"]
         assert "[nuisances]" not in plain.table.meta["study"]
     # What is marginalised detects less.
@@ -247,9 +247,9 @@ def test_the_table_and_its_picture(tmp_path: Path) -> None:
     """METHODS section 7's row again, and the smallest amplitude has the power asked for."""
     found = unknown_table(study())
     rows = {row["unknown"]: row for row in found.table}
-    assert rows["dark +-0.1 deg C"]["marginalised"] == pytest.approx(3.06, rel=0.01)
-    assert rows["dark and light, free"]["marginalised"] == pytest.approx(3.05, rel=0.01)
-    assert rows["light +-1 %"]["plain"] == pytest.approx(4.12, rel=0.01)
+    assert rows["the dark level (+-0.1 deg C)"]["marginalised"] == pytest.approx(3.06, rel=0.01)
+    assert rows["the dark level (free) and the light level (free)"]["marginalised"] == pytest.approx(3.05, rel=0.01)
+    assert rows["the light level (+-1 %)"]["plain"] == pytest.approx(4.12, rel=0.01)
     for name, row in rows.items():
         snr = row["marginalised"] * found.smallest("G2V V = 7.4 (Vega = 0)", name) / row["amplitude"]
         assert power(np.array([snr]), 1e-3)[0] == pytest.approx(0.9)

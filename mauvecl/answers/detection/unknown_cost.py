@@ -103,18 +103,22 @@ def marginal_lines(study: Study) -> list[str]:
     return [f"Statistics are marginalised over {spoken(study.nuisances)}{drawn}."]
 
 
+#: What they are called in a sentence.
+CALLED = {"dark": "the dark level", "light": "the light level", "sky": "the sky level", "tilt": "the response's colour"}
+
+
 def spoken(choice: NuisanceChoice) -> str:
-    """Unknowns in a sentence: dark +-0.5 deg C, light (free)."""
+    """Unknowns in a sentence: the dark level (+-0.5 deg C) and the light level (free)."""
     sd: dict[str, float | str] = {u.nuisance: u.sd for u in USUAL} if choice.usual else {}
     sd |= {name: value for name in NUISANCES if (value := getattr(choice, name)) is not None}
-    sd |= {name: one.sd for name, one in choice.own.items()}
-    unit = {"dark": " deg C"}
-    return joined(
-        [
-            f"{name} (free)" if value in ("free", float("inf")) else f"{name} +-{value:g}{unit.get(name, '')}"
-            for name, value in sd.items()
-        ]
-    )
+    found = [f"{CALLED[name]} ({_size(value, '%' if name != 'dark' else 'deg C')})" for name, value in sd.items()]
+    return joined(found + [f"{name!r} ({_size(one.sd, '')})" for name, one in choice.own.items()])
+
+
+def _size(sd: float | str, unit: str) -> str:
+    if sd in ("free", float("inf")):
+        return "free"
+    return f"+-{100 * float(sd) if unit == '%' else float(sd):g} {unit}".rstrip()
 
 
 def _chosen(study: Study) -> NuisanceChoice:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.answers.detection.unknown_cost import Cost, unknown_cost
+from mauvecl.answers.detection.unknown_cost import Cost, spoken, unknown_cost
 from mauvecl.host.plotting import picture
 from mauvecl.study.labels import described, label
 from mauvecl.study.nuisances import NuisanceChoice
@@ -23,11 +23,14 @@ if TYPE_CHECKING:
 
 #: What is looked at where nothing else is named: METHODS' table, and more.
 SHOWN: dict[str, NuisanceChoice] = {
-    "dark +-0.1 deg C": NuisanceChoice(dark=0.1),
-    "light +-1 %": NuisanceChoice(light=0.01),
-    "dark and light, free": NuisanceChoice(dark="free", light="free"),
-    "sky +-10 %": NuisanceChoice(sky=0.1),
-    "tilt +-1 %": NuisanceChoice(tilt=0.01),
+    spoken(choice): choice
+    for choice in (
+        NuisanceChoice(dark=0.1),
+        NuisanceChoice(light=0.01),
+        NuisanceChoice(dark="free", light="free"),
+        NuisanceChoice(sky=0.1),
+        NuisanceChoice(tilt=0.01),
+    )
 }
 
 

@@ -16,7 +16,6 @@ from mauvecl.host.ranges import DAY_S
 from mauvecl.results.requests.hypotheses import check_shape
 from mauvecl.statistics.intervals import Interval
 from mauvecl.statistics.registry import STATISTICS
-from mauvecl.statistics.statistic import Setting
 from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.sections import Star
 from mauvecl.study.study import Study
@@ -109,18 +108,13 @@ class LimitSearch:
     def theory(self, value: float) -> float:
         """Detection probability for Gaussian noise; 0 where no pixel is left unsaturated."""
         quiet, flare = self.scaled(value)
-        # Nothing is drawn: the statistic's setting alone, without the arrays of a scene.
-        used = ~quiet.saturated
-        if not used.any():
+        setting, one = self.study.setting(quiet, flare), STATISTICS[self.statistic]
+        if not setting.used.any():
             return 0.0
-        unknown = self.study.nuisances.marginalised(quiet)
-        one = STATISTICS[self.statistic]
-        setting = Setting(quiet, used, self.study.run.comparison(), (flare,), unknown)
         one.check(setting)
-        shape = flare if one.shaped else None
-        if one.shaped and not flare.saturated[used].all():
-            check_shape(quiet, flare, used)
-        return one.closed_form(setting, flare, shape).sf(one.closed_form(setting, quiet, shape).isf(self.fap))
+        if one.shaped and not flare.saturated[setting.used].all():
+            check_shape(quiet, flare, setting.used)
+        return one.odds(setting, flare, self.fap).probability
 
     def simulated(self, value: float, seed: int) -> Interval:
         """Detection probability with its interval, by the engine."""

@@ -71,6 +71,8 @@
 if name == "realisations":
     count, _, tails = option.partition(" ")
     option = f"{int(count):,}" + (", sampled tails" if tails else "")
+elif name == "signal":
+    option = {"net": "the star (net)", "paper": "star and sky (paper)"}[option]
 %>${option}</%def>
 <a class="skip" href="#answer">To the answer</a>
 <header>

@@ -83,7 +83,7 @@ class Distributions(Picture):
         return canvas
 
     def drawn(self, closed: Closed, found: Found) -> Drawn:
-        q, cut, chance = closed.question, closed.cut, closed.chance
+        q, cut, chance = closed.question, closed.odds.threshold, closed.chance
         sources: dict[str, Any] = {}
         for name, form in (("null", closed.null), ("flare", closed.seen)):
             edges = np.linspace(form.mean - 5 * form.std, form.mean + 5 * form.std, 161)

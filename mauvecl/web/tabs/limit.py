@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
+from scipy.interpolate import PchipInterpolator
 
-from mauvecl.statistics.registry import STATISTICS
-from mauvecl.statistics.statistic import LinearStatistic
 from mauvecl.web.closed import percent
 from mauvecl.web.figures import Canvas
 from mauvecl.web.tabs.tab import Drawn, Found, Picture, Tab
@@ -17,6 +17,7 @@ from mauvecl.web.tabs.tab import Drawn, Found, Picture, Tab
 if TYPE_CHECKING:
     from astropy.table import Table
 
+    from mauvecl.statistics.statistic import Odds
     from mauvecl.study.study import Study
     from mauvecl.web.closed import Closed
 
@@ -24,14 +25,18 @@ Float = NDArray[np.float64]
 
 #: Ends of the pictures: magnitudes, and amplitudes in per cent; they stay, whatever is asked.
 MAGNITUDES, PERCENTS = (2.0, 14.0), (0.1, 100.0)
-#: Columns and rows of a map in closed form where the statistic is a weighted sum, and where it is not.
-STEPS = {True: (33, 19), False: (13, 7)}
+#: Columns and rows of a map in closed form; between them what varies evenly is interpolated.
+STEPS = 9, 5
 LEVELS = (0.1, 0.5, 0.9)
+#: A curve begins with so many points; distances are halved so many times where it changes by more than this.
+FIRST, HALVINGS, CHANGE = 9, 5, 0.25
+#: Standard deviations beside the threshold beyond which all is seen, or nothing.
+FARTHEST = 6.0
 
 
-def chances(closed: Closed, magnitudes: Float, rises: Float) -> Float:
-    """`Closed.chances` at magnitudes, shape (n_rise, n_magnitude)."""
-    return closed.chances(10 ** (-0.4 * (magnitudes - closed.question.magnitude)), rises)
+def odds(closed: Closed, magnitude: float, rises: Float) -> list[Odds]:
+    """`Closed.at` a magnitude."""
+    return closed.at(10 ** (-0.4 * (magnitude - closed.question.magnitude)), rises)
 
 
 def _key(closed: Closed) -> tuple[Any, ...]:
@@ -45,10 +50,10 @@ def _key(closed: Closed) -> tuple[Any, ...]:
 
 
 class _Kept:
-    """A question that is known by what its map depends on."""
+    """A question that is known by what its map, or its curve, depends on."""
 
-    def __init__(self, closed: Closed) -> None:
-        self.closed, self.key = closed, _key(closed)
+    def __init__(self, closed: Closed, *more: float) -> None:
+        self.closed, self.key = closed, (*_key(closed), *more)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Kept) and self.key == other.key
@@ -57,13 +62,56 @@ class _Kept:
         return hash(self.key)
 
 
+def probits(p: Float) -> Float:
+    """Probabilities as places on a normal's axis, where they are smooth; those that round to 0 or 1 at its ends."""
+    return np.asarray(special.ndtri(np.clip(p, 1e-15, 1 - 1e-15)))
+
+
+def probit(p: Any) -> Float:
+    """A probability's place on a normal's axis; those that round to 0 or 1 are at its ends."""
+    return np.asarray(special.ndtri(np.clip(p, 1e-15, 1 - 1e-15)))
+
+
+@lru_cache(maxsize=32)
+def _curve(kept: _Kept) -> tuple[Float, Float]:
+    """Magnitudes and probabilities, computed at more of them where they change."""
+
+    def exact(magnitudes: Float) -> list[float]:
+        each = (odds(kept.closed, magnitude, np.ones(1)) for magnitude in magnitudes)
+        return [one[0].probability if one else 0.0 for one in each]
+
+    x = np.linspace(*MAGNITUDES, FIRST)
+    y = np.array(exact(x))
+    for _ in range(HALVINGS):
+        steep = np.nonzero(np.abs(np.diff(y)) > CHANGE)[0]
+        new = (x[steep] + x[steep + 1]) / 2
+        x, y = np.insert(x, steep + 1, new), np.insert(y, steep + 1, exact(new))
+    fine = np.linspace(*MAGNITUDES, 241)
+    return fine, np.asarray(special.ndtr(PchipInterpolator(x, probit(y))(fine)))
+
+
 @lru_cache(maxsize=32)
 def _map(kept: _Kept) -> tuple[Float, Float, Float]:
-    """Magnitudes, amplitudes in per cent, and probabilities."""
-    closed = kept.closed
-    columns, rows = STEPS[isinstance(STATISTICS[closed.question.statistic], LinearStatistic)]
-    x, y = np.linspace(*MAGNITUDES, columns), np.geomspace(*PERCENTS, rows)
-    return x, y, chances(closed, x, y / closed.question.amplitude_percent)
+    """Magnitudes, logarithms of amplitudes in per cent, and probabilities.
+
+    Interpolated are the logarithm of the flare's part of the statistic, and the threshold, both in standard deviations;
+    and what the probit of the probability has beside their difference.
+    """
+    (columns, rows), (low, high) = STEPS, np.log10(PERCENTS)
+    x, y = np.linspace(*MAGNITUDES, columns), np.linspace(low, high, rows)
+    known = np.full((3, rows, columns), np.nan)
+    for i, magnitude in enumerate(x):
+        for j, one in enumerate(odds(kept.closed, magnitude, 10**y / kept.closed.question.amplitude_percent)):
+            part, cut = one.seen.mean - one.null.mean, one.threshold - one.null.mean
+            known[:2, j, i] = np.log(max(part, 1e-9 * cut) / one.seen.std), cut / one.seen.std
+            off = (part - cut) / one.seen.std
+            if abs(off) < FARTHEST:
+                known[2, j, i] = probit(one.probability) - off
+    # A saturated star shows nothing, and far from the threshold the rest does not matter.
+    known = np.where(np.isnan(known), np.array([-30.0, 0.0, 0.0])[:, None, None], known)
+    fine = np.linspace(*MAGNITUDES, 97), np.linspace(low, high, 61)
+    part, cut, rest = PchipInterpolator(y, PchipInterpolator(x, known, axis=2)(fine[0]), axis=1)(fine[1])
+    return *fine, np.asarray(special.ndtr(np.exp(part) - cut + rest))
 
 
 class Curve(Picture):
@@ -88,8 +136,7 @@ class Curve(Picture):
         sources["own"] = {"x": [q.magnitude], "y": [closed.chance]}
         text = f"The closed form of {q.statistic} takes too long for a curve: simulate it."
         if not closed.slow:
-            x = np.linspace(*MAGNITUDES, 2 * STEPS[isinstance(STATISTICS[q.statistic], LinearStatistic)][0] - 1)
-            y = chances(closed, x, np.ones(1))[0]
+            x, y = _curve(_Kept(closed, q.amplitude_percent))
             sources["closed form"] = {"x": x, "y": y}
             seen = np.nonzero(y >= power)[0]
             last = int(seen[-1]) if seen.size else -1
@@ -163,7 +210,7 @@ class Map(Picture):
         text = f"The closed form of {q.statistic} takes too long for a map: simulate it."
         if not closed.slow:
             x, y, p = _map(_Kept(closed))
-            sources |= {"map": _image(x, np.log10(y), p), "contours": _contours(x, np.log10(y), p)}
+            sources |= {"map": _image(x, y, p), "contours": _contours(x, y, p)}
             share = 100 * float(np.mean(p >= 0.5))
             text = (
                 f"At least half of the flares are detected in {share:.0f} % of the map, which spans {q.band} = "
@@ -178,15 +225,10 @@ class Map(Picture):
 
 
 def _image(x: Float, y: Float, p: Float) -> dict[str, Any]:
-    """Cells around the points at which probabilities are known, finer by straight lines between."""
-    from scipy.interpolate import RegularGridInterpolator
-
-    fine_x, fine_y = np.linspace(x[0], x[-1], 97), np.linspace(y[0], y[-1], 61)
-    between = RegularGridInterpolator((y, x), p)
-    shown = between(tuple(np.meshgrid(fine_y, fine_x, indexing="ij")))
-    half_x, half_y = 0.5 * (fine_x[1] - fine_x[0]), 0.5 * (fine_y[1] - fine_y[0])
+    """Cells around the points at which probabilities are known."""
+    half_x, half_y = 0.5 * (x[1] - x[0]), 0.5 * (y[1] - y[0])
     return {
-        "image": [shown], "x": [x[0] - half_x], "y": [y[0] - half_y], "dw": [x[-1] - x[0] + 2 * half_x],
+        "image": [p], "x": [x[0] - half_x], "y": [y[0] - half_y], "dw": [x[-1] - x[0] + 2 * half_x],
         "dh": [y[-1] - y[0] + 2 * half_y],
     }  # fmt: skip
 

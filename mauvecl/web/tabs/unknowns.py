@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import special
 
-from mauvecl.answers.detection.unknown_cost import unknown_cost
+from mauvecl.answers.detection.unknown_cost import spoken, unknown_cost
 from mauvecl.noise.usual import USUAL
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.web.closed import percent
@@ -25,11 +25,9 @@ Row = tuple[str, float, float]
 @lru_cache(maxsize=4)
 def costs(closed: Closed) -> tuple[float, list[Row]]:
     """The matched S/N of the flare with everything known, and with each unknown alone and together."""
-    choices = {f"{u.nuisance} ({u.marginalised.partition(':')[0]})": {u.nuisance: _spread(u.sd)} for u in USUAL}
-    chosen = {name: NuisanceChoice.model_validate(given) for name, given in choices.items()}
+    alone = [NuisanceChoice.model_validate({u.nuisance: _spread(u.sd)}) for u in USUAL] + [NuisanceChoice(tilt="free")]
+    chosen = {spoken(choice).removeprefix("the "): choice for choice in alone}
     chosen["all the usual together"] = NuisanceChoice(usual=True)
-    tilt = NuisanceChoice(tilt="free")
-    chosen["colour of the response (free)"] = tilt
     if closed.study.nuisances.own:
         chosen["your own spectrum"] = NuisanceChoice(own=closed.study.nuisances.own)
     rows, known = list[Row](), 0.0
