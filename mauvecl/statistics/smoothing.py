@@ -67,14 +67,18 @@ class Smoothing:
         step = max(int(sigma / STEPS_PER_SIGMA), 1)
         rows = _rows(n, sigma)
         smoothing = cls(*_places(n, step), sigma, rows[_places(n, step)[0]] * used)
-        if step == 1 or all(smoothing._follows(flare, rows * used) for flare in flares or (x,)):
+        if step == 1:
+            return smoothing
+        squares = (rows * used) ** 2
+        if all(smoothing._follows(flare, squares) for flare in flares or (x,)):
             return smoothing
         return cls(np.arange(n), np.eye(n), sigma, rows * used)
 
-    def _follows(self, flare: Expectation, rows: Float) -> bool:
+    def _follows(self, flare: Expectation, squares: Float) -> bool:
         """Whether the sum over every pixel comes out on average, by weights of which none is negative."""
-        scale, each = self.scale(flare), self._each(flare)
-        whole, ours = (factor @ (part**2 @ flare.variance_dn2) for factor, part in ((each, rows), (scale, self.rows)))
+        each = self._each(flare)
+        scale = each @ self.between
+        whole, ours = each @ (squares @ flare.variance_dn2), scale @ (self.rows**2 @ flare.variance_dn2)
         return bool((scale >= 0).all() and abs(ours - whole) <= WORST * whole)
 
     def _each(self, flare: Expectation) -> Float:
