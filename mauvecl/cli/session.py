@@ -125,13 +125,12 @@ class Session:
             stack.enter_context(told_of_interrupts(lambda: self._kept(checkpoint)))
             stack.enter_context(checkpoint)
             self.say(checkpoint.messages)
-            if self.pictures:
-                # Half a second that would be waited for at the end; devices leave one thread idle meanwhile.
-                threading.Thread(target=_load_matplotlib, name="mauvecl-load", daemon=True).start()
             stack.enter_context(self.meter)
             workers = stack.enter_context(working(self.device, self.cluster))
             progress = self.meter if unit == "realisations" else None
-            self._pool = Pool(workers, checkpoint=checkpoint, progress=progress)
+            # Half a second that would be waited for at the end.
+            meanwhile = _load_matplotlib if self.pictures else None
+            self._pool = Pool(workers, checkpoint=checkpoint, progress=progress, meanwhile=meanwhile)
             self.meter.standing = lambda: self._pool.standing
             yield self._pool
             if checkpoint.damaged:

@@ -216,6 +216,8 @@ class Pool:
         Where shards are kept, and looked for.
     progress : callable, optional
         Called as ``progress(done, total)`` in realisations of all requests known so far; may raise to stop the work.
+    meanwhile : callable, optional
+        Done once, in a thread of its own, as soon as devices are busy: what would keep them waiting before.
     """
 
     def __init__(
@@ -224,8 +226,10 @@ class Pool:
         *,
         checkpoint: Checkpoint | None = None,
         progress: Progress | None = None,
+        meanwhile: Callable[[], None] | None = None,
     ) -> None:
         self.workers = workers or LocalWorkers()
+        self._meanwhile = meanwhile
         self.checkpoint, self._progress = checkpoint, progress
         self._lock = threading.RLock()
         self._done = self._total = self._shards = self._of = self._resumed = self._expected = 0
@@ -330,6 +334,9 @@ class Pool:
     def _tick(self, name: str, done: int) -> None:
         with self._lock:
             self._partly[name] = done
+            aside, self._meanwhile = self._meanwhile, None
+        if aside is not None:
+            threading.Thread(target=aside, name="mauvecl-aside", daemon=True).start()
         self._told()
 
     def _finished(self, name: str, shard: Shard, *, resumed: bool = False) -> None:

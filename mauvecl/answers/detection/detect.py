@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -204,11 +203,14 @@ def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
 
     if isinstance(engine, Pool):
         engine.expect(len(prepared) * run.realisations)
-    # What is drawn nothing for is computed while the devices count.
-    with ThreadPoolExecutor(1) as beside:
-        paper = beside.submit(_paper, study, [group for *_, group in prepared])
-        stars = list(together(engine, answered, prepared))
-    costs = [text for (_, cell, *_), star in zip(prepared, stars, strict=True) for text in _template_costs(cell, star)]
+    stars: list[StarDetection] = []
+    paper: list[str] = []
+    for star in together(engine, answered, prepared):
+        if not stars:
+            # What is drawn nothing for is computed while the devices count the next star.
+            paper = _paper(study, [group for *_, group in prepared])
+        stars.append(star)
+    costs = [text for (_, cell, *_), one in zip(prepared, stars, strict=True) for text in _template_costs(cell, one)]
     answer = DetectAnswer(study, stars)
     blinding = [f"{text[:-1]} ({star.title})." for star in stars for text in star.detection.messages]
     messages = [*blinding, *told([x for *_, group in prepared for x in group])]
@@ -225,7 +227,7 @@ def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
     ]
     last = [*_few_terms(stars), *marginal_lines(study), *cost_lines(unknown, study)]
     answer.messages = list(dict.fromkeys([*messages, *campaign_told, *costs, *last]))
-    answer.paper = paper.result()
+    answer.paper = paper
     return answer
 
 
