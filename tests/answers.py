@@ -6,8 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from mauvecl.device.engine import Engine
 from mauvecl.results.detection.detection import Detection
+from mauvecl.results.requests.requests import DetectRequest, Shard
 from mauvecl.results.snr import Counts, SnrResult
+from mauvecl.results.sums import DetectionSums
 from mauvecl.study.study import Study
 
 #: Realisations: several shards, the last a short one.
@@ -25,6 +28,18 @@ def same(ours: Detection, theirs: Detection) -> None:
     for key, kept in ours._samples.items():
         np.testing.assert_array_equal(kept.values, theirs._samples[key].values)
         np.testing.assert_array_equal(kept.realisations, theirs._samples[key].realisations)
+
+
+def twice(engine: Engine, request: DetectRequest) -> tuple[Detection, Detection]:
+    """What is asked, and again with as many realisations after those: planned once, which takes longer than drawing."""
+    return _counted(engine, request, request.start), _counted(engine, request, request.start + request.realisations)
+
+
+def _counted(engine: Engine, request: DetectRequest, start: int) -> Detection:
+    sums = DetectionSums(request)
+    for part in range(request.parts):
+        sums.add(part, engine.count(request, Shard(part, start, request.realisations)))
+    return sums.answer()
 
 
 def same_snr(ours: SnrResult, theirs: SnrResult) -> None:
