@@ -17,7 +17,7 @@ from mauvecl.lightcurve.stares.stare import Stare
 
 
 def test_bank_of_the_page():
-    """Eight filters a factor of two apart: .41 to .48 tests a frame, the median of a day at 3.73 (TIME.md, section 4)."""
+    """Eight filters a factor of two apart: .41 to .48 tests a frame, the median of a day at 3.73 (TIME.md)."""
     bank = Bank(tuple(30 * 2.0**k for k in range(8)), ONE, DAVENPORT, 5.0, KNOWN)
     trials = Trials.of(bank)
     assert 0.41 < trials.per_frame_above(3.5) < trials.per_frame_above(3.73) < 0.51
