@@ -79,6 +79,11 @@ class SearchChoice(Part):
         """False alarms per star-day."""
         return per_day(self.false_alarms, self.per)
 
+    def white_bank(self, frame_s: float) -> Bank:
+        """For one sum of each frame and no curves, as closed forms take it."""
+        level = Level(self.offset, self.slope, False, WINDOW_S if self.window_s is None else self.window_s)
+        return Bank(self.half_widths_s, np.ones((1, 1)), shape_of(self.shape), frame_s, level)
+
     def level(self, stare: Stare, orbit_s: float) -> Level:
         """What is unknown of the level in a stare."""
         from mauvecl.lightcurve.search.bank import Level

@@ -21,7 +21,7 @@ from mauvecl.answers.campaigns.planned import (
 )
 from mauvecl.answers.campaigns.visible import VisibleAnswer, visible
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.search.completeness import DAY_S
+from mauvecl.lightcurve.search.null import DAY_S
 from mauvecl.lightcurve.search.yields import Yield, recovered_per_day
 from mauvecl.study.labels import described, stacked, told
 from mauvecl.study.study import Study

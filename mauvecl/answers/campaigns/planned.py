@@ -116,8 +116,7 @@ def closed_form(study: Study, looked: Looked) -> Completeness:
         looked.scale,
         window_s=looked.window_s,
         false_alarms_per_day=study.search.rate,
-        frame_s=looked.quiet.frame_s,
-        shape=study.search.shape,
+        bank=study.search.white_bank(looked.quiet.frame_s),
         law=study.plan.law(),
     )
 
