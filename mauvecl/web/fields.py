@@ -229,8 +229,8 @@ FIELDS = {
     ),
     "signal": Field(
         "Counted as signal", "net", Choice(("net", "paper")),
-        "In the S/N: the light of the star alone (net), or that of the sky too, as in the MauveSim paper. It changes no "
-        "detection.",
+        "In the S/N: the light of the star alone (net), or that of the sky too, as in the MauveSim paper. It "
+        "changes no detection.",
     ),
     "sky": Field("Sky", "brightness", Choice(SKIES), "Zodiacal light behind the star."),
     "sky_brightness": Field(

@@ -8,12 +8,13 @@ from scipy import special
 from searches import DAVENPORT, KNOWN, ONE
 
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.search.bank import HALF_WIDTHS_S, Bank, Level
+from mauvecl.lightcurve.search.bank import Bank, Level
 from mauvecl.lightcurve.search.completeness import default_bank, search_threshold
 from mauvecl.lightcurve.search.null import counted, sampled
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.search.trials import Trials
 from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.lightcurve.usual import HALF_WIDTHS_S
 
 
 def test_bank_of_the_page():

@@ -387,7 +387,8 @@ def test_what_is_done_meanwhile_begins_once_and_not_before_the_devices() -> None
     assert begun == []
     for _ in range(2):
         pool.detect(quiet, flares, realisations=N, seed=5)
-    assert len(begun) == 1 and begun[0] > 0
+    (of,) = begun
+    assert of > 0
 
 
 def test_progress_tells_shards_and_what_was_resumed(tmp_path: Path, engine: Engine) -> None:

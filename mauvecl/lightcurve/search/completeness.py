@@ -13,10 +13,10 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.lightcurve.flares.energies import EnergyScale
 from mauvecl.lightcurve.flares.shapes import Shape, shape_of
-from mauvecl.lightcurve.search.bank import HALF_WIDTHS_S as BANK_S
 from mauvecl.lightcurve.search.bank import Bank
 from mauvecl.lightcurve.search.null import DAY_S
 from mauvecl.lightcurve.search.trials import Trials
+from mauvecl.lightcurve.usual import HALF_WIDTHS_S as BANK_S
 
 Float = NDArray[np.float64]
 
