@@ -224,7 +224,7 @@ class Run(Part):
     statistics: Annotated[tuple[str, ...], Field(min_length=1)] = USUAL_STATISTICS
     fap: Annotated[float, Field(gt=0, lt=1)] = 1e-3
     tails: Literal["counted", "sampled"] = "counted"
-    reference: str = "expectation"
+    reference: str = "template"
     variances: Literal["model", "estimated"] = "model"
     template_temperatures_k: tuple[float, ...] = ()
     weights: dict[str, Path] = Field(default_factory=dict)

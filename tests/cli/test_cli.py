@@ -392,7 +392,7 @@ BAD = {
     "instrument": (["detect", "--instrument", "hubble"], "hubble"),
     "device": (["detect", "--device", "abacus"], "'abacus' is not here, expected one of"),
     "statistic": (["detect", "--statistic", "chi3"], "'chi3' is unknown"),
-    "reference": (["detect", "--reference", "stack"], "reference = 'stack', expected 'expectation', 'exposure' or"),
+    "reference": (["detect", "--reference", "stack"], "reference = 'stack', expected 'template', 'exposure' or"),
     "variances": (["detect", "--variances", "guessed"], "run.variances = 'guessed'"),
     "rare fap": (["detect", "--fap", "1e-6", "-n", "1000", "--star", "G2V"], "ask for 100000000 realisations"),
     "realisations": (["detect", "-n", "0"], "run.realisations = 0"),
