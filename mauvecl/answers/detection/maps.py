@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
+from mauvecl.host.tables import tabled
 from mauvecl.results.requests.fap import check_fap
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, told
@@ -67,30 +68,22 @@ class MapResult(Answer):
     @property
     def table(self) -> QTable:
         """One row per cell and statistic."""
-        import astropy.units as u
-        from astropy.table import QTable
-
-        table = QTable()
-        s, j, i = np.indices(self.probability.shape)
-        for axis, values, index in ((self.study.map.x, self.x, i), (self.study.map.y, self.y, j)):
-            column = np.array(values)[index.ravel()]
-            unit = UNITS.get(axis.quantity)
-            table[axis.quantity] = column if unit is None else column * u.Unit(unit)
-        table["statistic"] = np.array(self.statistics)[s.ravel()]
-        for name, text in (
-            ("probability", "detection probability"),
-            ("low", "its 95 % interval, lower end, with the threshold's own"),
-            ("high", "its 95 % interval, upper end, with the threshold's own"),
-            ("closed_form", "the same for Gaussian noise"),
-        ):
-            table[name] = getattr(self, name).ravel()
-            table[name].info.description = text
-        table.meta |= {
-            "star": self.star,
-            "fap": self.study.run.fap,
-            "realisations": self.study.run.realisations,
-            "study": self.study.text(),
-        }
+        s, j, i = (index.ravel() for index in np.indices(self.probability.shape))
+        axes = ((self.study.map.x, self.x, i), (self.study.map.y, self.y, j))
+        table = tabled(
+            (
+                *((a.quantity, np.array(values)[at], "", UNITS.get(a.quantity, "")) for a, values, at in axes),
+                ("statistic", np.array(self.statistics)[s]),
+                ("probability", self.probability.ravel(), "detection probability"),
+                ("low", self.low.ravel(), "its 95 % interval, lower end, with the threshold's own"),
+                ("high", self.high.ravel(), "its 95 % interval, upper end, with the threshold's own"),
+                ("closed_form", self.closed_form.ravel(), "the same for Gaussian noise"),
+            ),
+            star=self.star,
+            fap=self.study.run.fap,
+            realisations=self.study.run.realisations,
+            study=self.study.text(),
+        )
         return described(table)
 
     ENDINGS = ("ecsv", "fits")

@@ -13,6 +13,7 @@ from scipy import special
 
 from mauvecl.answers.detection.unknown_cost import Cost, spoken, unknown_cost
 from mauvecl.host.plotting import picture
+from mauvecl.host.tables import telling
 from mauvecl.study.labels import described, label
 from mauvecl.study.nuisances import NuisanceChoice
 
@@ -31,6 +32,14 @@ SHOWN: dict[str, NuisanceChoice] = {
         NuisanceChoice(sky=0.1),
         NuisanceChoice(tilt=0.01),
     )
+}
+
+DESCRIPTIONS = {
+    "unknown": "what is unknown",
+    "known": "S/N of the matched statistic with everything known",
+    "plain": "the same where it is unknown and the statistic does not know of it",
+    "marginalised": "the same, marginalised",
+    "smallest": "flare amplitude that is detected, marginalised, at the header's power and false alarms",
 }
 
 
@@ -78,19 +87,8 @@ class UnknownTable:
             for unknown, c in costs.items()
         ]
         table = QTable(rows=rows, names=("star", "amplitude", "unknown", "known", "plain", "marginalised", "smallest"))
-        for name, text in (
-            ("unknown", "what is unknown"),
-            ("known", "S/N of the matched statistic with everything known"),
-            ("plain", "the same where it is unknown and the statistic does not know of it"),
-            ("marginalised", "the same, marginalised"),
-            (
-                "smallest",
-                "flare amplitude that is detected, marginalised, at the header's power and false alarms",
-            ),
-        ):
-            table[name].info.description = text
         table.meta |= {"fap": self.study.run.fap, "power": self.study.limit.power, "study": self.study.toml()}
-        return described(table)
+        return described(telling(table, DESCRIPTIONS))
 
     def _repr_html_(self) -> str:
         return str(self.table._repr_html_())

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.limits.search import LimitSearch
+from mauvecl.host.tables import tabled
 from mauvecl.noise.processes import Uniform
 from mauvecl.study.labels import described
 from mauvecl.study.sections import Star, Unknowns
@@ -89,8 +90,6 @@ def what_matters(study: Study) -> QTable:
     InputError
         As `limits.limiting_magnitude`.
     """
-    from astropy.table import QTable
-
     amplitudes = (None,) if study.limit.of == "amplitude" else study.flare.amplitudes
     rows: list[Moved] = []
     for star in study.star:
@@ -98,21 +97,25 @@ def what_matters(study: Study) -> QTable:
             for statistic in study.run.statistics:
                 rows += sorted(_moves(study, star, amplitude, statistic), key=lambda m: -m.span)
     of = study.limit.of
-    table = QTable()
-    table["star"] = [m.star for m in rows]
-    table["amplitude"] = [m.amplitude for m in rows]
-    table["statistic"] = [m.statistic for m in rows]
-    table["assumption"] = [m.assumption.name for m in rows]
-    table["low_end"] = [m.assumption.ends[0] for m in rows]
-    table["high_end"] = [m.assumption.ends[1] for m in rows]
-    table[of] = [m.nominal for m in rows]
-    table["at_low_end"] = [m.at_ends[0] for m in rows]
-    table["at_high_end"] = [m.at_ends[1] for m in rows]
-    table["span"] = [m.span for m in rows]
+    table = tabled(
+        (
+            ("star", [m.star for m in rows]),
+            ("amplitude", [m.amplitude for m in rows]),
+            ("statistic", [m.statistic for m in rows]),
+            ("assumption", [m.assumption.name for m in rows]),
+            ("low_end", [m.assumption.ends[0] for m in rows]),
+            ("high_end", [m.assumption.ends[1] for m in rows]),
+            (of, [m.nominal for m in rows]),
+            ("at_low_end", [m.at_ends[0] for m in rows]),
+            ("at_high_end", [m.at_ends[1] for m in rows]),
+            ("span", [m.span for m in rows], f"how far the closed-form limit of {of} moves from end to end"),
+        ),
+        power=study.limit.power,
+        fap=study.run.fap,
+        study=study.text(),
+    )
     for name in (of, "at_low_end", "at_high_end", "span"):
         table[name].info.format = ".3f"
-    table["span"].info.description = f"how far the closed-form limit of {of} moves from end to end"
-    table.meta |= {"power": study.limit.power, "fap": study.run.fap, "study": study.text()}
     return described(table)
 
 

@@ -11,6 +11,7 @@ from mauvecl.answers.answer import Answer
 from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import number
 from mauvecl.host.ranges import DAY_S
+from mauvecl.host.tables import tabled
 from mauvecl.study.labels import described, label, told
 from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.sections import Star
@@ -61,24 +62,19 @@ class ExposureResult(Answer):
     @property
     def table(self) -> QTable:
         """One row per star."""
-        import astropy.units as u
-        from astropy.table import QTable
-
-        table = QTable()
-        rows = self.exposures
-        table["star"] = [r.star for r in rows]
-        table["wavelength"] = [r.wavelength_nm for r in rows] * u.nm
-        table["per"] = [r.per for r in rows]
-        table["wanted"] = [r.wanted for r in rows]
-        table["exposure"] = [r.exposure_s for r in rows] * u.s
-        table["frames"] = [r.frames for r in rows]
-        table["snr"] = [r.snr for r in rows]
-        table["snr_one_frame_less"] = [r.snr_one_frame_less for r in rows]
-        table["saturated"] = [r.saturated for r in rows]
-        table["exposure"].info.description = "the fewest frames whose closed-form S/N reaches the wanted one"
-        table["saturated"].info.description = "whether the pixel, or one of the element, saturates in a single frame"
-        table.meta["study"] = self.study.text()
-        return described(table)
+        columns = (
+            ("star", "star"),
+            ("wavelength", "wavelength_nm", "", "nm"),
+            ("per", "per"),
+            ("wanted", "wanted"),
+            ("exposure", "exposure_s", "the fewest frames whose closed-form S/N reaches the wanted one", "s"),
+            ("frames", "frames"),
+            ("snr", "snr"),
+            ("snr_one_frame_less", "snr_one_frame_less"),
+            ("saturated", "saturated", "whether the pixel, or one of the element, saturates in a single frame"),
+        )
+        made = ((name, [getattr(r, of) for r in self.exposures], *more) for name, of, *more in columns)
+        return described(tabled(made, study=self.study.text()))
 
     @property
     def tables(self) -> dict[str, Table]:

@@ -6,7 +6,7 @@ import hashlib
 import os
 from collections.abc import Callable, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
@@ -15,13 +15,14 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
 from mauvecl.host.errors import InputError
+from mauvecl.host.tables import tabled
 from mauvecl.lightcurve.search.injected import Fitted, InjectedShares, fitted
 from mauvecl.lightcurve.search.injections import Injections
 from mauvecl.lightcurve.search.null import DAY_S, Counted, counted, in_a_row_rate, sampled
 from mauvecl.results.requests.requests import Shard
 from mauvecl.results.sums import Arrays
 from mauvecl.statistics.intervals import Interval
-from mauvecl.study.labels import described, label, put_first, stacked, titled, told
+from mauvecl.study.labels import described, label, stacked, titled, told
 from mauvecl.study.staring import orbit_lines
 from mauvecl.study.study import Study
 from mauvecl.study.surveys import Sizes, Surveyed, sizes_of, surveyed
@@ -133,11 +134,7 @@ class InjectAnswer(Answer):
         return self._together(_search)
 
     def _together(self, make: Callable[[StarCompleteness], QTable]) -> QTable:
-        parts: list[tuple[Mapping[str, float | str], QTable]] = []
-        for star in self.stars:
-            table = make(star)
-            put_first(table, {"star": star.label})
-            parts.append((star.at, table))
+        parts = (({**star.at, "star": star.label}, make(star)) for star in self.stars)
         choice = self.study.search
         meta = {
             "false_alarms": f"{choice.false_alarms:g} per star-{choice.per}",
@@ -162,86 +159,57 @@ class InjectAnswer(Answer):
         return {"completeness": ("injections.maps", self), "curves": ("injections.curves", self), **fitted}
 
 
-def _size_column(values: Any, sizes: Sizes) -> Any:
-    import astropy.units as u
-
-    unit = SIZE_UNITS[sizes.of]
-    return values * u.Unit(unit) if unit else values
-
-
 def _limits(star: StarCompleteness) -> QTable:
-    import astropy.units as u
-    from astropy.table import QTable
-
-    found = star.found
-    table = QTable()
-    widths = np.array([np.nan, *found.half_widths_s])
-    table["half_width"] = widths * u.s
-    table["half_width"].info.description = "half-width of the injected flares; NaN for all of them alike"
+    found, unit = star.found, SIZE_UNITS[star.sizes.of]
+    every = (None, *range(len(found.half_widths_s)))
+    widths, told = [np.nan, *found.half_widths_s], "half-width of the injected flares; NaN for all of them alike"
+    columns: list[tuple[object, ...]] = [("half_width", widths, told, "s")]
     for power in POWERS:
-        each = [found.limit(power, None), *(found.limit(power, k) for k in range(len(found.half_widths_s)))]
-        name = f"e{100 * power:.0f}"
-        for ending, values in (("", "value"), ("_low", "low"), ("_high", "high")):
-            table[name + ending] = _size_column(np.array([getattr(x, values) for x in each]), star.sizes)
-        table[name].info.description = f"{star.sizes.of} at which the completeness is {power:g}"
-        table[name + "_low"].info.description = "its 95 % interval, lower end"
-        table[name + "_high"].info.description = "its 95 % interval, upper end"
-    table["never"] = np.array([found.never(None), *(found.never(k) for k in range(len(found.half_widths_s)))])
-    table["never"].info.description = "share of flares for which no template fits into what is observed"
-    return described(table)
+        name, limits = f"e{100 * power:.0f}", np.array([astuple(found.limit(power, k)) for k in every]).T
+        columns += [
+            (name, limits[0], f"{star.sizes.of} at which the completeness is {power:g}", unit),
+            (f"{name}_low", limits[1], "its 95 % interval, lower end", unit),
+            (f"{name}_high", limits[2], "its 95 % interval, upper end", unit),
+        ]
+    text = "share of flares for which no template fits into what is observed"
+    return described(tabled([*columns, ("never", np.array([found.never(k) for k in every]), text)]))
 
 
 def _cells(star: StarCompleteness) -> QTable:
-    import astropy.units as u
-    from astropy.table import QTable
-
-    found = star.found
+    found, of, unit = star.found, star.sizes.of, SIZE_UNITS[star.sizes.of]
     d, s = (index.ravel() for index in np.indices((len(found.half_widths_s), len(found.sizes))))
-    table = QTable()
-    table["half_width"] = np.array(found.half_widths_s)[d] * u.s
-    table["half_width"].info.description = "half-width of the injected flares"
-    table["size"] = _size_column(found.sizes[s], star.sizes)
-    table["size"].info.description = f"{star.sizes.of} of the injected flares"
-    table["amplitude"] = found.amplitudes[d, s]
-    table["amplitude"].info.description = "their amplitude: relative rise of the photons in the flare's band"
-    for name, text in (
-        ("completeness", "share of injected flares that the search finds"),
-        ("completeness_low", "its 95 % interval, lower end"),
-        ("completeness_high", "its 95 % interval, upper end"),
-    ):
-        table[name] = getattr(found, name)[d, s]
-        table[name].info.description = text
-    table["injections"] = np.full(d.size, found.count)
+    columns = [
+        ("half_width", np.array(found.half_widths_s)[d], "half-width of the injected flares", "s"),
+        ("size", found.sizes[s], f"{of} of the injected flares", unit),
+        ("amplitude", found.amplitudes[d, s], "their amplitude: relative rise of the photons in the flare's band"),
+        ("completeness", found.completeness[d, s], "share of injected flares that the search finds"),
+        ("completeness_low", found.completeness_low[d, s], "its 95 % interval, lower end"),
+        ("completeness_high", found.completeness_high[d, s], "its 95 % interval, upper end"),
+        ("injections", np.full(d.size, found.count)),
+    ]
     if star.fitted is not None:
-        for name, text in Fitted.COLUMNS.items():
-            table[name] = getattr(star.fitted, name)[d, s]
-            table[name].info.description = text
-    return described(table)
+        columns += [(name, getattr(star.fitted, name)[d, s], text) for name, text in Fitted.COLUMNS.items()]
+    return described(tabled(columns))
 
 
 def _search(star: StarCompleteness) -> QTable:
-    from astropy.table import QTable
-
     s = star.surveyed.survey
-    rows = {
-        "threshold": (star.threshold.value, "S/N from which on a template is an alarm"),
-        "threshold_low": (star.threshold.low, "its 95 % interval, lower end"),
-        "threshold_high": (star.threshold.high, "its 95 % interval, upper end"),
-        "checked_at": (star.checked, "S/N at which drawn stares are held against normal noise"),
-        "alarms_sampled": (star.asked, "false alarms per star-day there, normal noise"),
-        "alarms_simulated": (star.simulated.value, "false alarms per star-day there, drawn stares"),
-        "alarms_low": (star.simulated.low, "lower end: 4 standard errors"),
-        "alarms_high": (star.simulated.high, "upper end: 4 standard errors"),
-        "in_a_row": (star.in_a_row, "false alarms per star-day of the common rule, white noise"),
-        "templates": (s.search.n_filters, "templates of the bank"),
-        "sums": (s.components.n_statistics, "weighted sums of a frame"),
-        "spectral_loss": (float(star.surveyed.templates.loss.max()), "largest share of S/N lost to so few sums"),
-        "star_days": (s.stare.observed_s / DAY_S, "star-days of a stare"),
-    }
-    table = QTable({name: [value] for name, (value, _) in rows.items()})
-    for name, (_, text) in rows.items():
-        table[name].info.description = text
-    return described(table)
+    rows = (
+        ("threshold", star.threshold.value, "S/N from which on a template is an alarm"),
+        ("threshold_low", star.threshold.low, "its 95 % interval, lower end"),
+        ("threshold_high", star.threshold.high, "its 95 % interval, upper end"),
+        ("checked_at", star.checked, "S/N at which drawn stares are held against normal noise"),
+        ("alarms_sampled", star.asked, "false alarms per star-day there, normal noise"),
+        ("alarms_simulated", star.simulated.value, "false alarms per star-day there, drawn stares"),
+        ("alarms_low", star.simulated.low, "lower end: 4 standard errors"),
+        ("alarms_high", star.simulated.high, "upper end: 4 standard errors"),
+        ("in_a_row", star.in_a_row, "false alarms per star-day of the common rule, white noise"),
+        ("templates", s.search.n_filters, "templates of the bank"),
+        ("sums", s.components.n_statistics, "weighted sums of a frame"),
+        ("spectral_loss", float(star.surveyed.templates.loss.max()), "largest share of S/N lost to so few sums"),
+        ("star_days", s.stare.observed_s / DAY_S, "star-days of a stare"),
+    )
+    return described(tabled((name, [value], text) for name, value, text in rows))
 
 
 def inject(

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from mauvecl.host.tables import tabled
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.results.requests.fap import countable
 from mauvecl.statistics.distributions import Form
@@ -151,15 +152,9 @@ def departure_table(detection: Detection, amplitudes: Sequence[float], fap: floa
         Of its flares.
     fap : float
     """
-    from astropy.table import QTable
-
     rows = departures(detection, fap) if countable(fap, detection.realisations) else []
-    table = QTable()
-    table["statistic"] = np.array([d.statistic for d in rows], str)
-    table["amplitude"] = np.array(
-        [amplitudes[d.template] if detection.statistic(d.statistic).shaped else np.nan for d in rows]
-    )
-    for name, values, text in (
+    shaped = [detection.statistic(d.statistic).shaped for d in rows]
+    numbers = (
         ("gaussian_threshold", [d.threshold for d in rows], "threshold for Gaussian noise"),
         ("fap", [d.simulated.value for d in rows], "simulated false-alarm probability there"),
         ("fap_low", [d.simulated.low for d in rows], "its 95 % interval, lower end"),
@@ -169,14 +164,21 @@ def departure_table(detection: Detection, amplitudes: Sequence[float], fap: floa
         ("skew", [d.skew for d in rows], "predicted change of the ratio by the noise's skew and kurtosis"),
         ("rounding", [d.rounding for d in rows], "predicted change of the ratio by the ADC's steps"),
         ("clipping", [d.clipping for d in rows], "predicted change of the ratio by the ADC's ends"),
-    ):
-        table[name] = np.array(values, float)
-        table[name].info.description = text
-    table["differs"] = np.array([d.differs for d in rows], bool)
-    table["differs"].info.description = "whether chance does not explain the ratio: 4 standard errors"
-    table["why"] = np.array([d.why for d in rows], str)
-    table.meta["fap"] = fap
-    return table
+    )
+    differs = np.array([d.differs for d in rows], bool)
+    return tabled(
+        (
+            ("statistic", np.array([d.statistic for d in rows], str)),
+            (
+                "amplitude",
+                np.array([amplitudes[d.template] if s else np.nan for d, s in zip(rows, shaped, strict=True)]),
+            ),
+            *((name, np.array(values, float), text) for name, values, text in numbers),
+            ("differs", differs, "whether chance does not explain the ratio: 4 standard errors"),
+            ("why", np.array([d.why for d in rows], str)),
+        ),
+        fap=fap,
+    )
 
 
 def _skewed(detection: Detection, statistic: str, template: int, null: Form, cut: float) -> float:

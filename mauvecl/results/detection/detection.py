@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mauvecl.host.content import ByContent
 from mauvecl.host.plotting import picture
 from mauvecl.host.quantities import count
+from mauvecl.host.tables import tabled, telling
 from mauvecl.results.counts.tally import Distribution, TailSamples, Tally
 from mauvecl.results.detection.roc import Roc
 from mauvecl.results.requests.channels import ChannelPlan, Key
@@ -196,15 +197,12 @@ class Detection(ByContent, Hypotheses):
         QTable
             ``realisation`` and ``value``, the most extreme first.
         """
-        from astropy.table import QTable
-
         self._check(statistic, flare, template)
         key: Key = (statistic, "flare", flare) if flare is not None else self._null_key(statistic, template)
         self._at(key)
         kept = self._samples[key]
-        table = QTable({"realisation": kept.realisations, "value": kept.values})
-        table["value"].info.description = "of the statistic, as the device computed it"
-        return table
+        told = "of the statistic, as the device computed it"
+        return tabled([("realisation", kept.realisations), ("value", kept.values, told)])
 
     def roc(self, statistic: str = "chi2", flare: int = 0) -> Roc:
         """False-alarm probability against detection probability, and the area under the curve."""
@@ -248,15 +246,12 @@ class Detection(ByContent, Hypotheses):
                 row = (x.name, statistic, dof, *of_flare, cut.value, cut.low, cut.high, p.value, p.low, p.high)
                 rows.append((*row, limit, power))
         table = QTable(rows=rows, names=columns)
-        for name, text in DESCRIPTIONS.items():
-            table[name].info.description = text
         tails = [self.tail(fap, s, template=flare) for flare in range(len(self.flares)) for s in self.statistics]
         binomial = float(np.sqrt((1 - fap) / (fap * self.realisations)))
         table["fap_error"] = [binomial if tail is None else tail.relative_error for tail in tails]
-        table["fap_error"].info.description = "relative standard error of the false-alarm probability at the threshold"
         table.meta |= {"fap": fap, "realisations": self.realisations, "exposure_s": self.quiet.exposure_s}
         table.meta["tails"] = "counted" if countable(fap, self.realisations) else "importance sampling"
-        return table
+        return telling(table, DESCRIPTIONS)
 
     def _null_key(self, statistic: str, template: int) -> Key:
         return statistic, "null", self._null(statistic, template)
@@ -289,4 +284,5 @@ DESCRIPTIONS = {
     "high": "its 95 % interval, upper end, the threshold's error included",
     "closed_form_threshold": "threshold for Gaussian noise",
     "closed_form_probability": "detection probability for Gaussian noise",
+    "fap_error": "relative standard error of the false-alarm probability at the threshold",
 }
