@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, Self
 
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import count
 
@@ -14,6 +15,7 @@ Variances = Literal["model", "estimated"]
 MOST_EXPOSURES = 1000
 
 
+@public
 @dataclass(frozen=True)
 class Comparison:
     """The quiescent spectrum that is subtracted, and the variances that are divided by.

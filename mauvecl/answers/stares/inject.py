@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.search.injected import Fitted, InjectedShares, fitted
 from mauvecl.lightcurve.search.injections import Injections
@@ -244,6 +245,7 @@ def _search(star: StarCompleteness) -> QTable:
     return described(table)
 
 
+@public
 def inject(
     study: Study,
     stares: Stares | None = None,
