@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..content import ByContent
+from ..doors import public
 from ..errors import InputError
 from ..files.ecsv import read_ecsv
 from ..quantities import count
@@ -29,6 +30,7 @@ COLUMNS = {
 }
 
 
+@public
 @dataclass(frozen=True, eq=False)
 class PixelMap(ByContent):
     """One value per pixel of the whole array; None leaves the instrument's value.

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..content import ByContent
+from ..doors import public
 from ..errors import InputError
 from ..plotting import picture
 from ..quantities import number
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 BRIGHTEST_V, SUN_V = -2.0, (-27.3, -26.2)
 
 
+@public
 @dataclass(frozen=True, eq=False)
 class Source(ByContent):
     """A stellar spectrum at the telescope.
@@ -279,6 +281,10 @@ class Source(ByContent):
         import astropy.units as u
         from synphot.units import FLAM
 
+        if not hasattr(spectrum, "waveset"):
+            raise InputError(
+                f"the spectrum is of the type {type(spectrum).__name__}, expected a SourceSpectrum of synphot"
+            )
         own = spectrum.waveset
         if own is None:
             raise InputError(f"{name} has no wavelengths of its own, expected a spectrum with a waveset")
@@ -295,6 +301,8 @@ class Source(ByContent):
     @classmethod
     def from_specutils(cls, spectrum: Any, *, name: str = "specutils spectrum") -> Self:
         """A one-dimensional specutils Spectrum with units."""
+        if not (hasattr(spectrum, "spectral_axis") and hasattr(spectrum, "flux")):
+            raise InputError(f"the spectrum is of the type {type(spectrum).__name__}, expected a Spectrum of specutils")
         axis, flux = spectrum.spectral_axis, spectrum.flux
         if flux.ndim != 1:
             raise InputError(f"{name} has shape {flux.shape}, expected one spectrum")

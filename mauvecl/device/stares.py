@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mauvecl.device.opened import Device
 from mauvecl.device.stare_launches import StareLaunches
 from mauvecl.device.tiles import Progress, Tile, Tiles
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.stares.components import Components
 from mauvecl.lightcurve.stares.requests import Arrays, Kept, Method, StaresRequest, joined
@@ -26,6 +27,7 @@ Floats = NDArray[np.float32]
 REDUCED_BYTES = 4 * 2**20
 
 
+@public
 class Stares:
     """Draws stares on an OpenCL device.
 

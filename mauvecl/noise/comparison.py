@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Self
 
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import count
 
@@ -12,6 +13,7 @@ from mauvecl.host.quantities import count
 MOST_EXPOSURES = 1000
 
 
+@public
 @dataclass(frozen=True)
 class Comparison:
     """The quiescent spectrum that is subtracted, and the variances that are divided by.

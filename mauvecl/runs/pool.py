@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
 from mauvecl.device.tiles import Progress
+from mauvecl.host.doors import public
+from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import count as whole
 from mauvecl.lightcurve.stares.requests import StaresRequest, StareSums
 from mauvecl.results.requests.requests import Countable, DetectRequest, RealiseRequest, Shard, SnrRequest
@@ -83,6 +85,7 @@ class Workers(Protocol):
         """Let go of everything."""
 
 
+@public
 class LocalWorkers:
     """The OpenCL devices of this machine, in a thread each.
 
@@ -205,6 +208,7 @@ class Standing:
     resumed: int
 
 
+@public
 class Pool:
     """Answers what an `Engine` answers, with all workers, and the same to the last bit.
 
@@ -228,7 +232,10 @@ class Pool:
         progress: Progress | None = None,
         meanwhile: Callable[[], None] | None = None,
     ) -> None:
-        self.workers = workers or LocalWorkers()
+        if workers is not None and not hasattr(workers, "submit"):
+            kind = type(workers).__name__
+            raise InputError(f"the workers are of the type {kind}, expected LocalWorkers or DaskWorkers")
+        self.workers = LocalWorkers() if workers is None else workers
         self._meanwhile = meanwhile
         self.checkpoint, self._progress = checkpoint, progress
         self._lock = threading.RLock()

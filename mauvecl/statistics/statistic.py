@@ -49,7 +49,11 @@ class Setting:
     flares: Sequence[Expectation] = ()
     nuisances: Nuisances | None = None
     drawn: Drawn | None = None
-    _kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
+    _kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # What is remembered is known by where it lies in this process's memory.
+        return vars(self) | {"_kept": {}}
 
     @property
     def integrates(self) -> bool:

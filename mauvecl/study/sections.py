@@ -27,6 +27,8 @@ def plain(key: str, given: Any) -> Any:
         return numbers(key, given, unit_of(key)).tolist()
     if isinstance(given, list | tuple) and any(map(is_quantity, given)):
         return [plain(key, one) for one in given]
+    if hasattr(given, "tolist"):
+        return given.tolist()
     if hasattr(given, "utc") and hasattr(given, "isot"):
         return str(given.utc.isot)
     if hasattr(given, "icrs") and hasattr(given, "to_string"):

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import Field, ValidationError, model_validator
 
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import possible, read_text, toml
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
 PAPER_STARS = (Star(library="K3V", magnitude=3.7), Star(library="G2V", magnitude=7.4))
 
 
+@public
 class Study(Part):
     """Everything that an answer depends on; the default is the paper's question.
 

@@ -20,6 +20,7 @@ from mauvecl.answers.campaigns.planned import (
     star_of,
 )
 from mauvecl.answers.campaigns.visible import VisibleAnswer, visible
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.search.null import DAY_S
 from mauvecl.lightcurve.search.yields import Yield, recovered_per_day
@@ -270,6 +271,7 @@ def _measured(one: Planned) -> str:
     return f"published for {low:.2g} to {high:.2g} erg, bolometric; scatter {one.rates.scatter_dex:g} dex (assumption)"
 
 
+@public
 def plan(
     study: Study,
     completeness: CompletenessOf | None = None,

@@ -11,6 +11,7 @@ import numpy as np
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.results.detection.campaign import campaign, per_test
 from mauvecl.results.detection.departures import departure_table
@@ -179,6 +180,7 @@ def _tails(star: StarDetection) -> QTable:
     return samples
 
 
+@public
 def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
     """Null and flare distributions of every star of a study, in every cell of its sweep.
 

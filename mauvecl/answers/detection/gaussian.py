@@ -17,6 +17,7 @@ from scipy import special
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.detect import DetectAnswer, detect
 from mauvecl.answers.signal.snr import SnrAnswer, snr
+from mauvecl.host.doors import public
 from mauvecl.host.tables import telling
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.results.snr import steps_of
@@ -242,6 +243,7 @@ def _of_thresholds(tested: QTable, flares: QTable) -> dict[str, float | str]:
     }
 
 
+@public
 def gaussian_report(study: Study, engine: Engine | Pool | None = None) -> GaussianReport:
     """The usual formula beside the simulation, over magnitude and exposure or what else the study sweeps.
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
+from mauvecl.host.doors import public
 from mauvecl.host.tables import tabled
 from mauvecl.results.requests.fap import check_fap
 from mauvecl.statistics.intervals import Interval
@@ -104,6 +105,7 @@ class MapResult(Answer):
         return {"map": ("plans.detection_map", self)}
 
 
+@public
 def detection_map(
     study: Study, engine: Engine | Pool | None = None, *, progress: Callable[[int, int], None] | None = None
 ) -> MapResult:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.limits.search import LimitSearch
+from mauvecl.host.doors import public
 from mauvecl.host.tables import tabled
 from mauvecl.noise.processes import Uniform
 from mauvecl.study.labels import described
@@ -72,6 +73,7 @@ class Moved:
         return abs(self.at_ends[1] - self.at_ends[0])
 
 
+@public
 def what_matters(study: Study) -> QTable:
     """The closed-form limits of a study with each assumption at both ends of its range, the largest move first.
 

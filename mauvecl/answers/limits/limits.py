@@ -12,6 +12,7 @@ import numpy as np
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import Cost, cost_lines, marginal_lines, unknown_cost
 from mauvecl.answers.limits.search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.tables import tabled
 from mauvecl.results.requests.fap import check_fap
@@ -251,6 +252,7 @@ def solve(
     )
 
 
+@public
 def limiting_magnitude(
     study: Study, engine: Engine | Pool | None = None, *, progress: Callable[[int, int], None] | None = None
 ) -> LimitResult:
@@ -305,11 +307,13 @@ def limiting_magnitude(
     return result
 
 
+@public
 def smallest_amplitude(study: Study, engine: Engine | Pool | None = None) -> LimitResult:
     """The smallest flare that is detected; as `limiting_magnitude`."""
     return limiting_magnitude(_asking(study, "amplitude"), engine)
 
 
+@public
 def shortest_exposure(study: Study, engine: Engine | Pool | None = None) -> LimitResult:
     """The shortest exposure in which the flares are detected; as `limiting_magnitude`."""
     return limiting_magnitude(_asking(study, "exposure"), engine)

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from mauvecl.answers.answer import Answer
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import number
 from mauvecl.host.ranges import DAY_S
@@ -119,6 +120,7 @@ def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
     return int(x.element[pixel]) if per == "element" else pixel
 
 
+@public
 def exposure_for(
     study: Study, snr: float | None = None, wavelength_nm: u.Quantity | float | None = None, *, per: Per | None = None
 ) -> ExposureResult:

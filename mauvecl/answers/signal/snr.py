@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.signal.exposures import place_of
+from mauvecl.host.doors import public
 from mauvecl.runs.pool import Pool, together
 from mauvecl.study.labels import label, stacked, titled, told
 from mauvecl.study.study import Study
@@ -112,6 +113,7 @@ class SnrAnswer(Answer):
         return stacked(parts, realisations=self.study.run.realisations, study=self.study.text())
 
 
+@public
 def snr(study: Study, engine: Engine | Pool) -> SnrAnswer:
     """S/N distributions of every star of a study, without flares, in every cell of its sweep.
 

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.tables import tabled
 from mauvecl.lightcurve.search.injected import Fitted, InjectedShares, fitted
@@ -212,6 +213,7 @@ def _search(star: StarCompleteness) -> QTable:
     return described(tabled((name, [value], text) for name, value, text in rows))
 
 
+@public
 def inject(
     study: Study,
     stares: Stares | None = None,

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.answers.answer import Answer
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.tables import tabled
 from mauvecl.lightcurve.flares.events import Event, coefficients, temperatures_of
@@ -263,6 +264,7 @@ class StareAnswer(Answer):
         return {"messages": self.messages} | {name: rows(table) for name, table in tables.items()}
 
 
+@public
 def stare(study: Study, stares: Stares) -> StareAnswer:
     """One simulated stare at every star of a study, in every cell of its sweep.
 

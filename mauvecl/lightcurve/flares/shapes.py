@@ -15,6 +15,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.lightcurve.usual import check_shape
@@ -265,6 +266,7 @@ class Fiducial(Shape):
         return self.BOX + self.FOLD * float(np.log(2))
 
 
+@public
 @dataclass(frozen=True, eq=False)
 class TableShape(Shape):
     """A shape of one's own: linear between its points, zero outside them, scaled to a peak of one.

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from mauvecl.host.doors import public
 from mauvecl.host.tables import tabled
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.results.requests.fap import countable
@@ -91,6 +92,7 @@ class Departure:
         return name if abs(size) > 0.2 * abs(self.ratio - 1.0) else "unexplained"
 
 
+@public
 def departures(detection: Detection, fap: float) -> list[Departure]:
     """One row per statistic, and per flare for those that look for a flare's shape.
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.content import ByContent
+from mauvecl.host.doors import public
 from mauvecl.host.plotting import picture
 from mauvecl.host.quantities import count
 from mauvecl.host.tables import tabled, telling
@@ -29,6 +30,7 @@ if TYPE_CHECKING:
     from mauvecl.results.detection.tails import Tail
 
 
+@public
 @dataclass(eq=False)
 class Detection(ByContent, Hypotheses):
     """Null and flare distributions as they were counted; made by `Engine.detect`.
