@@ -131,8 +131,8 @@ class Source(ByContent):
         table = catalogue.spectrum_table(entry["file"])
         noisy = entry["noisy_below_nm"]
         return cls(
-            np.asarray(table["wavelength"], float),
-            np.asarray(table["flux"], float),
+            table["wavelength"],
+            table["flux"],
             entry["name"],
             f"{entry['origin']}; {entry['citation']}",
             (
@@ -313,7 +313,14 @@ class Source(ByContent):
 
     def to_synphot(self) -> Any:
         """The spectrum as a synphot SourceSpectrum, linear between its points."""
-        return bands.synphot_spectrum(self.wavelength_nm, self.flux_flam)
+        import astropy.units as u
+        from synphot import Empirical1D, SourceSpectrum
+        from synphot.units import FLAM, PHOTLAM, convert_flux
+
+        at = self.wavelength_nm * u.nm
+        photons = convert_flux(at, self.flux_flam * FLAM, PHOTLAM)
+        # Negative fluxes are measured noise; without this they become zero.
+        return SourceSpectrum(Empirical1D, points=at, lookup_table=photons, keep_neg=True)
 
     def to_specutils(self) -> Any:
         """The spectrum as a specutils Spectrum (needs the extra ``spectra``)."""
