@@ -206,7 +206,9 @@ def search_threshold(false_alarms_per_day: float, bank: Bank | None = None) -> f
     return float(optimize.brentq(over, *THRESHOLDS, xtol=1e-9))
 
 
-def frame_signal(quiet: Expectation, flare: Expectation, amplitude: float = 1.0) -> float:
+def frame_signal(
+    quiet: Expectation, flare: Expectation, amplitude: float = 1.0, *, added_variance_dn2: Float | None = None
+) -> float:
     """S/N of one frame with a flare of amplitude 1 against the quiescent star, by weights light / variance.
 
     Parameters
@@ -215,12 +217,15 @@ def frame_signal(quiet: Expectation, flare: Expectation, amplitude: float = 1.0)
         One frame each; pixels that saturate without a flare are left out.
     amplitude : float
         That of the flare.
+    added_variance_dn2 : ndarray, shape (n_pixel,), optional
+        Beside what is expected: of hits by particles.
     """
     if quiet.n_frames != 1 or flare.n_frames != 1:
         raise InputError(f"expectations of {quiet.n_frames} and {flare.n_frames} frames, expected one frame each")
     light = (flare.source_electrons - quiet.source_electrons) * quiet.gain_dn_per_electron / amplitude
+    variance = quiet.unsaturated_variance_dn2 + (0.0 if added_variance_dn2 is None else added_variance_dn2)
     used = ~quiet.saturated
-    return float(np.sqrt(np.sum(light[used] ** 2 / quiet.unsaturated_variance_dn2[used])))
+    return float(np.sqrt(np.sum(light[used] ** 2 / variance[used])))
 
 
 def _gains(shape: Shape, window_s: float, frame_s: float) -> tuple[Float, Float]:
