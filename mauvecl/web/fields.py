@@ -229,7 +229,7 @@ FIELDS = {
     ),
     "signal": Field(
         "Counted as signal", "net", Choice(("net", "paper")),
-        "In the S/N: the light of the star alone (net), or that of the sky too, as in the MauveSim paper. It changes no "
+        "In the S/N: the light of the star alone (net), or that of the sky too, as in the MauveSim paper. It moves no "
         "detection.",
     ),
     "sky": Field("Sky", "brightness", Choice(SKIES), "Zodiacal light behind the star."),

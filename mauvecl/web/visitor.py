@@ -22,7 +22,7 @@ from mauvecl.device.program import DeviceError
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.version import VERSION
-from mauvecl.web.asked import SIMULATED
+from mauvecl.web.asked import DRAWING, SIMULATED
 from mauvecl.web.card import card
 from mauvecl.web.closed import Closed
 from mauvecl.web.downloads import as_command, as_file, as_python, study_file
@@ -227,7 +227,7 @@ class Visitor(WebSocketHandler):
             closed = await self._beside(partial(self.closed, state))
             if self.job is not None:
                 raise InputError("there is a simulation already, expected its end first")
-            job = self.job = Job(partial(SIMULATED[kind], closed.study))
+            job = self.job = Job(partial(SIMULATED[kind], closed.study), drawing=kind in DRAWING)
         except InputError as error:
             self.tell(n=n, ended="", refused=str(error))
             return

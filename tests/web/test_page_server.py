@@ -503,6 +503,36 @@ def test_of_questions_in_a_row_the_last_is_answered(served: Any) -> None:
     assert served(work) < 50, "others have become pointless"
 
 
+@pytest.mark.parametrize("kind", SIMULATED)
+def test_cancel_ends_whatever_is_computed(served: Any, kind: str) -> None:
+    """Each is ended once it has begun, and the next one is computed."""
+    link = "?realisations=4000000&see=eps+Eri"
+
+    async def work(host: str) -> tuple[float, float]:
+        talk = await Talk.begin(host)
+        await talk.answer(link)
+        await talk._connection.write_message(json.dumps({"ask": "simulate", "n": 99, "kind": kind, "link": link}))
+        while "waiting" in (told := await talk.next()).get("told", "waiting"):
+            assert "ended" not in told, told
+        used = resource.getrusage(resource.RUSAGE_SELF).ru_utime
+        await talk._connection.write_message(json.dumps({"ask": "cancel", "n": 100}))
+        while "ended" not in (told := await talk.next()):
+            pass
+        assert told["ended"] == "Cancelled."
+        spent = resource.getrusage(resource.RUSAGE_SELF).ru_utime - used
+        await asyncio.sleep(0.3)
+        idle = resource.getrusage(resource.RUSAGE_SELF).ru_utime - used - spent
+        small = "?realisations=10000&fap=0.05&see=eps+Eri"
+        assert (await talk.simulate("detection", small))["ended"].startswith("Done")
+        talk.end()
+        return spent, idle
+
+    spent, idle = served(work)
+    # Processor time, for others may be at work; a tile may be under way on both processors.
+    assert spent < (2.0 if kind in ("completeness", "visible") else 8.0)
+    assert idle < 0.25, "nothing goes on behind it"
+
+
 #: For each table of a tab: verb, what it needs beside the study, its file.
 COMMANDS = {
     "detection": ("detect", [], "detection.ecsv"),
