@@ -474,7 +474,7 @@ def test_a_fault_of_our_own_leaves_no_answer(served: Any, monkeypatch: pytest.Mo
     async def work(host: str) -> None:
         talk = await Talk.begin(host)
         with monkeypatch.context() as patch:
-            patch.setattr(closed_forms, "Setting", lambda *_, **__: 1 / 0)
+            patch.setattr(closed_forms, "STATISTICS", {})
             told = await talk.answer("?magnitude=8")
             assert "answer" not in told
             assert told["refused"] == visitor.OWN_FAULT
@@ -615,7 +615,7 @@ def test_command_and_program_are_the_question(link: str, tmp_path: Path) -> None
     wanted = question.study()
     program = as_python(question)
     given: dict[str, Any] = {}
-    exec(program.partition("found =")[0], given)
+    exec(program.partition("answer =")[0], given)
     assert given["study"] == wanted
     seen: list[Study] = []
     from mauvecl.cli import session
