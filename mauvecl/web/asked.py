@@ -60,11 +60,11 @@ def _detection(study: Study, pool: Pool) -> dict[str, Any]:
 
 def _visible(study: Study) -> dict[str, Any]:
     """The answer with its tables, which are dear to make and looked at again and again."""
-    found = visible(study)
-    return {"visible": found, "seen": {name: getattr(found, name) for name in ("table", "months", "by_day")}}
+    answer = visible(study)
+    return {"visible": answer, "seen": {name: getattr(answer, name) for name in ("table", "months", "by_day")}}
 
 
-#: What may be simulated, by name: what is then found, by name.
+#: What may be computed on demand, by name: what is then known, by name.
 SIMULATED: dict[str, Callable[[Study, Pool], dict[str, Any]]] = {
     "detection": _detection,
     "limit": lambda study, pool: {"limit": limiting_magnitude(study, pool)},
@@ -72,3 +72,5 @@ SIMULATED: dict[str, Callable[[Study, Pool], dict[str, Any]]] = {
     "completeness": lambda study, pool: {"completeness": completeness(study)},
     "visible": lambda study, pool: _visible(study),
 }
+#: Those that draw by the pool.
+DRAWING = {"detection", "limit", "map"}

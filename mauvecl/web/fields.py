@@ -81,10 +81,10 @@ def points(text: str) -> tuple[tuple[float, float], ...] | None:
     pairs = [pair.split() for pair in text.split(",") if text.strip()]
     if any(len(pair) != 2 for pair in pairs):
         raise InputError(f"{shortened(text)} is no spectrum, expected pairs of nm and DN with commas between them")
-    found = tuple((float(number(nm)), float(number(dn))) for nm, dn in pairs)
-    if any(low >= high for (low, _), (high, _) in itertools.pairwise(found)):
+    spectrum = tuple((float(number(nm)), float(number(dn))) for nm, dn in pairs)
+    if any(low >= high for (low, _), (high, _) in itertools.pairwise(spectrum)):
         raise InputError(f"{shortened(text)} does not ascend in nm, expected pairs of nm and DN that do")
-    return found
+    return spectrum
 
 
 class Draws(NamedTuple):
@@ -229,8 +229,8 @@ FIELDS = {
     ),
     "signal": Field(
         "Counted as signal", "net", Choice(("net", "paper")),
-        "In the S/N: the light of the star alone (net), or that of the sky too, as in the MauveSim paper. It "
-        "changes no detection.",
+        "In the S/N: the light of the star alone (net), or that of the sky too, as in the MauveSim paper. It moves no "
+        "detection.",
     ),
     "sky": Field("Sky", "brightness", Choice(SKIES), "Zodiacal light behind the star."),
     "sky_brightness": Field(

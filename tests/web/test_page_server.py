@@ -478,7 +478,7 @@ def test_a_fault_of_our_own_leaves_no_answer(served: Any, monkeypatch: pytest.Mo
     async def work(host: str) -> None:
         talk = await Talk.begin(host)
         with monkeypatch.context() as patch:
-            patch.setattr(closed_forms, "Setting", lambda *_, **__: 1 / 0)
+            patch.setattr(closed_forms, "STATISTICS", {})
             told = await talk.answer("?magnitude=8")
             assert "answer" not in told
             assert told["refused"] == visitor.OWN_FAULT
@@ -505,6 +505,36 @@ def test_of_questions_in_a_row_the_last_is_answered(served: Any) -> None:
                 return answered
 
     assert served(work) < 50, "others have become pointless"
+
+
+@pytest.mark.parametrize("kind", SIMULATED)
+def test_cancel_ends_whatever_is_computed(served: Any, kind: str) -> None:
+    """Each is ended once it has begun, and the next one is computed."""
+    link = "?realisations=4000000&see=eps+Eri"
+
+    async def work(host: str) -> tuple[float, float]:
+        talk = await Talk.begin(host)
+        await talk.answer(link)
+        await talk._connection.write_message(json.dumps({"ask": "simulate", "n": 99, "kind": kind, "link": link}))
+        while "waiting" in (told := await talk.next()).get("told", "waiting"):
+            assert "ended" not in told, told
+        used = resource.getrusage(resource.RUSAGE_SELF).ru_utime
+        await talk._connection.write_message(json.dumps({"ask": "cancel", "n": 100}))
+        while "ended" not in (told := await talk.next()):
+            pass
+        assert told["ended"] == "Cancelled."
+        spent = resource.getrusage(resource.RUSAGE_SELF).ru_utime - used
+        await asyncio.sleep(0.3)
+        idle = resource.getrusage(resource.RUSAGE_SELF).ru_utime - used - spent
+        small = "?realisations=10000&fap=0.05&see=eps+Eri"
+        assert (await talk.simulate("detection", small))["ended"].startswith("Done")
+        talk.end()
+        return spent, idle
+
+    spent, idle = served(work)
+    # Processor time, for others may be at work; a tile may be under way on both processors.
+    assert spent < (2.0 if kind in ("completeness", "visible") else 8.0)
+    assert idle < 0.25, "nothing goes on behind it"
 
 
 #: For each table of a tab: verb, what it needs beside the study, its file.
@@ -589,7 +619,7 @@ def test_command_and_program_are_the_question(link: str, tmp_path: Path) -> None
     wanted = question.study()
     program = as_python(question)
     given: dict[str, Any] = {}
-    exec(program.partition("found =")[0], given)
+    exec(program.partition("answer =")[0], given)
     assert given["study"] == wanted
     seen: list[Study] = []
     from mauvecl.cli import session

@@ -346,8 +346,10 @@ def _kept(
         found = {p: part for p, part in kept.items() if part is not None}
     todo = [p for p in range(positions) if p not in found]
     pool = ThreadPoolExecutor(threads or os.cpu_count())
+    # One thread is the caller's own, which may be told to end.
+    each = map(work, todo) if threads == 1 else pool.map(work, todo)
     try:
-        for position, part in zip(todo, pool.map(work, todo), strict=True):
+        for position, part in zip(todo, each, strict=True):
             found[position] = part
             if checkpoint is not None:
                 checkpoint.put(f"{name}-{Shard(0, position, 1).name}", part)

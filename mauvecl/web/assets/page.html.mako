@@ -181,6 +181,9 @@ ${control(name)}
 <label><input type="checkbox" data-marks="marks" checked> spectral lines</label>
 <label><input type="checkbox" data-marks="more marks"> H alpha</label>
 % endif
+% if any(p.pins for p in tab.pictures):
+<label data-beside hidden><input type="checkbox" data-marks="pins" checked> pinned scenarios</label>
+% endif
 </div>
 <div class="wide rows" tabindex="0" role="region" aria-label="Table of ${tab.title}" hidden></div>
 % if tab.files:

@@ -12,7 +12,7 @@ from scipy.interpolate import PchipInterpolator
 
 from mauvecl.web.closed import percent
 from mauvecl.web.figures import Canvas
-from mauvecl.web.tabs.tab import Drawn, Found, Picture, Tab
+from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -27,7 +27,6 @@ Float = NDArray[np.float64]
 MAGNITUDES, PERCENTS = (2.0, 14.0), (0.1, 100.0)
 #: Columns and rows of a map in closed form; between them what varies evenly is interpolated.
 STEPS = 9, 5
-LEVELS = (0.1, 0.5, 0.9)
 #: A curve begins with so many points; distances are halved so many times where it changes by more than this.
 FIRST, HALVINGS, CHANGE = 9, 5, 0.25
 #: Standard deviations beside the threshold beyond which all is seen, or nothing.
@@ -119,17 +118,19 @@ class Curve(Picture):
 
     name, title = "limit", "How faint a star: this flare is detected"
     sets = "magnitude=x"
+    pins, alike = "closed form", ("band",)
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         canvas = Canvas(ink, "magnitude", "detection probability", logs, x_range=MAGNITUDES, y_range=(-0.03, 1.05))
         told = canvas.line("closed form", "closed form", "flare", line_width=2)
         canvas.rule("power", "wanted: 90 %", "y")
         canvas.dots("simulated", "simulated", "drawn", size=8)
+        canvas.pinned()
         canvas.own_point()
         canvas.tooltips(told, ("magnitude", "x"), ("detected", "y"))
         return canvas
 
-    def drawn(self, closed: Closed, found: Found) -> Drawn:
+    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
         q, power = closed.question, closed.study.limit.power
         empty: dict[str, Any] = {"x": [], "y": []}
         sources: dict[str, Any] = {"closed form": empty, "simulated": empty}
@@ -148,8 +149,8 @@ class Curve(Picture):
             else:
                 part = (y[last] - power) / (y[last] - y[last + 1])
                 text += f"to {q.band} = {x[last] + part * (x[last + 1] - x[last]):.2f}, in closed form."
-        if "limit" in found:
-            limits = [one for one in found["limit"].limits if one.statistic == q.statistic]
+        if "limit" in answers:
+            limits = [one for one in answers["limit"].limits if one.statistic == q.statistic]
             points = [(p.value, p.probability.value) for one in limits for p in (*one.points, one.check)]
             sources["simulated"] = dict(zip(("x", "y"), np.array(points).T, strict=True))
             text += "".join(
@@ -164,6 +165,7 @@ class Map(Picture):
 
     name, title = "map", "How faint a star, how small a flare"
     sets = "magnitude=x,amplitude_percent=10^y"
+    pins, alike = "half", ("band",)
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         from bokeh.models import FixedTicker, LinearColorMapper
@@ -175,15 +177,15 @@ class Map(Picture):
         mapper = LinearColorMapper(palette="Cividis256", low=0, high=1)
         plot.image("image", "x", "y", "dw", "dh", source=canvas.source("map", "image", "x", "y", "dw", "dh"),
                    color_mapper=mapper)  # fmt: skip
-        lines = plot.multi_line(
-            "xs", "ys", source=canvas.source("contours", "xs", "ys"), line_color="#ffffff", line_width=1.4
-        )
-        lines.name = "contours"
+        for name, width in (("contours", 1.2), ("half", 2.2)):
+            source = canvas.source(name, "xs", "ys")
+            plot.multi_line("xs", "ys", source=source, line_color="#ffffff", line_width=width).name = name
         cells = plot.scatter(
             "x", "y", source=canvas.source("simulated", "x", "y", "p"), size=10, marker="square",
             fill_color={"field": "p", "transform": mapper}, line_color="#ffffff",
         )  # fmt: skip
         cells.name = "simulated"
+        canvas.pinned("xs", "ys")
         canvas.own_point()
         plot.yaxis.ticker = FixedTicker(ticks=[-1, 0, 1, 2])
         plot.yaxis.major_label_overrides = {-1: "0.1 %", 0: "1 %", 1: "10 %", 2: "100 %"}
@@ -195,29 +197,34 @@ class Map(Picture):
             ),
             "right",
         )  # fmt: skip
-        canvas.legend += [("10, 50 and 90 % in closed form", "#b8c0c8", "line", ""),
+        canvas.legend += [("10, 50 (bold) and 90 % in closed form", "#b8c0c8", "line", ""),
                           ("simulated", "#8a8678", "dot", "if any")]  # fmt: skip
         return canvas
 
-    def drawn(self, closed: Closed, found: Found) -> Drawn:
+    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
         q = closed.question
         sources: dict[str, Any] = {
             "own": {"x": [q.magnitude], "y": [np.log10(q.amplitude_percent)]},
             "simulated": {"x": [], "y": [], "p": []},
             "map": {"image": [], "x": [], "y": [], "dw": [], "dh": []},
             "contours": {"xs": [], "ys": []},
+            "half": {"xs": [], "ys": []},
         }
         text = f"The closed form of {q.statistic} takes too long for a map: simulate it."
         if not closed.slow:
             x, y, p = _map(_Kept(closed))
-            sources |= {"map": _image(x, y, p), "contours": _contours(x, y, p)}
+            sources |= {
+                "map": _image(x, y, p),
+                "contours": _contours(x, y, p, 0.1, 0.9),
+                "half": _contours(x, y, p, 0.5),
+            }
             share = 100 * float(np.mean(p >= 0.5))
             text = (
                 f"At least half of the flares are detected in {share:.0f} % of the map, which spans {q.band} = "
                 f"{MAGNITUDES[0]:g} to {MAGNITUDES[1]:g} and amplitudes of {PERCENTS[0]:g} to {PERCENTS[1]:g} %."
             )
-        if "map" in found:
-            got = found["map"]
+        if "map" in answers:
+            got = answers["map"]
             at_x, at_y = np.meshgrid(np.array(got.x, float), np.log10(100 * np.array(got.y, float)))
             sources["simulated"] = {"x": at_x.ravel(), "y": at_y.ravel(), "p": got.probability[0].ravel()}
             text += f" {at_x.size} cells are simulated."
@@ -233,10 +240,10 @@ def _image(x: Float, y: Float, p: Float) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _contours(x: Float, y: Float, p: Float) -> dict[str, Any]:
+def _contours(x: Float, y: Float, p: Float, *levels: float) -> dict[str, Any]:
     from contourpy import contour_generator
 
-    lines: list[Any] = [line for level in LEVELS for line in contour_generator(x, y, p).lines(level)]
+    lines: list[Any] = [line for level in levels for line in contour_generator(x, y, p).lines(level)]
     return {"xs": [line[:, 0].tolist() for line in lines], "ys": [line[:, 1].tolist() for line in lines]}
 
 
@@ -249,11 +256,11 @@ class Limit(Tab):
     simulations = {"limit": "Simulate the limit", "map": "Simulate the map"}  # noqa: RUF012
     files = {"limit": "limit", "map": "map"}  # noqa: RUF012
 
-    def table(self, name: str, closed: Closed, found: Found) -> Table:
-        return found[name].table
+    def table(self, name: str, closed: Closed, answers: Answers) -> Table:
+        return answers[name].table
 
-    def rows(self, closed: Closed, found: Found) -> list[list[str]]:
-        if "limit" not in found:
+    def rows(self, closed: Closed, answers: Answers) -> list[list[str]]:
+        if "limit" not in answers:
             return []
         heads = ["statistic", "limiting magnitude", "95 % interval", "closed form", "simulated again there"]
         return [heads] + [
@@ -261,9 +268,9 @@ class Limit(Tab):
                 one.statistic, f"{one.value.value:.3f}", f"{one.value.low:.3f} to {one.value.high:.3f}",
                 f"{one.closed_form:.3f}", percent(one.check.probability.value),
             ]
-            for one in found["limit"].limits
+            for one in answers["limit"].limits
         ]  # fmt: skip
 
-    def study(self, name: str, closed: Closed, found: Found) -> Study:
-        study: Study = found[name].study
+    def study(self, name: str, closed: Closed, answers: Answers) -> Study:
+        study: Study = answers[name].study
         return study

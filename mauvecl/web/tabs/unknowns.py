@@ -13,7 +13,7 @@ from mauvecl.noise.usual import USUAL
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.web.closed import percent
 from mauvecl.web.figures import Canvas
-from mauvecl.web.tabs.tab import Drawn, Found, Picture, Tab
+from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
 
 if TYPE_CHECKING:
     from mauvecl.web.closed import Closed
@@ -69,7 +69,7 @@ class Cost(Picture):
         plot.x_range.start = 0
         return canvas
 
-    def drawn(self, closed: Closed, found: Found) -> Drawn:
+    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
         known, rows = costs(closed)
         names = [name for name, *_ in rows][::-1]
         columns: dict[str, Any] = {"name": names}
@@ -93,7 +93,7 @@ class Unknown(Tab):
     )
     pictures = (Cost(),)
 
-    def rows(self, closed: Closed, found: Found) -> list[list[str]]:
+    def rows(self, closed: Closed, answers: Answers) -> list[list[str]]:
         known, rows = costs(closed)
         fap = closed.question.fap
         heads = ["unknown", "S/N, not looked for", "S/N, marginalised", "then detected"]
