@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 from numpy.typing import NDArray
 
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
+from mauvecl.device.stares import Stares
 from mauvecl.device.tiles import Progress
 from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
@@ -360,7 +361,7 @@ class Pool:
             self._progress(standing.done, standing.total)
 
 
-def together(engine: Engine | Pool, work: Callable[[Item], Answer], items: Iterable[Item]) -> Iterator[Answer]:
+def together(engine: Engine | Pool | Stares, work: Callable[[Item], Answer], items: Iterable[Item]) -> Iterator[Answer]:
     """What `work` makes of each item, in their order; by a pool some at a time, so that devices need not wait."""
     if not isinstance(engine, Pool):
         yield from map(work, items)

@@ -47,8 +47,8 @@ def injected(study: Study, looked: Looked) -> Completeness:
         f"{study.search.false_alarms:g} false alarms per {study.search.per}"
     )
     energy = 10 ** np.arange(24.0, 40.0, 1 / PER_DECADE)
-    widths = np.array(star.found.half_widths_s)
-    share = found_share(star.found.critical.reshape(widths.size, -1), widths, energy, study.plan.law())
+    widths = np.array(star.injected.half_widths_s)
+    share = found_share(star.injected.critical.reshape(widths.size, -1), widths, energy, study.plan.law())
     return Completeness(energy, share, BOLOMETRIC, how)
 
 
