@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import Answer
+from mauvecl.answers.answer import Answer, InCell
 from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.tables import tabled
@@ -23,7 +23,7 @@ from mauvecl.lightcurve.search.null import DAY_S, Counted, counted, in_a_row_rat
 from mauvecl.results.requests.requests import Shard
 from mauvecl.results.sums import Arrays
 from mauvecl.statistics.intervals import Interval
-from mauvecl.study.labels import described, label, stacked, titled, told
+from mauvecl.study.labels import described, label, stacked, told
 from mauvecl.study.staring import orbit_lines
 from mauvecl.study.study import Study
 from mauvecl.study.surveys import Sizes, Surveyed, sizes_of, surveyed
@@ -52,13 +52,11 @@ MOST_DRAWN = 6
 
 
 @dataclass(frozen=True, eq=False)
-class StarCompleteness:
+class StarCompleteness(InCell):
     """One star in one cell of the sweep.
 
     Attributes
     ----------
-    label : str
-    at : mapping
     surveyed : Surveyed
     sizes : Sizes
     threshold : Interval
@@ -74,8 +72,6 @@ class StarCompleteness:
     fitted : Fitted, optional
     """
 
-    label: str
-    at: Mapping[str, float | str]
     surveyed: Surveyed
     sizes: Sizes
     threshold: Interval
@@ -85,11 +81,6 @@ class StarCompleteness:
     in_a_row: float
     found: InjectedShares
     fitted: Fitted | None
-
-    @property
-    def title(self) -> str:
-        """The star and what is swept, for pictures."""
-        return titled(self.label, self.at)
 
     @property
     def message(self) -> str | None:
