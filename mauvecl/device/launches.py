@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -94,6 +96,26 @@ class Launches:
             self._buffers.append(buffer)
         return buffer
 
+    @contextlib.contextmanager
+    def _into(self, name: str, out: NDArray[Any]) -> Iterator[Any]:
+        """A buffer of which `out` holds the content at the end; a processor's own memory needs no copy."""
+        if self._device.record.kind != "cpu":
+            buffer = self._room(name, out.nbytes)
+            yield buffer
+            self._cl.enqueue_copy(self._queue, out, buffer)
+            return
+        flags = self._cl.mem_flags
+        buffer = self._cl.Buffer(self._device.context, flags.WRITE_ONLY | flags.USE_HOST_PTR, hostbuf=out)
+        try:
+            yield buffer
+            mapped, _ = self._cl.enqueue_map_buffer(
+                self._queue, buffer, self._cl.map_flags.READ, 0, out.shape, out.dtype
+            )
+            mapped.base.release(self._queue)
+            self._queue.finish()
+        finally:
+            buffer.release()
+
     def _launch(self, name: str, items: tuple[int, ...], *arguments: Any) -> None:
         if name not in self._kernels:
             # One build for those that are always used together.
@@ -116,30 +138,11 @@ class Launches:
         ndarray of uint32, shape (tile.wanted,)
             Frames of any pixel cut off at zero or saturation.
         """
-        flags = self._cl.mem_flags
         clipped = np.empty(tile.wanted, np.uint32)
-        counts = self._room("clipped", clipped.nbytes)
-        # A processor's own memory needs no copy.
-        shared = self._device.record.kind == "cpu"
-        if shared:
-            rows = self._cl.Buffer(self._device.context, flags.WRITE_ONLY | flags.USE_HOST_PTR, hostbuf=out)
-        else:
-            rows = self._room("rows", out.nbytes)
-        try:
-            items = (tile.size // self.variant.width,)
+        counts, items = self._room("clipped", clipped.nbytes), (tile.size // self.variant.width,)
+        with self._into("rows", out) as rows:
             self._launch("realise", items, *self._arguments, *tile.address(), *tile.rows(), counts, rows)
-            if shared:
-                mapped, _ = self._cl.enqueue_map_buffer(
-                    self._queue, rows, self._cl.map_flags.READ, 0, out.shape, out.dtype
-                )
-                mapped.base.release(self._queue)
-            else:
-                self._cl.enqueue_copy(self._queue, out, rows)
-            self._cl.enqueue_copy(self._queue, clipped, counts)
-            self._queue.finish()
-        finally:
-            if shared:
-                rows.release()
+        self._cl.enqueue_copy(self._queue, clipped, counts)
         return clipped
 
     def observe(self, observers: NDArray[np.void], elements: NDArray[np.void]) -> None:

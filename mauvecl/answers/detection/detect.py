@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.answer import Answer
+from mauvecl.answers.answer import Answer, InCell
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
 from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
@@ -22,7 +22,7 @@ from mauvecl.runs.pool import Pool, together
 from mauvecl.statistics.distributions import QuadraticForm
 from mauvecl.statistics.linear import Linear, Matched
 from mauvecl.statistics.statistic import Setting
-from mauvecl.study.labels import label, put_first, stacked, titled, told
+from mauvecl.study.labels import label, put_first, stacked, told
 from mauvecl.study.sections import Star
 from mauvecl.study.study import PAPER_STARS, Study
 from mauvecl.study.weights import read_weights
@@ -40,18 +40,11 @@ MOST_DRAWN = 6
 
 
 @dataclass(frozen=True, eq=False)
-class StarDetection:
+class StarDetection(InCell):
     """One star in one cell of the sweep."""
 
-    label: str
-    at: Mapping[str, float | str]
     amplitudes: tuple[float, ...]
     detection: Detection
-
-    @property
-    def title(self) -> str:
-        """The star and what is swept, for pictures."""
-        return titled(self.label, self.at)
 
     @property
     def shown(self) -> tuple[str, Detection, list[str]]:

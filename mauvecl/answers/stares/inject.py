@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import Answer
+from mauvecl.answers.answer import Answer, InCell
 from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.tables import tabled
@@ -21,7 +21,7 @@ from mauvecl.lightcurve.search.recoveries import Fitted, Refit
 from mauvecl.lightcurve.stares.requests import Arrays
 from mauvecl.runs.pool import Pool, together
 from mauvecl.statistics.intervals import Interval
-from mauvecl.study.labels import described, label, stacked, titled, told
+from mauvecl.study.labels import described, label, stacked, told
 from mauvecl.study.staring import orbit_lines
 from mauvecl.study.study import Study
 from mauvecl.study.surveys import Sizes, Surveyed, sizes_of, surveyed
@@ -49,13 +49,11 @@ MOST_DRAWN = 6
 
 
 @dataclass(frozen=True, eq=False)
-class StarCompleteness:
+class StarCompleteness(InCell):
     """One star in one cell of the sweep.
 
     Attributes
     ----------
-    label : str
-    at : mapping
     surveyed : Surveyed
     sizes : Sizes
     threshold : Interval
@@ -73,8 +71,6 @@ class StarCompleteness:
     fitted : Fitted, optional
     """
 
-    label: str
-    at: Mapping[str, float | str]
     surveyed: Surveyed
     sizes: Sizes
     threshold: Interval
@@ -87,27 +83,22 @@ class StarCompleteness:
     fitted: Fitted | None
 
     @property
-    def title(self) -> str:
-        """The star and what is swept, for pictures."""
-        return titled(self.label, self.at)
-
-    @property
     def messages(self) -> list[str]:
         """Where drawn stares alarm more or less often than normal noise, and where flares saturate."""
-        found = []
+        messages = []
         if not np.isnan(self.simulated.value) and not self.simulated.low <= self.asked <= self.simulated.high:
-            found.append(
+            messages.append(
                 f"FALSE ALARMS of {self.title} are not those of normal noise: {self.simulated.value:.3g} per star-day "
                 f"at {self.checked:.2f} in drawn stares, {self.asked:.3g} by importance sampling: the search does not "
                 "marginalise over what changes in the stare (see [search] frame, cycle, window_s), or set "
                 'search.null = "counted".'
             )
         if self.injected.amplitudes.max() > self.saturates:
-            found.append(
+            messages.append(
                 f"SATURATED: flares of {self.title} with an amplitude above {self.saturates:.3g} saturate a pixel, "
                 "which injections leave out."
             )
-        return found
+        return messages
 
 
 @dataclass(eq=False)

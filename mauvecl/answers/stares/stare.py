@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.answer import Answer
+from mauvecl.answers.answer import Answer, InCell
 from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.tables import tabled
@@ -17,7 +17,7 @@ from mauvecl.lightcurve.flares.events import Event, coefficients, temperatures_o
 from mauvecl.lightcurve.search.alarms import Alarm, alarms
 from mauvecl.lightcurve.search.null import sampled
 from mauvecl.lightcurve.stares.observed import Draw, Light, Staring, seen
-from mauvecl.study.labels import described, label, stacked, titled, told
+from mauvecl.study.labels import described, label, stacked, told
 from mauvecl.study.stares import check_sweep
 from mauvecl.study.staring import energy_of, orbit_lines, stare_of, staring_of
 from mauvecl.study.study import Study
@@ -74,20 +74,13 @@ class Searched:
 
 
 @dataclass(frozen=True, eq=False)
-class StarStare:
+class StarStare(InCell):
     """One star in one cell of the sweep; `searched` is a sentence where no search was possible."""
 
-    label: str
-    at: Mapping[str, float | str]
     staring: Staring
     flares: tuple[Flaring, ...]
     light: Light
     searched: Searched | str | None = None
-
-    @property
-    def title(self) -> str:
-        """The star and what is swept, for pictures."""
-        return titled(self.label, self.at)
 
 
 @dataclass(eq=False)
