@@ -20,7 +20,7 @@ from mauvecl.lightcurve.search.recovery import Fit
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.noise.processes import CosmicRays
-from mauvecl.results.requests import Shard
+from mauvecl.results.requests.requests import Shard
 from mauvecl.runs.shards import fingerprint
 
 #: What a bank's weakest found flares are, in sigma of a frame; half of them are found (C; +-5 %).
