@@ -243,7 +243,7 @@ class Session:
             from mauvecl.host.plotting import picture
 
             for name, (function, *given) in answer.pictures.items():
-                self.leave(partial(picture, function, *given, self.folder / f"{name}.png"))
+                self.leave(partial(picture, function, *given, path=self.folder / f"{name}.png"))
         self.record(answer.study, answer.inputs, [*answer.messages, *answer.remarks])
 
     def _written(self) -> str:
