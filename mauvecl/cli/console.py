@@ -146,7 +146,7 @@ def show_table(title: str, columns: Sequence[str], cells: Sequence[Sequence[Any]
     console.print(title, soft_wrap=True)
     for part in _parts(columns, cells, filled, console.width):
         # What fits in no terminal is told whole all the same.
-        console.print(_table(columns, cells, part), width=max(console.width, _width(columns, cells, part)), crop=False)
+        Console(**how, width=max(console.width, _width(columns, cells, part))).print(_table(columns, cells, part))
 
 
 def _table(columns: Sequence[str], cells: Sequence[Sequence[Any]], part: Sequence[int]) -> Table:
