@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.stares.stare import Searched
-from mauvecl.pictures.style import COLOURS, NULL, STYLE, finished, pyplot
+from mauvecl.pictures.style import COLOURS, NULL, STYLE, finished, headline, pyplot
 
 if TYPE_CHECKING:
     from mauvecl.answers.stares.stare import StareAnswer, StarStare
@@ -50,7 +50,7 @@ def light_curves(one: StarStare, path: str | Path | None = None) -> Any:
             axis.set_title(light.bands[k])
             axis.set_ylabel("relative light")
         axes[-1, 0].set_xlabel(f"time from the start of the stare ({unit})")
-        figure.suptitle(f"{one.title}: one simulated stare; nominal throughput", fontsize=10)
+        headline(figure, f"{one.title}: one simulated stare; nominal throughput")
         return finished(figure, path)
 
 
