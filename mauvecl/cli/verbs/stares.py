@@ -49,7 +49,7 @@ def _show(answer: StareAnswer) -> None:
     swept = tuple(axis.quantity for axis in answer.study.sweep.axes)
     show_table(
         "One stare each",
-        ("star", *swept, "frames", "in frames (s)", "intervals", "light (DN/s)", "noise of a frame", "saturated"),
+        ("star", *swept, "frames", "recorded (s)", "intervals", "light (DN/s)", "noise of a frame", "saturated"),
         [
             (one.label, *map(short, one.at.values()), str(row["frames"]), f"{row['observed'].value:g}",
              str(row["intervals"]), f"{row['flux'].value:.4g}", f"{100 * row['frame_noise']:.3g} %",
