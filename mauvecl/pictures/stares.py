@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.stares.stare import Searched
-from mauvecl.pictures.style import COLOURS, NULL, drawn
+from mauvecl.pictures.style import COLOURS, NULL, drawn, headline
 
 if TYPE_CHECKING:
     from mauvecl.answers.stares.stare import StareAnswer, StarStare
@@ -48,7 +48,7 @@ def light_curves(plt: Any, one: StarStare) -> Any:
         axis.set_title(light.bands[k])
         axis.set_ylabel("relative light")
     axes[-1, 0].set_xlabel(f"time from the start of the stare ({unit})")
-    figure.suptitle(f"{one.title}: one simulated stare; nominal throughput", fontsize=10)
+    headline(figure, f"{one.title}: one simulated stare; nominal throughput")
     return figure
 
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.pictures.style import STYLE, finished, pyplot
+from mauvecl.pictures.style import STYLE, finished, headline, pyplot
 
 if TYPE_CHECKING:
     from mauvecl.answers.campaigns.visible import VisibleAnswer
@@ -24,7 +24,7 @@ def calendar(found: VisibleAnswer, path: str | Path | None) -> Any:
     with plt.rc_context(STYLE):
         figure = draw(plt, found)
         kind = "mean orbit" if found.study.orbit.orbit().resolved(found.moments) == "mean" else "SGP4"
-        figure.suptitle(f"Hours of exposure a day ({kind}); limits are assumptions, no stray light", fontsize=9)
+        headline(figure, f"Hours of exposure a day ({kind}); limits are assumptions, no stray light")
         return finished(figure, path)
 
 
