@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from astropy.table import Table
+from tables import write
 
 REPEATS = 5
 
@@ -66,10 +67,7 @@ def main() -> None:
     table["seconds"].unit = table["wanted"].unit = "s"
     table["seconds"].info.format = ".2f"
     table["seconds"].info.description = f"median of {REPEATS} new processes"
-    table.meta["date_utc"] = time.strftime("%Y-%m-%d", time.gmtime())
-    output.parent.mkdir(parents=True, exist_ok=True)
-    table.write(output, format="ascii.ecsv", overwrite=True)
-    table.pprint(max_width=-1)
+    write(table, output)
 
 
 if __name__ == "__main__":

@@ -7,18 +7,13 @@ from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Callable
-from functools import wraps
-from inspect import isclass, signature
-from typing import TYPE_CHECKING, Any, TypeVar, cast
+from typing import TYPE_CHECKING, Any
 
 from .errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
-
-Given = TypeVar("Given", bound=Callable[..., Any])
 
 #: What a unit is called in a sentence.
 WORDS = {
@@ -56,7 +51,13 @@ UNITS = {
     "_s": "s",
 }
 #: Names without such an end that have a unit.
-NAMED = {"magnitude": "mag", "ebv": "mag", "surface_brightness": "mag / arcsec2"}
+NAMED = {
+    "magnitude": "mag",
+    "ebv": "mag",
+    "surface_brightness": "mag / arcsec2",
+    "temperature": "K",
+    "seconds": "s",
+}
 
 
 def unit_of(name: str) -> str:
@@ -67,46 +68,6 @@ def unit_of(name: str) -> str:
 def is_quantity(value: Any) -> bool:
     """Whether a value has a unit of astropy's."""
     return hasattr(value, "to_value") and hasattr(value, "unit")
-
-
-def takes_quantities_of(**units: str) -> Callable[[Given], Given]:
-    """Let a function or class take Quantities where its parameters' names mean a unit (`UNITS`).
-
-    Parameters
-    ----------
-    **units : str
-        Of parameters whose names do not tell.
-
-    Notes
-    -----
-    Plain values go through untouched: ranges are the function's own matter. Whole numbers are `count`'s.
-    """
-
-    def decorate(function: Given) -> Given:
-        if isclass(function):
-            # `__init__` of the class itself is not looked up through an instance.
-            setattr(function, "__init__", decorate(function.__init__))  # noqa: B010
-            return function
-        known = signature(function)
-
-        @wraps(function)
-        def taking(*args: Any, **words: Any) -> Any:
-            if not (any(map(is_quantity, args)) or any(map(is_quantity, words.values()))):
-                return function(*args, **words)
-            bound = known.bind(*args, **words)
-            for name, value in bound.arguments.items():
-                if is_quantity(value):
-                    plain = numbers(name, value, units.get(name, unit_of(name)))
-                    bound.arguments[name] = plain if plain.ndim else float(plain)
-            return function(*bound.args, **bound.kwargs)
-
-        return cast(Given, taking)
-
-    return decorate
-
-
-#: The same where all names tell.
-takes_quantities = takes_quantities_of()
 
 
 def number(
@@ -133,13 +94,13 @@ def number(
     """
     wanted = expected or _expected(unit, low, high)
     if type(value) is float:
-        found = value
+        plain = value
     else:
         one = _plain(what, value, unit, wanted)
-        found = float(one) if not one.ndim else math.nan
-    if not (math.isfinite(found) and low <= found <= high):
-        raise InputError(f"{what} = {_shown(value)}, expected {wanted}")
-    return found
+        plain = float(one) if not one.ndim else math.nan
+    if not (math.isfinite(plain) and low <= plain <= high):
+        raise InputError(f"{what} = {shown(value)}, expected {wanted}")
+    return plain
 
 
 def numbers(
@@ -149,12 +110,12 @@ def numbers(
     import numpy as np
 
     wanted = _expected(unit, low, high)
-    found = _plain(what, values, unit, wanted)
-    bad = ~(np.isfinite(found) & (found >= low) & (found <= high))
+    plain = _plain(what, values, unit, wanted)
+    bad = ~(np.isfinite(plain) & (plain >= low) & (plain <= high))
     if bad.any():
-        first = found[np.unravel_index(int(np.argmax(bad)), found.shape)]
+        first = plain[np.unravel_index(int(np.argmax(bad)), plain.shape)]
         raise InputError(f"{what} = {first:g}{f' {unit}' if unit else ''}, expected {wanted}")
-    return found
+    return plain
 
 
 def count(what: str, value: Any, *, low: int = 0, high: int = 2**63 - 1) -> int:
@@ -168,15 +129,15 @@ def count(what: str, value: Any, *, low: int = 0, high: int = 2**63 - 1) -> int:
     wanted = f"a whole number from {low} to {high}" if high < 2**63 - 1 else f"a whole number of at least {low}"
     try:
         # Whole numbers beyond 2**53 are no floats.
-        found = operator.index(_no_truth(value))
+        whole = operator.index(_no_truth(value))
     except TypeError:
         plain = number(what, value, expected=wanted)
         if not plain.is_integer():
-            raise InputError(f"{what} = {_shown(value)}, expected {wanted}") from None
-        found = int(plain)
-    if not low <= found <= high:
-        raise InputError(f"{what} = {found}, expected {wanted}")
-    return found
+            raise InputError(f"{what} = {shown(value)}, expected {wanted}") from None
+        whole = int(plain)
+    if not low <= whole <= high:
+        raise InputError(f"{what} = {whole}, expected {wanted}")
+    return whole
 
 
 def _plain(what: str, value: Any, unit: str, wanted: str) -> NDArray[np.float64]:
@@ -189,7 +150,7 @@ def _plain(what: str, value: Any, unit: str, wanted: str) -> NDArray[np.float64]
             raise TypeError("no number")
         return np.asarray(value, np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{what} = {_shown(value)}, expected {wanted}") from error
+        raise InputError(f"{what} = {shown(value)}, expected {wanted}") from error
 
 
 def _converted(value: Any, unit: str) -> Any:
@@ -214,6 +175,11 @@ def _no_truth(value: Any) -> Any:
     return value
 
 
+def word_of(unit: str) -> str:
+    """What a unit is called in a sentence."""
+    return WORDS.get(unit, unit)
+
+
 def _expected(unit: str, low: float, high: float) -> str:
     word = WORDS.get(unit, unit)
     if math.isfinite(low) and math.isfinite(high):
@@ -221,6 +187,7 @@ def _expected(unit: str, low: float, high: float) -> str:
     return f"{word} of at least {low:g}" if math.isfinite(low) else word
 
 
-def _shown(value: Any) -> str:
-    text = str(value) if hasattr(value, "unit") else repr(value)
+def shown(value: Any) -> str:
+    """A value for a sentence: on one line, and short."""
+    text = " ".join((str(value) if hasattr(value, "unit") else repr(value)).split())
     return text if len(text) <= 60 else f"{text[:57]}..."

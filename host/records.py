@@ -61,6 +61,10 @@ def sentence(model: type[BaseModel], error: ValidationError) -> str:
         return told if own else f"{key}: {told}"
     told = first["msg"].removeprefix("Input should be ")
     value = f"{key} = {shown(first['input'])}"
+    if first["type"] in ("too_long", "too_short"):
+        return f"{value}, expected {told.partition('should have ')[2].partition(' after')[0]}"
+    if first["type"] == "path_type":
+        return f"{value}, expected a path"
     return f"{value}: {told.lower()}" if told == first["msg"] else f"{value}, expected {told}"
 
 

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
+from ..doors import public
 from ..errors import InputError
 from ..quantities import count, is_quantity, number, numbers, unit_of
 from ..records import Record, sentence
@@ -54,6 +55,7 @@ NotNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=0, le=20)]
 
 
+@public
 class Instrument(Record):
     """An instrument, frozen; units are in the names.
 

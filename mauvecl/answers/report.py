@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.parsed import read_text
+from mauvecl.host.files.whole import write_whole
 from mauvecl.host.version import VERSION
-from mauvecl.runs.durable import write_whole
 
 if TYPE_CHECKING:
     from astropy.table import Table

@@ -132,14 +132,14 @@ class Drawn:
         medians: tuple[float, float, float],
         n_frames: int,
     ) -> Drawn | None:
-        found: dict[str, list[Spread]] = {}
+        spreads: dict[str, list[Spread]] = {}
         for (name, factor), table in zip(modulations, tables, strict=True):
             one = _of_table(table)
             if name == "jitter" and n_frames > 1:
                 one = _normal(one.mean, one.sd / np.sqrt(n_frames))
-            found.setdefault(factor, []).append(one)
+            spreads.setdefault(factor, []).append(one)
         median = dict(zip(("light", "dark", "sky"), medians, strict=True))
-        return cls({name: _together(ones, median[name]) for name, ones in found.items()}) if found else None
+        return cls({name: _together(ones, median[name]) for name, ones in spreads.items()}) if spreads else None
 
     def nodes(self, x: Expectation, *, weighted: bool) -> tuple[list[Node], Float]:
         """What the factors do to an exposure.

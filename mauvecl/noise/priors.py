@@ -5,7 +5,6 @@ A study holds them long before anything is asked of them: numpy is loaded where 
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -23,12 +22,14 @@ FURTHEST = 1e5
 
 
 def _make_plain(prior: object, *names: str) -> None:
-    """Values of a prior that came with a unit as plain numbers."""
+    """Values of a prior as plain numbers, also those that came with a unit."""
     for name in names:
         value = getattr(prior, name)
-        if hasattr(value, "unit"):
-            unit = "" if value.unit.is_unity() or value.unit.physical_type == "dimensionless" else "deg_C"
-            object.__setattr__(prior, name, number(f"{name} of a prior", value, unit))
+        unit = getattr(value, "unit", None)
+        kind = "deg_C" if unit is not None and unit.physical_type == "temperature" and name != "sd" else ""
+        plain = number(f"{name} of a prior", value, kind, expected="a finite number")
+        if unit is not None:
+            object.__setattr__(prior, name, plain)
 
 
 @dataclass(frozen=True)
@@ -40,8 +41,8 @@ class Uniform:
 
     def __post_init__(self) -> None:
         _make_plain(self, "low", "high")
-        if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low <= self.high):
-            raise InputError(f"a uniform prior from {self.low:g} to {self.high:g}, expected low <= high, both finite")
+        if not self.low <= self.high:
+            raise InputError(f"a uniform prior from {self.low:g} to {self.high:g}, expected low <= high")
 
     def quantile(self, below: Float, above: Float | None = None) -> Float:
         """The values that the prior stays below with these probabilities; see `Normal.quantile`."""
@@ -63,12 +64,11 @@ class Normal:
     high: float
 
     def __post_init__(self) -> None:
-        _make_plain(self, "mean", "low", "high")
-        finite = all(map(math.isfinite, (self.mean, self.sd, self.low, self.high)))
-        if not (self.sd > 0 and finite and self.low < self.high):
+        _make_plain(self, "mean", "sd", "low", "high")
+        if not (self.sd > 0 and self.low < self.high):
             raise InputError(
                 f"a normal prior of mean {self.mean:g}, sd {self.sd:g}, cut at {self.low:g} and {self.high:g}, "
-                "expected sd > 0 and low < high, all finite"
+                "expected sd > 0 and low < high"
             )
         away = max(self.low - self.mean, self.mean - self.high) / self.sd
         if away > FURTHEST:

@@ -11,6 +11,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import count, number
 from mauvecl.noise import layout
@@ -23,6 +24,7 @@ __all__ = ["NONE", "CosmicRays", "Factors", "Normal", "Prior", "Processes", "Uni
 Float = NDArray[np.float64]
 
 
+@public
 @dataclass(frozen=True)
 class CosmicRays:
     """Hits by charged particles; the defaults are assumptions (INSTRUMENT.md: outside the South Atlantic Anomaly).
@@ -95,6 +97,7 @@ class CosmicRays:
         return np.maximum(np.fft.irfft(spectrum, size)[: most * high + 1], 0.0)
 
 
+@public
 @dataclass(frozen=True)
 class Processes:
     """Which optional processes act.

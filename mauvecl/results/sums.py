@@ -23,7 +23,7 @@ def packed_detection(tally: Tally, samples: Sequence[TailSamples | None]) -> Arr
     shard["sums"] = np.array([[str(value) for value in row] for row in tally.sums])
     shard["n"] = np.array(tally.n)
     for number, far in enumerate(tally.far):
-        beyond = far.found()
+        beyond = far.frozen()
         if beyond.n or beyond.undefined:
             shard |= _spread(f"far-{number}", beyond.keys, beyond.counts)
             shard[f"far-{number}-sums"] = np.array([str(x) for x in (beyond.first, beyond.second, beyond.undefined)])
@@ -64,10 +64,7 @@ class DetectionSums:
     def answer(self) -> Detection:
         """The answer, once all shards have come."""
         asked = self._request
-        h = asked.hypotheses
-        detection = Detection(
-            h.quiet, h.flares, h.asked, h.scene, asked.realisations, asked.tails, asked.seed, nuisances=h.nuisances
-        )
+        detection = Detection.of(asked.hypotheses, asked.realisations, asked.tails, asked.seed)
         for (plan, _), (tally, samples) in zip(asked.plans, self._sums, strict=True):
             detection.collect(plan, tally, samples)
         return detection

@@ -49,7 +49,11 @@ class Setting:
     flares: Sequence[Expectation] = ()
     nuisances: Nuisances | None = None
     drawn: Drawn | None = None
-    _kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
+    _kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # What is remembered is known by where it lies in this process's memory.
+        return vars(self) | {"_kept": {}}
 
     @property
     def integrates(self) -> bool:
@@ -297,14 +301,14 @@ class LinearStatistic(Statistic):
         variance = self.variance(setting) * setting.used
         sought = variance * weights
         rows = setting.nuisances.rows(variance, setting.nuisances.spectra * setting.used)
-        found = weights - (rows @ sought) @ rows
-        power = float(found @ sought)
+        left = weights - (rows @ sought) @ rows
+        power = float(left @ sought)
         if power <= 1e-10 * float(weights @ sought):
             raise InputError(
                 f"statistic {self.name!r} looks for what cannot be told from {joined(setting.nuisances.names)}, "
                 "expected fewer unknowns or smaller standard deviations"
             )
-        return np.asarray(found / np.sqrt(power) if self.normalised else found)
+        return np.asarray(left / np.sqrt(power) if self.normalised else left)
 
     def dof(self, setting: Setting) -> int:
         return 1

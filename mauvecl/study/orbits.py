@@ -224,6 +224,9 @@ class PlanQuestion(Part):
         See `lightcurve.completeness.DurationLaw`.
     completeness : {"injections", "closed form"}
         By flares put into drawn noise and searched for, or at once, for white noise.
+    along_orbit : bool
+        Whether each target's frames have the temperature and the hits by particles that the orbit gives them; those of
+        the study otherwise.
     injections : int
         Of each half-width.
     best_months : int
@@ -237,6 +240,7 @@ class PlanQuestion(Part):
     exponent: Annotated[float, Field(ge=0, lt=1)] = 0.39
     scatter_dex: Annotated[float, Field(ge=0, le=2)] = 0.3
     completeness: Literal["injections", "closed form"] = "injections"
+    along_orbit: bool = True
     injections: Annotated[int, Field(ge=20, le=1_000_000)] = 100
     best_months: Annotated[int, Field(ge=1, le=12)] = 3
     report: Literal["pdf", "html"] = "pdf"

@@ -11,7 +11,7 @@ from mauvecl.study.nuisances import Spread
 from mauvecl.study.sections import Part
 
 if TYPE_CHECKING:
-    from mauvecl.lightcurve.search.bank import Level
+    from mauvecl.lightcurve.search.bank import Bank, Level
     from mauvecl.lightcurve.stares.stare import Stare
     from mauvecl.study.study import Study
 
@@ -78,6 +78,16 @@ class SearchChoice(Part):
     def rate(self) -> float:
         """False alarms per star-day."""
         return per_day(self.false_alarms, self.per)
+
+    def white_bank(self, frame_s: float) -> Bank:
+        """For one sum of each frame and no curves, as closed forms take it."""
+        import numpy as np
+
+        from mauvecl.lightcurve.flares.shapes import shape_of
+        from mauvecl.lightcurve.search.bank import Bank, Level
+
+        level = Level(self.offset, self.slope, False, WINDOW_S if self.window_s is None else self.window_s)
+        return Bank(self.half_widths_s, np.ones((1, 1)), shape_of(self.shape), frame_s, level)
 
     def level(self, stare: Stare, orbit_s: float) -> Level:
         """What is unknown of the level in a stare."""

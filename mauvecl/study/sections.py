@@ -27,6 +27,8 @@ def plain(key: str, given: Any) -> Any:
         return numbers(key, given, unit_of(key)).tolist()
     if isinstance(given, list | tuple) and any(map(is_quantity, given)):
         return [plain(key, one) for one in given]
+    if hasattr(given, "tolist"):
+        return given.tolist()
     if hasattr(given, "utc") and hasattr(given, "isot"):
         return str(given.utc.isot)
     if hasattr(given, "icrs") and hasattr(given, "to_string"):
@@ -83,18 +85,20 @@ class Star(Part):
         from mauvecl.host.stars.source import Source
 
         if self.library is not None:
-            found = Source.from_library(self.library)
+            source = Source.from_library(self.library)
         else:
-            found = Source.read(
+            source = Source.read(
                 self.file or "", wavelength_unit=self.wavelength_unit, flux_unit=self.flux_unit, extend=self.extend
             )
         if self.effective_temperature_k is not None:
-            found = replace(found, temperature_k=self.effective_temperature_k)
+            source = replace(source, temperature_k=self.effective_temperature_k)
         if self.bin_nm is not None:
-            found = found.binned(self.bin_nm)
+            source = source.binned(self.bin_nm)
         if self.ebv is not None:
-            found = found.reddened(self.ebv)
-        return found if self.magnitude is None else found.at_magnitude(self.magnitude, self.band, self.magnitude_system)
+            source = source.reddened(self.ebv)
+        if self.magnitude is None:
+            return source
+        return source.at_magnitude(self.magnitude, self.band, self.magnitude_system)
 
 
 class Flare(Part):
@@ -222,7 +226,7 @@ class Run(Part):
     statistics: Annotated[tuple[str, ...], Field(min_length=1)] = USUAL_STATISTICS
     fap: Annotated[float, Field(gt=0, lt=1)] = 1e-3
     tails: Literal["counted", "sampled"] = "counted"
-    reference: str = "expectation"
+    reference: str = "template"
     variances: Literal["model", "estimated"] = "model"
     template_temperatures_k: tuple[float, ...] = ()
     weights: dict[str, Path] = Field(default_factory=dict)

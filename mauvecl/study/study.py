@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import Field, ValidationError, model_validator
 
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import possible, read_text, toml
@@ -43,6 +44,7 @@ if TYPE_CHECKING:
 PAPER_STARS = (Star(library="K3V", magnitude=3.7), Star(library="G2V", magnitude=7.4))
 
 
+@public
 class Study(Part):
     """Everything that an answer depends on; the default is the paper's question.
 
@@ -218,9 +220,9 @@ class Study(Part):
         """The instrument with what the study changes of it: its ``changes``, and the detector's temperature."""
         from mauvecl.host.instrument.instrument import Instrument
 
-        found, o = Instrument.load(self.observation.instrument), self.observation
+        instrument, o = Instrument.load(self.observation.instrument), self.observation
         changes = o.changes | ({} if o.temperature_c is None else {"temperature_c": o.temperature_c})
-        return found.with_(**changes) if changes else found
+        return instrument.with_(**changes) if changes else instrument
 
     def with_instrument(self, changes: Mapping[str, Any]) -> Self:
         """The study with some values of the instrument changed; see `Instrument.with_`."""
@@ -272,20 +274,20 @@ class Study(Part):
             If nothing is left unknown, and draws are asked for.
         """
         stated = {*self.observation.changes, *(() if self.observation.temperature_c is None else ("temperature_c",))}
-        found = {name: prior for name, prior in self.unknowns.priors().items() if name not in stated}
-        if self.unknowns.draws and not found:
+        priors = {name: prior for name, prior in self.unknowns.priors().items() if name not in stated}
+        if self.unknowns.draws and not priors:
             raise InputError("everything is known of the instrument, expected a prior, or unknowns.draws = 0")
-        return found
+        return priors
 
     def cells(self) -> list[tuple[dict[str, float | str], Self]]:
         """The values that the study sweeps over, and the study at each; itself where it sweeps over nothing."""
-        found = []
+        cells = []
         for values in self.sweep.cells():
             study = self.model_copy(update={"sweep": Sweep()})
             for quantity, value in values.items():
                 study = study.at(quantity, value)
-            found.append((values, study))
-        return found
+            cells.append((values, study))
+        return cells
 
     @property
     def drawing(self) -> dict[str, Any]:

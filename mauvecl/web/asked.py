@@ -47,12 +47,12 @@ def map_around(study: Study, pool: Pool) -> MapResult:
     return detection_map(Study.build(data, "page"), pool)
 
 
-def completeness(study: Study) -> InjectAnswer:
+def completeness(study: Study, pool: Pool) -> InjectAnswer:
     """What a search of a stare of one orbit finds, coarsely."""
     data = study.model_dump()
     data["injections"] |= INJECTED
     data["search"] |= {"nulls": 0}
-    return inject(Study.build(data, "page"), threads=1)
+    return inject(Study.build(data, "page"), pool)
 
 
 def planned(study: Study) -> PlanAnswer:
@@ -78,7 +78,7 @@ SIMULATED: dict[str, Callable[[Study, Pool], dict[str, Any]]] = {
     "detection": _detection,
     "limit": lambda study, pool: {"limit": limiting_magnitude(study, pool)},
     "map": lambda study, pool: {"map": map_around(study, pool)},
-    "completeness": lambda study, pool: {"completeness": completeness(study)},
+    "completeness": lambda study, pool: {"completeness": completeness(study, pool)},
     "visible": lambda study, pool: _visible(study),
     "plan": lambda study, pool: {"plan": planned(study)},
 }

@@ -281,10 +281,10 @@ def test_tiles_change_no_bit(engine: Engine, tile: int) -> None:
     (quiet, *flares), _ = case("stack")
     whole = engine.detect(quiet, flares, realisations=3001, start=77, seed=6, statistics=tuple(STATISTICS))
     parts = Engine(tile=tile).detect(quiet, flares, realisations=3001, start=77, seed=6, statistics=tuple(STATISTICS))
-    for key, distribution in whole._found.items():
-        np.testing.assert_array_equal(distribution.counts, parts._found[key].counts)
-        assert distribution.far.equals(parts._found[key].far)
-        assert (distribution.mean, distribution.std) == (parts._found[key].mean, parts._found[key].std)
+    for key, distribution in whole._distributions.items():
+        np.testing.assert_array_equal(distribution.counts, parts._distributions[key].counts)
+        assert distribution.far.equals(parts._distributions[key].far)
+        assert (distribution.mean, distribution.std) == (parts._distributions[key].mean, parts._distributions[key].std)
 
 
 THREADS = """

@@ -380,6 +380,17 @@ def test_a_full_disk_stops_with_a_sentence_and_loses_nothing(
     same(found, engine.detect(quiet, flares, realisations=N, seed=5))
 
 
+def test_what_is_done_meanwhile_begins_once_and_not_before_the_devices() -> None:
+    quiet, *flares = small().expectations(small().star[0])
+    begun: list[int] = []
+    pool = Pool(LocalWorkers(), meanwhile=lambda: begun.append(pool.standing.of))
+    assert begun == []
+    for _ in range(2):
+        pool.detect(quiet, flares, realisations=N, seed=5)
+    (of,) = begun
+    assert of > 0
+
+
 def test_progress_tells_shards_and_what_was_resumed(tmp_path: Path, engine: Engine) -> None:
     with pytest.raises(KeyboardInterrupt):
         at_work(tmp_path, engine, interrupting(20_000))

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.answer import Answer
+from mauvecl.answers.answer import Answer, InCell
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.results.detection.campaign import campaign, per_test
 from mauvecl.results.detection.departures import departure_table
@@ -22,7 +22,7 @@ from mauvecl.runs.pool import Pool, together
 from mauvecl.statistics.distributions import QuadraticForm
 from mauvecl.statistics.linear import Linear, Matched
 from mauvecl.statistics.statistic import Setting
-from mauvecl.study.labels import label, put_first, stacked, titled, told
+from mauvecl.study.labels import label, put_first, stacked, told
 from mauvecl.study.sections import Star
 from mauvecl.study.study import PAPER_STARS, Study
 from mauvecl.study.weights import read_weights
@@ -40,23 +40,16 @@ MOST_DRAWN = 6
 
 
 @dataclass(frozen=True, eq=False)
-class StarDetection:
+class StarDetection(InCell):
     """One star in one cell of the sweep."""
 
-    label: str
-    at: Mapping[str, float | str]
     amplitudes: tuple[float, ...]
-    found: Detection
-
-    @property
-    def title(self) -> str:
-        """The star and what is swept, for pictures."""
-        return titled(self.label, self.at)
+    detection: Detection
 
     @property
     def shown(self) -> tuple[str, Detection, list[str]]:
         """Title, findings and names of the flares, as pictures take them."""
-        return self.title, self.found, [f"flare {100 * amplitude:g} %" for amplitude in self.amplitudes]
+        return self.title, self.detection, [f"flare {100 * amplitude:g} %" for amplitude in self.amplitudes]
 
 
 @dataclass(eq=False)
@@ -109,7 +102,7 @@ class DetectAnswer(Answer):
 
     @property
     def inputs(self) -> list[Expectation]:
-        return [x for star in self.stars for x in (star.found.quiet, *star.found.flares)]
+        return [x for star in self.stars for x in (star.detection.quiet, *star.detection.flares)]
 
     @property
     def pictures(self) -> dict[str, tuple[Any, ...]]:
@@ -129,15 +122,15 @@ class DetectAnswer(Answer):
         return {"messages": self.messages, "paper": self.paper} | tables
 
     def _detections(self, star: StarDetection) -> QTable:
-        table = star.found.table(self.study.run.fap)
+        table = star.detection.table(self.study.run.fap)
         table.remove_column("name")
-        amplitudes = np.repeat(star.amplitudes, len(star.found.statistics))
+        amplitudes = np.repeat(star.amplitudes, len(star.detection.statistics))
         table.add_column(amplitudes, name="amplitude", index=0)
         table["amplitude"].info.description = f"relative rise of the photons in the band {self.study.flare.band}"
         return table
 
     def _departures(self, star: StarDetection) -> QTable:
-        return departure_table(star.found, star.amplitudes, self.study.run.fap)
+        return departure_table(star.detection, star.amplitudes, self.study.run.fap)
 
     def _together(self, table_of: Callable[[StarDetection], QTable]) -> QTable:
         parts = []
@@ -152,9 +145,9 @@ def _rocs(star: StarDetection) -> QTable:
     from astropy.table import vstack
 
     parts = []
-    for statistic in star.found.statistics:
+    for statistic in star.detection.statistics:
         for flare, amplitude in enumerate(star.amplitudes):
-            curve = star.found.roc(statistic, flare).table()
+            curve = star.detection.roc(statistic, flare).table()
             for name in ("area", "area_low", "area_high"):
                 curve[name] = curve.meta.pop(name)
             curve["area"].info.description = "under the curve; 95 % interval by DeLong's method"
@@ -167,19 +160,20 @@ def _tails(star: StarDetection) -> QTable:
     from astropy.table import vstack
 
     parts = []
-    for statistic in star.found.statistics:
+    for statistic in star.detection.statistics:
         for flare, amplitude in enumerate(star.amplitudes):
-            kept = [(amplitude, star.found.tail_samples(statistic, flare))]
-            if star.found.statistic(statistic).shaped or flare == 0:
-                kept.append((0.0, star.found.tail_samples(statistic, template=flare)))
+            kept = [(amplitude, star.detection.tail_samples(statistic, flare))]
+            if star.detection.statistic(statistic).shaped or flare == 0:
+                kept.append((0.0, star.detection.tail_samples(statistic, template=flare)))
             for name, table in kept:
                 put_first(table, {"statistic": statistic, "amplitude": name, "template": amplitude})
                 parts.append(table)
-    found = vstack(parts)
-    found.meta["seed"] = star.found.seed
-    return found
+    samples = vstack(parts)
+    samples.meta["seed"] = star.detection.seed
+    return samples
 
 
+@public
 def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
     """Null and flare distributions of every star of a study, in every cell of its sweep.
 
@@ -199,18 +193,21 @@ def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
         how = cell.detecting(quiet)
         own = [read_weights(name, path, quiet.wavelength_nm) for name, path in run.weights.items()]
         how["statistics"] = (*run.statistics, *own, *_other_templates(cell, star, quiet))
-        found = engine.detect(quiet, flares, seed=run.seed, **how)
-        return StarDetection(label(star, quiet), at, cell.flare.amplitudes, found)
+        detection = engine.detect(quiet, flares, seed=run.seed, **how)
+        return StarDetection(label(star, quiet), at, cell.flare.amplitudes, detection)
 
     if isinstance(engine, Pool):
         engine.expect(len(prepared) * run.realisations)
-    # What is drawn nothing for is computed while the devices count.
-    with ThreadPoolExecutor(1) as beside:
-        paper = beside.submit(_paper, study, [group for *_, group in prepared])
-        stars = list(together(engine, answered, prepared))
-    costs = [text for (_, cell, *_), star in zip(prepared, stars, strict=True) for text in _template_costs(cell, star)]
+    stars: list[StarDetection] = []
+    paper: list[str] = []
+    for star in together(engine, answered, prepared):
+        if not stars:
+            # What is drawn nothing for is computed while the devices count the next star.
+            paper = _paper(study, [group for *_, group in prepared])
+        stars.append(star)
+    costs = [text for (_, cell, *_), one in zip(prepared, stars, strict=True) for text in _template_costs(cell, one)]
     answer = DetectAnswer(study, stars)
-    blinding = [f"{text[:-1]} ({star.title})." for star in stars for text in star.found.messages]
+    blinding = [f"{text[:-1]} ({star.title})." for star in stars for text in star.detection.messages]
     messages = [*blinding, *told([x for *_, group in prepared for x in group])]
     if not countable(run.fap, run.realisations):
         messages.append(
@@ -219,22 +216,22 @@ def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
             "100 beyond them."
         )
     unknown = [
-        unknown_cost(f"{star.label}, flare of {100 * amplitude:g} %", star.found.quiet, flare, cell)
+        unknown_cost(f"{star.label}, flare of {100 * amplitude:g} %", star.detection.quiet, flare, cell)
         for (_, cell, *_), star in zip(prepared, stars, strict=True)
-        for amplitude, flare in zip(star.amplitudes, star.found.flares, strict=True)
+        for amplitude, flare in zip(star.amplitudes, star.detection.flares, strict=True)
     ]
     last = [*_few_terms(stars), *marginal_lines(study), *cost_lines(unknown, study)]
     answer.messages = list(dict.fromkeys([*messages, *campaign_told, *costs, *last]))
-    answer.paper = paper.result()
+    answer.paper = paper
     return answer
 
 
 def _few_terms(stars: Sequence[StarDetection]) -> list[str]:
     """How few pixels' worth of noise the paper's own sum holds."""
     forms = [
-        star.found.closed_form("paper", template=flare)
+        star.detection.closed_form("paper", template=flare)
         for star in stars
-        if "paper" in star.found.statistics
+        if "paper" in star.detection.statistics
         for flare in range(len(star.amplitudes))
     ]
     terms = [form.effective_terms for form in forms if isinstance(form, QuadraticForm)]
@@ -242,30 +239,30 @@ def _few_terms(stars: Sequence[StarDetection]) -> list[str]:
         return []
     few, many = (f"{end:.1f}" for end in (min(terms), max(terms)))
     return [
-        f"The paper's sum over {stars[0].found.dof('paper')} pixels scatters like one of "
+        f"The paper's sum over {stars[0].detection.dof('paper')} pixels scatters like one of "
         f"{few if few == many else f'{few} to {many}'} independent squares: its faintest pixels make most of it."
     ]
 
 
 def _other_templates(study: Study, star: Star, quiet: Expectation) -> list[Linear]:
     """Matched statistics that look for flares of other temperatures than the study's."""
-    found = []
+    filters = []
     for temperature in study.run.template_temperatures_k:
         source = star.source()
         other = study.at("flare_temperature", temperature)
         (shape,) = other.expect([other.flaring(source, study.flare.amplitudes[0])])
         setting = Setting(quiet, ~quiet.saturated, study.run.comparison())
-        found.append(Linear(f"matched {temperature:g} K", Matched().weights_per_dn(setting, shape)))
-    return found
+        filters.append(Linear(f"matched {temperature:g} K", Matched().weights_per_dn(setting, shape)))
+    return filters
 
 
 def _template_costs(study: Study, star: StarDetection) -> list[str]:
     """What looking for the wrong temperature costs, for Gaussian noise."""
-    found, lines = star.found, []
+    detection, lines = star.detection, []
     for temperature in study.run.template_temperatures_k:
-        right = Matched().closed_form(found.setting, found.flares[0], found.flares[0]).mean
+        right = Matched().closed_form(detection.setting, detection.flares[0], detection.flares[0]).mean
         name = f"matched {temperature:g} K"
-        kept = found.closed_form(name, 0).mean / found.closed_form(name).std / right if right else 0.0
+        kept = detection.closed_form(name, 0).mean / detection.closed_form(name).std / right if right else 0.0
         lines.append(
             f"{star.label}: looking for a flare of {temperature:g} K in one of {study.flare.temperature_k:g} K keeps "
             f"{100 * kept:.1f} % of the matched statistic's S/N."
@@ -278,16 +275,16 @@ def _campaign(study: Study, quiet: Expectation) -> list[str]:
     asked = study.campaign
     if asked.frames is None:
         return []
-    found = campaign(study.run.fap, asked.frames, quiet.n_frames, step=asked.step, seed=study.run.seed)
+    many = campaign(study.run.fap, asked.frames, quiet.n_frames, step=asked.step, seed=study.run.seed)
     text = (
-        f"A campaign of {asked.frames} frames makes {found.tests} tests: at {found.fap:g} per test "
-        f"{found.expected:.3g} false alarms are expected, and the chance of any is {found.independent:.3g} if tests "
-        f"are independent, at most {found.at_most:.3g}"
+        f"A campaign of {asked.frames} frames makes {many.tests} tests: at {many.fap:g} per test "
+        f"{many.expected:.3g} false alarms are expected, and the chance of any is {many.independent:.3g} if tests "
+        f"are independent, at most {many.at_most:.3g}"
     )
-    if found.overlapping is not None:
-        o = found.overlapping
+    if many.overlapping is not None:
+        o = many.overlapping
         text += f"; with the overlap of its stacks {o.value:.3g} [{o.low:.3g}, {o.high:.3g}] for a linear statistic"
-    return [text + ".", *_wanted(asked, found.tests, quiet.n_frames, study.run.seed)]
+    return [text + ".", *_wanted(asked, many.tests, quiet.n_frames, study.run.seed)]
 
 
 def _wanted(asked: CampaignQuestion, tests: int, stack: int, seed: int) -> list[str]:

@@ -17,6 +17,8 @@ from scipy import special
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.detect import DetectAnswer, detect
 from mauvecl.answers.signal.snr import SnrAnswer, snr
+from mauvecl.host.doors import public
+from mauvecl.host.tables import telling
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.results.snr import steps_of
 from mauvecl.study.labels import described
@@ -38,6 +40,25 @@ ONE_SIGMA = float(special.ndtr(1.0) - special.ndtr(-1.0))
 SURE, ERRORS_IN_INTERVAL = 4, 3.92
 #: A false-alarm probability further below the promised one is as wrong as this.
 SMALLEST_RATIO = 1e-3
+#: What the columns are, of an element and of a cell.
+PROMISED = {
+    "expected": "S/N by the formula",
+    "mean": "mean S/N of the realisations",
+    "error": "standard error of the mean",
+    "bias": "mean over expected S/N, less one",
+    "coverage": "share of 1-sigma intervals of its pixels that hold the truth; 0.6827 promised",
+}
+WORST = {
+    "best_snr": "largest S/N per element by the formula",
+    "snr_off_by": "largest significant (4 standard errors) difference of the mean S/N from it; 0 if none",
+    "at_nm": "where",
+    "coverage_low": "smallest share of 1-sigma intervals that hold the truth, of all elements",
+    "coverage_high": "largest",
+    "five_sigma_above": "how often a pixel lies 5 sigma above its mean, over the normal 2.9e-7; the most",
+    "five_sigma_below": "how often a pixel lies 5 sigma below its mean, over the normal 2.9e-7; the least",
+    "probability_off_by": "largest significant difference of a detection probability from the closed form",
+    "fap_ratio": "most wrong false-alarm probability over the promised one; 1 if none differs",
+}
 #: Looked at where a study sweeps over nothing.
 GRID = Sweep(
     axes=(
@@ -119,15 +140,7 @@ def _promises(result: SnrResult) -> QTable:
     with np.errstate(divide="ignore", invalid="ignore"):
         table["bias"] = table["mean"] / table["expected"] - 1.0
     table["coverage"] = x.per_element(coverage(result)) / x.per_element(np.ones(x.wavelength_nm.size))
-    for name, text in (
-        ("expected", "S/N by the formula"),
-        ("mean", "mean S/N of the realisations"),
-        ("error", "standard error of the mean"),
-        ("bias", "mean over expected S/N, less one"),
-        ("coverage", "share of 1-sigma intervals of its pixels that hold the truth; 0.6827 promised"),
-    ):
-        table[name].info.description = text
-    return table
+    return telling(table, PROMISED)
 
 
 @dataclass(eq=False)
@@ -188,20 +201,8 @@ class GaussianReport(Answer):
         for axis in self.study.sweep.axes:
             if axis.quantity in UNITS:
                 table[axis.quantity] = table[axis.quantity] * u.Unit(UNITS[axis.quantity])
-        for name, text in (
-            ("best_snr", "largest S/N per element by the formula"),
-            ("snr_off_by", "largest significant (4 standard errors) difference of the mean S/N from it; 0 if none"),
-            ("at_nm", "where"),
-            ("coverage_low", "smallest share of 1-sigma intervals that hold the truth, of all elements"),
-            ("coverage_high", "largest"),
-            ("five_sigma_above", "how often a pixel lies 5 sigma above its mean, over the normal 2.9e-7; the most"),
-            ("five_sigma_below", "how often a pixel lies 5 sigma below its mean, over the normal 2.9e-7; the least"),
-            ("probability_off_by", "largest significant difference of a detection probability from the closed form"),
-            ("fap_ratio", "most wrong false-alarm probability over the promised one; 1 if none differs"),
-        ):
-            table[name].info.description = text
         table.meta |= {"fap": self.study.run.fap, "study": self.study.text()}
-        return described(table)
+        return described(telling(table, WORST))
 
 
 def _by_star(table: QTable, stars: int) -> list[QTable]:
@@ -242,6 +243,7 @@ def _of_thresholds(tested: QTable, flares: QTable) -> dict[str, float | str]:
     }
 
 
+@public
 def gaussian_report(study: Study, engine: Engine | Pool | None = None) -> GaussianReport:
     """The usual formula beside the simulation, over magnitude and exposure or what else the study sweeps.
 

@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
+from mauvecl.host.doors import public
+from mauvecl.host.tables import tabled
 from mauvecl.results.requests.fap import check_fap
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, told
@@ -67,30 +69,22 @@ class MapResult(Answer):
     @property
     def table(self) -> QTable:
         """One row per cell and statistic."""
-        import astropy.units as u
-        from astropy.table import QTable
-
-        table = QTable()
-        s, j, i = np.indices(self.probability.shape)
-        for axis, values, index in ((self.study.map.x, self.x, i), (self.study.map.y, self.y, j)):
-            column = np.array(values)[index.ravel()]
-            unit = UNITS.get(axis.quantity)
-            table[axis.quantity] = column if unit is None else column * u.Unit(unit)
-        table["statistic"] = np.array(self.statistics)[s.ravel()]
-        for name, text in (
-            ("probability", "detection probability"),
-            ("low", "its 95 % interval, lower end, with the threshold's own"),
-            ("high", "its 95 % interval, upper end, with the threshold's own"),
-            ("closed_form", "the same for Gaussian noise"),
-        ):
-            table[name] = getattr(self, name).ravel()
-            table[name].info.description = text
-        table.meta |= {
-            "star": self.star,
-            "fap": self.study.run.fap,
-            "realisations": self.study.run.realisations,
-            "study": self.study.text(),
-        }
+        s, j, i = (index.ravel() for index in np.indices(self.probability.shape))
+        axes = ((self.study.map.x, self.x, i), (self.study.map.y, self.y, j))
+        table = tabled(
+            (
+                *((a.quantity, np.array(values)[at], "", UNITS.get(a.quantity, "")) for a, values, at in axes),
+                ("statistic", np.array(self.statistics)[s]),
+                ("probability", self.probability.ravel(), "detection probability"),
+                ("low", self.low.ravel(), "its 95 % interval, lower end, with the threshold's own"),
+                ("high", self.high.ravel(), "its 95 % interval, upper end, with the threshold's own"),
+                ("closed_form", self.closed_form.ravel(), "the same for Gaussian noise"),
+            ),
+            star=self.star,
+            fap=self.study.run.fap,
+            realisations=self.study.run.realisations,
+            study=self.study.text(),
+        )
         return described(table)
 
     ENDINGS = ("ecsv", "fits")
@@ -111,6 +105,7 @@ class MapResult(Answer):
         return {"map": ("plans.detection_map", self)}
 
 
+@public
 def detection_map(
     study: Study, engine: Engine | Pool | None = None, *, progress: Callable[[int, int], None] | None = None
 ) -> MapResult:
@@ -148,9 +143,9 @@ def detection_map(
                 progress(number * cells + done, len(studies) * cells)
 
         maps.append(_map(one, x, y, engine, seen, told_of))
-    found, parts = maps[0], {}
+    values, parts = maps[0], {}
     if unknown is not None:
-        found = _averaged(maps)
+        values = _averaged(maps)
         for s, statistic in enumerate(study.run.statistics):
             means = [float(np.nanmean(one["probability"][s])) for one in maps]
             parts[statistic] = shares(unknown, np.array(means))
@@ -165,10 +160,10 @@ def detection_map(
         x=x,
         y=y,
         statistics=study.run.statistics,
-        messages=[*_blinded(found["probability"]), *told(seen), *marginal_lines(study), *_cost(study, x, y)],
+        messages=[*_blinded(values["probability"]), *told(seen), *marginal_lines(study), *_cost(study, x, y)],
         shares=parts,
         quiet=quiet,
-        **found,
+        **values,
     )
 
 
@@ -208,12 +203,12 @@ def _map(
     from mauvecl.runs.pool import together
 
     shape = (len(study.run.statistics), len(y), len(x))
-    found = {name: np.full(shape, np.nan) for name in ("probability", "low", "high", "closed_form")}
+    values = {name: np.full(shape, np.nan) for name in ("probability", "low", "high", "closed_form")}
 
     def filled(cells: list[tuple[int, int]]) -> tuple[Expectation, int]:
         quiet, flares = _expectations(study, [(x[i], y[j]) for i, j in cells])
         if not quiet.saturated.all():
-            _fill(found, cells, study, quiet, flares, engine)
+            _fill(values, cells, study, quiet, flares, engine)
         return quiet, len(cells)
 
     done = 0
@@ -221,17 +216,17 @@ def _map(
         seen.append(quiet)
         done += count
         told_of(done)
-    return found
+    return values
 
 
 def _averaged(maps: list[Arrays]) -> Arrays:
     """The mean over draws of the unknown, with its interval; NaN where a draw has none."""
-    found = {name: np.mean([one[name] for one in maps], axis=0) for name in ("probability", "closed_form")}
-    found |= {name: np.full_like(found["probability"], np.nan) for name in ("low", "high")}
-    for at in zip(*np.nonzero(np.isfinite(found["probability"])), strict=True):
+    values = {name: np.mean([one[name] for one in maps], axis=0) for name in ("probability", "closed_form")}
+    values |= {name: np.full_like(values["probability"], np.nan) for name in ("low", "high")}
+    for at in zip(*np.nonzero(np.isfinite(values["probability"])), strict=True):
         p = average([Interval(*(float(one[name][at]) for name in ("probability", "low", "high"))) for one in maps])
-        found["low"][at], found["high"][at] = p.low, p.high
-    return found
+        values["low"][at], values["high"][at] = p.low, p.high
+    return values
 
 
 def _groups(study: Study, x: tuple[float | str, ...], y: tuple[float | str, ...]) -> list[list[tuple[int, int]]]:
@@ -257,7 +252,7 @@ def _expectations(study: Study, cells: list[tuple[float | str, float | str]]) ->
 
 
 def _fill(
-    found: dict[str, NDArray[np.float64]],
+    values: dict[str, NDArray[np.float64]],
     cells: list[tuple[int, int]],
     study: Study,
     quiet: Expectation,
@@ -270,7 +265,7 @@ def _fill(
         probabilities = result.detection_probability(run.fap, statistic)
         for k, ((i, j), p) in enumerate(zip(cells, probabilities, strict=True)):
             at = (s, j, i)
-            found["probability"][at], found["low"][at], found["high"][at] = p.value, p.low, p.high
+            values["probability"][at], values["low"][at], values["high"][at] = p.value, p.low, p.high
             limit = result.closed_form(statistic, template=k).isf(run.fap)
             if k not in result.blinding:
-                found["closed_form"][at] = result.closed_form(statistic, k).sf(limit)
+                values["closed_form"][at] = result.closed_form(statistic, k).sf(limit)

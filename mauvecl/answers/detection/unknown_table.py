@@ -13,6 +13,7 @@ from scipy import special
 
 from mauvecl.answers.detection.unknown_cost import Cost, spoken, unknown_cost
 from mauvecl.host.plotting import picture
+from mauvecl.host.tables import telling
 from mauvecl.study.labels import described, label
 from mauvecl.study.nuisances import NuisanceChoice
 
@@ -31,6 +32,14 @@ SHOWN: dict[str, NuisanceChoice] = {
         NuisanceChoice(sky=0.1),
         NuisanceChoice(tilt=0.01),
     )
+}
+
+DESCRIPTIONS = {
+    "unknown": "what is unknown",
+    "known": "S/N of the matched statistic with everything known",
+    "plain": "the same where it is unknown and the statistic does not know of it",
+    "marginalised": "the same, marginalised",
+    "smallest": "flare amplitude that is detected, marginalised, at the header's power and false alarms",
 }
 
 
@@ -61,8 +70,8 @@ class UnknownTable:
         -----
         S/N grows with the amplitude; the flare's own photon noise is left out.
         """
-        (amplitude, found), *_ = ((a, c) for (name, a), c in self.costs.items() if name == star)
-        cost = next(iter(found.values())) if unknown is None else found[unknown]
+        (amplitude, costs), *_ = ((a, c) for (name, a), c in self.costs.items() if name == star)
+        cost = next(iter(costs.values())) if unknown is None else costs[unknown]
         snr = cost.known if unknown is None else cost.marginal
         needed = special.ndtri(self.study.limit.power) - special.ndtri(self.study.run.fap)
         return float(amplitude * needed / snr) if snr > 0 else float("inf")
@@ -74,23 +83,12 @@ class UnknownTable:
 
         rows = [
             (star, amplitude, unknown, c.known, c.plain, c.marginal, self.smallest(star, unknown))
-            for (star, amplitude), found in self.costs.items()
-            for unknown, c in found.items()
+            for (star, amplitude), costs in self.costs.items()
+            for unknown, c in costs.items()
         ]
         table = QTable(rows=rows, names=("star", "amplitude", "unknown", "known", "plain", "marginalised", "smallest"))
-        for name, text in (
-            ("unknown", "what is unknown"),
-            ("known", "S/N of the matched statistic with everything known"),
-            ("plain", "the same where it is unknown and the statistic does not know of it"),
-            ("marginalised", "the same, marginalised"),
-            (
-                "smallest",
-                "flare amplitude that is detected, marginalised, at the header's power and false alarms",
-            ),
-        ):
-            table[name].info.description = text
         table.meta |= {"fap": self.study.run.fap, "power": self.study.limit.power, "study": self.study.toml()}
-        return described(table)
+        return described(telling(table, DESCRIPTIONS))
 
     def _repr_html_(self) -> str:
         return str(self.table._repr_html_())

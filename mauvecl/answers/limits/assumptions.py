@@ -6,6 +6,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.limits.search import LimitSearch
+from mauvecl.host.doors import public
+from mauvecl.host.tables import tabled
 from mauvecl.noise.processes import Uniform
 from mauvecl.study.labels import described
 from mauvecl.study.sections import Star, Unknowns
@@ -41,17 +43,17 @@ NAMES = {
 
 def assumptions(nominal: Instrument) -> tuple[Assumption, ...]:
     """The uncertain values of the payload and their ranges, those of a study's `Unknowns` to one standard deviation."""
-    found = []
+    rows = []
     for name, prior in Unknowns().priors().items():
         ends = (prior.low, prior.high) if isinstance(prior, Uniform) else (prior.mean - prior.sd, prior.mean + prior.sd)
         # The quantum efficiency scales all light alike, as the area does.
         key, scale = ("collecting_area_cm2", nominal.collecting_area_cm2) if name == "qe_scale" else (name, 1.0)
         low, high = ({key: scale * float(f"{end:.12g}")} for end in ends)
-        found.append(Assumption(NAMES[name], (f"{ends[0]:g}", f"{ends[1]:g}"), (low, high)))
+        rows.append(Assumption(NAMES[name], (f"{ends[0]:g}", f"{ends[1]:g}"), (low, high)))
     dark = Assumption(
         "dark counts are Poisson in", ("DN", "electrons"), ({"dark_unit": "DN"}, {"dark_unit": "electrons"})
     )
-    return (*found, dark)
+    return (*rows, dark)
 
 
 @dataclass(frozen=True)
@@ -71,6 +73,7 @@ class Moved:
         return abs(self.at_ends[1] - self.at_ends[0])
 
 
+@public
 def what_matters(study: Study) -> QTable:
     """The closed-form limits of a study with each assumption at both ends of its range, the largest move first.
 
@@ -89,8 +92,6 @@ def what_matters(study: Study) -> QTable:
     InputError
         As `limits.limiting_magnitude`.
     """
-    from astropy.table import QTable
-
     amplitudes = (None,) if study.limit.of == "amplitude" else study.flare.amplitudes
     rows: list[Moved] = []
     for star in study.star:
@@ -98,34 +99,38 @@ def what_matters(study: Study) -> QTable:
             for statistic in study.run.statistics:
                 rows += sorted(_moves(study, star, amplitude, statistic), key=lambda m: -m.span)
     of = study.limit.of
-    table = QTable()
-    table["star"] = [m.star for m in rows]
-    table["amplitude"] = [m.amplitude for m in rows]
-    table["statistic"] = [m.statistic for m in rows]
-    table["assumption"] = [m.assumption.name for m in rows]
-    table["low_end"] = [m.assumption.ends[0] for m in rows]
-    table["high_end"] = [m.assumption.ends[1] for m in rows]
-    table[of] = [m.nominal for m in rows]
-    table["at_low_end"] = [m.at_ends[0] for m in rows]
-    table["at_high_end"] = [m.at_ends[1] for m in rows]
-    table["span"] = [m.span for m in rows]
+    table = tabled(
+        (
+            ("star", [m.star for m in rows]),
+            ("amplitude", [m.amplitude for m in rows]),
+            ("statistic", [m.statistic for m in rows]),
+            ("assumption", [m.assumption.name for m in rows]),
+            ("low_end", [m.assumption.ends[0] for m in rows]),
+            ("high_end", [m.assumption.ends[1] for m in rows]),
+            (of, [m.nominal for m in rows]),
+            ("at_low_end", [m.at_ends[0] for m in rows]),
+            ("at_high_end", [m.at_ends[1] for m in rows]),
+            ("span", [m.span for m in rows], f"how far the closed-form limit of {of} moves from end to end"),
+        ),
+        power=study.limit.power,
+        fap=study.run.fap,
+        study=study.text(),
+    )
     for name in (of, "at_low_end", "at_high_end", "span"):
         table[name].info.format = ".3f"
-    table["span"].info.description = f"how far the closed-form limit of {of} moves from end to end"
-    table.meta |= {"power": study.limit.power, "fap": study.run.fap, "study": study.text()}
     return described(table)
 
 
 def _moves(study: Study, star: Star, amplitude: float | None, statistic: str) -> list[Moved]:
     question = LimitSearch(study, star, amplitude, statistic)
     nominal = question.root()
-    found = []
+    moves = []
     for assumption in assumptions(study.load_instrument()):
         ends = [
             LimitSearch(study.with_instrument(change), star, amplitude, statistic).root(near=nominal)
             for change in assumption.changes
         ]
-        found.append(
+        moves.append(
             Moved(
                 star=star.library or str(star.file),
                 amplitude=float("nan") if amplitude is None else amplitude,
@@ -135,4 +140,4 @@ def _moves(study: Study, star: Star, amplitude: float | None, statistic: str) ->
                 at_ends=(ends[0], ends[1]),
             )
         )
-    return found
+    return moves

@@ -12,7 +12,9 @@ import numpy as np
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import Cost, cost_lines, marginal_lines, unknown_cost
 from mauvecl.answers.limits.search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
+from mauvecl.host.tables import tabled
 from mauvecl.results.requests.fap import check_fap
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, stacked, told
@@ -123,49 +125,36 @@ class LimitResult(Answer):
     @property
     def table(self) -> QTable:
         """One row per star, flare and statistic."""
-        import astropy.units as u
-        from astropy.table import QTable
-
-        of = self.study.limit.of
-        unit = UNITS.get(of)
-        rows = self.limits
-        table = QTable()
-        table["star"] = [r.star for r in rows]
-        for axis in self.study.sweep.axes:
-            if axis.quantity != "amplitude":
-                swept = np.array([r.at[axis.quantity] for r in rows])
-                table[axis.quantity] = swept * u.Unit(UNITS[axis.quantity]) if axis.quantity in UNITS else swept
+        of, rows = self.study.limit.of, self.limits
+        unit = UNITS.get(of, "")
+        columns: list[tuple[object, ...]] = [("star", [r.star for r in rows])]
+        swept = [axis.quantity for axis in self.study.sweep.axes if axis.quantity != "amplitude"]
+        columns += [(name, np.array([r.at[name] for r in rows]), "", UNITS.get(name, "")) for name in swept]
         if of != "amplitude":
-            table["amplitude"] = [r.amplitude for r in rows]
-        table["statistic"] = [r.statistic for r in rows]
-        for name, values, text in (
-            (of, [r.value.value for r in rows], "where the flare is detected with the wanted probability"),
-            ("low", [r.value.low for r in rows], "its 95 % interval, lower end, with the threshold's own"),
-            ("high", [r.value.high for r in rows], "its 95 % interval, upper end, with the threshold's own"),
-            ("closed_form", [r.closed_form for r in rows], "the same for Gaussian noise"),
-        ):
-            table[name] = values if unit is None else np.array(values) * u.Unit(unit)
-            table[name].info.description = text
-        for name, value in (("check", "value"), ("check_low", "low"), ("check_high", "high")):
-            table[name] = [getattr(r.check.probability, value) for r in rows]
-            table[name].info.description = "detection probability there, with a fresh seed" + (
-                "" if name == "check" else f"; 95 % interval, {name[6:]}er end"
-            )
+            columns.append(("amplitude", [r.amplitude for r in rows]))
+        check = "detection probability there, with a fresh seed"
+        columns += [
+            ("statistic", [r.statistic for r in rows]),
+            (of, [r.value.value for r in rows], "where the flare is detected with the wanted probability", unit),
+            ("low", [r.value.low for r in rows], "its 95 % interval, lower end, with the threshold's own", unit),
+            ("high", [r.value.high for r in rows], "its 95 % interval, upper end, with the threshold's own", unit),
+            ("closed_form", [r.closed_form for r in rows], "the same for Gaussian noise", unit),
+            ("check", [r.check.probability.value for r in rows], check),
+            ("check_low", [r.check.probability.low for r in rows], f"{check}; 95 % interval, lower end"),
+            ("check_high", [r.check.probability.high for r in rows], f"{check}; 95 % interval, higher end"),
+        ]
         if self.study.unknowns.draws:
             unknowns = [r.unknown for r in rows if r.unknown is not None]
-            table["unknown_low"], table["unknown_high"] = np.array([one.range for one in unknowns]).T
-            table["unknown_low"].info.description = "central 95 % of the limits over what is unknown, lower end"
-            table["unknown_high"].info.description = "central 95 % of the limits over what is unknown, upper end"
-            table["matters_most"] = [next(iter(one.shares)) for one in unknowns]
-            table["its_share"] = [next(iter(one.shares.values())) for one in unknowns]
-            table["its_share"].info.description = "share of the limits' variance that this unknown explains"
-        table.meta |= {
-            "power": self.study.limit.power,
-            "fap": self.study.run.fap,
-            "realisations": self.study.run.realisations,
-            "study": self.study.text(),
-        }
-        return described(table)
+            low, high = np.array([one.range for one in unknowns]).T
+            most = [next(iter(one.shares.items())) for one in unknowns]
+            columns += [
+                ("unknown_low", low, "central 95 % of the limits over what is unknown, lower end"),
+                ("unknown_high", high, "central 95 % of the limits over what is unknown, upper end"),
+                ("matters_most", [name for name, _ in most]),
+                ("its_share", [share for _, share in most], "share of the limits' variance that this unknown explains"),
+            ]
+        run = {"fap": self.study.run.fap, "realisations": self.study.run.realisations}
+        return described(tabled(columns, power=self.study.limit.power, **run, study=self.study.text()))
 
     @property
     def draws(self) -> QTable:
@@ -263,6 +252,7 @@ def solve(
     )
 
 
+@public
 def limiting_magnitude(
     study: Study, engine: Engine | Pool | None = None, *, progress: Callable[[int, int], None] | None = None
 ) -> LimitResult:
@@ -304,24 +294,26 @@ def limiting_magnitude(
             # One star's failure does not lose the others'.
             return error
 
-    found: list[Limit | InputError] = []
+    outcomes: list[Limit | InputError] = []
     for one in together(engine, solved, asked):
-        found.append(one)
+        outcomes.append(one)
         if progress is not None:
-            progress(len(found), len(asked))
-    errors = [one for one in found if isinstance(one, InputError)]
-    if len(errors) == len(found):
+            progress(len(outcomes), len(asked))
+    errors = [one for one in outcomes if isinstance(one, InputError)]
+    if len(errors) == len(outcomes):
         raise errors[0]
-    result.limits.extend(one for one in found if isinstance(one, Limit))
+    result.limits.extend(one for one in outcomes if isinstance(one, Limit))
     result.failed = tuple(dict.fromkeys(map(str, errors)))
     return result
 
 
+@public
 def smallest_amplitude(study: Study, engine: Engine | Pool | None = None) -> LimitResult:
     """The smallest flare that is detected; as `limiting_magnitude`."""
     return limiting_magnitude(_asking(study, "amplitude"), engine)
 
 
+@public
 def shortest_exposure(study: Study, engine: Engine | Pool | None = None) -> LimitResult:
     """The shortest exposure in which the flares are detected; as `limiting_magnitude`."""
     return limiting_magnitude(_asking(study, "exposure"), engine)

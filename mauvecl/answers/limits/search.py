@@ -120,12 +120,12 @@ class LimitSearch:
         """Detection probability with its interval, by the engine."""
         assert self.engine is not None
         quiet, flare = self.pair(value)
-        found = self.engine.detect(
+        detection = self.engine.detect(
             quiet, [flare], seed=seed, **self.study.detecting(quiet) | {"statistics": (self.statistic,)}
         )
-        for message in found.messages:
+        for message in detection.messages:
             raise InputError(f"at a {self.of} of {value:g}: {message} Expected a limit where some pixel tells")
-        (probability,) = found.detection_probability(self.fap, self.statistic)
+        (probability,) = detection.detection_probability(self.fap, self.statistic)
         self.points.append(Point(value, probability, seed))
         return probability
 
@@ -207,9 +207,9 @@ class MarginalLimitSearch(LimitSearch):
 
     def simulated(self, value: float, seed: int) -> Interval:
         """Mean over the draws of the unknown, each with its own reference and threshold."""
-        found = average([one.simulated(value, seed) for one in self.each])
-        self.points.append(Point(value, found, seed))
-        return found
+        probability = average([one.simulated(value, seed) for one in self.each])
+        self.points.append(Point(value, probability, seed))
+        return probability
 
     def unknown(self, near: float) -> Unknown:
         """The closed-form limit of each draw, and which unknown moves it most."""
@@ -219,8 +219,8 @@ class MarginalLimitSearch(LimitSearch):
                 limits.append(one.root(near=near))
             except InputError:
                 limits.append(float("nan"))
-        found = np.array(limits)
-        return Unknown(self.draws, found, shares(self.draws, found))
+        roots = np.array(limits)
+        return Unknown(self.draws, roots, shares(self.draws, roots))
 
 
 def _further(of: str) -> Callable[[float, float], float]:

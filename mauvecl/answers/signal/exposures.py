@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from mauvecl.answers.answer import Answer
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import number
 from mauvecl.host.ranges import DAY_S
+from mauvecl.host.tables import tabled
 from mauvecl.study.labels import described, label, told
 from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.sections import Star
@@ -61,24 +63,19 @@ class ExposureResult(Answer):
     @property
     def table(self) -> QTable:
         """One row per star."""
-        import astropy.units as u
-        from astropy.table import QTable
-
-        table = QTable()
-        rows = self.exposures
-        table["star"] = [r.star for r in rows]
-        table["wavelength"] = [r.wavelength_nm for r in rows] * u.nm
-        table["per"] = [r.per for r in rows]
-        table["wanted"] = [r.wanted for r in rows]
-        table["exposure"] = [r.exposure_s for r in rows] * u.s
-        table["frames"] = [r.frames for r in rows]
-        table["snr"] = [r.snr for r in rows]
-        table["snr_one_frame_less"] = [r.snr_one_frame_less for r in rows]
-        table["saturated"] = [r.saturated for r in rows]
-        table["exposure"].info.description = "the fewest frames whose closed-form S/N reaches the wanted one"
-        table["saturated"].info.description = "whether the pixel, or one of the element, saturates in a single frame"
-        table.meta["study"] = self.study.text()
-        return described(table)
+        columns = (
+            ("star", "star"),
+            ("wavelength", "wavelength_nm", "", "nm"),
+            ("per", "per"),
+            ("wanted", "wanted"),
+            ("exposure", "exposure_s", "the fewest frames whose closed-form S/N reaches the wanted one", "s"),
+            ("frames", "frames"),
+            ("snr", "snr"),
+            ("snr_one_frame_less", "snr_one_frame_less"),
+            ("saturated", "saturated", "whether the pixel, or one of the element, saturates in a single frame"),
+        )
+        made = ((name, [getattr(r, of) for r in self.exposures], *more) for name, of, *more in columns)
+        return described(tabled(made, study=self.study.text()))
 
     @property
     def tables(self) -> dict[str, Table]:
@@ -123,6 +120,7 @@ def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
     return int(x.element[pixel]) if per == "element" else pixel
 
 
+@public
 def exposure_for(
     study: Study, snr: float | None = None, wavelength_nm: u.Quantity | float | None = None, *, per: Per | None = None
 ) -> ExposureResult:
@@ -151,16 +149,16 @@ def exposure_for(
     if snr is None or wavelength_nm is None:
         missing = "S/N" if snr is None else "wavelength"
         raise InputError(f"no wanted {missing}, expected --snr and --at, or snr and wavelength_nm of a study's signal")
-    found, failed = [], []
+    answered, failed = [], []
     for star in study.star:
         try:
-            found.append(_one(study, star, snr, wavelength_nm, per))
+            answered.append(_one(study, star, snr, wavelength_nm, per))
         except InputError as error:
             # One star's failure does not lose the others'.
             failed.append(error)
-    if not found:
+    if not answered:
         raise failed[0]
-    exposures, seen = zip(*found, strict=True)
+    exposures, seen = zip(*answered, strict=True)
     long = [f"{e.star} needs more than a day: {np.ceil(e.exposure_s / DAY_S):.0f} exposures of a day at most, added up."
             for e in exposures if e.exposure_s > DAY_S]  # fmt: skip
     messages = [*(f"NO ANSWER: {error}." for error in failed), *told(list(seen)), *long]

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.answer import Answer
+from mauvecl.host.doors import public
 from mauvecl.host.plotting import picture
 from mauvecl.host.quantities import count
 from mauvecl.noise.components import components
@@ -74,6 +75,7 @@ class SimulateAnswer(Answer):
         return picture("answers.observation", title, table, path, ax=ax)
 
 
+@public
 def simulate(study: Study, *, realisation: int = 0, flaring: bool = False) -> SimulateAnswer:
     """One observation of every star of a study, taken apart; with its flares too where asked."""
     realisation = count("realisation", realisation)

@@ -6,10 +6,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from mauvecl.answers.answer import Answer
+from mauvecl.answers.answer import Answer, InCell
 from mauvecl.answers.signal.exposures import place_of
+from mauvecl.host.doors import public
 from mauvecl.runs.pool import Pool, together
-from mauvecl.study.labels import label, stacked, titled, told
+from mauvecl.study.labels import label, stacked, told
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -27,18 +28,11 @@ MOST_DRAWN = 6
 
 
 @dataclass(frozen=True, eq=False)
-class StarSnr:
+class StarSnr(InCell):
     """One star in one cell of the sweep."""
 
-    label: str
-    at: Mapping[str, float | str]
     result: SnrResult
     asked_nm: float | None = None
-
-    @property
-    def title(self) -> str:
-        """The star and what is swept, for pictures."""
-        return titled(self.label, self.at)
 
     @property
     def shown_nm(self) -> list[float]:
@@ -112,6 +106,7 @@ class SnrAnswer(Answer):
         return stacked(parts, realisations=self.study.run.realisations, study=self.study.text())
 
 
+@public
 def snr(study: Study, engine: Engine | Pool) -> SnrAnswer:
     """S/N distributions of every star of a study, without flares, in every cell of its sweep.
 

@@ -2,26 +2,26 @@
 
 from __future__ import annotations
 
-import hashlib
-import os
 from collections.abc import Callable, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
-from functools import cached_property, partial
+from dataclasses import astuple, dataclass, field
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import Answer
+from mauvecl.answers.answer import Answer, InCell
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.search.injected import Fitted, InjectedShares, fitted
+from mauvecl.host.tables import tabled
+from mauvecl.lightcurve.search.injected import Injected
 from mauvecl.lightcurve.search.injections import Injections
-from mauvecl.lightcurve.search.null import DAY_S, Counted, counted, in_a_row_rate, sampled
-from mauvecl.results.requests.requests import Shard
-from mauvecl.results.sums import Arrays
+from mauvecl.lightcurve.search.null import DAY_S, Counted, in_a_row_rate, sampled
+from mauvecl.lightcurve.search.recoveries import Fitted, Refit
+from mauvecl.lightcurve.stares.requests import Arrays
+from mauvecl.runs.pool import Pool, together
 from mauvecl.statistics.intervals import Interval
-from mauvecl.study.labels import described, label, put_first, stacked, titled, told
+from mauvecl.study.labels import described, label, stacked, told
 from mauvecl.study.staring import orbit_lines
 from mauvecl.study.study import Study
 from mauvecl.study.surveys import Sizes, Surveyed, sizes_of, surveyed
@@ -31,8 +31,7 @@ if TYPE_CHECKING:
 
     from mauvecl.device.stares import Stares
     from mauvecl.host.expectation import Expectation
-    from mauvecl.lightcurve.search.survey import Survey
-    from mauvecl.runs.checkpoint import Checkpoint
+    from mauvecl.lightcurve.stares.requests import StaresRequest
     from mauvecl.study.sections import Star
 
 Float = NDArray[np.float64]
@@ -50,13 +49,11 @@ MOST_DRAWN = 6
 
 
 @dataclass(frozen=True, eq=False)
-class StarCompleteness:
+class StarCompleteness(InCell):
     """One star in one cell of the sweep.
 
     Attributes
     ----------
-    label : str
-    at : mapping
     surveyed : Surveyed
     sizes : Sizes
     threshold : Interval
@@ -66,40 +63,42 @@ class StarCompleteness:
     asked : float
         What it should be there by importance sampling.
     checked : float
+    saturates : float
+        Amplitude from which on flares saturate a used pixel, which injections leave out.
     in_a_row : float
         False alarms per star-day of the common rule in white noise.
-    found : InjectedShares
+    injected : Injected
     fitted : Fitted, optional
     """
 
-    label: str
-    at: Mapping[str, float | str]
     surveyed: Surveyed
     sizes: Sizes
     threshold: Interval
     simulated: Interval
     asked: float
     checked: float
+    saturates: float
     in_a_row: float
-    found: InjectedShares
+    injected: Injected
     fitted: Fitted | None
 
     @property
-    def title(self) -> str:
-        """The star and what is swept, for pictures."""
-        return titled(self.label, self.at)
-
-    @property
-    def message(self) -> str | None:
-        """Where drawn stares alarm more or less often than normal noise."""
-        if np.isnan(self.simulated.value) or self.simulated.low <= self.asked <= self.simulated.high:
-            return None
-        return (
-            f"FALSE ALARMS of {self.title} are not those of normal noise: {self.simulated.value:.3g} per star-day at "
-            f"{self.checked:.2f} in drawn stares, {self.asked:.3g} by importance sampling: the search does not "
-            "marginalise over what changes in the stare (see [search] frame, cycle, window_s), or set search.null = "
-            '"counted".'
-        )
+    def messages(self) -> list[str]:
+        """Where drawn stares alarm more or less often than normal noise, and where flares saturate."""
+        messages = []
+        if not np.isnan(self.simulated.value) and not self.simulated.low <= self.asked <= self.simulated.high:
+            messages.append(
+                f"FALSE ALARMS of {self.title} are not those of normal noise: {self.simulated.value:.3g} per star-day "
+                f"at {self.checked:.2f} in drawn stares, {self.asked:.3g} by importance sampling: the search does not "
+                "marginalise over what changes in the stare (see [search] frame, cycle, window_s), or set "
+                'search.null = "counted".'
+            )
+        if self.injected.amplitudes.max() > self.saturates:
+            messages.append(
+                f"SATURATED: flares of {self.title} with an amplitude above {self.saturates:.3g} saturate a pixel, "
+                "which injections leave out."
+            )
+        return messages
 
 
 @dataclass(eq=False)
@@ -133,11 +132,7 @@ class InjectAnswer(Answer):
         return self._together(_search)
 
     def _together(self, make: Callable[[StarCompleteness], QTable]) -> QTable:
-        parts: list[tuple[Mapping[str, float | str], QTable]] = []
-        for star in self.stars:
-            table = make(star)
-            put_first(table, {"star": star.label})
-            parts.append((star.at, table))
+        parts = (({**star.at, "star": star.label}, make(star)) for star in self.stars)
         choice = self.study.search
         meta = {
             "false_alarms": f"{choice.false_alarms:g} per star-{choice.per}",
@@ -162,109 +157,72 @@ class InjectAnswer(Answer):
         return {"completeness": ("injections.maps", self), "curves": ("injections.curves", self), **fitted}
 
 
-def _size_column(values: Any, sizes: Sizes) -> Any:
-    import astropy.units as u
-
-    unit = SIZE_UNITS[sizes.of]
-    return values * u.Unit(unit) if unit else values
-
-
 def _limits(star: StarCompleteness) -> QTable:
-    import astropy.units as u
-    from astropy.table import QTable
-
-    found = star.found
-    table = QTable()
-    widths = np.array([np.nan, *found.half_widths_s])
-    table["half_width"] = widths * u.s
-    table["half_width"].info.description = "half-width of the injected flares; NaN for all of them alike"
+    injected, unit = star.injected, SIZE_UNITS[star.sizes.of]
+    every = (None, *range(len(injected.half_widths_s)))
+    widths, told = [np.nan, *injected.half_widths_s], "half-width of the injected flares; NaN for all of them alike"
+    columns: list[tuple[object, ...]] = [("half_width", widths, told, "s")]
     for power in POWERS:
-        each = [found.limit(power, None), *(found.limit(power, k) for k in range(len(found.half_widths_s)))]
-        name = f"e{100 * power:.0f}"
-        for ending, values in (("", "value"), ("_low", "low"), ("_high", "high")):
-            table[name + ending] = _size_column(np.array([getattr(x, values) for x in each]), star.sizes)
-        table[name].info.description = f"{star.sizes.of} at which the completeness is {power:g}"
-        table[name + "_low"].info.description = "its 95 % interval, lower end"
-        table[name + "_high"].info.description = "its 95 % interval, upper end"
-    table["never"] = np.array([found.never(None), *(found.never(k) for k in range(len(found.half_widths_s)))])
-    table["never"].info.description = "share of flares for which no template fits into what is observed"
-    return described(table)
+        name, limits = f"e{100 * power:.0f}", np.array([astuple(injected.limit(power, k)) for k in every]).T
+        columns += [
+            (name, limits[0], f"{star.sizes.of} at which the completeness is {power:g}", unit),
+            (f"{name}_low", limits[1], "its 95 % interval, lower end", unit),
+            (f"{name}_high", limits[2], "its 95 % interval, upper end", unit),
+        ]
+    text = "share of flares for which no template fits into what is observed"
+    return described(tabled([*columns, ("never", np.array([injected.never(k) for k in every]), text)]))
 
 
 def _cells(star: StarCompleteness) -> QTable:
-    import astropy.units as u
-    from astropy.table import QTable
-
-    found = star.found
-    d, s = (index.ravel() for index in np.indices((len(found.half_widths_s), len(found.sizes))))
-    table = QTable()
-    table["half_width"] = np.array(found.half_widths_s)[d] * u.s
-    table["half_width"].info.description = "half-width of the injected flares"
-    table["size"] = _size_column(found.sizes[s], star.sizes)
-    table["size"].info.description = f"{star.sizes.of} of the injected flares"
-    table["amplitude"] = found.amplitudes[d, s]
-    table["amplitude"].info.description = "their amplitude: relative rise of the photons in the flare's band"
-    for name, text in (
-        ("completeness", "share of injected flares that the search finds"),
-        ("completeness_low", "its 95 % interval, lower end"),
-        ("completeness_high", "its 95 % interval, upper end"),
-    ):
-        table[name] = getattr(found, name)[d, s]
-        table[name].info.description = text
-    table["injections"] = np.full(d.size, found.count)
+    injected, of, unit = star.injected, star.sizes.of, SIZE_UNITS[star.sizes.of]
+    d, s = (index.ravel() for index in np.indices((len(injected.half_widths_s), len(injected.sizes))))
+    columns = [
+        ("half_width", np.array(injected.half_widths_s)[d], "half-width of the injected flares", "s"),
+        ("size", injected.sizes[s], f"{of} of the injected flares", unit),
+        ("amplitude", injected.amplitudes[d, s], "their amplitude: relative rise of the photons in the flare's band"),
+        ("completeness", injected.completeness[d, s], "share of injected flares that the search finds"),
+        ("completeness_low", injected.completeness_low[d, s], "its 95 % interval, lower end"),
+        ("completeness_high", injected.completeness_high[d, s], "its 95 % interval, upper end"),
+        ("injections", np.full(d.size, injected.count)),
+    ]
     if star.fitted is not None:
-        for name, text in Fitted.COLUMNS.items():
-            table[name] = getattr(star.fitted, name)[d, s]
-            table[name].info.description = text
-    return described(table)
+        columns += [(name, getattr(star.fitted, name)[d, s], text) for name, text in Fitted.COLUMNS.items()]
+    return described(tabled(columns))
 
 
 def _search(star: StarCompleteness) -> QTable:
-    from astropy.table import QTable
-
     s = star.surveyed.survey
-    rows = {
-        "threshold": (star.threshold.value, "S/N from which on a template is an alarm"),
-        "threshold_low": (star.threshold.low, "its 95 % interval, lower end"),
-        "threshold_high": (star.threshold.high, "its 95 % interval, upper end"),
-        "checked_at": (star.checked, "S/N at which drawn stares are held against normal noise"),
-        "alarms_sampled": (star.asked, "false alarms per star-day there, normal noise"),
-        "alarms_simulated": (star.simulated.value, "false alarms per star-day there, drawn stares"),
-        "alarms_low": (star.simulated.low, "lower end: 4 standard errors"),
-        "alarms_high": (star.simulated.high, "upper end: 4 standard errors"),
-        "in_a_row": (star.in_a_row, "false alarms per star-day of the common rule, white noise"),
-        "templates": (s.search.n_filters, "templates of the bank"),
-        "sums": (s.components.n_statistics, "weighted sums of a frame"),
-        "spectral_loss": (float(star.surveyed.templates.loss.max()), "largest share of S/N lost to so few sums"),
-        "star_days": (s.stare.observed_s / DAY_S, "star-days of a stare"),
-    }
-    table = QTable({name: [value] for name, (value, _) in rows.items()})
-    for name, (_, text) in rows.items():
-        table[name].info.description = text
-    return described(table)
+    rows = (
+        ("threshold", star.threshold.value, "S/N from which on a template is an alarm"),
+        ("threshold_low", star.threshold.low, "its 95 % interval, lower end"),
+        ("threshold_high", star.threshold.high, "its 95 % interval, upper end"),
+        ("checked_at", star.checked, "S/N at which drawn stares are held against normal noise"),
+        ("alarms_sampled", star.asked, "false alarms per star-day there, normal noise"),
+        ("alarms_simulated", star.simulated.value, "false alarms per star-day there, drawn stares"),
+        ("alarms_low", star.simulated.low, "lower end: 4 standard errors"),
+        ("alarms_high", star.simulated.high, "upper end: 4 standard errors"),
+        ("in_a_row", star.in_a_row, "false alarms per star-day of the common rule, white noise"),
+        ("templates", s.search.n_filters, "templates of the bank"),
+        ("sums", s.components.n_statistics, "weighted sums of a frame"),
+        ("spectral_loss", float(star.surveyed.templates.loss.max()), "largest share of S/N lost to so few sums"),
+        ("star_days", s.stare.observed_s / DAY_S, "star-days of a stare"),
+    )
+    return described(tabled((name, [value], text) for name, value, text in rows))
 
 
+@public
 def inject(
-    study: Study,
-    stares: Stares | None = None,
-    *,
-    checkpoint: Checkpoint | None = None,
-    progress: Callable[[int, int], None] | None = None,
-    threads: int | None = None,
+    study: Study, engine: Stares | Pool | None = None, *, progress: Callable[[int, int], None] | None = None
 ) -> InjectAnswer:
     """Completeness of a study's search at each of its stars, in every cell of its sweep.
 
     Parameters
     ----------
     study : Study
-    stares : Stares, optional
-        Who draws stares without flares; the default device.
-    checkpoint : Checkpoint, optional
-        Where finished positions are kept, and looked for.
+    engine : Stares or Pool, optional
+        Who draws; the default device.
     progress : callable, optional
-        Called as ``progress(done, total)`` in injections.
-    threads : int, optional
-        As many as there are processors by default.
+        Called as ``progress(done, total)`` in injections; may raise to stop the work.
 
     Raises
     ------
@@ -274,21 +232,25 @@ def inject(
     idle = next((axis.quantity for axis in study.sweep.axes if axis.quantity in ("amplitude", "exposure")), None)
     if idle is not None:
         raise InputError(f"the sweep has the quantity {idle!r}, which injections have none of, expected another")
+    if engine is None:
+        from mauvecl.device.stares import Stares as Default
+
+        engine = Default()
     cells = [(values, one, star) for values, one in study.cells() for star in one.star]
     q = study.injections
     each = q.count * q.sizes * q.widths
     answer = InjectAnswer(study, [])
     for number, (values, one, star) in enumerate(cells):
 
-        def told_of(share: float, number: int = number) -> None:
+        def told_of(part: float, number: int = number) -> None:
             if progress is not None:
-                progress(round((number + share) * each), len(cells) * each)
+                progress(round((number + part) * each), len(cells) * each)
 
         told_of(0.0)
-        answer.stars.append(_star(one, star, values, stares, checkpoint, told_of, threads))
+        answer.stars.append(_star(one, star, values, engine, told_of))
     told_of(1.0)
     answer.messages = [
-        *(text for text in (star.message for star in answer.stars) if text is not None),
+        *(text for star in answer.stars for text in star.messages),
         *told(answer.inputs),
         *orbit_lines(study),
     ]
@@ -296,18 +258,16 @@ def inject(
 
 
 def _star(
-    study: Study,
-    star: Star,
-    at: Mapping[str, float | str],
-    stares: Stares | None,
-    checkpoint: Checkpoint | None,
-    told_of: Callable[[float], None],
-    threads: int | None,
+    study: Study, star: Star, at: Mapping[str, float | str], engine: Stares | Pool, told_of: Callable[[float], None]
 ) -> StarCompleteness:
     choice, asked, seed = study.search, study.injections, study.run.seed
+    rays = study.processes.processes().cosmic_rays
     known = surveyed(study, star)
     survey = known.survey
-    drawn = _null(survey, study, stares)
+    drawn = None
+    if choice.nulls:
+        maxima = _reduced(engine, survey.null(choice.nulls, seed, rays))["maximum"]
+        drawn = Counted(np.sort(maxima), survey.stare.observed_s / DAY_S)
     short = survey.of_days(SAMPLED_DAYS)
     tail = sampled(short.search, seed=seed)
     threshold = (
@@ -317,24 +277,20 @@ def _star(
     values = sizes_of(study, sizes, known.unit_snr, threshold.value)
     positions = min(asked.positions, asked.count)
     injections = Injections(
-        survey,
-        0,
-        asked.half_widths_s,
-        threshold.value,
-        study.flare.temperature_k,
-        seed,
-        positions,
-        -(-asked.count // positions),
+        survey, 0, asked.half_widths_s, threshold.value, seed, positions, -(-asked.count // positions), rays
     )
     widths = np.array(injections.half_widths_s)
     amplitudes = np.asarray(sizes.amplitude(values[None], widths[:, None]))
-    to_fit = -(-asked.fitted // positions)
-    work = partial(_position, injections, known, amplitudes, to_fit)
-    parts = _kept(work, positions, _name(study, star, threshold.value, amplitudes), checkpoint, told_of, threads)
-    critical = np.stack([part["critical"] for part in parts], axis=1)
-    found = InjectedShares(
-        injections.half_widths_s, values, amplitudes, sizes.of_amplitude(critical, widths[:, None, None])
-    )
+    refit = Refit(known.fit, amplitudes, study.flare.temperature_k, -(-asked.fitted // positions))
+
+    def at_one_peak(position: int) -> Arrays:
+        return _reduced(engine, injections.request(position, refit if refit.count else None))
+
+    parts: list[Arrays] = []
+    for part in together(engine, at_one_peak, range(positions)):
+        parts.append(part)
+        told_of(len(parts) / positions)
+    critical = np.stack([part["critical"].T for part in parts], axis=1)
     # Where a few stares in ten have an alarm, drawn ones say most of whether the two agree.
     checked, likely, error = tail.likely
     simulated, expected = _checked(drawn, checked, likely, error, survey.stare.observed_s / short.stare.observed_s)
@@ -347,70 +303,15 @@ def _star(
         simulated,
         expected,
         checked,
+        injections.saturates,
         in_a_row_rate(choice.points, choice.sigma, survey.stare.frame_s),
-        found,
-        Fitted.of(parts) if to_fit else None,
+        Injected(injections.half_widths_s, values, amplitudes, sizes.of_amplitude(critical, widths[:, None, None])),
+        Fitted.of(parts) if refit.count else None,
     )
 
 
-def _position(injections: Injections, known: Surveyed, amplitudes: Float, to_fit: int, position: int) -> Arrays:
-    """Everything at one peak."""
-    places = injections.places(position)
-    blocks = [injections.critical(places, p, k, n) for p, k, n in injections.blocks() if p == position]
-    part: Arrays = {"critical": np.concatenate(blocks, axis=1)}
-    return part | fitted(injections, known.fit, places, position, to_fit, amplitudes) if to_fit else part
-
-
-def _kept(
-    work: Callable[[int], Arrays],
-    positions: int,
-    name: str,
-    checkpoint: Checkpoint | None,
-    told_of: Callable[[float], None],
-    threads: int | None,
-) -> list[Arrays]:
-    """What comes of each position, worked out by some threads or kept from before."""
-    found: dict[int, Arrays] = {}
-    if checkpoint is not None:
-        kept = {p: checkpoint.get(f"{name}-{Shard(0, p, 1).name}") for p in range(positions)}
-        found = {p: part for p, part in kept.items() if part is not None}
-    todo = [p for p in range(positions) if p not in found]
-    pool = ThreadPoolExecutor(threads or os.cpu_count())
-    # One thread is the caller's own, which may be told to end.
-    each = map(work, todo) if threads == 1 else pool.map(work, todo)
-    try:
-        for position, part in zip(todo, each, strict=True):
-            found[position] = part
-            if checkpoint is not None:
-                checkpoint.put(f"{name}-{Shard(0, position, 1).name}", part)
-            told_of(len(found) / positions)
-    finally:
-        # What nobody waits for any longer is not begun.
-        pool.shutdown(cancel_futures=True)
-    return [found[position] for position in range(positions)]
-
-
-def _name(study: Study, star: Star, threshold: float, amplitudes: Float) -> str:
-    """What shards of one star are kept under."""
-    text = f"{study.toml()}|{star!r}|{threshold.hex()}|".encode() + amplitudes.tobytes()
-    return hashlib.sha256(text).hexdigest()[:32]
-
-
-def _null(survey: Survey, study: Study, stares: Stares | None) -> Counted | None:
-    """Largest values of drawn stares without a flare."""
-    if not study.search.nulls:
-        return None
-    from mauvecl.device.stares import Stares as Default
-
-    drawing = stares or Default()
-
-    def draw(first: int, count: int) -> NDArray[np.float32]:
-        sums = drawing.frames(
-            survey.components, survey.stare, first=first, count=count, seed=study.run.seed, method="cumulants"
-        )
-        return survey.net(sums)
-
-    return counted(survey.search, draw, study.search.nulls, batch=survey.batch)
+def _reduced(engine: Stares | Pool, request: StaresRequest) -> Arrays:
+    return engine.stares(request) if isinstance(engine, Pool) else engine.reduced(request)
 
 
 def _checked(

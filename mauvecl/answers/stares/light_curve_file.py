@@ -23,12 +23,12 @@ DAY_S = 86_400.0
 NO_TIME_MJD = 61_041
 
 
-def light_curve_file(found: StareAnswer, number: int = 0) -> bytes:
+def light_curve_file(answer: StareAnswer, number: int = 0) -> bytes:
     """The file of one star and cell."""
     from astropy.io import fits
 
-    one = found.stares[number]
-    when = found.study.sky.time
+    one = answer.stares[number]
+    when = answer.study.sky.time
     first, comment = (NO_TIME_MJD, "arbitrary: no time was named") if when is None else (_mjd(when), "start of stare")
     primary = fits.PrimaryHDU()
     named: tuple[tuple[str, str | int, str], ...] = (
@@ -36,8 +36,8 @@ def light_curve_file(found: StareAnswer, number: int = 0) -> bytes:
         ("TELESCOP", "Mauve", "simulated"),
         ("INSTRUME", one.staring.quiet.instrument, ""),
         ("CREATOR", f"mauvecl {VERSION}", ""),
-        ("SEED", str(found.study.run.seed), "of the draws"),
-        ("STARENO", found.study.stare.number, "number of the stare"),
+        ("SEED", str(answer.study.run.seed), "of the draws"),
+        ("STARENO", answer.study.stare.number, "number of the stare"),
     )
     for key, value, text in named:
         primary.header[key] = (value, text)

@@ -9,13 +9,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.answer import Answer
+from mauvecl.answers.answer import Answer, InCell
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
+from mauvecl.host.tables import tabled
 from mauvecl.lightcurve.flares.events import Event, coefficients, temperatures_of
 from mauvecl.lightcurve.search.alarms import Alarm, alarms
 from mauvecl.lightcurve.search.null import sampled
 from mauvecl.lightcurve.stares.observed import Draw, Light, Staring, seen
-from mauvecl.study.labels import described, label, stacked, titled, told
+from mauvecl.study.labels import described, label, stacked, told
 from mauvecl.study.stares import check_sweep
 from mauvecl.study.staring import energy_of, orbit_lines, stare_of, staring_of
 from mauvecl.study.study import Study
@@ -72,20 +74,13 @@ class Searched:
 
 
 @dataclass(frozen=True, eq=False)
-class StarStare:
+class StarStare(InCell):
     """One star in one cell of the sweep; `searched` is a sentence where no search was possible."""
 
-    label: str
-    at: Mapping[str, float | str]
     staring: Staring
     flares: tuple[Flaring, ...]
     light: Light
     searched: Searched | str | None = None
-
-    @property
-    def title(self) -> str:
-        """The star and what is swept, for pictures."""
-        return titled(self.label, self.at)
 
 
 @dataclass(eq=False)
@@ -107,122 +102,107 @@ class StareAnswer(Answer):
     @property
     def table(self) -> QTable:
         """One row per star and cell: frames, gaps, light and noise of a frame, flares."""
-        import astropy.units as u
-        from astropy.table import QTable
 
         def row(one: StarStare) -> QTable:
-            stare, light = one.staring.stare, one.light
-            table = QTable({"frames": [stare.n_frames]})
-            table["observed"] = [stare.observed_s] * u.s
-            table["intervals"] = [len(stare.gtis)]
-            table["flux"] = [float(np.median(light.mean[:, 0]))] * u.DN / u.s
-            table["frame_noise"] = [float(np.median(light.sd[:, 0] / light.mean[:, 0]))]
-            table["flares"] = [len(one.flares)]
+            stare, light, told = one.staring.stare, one.light, one.searched
+            columns: list[tuple[object, ...]] = [
+                ("frames", [stare.n_frames], "frames of the stare"),
+                ("observed", [stare.observed_s], "time in them", "s"),
+                ("intervals", [len(stare.gtis)], "good time intervals: runs of frames without a gap"),
+                ("flux", [float(np.median(light.mean[:, 0]))],
+                 "median net light of a frame, sky included, without bias and dark", "DN / s"),
+                ("frame_noise", [float(np.median(light.sd[:, 0] / light.mean[:, 0]))],
+                 "standard deviation of a frame's own noise, relative to its light"),
+                ("flares", [len(one.flares)], "flares put into it"),
+            ]  # fmt: skip
             if self.study.stare.search:
-                searched = one.searched
-                told = searched if isinstance(searched, Searched) else None
-                table["threshold"] = [np.nan if told is None else told.threshold]
-                table["threshold"].info.description = "value of the search's statistic from which on it alarms"
-                table["found"] = [-1 if told is None else len(told.alarms)]
-                table["found"].info.description = "flares found; -1: not searched"
-            table["saturated_frames"] = [int(np.count_nonzero(one.staring.quality))]
-            for name, text in (
-                ("frames", "frames of the stare"),
-                ("observed", "time in them"),
-                ("intervals", "good time intervals: runs of frames without a gap"),
-                ("flux", "median net light of a frame, sky included, without bias and dark"),
-                ("frame_noise", "standard deviation of a frame's own noise, relative to its light"),
-                ("flares", "flares put into it"),
-                ("saturated_frames", "frames in which the mean of a used pixel reaches saturation"),
-            ):
-                table[name].info.description = text
-            return table
+                threshold, alarms = (told.threshold, len(told.alarms)) if isinstance(told, Searched) else (np.nan, -1)
+                columns += [
+                    ("threshold", [threshold], "value of the search's statistic from which on it alarms"),
+                    ("found", [alarms], "flares found; -1: not searched"),
+                ]
+            saturated = int(np.count_nonzero(one.staring.quality))
+            told_of = "frames in which the mean of a used pixel reaches saturation"
+            return tabled([*columns, ("saturated_frames", [saturated], told_of)])
 
         return self._together(row)
 
     @property
     def events(self) -> QTable:
         """One row per flare: when, how long, how large, how hot, and the S/N of one who looks for just this one."""
-        import astropy.units as u
-        from astropy.table import QTable
 
         def rows(one: StarStare) -> QTable:
             flares, events = one.flares, [flare.event for flare in one.flares]
-            table = QTable()
-            for name, values, unit, text in (
-                ("peak_time", [e.peak_s for e in events], u.s, "from the start of the stare; tau = 0 of the shape"),
-                ("half_width", [e.half_width_s for e in events], u.s, "t_1/2 of the shape's publication"),
-                ("amplitude", [e.amplitude for e in events], None, "the shape's own, in the flare's band"),
-                ("peak", [e.peak for e in events], None, "highest relative rise of the photons in the flare's band"),
-                ("temperature", [e.hottest_k for e in events], u.K, "blackbody temperature, at the peak"),
-                ("equivalent_duration", [e.equivalent_duration_s for e in events], u.s, "in the flare's band"),
-                ("energy_band", [f.band_erg for f in flares], u.erg, "in the flare's band; nan: star of unknown size"),
-                ("energy_bolometric", [f.bolometric_erg for f in flares], u.erg, "of all of its light"),
-                ("snr", [f.snr for f in flares], None, "of one who knows all but whether the flare is there"),
-            ):
-                table[name] = np.array(values, np.float64) if unit is None else np.array(values, np.float64) * unit
-                table[name].info.description = text
-            table["shape"] = np.array([e.form.name for e in events], dtype="U32")
-            return table
+            numbers = (
+                ("peak_time", [e.peak_s for e in events], "from the start of the stare; tau = 0 of the shape", "s"),
+                ("half_width", [e.half_width_s for e in events], "t_1/2 of the shape's publication", "s"),
+                ("amplitude", [e.amplitude for e in events], "the shape's own, in the flare's band", ""),
+                ("peak", [e.peak for e in events], "highest relative rise of the photons in the flare's band", ""),
+                ("temperature", [e.hottest_k for e in events], "blackbody temperature, at the peak", "K"),
+                ("equivalent_duration", [e.equivalent_duration_s for e in events], "in the flare's band", "s"),
+                ("energy_band", [f.band_erg for f in flares], "in the flare's band; nan: star of unknown size", "erg"),
+                ("energy_bolometric", [f.bolometric_erg for f in flares], "of all of its light", "erg"),
+                ("snr", [f.snr for f in flares], "of one who knows all but whether the flare is there", ""),
+            )
+            shapes = np.array([e.form.name for e in events], dtype="U32")
+            plain = ((name, np.array(values, np.float64), *more) for name, values, *more in numbers)
+            return tabled([*plain, ("shape", shapes)])
 
         return self._together(rows)
 
     @property
     def found(self) -> QTable:
         """One row per flare that the search found: what it was by a fit, with standard errors, and which was put in."""
-        import astropy.units as u
-        from astropy.table import QTable
 
         def rows(one: StarStare) -> QTable:
-            searched = one.searched
-            alarms = searched.alarms if isinstance(searched, Searched) else []
-            fits = [alarm.recovered for alarm in alarms]
-            table = QTable()
-            for name, key, unit, text in (
-                ("peak_time", "peak{}_s", u.s, "from the start of the stare"),
-                ("amplitude", "amplitude{}", None, "in the flare's band"),
-                ("half_width", "half_width{}_s", u.s, "t_1/2 of the search's shape"),
-                ("temperature", "temperature{}_k", u.K, "blackbody temperature"),
-                ("equivalent_duration", "equivalent_duration{}_s", u.s, "in the flare's band"),
-            ):
-                for suffix, more in (("", ""), ("_error", "; standard error")):
-                    values = np.array([float(getattr(fit, key.format(suffix))[0]) for fit in fits], np.float64)
-                    table[name + suffix] = values if unit is None else values * unit
-                    table[name + suffix].info.description = text + more
-            of_them = searched if isinstance(searched, Searched) else Searched(np.nan, [], (), ())
-            table["energy_bolometric"] = np.array(of_them.bolometric_erg, np.float64) * u.erg
-            table["value"] = np.array([alarm.rho for alarm in alarms], np.float64)
-            table["event"] = np.array(of_them.events, np.int64)
-            table["value"].info.description = "of the search's statistic: S/N of the template that fits best"
-            table["event"].info.description = "row of the star's flares that it is nearest to, from 1 on; 0: none near"
-            return table
+            searched = one.searched if isinstance(one.searched, Searched) else Searched(np.nan, [], (), ())
+            fits = [alarm.recovered for alarm in searched.alarms]
+            fitted = (
+                ("peak_time", "peak{}_s", "from the start of the stare", "s"),
+                ("amplitude", "amplitude{}", "in the flare's band", ""),
+                ("half_width", "half_width{}_s", "t_1/2 of the search's shape", "s"),
+                ("temperature", "temperature{}_k", "blackbody temperature", "K"),
+                ("equivalent_duration", "equivalent_duration{}_s", "in the flare's band", "s"),
+            )
+            best = "of the search's statistic: S/N of the template that fits best"
+            nearest = "row of the star's flares that it is nearest to, from 1 on; 0: none near"
+            columns: list[tuple[object, ...]] = []
+            for name, key, text, unit in fitted:
+                for end, more in (("", ""), ("_error", "; standard error")):
+                    values = [float(getattr(fit, key.format(end))[0]) for fit in fits]
+                    columns.append((name + end, np.array(values, np.float64), text + more, unit))
+            columns += [
+                ("energy_bolometric", np.array(searched.bolometric_erg, np.float64), "", "erg"),
+                ("value", np.array([alarm.rho for alarm in searched.alarms], np.float64), best),
+                ("event", np.array(searched.events, np.int64), nearest),
+            ]
+            return tabled(columns)
 
         return self._together(rows)
 
     def light_curve(self, number: int = 0) -> QTable:
         """Frames of one star and cell: time, cadence number, quality, and light in every band."""
-        import astropy.units as u
-        from astropy.table import QTable
-
         one = self.stares[number]
         stare, light = one.staring.stare, one.light
-        table = QTable({"time": stare.middle_s * u.s, "frame": stare.numbers, "quality": one.staring.quality})
-        table["time"].info.description = "middle of the frame, from the start of the stare"
-        table["frame"].info.description = "number of the frame, gaps included"
-        table["quality"].info.description = "1 where the mean of a used pixel reaches saturation"
-        rate = u.DN / u.s
-        for k, name in enumerate(light.bands):
-            suffix = "" if k == 0 else "_" + name.removesuffix(" nm").replace("-", "_")
-            for column, values, text in (
-                ("flux", light.flux, "net light, bias and known dark taken off"),
-                ("flux_err", light.sd, "standard deviation of its photons, dark and reading"),
-                ("mean", light.mean, "the same without any noise"),
-            ):
-                table[column + suffix] = values[:, k] * rate
-                table[column + suffix].info.description = f"{name}: {text}"
-        table.meta |= {"star": one.label, "study": self.study.text(), "seed": self.study.run.seed}
-        table.meta |= dict(one.at)
-        return table
+        kinds = (
+            ("flux", light.flux, "net light, bias and known dark taken off"),
+            ("flux_err", light.sd, "standard deviation of its photons, dark and reading"),
+            ("mean", light.mean, "the same without any noise"),
+        )
+        suffixes = ["", *("_" + name.removesuffix(" nm").replace("-", "_") for name in light.bands[1:])]
+        return tabled(
+            [
+                ("time", stare.middle_s, "middle of the frame, from the start of the stare", "s"),
+                ("frame", stare.numbers, "number of the frame, gaps included"),
+                ("quality", one.staring.quality, "1 where the mean of a used pixel reaches saturation"),
+                *(
+                    (column + suffix, values[:, k], f"{name}: {text}", "DN / s")
+                    for k, (name, suffix) in enumerate(zip(light.bands, suffixes, strict=True))
+                    for column, values, text in kinds
+                ),
+            ],
+            **{"star": one.label, "study": self.study.text(), "seed": self.study.run.seed, **one.at},
+        )
 
     def _together(self, table_of: Callable[[StarStare], QTable]) -> QTable:
         parts = (({"star": one.label, **one.at}, table_of(one)) for one in self.stares)
@@ -277,6 +257,7 @@ class StareAnswer(Answer):
         return {"messages": self.messages} | {name: rows(table) for name, table in tables.items()}
 
 
+@public
 def stare(study: Study, stares: Stares) -> StareAnswer:
     """One simulated stare at every star of a study, in every cell of its sweep.
 

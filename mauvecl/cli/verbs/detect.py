@@ -43,7 +43,7 @@ def _show_detections(answer: DetectAnswer) -> None:
     study = answer.study
     run = study.run
     exposures = " and ".join(
-        dict.fromkeys(f"{x.exposure_s:g} s ({x.n_frames} frames)" for x in (s.found.quiet for s in answer.stars))
+        dict.fromkeys(f"{x.exposure_s:g} s ({x.n_frames} frames)" for x in (s.detection.quiet for s in answer.stars))
     )
     swept = [axis.quantity for axis in study.sweep.axes if axis.quantity != "amplitude"]
     columns = ("flare", "statistic", "expected", "simulated", "reduced", "threshold", "detected", "", "closed form")

@@ -67,12 +67,9 @@ def inject(study: Study, session: Session) -> None:
     mauvecl inject --star M3V --magnitude 9 --orbit-gap 2100 --with-unknowns --sweep flare_temperature=7000,10000,15000
     """
     from mauvecl.answers.stares.inject import inject as compute
-    from mauvecl.device.stares import Stares
 
-    with session.pool(unit="injections") as pool:
-        first = pool.workers.first
-        stares = Stares() if first is None else Stares(first.opened)
-        answer = compute(study, stares, checkpoint=pool.checkpoint, progress=session.meter)
+    with session.pool(unit="injections") as engine:
+        answer = compute(study, engine, progress=session.meter)
     session.answer(answer, lambda: _show(answer))
 
 

@@ -10,7 +10,6 @@ with a spread that does not grow with u (Adler, Blanchet & Liu 2012, doi 10.1214
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -83,23 +82,6 @@ class Counted:
         low, high = central_counts(n, 1 - alarmed)
         places = np.clip([round(n * (1 - alarmed)), low, high], 0, n - 1)
         return Interval(*(float(self.maxima[k]) for k in places))
-
-
-def counted(search: Search, draw: Callable[[int, int], NDArray[Any]], count: int, *, batch: int = 64) -> Counted:
-    """The null as drawn.
-
-    Parameters
-    ----------
-    search : Search
-    draw : callable
-        ``draw(first, count)`` gives the sums of stares first to first + count - 1, shape (count, n_frame, n_sum).
-    count : int
-        Stares.
-    batch : int
-        Stares drawn at once.
-    """
-    parts = [search.largest(draw(i, min(batch, count - i))).maximum for i in range(0, count, batch)]
-    return Counted(np.sort(np.concatenate(parts)), search.stare.observed_s / DAY_S)
 
 
 def in_a_row(values: NDArray[Any], points: int, sigma: float) -> NDArray[np.bool_]:

@@ -7,14 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
-from mauvecl.host.quantities import takes_quantities
 from mauvecl.lightcurve.usual import ORBIT_S
 
 Float = NDArray[np.float64]
 
 
-@takes_quantities
+@public
 @dataclass(frozen=True)
 class Sinusoid:
     """amplitude * sin(2 pi t / period + phase).

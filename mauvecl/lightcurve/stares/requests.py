@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar, Literal, Protocol
@@ -27,6 +27,11 @@ REDUCED = 500
 class Reduction(Protocol):
     """What is kept of stares: a frozen dataclass, so that it travels and can be told from others.
 
+    It is called as ``reduction(values, first)``, and gives arrays by name for stares `first` and on, each looked at by
+    itself. ``values`` are float32, (n_stare, n_frame, n_statistic), with scenarios one axis more in front; they are
+    valid during the call. Where the request has `glow` it is called as ``reduction(values, first, glow)``, with another
+    array of the shape (n_stare, n_frame, n_statistic + 1).
+
     Attributes
     ----------
     adds : bool
@@ -34,21 +39,11 @@ class Reduction(Protocol):
         axis, stares in their order.
     """
 
-    adds: bool
+    adds: ClassVar[bool]
 
-    def __call__(
-        self, values: NDArray[np.float32], first: int, *glow: NDArray[np.float32]
-    ) -> Mapping[str, NDArray[Any]]:
-        """What is kept of stares `first` and on, each looked at by itself.
-
-        Parameters
-        ----------
-        values : ndarray of float32, shape (n_stare, n_frame, n_statistic)
-            With scenarios one axis more in front; valid during the call.
-        first : int
-        *glow : ndarray of float32, shape (n_stare, n_frame, n_statistic + 1)
-            Where the request has `glow`.
-        """
+    @property
+    def __call__(self) -> Callable[..., Mapping[str, NDArray[Any]]]:
+        """See the class."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
-from mauvecl.host.quantities import takes_quantities
 from mauvecl.lightcurve.stares.curves import Curve, Sinusoid
 from mauvecl.lightcurve.usual import CHANGING, ORBIT_S, Changing
 
@@ -55,7 +55,7 @@ class StareUnknown:
         _check_spread(self.name, self.of, self.sd)
 
 
-@takes_quantities
+@public
 @dataclass(frozen=True, eq=False)
 class Stare:
     """Frames of one star, one after the other with gaps between them; arrays are read-only.
@@ -136,7 +136,6 @@ class Stare:
         return named + [(unknown.name, unknown.curve) for unknown in self.unknowns]
 
     @classmethod
-    @takes_quantities
     def of(
         cls,
         duration_s: float,
@@ -217,7 +216,6 @@ class Stare:
         )
 
     @classmethod
-    @takes_quantities
     def along(cls, orbit: Orbit, target: Target | str, start: str, duration_s: float, **how: Any) -> Stare:
         """As the orbit gives it: frames while the target is seen, the detector's temperature through sun and shadow.
 

@@ -14,8 +14,6 @@ from numpy.typing import NDArray
 
 #: Bits of a float32's integer image that a bin does not tell apart: what is left is 2**-13 of the value, or finer.
 DROPPED_BITS = 10
-#: The widest bin, relative to the values in it.
-WIDTH = 2.0 ** (DROPPED_BITS - 23)
 #: Added to the keys of bins above the fine ones: a bin may reach from below them to above.
 ABOVE = 1 << (32 - DROPPED_BITS)
 #: Sums are of whole multiples of the smallest float32, and of its square.
@@ -194,6 +192,6 @@ class Far:
         self.second += other.second
         self.undefined += other.undefined
 
-    def found(self) -> FarCounts:
+    def frozen(self) -> FarCounts:
         """All of it."""
         return FarCounts(self.bins.keys, self.bins.counts, self.first, self.second, self.undefined)

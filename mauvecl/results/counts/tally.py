@@ -113,7 +113,7 @@ class Tally:
             first=first,
             second=second,
             n=self.n,
-            far=self.far[index].found(),
+            far=self.far[index].frozen(),
         )
 
 
@@ -300,16 +300,16 @@ class TailSamples:
         """Look through the values of realisations `first` and on; of equal ones the earlier realisation stays."""
         signed = self._sign * values
         if self.values.size == TAIL_SAMPLES:
-            found = np.flatnonzero(signed > self._sign * self.values[-1])
+            beyond = np.flatnonzero(signed > self._sign * self.values[-1])
         elif values.size > TAIL_SAMPLES:
             # None below the thousandth can be kept, and sorting few is fast.
-            found = np.flatnonzero(signed >= np.partition(signed, -TAIL_SAMPLES)[-TAIL_SAMPLES])
+            beyond = np.flatnonzero(signed >= np.partition(signed, -TAIL_SAMPLES)[-TAIL_SAMPLES])
         else:
-            found = np.arange(values.size)
-        if not found.size:
+            beyond = np.arange(values.size)
+        if not beyond.size:
             return
-        merged = np.concatenate([self.values, values[found]])
-        realisations = np.concatenate([self.realisations, first + found])
+        merged = np.concatenate([self.values, values[beyond]])
+        realisations = np.concatenate([self.realisations, first + beyond])
         self._keep(merged, realisations)
 
     def merge(self, values: NDArray[np.float32], realisations: NDArray[np.int64]) -> None:

@@ -99,15 +99,16 @@ def per_test(wanted: float, frames: int, stack: int = 1, *, step: int | None = N
     step = stack if step is None else step
     tests = count_tests(frames, stack, step)
     _check("wanted campaign fap", wanted)
-    found = None
+    overlapping = None
     if step < stack and tests > 1:
         stretch = min(tests, STRETCH)
         share = float(-np.expm1(stretch / tests * np.log1p(-wanted)))
         if share * DRAWN >= FEWEST:
             maxima = np.sort(_maxima(stretch, stack, step, seed)) / np.sqrt(stack)
             low, high = central_counts(DRAWN, share)
-            found = Interval(*(float(special.ndtr(-maxima[DRAWN - k])) for k in (round(share * DRAWN), low, high)))
-    return PerTest(tests, wanted, wanted / tests, float(-np.expm1(np.log1p(-wanted) / tests)), found)
+            counts = (round(share * DRAWN), low, high)
+            overlapping = Interval(*(float(special.ndtr(-maxima[DRAWN - k])) for k in counts))
+    return PerTest(tests, wanted, wanted / tests, float(-np.expm1(np.log1p(-wanted) / tests)), overlapping)
 
 
 def campaign(fap: float, frames: int, stack: int = 1, *, step: int | None = None, seed: int = 1) -> Campaign:
@@ -179,10 +180,10 @@ def _overlapping(fap: float, tests: int, stack: int, step: int, seed: int) -> In
     stretch = min(tests, STRETCH)
     cut = -special.ndtri(fap) * np.sqrt(stack)
     alarms = int((_maxima(stretch, stack, step, seed) >= cut).sum())
-    found = clopper_pearson(alarms, DRAWN)
+    chance = clopper_pearson(alarms, DRAWN)
     power = tests / stretch
     return Interval(
-        *(float(-np.expm1(power * np.log1p(-min(p, 1 - 1e-16)))) for p in (found.value, found.low, found.high))
+        *(float(-np.expm1(power * np.log1p(-min(p, 1 - 1e-16)))) for p in (chance.value, chance.low, chance.high))
     )
 
 

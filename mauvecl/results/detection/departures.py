@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from mauvecl.host.doors import public
+from mauvecl.host.tables import tabled
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.results.requests.fap import countable
 from mauvecl.statistics.distributions import Form
@@ -90,12 +92,13 @@ class Departure:
         return name if abs(size) > 0.2 * abs(self.ratio - 1.0) else "unexplained"
 
 
-def departures(found: Detection, fap: float) -> list[Departure]:
+@public
+def departures(detection: Detection, fap: float) -> list[Departure]:
     """One row per statistic, and per flare for those that look for a flare's shape.
 
     Parameters
     ----------
-    found : Detection
+    detection : Detection
     fap : float
         Wanted, per test.
 
@@ -104,62 +107,56 @@ def departures(found: Detection, fap: float) -> list[Departure]:
     InputError
         As `Detection.threshold`, for one that cannot be counted.
     """
-    scene = found.scene
+    scene = detection.scene
     others = []
     if scene.comparison.estimated:
         others.append("variances estimated from the counts")
     if scene.cosmic:
         others.append("cosmic rays")
-    if scene.modulations and not found.setting.integrates:
+    if scene.modulations and not detection.setting.integrates:
         others.append("priors that the reference does not know")
-    elif found.nuisances is not None and not scene.modulations:
+    elif detection.nuisances is not None and not scene.modulations:
         others.append("unknowns that are marginalised over and not drawn")
-    digital = _digital(found.quiet) if scene.clip else None
+    digital = _digital(detection.quiet) if scene.clip else None
     rows = []
-    for statistic in found.statistics:
-        for template in range(len(found.flares)) if found.statistic(statistic).shaped else (0,):
-            null = found.closed_form(statistic, template=template)
+    for statistic in detection.statistics:
+        for template in range(len(detection.flares)) if detection.statistic(statistic).shaped else (0,):
+            null = detection.closed_form(statistic, template=template)
             cut = null.isf(fap)
             rounding = clipping = 0.0
             if digital is not None:
-                rounding = _moved(found, statistic, template, *digital[0], cut) / fap - 1.0
-                clipping = _moved(found, statistic, template, *digital[1], cut) / fap - 1.0 - rounding
+                rounding = _moved(detection, statistic, template, *digital[0], cut) / fap - 1.0
+                clipping = _moved(detection, statistic, template, *digital[1], cut) / fap - 1.0 - rounding
             rows.append(
                 Departure(
                     statistic,
                     template,
                     cut,
                     fap,
-                    found.false_alarm_probability(cut, statistic, template=template),
-                    _skewed(found, statistic, template, null, cut) / fap - 1.0,
+                    detection.false_alarm_probability(cut, statistic, template=template),
+                    _skewed(detection, statistic, template, null, cut) / fap - 1.0,
                     rounding,
                     clipping,
                     tuple(others),
-                    found.realisations,
+                    detection.realisations,
                 )
             )
     return rows
 
 
-def departure_table(found: Detection, amplitudes: Sequence[float], fap: float) -> QTable:
+def departure_table(detection: Detection, amplitudes: Sequence[float], fap: float) -> QTable:
     """The departures of a detection, one row each; none where thresholds cannot be counted.
 
     Parameters
     ----------
-    found : Detection
+    detection : Detection
     amplitudes : sequence of float
         Of its flares.
     fap : float
     """
-    from astropy.table import QTable
-
-    rows = departures(found, fap) if countable(fap, found.realisations) else []
-    table = QTable()
-    table["statistic"] = np.array([d.statistic for d in rows], str)
-    table["amplitude"] = np.array(
-        [amplitudes[d.template] if found.statistic(d.statistic).shaped else np.nan for d in rows]
-    )
-    for name, values, text in (
+    rows = departures(detection, fap) if countable(fap, detection.realisations) else []
+    shaped = [detection.statistic(d.statistic).shaped for d in rows]
+    numbers = (
         ("gaussian_threshold", [d.threshold for d in rows], "threshold for Gaussian noise"),
         ("fap", [d.simulated.value for d in rows], "simulated false-alarm probability there"),
         ("fap_low", [d.simulated.low for d in rows], "its 95 % interval, lower end"),
@@ -169,30 +166,37 @@ def departure_table(found: Detection, amplitudes: Sequence[float], fap: float) -
         ("skew", [d.skew for d in rows], "predicted change of the ratio by the noise's skew and kurtosis"),
         ("rounding", [d.rounding for d in rows], "predicted change of the ratio by the ADC's steps"),
         ("clipping", [d.clipping for d in rows], "predicted change of the ratio by the ADC's ends"),
-    ):
-        table[name] = np.array(values, float)
-        table[name].info.description = text
-    table["differs"] = np.array([d.differs for d in rows], bool)
-    table["differs"].info.description = "whether chance does not explain the ratio: 4 standard errors"
-    table["why"] = np.array([d.why for d in rows], str)
-    table.meta["fap"] = fap
-    return table
+    )
+    differs = np.array([d.differs for d in rows], bool)
+    return tabled(
+        (
+            ("statistic", np.array([d.statistic for d in rows], str)),
+            (
+                "amplitude",
+                np.array([amplitudes[d.template] if s else np.nan for d, s in zip(rows, shaped, strict=True)]),
+            ),
+            *((name, np.array(values, float), text) for name, values, text in numbers),
+            ("differs", differs, "whether chance does not explain the ratio: 4 standard errors"),
+            ("why", np.array([d.why for d in rows], str)),
+        ),
+        fap=fap,
+    )
 
 
-def _skewed(found: Detection, statistic: str, template: int, null: Form, cut: float) -> float:
+def _skewed(detection: Detection, statistic: str, template: int, null: Form, cut: float) -> float:
     """False-alarm probability at a threshold with the noise's third and fourth cumulants."""
-    scene, quiet = found.scene, found.quiet
+    scene, quiet = detection.scene, detection.quiet
     each = 1 if scene.frames else quiet.n_frames
     c, draws = Cumulants.of(quiet, each), quiet.n_frames // each
-    one, flare = found.statistic(statistic), found.shape(statistic, template)
+    one, flare = detection.statistic(statistic), detection.shape(statistic, template)
     # Of the difference from the mean of some exposures.
-    added = one.added_variance(found.setting)
+    added = one.added_variance(detection.setting)
     third, fourth, sixth = (
         draws * (c.photon_cumulant(r) + c.dark_cumulant(r)) * (1.0 + (-1.0) ** r * added ** (r - 1)) for r in (3, 4, 6)
     )
-    variance = one.variance(found.setting)
+    variance = one.variance(detection.setting)
     if isinstance(one, LinearStatistic):
-        weights = one.weights_per_dn(found.setting, flare)
+        weights = one.weights_per_dn(detection.setting, flare)
         sd = float(np.sqrt(weights**2 @ variance))
         z, skew, excess = cut / null.std, weights**3 @ third / sd**3, weights**4 @ fourth / sd**4
         # Edgeworth's series (Abramowitz & Stegun 26.2.48).
@@ -200,7 +204,7 @@ def _skewed(found: Detection, statistic: str, template: int, null: Form, cut: fl
         return float(null.sf(cut) + np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) * series)
     assert isinstance(one, QuadraticStatistic)
     # Each pixel's own square has more variance and more skew than a normal's.
-    own = one.own(found.setting, flare)
+    own = one.own(detection.setting, flare)
     second = null.std**2
     skewed = null.third
     more = own**2 @ fourth, own**3 @ (12.0 * fourth * variance + 10.0 * third**2 + sixth)
@@ -216,12 +220,12 @@ def _gamma_sf(value: float, mean: float, variance: float, third: float) -> float
     return float(special.gammaincc(shape, max(shape + (value - mean) / np.sqrt(variance) * np.sqrt(shape), 0.0)))
 
 
-def _moved(found: Detection, statistic: str, template: int, shift: Float, variance: Float, cut: float) -> float:
+def _moved(detection: Detection, statistic: str, template: int, shift: Float, variance: Float, cut: float) -> float:
     """False-alarm probability at a threshold if the exposure's counts had another mean and variance, per pixel."""
-    one, used = found.statistic(statistic), found.scene.used
-    added = one.added_variance(found.setting)
+    one, used = detection.statistic(statistic), detection.scene.used
+    added = one.added_variance(detection.setting)
     delta, true = np.where(used, (1.0 - (added > 0)) * shift, 0.0), (1.0 + added) * variance
-    return one.as_drawn(found.setting, found.quiet, delta, true, found.shape(statistic, template)).sf(cut)
+    return one.as_drawn(detection.setting, detection.quiet, delta, true, detection.shape(statistic, template)).sf(cut)
 
 
 def _digital(x: Expectation) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
@@ -235,7 +239,7 @@ def _digital(x: Expectation) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
     """
     mean, sd = x.mean_raw_dn, np.sqrt(np.maximum(x.unsaturated_variance_dn2 / x.n_frames - 1 / 12, 0.0))
     recorded = x.recorded_dn / x.n_frames
-    found = []
+    moments = []
     for low, high in ((-np.inf, float(x.highest_dn)), (0.0, float(x.highest_dn))):
         shift, variance = np.zeros_like(mean), np.zeros_like(mean)
         for p, (m, s) in enumerate(zip(mean, sd, strict=True)):
@@ -246,5 +250,5 @@ def _digital(x: Expectation) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
             seen = np.clip(dn, low, high)
             centre = float(chance @ seen)
             shift[p], variance[p] = centre - recorded[p], chance @ (seen - centre) ** 2
-        found.append((x.n_frames * shift, x.n_frames * variance))
-    return found[0], found[1]
+        moments.append((x.n_frames * shift, x.n_frames * variance))
+    return moments[0], moments[1]

@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.content import ByContent
+from mauvecl.host.doors import public
 from mauvecl.host.plotting import picture
 from mauvecl.host.quantities import count
+from mauvecl.host.tables import tabled, telling
 from mauvecl.results.counts.tally import Distribution, TailSamples, Tally
 from mauvecl.results.detection.roc import Roc
 from mauvecl.results.requests.channels import ChannelPlan, Key
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
     from mauvecl.results.detection.tails import Tail
 
 
+@public
 @dataclass(eq=False)
 class Detection(ByContent, Hypotheses):
     """Null and flare distributions as they were counted; made by `Engine.detect`.
@@ -47,8 +50,16 @@ class Detection(ByContent, Hypotheses):
     tails: Tails = "counted"
     seed: int = 0
     _tails: dict[tuple[str, int, float], Tail] = field(default_factory=dict, init=False, repr=False, compare=False)
-    _found: dict[Key, Distribution] = field(default_factory=dict, init=False, repr=False)
+    _distributions: dict[Key, Distribution] = field(default_factory=dict, init=False, repr=False)
     _samples: dict[Key, TailSamples] = field(default_factory=dict, init=False, repr=False)
+
+    @classmethod
+    def of(cls, hypotheses: Hypotheses, realisations: int, tails: Tails, seed: int) -> Self:
+        """Of hypotheses as they are: nothing is prepared again, and closed forms that one computes the other has."""
+        made = object.__new__(cls)
+        counts: dict[str, Any] = {"_tails": {}, "_distributions": {}, "_samples": {}}
+        vars(made).update(vars(hypotheses) | counts, realisations=realisations, tails=tails, seed=seed)
+        return made
 
     def _line(self) -> str:
         flares, names = len(self.flares), ", ".join(self.statistics)
@@ -57,7 +68,7 @@ class Detection(ByContent, Hypotheses):
     def collect(self, plan: ChannelPlan, tally: Tally, samples: Sequence[TailSamples | None]) -> None:
         """Take over the distributions and tails of one batch."""
         for index, (key, kept) in enumerate(zip(plan.keys, samples, strict=True)):
-            self._found[key] = tally.distribution(index)
+            self._distributions[key] = tally.distribution(index)
             if kept is not None:
                 self._samples[key] = kept
 
@@ -80,7 +91,7 @@ class Detection(ByContent, Hypotheses):
     def _at(self, key: Key) -> Distribution:
         """What was counted; InputError where it has values that are no finite numbers."""
         statistic, role, flare = key
-        counted = self._found[key]
+        counted = self._distributions[key]
         of = "without a flare" if role == "null" else f"with flare {flare + 1}"
         counted.refuse_undefined(f"statistic {statistic!r} {of}")
         return counted
@@ -188,15 +199,12 @@ class Detection(ByContent, Hypotheses):
         QTable
             ``realisation`` and ``value``, the most extreme first.
         """
-        from astropy.table import QTable
-
         self._check(statistic, flare, template)
         key: Key = (statistic, "flare", flare) if flare is not None else self._null_key(statistic, template)
         self._at(key)
         kept = self._samples[key]
-        table = QTable({"realisation": kept.realisations, "value": kept.values})
-        table["value"].info.description = "of the statistic, as the device computed it"
-        return table
+        told = "of the statistic, as the device computed it"
+        return tabled([("realisation", kept.realisations), ("value", kept.values, told)])
 
     def roc(self, statistic: str = "chi2", flare: int = 0) -> Roc:
         """False-alarm probability against detection probability, and the area under the curve."""
@@ -240,15 +248,12 @@ class Detection(ByContent, Hypotheses):
                 row = (x.name, statistic, dof, *of_flare, cut.value, cut.low, cut.high, p.value, p.low, p.high)
                 rows.append((*row, limit, power))
         table = QTable(rows=rows, names=columns)
-        for name, text in DESCRIPTIONS.items():
-            table[name].info.description = text
         tails = [self.tail(fap, s, template=flare) for flare in range(len(self.flares)) for s in self.statistics]
         binomial = float(np.sqrt((1 - fap) / (fap * self.realisations)))
         table["fap_error"] = [binomial if tail is None else tail.relative_error for tail in tails]
-        table["fap_error"].info.description = "relative standard error of the false-alarm probability at the threshold"
         table.meta |= {"fap": fap, "realisations": self.realisations, "exposure_s": self.quiet.exposure_s}
         table.meta["tails"] = "counted" if countable(fap, self.realisations) else "importance sampling"
-        return table
+        return telling(table, DESCRIPTIONS)
 
     def _null_key(self, statistic: str, template: int) -> Key:
         return statistic, "null", self._null(statistic, template)
@@ -281,4 +286,5 @@ DESCRIPTIONS = {
     "high": "its 95 % interval, upper end, the threshold's error included",
     "closed_form_threshold": "threshold for Gaussian noise",
     "closed_form_probability": "detection probability for Gaussian noise",
+    "fap_error": "relative standard error of the false-alarm probability at the threshold",
 }

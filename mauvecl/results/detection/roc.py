@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.host.plotting import picture
+from mauvecl.host.tables import tabled
 from mauvecl.statistics.intervals import CONFIDENCE, Interval, clopper_pearson
 
 if TYPE_CHECKING:
@@ -85,22 +86,13 @@ class Roc:
         rows : int
             At most so many, even in the logarithm of the false-alarm probability; the ends are always there.
         """
-        from astropy.table import QTable
-
         n = self.realisations
         wanted = np.append(np.geomspace(1.0, 1.0 / n, max(rows - 1, 1)), 0.0)
         chosen = np.unique(np.minimum(np.searchsorted(-self.fap, -wanted), self.fap.size - 1))
-        table = QTable({"threshold": self.threshold[chosen]})
-        for name, share in (("fap", self.fap), ("probability", self.probability)):
-            intervals = [clopper_pearson(round(p * n), n) for p in share[chosen]]
-            table[name] = [p.value for p in intervals]
-            table[f"{name}_low"], table[f"{name}_high"] = [p.low for p in intervals], [p.high for p in intervals]
-        table["fap"].info.description = "false-alarm probability per test, with a 95 % Clopper-Pearson interval"
-        table["probability"].info.description = "detection probability, with a 95 % Clopper-Pearson interval"
-        table.meta |= {
-            "realisations": n,
-            "area": self.area.value,
-            "area_low": self.area.low,
-            "area_high": self.area.high,
-        }
-        return table
+        columns: list[tuple[object, ...]] = [("threshold", self.threshold[chosen])]
+        for name, what, chance in (("fap", "false-alarm", self.fap), ("probability", "detection", self.probability)):
+            values, low, high = np.array([astuple(clopper_pearson(round(p * n), n)) for p in chance[chosen]]).T
+            text = f"{what} probability{' per test' * (name == 'fap')}, with a 95 % Clopper-Pearson interval"
+            columns += [(name, values, text), (f"{name}_low", low), (f"{name}_high", high)]
+        area = dict(zip(("area", "area_low", "area_high"), astuple(self.area), strict=True))
+        return tabled(columns, realisations=n, **area)

@@ -61,12 +61,12 @@ class Tail:
     realisations: int
 
 
-def tail(found: Detection, fap: float, statistic: str, *, template: int = 0, seed: int) -> Tail:
+def tail(detection: Detection, fap: float, statistic: str, *, template: int = 0, seed: int) -> Tail:
     """The threshold that a statistic's null exceeds with a small probability.
 
     Parameters
     ----------
-    found : Detection
+    detection : Detection
         Of which only the scene and the quiescent star matter.
     fap : float
         1e-10 to 0.1.
@@ -83,12 +83,12 @@ def tail(found: Detection, fap: float, statistic: str, *, template: int = 0, see
     """
     if not SMALLEST_FAP <= fap <= 0.1:
         raise InputError(f"fap = {fap:g}, expected {SMALLEST_FAP:g} to 0.1 for importance sampling")
-    _check(found)
-    how = _Tilt.towards(fap, found, statistic, template)
+    _check(detection)
+    how = _Tilt.towards(fap, detection, statistic, template)
     values, logs = np.empty(0), np.empty(0)
     goal = FEWEST
     while True:
-        more = _tilted(found, statistic, template, how, seed, values.size, goal)
+        more = _tilted(detection, statistic, template, how, seed, values.size, goal)
         values, logs = (np.concatenate(pair) for pair in zip((values, logs), more, strict=True))
         cut, low, high, error = _threshold(values, logs, fap)
         if error <= WANTED_ERROR:
@@ -101,13 +101,13 @@ def tail(found: Detection, fap: float, statistic: str, *, template: int = 0, see
         goal *= 2
 
 
-def _check(found: Detection) -> None:
-    scene = found.scene
+def _check(detection: Detection) -> None:
+    scene, setting = detection.scene, detection.setting
     reasons = {
         "noise drawn apart": not scene.joint,
         "frames drawn one by one": scene.frames,
         "cosmic rays": scene.cosmic,
-        "priors that statistics are not marginalised over": bool(scene.modulations) and not found.setting.integrates,
+        "priors that statistics are not marginalised over": bool(scene.modulations) and not setting.integrates,
         f"{scene.comparison.exposures} averaged exposures": scene.comparison.exposures > MOST_AVERAGED,
     }
     for reason, holds in reasons.items():
@@ -157,15 +157,15 @@ class _Tilt:
     scores: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @classmethod
-    def towards(cls, fap: float, found: Detection, statistic: str, template: int) -> _Tilt:
+    def towards(cls, fap: float, detection: Detection, statistic: str, template: int) -> _Tilt:
         """Such that alarms of this probability are common."""
-        one, setting, flare = found.statistic(statistic), found.setting, found.shape(statistic, template)
+        one, setting, flare = detection.statistic(statistic), detection.setting, detection.shape(statistic, template)
         tilt = one.tilt(setting, flare)
         nothing = np.zeros(setting.used.size)
         # What is marginalised over and not drawn does not scatter.
         estimated = setting.comparison.estimated
         null = one.as_drawn(
-            setting, found.quiet, nothing, one.variance(setting), flare, estimated=estimated, priors=False
+            setting, detection.quiet, nothing, one.variance(setting), flare, estimated=estimated, priors=False
         )
         goal = null.isf(fap)
         parts, chance, scores = null.parts if isinstance(null, Mixture) else (null,), np.ones(1), {}
@@ -174,7 +174,7 @@ class _Tilt:
             # Which factors an alarm has: Bayes's theorem.
             chance = null.weights * [part.sf(goal) for part in parts]
             chance = chance / chance.sum()
-            nodes = setting.drawn.nodes(found.quiet, weighted=tilt.square is None)[0]
+            nodes = setting.drawn.nodes(detection.quiet, weighted=tilt.square is None)[0]
             for name in nodes[0].scores:
                 score = np.array([node.scores[name] for node in nodes])
                 mean = float(chance @ score)
@@ -226,20 +226,22 @@ def _stretch(square: Float, goal: float) -> Float:
 
 
 def _tilted(
-    found: Detection, statistic: str, template: int, tilt: _Tilt, seed: int, start: int, stop: int
+    detection: Detection, statistic: str, template: int, tilt: _Tilt, seed: int, start: int, stop: int
 ) -> tuple[Float, Float]:
     """Values of tilted draws number start to stop - 1, whole blocks, and the logarithms of their weights."""
-    parts = [_block(found, statistic, template, tilt, seed, b) for b in range(start // BLOCK, stop // BLOCK)]
+    parts = [_block(detection, statistic, template, tilt, seed, b) for b in range(start // BLOCK, stop // BLOCK)]
     values, logs = (np.concatenate(part) for part in zip(*parts, strict=True))
     return values, logs
 
 
-def _block(found: Detection, statistic: str, template: int, tilt: _Tilt, seed: int, block: int) -> tuple[Float, Float]:
-    scene = found.scene
-    one = found.statistic(statistic)
+def _block(
+    detection: Detection, statistic: str, template: int, tilt: _Tilt, seed: int, block: int
+) -> tuple[Float, Float]:
+    scene = detection.scene
+    one = detection.statistic(statistic)
     exposures = 1 if one.paired else scene.comparison.exposures
     z, *others = (_normals(scene.n_pixel, seed, block, exposure) for exposure in range(1 + exposures))
-    added = one.added_variance(found.setting)
+    added = one.added_variance(detection.setting)
     # Only the difference is tilted; what it does not see stays as drawn.
     root = np.sqrt(1.0 + added)
     difference = (z - added * sum(others)) / root
@@ -251,17 +253,17 @@ def _block(found: Detection, statistic: str, template: int, tilt: _Tilt, seed: i
         excess = _excess(scene, z + move / root)
     subtracted = [_excess(scene, other - added * move / root) for other in others]
     mean = added * np.sum(subtracted, axis=0) if subtracted else np.zeros_like(excess)
-    return _value(found, statistic, template, excess, mean), logs
+    return _value(detection, statistic, template, excess, mean), logs
 
 
-def _value(found: Detection, statistic: str, template: int, excess: Float, mean: Float) -> Float:
+def _value(detection: Detection, statistic: str, template: int, excess: Float, mean: Float) -> Float:
     """The statistic of each draw, from observed less reference and subtracted less reference, DN, (n, n_pixel)."""
-    scene, one = found.scene, found.statistic(statistic)
-    x, added = excess - mean, one.added_variance(found.setting)
-    variance = np.broadcast_to(one.variance(found.setting), x.shape)
+    scene, one = detection.scene, detection.statistic(statistic)
+    x, added = excess - mean, one.added_variance(detection.setting)
+    variance = np.broadcast_to(one.variance(detection.setting), x.shape)
     if scene.comparison.estimated:
         variance = _estimated(scene, excess) + added * _estimated(scene, mean)
-    return one.values(found.setting, x, variance, found.shape(statistic, template))
+    return one.values(detection.setting, x, variance, detection.shape(statistic, template))
 
 
 def _estimated(scene: Scene, excess: Float) -> Float:

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise.drawn import Drawn
@@ -20,6 +21,7 @@ from mauvecl.statistics.registry import chosen
 from mauvecl.statistics.statistic import LinearStatistic, Setting, Statistic
 
 
+@public
 @dataclass(eq=False)
 class Hypotheses:
     """The null hypothesis, the flares, and what tells them apart.
@@ -51,7 +53,7 @@ class Hypotheses:
     statistics: tuple[str, ...] = field(init=False)
     setting: Setting = field(init=False, repr=False)
     _chosen: dict[str, Statistic] = field(init=False, repr=False)
-    _forms: dict[tuple[str, int | None, int], Form] = field(default_factory=dict, init=False, repr=False)
+    _forms: dict[tuple[str, int | None, int], Form] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         self._chosen = chosen(self.asked)
@@ -88,6 +90,7 @@ class Hypotheses:
 
     def shape(self, statistic: str, template: int = 0) -> Expectation | None:
         """The flare whose shape a statistic looks for; None for those that look for none."""
+        self._check(statistic, None, template)
         return self.flares[template] if self.statistic(statistic).shaped else None
 
     def weights(self, statistic: str, template: int = 0) -> NDArray[np.float64] | None:
@@ -139,7 +142,7 @@ class Hypotheses:
         return self.statistic(statistic).dof(self.setting)
 
     def _check(self, statistic: str, flare: int | None, template: int = 0) -> None:
-        if flare is None and self.statistic(statistic).shaped:
+        if self.statistic(statistic).shaped and flare is None:
             flare = template
         if flare is not None and not 0 <= flare < len(self.flares):
             raise InputError(f"flare = {flare}, expected 0 to {len(self.flares) - 1}")

@@ -103,9 +103,9 @@ class Distributions(Picture):
         if "detection" in answers:
             (star,) = answers["detection"].stars
             for name, flare in (("null bars", None), ("flare bars", 0)):
-                edges, counts = star.found.histogram(q.statistic, flare, bins=80)
+                edges, counts = star.detection.histogram(q.statistic, flare, bins=80)
                 sources[name] = {"left": edges[:-1], "right": edges[1:], "top": counts / max(counts.max(), 1)}
-            cut = star.found.threshold(q.fap, q.statistic).value
+            cut = star.detection.threshold(q.fap, q.statistic).value
             (row,) = (row for row in answers["detection"].table if row["statistic"] == q.statistic)
             chance = float(row["probability"])
         text = (
@@ -145,7 +145,7 @@ class Trade(Picture):
             "simulated": {"x": [], "low": [], "high": []},
         }
         if "detection" in answers:
-            curve = answers["detection"].stars[0].found.roc(q.statistic).table()
+            curve = answers["detection"].stars[0].detection.roc(q.statistic).table()
             seen = np.asarray(curve["fap"], float) > 0
             columns = {"x": "fap", "low": "probability_low", "high": "probability_high"}
             sources["simulated"] = {to: np.asarray(curve[name], float)[seen] for to, name in columns.items()}
