@@ -205,7 +205,7 @@ class Statistic(ABC):
         assert setting.drawn
         nodes, rows = setting.drawn.nodes(observed, weighted=isinstance(self, LinearStatistic))
         # Other unknowns keep their Gaussian priors.
-        others = setting.nuisances.without(setting.drawn.spreads)
+        others = setting.nuisances.without(tuple(setting.drawn.spreads))
         if priors:
             rows = np.vstack([rows, others.finite(others.spectra)])
         parts = []

@@ -11,6 +11,7 @@ import sys
 import time
 import zipfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -466,7 +467,7 @@ def test_scenarios_side_by_side(page: Page) -> None:
         tab(page, name)
         models = f"page.pictures.all.{picture}.models"
         filled = f"[0, 1, 2].map(k => Object.values({models}?.get(`pin ${{k}}`).data ?? {{}})[0]?.length > 0)"
-        page.wait_for_function(f"JSON.stringify({filled}) === '[true,true,false]'")
+        until(page, partial(lambda script: page.evaluate(script) == [True, True, False], filled))
         lines = f"page.pictures.all.{picture}.plot.renderers.filter(r => r.name?.startsWith('pinned'))"
         drawn = page.evaluate(f"{lines}.map(r => r.glyph.line_color.value)")
         assert [colour for colour in drawn if colour != "#ffffff"][:2] == colours
