@@ -138,8 +138,10 @@ class Session:
         self._checkpoint = checkpoint
 
     def _load(self) -> None:
-        """What tables and pictures are made with: half a second that would be waited for at the end."""
+        """What tables and pictures are made with: three quarters of a second that would be waited for at the end."""
+        import astropy.io.misc.yaml  # noqa: F401
         import astropy.table  # noqa: F401
+        import rich.table  # noqa: F401
 
         from mauvecl.pictures.style import available, pyplot
 
@@ -163,7 +165,7 @@ class Session:
         """Tell the reader, unless standard output is for JSON alone."""
         from mauvecl.cli.console import show
 
-        if not self.as_json:
+        if lines and not self.as_json:
             show(lines)
 
     @cached_property
