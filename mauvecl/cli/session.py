@@ -139,12 +139,12 @@ class Session:
 
     def _load(self) -> None:
         """What tables and pictures are made with: three quarters of a second that would be waited for at the end."""
-        import astropy.io.misc.yaml  # noqa: F401
-        import astropy.table  # noqa: F401
-        import rich.table  # noqa: F401
+        from importlib import import_module
 
         from mauvecl.pictures.style import available, pyplot
 
+        for name in ("astropy.table", "astropy.io.misc.yaml", "rich.table"):
+            import_module(name)
         if self.pictures and available():
             pyplot()
 
