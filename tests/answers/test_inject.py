@@ -75,6 +75,7 @@ class Stop(Exception):  # noqa: N818
     """An interruption."""
 
 
+@pytest.mark.long
 def test_resume_gives_the_same(found, stares, tmp_path):
     """Some positions kept, the others drawn later: the same to the last bit."""
 
@@ -91,6 +92,7 @@ def test_resume_gives_the_same(found, stares, tmp_path):
     assert np.array_equal(again.stars[0].fitted.energy_ratio, found.stars[0].fitted.energy_ratio, equal_nan=True)
 
 
+@pytest.mark.long
 def test_sweep_over_magnitude_and_temperature(stares):
     """Fainter stars hide larger flares; every cell on common draws, so that each limit moves."""
     axes = [
@@ -108,6 +110,7 @@ def test_sweep_over_magnitude_and_temperature(stares):
         inject(study(sweep={"axes": [{"quantity": "amplitude", "values": [0.1]}]}), stares)
 
 
+@pytest.mark.long
 def test_search_that_leaves_out_a_cycle_is_told(stares):
     """A thermal cycle that the search does not know: false alarms are not those of normal noise."""
     quick = {"count": 10, "positions": 2, "fitted": 0, "widths": 2, "sizes": 2}

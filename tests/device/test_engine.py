@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from answers import same_counts
+from marks import long_but
 from scenes import instrument, star
 from scipy import stats
 
@@ -77,6 +78,10 @@ CASES = {
 }
 
 
+#: A joint draw, one apart and frame by frame, and one with priors: what `make check` looks at.
+SHORT = ("stack", "apart, electrons, frames", "priors")
+
+
 def case(name: str) -> tuple[list, dict]:
     """Expectations, and how to draw them."""
     options = dict(CASES[name])
@@ -98,7 +103,7 @@ INDEX = np.arange(START, START + 40, dtype=np.uint64)
 SEED = 2**63 + 12345
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", long_but(CASES, *SHORT))
 def test_raw_spectra_are_the_twins(any_width: Engine, name: str) -> None:
     (quiet, *_), how = case(name)
     raw, clipped = any_width.realise_and_count(quiet, start=START, count=INDEX.size, seed=SEED, **how)
@@ -107,6 +112,7 @@ def test_raw_spectra_are_the_twins(any_width: Engine, name: str) -> None:
     assert (raw.dtype == np.uint16) == (quiet.n_frames == 1)
 
 
+@pytest.mark.long
 def test_raw_sums_beyond_what_float32_holds_are_whole(engine: Engine) -> None:
     """400 frames that lose up to 48 000 DN each."""
     how = {"mode": "frames", "processes": Processes(light_loss=Uniform(0.0, 0.9))}
@@ -138,7 +144,7 @@ def _raw_twin(name: str) -> tuple[np.ndarray, np.ndarray]:
     return reference.realise(scene, INDEX, SEED), reference.clipped(scene, INDEX, SEED).sum(axis=(1, 2))
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", long_but(CASES, *SHORT))
 def test_every_statistic_is_the_twins(any_width: Engine, name: str) -> None:
     """Those of the fast kernel alone, and all of them, with their histograms."""
     (quiet, *flares), how = case(name)
@@ -167,12 +173,15 @@ def test_every_statistic_is_the_twins(any_width: Engine, name: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "comparison"),
-    [
+    long_but(
+        [
+            ("stack", Comparison(1)),
+            ("stack", Comparison(0, True)),
+            ("stack", Comparison(3)),
+            *((name, Comparison(2, True)) for name in ("at the rail", "apart, electrons, frames", "uneven", "priors")),
+        ],
         ("stack", Comparison(1)),
-        ("stack", Comparison(0, True)),
-        ("stack", Comparison(3)),
-        *((name, Comparison(2, True)) for name in ("at the rail", "apart, electrons, frames", "uneven", "priors")),
-    ],
+    ),
 )
 def test_whatever_is_compared_is_the_twins(any_width: Engine, name: str, comparison: Comparison) -> None:
     """Noisy quiescent exposures, one or several, and variances from the counts."""
@@ -185,7 +194,9 @@ def test_whatever_is_compared_is_the_twins(any_width: Engine, name: str, compari
         np.testing.assert_allclose(values[0], values[2], rtol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["stack", "at the rail", "apart, electrons, frames", "priors", "cosmic rays"])
+@pytest.mark.parametrize(
+    "name", long_but(["stack", "at the rail", "apart, electrons, frames", "priors", "cosmic rays"], "stack")
+)
 def test_signal_to_noise_is_the_twins(any_width: Engine, name: str) -> None:
     (quiet, *_), how = case(name)
     scene = prepare([quiet], **how)
@@ -210,6 +221,7 @@ def test_modes_meet_the_rails(engine: Engine) -> None:
     assert not prepare([faint]).frames
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("payload", ["mauve", "mauve-electrons"])
 def test_moments_of_raw_spectra(engine: Engine, payload: str) -> None:
     """Mean and variance of each pixel follow the model: |z| < 6 in 1643 pixels fails once in 3e5 seeds."""
@@ -236,6 +248,7 @@ def test_frames_and_stacks_agree(engine: Engine) -> None:
     assert abs(total - 1) < 5 * np.sqrt(4 / n / quiet.wavelength_nm.size)
 
 
+@pytest.mark.long
 def test_pixels_and_realisations_are_uncorrelated(engine: Engine) -> None:
     """Neighbours in pixel, realisation and seed: |z| < 5 for sums of 3e7 products."""
     (quiet,) = star()
@@ -291,6 +304,7 @@ THREADS = """
 import hashlib, sys
 sys.path.insert(0, {tests!r})
 from answers import same_counts
+from marks import long_but
 from scenes import star
 from mauvecl.device.forms import scene_launches
 from mauvecl.device.engine import Engine
@@ -302,6 +316,7 @@ print(hashlib.sha256(repr([tuple(row) for row in table]).encode()).hexdigest())
 """
 
 
+@pytest.mark.long
 def test_threads_change_no_bit() -> None:
     """The same table from one thread and from two, to the last digit."""
     code = THREADS.format(tests=os.path.dirname(os.path.dirname(__file__)))

@@ -28,6 +28,7 @@ def day():
     ).value  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("half_width", TABLE)
 def test_half_are_found(day, half_width):
     """Within 5 % of the table. The median of 1000 amplitudes has an error of 0.7 %: once in 10^6 runs it fails."""
@@ -180,6 +181,7 @@ def test_sums_hold_what_the_values_say(injected):
     assert np.abs(rows[:, :, 0] - value).max() < 2e-3
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("half_width", "snr"), [(30.0, 30.0), (200.0, 30.0)])
 def test_recovered_flares(half_width, snr):
     """Pulls of all parameters, and coverage. Fails by chance once in 10^4 runs: 4 standard errors of each."""
