@@ -20,8 +20,11 @@ unexport PYTHONDONTWRITEBYTECODE
 demo: .venv/plot.stamp
 	$(BIN)/mauvecl detect --output demo
 
+# A file's tests stay in one process, which makes its fixtures and builds its kernels once.
+PYTEST := $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder
+
 test: .venv/test.stamp
-	$(BIN)/python -m pytest -n 3
+	$(PYTEST) -n 3
 
 lint: .venv/test.stamp .venv/lint.stamp
 	$(BIN)/ruff check .
@@ -34,7 +37,7 @@ check: .venv/test.stamp .venv/lint.stamp
 	@$(MAKE) --no-print-directory -j 2 lint quick
 
 quick: .venv/test.stamp
-	$(BIN)/python -m pytest -n 2 -q -m 'not long'
+	$(PYTEST) -n 2 -q -m 'not long'
 
 docs: .venv/docs.stamp
 	$(BIN)/sphinx-build -W -q -b html docs docs/_build
