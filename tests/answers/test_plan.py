@@ -142,6 +142,7 @@ def test_what_is_missing_is_said(answer: PlanAnswer) -> None:
     assert np.isinf(table["E50"][3].value)
 
 
+@pytest.mark.long
 def test_report(answer: PlanAnswer, study: Study) -> None:
     """A page for each target beside the summary and the assumptions; every assumption."""
     content = answer.documents["plan.pdf"]()
@@ -156,6 +157,7 @@ def test_report(answer: PlanAnswer, study: Study) -> None:
     assert {"stray light", "duration of flares", "noise of a stare", "throughput", "earth_limb_deg"} <= names
 
 
+@pytest.mark.long
 def test_markup_in_names_is_text(study: Study) -> None:
     target = {
         "name": "<script>$x^2$",

@@ -37,6 +37,7 @@ def day():
     ).value  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("half_width", TABLE)
 def test_half_are_found(day, half_width):
     """Within 5 % of the table. The median of 1000 amplitudes has an error of 0.7 %: once in 10^6 runs it fails."""
@@ -245,6 +246,7 @@ def test_flares_are_those_that_the_engine_draws(injections, stares):
         assert x.var() > 1.5 * a[1, :, best].var()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("half_width", "snr"), [(30.0, 30.0), (200.0, 30.0)])
 def test_recovered_flares(half_width, snr):
     """Pulls of all parameters, and coverage. Fails by chance once in 10^4 runs: 4 standard errors of each."""

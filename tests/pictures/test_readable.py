@@ -10,6 +10,7 @@ from typing import Any
 
 import matplotlib as mpl
 import pytest
+from marks import long_but
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 
@@ -72,7 +73,11 @@ def shown_ticks(axis: Any) -> list[Text]:
     return [tick.label1 for tick in inside if tick.label1.get_visible() and tick.label1.get_text()]
 
 
-@pytest.mark.parametrize("case", CASES)
+#: What `make check` looks at.
+SHORT = ("detect, one statistic", "limit of exposure", "map", "snr", "exposure")
+
+
+@pytest.mark.parametrize("case", long_but(CASES, *SHORT))
 def test_everything_is_inside_and_apart(case: str, engine: Engine) -> None:
     ask, settings, column = CASES[case]
     answer = ask(Study().with_settings(list(settings)), engine)
