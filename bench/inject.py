@@ -16,7 +16,7 @@ from pathlib import Path
 
 from astropy.table import Table
 
-from mauvecl.answers.inject import inject
+from mauvecl.answers.stares.inject import inject
 from mauvecl.device.stares import Stares
 from mauvecl.study.study import Study
 

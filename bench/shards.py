@@ -21,9 +21,10 @@ from typing import Any
 
 import numpy as np
 from astropy.table import Table
+from tables import write
 
 from mauvecl.device.engine import Engine
-from mauvecl.results.requests import DetectRequest, Shard
+from mauvecl.results.requests.requests import DetectRequest, Shard
 from mauvecl.results.sums import DetectionSums
 from mauvecl.runs.checkpoint import Checkpoint
 from mauvecl.runs.cluster import DaskWorkers
@@ -132,11 +133,8 @@ def main() -> None:
     workers.close()
     table = Table(rows=rows, names=("what", "value"))
     scene = f"5 scenarios of {quiet.wavelength_nm.size} pixels, chi2, chi2_element and matched"
-    table.meta["run"] = (
-        f"{scene}; the best of {given.repeats} turns of {n} realisations; {os.cpu_count()} cores, {engine.device_name}"
-    )
-    table.pprint(max_lines=-1, max_width=-1)
-    table.write(given.output, format="ascii.ecsv", overwrite=True)
+    turns = f"the best of {given.repeats} turns of {n} realisations"
+    write(table, given.output, run=f"{scene}; {turns}; {os.cpu_count()} cores, {engine.device_name}")
 
 
 if __name__ == "__main__":

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mauvecl.runs import durable
+from mauvecl.device.engine import Engine
+from mauvecl.host.files import whole
 from mauvecl.study.study import Study
 
 CHUNK, LAST = "star-1/quiescent/c/1/0", "star-1/flare-1/c/4/0"
@@ -43,8 +44,11 @@ def flip(path: Path, place: int = 100) -> None:
     path.write_bytes(data)
 
 
-class Painter:
+class Painter(Engine):
     """Draws nothing by chance and needs no OpenCL: rows that tell their number, for tests that fork."""
+
+    def __init__(self) -> None:
+        """Without a device."""
 
     def realise(
         self, x: Any, *, start: int, count: int, seed: int, out: NDArray[Any] | None = None, **how: Any
@@ -85,4 +89,4 @@ def full_after(n_bytes: int, monkeypatch: pytest.MonkeyPatch) -> None:
             raise OSError(28, "No space left on device")
         real(handle)
 
-    monkeypatch.setattr(durable.os, "fsync", fsync)
+    monkeypatch.setattr(whole.os, "fsync", fsync)

@@ -42,7 +42,7 @@ MUTATIONS = {
     "one unknown's row dropped": Mutation(
         (
             (
-                "mauvecl/results/channels.py",
+                "mauvecl/results/requests/channels.py",
                 "nuisances.names if nuisances else ()))",
                 "nuisances.names[1:] if nuisances else ()))",
             ),
@@ -273,7 +273,7 @@ MUTATIONS = {
         "tests/device/test_marginal.py::test_closed_forms_integrate_over_what_is_drawn[half a degree]",
     ),
     "moved scores that count like others": Mutation(
-        (("mauvecl/results/tails.py", "np.log(2.0) - np.logaddexp(0.0, ratio)", "np.zeros(BLOCK)"),),
+        (("mauvecl/results/detection/tails.py", "np.log(2.0) - np.logaddexp(0.0, ratio)", "np.zeros(BLOCK)"),),
         "tests/results/test_tails.py::test_brute_force_agrees_with_what_is_unknown[half a degree]",
     ),
     "shifts forgotten in the closed form's phase": Mutation(

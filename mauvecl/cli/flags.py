@@ -152,7 +152,7 @@ DETECTION = group(
     flag(
         str,
         "--reference",
-        "Compared with: expectation, exposure (noisy), or stack:N [expectation].",
+        "Compared with: template (noise-free), exposure (noisy), or stack:N of them [template].",
         "run.reference",
     ),
     flag(str, "--variances", "model, or estimated from the counts as an observer must [model].", "run.variances"),

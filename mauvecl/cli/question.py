@@ -61,7 +61,7 @@ def nuisances_of(study: Study, texts: list[str]) -> dict[str, Any]:
     """What is unknown, as words: dark=0.1, or a file's name, as in stray.txt=free."""
     from mauvecl.host.errors import InputError
     from mauvecl.host.files.bounded import shortened
-    from mauvecl.statistics.nuisances import NUISANCES
+    from mauvecl.statistics.names import NUISANCES
 
     nuisances: dict[str, Any] = {}
     own = {name: one.model_dump(exclude_none=True) for name, one in study.nuisances.own.items()}

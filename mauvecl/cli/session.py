@@ -125,13 +125,10 @@ class Session:
             stack.enter_context(told_of_interrupts(lambda: self._kept(checkpoint)))
             stack.enter_context(checkpoint)
             self.say(checkpoint.messages)
-            if self.pictures:
-                # Half a second that would be waited for at the end; devices leave one thread idle meanwhile.
-                threading.Thread(target=_load_matplotlib, name="mauvecl-load", daemon=True).start()
             stack.enter_context(self.meter)
             workers = stack.enter_context(working(self.device, self.cluster))
             progress = self.meter if unit == "realisations" else None
-            self._pool = Pool(workers, checkpoint=checkpoint, progress=progress)
+            self._pool = Pool(workers, checkpoint=checkpoint, progress=progress, meanwhile=self._load)
             self.meter.standing = lambda: self._pool.standing
             yield self._pool
             if checkpoint.damaged:
@@ -139,6 +136,17 @@ class Session:
                     [f"{checkpoint.damaged} files of {str(checkpoint.folder)!r} were damaged and are drawn again."]
                 )
         self._checkpoint = checkpoint
+
+    def _load(self) -> None:
+        """What tables and pictures are made with: three quarters of a second that would be waited for at the end."""
+        from importlib import import_module
+
+        from mauvecl.pictures.style import available, pyplot
+
+        for name in ("astropy.table", "astropy.io.misc.yaml", "rich.table"):
+            import_module(name)
+        if self.pictures and available():
+            pyplot()
 
     def metered(self, unit: str) -> Meter:
         """Progress in a unit, to be used in a `with` block."""
@@ -157,7 +165,7 @@ class Session:
         """Tell the reader, unless standard output is for JSON alone."""
         from mauvecl.cli.console import show
 
-        if not self.as_json:
+        if lines and not self.as_json:
             show(lines)
 
     @cached_property
@@ -237,7 +245,7 @@ class Session:
             from mauvecl.host.plotting import picture
 
             for name, (function, *given) in answer.pictures.items():
-                self.leave(partial(picture, function, *given, self.folder / f"{name}.png"))
+                self.leave(partial(picture, function, *given, path=self.folder / f"{name}.png"))
         self.record(answer.study, answer.inputs, [*answer.messages, *answer.remarks])
 
     def _written(self) -> str:
@@ -258,13 +266,6 @@ class Session:
         if self.files and not self.quiet:
             names = ", ".join(path.name for path in self.files)
             self.say([f"Wrote {names} to {self.folder}/ in {time.perf_counter() - self.started:.1f} s."])
-
-
-def _load_matplotlib() -> None:
-    from mauvecl.pictures.style import available, pyplot
-
-    if available():
-        pyplot()
 
 
 @contextmanager

@@ -13,16 +13,18 @@ from mauvecl.device.opened import Device
 from mauvecl.device.program import DeviceError, DeviceRecord, devices
 from mauvecl.device.stares import Stares
 from mauvecl.device.tiles import Progress, Tile, Tiles
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.stares.requests import StaresRequest
 from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.drawing import Drawing, DrawingWords
 from mauvecl.noise.scene import BATCH, prepare
-from mauvecl.results.channels import plan_channels
-from mauvecl.results.detection import Detection
-from mauvecl.results.fap import Tails
-from mauvecl.results.hypotheses import Hypotheses
-from mauvecl.results.requests import (
+from mauvecl.results.counts.tally import TailSamples, Tally
+from mauvecl.results.detection.detection import Detection
+from mauvecl.results.requests.channels import plan_channels
+from mauvecl.results.requests.fap import Tails
+from mauvecl.results.requests.hypotheses import Hypotheses
+from mauvecl.results.requests.requests import (
     Countable,
     DetectRequest,
     RealiseRequest,
@@ -33,7 +35,6 @@ from mauvecl.results.requests import (
 )
 from mauvecl.results.snr import Counts, SnrResult, elements, observers
 from mauvecl.results.sums import Arrays, DetectionSums, SnrSums, packed_detection, packed_snr
-from mauvecl.results.tally import TailSamples, Tally
 from mauvecl.statistics.linear import Linear
 from mauvecl.statistics.names import USUAL_STATISTICS
 from mauvecl.statistics.nuisances import Nuisances, known
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
 __all__ = ["DeviceError", "DeviceRecord", "Engine", "devices"]
 
 
+@public
 class Engine:
     """Draws realisations on an OpenCL device and reduces them there.
 

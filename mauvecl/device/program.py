@@ -138,21 +138,21 @@ def _devices() -> list[Any]:
         platforms = cl.get_platforms()
     except cl.Error:
         platforms = []
-    found = []
+    handles = []
     for platform in platforms:
         try:
-            found += platform.get_devices()
+            handles += platform.get_devices()
         except cl.Error:
             continue
-    if not found:
+    if not handles:
         raise DeviceError(
             "no OpenCL device found: install PoCL with `pip install 'pyopencl[pocl]'` or a driver for your device"
         )
-    for device in found:
+    for device in handles:
         if device.platform.name == POCL:
             processor.give_name(device)
     # PoCL on the CPU first: it is the default.
-    return sorted(found, key=lambda d: (d.platform.name != POCL, "cpu" not in _kind(d)))
+    return sorted(handles, key=lambda d: (d.platform.name != POCL, "cpu" not in _kind(d)))
 
 
 def _kind(device: Any) -> str:

@@ -24,10 +24,10 @@ from mauvecl.noise.comparison import Comparison
 from mauvecl.noise.processes import CosmicRays, Processes, Uniform
 from mauvecl.noise.scene import Scene, prepare
 from mauvecl.results import twin as sums_twin
-from mauvecl.results.channels import ChannelPlan, plan_channels
-from mauvecl.results.hypotheses import Hypotheses
+from mauvecl.results.counts.tally import Tally
+from mauvecl.results.requests.channels import ChannelPlan, plan_channels
+from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.results.snr import Counts, elements, observers
-from mauvecl.results.tally import Tally
 from mauvecl.statistics.nuisances import known
 from mauvecl.statistics.registry import STATISTICS
 
@@ -55,7 +55,7 @@ class Check:
 
     name: str
     passed: bool
-    found: str
+    result: str
 
 
 def toy(
@@ -143,8 +143,8 @@ def digests(engine: Engine, name: str) -> dict[str, str]:
         engine.statistic_values(quiet, [flare], count=COUNT, statistics=names, **place, **how)
         for names in (_asked(how), _asked(how, FAST))
     )
-    found = engine.detect(quiet, [flare], realisations=COUNT, statistics=_asked(how, FAST), **place, **how)
-    null = found.distribution("chi2")
+    detection = engine.detect(quiet, [flare], realisations=COUNT, statistics=_asked(how, FAST), **place, **how)
+    null = detection.distribution("chi2")
     return {
         "raw": _digest(raw.astype(np.int64), clipped),
         "statistics": _digest(values.view(np.uint32)),
@@ -183,10 +183,10 @@ def _statistics(name: str, scene: Scene) -> tuple[NDArray[np.float32], ChannelPl
     options, how = CASES[name]
     quiet, flare = toy(**options), toy(flare=0.3, **options)
     unknown = known(how.get("nuisances"), quiet)
-    found = Hypotheses(quiet, (flare,), _asked(how), scene, nuisances=unknown)
-    plan = plan_channels(found, range(1), first=True)
+    hypotheses = Hypotheses(quiet, (flare,), _asked(how), scene, nuisances=unknown)
+    plan = plan_channels(hypotheses, range(1), first=True)
     index = np.arange(START, START + COUNT, dtype=np.uint64)
-    smoothed = sums_twin.Smoothed.of(found, plan) if len(plan.scales) else None
+    smoothed = sums_twin.Smoothed.of(hypotheses, plan) if len(plan.scales) else None
     paired = "chi2_pair" in _asked(how)
     sums = sums_twin.statistics(scene, index, SEED, plan, pair=paired, smoothed=smoothed)
     return sums_twin.marginalise(sums, plan.subtractions), plan
@@ -220,10 +220,10 @@ def _histograms(counts: Counts) -> str:
 
 
 def _digest(*arrays: NDArray[Any]) -> str:
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for array in arrays:
-        found.update(np.ascontiguousarray(array).tobytes())
-    return found.hexdigest()[:12]
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:12]
 
 
 def known_answers(engine: Engine) -> Check:
@@ -281,9 +281,9 @@ def pearson(counts: NDArray[np.int64], probability: NDArray[np.float64]) -> floa
 
 def counts_of(engine: Engine, x: Expectation, realisations: int, recipe: Any) -> tuple[NDArray[np.int64], int]:
     """Histogram of raw counts over all pixels, which are alike, and the count of its first bin."""
-    found = engine.snr(x, realisations=realisations, seed=SEED, recipe=recipe)
-    first = int(found.scene.base_dn[0, 0]) - layout.OBSERVER_BINS // 2
-    return found.counts.pixel.sum(axis=0), first
+    signal = engine.snr(x, realisations=realisations, seed=SEED, recipe=recipe)
+    first = int(signal.scene.base_dn[0, 0]) - layout.OBSERVER_BINS // 2
+    return signal.counts.pixel.sum(axis=0), first
 
 
 def exact_counts(x: Expectation, first: int) -> NDArray[np.float64]:
@@ -324,10 +324,10 @@ def closed_forms(engine: Engine) -> Iterator[Check]:
     # The root's curvature moves the mean by about noise over eight signals of an element, 2 % here.
     worst = float(np.abs(z).max())
     yield Check("S/N per element, closed form", bool(worst < 0.03 + 5 / np.sqrt(n)), f"means within {worst:.3f} sigma")
-    found = engine.detect(quiet, [flare], realisations=n, seed=SEED, statistics=tuple(STATISTICS))
+    detection = engine.detect(quiet, [flare], realisations=n, seed=SEED, statistics=tuple(STATISTICS))
     for statistic in STATISTICS:
         for which in (None, 0):
-            ours, theory = found.distribution(statistic, which), found.closed_form(statistic, which)
+            ours, theory = detection.distribution(statistic, which), detection.closed_form(statistic, which)
             error = (ours.mean - theory.mean) / (theory.std / np.sqrt(n))
             name = f"{statistic}, mean {'with a flare' if which is not None else 'without'}"
             yield Check(f"{name}, closed form", bool(abs(error) < 5), f"{error:+.1f} standard errors")
@@ -345,10 +345,10 @@ def run(engine: Engine, told: Callable[[Check], None] = lambda check: None) -> l
     """All checks; `told` hears of each as it ends."""
     from mauvecl.device.selftest_stares import stares
 
-    found: list[Check] = []
+    checks: list[Check] = []
 
     def note(check: Check) -> None:
-        found.append(check)
+        checks.append(check)
         told(check)
 
     note(known_answers(engine))
@@ -356,7 +356,7 @@ def run(engine: Engine, told: Callable[[Check], None] = lambda check: None) -> l
         for check in group(engine):
             note(check)
     note(tiles(engine))
-    return found
+    return checks
 
 
 def keep(engine: Engine, checks: list[Check], seconds: float) -> None:

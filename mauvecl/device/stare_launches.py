@@ -136,18 +136,14 @@ class StareLaunches(Launches):
         self._in_frames("stare_glow", replace(self.variant, in_time=True), [], tile, out, row)
 
     def _in_frames(self, name: str, variant: Variant, own: list[Any], tile: Tile, out: Floats, row: int) -> None:
-        """One kernel whose lanes are frames; a processor's own memory needs no copy."""
-        flags, first = self._cl.mem_flags, tile.first + tile.start
+        """One kernel whose lanes are frames."""
+        first, each = tile.first + tile.start, FRAMES_EACH if variant.width > 1 else 1
         kernel = self._device.kernel(("stare", name), variant, name)
-        shared = self._device.record.kind == "cpu"
-        if shared:
-            values = self._cl.Buffer(self._device.context, flags.WRITE_ONLY | flags.USE_HOST_PTR, hostbuf=out)
-            place = (out.shape[1], row)
-        else:
-            values = self._room("values", out[:, : tile.wanted].nbytes)
-            place = (tile.wanted, 0)
-        each = FRAMES_EACH if variant.width > 1 else 1
-        try:
+        # Other memory holds this tile alone.
+        own_memory = self._device.record.kind == "cpu"
+        place = (out.shape[1], row) if own_memory else (tile.wanted, 0)
+        host = out if own_memory else np.empty((len(out), tile.wanted, *out.shape[2:]), np.float32)
+        with self._into("values", host) as values:
             kernel(
                 self._queue,
                 (tile.wanted, -(-out.shape[3] // each)),
@@ -161,16 +157,5 @@ class StareLaunches(Launches):
                 *map(np.uint32, place),
                 values,
             )
-            if shared:
-                mapped, _ = self._cl.enqueue_map_buffer(
-                    self._queue, values, self._cl.map_flags.READ, 0, out.shape, out.dtype
-                )
-                mapped.base.release(self._queue)
-                self._queue.finish()
-            else:
-                host = np.empty((len(out), tile.wanted, *out.shape[2:]), np.float32)
-                self._cl.enqueue_copy(self._queue, host, values)
-                out[:, row : row + tile.wanted] = host
-        finally:
-            if shared:
-                values.release()
+        if not own_memory:
+            out[:, row : row + tile.wanted] = host

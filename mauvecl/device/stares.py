@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mauvecl.device.opened import Device
 from mauvecl.device.stare_launches import StareLaunches
 from mauvecl.device.tiles import Progress, Tile, Tiles
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.stares.components import Components
 from mauvecl.lightcurve.stares.requests import Arrays, Kept, Method, StaresRequest, joined
@@ -18,7 +19,7 @@ from mauvecl.lightcurve.stares.scene import Flares, StareScene, padded_frames
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.lightcurve.stares.sums import check_sums
 from mauvecl.noise.processes import CosmicRays
-from mauvecl.results.requests import Shard
+from mauvecl.results.requests.requests import Shard
 
 Floats = NDArray[np.float32]
 
@@ -26,6 +27,7 @@ Floats = NDArray[np.float32]
 REDUCED_BYTES = 4 * 2**20
 
 
+@public
 class Stares:
     """Draws stares on an OpenCL device.
 
@@ -132,8 +134,8 @@ class Stares:
                 launches.draw(tile, out, done)
 
             self._tiles.over(first, count, out[:, 0].nbytes, work)
-        found = np.moveaxis(out[..., : stare.n_frames], 2, 3)
-        return found[0] if amplitudes is None else found
+        frames = np.moveaxis(out[..., : stare.n_frames], 2, 3)
+        return frames[0] if amplitudes is None else frames
 
     def reduced(self, request: StaresRequest, shard: Shard | None = None) -> Arrays:
         """What is kept of a request's stares, or of a shard of them, which are drawn and reduced a few at a time.
@@ -169,7 +171,7 @@ class Stares:
         with self._launches(components, stare, request.flares, *how) as launches:
 
             def work(tile: Tile, done: int) -> None:
-                found = []
+                reduced = []
                 for few in tile.pieces(piece):
                     out = room[: each * few.wanted // 4].reshape(-1, few.wanted, *shape)
                     first = few.first + few.start
@@ -180,13 +182,13 @@ class Stares:
                     if request.glow:
                         launches.glow(few, beside, 0)
                         more = [np.moveaxis(beside[0, : few.wanted, :, : stare.n_frames], 1, 2)]
-                    found.append(dict(reduction(values, first, *more)))
+                    reduced.append(dict(reduction(values, first, *more)))
                 # A tile that fails half way is drawn again.
-                parts.extend(found)
+                parts.extend(reduced)
 
             self._tiles.over(there.start, there.count, each, work)
-        found = joined(parts, adds=reduction.adds)
-        return found | {"start": np.array(there.start)} if shard else found
+        kept = joined(parts, adds=reduction.adds)
+        return kept | {"start": np.array(there.start)} if shard else kept
 
     def _launches(
         self,

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Self
 
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import count
-
-Variances = Literal["model", "estimated"]
 
 #: Quiescent exposures that one stack may hold.
 MOST_EXPOSURES = 1000
 
 
+@public
 @dataclass(frozen=True)
 class Comparison:
     """The quiescent spectrum that is subtracted, and the variances that are divided by.
@@ -33,13 +33,13 @@ class Comparison:
         object.__setattr__(self, "exposures", count("exposures", self.exposures, high=MOST_EXPOSURES))
 
     @classmethod
-    def of(cls, reference: str = "expectation", variances: str = "model") -> Self:
+    def of(cls, reference: str = "template", variances: str = "model") -> Self:
         """From words.
 
         Parameters
         ----------
         reference : str
-            ``"expectation"``, ``"exposure"`` or ``"stack:n"`` with n of 1 and more exposures.
+            ``"template"``, the expectation itself; ``"exposure"`` or ``"stack:n"`` with n of 1 and more exposures.
         variances : {"model", "estimated"}
 
         Raises
@@ -64,13 +64,12 @@ class Comparison:
 
 def _exposures(reference: str) -> int:
     word, colon, number = reference.partition(":")
-    # Studies of older versions say "template".
-    if not colon and word in ("expectation", "template", "exposure"):
+    if not colon and word in ("template", "exposure"):
         return int(word == "exposure")
     if word == "stack" and number.isdecimal() and 1 <= int(number) <= MOST_EXPOSURES:
         return int(number)
     raise InputError(
-        f"reference = {reference!r}, expected 'expectation', 'exposure' or 'stack:n' with n from 1 to {MOST_EXPOSURES}"
+        f"reference = {reference!r}, expected 'template', 'exposure' or 'stack:n' with n from 1 to {MOST_EXPOSURES}"
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import TYPE_CHECKING
@@ -11,11 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.noise import priors
+from mauvecl.noise.prior_tables import nodes
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
+    from mauvecl.noise.processes import Processes
     from mauvecl.noise.scene import Scene
+    from mauvecl.noise.varied import Modulated
 
 Float = NDArray[np.float64]
 
@@ -111,14 +113,33 @@ class Drawn:
     @classmethod
     def of(cls, scene: Scene) -> Drawn | None:
         """Of a scene; None where nothing is drawn."""
-        found: dict[str, list[Spread]] = {}
-        for (name, factor), table in zip(scene.modulations, scene.priors, strict=True):
+        return cls._of(scene.modulations, scene.priors, scene.medians, scene.n_frames)
+
+    @classmethod
+    def by(cls, processes: Processes, quiet: Expectation) -> Drawn | None:
+        """What a scene of a star would hold, without its arrays; None where nothing is drawn."""
+        if not processes.modulations:
+            return None
+        factors = processes.factors(quiet.conditions)
+        medians = factors.light, factors.dark, factors.sky
+        return cls._of(processes.modulations, factors.tables, medians, quiet.n_frames)
+
+    @classmethod
+    def _of(
+        cls,
+        modulations: Sequence[tuple[str, Modulated]],
+        tables: NDArray[np.float32],
+        medians: tuple[float, float, float],
+        n_frames: int,
+    ) -> Drawn | None:
+        spreads: dict[str, list[Spread]] = {}
+        for (name, factor), table in zip(modulations, tables, strict=True):
             one = _of_table(table)
-            if name == "jitter" and scene.n_frames > 1:
-                one = _normal(one.mean, one.sd / np.sqrt(scene.n_frames))
-            found.setdefault(factor, []).append(one)
-        medians = dict(zip(("light", "dark", "sky"), scene.medians, strict=True))
-        return cls({name: _together(ones, medians[name]) for name, ones in found.items()}) if found else None
+            if name == "jitter" and n_frames > 1:
+                one = _normal(one.mean, one.sd / np.sqrt(n_frames))
+            spreads.setdefault(factor, []).append(one)
+        median = dict(zip(("light", "dark", "sky"), medians, strict=True))
+        return cls({name: _together(ones, median[name]) for name, ones in spreads.items()}) if spreads else None
 
     def nodes(self, x: Expectation, *, weighted: bool) -> tuple[list[Node], Float]:
         """What the factors do to an exposure.
@@ -170,7 +191,7 @@ def _of_table(table: NDArray[np.float32]) -> Spread:
 def at_score(table: NDArray[np.float32], score: Float) -> Float:
     """What a device's table of quantiles holds where a standard normal has a value; shape as given."""
     below, above = special.ndtr(score), special.ndtr(-score)
-    tail, (low, high) = priors.nodes(), np.split(table.astype(np.float64), 2)
+    tail, (low, high) = nodes(), np.split(table.astype(np.float64), 2)
     return np.asarray(np.where(below < 0.5, np.interp(below, tail, low), np.interp(above, tail, high)))
 
 

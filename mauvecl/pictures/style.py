@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, Concatenate, ParamSpec
 
 import numpy as np
 
 from mauvecl.host.errors import InputError
+from mauvecl.host.files.whole import write_whole
 from mauvecl.host.plotting import AXES
-from mauvecl.runs.durable import write_whole
 
+P = ParamSpec("P")
 #: Okabe and Ito's colours, which colour-blind readers can tell apart (jfly.uni-koeln.de/color).
 COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7", "#000000")
 NULL = "#777777"
@@ -167,6 +169,18 @@ def _renderer(figure: Any) -> Any:
     return RendererAgg(size.width, size.height, figure.dpi)  # type: ignore[no-untyped-call]
 
 
+def drawn(draw: Callable[Concatenate[Any, P], Any]) -> Callable[..., Any]:
+    """A picture of what draws with pyplot and gives the figure: in our style, saved where a path is given."""
+
+    @wraps(draw)
+    def picture(*what: Any, path: str | Path | None = None, **how: Any) -> Any:
+        plt = pyplot()
+        with plt.rc_context(STYLE):
+            return finished(draw(plt, *what, **how), path)
+
+    return picture
+
+
 def finished(figure: Any, path: str | Path | None) -> Any:
     """Save a figure under a path, in the form of its ending (.png, .pdf, .svg), or hand it out; pyplot forgets it.
 
@@ -178,7 +192,14 @@ def finished(figure: Any, path: str | Path | None) -> Any:
     pyplot().close(figure)
     if path is None:
         return figure
-    drawn, place = io.BytesIO(), Path(path)
-    figure.figure.savefig(drawn, format=place.suffix[1:] or None)
+    drawn, place, whole = io.BytesIO(), Path(path), figure.figure
+    if place.suffix == ".png":
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+        # As savefig makes it, which draws each picture twice.
+        whole.set_dpi(pyplot().rcParams["savefig.dpi"])
+        FigureCanvasAgg(whole).print_png(drawn)  # type: ignore[no-untyped-call]
+    else:
+        whole.savefig(drawn, format=place.suffix[1:] or None)
     write_whole(place, drawn.getbuffer())
     return place

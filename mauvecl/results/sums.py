@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.results.detection import Detection
-from mauvecl.results.far import FarCounts
-from mauvecl.results.requests import DetectRequest, SnrRequest
+from mauvecl.results.counts.far import FarCounts
+from mauvecl.results.counts.tally import TailSamples, Tally
+from mauvecl.results.detection.detection import Detection
+from mauvecl.results.requests.requests import DetectRequest, SnrRequest
 from mauvecl.results.snr import Counts, SnrResult, elements, observers
-from mauvecl.results.tally import TailSamples, Tally
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -23,7 +23,7 @@ def packed_detection(tally: Tally, samples: Sequence[TailSamples | None]) -> Arr
     shard["sums"] = np.array([[str(value) for value in row] for row in tally.sums])
     shard["n"] = np.array(tally.n)
     for number, far in enumerate(tally.far):
-        beyond = far.found()
+        beyond = far.frozen()
         if beyond.n or beyond.undefined:
             shard |= _spread(f"far-{number}", beyond.keys, beyond.counts)
             shard[f"far-{number}-sums"] = np.array([str(x) for x in (beyond.first, beyond.second, beyond.undefined)])
@@ -64,10 +64,7 @@ class DetectionSums:
     def answer(self) -> Detection:
         """The answer, once all shards have come."""
         asked = self._request
-        h = asked.hypotheses
-        detection = Detection(
-            h.quiet, h.flares, h.asked, h.scene, asked.realisations, asked.tails, asked.seed, nuisances=h.nuisances
-        )
+        detection = Detection.of(asked.hypotheses, asked.realisations, asked.tails, asked.seed)
         for (plan, _), (tally, samples) in zip(asked.plans, self._sums, strict=True):
             detection.collect(plan, tally, samples)
         return detection

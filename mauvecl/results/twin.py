@@ -15,8 +15,8 @@ from mauvecl.results.snr import Counts
 from mauvecl.statistics.paper import Paper
 
 if TYPE_CHECKING:
-    from mauvecl.results.channels import ChannelPlan
-    from mauvecl.results.hypotheses import Hypotheses
+    from mauvecl.results.requests.channels import ChannelPlan
+    from mauvecl.results.requests.hypotheses import Hypotheses
 
 
 def statistics(
@@ -154,11 +154,11 @@ class Smoothed:
     scale_end: NDArray[np.uint32]
 
     @classmethod
-    def of(cls, found: Hypotheses, plan: ChannelPlan) -> Smoothed:
+    def of(cls, hypotheses: Hypotheses, plan: ChannelPlan) -> Smoothed:
         """Of a detection's channels."""
-        smoothing = Paper().smoothing(found.setting)
-        rows = np.zeros((len(smoothing.rows), len(found.scene.pixels)), np.float32)
-        rows[:, : found.scene.n_pixel] = smoothing.rows
+        smoothing = Paper().smoothing(hypotheses.setting)
+        rows = np.zeros((len(smoothing.rows), len(hypotheses.scene.pixels)), np.float32)
+        rows[:, : hypotheses.scene.n_pixel] = smoothing.rows
         return cls(rows, plan.scales, plan.scale_end)
 
     def sums(self, difference: Floats, k: int) -> list[Floats]:

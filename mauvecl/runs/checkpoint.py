@@ -27,8 +27,9 @@ import numpy as np
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import read_bytes
 from mauvecl.host.files.parsed import json_data, read_text
+from mauvecl.host.files.whole import UNFINISHED, write_whole
 from mauvecl.host.version import VERSION
-from mauvecl.runs.durable import UNFINISHED, alone, differing_keys, write_whole
+from mauvecl.runs.durable import alone, differing_keys
 from mauvecl.runs.shards import FORM
 
 if TYPE_CHECKING:
@@ -63,7 +64,7 @@ class Checkpoint:
 
     Attributes
     ----------
-    found, damaged : int
+    resumed, damaged : int
         Shards taken from files so far, and files that could not be used.
     messages : list of str
         What the user must be told.
@@ -82,7 +83,7 @@ class Checkpoint:
     ) -> None:
         self.parent, self.folder, self.verb, self.study = folder, folder / FOLDER, verb, study
         self._resume, self._restart, self._patience_s, self._is_held = resume, restart, patience_s, held
-        self.found = self.damaged = 0
+        self.resumed = self.damaged = 0
         self.messages: list[str] = []
         self._held: list[tuple[str, Arrays]] = []
         self._lock = threading.Lock()
@@ -172,7 +173,7 @@ class Checkpoint:
                 self.damaged += 1
             return None
         with self._lock:
-            self.found += 1
+            self.resumed += 1
         return shard
 
     def put(self, name: str, shard: Arrays) -> None:

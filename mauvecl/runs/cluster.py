@@ -18,11 +18,12 @@ from urllib.parse import urlsplit
 from numpy.typing import NDArray
 
 from mauvecl.device.program import DeviceError, DeviceRecord
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import is_file, json_data, read_text
 from mauvecl.host.version import VERSION
-from mauvecl.results.requests import Countable, Shard
+from mauvecl.results.requests.requests import Countable, Shard
 from mauvecl.results.sums import Arrays
 from mauvecl.runs.pool import Stopped
 
@@ -42,6 +43,7 @@ RECOUNT_S, REQUESTS = 5.0, 32
 THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
 
 
+@public
 class DaskWorkers:
     """Workers of a Dask cluster, each with an engine of its own.
 

@@ -16,15 +16,17 @@ from numpy.typing import NDArray
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
 from mauvecl.device.stares import Stares
 from mauvecl.device.tiles import Progress
+from mauvecl.host.doors import public
+from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import count as whole
 from mauvecl.lightcurve.stares.requests import StaresRequest, StareSums
-from mauvecl.results.requests import Countable, DetectRequest, RealiseRequest, Shard, SnrRequest
+from mauvecl.results.requests.requests import Countable, DetectRequest, RealiseRequest, Shard, SnrRequest
 from mauvecl.results.sums import Arrays, DetectionSums, SnrSums
 from mauvecl.runs.shards import fingerprint, shards
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
-    from mauvecl.results.detection import Detection
+    from mauvecl.results.detection.detection import Detection
     from mauvecl.results.snr import SnrResult
     from mauvecl.runs.checkpoint import Checkpoint
 
@@ -84,6 +86,7 @@ class Workers(Protocol):
         """Let go of everything."""
 
 
+@public
 class LocalWorkers:
     """The OpenCL devices of this machine, in a thread each.
 
@@ -206,6 +209,7 @@ class Standing:
     resumed: int
 
 
+@public
 class Pool:
     """Answers what an `Engine` answers, with all workers, and the same to the last bit.
 
@@ -217,6 +221,8 @@ class Pool:
         Where shards are kept, and looked for.
     progress : callable, optional
         Called as ``progress(done, total)`` in realisations of all requests known so far; may raise to stop the work.
+    meanwhile : callable, optional
+        Done once, in a thread of its own, as soon as devices are busy: what would keep them waiting before.
     """
 
     def __init__(
@@ -225,8 +231,13 @@ class Pool:
         *,
         checkpoint: Checkpoint | None = None,
         progress: Progress | None = None,
+        meanwhile: Callable[[], None] | None = None,
     ) -> None:
-        self.workers = workers or LocalWorkers()
+        if workers is not None and not hasattr(workers, "submit"):
+            kind = type(workers).__name__
+            raise InputError(f"the workers are of the type {kind}, expected LocalWorkers or DaskWorkers")
+        self.workers = LocalWorkers() if workers is None else workers
+        self._meanwhile = meanwhile
         self.checkpoint, self._progress = checkpoint, progress
         self._lock = threading.RLock()
         self._done = self._total = self._shards = self._of = self._resumed = self._expected = 0
@@ -331,6 +342,9 @@ class Pool:
     def _tick(self, name: str, done: int) -> None:
         with self._lock:
             self._partly[name] = done
+            aside, self._meanwhile = self._meanwhile, None
+        if aside is not None:
+            threading.Thread(target=aside, name="mauvecl-aside", daemon=True).start()
         self._told()
 
     def _finished(self, name: str, shard: Shard, *, resumed: bool = False) -> None:

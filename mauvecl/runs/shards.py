@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from mauvecl.results.requests import Asked, Divisible, Shard
+from mauvecl.results.requests.requests import Asked, Divisible, Shard
 
 #: What a shard holds, and how: raised with every change, so that none of an older form is ever added.
 FORM = 2

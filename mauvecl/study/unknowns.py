@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.host.errors import InputError
-from mauvecl.results.fap import FEWEST_IN_TAIL
+from mauvecl.results.requests.fap import FEWEST_IN_TAIL
 from mauvecl.statistics.intervals import CONFIDENCE, Interval
 
 if TYPE_CHECKING:
@@ -88,13 +88,13 @@ def realisations_each(study: Study) -> int:
     return max(run.realisations // study.unknowns.draws, fewest)
 
 
-def average(found: Sequence[Interval]) -> Interval:
+def average(intervals: Sequence[Interval]) -> Interval:
     """The mean of probabilities over draws of the unknown, with 95 % for their own errors and the number of draws.
 
     Draws are even, so that the interval, made for independent ones, errs on the wide side.
     """
-    values = np.array([p.value for p in found])
-    own = np.array([p.high - p.low for p in found]) / 2
+    values = np.array([p.value for p in intervals])
+    own = np.array([p.high - p.low for p in intervals]) / 2
     reach = float(special.ndtri(0.5 + CONFIDENCE / 2))
     spread = values.std(ddof=1) / np.sqrt(values.size) if values.size > 1 else 0.0
     half = float(np.hypot(reach * spread, np.sqrt(np.sum(own**2)) / values.size))
@@ -130,8 +130,8 @@ def shares(draws: DrawnStudies, outcome: Float) -> dict[str, float]:
             # So many orders have exactly these before it.
             weight = 1.0 / (len(names) * math.comb(len(names) - 1, len(some)))
             share[k] += weight * (explained[tuple(sorted((*some, k)))] - value)
-    found = {names[k]: float(share[k]) for k in np.argsort(-share)}
-    return found | {REST: 1.0 - explained[tuple(range(len(names)))]}
+    parts = {names[k]: float(share[k]) for k in np.argsort(-share)}
+    return parts | {REST: 1.0 - explained[tuple(range(len(names)))]}
 
 
 def _explained(x: Float, y: Float) -> float:

@@ -7,12 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.answers.campaigns.plan import PlanAnswer, plan
 from mauvecl.answers.campaigns.visible import visible
-from mauvecl.answers.detect import DetectAnswer, detect
-from mauvecl.answers.inject import InjectAnswer, inject
-from mauvecl.answers.limits import limiting_magnitude
-from mauvecl.answers.maps import MapResult, detection_map
-from mauvecl.answers.snr import SnrAnswer, snr
+from mauvecl.answers.detection.detect import DetectAnswer, detect
+from mauvecl.answers.detection.maps import MapResult, detection_map
+from mauvecl.answers.limits.limits import limiting_magnitude
+from mauvecl.answers.signal.snr import SnrAnswer, snr
+from mauvecl.answers.stares.inject import InjectAnswer, inject
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -54,21 +55,32 @@ def completeness(study: Study, pool: Pool) -> InjectAnswer:
     return inject(Study.build(data, "page"), pool)
 
 
+def planned(study: Study) -> PlanAnswer:
+    """What a campaign on the target would find, without injections."""
+    data = study.model_dump()
+    data["plan"] |= {"targets": [{"name": name} for name in study.orbit.targets], "completeness": "closed form"}
+    data["orbit"]["targets"] = ()
+    return plan(Study.build(data, "page"))
+
+
 def _detection(study: Study, pool: Pool) -> dict[str, Any]:
     return dict(zip(("detection", "snr"), detect_and_snr(study, pool), strict=True))
 
 
 def _visible(study: Study) -> dict[str, Any]:
     """The answer with its tables, which are dear to make and looked at again and again."""
-    found = visible(study)
-    return {"visible": found, "seen": {name: getattr(found, name) for name in ("table", "months", "by_day")}}
+    answer = visible(study)
+    return {"visible": answer, "seen": {name: getattr(answer, name) for name in ("table", "months", "by_day")}}
 
 
-#: What may be simulated, by name: what is then found, by name.
+#: What may be computed on demand, by name: what is then known, by name.
 SIMULATED: dict[str, Callable[[Study, Pool], dict[str, Any]]] = {
     "detection": _detection,
     "limit": lambda study, pool: {"limit": limiting_magnitude(study, pool)},
     "map": lambda study, pool: {"map": map_around(study, pool)},
     "completeness": lambda study, pool: {"completeness": completeness(study, pool)},
     "visible": lambda study, pool: _visible(study),
+    "plan": lambda study, pool: {"plan": planned(study)},
 }
+#: Those that draw by the pool.
+DRAWING = {"detection", "limit", "map"}

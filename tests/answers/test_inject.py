@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from commands import run
 
-from mauvecl.answers.inject import inject
+from mauvecl.answers.stares.inject import inject
 from mauvecl.device.engine import Engine
 from mauvecl.device.stares import Stares
 from mauvecl.host.errors import InputError
@@ -77,6 +77,7 @@ class Stop(Exception):  # noqa: N818
     """An interruption."""
 
 
+@pytest.mark.long
 def test_resume_gives_the_same(found, tmp_path):
     """Some peaks kept, the others drawn later by two devices of different form: the same to the last bit."""
 
@@ -90,13 +91,14 @@ def test_resume_gives_the_same(found, tmp_path):
     workers = LocalWorkers([None, "0"], make=lambda device, progress: Engine(device, width=next(widths)))
     with Checkpoint(tmp_path, "inject", study(), patience_s=0, resume=True) as checkpoint:
         again = inject(study(), Pool(workers, checkpoint=checkpoint))
-        assert checkpoint.found >= 3, "the null, and two peaks"
+        assert checkpoint.resumed >= 3, "the null, and two peaks"
     workers.close()
     assert (again.stars[0].injected.critical == found.stars[0].injected.critical).all()
     assert np.array_equal(again.stars[0].fitted.energy_ratio, found.stars[0].fitted.energy_ratio, equal_nan=True)
     assert again.stars[0].simulated == found.stars[0].simulated
 
 
+@pytest.mark.long
 def test_sweep_over_magnitude_and_temperature(stares):
     """Fainter stars hide larger flares; every cell on common draws, so that each limit moves."""
     axes = [
@@ -114,6 +116,7 @@ def test_sweep_over_magnitude_and_temperature(stares):
         inject(study(sweep={"axes": [{"quantity": "amplitude", "values": [0.1]}]}), stares)
 
 
+@pytest.mark.long
 def test_search_that_leaves_out_a_cycle_is_told(stares):
     """A thermal cycle that the search does not know: false alarms are not those of normal noise."""
     quick = {"count": 10, "positions": 2, "fitted": 0, "widths": 2, "sizes": 2}

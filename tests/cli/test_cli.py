@@ -15,8 +15,8 @@ from astropy.io import fits
 from astropy.table import QTable
 from commands import run, started
 
-from mauvecl.answers.detect import detect
-from mauvecl.answers.simulate import simulate
+from mauvecl.answers.detection.detect import detect
+from mauvecl.answers.signal.simulate import simulate
 from mauvecl.device.engine import Engine
 from mauvecl.noise.processes import CosmicRays, Normal, Processes, Uniform
 from mauvecl.statistics.registry import STATISTICS
@@ -55,6 +55,7 @@ def test_detect_answers_the_papers_question(answered: tuple[Path, str]) -> None:
     assert row["G2V", 0.0076, "chi2"] < 0.01 < 0.4 < row["G2V", 0.0076, "matched"]
 
 
+@pytest.mark.long
 def test_the_papers_pair_is_compared(answered: tuple[Path, str]) -> None:
     """Both of the paper's values are reconstructed within 30 %, and the text says why a calibrated answer differs."""
     _, text = answered
@@ -191,7 +192,7 @@ def test_a_study_may_ask_for_processes(tmp_path: Path, engine: Engine) -> None:
     assert study.drawing == {"mode": "auto", "recipe": "joint", "processes": processes}
     (tmp_path / "again.toml").write_text(study.toml())
     assert Study.read(tmp_path / "again.toml") == study
-    found = detect(study, engine).stars[0].found
+    found = detect(study, engine).stars[0].detection
     quiet, *flares = study.expectations(study.star[0])
     wanted = engine.detect(quiet, flares, realisations=2000, seed=1, processes=processes)
     np.testing.assert_array_equal(found.distribution("chi2", 0).counts, wanted.distribution("chi2", 0).counts)
@@ -392,7 +393,7 @@ BAD = {
     "instrument": (["detect", "--instrument", "hubble"], "hubble"),
     "device": (["detect", "--device", "abacus"], "'abacus' is not here, expected one of"),
     "statistic": (["detect", "--statistic", "chi3"], "'chi3' is unknown"),
-    "reference": (["detect", "--reference", "stack"], "reference = 'stack', expected 'expectation', 'exposure' or"),
+    "reference": (["detect", "--reference", "stack"], "reference = 'stack', expected 'template', 'exposure' or"),
     "variances": (["detect", "--variances", "guessed"], "run.variances = 'guessed'"),
     "rare fap": (["detect", "--fap", "1e-6", "-n", "1000", "--star", "G2V"], "ask for 100000000 realisations"),
     "realisations": (["detect", "-n", "0"], "run.realisations = 0"),
@@ -440,7 +441,7 @@ def test_bad_studies_are_a_sentence(text: str, sentence: str, tmp_path: Path) ->
 SMALL_SHARDS = [
     sys.executable,
     "-c",
-    "import mauvecl.runs.shards as s; s.SHARD = 2**29; from mauvecl.cli.app import main; main()",
+    "import mauvecl.runs.shards as s; s.SHARD = 2**27; from mauvecl.cli.app import main; main()",
 ]
 LONG = (
     "detect",
@@ -451,44 +452,43 @@ LONG = (
     "--statistic",
     "chi2",
     "-n",
-    "400000",
+    "100000",
     "--no-pictures",
     "--output",
     "out",
 )
 
 
-@pytest.fixture(scope="module")
-def never_stopped(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The answer of a run that nobody stopped."""
-    folder = tmp_path_factory.mktemp("long")
-    run(*LONG, folder=folder)
-    return folder / "out"
-
-
 @pytest.mark.long
-@pytest.mark.parametrize("stop", [signal.SIGINT, signal.SIGTERM, signal.SIGKILL])
-def test_stopped_and_resumed_as_if_never_stopped(stop: signal.Signals, tmp_path: Path, never_stopped: Path) -> None:
-    """Ctrl-C, the end of a batch job, kill -9: a second run goes on, and writes the same tables."""
-    command = [*SMALL_SHARDS, *LONG, "--keep-after", "0"]
-    process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-    shards = tmp_path / "out" / "checkpoint"
-    while not list(shards.glob("[!.]*.npz")):
-        time.sleep(0.005)
-        assert process.poll() is None
-    process.send_signal(stop)
-    _, errors = process.communicate(timeout=60)
-    assert process.returncode == {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -9}[stop]
-    assert "Traceback" not in errors
-    if stop != signal.SIGKILL:
-        assert "kept in 'out/checkpoint', and the same command with --resume goes on from there" in errors
-    kept = sum(int(p.stem.split("-")[-1]) for p in shards.glob("[!.]*.npz"))
-    done = subprocess.run([*SMALL_SHARDS, *LONG, "--resume"], cwd=tmp_path, capture_output=True, text=True)
+def test_stopped_and_resumed_as_if_never_stopped(tmp_path: Path) -> None:
+    """Ctrl-C, the end of a batch job, kill -9: each next run goes on, and the last writes the tables of one alone."""
+    command, shards, kept = [*SMALL_SHARDS, *LONG, "--resume", "--keep-after", "0"], tmp_path / "out" / "checkpoint", 0
+
+    def counted() -> int:
+        return sum(int(path.stem.split("-")[-1]) for path in shards.glob("[!.]*.npz"))
+
+    for stop in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
+        process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        while counted() == kept:
+            time.sleep(0.005)
+            assert process.poll() is None
+        process.send_signal(stop)
+        _, errors = process.communicate(timeout=60)
+        assert process.returncode == {signal.SIGINT: 130, signal.SIGTERM: 143, signal.SIGKILL: -9}[stop]
+        assert "Traceback" not in errors
+        if stop != signal.SIGKILL:
+            assert "kept in 'out/checkpoint', and the same command with --resume goes on from there" in errors
+        assert counted() > kept
+        kept = counted()
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert json.loads((tmp_path / "out" / "run.json").read_text())["shards"]["resumed"] == kept > 0
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["shards"]["resumed"] == kept
     assert not shards.exists()
+    alone = tmp_path / "alone"
+    alone.mkdir()
+    run(*LONG, folder=alone)
     for name in ("detection.ecsv", "tails.ecsv", "roc.ecsv", "departures.ecsv"):
-        assert (tmp_path / "out" / name).read_bytes() == (never_stopped / name).read_bytes()
+        assert (tmp_path / "out" / name).read_bytes() == (alone / "out" / name).read_bytes()
 
 
 def test_nothing_heavy_is_loaded_early() -> None:

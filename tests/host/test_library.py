@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import re
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.table import Table
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.stars import bands, catalogue
+from mauvecl.host.stars.band_names import ALIASES
 from mauvecl.host.stars.source import Source
 
 
@@ -99,7 +103,7 @@ def test_muscles_entries_admit_their_model_and_cite_their_data() -> None:
     assert all(row["citation"].endswith("10.17909/T9DG6F") for row in muscles)
 
 
-@pytest.mark.parametrize("name", bands.ALIASES)
+@pytest.mark.parametrize("name", ALIASES)
 def test_bands_say_where_they_are_from_and_what_they_mean(name: str) -> None:
     meta = catalogue.band_table(f"{name.lower().replace(' ', '_')}.ecsv").meta
     assert all(meta[field] for field in ("origin", "licence", "system", "zero_point"))
@@ -132,3 +136,21 @@ def test_the_response_of_v_is_per_photon() -> None:
     assert np.ptp([magnitude(star, 0) for star in stars]) > 0.01
     # And the package itself weights so.
     assert np.ptp([star.magnitude("V") for star in stars]) < 2e-4
+
+
+def test_every_spectrum_and_band_tells_the_file_it_is_from() -> None:
+    """By package, wheel and digests, as the headers' own words have it."""
+    library = Path(catalogue.__file__).parent / "library"
+    table = Table.read(library / "inputs.ecsv", format="ascii.ecsv")
+    assert all(re.fullmatch("[0-9a-f]{64}", digest) for digest in (*table["sha256"], *table.meta["wheels"].values()))
+    files = {row["entry"]: row for row in table}
+    index = Table.read(library / "index.ecsv", format="ascii.ecsv")
+    for row in index:
+        told = files.pop(f"spectrum {row['name']}")
+        assert told["file"].endswith("/" + row["source_file"])
+        assert told["package"] in row["origin"]
+    for file in (library / "bands").glob("*.ecsv"):
+        meta = Table.read(file, format="ascii.ecsv").meta
+        assert f"package {files.pop('band ' + meta['name'])['package']} " in meta["origin"]
+    assert not files
+    assert "not known" in table.meta["unknown"]

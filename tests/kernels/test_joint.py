@@ -119,15 +119,15 @@ def test_what_is_not_smooth_is_drawn_apart() -> None:
     assert prepare([one_pixel(0.0, 0.0, 0.0)]).joint
 
 
-#: Realisations of 1643 pixels that are all alike: 1e9 draws.
-ROWS = 610_000
+#: Realisations of 1643 pixels that are all alike: 1e8 draws, which see a skewness that is off by 0.003.
+ROWS = 61_000
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("recipe", ["joint", "apart"])
 @pytest.mark.parametrize("name", ["payload", "cold", "counting", "electrons"])
 def test_pearson_of_raw_counts(engine: Engine, name: str, recipe: str) -> None:
-    """Pearson's test of 1e9 raw counts from the production kernel; fails by chance once in 1e6 new seeds."""
+    """Pearson's test of 1e8 raw counts from the production kernel; fails by chance once in 1e6 new seeds."""
     x = PIXELS[name]
     low, size = span(x)
     assert prepare([x], recipe=recipe).joint == (recipe == "joint")

@@ -11,10 +11,11 @@ from mauvecl.device.stares import Stares
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.search.bank import Bank, Level
 from mauvecl.lightcurve.search.conditions import Conditions
-from mauvecl.lightcurve.search.null import DAYS, Counted, in_a_row, in_a_row_rate, per_day, sampled
+from mauvecl.lightcurve.search.null import Counted, in_a_row, in_a_row_rate, sampled
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.stares.curves import Sinusoid
 from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.lightcurve.usual import DAYS, per_day
 
 
 class TestInARow:

@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from marks import long_but
 from scenes import instrument, star
 
 from mauvecl.device.engine import Engine
@@ -19,7 +20,7 @@ from mauvecl.lightcurve.stares.scene import Flares, StareScene
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.lightcurve.stares.sums import SumTable
 from mauvecl.noise.processes import CosmicRays
-from mauvecl.results.requests import Shard
+from mauvecl.results.requests.requests import Shard
 
 SEED = 2**63 + 12345
 #: Around the boundary of the counter's first word.
@@ -65,7 +66,7 @@ def stares(request: pytest.FixtureRequest, engine: Engine) -> Stares:
     return Stares(engine.opened) if request.param == "vectors" else Stares(width=1)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", long_but(CASES, "plain", "all that wobbles"))
 @pytest.mark.parametrize("method", ["pixels", "cumulants"])
 def test_stares_are_the_twins(stares: Stares, name: str, method: Any) -> None:
     components, stare, flare, amplitudes, more = case(name)

@@ -30,7 +30,7 @@ from mauvecl.device.engine import DeviceError, Engine
 from mauvecl.device.stares import Stares
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
-from mauvecl.results.requests import RealiseRequest, Shard
+from mauvecl.results.requests.requests import RealiseRequest, Shard
 from mauvecl.runs.cluster import DaskWorkers
 from mauvecl.runs.pool import Pool, Stopped, together
 from mauvecl.store import bulk

@@ -18,18 +18,18 @@ import pytest
 from answers import N, same, same_snr, small
 from scenes import instrument, star
 
-from mauvecl.answers.detect import detect
-from mauvecl.answers.limits import limiting_magnitude
-from mauvecl.answers.maps import detection_map
-from mauvecl.answers.snr import snr
+from mauvecl.answers.detection.detect import detect
+from mauvecl.answers.detection.maps import detection_map
+from mauvecl.answers.limits.limits import limiting_magnitude
+from mauvecl.answers.signal.snr import snr
 from mauvecl.device.engine import DeviceError, Engine
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise.comparison import Comparison
 from mauvecl.noise.drawing import Drawing
 from mauvecl.noise.processes import Processes, Uniform
-from mauvecl.results.detection import Detection
-from mauvecl.results.requests import DetectRequest, Shard, SnrRequest
+from mauvecl.results.detection.detection import Detection
+from mauvecl.results.requests.requests import DetectRequest, Shard, SnrRequest
 from mauvecl.results.sums import Arrays
 from mauvecl.runs import shards
 from mauvecl.runs.checkpoint import Checkpoint, _digest_of
@@ -378,6 +378,17 @@ def test_a_full_disk_stops_with_a_sentence_and_loses_nothing(
     assert pool.standing.resumed == kept * 4096
     quiet, *flares = small().expectations(small().star[0])
     same(found, engine.detect(quiet, flares, realisations=N, seed=5))
+
+
+def test_what_is_done_meanwhile_begins_once_and_not_before_the_devices() -> None:
+    quiet, *flares = small().expectations(small().star[0])
+    begun: list[int] = []
+    pool = Pool(LocalWorkers(), meanwhile=lambda: begun.append(pool.standing.of))
+    assert begun == []
+    for _ in range(2):
+        pool.detect(quiet, flares, realisations=N, seed=5)
+    (of,) = begun
+    assert of > 0
 
 
 def test_progress_tells_shards_and_what_was_resumed(tmp_path: Path, engine: Engine) -> None:

@@ -99,8 +99,8 @@ def test_a_run_goes_on_where_it_stopped(engine: Engine, tmp_path: Path) -> None:
     with Checkpoint(tmp_path, "inject", study, resume=True) as kept:
         workers = Stopping(99)
         found = Pool(workers, checkpoint=kept).stares(asked)
-        assert 1 <= kept.found < 5
-        assert kept.found + 99 - workers.left == 5, "none was drawn twice"
+        assert 1 <= kept.resumed < 5
+        assert kept.resumed + 99 - workers.left == 5, "none was drawn twice"
     for name, values in Pool(Stopping(99)).stares(asked).items():
         np.testing.assert_array_equal(found[name], values)
 

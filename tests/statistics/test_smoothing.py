@@ -96,7 +96,7 @@ def test_the_sum_is_a_generalised_chi_squared() -> None:
         assert stats.kstwo.sf(np.abs(ours - theirs).max(), values.size) > 1e-6
 
 
-@pytest.mark.parametrize("words", [("stack",), ("stack:0",), ("mean",), ("exposure:2",), ("expectation", "guessed")])
+@pytest.mark.parametrize("words", [("stack",), ("stack:0",), ("mean",), ("exposure:2",), ("template", "guessed")])
 def test_words_that_are_none(words: tuple[str, ...]) -> None:
     with pytest.raises(InputError, match="expected"):
         Comparison.of(*words)

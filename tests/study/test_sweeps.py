@@ -10,14 +10,14 @@ import pytest
 from scenes import instrument, star
 from scipy import stats
 
-from mauvecl.answers.assumptions import what_matters
-from mauvecl.answers.detect import detect
-from mauvecl.answers.exposures import exposure_for
-from mauvecl.answers.gaussian import ONE_SIGMA, beyond, coverage, gaussian_report
-from mauvecl.answers.limits import limiting_magnitude
-from mauvecl.answers.maps import detection_map
-from mauvecl.answers.simulate import simulate
-from mauvecl.answers.snr import snr
+from mauvecl.answers.detection.detect import detect
+from mauvecl.answers.detection.gaussian import ONE_SIGMA, beyond, coverage, gaussian_report
+from mauvecl.answers.detection.maps import detection_map
+from mauvecl.answers.limits.assumptions import what_matters
+from mauvecl.answers.limits.limits import limiting_magnitude
+from mauvecl.answers.signal.exposures import exposure_for
+from mauvecl.answers.signal.simulate import simulate
+from mauvecl.answers.signal.snr import snr
 from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError
 from mauvecl.study.study import PAPER_BUDGETS, Study
@@ -142,6 +142,7 @@ def test_coverage_is_exact(engine: Engine) -> None:
     assert direct.mean() == pytest.approx(ONE_SIGMA, abs=5e-3)
 
 
+@pytest.mark.long
 def test_the_formula_holds_for_the_payload_and_fails_at_the_rail(engine: Engine) -> None:
     """No false alarm or S/N is off for the nominal payload; a bias near zero clips, and everything is."""
     asked = study([MAGNITUDES, EXPOSURES])
@@ -177,6 +178,7 @@ def test_pixels_beyond_five_sigma(name: str, temperature: float, sigmas: float) 
         assert (found > stats.norm.sf(sigmas)) == (side > 0)
 
 
+@pytest.mark.long
 def test_every_column_is_described_and_every_answer_knows_its_study(engine: Engine) -> None:
     """Tables of every kind of answer: a description for each column, and the study that is read back from each."""
     asked = study([{"quantity": "sky", "values": [21.0, 22.0]}])

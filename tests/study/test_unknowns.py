@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mauvecl.answers.limit_search import LimitSearch, MarginalLimitSearch
-from mauvecl.answers.limits import limiting_magnitude
-from mauvecl.answers.maps import detection_map
+from mauvecl.answers.detection.maps import detection_map
+from mauvecl.answers.limits.limits import limiting_magnitude
+from mauvecl.answers.limits.search import LimitSearch, MarginalLimitSearch
 from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError
 from mauvecl.statistics.intervals import Interval
@@ -62,6 +62,7 @@ def test_nothing_unknown_changes_nothing(engine: Engine) -> None:
     assert abs(one.value.value - two.value.value) < 0.03
 
 
+@pytest.mark.long
 def test_a_limit_over_the_unknown_has_the_power_on_average(engine: Engine) -> None:
     """The closed form's mean is the power; harder instruments have brighter limits; one unknown explains most."""
     asked = study({"draws": 24})

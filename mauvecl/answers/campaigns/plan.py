@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.answers.answer import Answer
+from mauvecl.answers.campaigns.conditions import Met
 from mauvecl.answers.campaigns.planned import (
     NOTHING,
     CompletenessOf,
@@ -20,10 +21,13 @@ from mauvecl.answers.campaigns.planned import (
     star_of,
 )
 from mauvecl.answers.campaigns.visible import VisibleAnswer, visible
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.search.completeness import DAY_S
+from mauvecl.host.orbit.conditions import PARTICLES_SOURCE, THERMAL_SOURCE
+from mauvecl.lightcurve.search.null import DAY_S
 from mauvecl.lightcurve.search.yields import Yield, recovered_per_day
 from mauvecl.study.labels import described, stacked, told
+from mauvecl.study.sections import Rays
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -66,11 +70,11 @@ class PlanAnswer(Answer):
         table["E50"] = [one.energy_at(0.5) for one in rows] * u.erg
         table["E90"] = [one.energy_at(0.9) for one in rows] * u.erg
         nothing = Yield(float("nan"), -1, -1, float("nan"))
-        found = [one.found or nothing for one in rows]
-        table["expected"] = [one.expected for one in found]
-        table["low"] = np.ma.MaskedArray([one.low for one in found], [one.low < 0 for one in found])
-        table["high"] = np.ma.MaskedArray([one.high for one in found], [one.high < 0 for one in found])
-        table["at_least_one"] = [one.at_least_one for one in found]
+        recovered = [one.recovered or nothing for one in rows]
+        table["expected"] = [one.expected for one in recovered]
+        table["low"] = np.ma.MaskedArray([one.low for one in recovered], [one.low < 0 for one in recovered])
+        table["high"] = np.ma.MaskedArray([one.high for one in recovered], [one.high < 0 for one in recovered])
+        table["at_least_one"] = [one.at_least_one for one in recovered]
         table["false_alarms"] = self.false_alarms
         table["best_months"] = [" ".join(one.best_months) for one in rows]
         for name, text in DESCRIPTIONS.items():
@@ -94,6 +98,7 @@ class PlanAnswer(Answer):
         table["target"] = [one.target.name for one in rows]
         table["ra"] = [one.target.ra_deg for one in rows] * u.deg
         table["dec"] = [one.target.dec_deg for one in rows] * u.deg
+        table["position"] = [one.target.source for one in rows]
         table["spectral_type"] = [one.target.spectral_type or "" for one in rows]
         table["spectrum"] = [one.star.library or "" for one in rows]
         table["V"] = [one.star.magnitude or 0.0 for one in rows] * u.mag
@@ -101,6 +106,8 @@ class PlanAnswer(Answer):
         table["sky"] = [float("nan") if one.sky is None else one.sky for one in rows] * u.mag / u.arcsec**2
         table["signal_per_frame"] = [one.signal_per_frame for one in rows]
         table["energy_per_second"] = [one.scale.erg_per_s for one in rows] * u.erg / u.s
+        table["temperature"] = [one.quiet.conditions["temperature_c"] for one in rows] * u.deg_C
+        table["hits"] = [one.hits_per_cm2_s for one in rows] / u.cm**2 / u.s
         table["window"] = [one.window_s / 60 for one in rows] * u.min
         table["saturated"] = [int(one.quiet.saturated.sum()) for one in rows]
         table["rates"] = [one.no_rates if one.rates is None else one.rates.source for one in self.planned]
@@ -169,10 +176,16 @@ class PlanAnswer(Answer):
                 "assumption; energies are those of all its light, spread alike in all directions",
             ),
             ("noise of a stare", "white", "beside what the study says is unknown of a stare; see completeness"),
+            *self._along_orbit,
             (
                 "false alarms",
                 f"{self.study.search.false_alarms:g} per {self.study.search.per} of exposure",
-                "sets the threshold; of noise, not of cosmic rays that look like flares",
+                "sets the threshold; of noise, not of hits by particles that look like flares",
+            ),
+            (
+                "stars known by name",
+                "V, spectral type",
+                "V of the Hipparcos catalogue (variable stars to 0.2 mag), rounded types (to some two subtypes)",
             ),
             (
                 "spectra",
@@ -181,8 +194,21 @@ class PlanAnswer(Answer):
             ),
         ]
         rows += [(f"flare rates of {one.name}", one.rates.source, _measured(one)) for one in self.planned if one.rates]
+        rows += [("where the satellite will be", "", text) for text in orbit.messages(self.seen.moments)]
         rows += [(f"completeness of {one.name}", "", one.completeness.how) for one in self.planned if one.completeness]
         return Table(rows=rows, names=("assumption", "value", "source"))
+
+    @property
+    def _along_orbit(self) -> list[tuple[str, str, str]]:
+        if not self.study.plan.along_orbit:
+            return [("temperature and particles", "the study's", "the same for all targets")]
+        rays = Rays() if self.study.processes.cosmic_rays is None else self.study.processes.cosmic_rays
+        low, high = rays.electrons
+        return [
+            ("temperature", "along the orbit", THERMAL_SOURCE),
+            ("hits by particles", "along the orbit", PARTICLES_SOURCE),
+            ("charge of a hit", f"{low:g} to {high:g} electrons in one pixel", "assumption; adds to the noise"),
+        ]
 
     @property
     def tables(self) -> dict[str, Table]:
@@ -214,24 +240,24 @@ class PlanAnswer(Answer):
     @property
     def messages(self) -> list[str]:
         """What saturates, which targets have no answer and why, what is extrapolated, what is said of visibility."""
-        found = [text for text in told(self.inputs) if text.startswith("SATURATED")]
+        lines = [text for text in told(self.inputs) if text.startswith("SATURATED")]
         typical = [one.name for one in self.planned if one.rates is not None and "typical" in one.rates.source]
         if typical:
-            found.append(
-                f"Flare rates of {', '.join(typical)} are those typical of their types at 1 Gyr: mass_msun and "
+            lines.append(
+                f"Flare rates of {', '.join(typical)} are those typical of their types at 1000 Myr: mass_msun and "
                 "age_myr, or rates of their own, say more."
             )
         for one in self.planned:
             if one.no_rates:
-                found.append(f"{one.no_rates}; its expected flares are not given.")
+                lines.append(f"{one.no_rates[0].upper()}{one.no_rates[1:]}; its expected flares are not given.")
             if one.rates is not None and one.completeness is not None and one.extrapolated:
                 low, high = one.rates.measured_erg
-                found.append(
+                lines.append(
                     f"E50 of {one.name}, {one.energy_at(0.5):.2g} erg, lies outside the {low:.2g} to {high:.2g} erg "
                     "for which its flare rates are published: they are extrapolated."
                 )
-        found += self.seen.messages
-        return list(dict.fromkeys(found))
+        lines += self.seen.messages
+        return list(dict.fromkeys(lines))
 
     @property
     def pictures(self) -> dict[str, tuple[Any, ...]]:
@@ -253,10 +279,13 @@ DESCRIPTIONS = {
     "best_months": "those with most hours",
 }
 STAR_COLUMNS = {
+    "position": "who says so",
     "spectrum": "embedded spectrum that stands for the star",
     "sky": "zodiacal light behind it, median over the days on which it is seen",
     "signal_per_frame": "S/N of one frame with a flare of amplitude 1",
     "energy_per_second": "bolometric energy of a second of equivalent duration",
+    "temperature": "of the detector, mean while it is seen",
+    "hits": "of cosmic rays and trapped protons, mean while it is seen",
     "window": "median stretch in which it is seen",
     "saturated": "pixels left out since they saturate",
     "recovered_per_day": "flares recovered in a day of exposure",
@@ -270,6 +299,7 @@ def _measured(one: Planned) -> str:
     return f"published for {low:.2g} to {high:.2g} erg, bolometric; scatter {one.rates.scatter_dex:g} dex (assumption)"
 
 
+@public
 def plan(
     study: Study,
     completeness: CompletenessOf | None = None,
@@ -297,8 +327,8 @@ def plan(
     --------
     >>> from mauvecl import Study, plan
     >>> study = Study().with_settings(["plan.targets=[{name = 'eps Eri'}]", "orbit.days=31", "plan.hours=100"])
-    >>> found = plan(study.with_settings(["plan.completeness='closed form'"]))
-    >>> found.table["hours"].value.tolist()
+    >>> answer = plan(study.with_settings(["plan.completeness='closed form'"]))
+    >>> answer.table["hours"].value.tolist()
     [100.0]
     """
     if not study.plan.targets:
@@ -309,25 +339,26 @@ def plan(
     seen = visible(study)
     names, hours = seen.visibility.by_month()
     completeness = completeness or _completeness(study)
-    found: list[Planned] = []
+    met = Met.along(seen.visibility.track) if study.plan.along_orbit else None
+    planned: list[Planned] = []
     for k, (text, star, target) in enumerate(zip(study.plan.targets, stars, seen.targets, strict=True)):
         if progress is not None:
             progress(k, len(stars))
-        looked = looked_of(study, text, star, target, seen, k)
+        looked = looked_of(study, text, star, target, seen, k, met)
         exposed = float(seen.visibility.hours[k])
         observed = exposed if study.plan.hours is None else min(exposed, study.plan.hours)
         order = np.argsort(-hours[:, k], kind="stable")[: study.plan.best_months]
         best = tuple(names[i] for i in sorted(order) if hours[i, k] > 0)
-        share = None
+        its = None
         if looked.window_s > 0:
-            share = completeness(study, looked) if looked.signal_per_frame > 0 else NOTHING
+            its = completeness(study, looked) if looked.signal_per_frame > 0 else NOTHING
         rates, why = rates_of(study, text, looked)
-        result = None
+        recovered = None
         if rates is not None:
             days = observed * 3600 / DAY_S
-            result = Yield.about(0.0, 0.0) if share is None else Yield.of(rates, share, days)
-        found.append(Planned(looked, exposed, observed, share, rates, result, best, why))
-    return PlanAnswer(study, seen, tuple(found))
+            recovered = Yield.about(0.0, 0.0) if its is None else Yield.of(rates, its, days)
+        planned.append(Planned(looked, exposed, observed, its, rates, recovered, best, why))
+    return PlanAnswer(study, seen, tuple(planned))
 
 
 def _completeness(study: Study) -> CompletenessOf:

@@ -83,7 +83,7 @@ def selftest(
     if as_json:
         print(json.dumps(selftest.last(engine.device) or [asdict(check) for check in checks], indent=2))
     else:
-        cells = [("PASS" if check.passed else "FAIL", check.name, check.found) for check in checks]
+        cells = [("PASS" if check.passed else "FAIL", check.name, check.result) for check in checks]
         show_table(f"Self-test of {engine.device_name}, driver {engine.driver}", ("", "check", "found"), cells)
         outcome = f"{failed} of {len(checks)} checks FAILED" if failed else f"All {len(checks)} checks passed"
         show([f"{outcome} in {seconds:.0f} s. Promise: {engine.device.promise}."])

@@ -12,8 +12,8 @@ from mauvecl.cli.verb import takes_study
 if TYPE_CHECKING:
     from astropy.table import QTable
 
-    from mauvecl.answers.detect import DetectAnswer
-    from mauvecl.answers.gaussian import GaussianReport
+    from mauvecl.answers.detection.detect import DetectAnswer
+    from mauvecl.answers.detection.gaussian import GaussianReport
     from mauvecl.cli.session import Session
     from mauvecl.study.study import Study
 
@@ -30,7 +30,7 @@ def detect(
 
     Example: mauvecl detect --star K5V --magnitude 6 --amplitude 0.05 --amplitude 0.1 --exposure 30
     """
-    from mauvecl.answers.detect import detect as compute
+    from mauvecl.answers.detection.detect import detect as compute
 
     with session.pool() as engine:
         answer = compute(study, engine)
@@ -43,7 +43,7 @@ def _show_detections(answer: DetectAnswer) -> None:
     study = answer.study
     run = study.run
     exposures = " and ".join(
-        dict.fromkeys(f"{x.exposure_s:g} s ({x.n_frames} frames)" for x in (s.found.quiet for s in answer.stars))
+        dict.fromkeys(f"{x.exposure_s:g} s ({x.n_frames} frames)" for x in (s.detection.quiet for s in answer.stars))
     )
     swept = [axis.quantity for axis in study.sweep.axes if axis.quantity != "amplitude"]
     columns = ("flare", "statistic", "expected", "simulated", "reduced", "threshold", "detected", "", "closed form")
@@ -105,7 +105,7 @@ def gaussian(
 
     Example: mauvecl gaussian --star G2V --sweep magnitude=6,10 --sweep exposure=5,50
     """
-    from mauvecl.answers.gaussian import gaussian_report
+    from mauvecl.answers.detection.gaussian import gaussian_report
 
     with session.pool() as engine:
         answer = gaussian_report(study, engine)

@@ -8,7 +8,7 @@ from mauvecl.cli.flags import DRAWS, FLARE, SHAPES, SIZE, STARE, SWEEP, flag, gr
 from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
-    from mauvecl.answers.inject import InjectAnswer
+    from mauvecl.answers.stares.inject import InjectAnswer
     from mauvecl.cli.session import Session
     from mauvecl.study.study import Study
 
@@ -66,7 +66,7 @@ def inject(study: Study, session: Session) -> None:
 
     mauvecl inject --star M3V --magnitude 9 --orbit-gap 2100 --with-unknowns --sweep flare_temperature=7000,10000,15000
     """
-    from mauvecl.answers.inject import inject as compute
+    from mauvecl.answers.stares.inject import inject as compute
 
     with session.pool(unit="injections") as engine:
         answer = compute(study, engine, progress=session.meter)

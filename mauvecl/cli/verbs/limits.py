@@ -11,8 +11,8 @@ from mauvecl.cli.flags import DETECTION, DRAWS, FLARE, LIMIT, MAP, NUISANCES, SW
 from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
-    from mauvecl.answers.limits import Limit, LimitResult
-    from mauvecl.answers.maps import MapResult
+    from mauvecl.answers.detection.maps import MapResult
+    from mauvecl.answers.limits.limits import Limit, LimitResult
     from mauvecl.cli.session import Session
     from mauvecl.study.study import Study
 
@@ -33,12 +33,12 @@ def limit(
 
     Example: mauvecl limit --star G2V --amplitude 0.24 --exposure 50
     """
-    from mauvecl.answers.limits import limiting_magnitude
+    from mauvecl.answers.limits.limits import limiting_magnitude
 
     with session.pool(unit="limits") as engine:
         answer = limiting_magnitude(study, engine, progress=session.meter)
     if assumptions:
-        from mauvecl.answers.assumptions import what_matters
+        from mauvecl.answers.limits.assumptions import what_matters
 
         answer.assumptions = what_matters(study)
     session.answer(answer, lambda: _show_limits(answer))
@@ -106,7 +106,7 @@ def detection_map(
 
     Example: mauvecl map --star G2V --x magnitude:4:10:16 --y amplitude:0.01:1:16:log
     """
-    from mauvecl.answers.maps import detection_map as compute
+    from mauvecl.answers.detection.maps import detection_map as compute
 
     with session.pool(unit="cells") as engine:
         answer = compute(study, engine, progress=session.meter)

@@ -12,9 +12,9 @@ from mauvecl.cli.flags import AT, COUNTED, DRAWS, FLARE, SIGNAL, SWEEP
 from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
-    from mauvecl.answers.exposures import ExposureResult
-    from mauvecl.answers.simulate import SimulateAnswer
-    from mauvecl.answers.snr import SnrAnswer
+    from mauvecl.answers.signal.exposures import ExposureResult
+    from mauvecl.answers.signal.simulate import SimulateAnswer
+    from mauvecl.answers.signal.snr import SnrAnswer
     from mauvecl.cli.session import Session
     from mauvecl.study.study import Study
 
@@ -32,7 +32,7 @@ def simulate(
 
     Example: mauvecl simulate --star G2V --magnitude 7.4 --exposure 50 --amplitude 0.24
     """
-    from mauvecl.answers.simulate import simulate as compute
+    from mauvecl.answers.signal.simulate import simulate as compute
 
     answer = compute(study, realisation=realisation, flaring=bool(given["amplitude"]))
     session.answer(answer, lambda: _show_observations(answer))
@@ -77,7 +77,7 @@ def snr(
 
     mauvecl snr --star G2V --sweep magnitude=4,6,8,10 --sweep exposure=5,50,600
     """
-    from mauvecl.answers.snr import snr as compute
+    from mauvecl.answers.signal.snr import snr as compute
 
     with session.pool() as engine:
         answer = compute(study, engine)
@@ -86,7 +86,7 @@ def snr(
 
 def _show_snr(answer: SnrAnswer) -> None:
     """S/N and noise at some wavelengths; all of them are in the files."""
-    from mauvecl.answers.exposures import place_of
+    from mauvecl.answers.signal.exposures import place_of
     from mauvecl.cli.console import show_table
 
     cells, budgets = [], []
@@ -126,7 +126,7 @@ def exposure(
 
     Example: mauvecl exposure --snr 10 --at 300 --star G2V --magnitude 7.4
     """
-    from mauvecl.answers.exposures import exposure_for
+    from mauvecl.answers.signal.exposures import exposure_for
 
     answer = exposure_for(study)
     session.answer(answer, lambda: _show_exposures(answer))

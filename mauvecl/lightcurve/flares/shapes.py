@@ -15,8 +15,10 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
+from mauvecl.lightcurve.usual import check_shape
 
 Float = NDArray[np.float64]
 
@@ -277,6 +279,7 @@ class Fiducial(Shape):
         return self.BOX + self.FOLD * float(np.log(2))
 
 
+@public
 @dataclass(frozen=True, eq=False)
 class TableShape(Shape):
     """A shape of one's own: linear between its points, zero outside them, scaled to a peak of one.
@@ -360,9 +363,8 @@ def shape_of(given: Shape | str) -> Shape:
     """
     if isinstance(given, Shape):
         return given
-    if given not in SHAPES:
-        raise InputError(f"flare shape {shortened(str(given))} is unknown, expected one of {', '.join(SHAPES)}")
-    return SHAPES[given]
+    check_shape(str(given))
+    return SHAPES[str(given)]
 
 
 def half_width_of_altaipony(duration: float, shape: Shape | str) -> float:

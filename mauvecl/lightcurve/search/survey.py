@@ -20,7 +20,8 @@ from mauvecl.lightcurve.stares.sums import method_for
 if TYPE_CHECKING:
     from mauvecl.lightcurve.search.bank import Bank
     from mauvecl.lightcurve.stares.components import Components
-    from mauvecl.lightcurve.stares.stare import Changing, Stare
+    from mauvecl.lightcurve.stares.stare import Stare
+    from mauvecl.lightcurve.usual import Changing
     from mauvecl.noise.processes import CosmicRays
 
 Float = NDArray[np.float64]

@@ -14,7 +14,7 @@ from mauvecl.lightcurve.stares.components import Components
 from mauvecl.lightcurve.stares.scene import Flares
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.noise.processes import CosmicRays
-from mauvecl.results.requests import Asked
+from mauvecl.results.requests.requests import Asked
 
 Arrays = dict[str, NDArray[Any]]
 Method = Literal["pixels", "cumulants"]

@@ -8,7 +8,7 @@ import numpy as np
 
 from mauvecl.web.closed import percent, short
 from mauvecl.web.figures import Canvas
-from mauvecl.web.tabs.tab import Drawn, Found, Picture, Tab
+from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
     from mauvecl.web.closed import Closed
 
-#: Half-widths of the flares, shortest first: as many as there are lines.
-COLOURS = ("star", "sky", "flare")
+#: Half-widths of the flares: as many as there are lines.
+LENGTHS = ("shortest", "middle", "longest")
 
 
 class Shares(Picture):
@@ -27,9 +27,14 @@ class Shares(Picture):
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         canvas = Canvas(
-            ink, "peak amplitude of the flare (%)", "found", logs | {"x"}, x_range=(0.01, 100), y_range=(-0.03, 1.05)
+            ink,
+            "peak amplitude of the flare (%)",
+            "share of flares found",
+            logs | {"x"},
+            x_range=(0.01, 100),
+            y_range=(-0.03, 1.05),
         )
-        for k, (called, colour) in enumerate(zip(("shortest", "middle", "longest"), COLOURS, strict=True)):
+        for k, (called, colour) in enumerate(zip(LENGTHS, ink.lengths, strict=True)):
             canvas.band(f"band {k}", f"{called} flares", colour)
             canvas.legend.pop()
             told = canvas.line(f"line {k}", f"{called} flares", colour, line_width=2)
@@ -37,18 +42,18 @@ class Shares(Picture):
         canvas.rule("own", "amplitude of your question", "x", "own")
         return canvas
 
-    def drawn(self, closed: Closed, found: Found) -> Drawn:
+    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
         sources: dict[str, Any] = {}
-        for k in range(len(COLOURS)):
+        for k in range(len(LENGTHS)):
             sources |= {f"band {k}": {"x": [], "low": [], "high": []}, f"line {k}": {"x": [], "y": []}}
         own = {"own": {"location": closed.question.amplitude_percent}}
-        if "completeness" not in found:
+        if "completeness" not in answers:
             text = (
                 "Nothing is injected yet: Inject flares puts flares of several lengths and sizes into a stare of one "
                 "orbit, and searches it at one false alarm a month."
             )
             return Drawn(text, sources, own)
-        table, parts = found["completeness"].completeness, []
+        table, parts = answers["completeness"].completeness, []
         for k, width in enumerate(np.unique(np.asarray(table["half_width"].value))):
             rows = table[np.asarray(table["half_width"].value) == width]
             x = 100 * np.asarray(rows["amplitude"], float)
@@ -74,13 +79,13 @@ class Completeness(Tab):
     simulations = {"completeness": "Inject flares"}  # noqa: RUF012
     files = {"completeness": "completeness", "limits": "completeness"}  # noqa: RUF012
 
-    def table(self, name: str, closed: Closed, found: Found) -> Table:
-        return found["completeness"].tables[name]
+    def table(self, name: str, closed: Closed, answers: Answers) -> Table:
+        return answers["completeness"].tables[name]
 
-    def rows(self, closed: Closed, found: Found) -> list[list[str]]:
-        if "completeness" not in found:
+    def rows(self, closed: Closed, answers: Answers) -> list[list[str]]:
+        if "completeness" not in answers:
             return []
-        table = found["completeness"].table
+        table = answers["completeness"].table
         rows = [["half-width of the flare", "half are found at", "90 % are found at"]]
         for row in table:
             width = float(getattr(row["half_width"], "value", row["half_width"]))
@@ -88,6 +93,6 @@ class Completeness(Tab):
             rows.append([called, *(f"{100 * float(row[name]):.3g} %" for name in ("e50", "e90"))])
         return rows
 
-    def study(self, name: str, closed: Closed, found: Found) -> Study:
-        study: Study = found["completeness"].study
+    def study(self, name: str, closed: Closed, answers: Answers) -> Study:
+        study: Study = answers["completeness"].study
         return study

@@ -8,7 +8,7 @@ import numpy as np
 
 from mauvecl.web.closed import short
 from mauvecl.web.figures import Canvas
-from mauvecl.web.tabs.tab import Drawn, Found, Picture, Tab
+from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -22,24 +22,26 @@ class Hours(Picture):
     name, title = "hours", "Hours in which the target is seen, day by day"
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
-        canvas = Canvas(ink, "days from the start", "hours in the day", logs, x_range=(0, 365), y_range=(-0.5, 24.5))
+        canvas = Canvas(ink, "", "hours in the day", logs, x_axis_type="datetime", y_range=(-0.5, 24.5))
         canvas.band("area", "hours seen", "star", alpha=0.3)
+        canvas.legend.pop()
         told = canvas.line("hours", "hours seen, day by day", "star", line_width=1.2)
-        canvas.tooltips(told, ("day", "x"), ("hours", "y"))
+        canvas.tooltips(told, ("hours", "y"))
         return canvas
 
-    def drawn(self, closed: Closed, found: Found) -> Drawn:
+    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
         orbit = closed.study.orbit
         sources: dict[str, Any] = {"area": {"x": [], "low": [], "high": []}, "hours": {"x": [], "y": []}}
-        if "visible" not in found:
+        if "visible" not in answers:
             named = ", ".join(orbit.targets)
             if named:
                 return Drawn(f"When {named} is seen is not looked up yet: press Find when.", sources)
-            text = "No target is named yet. Name one under Advanced, Visibility, such as eps Eri, and press Find when."
+            text = "No target is named yet. Name one under Advanced, such as eps Eri, and press Find when."
             return Drawn(text, sources)
-        table = found["seen"]["by_day"]
+        table = answers["seen"]["by_day"]
         hours = np.asarray(table["hours"].to_value("h"))
-        day = np.arange(hours.size)
+        # Milliseconds, as browsers count time.
+        day = (np.datetime64(orbit.start, "ms") + np.arange(hours.size) * np.timedelta64(1, "D")).astype(float)
         sources = {
             "area": {"x": day, "low": np.zeros(hours.size), "high": hours},
             "hours": {"x": day, "y": hours},
@@ -63,12 +65,12 @@ class Visibility(Tab):
     simulations = {"visible": "Find when"}  # noqa: RUF012
     files = {"visible": "visible", "months": "visible", "days": "visible"}  # noqa: RUF012
 
-    def table(self, name: str, closed: Closed, found: Found) -> Table:
-        return found["seen"][{"visible": "table", "months": "months", "days": "by_day"}[name]]
+    def table(self, name: str, closed: Closed, answers: Answers) -> Table:
+        return answers["seen"][{"visible": "table", "months": "months", "days": "by_day"}[name]]
 
-    def rows(self, closed: Closed, found: Found) -> list[list[str]]:
-        if "visible" not in found:
+    def rows(self, closed: Closed, answers: Answers) -> list[list[str]]:
+        if "visible" not in answers:
             return []
-        table = found["seen"]["months"]
+        table = answers["seen"]["months"]
         (target,) = (name for name in table.colnames if name != "month")
         return [["month", *map(str, table["month"])], ["hours", *(f"{h:.0f}" for h in table[target].to_value("h"))]]
