@@ -228,14 +228,14 @@ class Injecting:
             for column, place in zip(critical[part].T, self.places, strict=True):
                 if len(place.filters):
                     column[:] = self._critical(place, self.values(place, drawn))
-        found: dict[str, NDArray[Any]] = {"critical": critical}
+        kept: dict[str, NDArray[Any]] = {"critical": critical}
         if self.refit is not None:
             # One stare at a time: a fit knows nothing of what is fitted beside it.
             these = range(min(len(values), max(0, self.start + self.refit.count - first)))
             each = [self._fitted(self.drawn(values[k : k + 1], glow[k : k + 1]), self.refit) for k in these]
             none = np.zeros((0, *self.refit.amplitudes.shape), np.float32)
-            found |= {name: np.array([one[name] for one in each]) if each else none for name in KEPT}
-        return found
+            kept |= {name: np.array([one[name] for one in each]) if each else none for name in KEPT}
+        return kept
 
     def drawn(self, values: Single, glow: Single) -> Drawn:
         """A few stares."""
@@ -358,9 +358,9 @@ def _multiple(values: Single, step: float) -> Single:
 def _combined(rows: Float, values: Float) -> Single:
     """Sums over the first axis of values (n_sum, n_draw, n_filter), one after the other, (n_row, n_draw, n_filter)."""
     small = values.astype(np.float32)
-    found = np.empty((len(rows), *values.shape[1:]), np.float32)
-    for row, out in zip(rows.astype(np.float32), found, strict=True):
+    combined = np.empty((len(rows), *values.shape[1:]), np.float32)
+    for row, out in zip(rows.astype(np.float32), combined, strict=True):
         np.multiply(row[0], small[0], out=out)
         for weight, value in zip(row[1:], small[1:], strict=True):
             out += weight * value
-    return found
+    return combined
