@@ -242,11 +242,11 @@ class Injecting:
         n_sum = values.shape[2]
         noise = np.moveaxis(values, 2, 0) - self.known.T[:, None]
         own, light = np.ascontiguousarray(np.moveaxis(glow[:, :, :n_sum], 2, 0)), glow[:, :, n_sum]
-        return Drawn(_multiple(noise, NOISE_STEP), own, light if light.any() else None)
+        return Drawn(_multiple(noise, NOISE_STEP).astype(np.float64), own, light if light.any() else None)
 
     def values(self, place: Place, drawn: Drawn) -> tuple[Single, Single, Single]:
         """a, b and c of the module's formula, shapes (n_temperature, n_draw or 1, n_filter)."""
-        filters, here = place.filters.T.astype(np.float64), place.frames
+        filters, here = place.weights, place.frames
         mean = np.atleast_2d(place.mean if drawn.light is None else place.mean * (1 + drawn.light[:, here]))
         start, width = self.start_s[here], place.half_width_s
         shining = (start > place.peak_s - width - self.frame_s) & (start < place.peak_s + GLOW * width)
@@ -254,7 +254,7 @@ class Injecting:
         lit = slice(int(ends[0]), int(ends[1]) + 1)
         own = drawn.own[:, :, here][:, :, lit] * np.sqrt(np.maximum(place.mean[lit], 0))
         return (
-            _combined(self.directions, drawn.noise[:, :, here].astype(np.float64) @ filters),
+            _combined(self.directions, drawn.noise[:, :, here] @ filters),
             _combined((self.directions @ self.response)[:, None], (_multiple(mean, MEAN_STEP) @ filters)[None]),
             _combined(self.directions @ self.photons, _multiple(own, NOISE_STEP) @ filters[lit]),
         )
@@ -336,7 +336,7 @@ class Drawn:
 
     Attributes
     ----------
-    noise : ndarray of float32, shape (n_sum, n_draw, n_frame)
+    noise : ndarray, shape (n_sum, n_draw, n_frame)
         The sums without a flare, less what is known of them.
     own : ndarray of float32, shape (n_sum, n_draw, n_frame)
         Standard normal, for the flare's photons.
@@ -344,7 +344,7 @@ class Drawn:
         Relative change of all light, where there is any.
     """
 
-    noise: Single
+    noise: Float
     own: Single
     light: Single | None
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -57,6 +58,11 @@ class Place:
     def frames(self) -> slice:
         """Of the stare, to which templates reach."""
         return slice(self.first, self.first + self.mean.size)
+
+    @cached_property
+    def weights(self) -> Float:
+        """The filters as sums over frames take them, shape (n_frame, n_filter)."""
+        return np.ascontiguousarray(self.filters.T, np.float64)
 
     def within(self, first: int) -> Place:
         """The same in the part of the stare that begins with a frame."""
