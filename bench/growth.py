@@ -12,10 +12,10 @@ import argparse
 import json
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 from astropy.table import Table
+from tables import write
 
 #: What grows, and through which values.
 AXES = {
@@ -79,11 +79,8 @@ def main() -> None:
         ("above_start", "MiB", ".0f", "of it, beyond what the process had after its first 64 realisations"),
     ):
         table[name].unit, table[name].info.format, table[name].info.description = unit, form, text
-    table.meta["date_utc"] = time.strftime("%Y-%m-%d", time.gmtime())
-    table.meta["plain"] = "20 000 realisations of 1 600 pixels, a stack of 10 frames, one scenario, chi2"
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    table.write(options.output, format="ascii.ecsv", overwrite=True)
-    table.pprint(max_lines=-1, max_width=-1)
+    plain = "20 000 realisations of 1 600 pixels, a stack of 10 frames, one scenario, chi2"
+    write(table, options.output, plain=plain)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from astropy.table import Table
 
-from mauvecl.answers.inject import inject
+from mauvecl.answers.stares.inject import inject
 from mauvecl.device.stares import Stares
 from mauvecl.study.study import Study
 
@@ -61,8 +61,8 @@ def main() -> None:
         found = inject(study, stares)
         wall, used = time.perf_counter() - wall, time.process_time() - used
         (star,) = found.stars
-        cells = star.found.completeness.size
-        table.add_row((name, cells, star.found.count, wall, used, cells * star.found.count / used))
+        cells = star.injected.completeness.size
+        table.add_row((name, cells, star.injected.count, wall, used, cells * star.injected.count / used))
         print(*table[-1], flush=True)
     for name, unit, form, text in (
         ("injections", "", "d", "of each cell"),

@@ -8,13 +8,13 @@ Writes bench/results/paper_limits.ecsv (each statistic, one frame and 50 s) and 
 from __future__ import annotations
 
 import argparse
-import time
 from pathlib import Path
 
 from astropy.table import vstack
+from tables import write
 
 from mauvecl import Study, limiting_magnitude
-from mauvecl.answers.assumptions import what_matters
+from mauvecl.answers.limits.assumptions import what_matters
 from mauvecl.statistics.registry import STATISTICS
 
 KEPT = ("amplitude", "exposure", "statistic", "magnitude", "low", "high", "closed_form", "check")
@@ -46,17 +46,15 @@ def main() -> None:
             table.meta.clear()
             parts.append(table[list(KEPT)])
             parts[-1].pprint(max_width=-1)
-    found = vstack(parts)
-    found["exposure"].unit = "s"
+    limits = vstack(parts)
+    limits["exposure"].unit = "s"
     for name in ("magnitude", "low", "high", "closed_form", "check"):
-        found[name].info.format = ".3f"
+        limits[name].info.format = ".3f"
     moved = what_matters(study(50.0, 0.24, "chi2", "matched"))
     moved.meta.clear()
-    moved.pprint(max_width=-1, max_lines=-1)
-    for table, name in ((found, "paper_limits"), (moved["statistic", "assumption", "low_end", "high_end", "magnitude",
-                        "at_low_end", "at_high_end", "span"], "paper_assumptions")):  # fmt: skip
-        table.meta["date_utc"] = time.strftime("%Y-%m-%d", time.gmtime())
-        table.write(folder / f"{name}.ecsv", format="ascii.ecsv", overwrite=True)
+    write(limits, folder / "paper_limits.ecsv")
+    moves = ("statistic", "assumption", "low_end", "high_end", "magnitude", "at_low_end", "at_high_end", "span")
+    write(moved[moves], folder / "paper_assumptions.ecsv")
 
 
 if __name__ == "__main__":

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
@@ -19,6 +18,7 @@ import numpy as np
 from astropy.table import Table
 from numpy.typing import NDArray
 from scipy import special, stats
+from tables import write
 
 from mauvecl import Engine
 from mauvecl.device.selftest import pearson, toy
@@ -86,11 +86,7 @@ def main() -> int:
     for name in names[4:]:
         table[name].info.format = "+.2f"
         table[name].info.description = "moment less the exact one, standard errors"
-    table.meta = {"device": engine.device_name, "driver": engine.driver, "seed": SEED}
-    table.meta["date_utc"] = time.strftime("%Y-%m-%d", time.gmtime())
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    table.write(options.output, format="ascii.ecsv", overwrite=True)
-    table.pprint(max_width=-1)
+    write(table, options.output, device=engine.device_name, driver=engine.driver, seed=SEED)
     return 0 if table["p"].min() > 1e-6 else 1
 
 

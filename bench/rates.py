@@ -10,9 +10,6 @@ and by processor time, which other programs disturb less. Peers: pip install '.[
 from __future__ import annotations
 
 import argparse
-import importlib.metadata
-import os
-import platform
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,6 +19,7 @@ from typing import Any
 import numpy as np
 from astropy.table import Table
 from peers import children
+from tables import processor, versions, write
 
 from mauvecl import Engine, Expectation, Instrument, Sky, Source, __version__, expect
 
@@ -122,13 +120,6 @@ def engine_lines(engine: Engine) -> list[Line]:
     ]  # fmt: skip
 
 
-def processor() -> str:
-    """The processor's name."""
-    info = Path("/proc/cpuinfo")
-    names = [line.split(":")[1].strip() for line in info.read_text().splitlines() if line.startswith("model name")]
-    return f"{names[0] if names else platform.processor()}, {os.cpu_count()} cores"
-
-
 def main() -> None:
     """Print the table and write it."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -170,23 +161,8 @@ def main() -> None:
             name
         ].info.description = f"pixel-realisations per second, counted per scenario, by the {which} of {REPEATS} times"
     table["slower"].info.description = "how many times slower than the engine's chi2 of one scenario"
-    table.meta = {
-        "device": engine.device_name,
-        "driver": engine.driver,
-        "processor": processor(),
-        "pixels": pixels,
-        "versions": {
-            "mauvecl": __version__,
-            "python": platform.python_version(),
-            "numpy": np.__version__,
-            "pyopencl": importlib.metadata.version("pyopencl"),
-        },
-        "date_utc": time.strftime("%Y-%m-%d", time.gmtime()),
-    }
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    table.write(options.output, format="ascii.ecsv", overwrite=True)
-    print(f"{engine.device_name}, driver {engine.driver}; {processor()}")
-    table.pprint(max_lines=-1, max_width=-1, align="<")
+    told: dict[str, Any] = {"device": engine.device_name, "driver": engine.driver, "processor": processor()}
+    write(table, options.output, **told, pixels=pixels, versions=versions())
     one, three, marginal = lines[1:4]
     print(f"three statistics at the rate of chi2 alone, quiescent and flare each: {ratio(three, one)}")
     print(f"the three marginalised at the rate of the plain three: {ratio(marginal, three)}")

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 from astropy.table import Table
 from rates import engine_lines
+from tables import write
 
 from mauvecl import Engine
 from mauvecl.device.kernel_cache import kernel_cache
@@ -141,7 +142,6 @@ def main() -> None:
     table.meta = {
         "device": engine.device_name,
         "driver": engine.driver,
-        "date_utc": time.strftime("%Y-%m-%d", time.gmtime()),
         "peak_vector_operations_per_s": float(f"{peak:.3g}"),
         "copy_bytes_per_s": float(f"{copy:.3g}"),
         "instructions_per_pixel_realisation": round(every / 16, 2),
@@ -152,9 +152,7 @@ def main() -> None:
         "frames_rate": float(f"{frames.rate(pixels):.3g}"),
         "frames_share_of_copy": round(2 * frames.rate(pixels) / copy, 2),
     }
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    table.write(options.output, format="ascii.ecsv", overwrite=True)
-    table.pprint(max_width=-1)
+    write(table, options.output)
     for key, value in table.meta.items():
         print(f"{key}: {value}")
     points = [

@@ -12,19 +12,17 @@ other work on the machine disturbs less.
 from __future__ import annotations
 
 import argparse
-import importlib.metadata
 import json
-import platform
 import subprocess
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 from astropy.table import Table
-from rates import processor
+from tables import processor, versions, write
 
 from mauvecl import Instrument, Sky, Source, __version__, expect
 from mauvecl.device.stares import Stares
@@ -249,21 +247,8 @@ def main() -> None:
     for column, text in told.items():
         table[column].unit = "1 / s"
         table[column].info.format, table[column].info.description = ".3g", text
-    table.meta = {
-        "device": stares.opened.record.label,
-        "processor": processor(),
-        "pixels": payload(1).quiet.wavelength_nm.size,
-        "versions": {
-            "mauvecl": __version__,
-            "python": platform.python_version(),
-            "numpy": np.__version__,
-            "pyopencl": importlib.metadata.version("pyopencl"),
-        },
-        "date_utc": time.strftime("%Y-%m-%d", time.gmtime()),
-    }
-    options.output.parent.mkdir(parents=True, exist_ok=True)
-    table.write(options.output, format="ascii.ecsv", overwrite=True)
-    table.pprint(max_lines=-1, max_width=-1, align="<")
+    told: dict[str, Any] = {"device": stares.opened.record.label, "processor": processor()}
+    write(table, options.output, **told, pixels=payload(1).quiet.wavelength_nm.size, versions=versions())
 
 
 if __name__ == "__main__":

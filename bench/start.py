@@ -15,6 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from astropy.table import Table
+from tables import write
 
 REPEATS = 5
 
@@ -24,7 +25,7 @@ import time
 from mauvecl.device.engine import Engine
 from mauvecl.device.selftest import toy
 quiet, flare = toy(1600), toy(1600, flare=0.1)
-import mauvecl.results.detection, pyopencl, scipy.special
+import mauvecl.results.detection.detection, pyopencl, scipy.special
 start = time.perf_counter()
 Engine().detect(quiet, [flare], realisations=64, seed=1)
 print(time.perf_counter() - start)
@@ -66,10 +67,7 @@ def main() -> None:
     table["seconds"].unit = table["wanted"].unit = "s"
     table["seconds"].info.format = ".2f"
     table["seconds"].info.description = f"median of {REPEATS} new processes"
-    table.meta["date_utc"] = time.strftime("%Y-%m-%d", time.gmtime())
-    output.parent.mkdir(parents=True, exist_ok=True)
-    table.write(output, format="ascii.ecsv", overwrite=True)
-    table.pprint(max_width=-1)
+    write(table, output)
 
 
 if __name__ == "__main__":

@@ -22,6 +22,7 @@ from pathlib import Path
 
 import numpy as np
 from astropy.table import Table
+from tables import write
 
 from mauvecl.device.engine import Engine
 from mauvecl.store import bulk
@@ -104,9 +105,8 @@ def main() -> None:
     table["median"] = [f"{value:.2f}" for value in (*medians.values(), share)] + [f"{p:.0f}" for p in peaks]
     spread = [f"{min(v):.2f}-{max(v):.2f}" for v in rates.values()]
     table["range"] = [*spread, "", "", ""]
-    table.meta["run"] = f"{total / 1e9:.2f} GB of 16-bit frames, {given.repeats} turns, {engine.device_name}"
-    table.pprint(max_lines=-1, max_width=-1)
-    table.write(given.output, format="ascii.ecsv", overwrite=True)
+    run = f"{total / 1e9:.2f} GB of 16-bit frames, {given.repeats} turns, {engine.device_name}"
+    write(table, given.output, run=run)
 
 
 if __name__ == "__main__":

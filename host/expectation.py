@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from .content import ByContent
+from .doors import public
 from .errors import InputError
 from .instrument.instrument import Instrument
 from .measured_noise import below_zero
@@ -42,6 +43,7 @@ Signal = Literal["net", "paper"]
 SIGNALS: tuple[Signal, ...] = get_args(Signal)
 
 
+@public
 @dataclass(frozen=True, eq=False)
 class Expectation(ByContent):
     """Means and noise per pixel of an exposure of `n_frames` frames; arrays are for ONE frame and read-only.
@@ -307,6 +309,10 @@ class Expectation(ByContent):
 
     def per_element(self, values: Float) -> Float:
         """Sums of pixels over resolution elements: (n_pixel,) to (n_element,)."""
+        if np.shape(values) != self.element.shape:
+            raise InputError(
+                f"values of the shape {np.shape(values)}, expected {self.element.shape}: one for each pixel"
+            )
         return np.asarray(np.bincount(self.element, values, minlength=self.element_wavelength_nm.size), np.float64)
 
     def noise_budget(self) -> QTable:
@@ -378,6 +384,7 @@ def _ratio(signal: Float, variance: Float) -> Float:
     return np.divide(signal, np.sqrt(variance), out=np.zeros_like(signal), where=variance > 0)
 
 
+@public
 def expect(
     source: Source | str,
     instrument: Instrument | str | Path,

@@ -6,6 +6,9 @@ from contextvars import ContextVar
 from importlib import import_module
 from typing import Any
 
+from .errors import InputError
+from .quantities import shown
+
 #: Axes of the caller's that a picture is drawn in; None where it has a figure of its own.
 AXES: ContextVar[Any] = ContextVar("axes", default=None)
 
@@ -21,7 +24,14 @@ def picture(name: str, *given: Any, ax: Any = None) -> Any:
         What the function takes.
     ax : matplotlib Axes, optional
         Drawn into instead, and handed back; a picture of several panels takes their place.
+
+    Raises
+    ------
+    InputError
+        If `ax` is no axes.
     """
+    if ax is not None and not (hasattr(ax, "plot") and hasattr(ax, "figure")):
+        raise InputError(f"ax = {shown(ax)}, expected axes, as plt.subplots makes")
     module, _, function = name.rpartition(".")
     before = AXES.set(ax)
     try:

@@ -1,19 +1,19 @@
-"""Units at the door: numbers, arrays and counts, from Quantities of any fitting unit or plain in the documented one."""
+"""Units at the door: numbers, arrays and counts, from Quantities of any fitting unit or plain in the documented one.
+
+What checks a plain number loads no numpy: a wrong one is told at once.
+"""
 
 from __future__ import annotations
 
+import math
 import operator
-from collections.abc import Callable
-from functools import wraps
-from inspect import isclass, signature
-from typing import Any, TypeVar, cast
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING, Any
 
 from .errors import InputError
 
-Given = TypeVar("Given", bound=Callable[..., Any])
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
 
 #: What a unit is called in a sentence.
 WORDS = {
@@ -51,7 +51,13 @@ UNITS = {
     "_s": "s",
 }
 #: Names without such an end that have a unit.
-NAMED = {"magnitude": "mag", "ebv": "mag", "surface_brightness": "mag / arcsec2"}
+NAMED = {
+    "magnitude": "mag",
+    "ebv": "mag",
+    "surface_brightness": "mag / arcsec2",
+    "temperature": "K",
+    "seconds": "s",
+}
 
 
 def unit_of(name: str) -> str:
@@ -64,48 +70,8 @@ def is_quantity(value: Any) -> bool:
     return hasattr(value, "to_value") and hasattr(value, "unit")
 
 
-def takes_quantities_of(**units: str) -> Callable[[Given], Given]:
-    """Let a function or class take Quantities where its parameters' names mean a unit (`UNITS`).
-
-    Parameters
-    ----------
-    **units : str
-        Of parameters whose names do not tell.
-
-    Notes
-    -----
-    Plain values go through untouched: ranges are the function's own matter. Whole numbers are `count`'s.
-    """
-
-    def decorate(function: Given) -> Given:
-        if isclass(function):
-            # `__init__` of the class itself is not looked up through an instance.
-            setattr(function, "__init__", decorate(function.__init__))  # noqa: B010
-            return function
-        known = signature(function)
-
-        @wraps(function)
-        def taking(*args: Any, **words: Any) -> Any:
-            if not (any(map(is_quantity, args)) or any(map(is_quantity, words.values()))):
-                return function(*args, **words)
-            bound = known.bind(*args, **words)
-            for name, value in bound.arguments.items():
-                if is_quantity(value):
-                    plain = numbers(name, value, units.get(name, unit_of(name)))
-                    bound.arguments[name] = plain if plain.ndim else float(plain)
-            return function(*bound.args, **bound.kwargs)
-
-        return cast(Given, taking)
-
-    return decorate
-
-
-#: The same where all names tell.
-takes_quantities = takes_quantities_of()
-
-
 def number(
-    what: str, value: Any, unit: str = "", *, low: float = -np.inf, high: float = np.inf, expected: str = ""
+    what: str, value: Any, unit: str = "", *, low: float = -math.inf, high: float = math.inf, expected: str = ""
 ) -> float:
     """One finite number in a unit.
 
@@ -127,25 +93,29 @@ def number(
         If it is no such number, not finite, or outside.
     """
     wanted = expected or _expected(unit, low, high)
-    found = _plain(what, value, unit, wanted)
-    if found.ndim:
-        raise InputError(f"{what} = {_shown(value)}, expected {wanted}")
-    if not (np.isfinite(found) and low <= found <= high):
-        raise InputError(f"{what} = {_shown(value)}, expected {wanted}")
-    return float(found)
+    if type(value) is float:
+        plain = value
+    else:
+        one = _plain(what, value, unit, wanted)
+        plain = float(one) if not one.ndim else math.nan
+    if not (math.isfinite(plain) and low <= plain <= high):
+        raise InputError(f"{what} = {shown(value)}, expected {wanted}")
+    return plain
 
 
 def numbers(
-    what: str, values: Any, unit: str = "", *, low: float = -np.inf, high: float = np.inf
+    what: str, values: Any, unit: str = "", *, low: float = -math.inf, high: float = math.inf
 ) -> NDArray[np.float64]:
     """An array of finite numbers in a unit, of the shape of `values`; parameters and errors as for `number`."""
+    import numpy as np
+
     wanted = _expected(unit, low, high)
-    found = _plain(what, values, unit, wanted)
-    bad = ~(np.isfinite(found) & (found >= low) & (found <= high))
+    plain = _plain(what, values, unit, wanted)
+    bad = ~(np.isfinite(plain) & (plain >= low) & (plain <= high))
     if bad.any():
-        first = found[np.unravel_index(int(np.argmax(bad)), found.shape)]
+        first = plain[np.unravel_index(int(np.argmax(bad)), plain.shape)]
         raise InputError(f"{what} = {first:g}{f' {unit}' if unit else ''}, expected {wanted}")
-    return found
+    return plain
 
 
 def count(what: str, value: Any, *, low: int = 0, high: int = 2**63 - 1) -> int:
@@ -159,18 +129,20 @@ def count(what: str, value: Any, *, low: int = 0, high: int = 2**63 - 1) -> int:
     wanted = f"a whole number from {low} to {high}" if high < 2**63 - 1 else f"a whole number of at least {low}"
     try:
         # Whole numbers beyond 2**53 are no floats.
-        found = operator.index(_no_truth(value))
+        whole = operator.index(_no_truth(value))
     except TypeError:
         plain = number(what, value, expected=wanted)
         if not plain.is_integer():
-            raise InputError(f"{what} = {_shown(value)}, expected {wanted}") from None
-        found = int(plain)
-    if not low <= found <= high:
-        raise InputError(f"{what} = {found}, expected {wanted}")
-    return found
+            raise InputError(f"{what} = {shown(value)}, expected {wanted}") from None
+        whole = int(plain)
+    if not low <= whole <= high:
+        raise InputError(f"{what} = {whole}, expected {wanted}")
+    return whole
 
 
 def _plain(what: str, value: Any, unit: str, wanted: str) -> NDArray[np.float64]:
+    import numpy as np
+
     try:
         if is_quantity(value):
             value = _converted(value, unit)
@@ -178,7 +150,7 @@ def _plain(what: str, value: Any, unit: str, wanted: str) -> NDArray[np.float64]
             raise TypeError("no number")
         return np.asarray(value, np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{what} = {_shown(value)}, expected {wanted}") from error
+        raise InputError(f"{what} = {shown(value)}, expected {wanted}") from error
 
 
 def _converted(value: Any, unit: str) -> Any:
@@ -198,18 +170,24 @@ def _converted(value: Any, unit: str) -> Any:
 
 
 def _no_truth(value: Any) -> Any:
-    if isinstance(value, bool | np.bool_):
+    if isinstance(value, bool):
         raise TypeError("true or false is no number")
     return value
 
 
+def word_of(unit: str) -> str:
+    """What a unit is called in a sentence."""
+    return WORDS.get(unit, unit)
+
+
 def _expected(unit: str, low: float, high: float) -> str:
     word = WORDS.get(unit, unit)
-    if np.isfinite(low) and np.isfinite(high):
+    if math.isfinite(low) and math.isfinite(high):
         return f"{low:g} to {high:g}{f' {unit}' if unit else ''}"
-    return f"{word} of at least {low:g}" if np.isfinite(low) else word
+    return f"{word} of at least {low:g}" if math.isfinite(low) else word
 
 
-def _shown(value: Any) -> str:
-    text = str(value) if hasattr(value, "unit") else repr(value)
+def shown(value: Any) -> str:
+    """A value for a sentence: on one line, and short."""
+    text = " ".join((str(value) if hasattr(value, "unit") else repr(value)).split())
     return text if len(text) <= 60 else f"{text[:57]}..."

@@ -46,7 +46,7 @@ def remembered(most: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
         @lru_cache(maxsize=most)
-        def found(given: _Given) -> R:
+        def computed(given: _Given) -> R:
             (arguments, named), given.values = given.values, ()
             value = function(*arguments, **named)
             if isinstance(value, np.ndarray):
@@ -57,7 +57,7 @@ def remembered(most: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
         def wrapper(*arguments: P.args, **named: P.kwargs) -> R:
             given = _Given((*arguments, *sorted(named.items())))
             given.values = arguments, named
-            return found(given)
+            return computed(given)
 
         return wrapper
 

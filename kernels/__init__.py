@@ -1,1 +1,1 @@
-"""OpenCL C templates: what the device runs. They know pixels, not stars."""
+"""OpenCL C sources (Mako): what the device runs. They know pixels, not stars."""

@@ -1,4 +1,4 @@
-## Every statistic of every scenario where more is compared than the template: noisy quiescent exposures, variances
+## Every statistic of every scenario where more is compared than the expectation: noisy quiescent exposures, variances
 ## estimated from the counts, smoothed spectra. What `statistics.cl.mako` knows too comes out here with the same bits.
 <%
     single = pair or slots
@@ -14,7 +14,7 @@ INLINE floatv variance_of(floatv x, __global const Estimate *e)
 
 __kernel ${attributes}
 void comparison(SCENE, const uint first_low, const uint first_high,
-                __global const uint *restrict templates, __global const float *restrict constants,
+                __global const uint *restrict references, __global const float *restrict constants,
                 __global const float *restrict weights, __global const uint *restrict linear_end,
                 __global const uint *restrict pixels_end,
                 __global const Estimate *restrict estimates, __global const float *restrict bands,
@@ -60,7 +60,7 @@ void comparison(SCENE, const uint first_low, const uint first_high,
         intv counts[${scenarios}][${chunk}];
         expose(SCENE_PASSED, &observation, start, 0u, scenario_count, counts, 0, 0u);
 % if noisy or single:
-        /* The first quiescent exposure, and the sum of all; scenarios with one template share them. */
+        /* The first quiescent exposure, and the sum of all; scenarios with one reference share them. */
         floatv first[${chunk}], sum[${chunk}];
         uint seen = ~0u;
 % endif
@@ -72,8 +72,8 @@ void comparison(SCENE, const uint first_low, const uint first_high,
             __global const Level *level = levels + k * padded + start;
             __global const Edge *edge = edges + k * padded + start;
 % if noisy or single:
-            if (templates[k] != seen) {
-                seen = templates[k];
+            if (references[k] != seen) {
+                seen = references[k];
                 for (uint i = 0; i < CHUNK; i++) sum[i] = (floatv)0.0f;
                 for (uint number = 0; number < ${exposures}; number++) {
                     const Exposure other = another(SCENE_PASSED, observation, REFERENCE, number);
@@ -107,11 +107,11 @@ void comparison(SCENE, const uint first_low, const uint first_high,
             }
 % endif
             for (uint i = 0; i < CHUNK; i++) {
-                x[i] = ${"FMA(sum[i], (floatv)-job->reference_share, t[i])" if noisy else "t[i]"};
+                x[i] = ${"FMA(sum[i], (floatv)-job->reference_weight, t[i])" if noisy else "t[i]"};
 % if estimated:
                 variance[i] = variance_of(t[i], estimate + i);
 % if noisy:
-                variance[i] += job->reference_share * variance_of(sum[i] * job->reference_share, estimate + i);
+                variance[i] += job->reference_weight * variance_of(sum[i] * job->reference_weight, estimate + i);
 % endif
                 x[i] += estimate[i].fraction;
 % endif

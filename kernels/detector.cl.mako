@@ -129,16 +129,16 @@ INLINE floatv analogue(SCENE_GIVEN, const Draws *drawn, uint i, __global const L
     floatv variance = FMA(light, (floatv)r->light_variance, FMA(dark, (floatv)r->dark_variance, (floatv)r->other_variance));
     floatv third = FMA(light, (floatv)r->light_third, dark * r->dark_third);
     floatv fourth = FMA(light, (floatv)r->light_fourth, dark * r->dark_fourth);
-    floatv sd = root(variance), share = third / variance, zz = z * z;
+    floatv sd = root(variance), skew = third / variance, zz = z * z;
     /* z + k3 (z^2 - 1) / (6 s^3) + k4 (z^3 - 3 z) / (24 s^4) - k3^2 (2 z^3 - 5 z) / (36 s^6), all times s */
-    floatv cubic = (fourth * FMA(zz, (floatv)0.041666668f, (floatv)-0.125f) - third * share * FMA(zz, (floatv)0.055555556f, (floatv)-0.1388889f)) / (variance * sd);
-    floatv v = FMA(z, sd + cubic, FMA(share, FMA(zz, (floatv)0.16666667f, (floatv)-0.16666667f), (floatv)level->c0));
+    floatv cubic = (fourth * FMA(zz, (floatv)0.041666668f, (floatv)-0.125f) - third * skew * FMA(zz, (floatv)0.055555556f, (floatv)-0.1388889f)) / (variance * sd);
+    floatv v = FMA(z, sd + cubic, FMA(skew, FMA(zz, (floatv)0.16666667f, (floatv)-0.16666667f), (floatv)level->c0));
 % if quartic:
     /* k5 (z^4 - 6 z^2 + 3) / (120 s^5) - k3 k4 (z^4 - 5 z^2 + 2) / (24 s^7) + k3^3 (12 z^4 - 53 z^2 + 17) / (324 s^9) */
     floatv fifth = FMA(light, (floatv)r->light_fifth, dark * r->dark_fifth);
     floatv even = fifth * FMA(zz, FMA(zz, (floatv)0.008333334f, (floatv)-0.05f), (floatv)0.025f);
-    even = even - share * fourth * FMA(zz, FMA(zz, (floatv)0.041666668f, (floatv)-0.20833333f), (floatv)0.083333336f);
-    even = even + share * share * third * FMA(zz, FMA(zz, (floatv)0.037037037f, (floatv)-0.16358025f), (floatv)0.052469134f);
+    even = even - skew * fourth * FMA(zz, FMA(zz, (floatv)0.041666668f, (floatv)-0.20833333f), (floatv)0.083333336f);
+    even = even + skew * skew * third * FMA(zz, FMA(zz, (floatv)0.037037037f, (floatv)-0.16358025f), (floatv)0.052469134f);
     v += even / (variance * variance);
 % endif
     v += FMA(more, (floatv)r->light, factors->dark * r->dark);

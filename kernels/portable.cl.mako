@@ -4,8 +4,8 @@
     lanes = [""] if width == 1 else [f".s{lane:x}" for lane in range(width)]
     w = "" if width == 1 else str(width)
     half = width // 2
-    def per_lane(template):
-        values = ", ".join(template.replace("@", lane) for lane in lanes)
+    def per_lane(pattern):
+        values = ", ".join(pattern.replace("@", lane) for lane in lanes)
         return values if width == 1 else f"(float{w})({values})"
 %>\
 #pragma OPENCL FP_CONTRACT OFF

@@ -65,14 +65,14 @@ void stare_pixels(SCENE, STARE, const uint first_low, const uint first_high, con
                 fifth = FMA(light, (floatv)m->photon_fifth, fifth);
 % endif
                 /* As analogue() has it for factors on light and dark. */
-                const floatv sd = root(variance), each = 1.0f / variance, share = third * each;
+                const floatv sd = root(variance), each = 1.0f / variance, skew = third * each;
                 const floatv curve = fourth * FMA(zz, (floatv)0.041666668f, (floatv)-0.125f)
-                                   - third * share * FMA(zz, (floatv)0.055555556f, (floatv)-0.1388889f);
+                                   - third * skew * FMA(zz, (floatv)0.055555556f, (floatv)-0.1388889f);
                 floatv even = fifth * FMA(zz, FMA(zz, (floatv)0.008333334f, (floatv)-0.05f), (floatv)0.025f);
-                even = even - share * fourth * FMA(zz, FMA(zz, (floatv)0.041666668f, (floatv)-0.20833333f), (floatv)0.083333336f);
-                even = even + share * share * third * FMA(zz, FMA(zz, (floatv)0.037037037f, (floatv)-0.16358025f), (floatv)0.052469134f);
+                even = even - skew * fourth * FMA(zz, FMA(zz, (floatv)0.041666668f, (floatv)-0.20833333f), (floatv)0.083333336f);
+                even = even + skew * skew * third * FMA(zz, FMA(zz, (floatv)0.037037037f, (floatv)-0.16358025f), (floatv)0.052469134f);
                 const floatv straight = FMA(curve * each, sd * each, sd);
-                floatv v = FMA(z, straight, FMA(share, FMA(zz, (floatv)0.16666667f, (floatv)-0.16666667f), (floatv)m->rest));
+                floatv v = FMA(z, straight, FMA(skew, FMA(zz, (floatv)0.16666667f, (floatv)-0.16666667f), (floatv)m->rest));
                 v = FMA(even * each, each, v);
                 v += FMA(strengths.dark, (floatv)m->dark, light);
 % if cosmic:

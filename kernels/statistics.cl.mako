@@ -1,4 +1,4 @@
-## chi2, chi2_element and linear statistics of every scenario against its template, from one pass over common draws:
+## chi2, chi2_element and linear statistics of every scenario against its reference, from one pass over common draws:
 ## the fast kernel, for what is asked most. `comparison.cl.mako` knows the rest.
 <%
     plain = joint and not (modulations or frames or photons or cosmic)
@@ -8,7 +8,7 @@
         """Statements, each for all vectors of realisations before the next; @ is a vector's number."""
         return " ".join(one.replace("@", str(v)) + ";" for one in text.split(";")[:-1] for v in range(vectors))
 %>\
-## x = observed - template, whole DN: what is left of the template's fraction of a DN is a constant of each sum.
+## x = observed - reference, whole DN: what is left of the reference's fraction of a DN is a constant of each sum.
 /* Each work-item follows ${vectors} vectors of realisations: what is read of a level serves them all. */
 __kernel ${attributes}
 void statistics(SCENE, const uint first_low, const uint first_high,

@@ -47,10 +47,10 @@ void tally(const uint from, const uint to, const uint stride, __global const flo
     long first = 0, second = 0;
     uint out = 0u;
 % if width == 1:
-    const uint share = get_global_id(1), shares = get_global_size(1);
-    for (uint i = from + share; i < to; i += shares) {
+    const uint item = get_global_id(1), items = get_global_size(1);
+    for (uint i = from + item; i < to; i += items) {
 % else:
-    const uint share = 0u, shares = 1u;
+    const uint item = 0u, items = 1u;
     uint i = from;
     for (; i + ${block}u <= to; i += ${block}u) {
         /* Blocks, because a compiler makes vectors of what has a fixed length. */
@@ -73,8 +73,8 @@ void tally(const uint from, const uint to, const uint stride, __global const flo
         second += (long)inner * inner;
         COUNT(bin_of(step));
     }
-    /* sums[channel][share][first, second] */
-    __global long *mine = sums + 2u * (g * shares + share);
+    /* sums[channel][item][first, second] */
+    __global long *mine = sums + 2u * (g * items + item);
     mine[0] += first;
     mine[1] += second;
     if (out) ADD(outside + g, out);

@@ -11,18 +11,18 @@ from typing import TYPE_CHECKING, Any
 from mauvecl.host.version import VERSION
 
 if TYPE_CHECKING:
-    from mauvecl.answers.assumptions import what_matters
     from mauvecl.answers.campaigns.plan import plan
     from mauvecl.answers.campaigns.visible import visible
-    from mauvecl.answers.detect import detect
-    from mauvecl.answers.exposures import exposure_for
-    from mauvecl.answers.gaussian import gaussian_report
-    from mauvecl.answers.inject import inject
-    from mauvecl.answers.limits import limiting_magnitude, shortest_exposure, smallest_amplitude
-    from mauvecl.answers.maps import detection_map
-    from mauvecl.answers.simulate import simulate
-    from mauvecl.answers.snr import snr
-    from mauvecl.answers.stare import stare
+    from mauvecl.answers.detection.detect import detect
+    from mauvecl.answers.detection.gaussian import gaussian_report
+    from mauvecl.answers.detection.maps import detection_map
+    from mauvecl.answers.limits.assumptions import what_matters
+    from mauvecl.answers.limits.limits import limiting_magnitude, shortest_exposure, smallest_amplitude
+    from mauvecl.answers.signal.exposures import exposure_for
+    from mauvecl.answers.signal.simulate import simulate
+    from mauvecl.answers.signal.snr import snr
+    from mauvecl.answers.stares.inject import inject
+    from mauvecl.answers.stares.stare import stare
     from mauvecl.device.engine import Engine
     from mauvecl.device.stares import Stares
     from mauvecl.host.errors import InputError
@@ -39,8 +39,8 @@ if TYPE_CHECKING:
     from mauvecl.noise.comparison import Comparison
     from mauvecl.noise.priors import Normal, Uniform
     from mauvecl.noise.processes import CosmicRays, Processes
-    from mauvecl.results.departures import departures
-    from mauvecl.results.detection import Detection
+    from mauvecl.results.detection.departures import departures
+    from mauvecl.results.detection.detection import Detection
     from mauvecl.runs.cluster import DaskWorkers
     from mauvecl.runs.pool import LocalWorkers, Pool
     from mauvecl.statistics.linear import Linear
@@ -103,7 +103,7 @@ _HOMES = {
     "Cooling": "lightcurve.flares.events",
     "CosmicRays": "noise.processes",
     "DaskWorkers": "runs.cluster",
-    "Detection": "results.detection",
+    "Detection": "results.detection.detection",
     "EnergyScale": "lightcurve.flares.energies",
     "Engine": "device.engine",
     "Event": "lightcurve.flares.events",
@@ -128,22 +128,22 @@ _HOMES = {
     "TableShape": "lightcurve.flares.shapes",
     "Uniform": "noise.priors",
     "bulk": "store",
-    "departures": "results.departures",
-    "detect": "answers.detect",
-    "detection_map": "answers.maps",
+    "departures": "results.detection.departures",
+    "detect": "answers.detection.detect",
+    "detection_map": "answers.detection.maps",
     "expect": "host.expectation",
-    "exposure_for": "answers.exposures",
-    "gaussian_report": "answers.gaussian",
-    "inject": "answers.inject",
-    "limiting_magnitude": "answers.limits",
-    "shortest_exposure": "answers.limits",
+    "exposure_for": "answers.signal.exposures",
+    "gaussian_report": "answers.detection.gaussian",
+    "inject": "answers.stares.inject",
+    "limiting_magnitude": "answers.limits.limits",
+    "shortest_exposure": "answers.limits.limits",
     "plan": "answers.campaigns.plan",
-    "simulate": "answers.simulate",
-    "smallest_amplitude": "answers.limits",
-    "snr": "answers.snr",
-    "stare": "answers.stare",
+    "simulate": "answers.signal.simulate",
+    "smallest_amplitude": "answers.limits.limits",
+    "snr": "answers.signal.snr",
+    "stare": "answers.stares.stare",
     "visible": "answers.campaigns.visible",
-    "what_matters": "answers.assumptions",
+    "what_matters": "answers.limits.assumptions",
 }
 
 

@@ -7,21 +7,21 @@ from typing import Any
 import numpy as np
 
 from mauvecl.device.engine import Engine
-from mauvecl.results.detection import Detection
-from mauvecl.results.requests import DetectRequest, Share
+from mauvecl.results.detection.detection import Detection
+from mauvecl.results.requests.requests import DetectRequest, Shard
 from mauvecl.results.snr import Counts, SnrResult
 from mauvecl.results.sums import DetectionSums
 from mauvecl.study.study import Study
 
-#: Realisations: several shares, the last a short one.
+#: Realisations: several shards, the last a short one.
 N = 30_000
 
 
 def same(ours: Detection, theirs: Detection) -> None:
     """Every count, sum and extreme, to the bit."""
-    assert ours._found.keys() == theirs._found.keys()
-    for key, found in ours._found.items():
-        other = theirs._found[key]
+    assert ours._distributions.keys() == theirs._distributions.keys()
+    for key, found in ours._distributions.items():
+        other = theirs._distributions[key]
         np.testing.assert_array_equal(found.counts, other.counts)
         assert (found.first, found.second, found.n) == (other.first, other.second, other.n)
         assert found.far.equals(other.far)
@@ -38,7 +38,7 @@ def twice(engine: Engine, request: DetectRequest) -> tuple[Detection, Detection]
 def _counted(engine: Engine, request: DetectRequest, start: int) -> Detection:
     sums = DetectionSums(request)
     for part in range(request.parts):
-        sums.add(part, engine.count(request, Share(part, start, request.realisations)))
+        sums.add(part, engine.count(request, Shard(part, start, request.realisations)))
     return sums.answer()
 
 

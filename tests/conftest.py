@@ -21,9 +21,9 @@ def engine() -> Engine:
 
 
 @pytest.fixture
-def small_shares(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Shares of 4096 realisations."""
-    monkeypatch.setattr(shards, "SHARE", 1)
+def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Shards of 4096 realisations."""
+    monkeypatch.setattr(shards, "SHARD", 1)
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mauvecl.runs import durable
+from mauvecl.host.files import whole
 from mauvecl.study.study import Study
 
 CHUNK, LAST = "star-1/quiescent/c/1/0", "star-1/flare-1/c/4/0"
@@ -85,4 +85,4 @@ def full_after(n_bytes: int, monkeypatch: pytest.MonkeyPatch) -> None:
             raise OSError(28, "No space left on device")
         real(handle)
 
-    monkeypatch.setattr(durable.os, "fsync", fsync)
+    monkeypatch.setattr(whole.os, "fsync", fsync)

@@ -21,7 +21,7 @@ from mauvecl.study.study import Study
 ROOT = Path(__file__).parent.parent
 #: Pages whose Python needs a store or a cluster; that of all others runs as it stands.
 APART = ("bulk.md", "cluster.md")
-#: `mauvecl/results/roc.py`, or with a name in it: `mauvecl/results/roc.py: Roc`.
+#: `mauvecl/results/detection/roc.py`, or with a name in it: `mauvecl/results/detection/roc.py: Roc`.
 NAMED = re.compile(r"`((?:host|kernels|mauvecl|tests|bench|tools|docs)/[\w./*-]+\.\w+)(?::\s*(\w+))?[^`]*`")
 #: What defines a name, by a file's ending.
 DEFINITIONS = {

@@ -55,7 +55,7 @@ def study(**settings: object) -> Study:
 ONE = {"run.statistics": "['matched']", "flare.amplitudes": "[0.3]"}
 ANSWERS: dict[str, Callable[[Engine, dict[str, object]], Any]] = {
     "detect": lambda e, s: detect(study(**s), e),
-    "detection": lambda e, s: detect(study(**s), e).stars[0].found,
+    "detection": lambda e, s: detect(study(**s), e).stars[0].detection,
     "snr": lambda e, s: snr(study(**s), e),
     "snr result": lambda e, s: snr(study(**s), e).stars[0].result,
     "exposure": lambda e, s: exposure_for(study(**s), 5.0, 310.0),

@@ -63,6 +63,8 @@ REASONS = {
     "Engine.realise_and_count.seed": "what Engine.realise calls",
     "Engine.realise_and_count.start": "what Engine.realise calls",
     "Engine.realise_and_count.count": "what Engine.realise calls",
+    "Detection.of.realisations": "made by Engine.detect",
+    "Detection.of.seed": "made by Engine.detect",
     "bulk.draw.start": "hands on to Engine.realise, once whole",
     "bulk.draw.count": "hands on to Engine.realise, once whole",
 }

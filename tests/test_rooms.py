@@ -5,7 +5,9 @@ from __future__ import annotations
 import shutil
 import subprocess
 import sys
+from graphlib import TopologicalSorter
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -13,9 +15,9 @@ ROOT = Path(__file__).parent.parent
 #: Who must not import whom: up, up for types alone, up inside the host, and OpenCL outside the device's room.
 FORBIDDEN = {
     "noise/layout.py": ("import mauvecl.study.study", "mauvecl.noise.layout -> mauvecl.study.study"),
-    "results/roc.py": (
+    "results/detection/roc.py": (
         "from typing import TYPE_CHECKING\nif TYPE_CHECKING:\n    from mauvecl.cli.app import main",
-        "mauvecl.results.roc -> mauvecl.cli.app",
+        "mauvecl.results.detection.roc -> mauvecl.cli.app",
     ),
     "host/files/bounded.py": (
         "from mauvecl.host.stars.source import Source",
@@ -45,6 +47,33 @@ def test_forbidden_imports_are_found(tmp_path: Path) -> None:
     told = " ".join(done.stdout.split())
     for _, arrow in FORBIDDEN.values():
         assert arrow in told
+
+
+def test_the_drawing_by_imports() -> None:
+    """Room by room no circle, at any depth, lazy imports and those for types among them; few rooms on few floors."""
+    grimp = pytest.importorskip("grimp")
+    graph = grimp.build_graph("mauvecl", cache_dir=None)
+    drawn = {room: floors(graph, room) for room in graph.modules if rooms_in(graph, room)}
+    assert len(drawn["mauvecl"]) <= 20
+    assert max(drawn["mauvecl"].values()) <= 11
+
+
+def rooms_in(graph: Any, room: str) -> set[str]:
+    return {inner for inner in graph.find_children(room) if graph.find_children(inner)}
+
+
+def floors(graph: Any, room: str) -> dict[str, int]:
+    """Of each room in this one; a circle raises CycleError."""
+    inside = {inner: {inner, *graph.find_descendants(inner)} for inner in rooms_in(graph, room)}
+    below = {
+        inner: {other for other in inside if other != inner and inside[other] & imported}
+        for inner, files in inside.items()
+        for imported in [set().union(*map(graph.find_modules_directly_imported_by, files))]
+    }
+    floor: dict[str, int] = {}
+    for inner in TopologicalSorter(below).static_order():
+        floor[inner] = 1 + max((floor[other] for other in below[inner]), default=0)
+    return floor
 
 
 def only_python(folder: str, names: list[str]) -> list[str]:

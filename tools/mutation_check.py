@@ -42,7 +42,7 @@ MUTATIONS = {
     "one unknown's row dropped": Mutation(
         (
             (
-                "mauvecl/results/channels.py",
+                "mauvecl/results/requests/channels.py",
                 "nuisances.names if nuisances else ()))",
                 "nuisances.names[1:] if nuisances else ()))",
             ),
@@ -104,19 +104,19 @@ MUTATIONS = {
         ),
         "tests/lightcurve/test_twin.py::test_a_split_changes_no_bit[cumulants]",
     ),
-    "a share's flares from the first": Mutation(
+    "a shard's flares from the first": Mutation(
         (("mauvecl/device/stares.py", "request.flares.part(first - request.start,", "request.flares.part(done,"),),
-        "tests/runs/test_stares.py::test_shares_join_to_the_same_bits[None-cumulants]",
+        "tests/runs/test_stares.py::test_shards_join_to_the_same_bits[None-cumulants]",
     ),
-    "a share under another's name": Mutation(
+    "a shard under another's name": Mutation(
         (("mauvecl/runs/checkpoint.py", 'name.encode() + b"\\0" + body', "body"),),
-        "tests/runs/test_pool.py::test_a_share_in_anothers_place",
+        "tests/runs/test_pool.py::test_a_shard_in_anothers_place",
     ),
     "foreign chunks unseen": Mutation(
         (("mauvecl/store/bulk.py", 'return "good" if digest(data) == known else "foreign"', 'return "good"'),),
         "tests/store/test_bulk.py::test_faults_are_found_and_repaired_to_the_bit",
     ),
-    "half a failed share kept": Mutation(
+    "half a failed shard kept": Mutation(
         (
             (
                 "mauvecl/device/engine.py",
@@ -250,18 +250,18 @@ MUTATIONS = {
         (("host/expectation.py", "min(self.saturation_dn, float(self.adc_max_dn))", "float(self.adc_max_dn)"),),
         "tests/noise/test_saturation.py::test_closed_forms_are_those_of_what_is_drawn",
     ),
-    "template of what is not recorded": Mutation(
+    "reference of what is not recorded": Mutation(
         (
             (
                 "mauvecl/noise/scene.py",
-                "mean_sum = template.recorded_dn",
-                "mean_sum = template.n_frames * template.mean_raw_dn",
+                "mean_sum = reference.recorded_dn",
+                "mean_sum = reference.n_frames * reference.mean_raw_dn",
             ),
         ),
         "tests/noise/test_saturation.py::test_closed_forms_are_those_of_what_is_drawn",
     ),
     "noise of what is subtracted forgotten": Mutation(
-        (("mauvecl/noise/scene.py", "return 1.0 + comparison.share", "return 1.0"),),
+        (("mauvecl/noise/scene.py", "return 1.0 + comparison.added_variance", "return 1.0"),),
         "tests/results/test_tails.py::test_brute_force_agrees_whatever_is_compared",
     ),
     "quiescent exposures with the observed draws": Mutation(
@@ -273,7 +273,7 @@ MUTATIONS = {
         "tests/device/test_marginal.py::test_closed_forms_integrate_over_what_is_drawn[half a degree]",
     ),
     "moved scores that count like others": Mutation(
-        (("mauvecl/results/tails.py", "np.log(2.0) - np.logaddexp(0.0, ratio)", "np.zeros(BLOCK)"),),
+        (("mauvecl/results/detection/tails.py", "np.log(2.0) - np.logaddexp(0.0, ratio)", "np.zeros(BLOCK)"),),
         "tests/results/test_tails.py::test_brute_force_agrees_with_what_is_unknown[half a degree]",
     ),
     "shifts forgotten in the closed form's phase": Mutation(

@@ -3,7 +3,7 @@
     python batch_cluster.py slurm --jobs 10 --queue astro --hours 12 &
     mauvecl detect study.toml --cluster scheduler.json --resume
 
-Jobs that end, die or are taken back cost the shares in their hands, which others count again. Needs dask-jobqueue and
+Jobs that end, die or are taken back cost the shards in their hands, which others count again. Needs dask-jobqueue and
 mauvecl[cluster] on every node.
 """
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +12,9 @@ from .bounded import limit_bytes, read_bytes, shortened, unpacked
 from .parsed import as_text, parsing
 
 if TYPE_CHECKING:
+    import numpy as np
     from astropy.table import Table
+    from numpy.typing import NDArray
 
 #: Values that a header may hold once its aliases are written out: a few KiB of them can stand for 1e9.
 MOST_VALUES = 100_000
@@ -58,6 +61,69 @@ def parse_ecsv(text: str, what: str, expected: str = "an ECSV table") -> Table:
         warnings.simplefilter("ignore")
         # Lines, since a text of one line would be taken for a file's name.
         return Table.read([*lines, ""], format="ascii.ecsv")
+
+
+@dataclass(frozen=True, eq=False)
+class Numbers:
+    """A table of numbers and nothing else.
+
+    Attributes
+    ----------
+    columns : dict of str to ndarray of float64, shape (n,)
+    units : dict of str to str
+        Of the columns; empty for one without.
+    meta : dict
+    """
+
+    columns: dict[str, NDArray[np.float64]]
+    units: dict[str, str]
+    meta: dict[str, Any]
+
+    def __getitem__(self, name: str) -> NDArray[np.float64]:
+        return self.columns[name]
+
+
+def read_numbers(path: str | Path, what: str) -> Numbers:
+    """An ECSV table whose columns are numbers, each there; errors as `read_ecsv`, and for any other column."""
+    path = Path(path)
+    named = f"{what} {shortened(str(path))}"
+    return parse_numbers(as_text(unpacked(read_bytes(path, what), named), named), named)
+
+
+def parse_numbers(text: str, what: str) -> Numbers:
+    """The numbers in a text, as `read_numbers`."""
+    import numpy as np
+
+    lines = text.splitlines()
+    check_header(lines, what)
+    found = _plain_numbers(lines)
+    if found is not None:
+        return found
+    table = parse_ecsv(text, what)
+    for name in table.colnames:
+        if table[name].dtype.kind not in "iuf" or np.ma.is_masked(table[name]) or table[name].ndim != 1:
+            raise InputError(f"{what}: {name} has missing or non-numeric values, expected numbers")
+    columns = {name: np.asarray(table[name], np.float64) for name in table.colnames}
+    return Numbers(columns, {name: str(table[name].unit or "") for name in table.colnames}, dict(table.meta))
+
+
+def _plain_numbers(lines: list[str]) -> Numbers | None:
+    """Numbers with spaces between them, without the time that astropy's tables take to load; None for anything else."""
+    import numpy as np
+    import yaml  # comes with astropy
+
+    header, rows = [line[2:] for line in lines if line[:1] == "#"], [line for line in lines if line[:1] != "#"]
+    try:
+        said = yaml.load("\n".join(header[1:]), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
+        names = [one["name"] for one in said["datatype"]]
+        numeric = all(one["datatype"][:3] in ("flo", "int", "uin") and "subtype" not in one for one in said["datatype"])
+        if not numeric or "delimiter" in said or rows[0].split(" ") != names:
+            return None
+        values = np.array([row.split(" ") for row in rows[1:] if row], np.float64).reshape(-1, len(names))
+        units = {one["name"]: str(one.get("unit", "")) for one in said["datatype"]}
+        return Numbers(dict(zip(names, values.T.copy(), strict=True)), units, dict(said.get("meta") or {}))
+    except (yaml.YAMLError, LookupError, TypeError, ValueError, AttributeError):
+        return None
 
 
 def check_header(lines: list[str], what: str) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from ..files.ecsv import read_ecsv
+from ..files.ecsv import Numbers, read_numbers
 
 
 @dataclass(frozen=True)
@@ -61,12 +61,12 @@ class Curve:
         InputError
             If the file is missing or is not such a table.
         """
-        table = read_ecsv(path, "curve file")
-        if "wavelength" not in table.colnames or len(table.colnames) != 2:
+        table = read_numbers(path, "curve file")
+        if "wavelength" not in table.columns or len(table.columns) != 2:
             raise InputError(
-                f"curve file {path} has the columns {', '.join(table.colnames)}, expected 'wavelength' and one value"
+                f"curve file {path} has the columns {', '.join(table.columns)}, expected 'wavelength' and one value"
             )
-        name = next(column for column in table.colnames if column != "wavelength")
+        name = next(column for column in table.columns if column != "wavelength")
         meta = table.meta
         try:
             wavelength = _plain(table, "wavelength", [u.nm])
@@ -88,13 +88,10 @@ class Curve:
         return len(self.value) == 1 or (self.wavelength_nm[0] <= low_nm and self.wavelength_nm[-1] >= high_nm)
 
 
-def _plain(table: object, name: str, units: list[u.UnitBase]) -> NDArray[np.float64]:
+def _plain(table: Numbers, name: str, units: list[u.UnitBase]) -> NDArray[np.float64]:
     """A column's numbers in the first of `units` that it converts to."""
-    column = table[name]  # type: ignore[index]
-    unit = u.dimensionless_unscaled if column.unit is None else column.unit
-    if column.dtype.kind not in "iuf" or np.ma.is_masked(column):
-        raise InputError(f"column {name!r} has missing or non-numeric values, expected numbers")
+    unit = u.Unit(table.units[name], parse_strict="silent")
     for wanted in units:
         if unit.is_equivalent(wanted):
-            return np.asarray((np.asarray(column, np.float64) * unit).to_value(wanted))
+            return np.asarray((table[name] * unit).to_value(wanted))
     raise InputError(f"column {name!r} has the unit {str(unit) or 'none'!r}, expected {units[0]}")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import hashlib
 from functools import cached_property
 from pathlib import Path
@@ -10,10 +9,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
+from ..doors import public
 from ..errors import InputError
 from ..quantities import count, is_quantity, number, numbers, unit_of
+from ..records import Record, sentence
 from .curve import Curve
 from .pixel_map import MOST_PIXELS, PixelMap
 
@@ -54,7 +55,8 @@ NotNegative = Annotated[float, Field(ge=0)]
 Count = Annotated[int, Field(ge=0, le=20)]
 
 
-class Instrument(BaseModel):
+@public
+class Instrument(Record):
     """An instrument, frozen; units are in the names.
 
     `Instrument.load` reads one, `with_` gives a changed copy. The values of the nominal payload, with the source
@@ -106,9 +108,7 @@ class Instrument(BaseModel):
     'P: table of the payload performance'
     """
 
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", strict=True, allow_inf_nan=False, arbitrary_types_allowed=True
-    )
+    model_config = ConfigDict(strict=True, arbitrary_types_allowed=True)
 
     name: str = Field(min_length=1)
     notice: str
@@ -176,7 +176,7 @@ class Instrument(BaseModel):
         try:
             return cls.model_validate(values)
         except ValidationError as error:
-            raise InputError(f"{where}: {_sentence(error)}") from None
+            raise InputError(f"{where}: {sentence(cls, error)}") from None
 
     def with_(self, **changes: Any) -> Instrument:
         """A copy with some values changed, each marked as the user's in `sources`.
@@ -442,20 +442,3 @@ LABELS = ("name", "notice", "sources")
 #: The curves, and those of them that are fractions.
 CURVES = tuple(name for name, field in Instrument.model_fields.items() if field.annotation is Curve)
 OPTICS = tuple(name for name in CURVES if name != "quantum_efficiency_a_per_w")
-
-
-def _sentence(error: ValidationError) -> str:
-    """The first complaint of pydantic in one sentence of ours."""
-    first = error.errors()[0]
-    name = ".".join(str(part) for part in first["loc"])
-    kind = first["type"]
-    if kind == "extra_forbidden":
-        near = difflib.get_close_matches(name, Instrument.model_fields, n=1, cutoff=0.0)
-        return f"unknown key {name!r}, expected one of the instrument's values; the nearest is {near[0]!r}"
-    if kind == "missing":
-        return f"{name!r} is missing, expected a value"
-    given = first.get("ctx", {}).get("error")
-    if isinstance(given, InputError):
-        return f"{name}: {given}" if name else str(given)
-    expected = first["msg"].removeprefix("Input should be ").removeprefix("Value error, ")
-    return f"{name} = {first['input']!r}, expected {expected}"

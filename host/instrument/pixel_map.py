@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..content import ByContent
+from ..doors import public
 from ..errors import InputError
-from ..files.ecsv import read_ecsv
+from ..files.ecsv import read_numbers
 from ..quantities import count
 
 Float = NDArray[np.float64]
@@ -29,6 +30,7 @@ COLUMNS = {
 }
 
 
+@public
 @dataclass(frozen=True, eq=False)
 class PixelMap(ByContent):
     """One value per pixel of the whole array; None leaves the instrument's value.
@@ -100,25 +102,22 @@ class PixelMap(ByContent):
         InputError
             If the file is missing, is not such a table, or holds a value that cannot be.
         """
-        table = read_ecsv(path, "pixel map")
-        unknown = [name for name in table.colnames if name not in COLUMNS and name != "pixel"]
-        if unknown or table.colnames in ([], ["pixel"]):
+        table = read_numbers(path, "pixel map")
+        unknown = [name for name in table.columns if name not in COLUMNS and name != "pixel"]
+        if unknown or list(table.columns) in ([], ["pixel"]):
             what = f"the column {unknown[0]!r}" if unknown else "no column of values"
             raise InputError(f"pixel map {path} has {what}, expected some of {', '.join(COLUMNS)}")
-        if "pixel" in table.colnames and not np.array_equal(table["pixel"], np.arange(len(table))):
+        if "pixel" in table.columns and not np.array_equal(table["pixel"], np.arange(table["pixel"].size)):
             raise InputError(f"pixel map {path}: the column 'pixel' is not 0, 1, 2, ..., expected every pixel in order")
         values = {}
-        for name in table.colnames:
+        for name in table.columns:
             if name == "pixel":
                 continue
-            column = table[name]
-            unit = u.dimensionless_unscaled if column.unit is None else column.unit
-            if column.dtype.kind not in "iuf" or np.ma.is_masked(column):
-                raise InputError(f"pixel map {path}: {name} has missing or non-numeric values, expected numbers")
+            unit = u.Unit(table.units[name], parse_strict="silent")
             if not unit.is_equivalent(COLUMNS[name]):
                 wanted = str(COLUMNS[name]) or "none"
                 raise InputError(f"pixel map {path}: {name} has the unit {str(unit) or 'none'!r}, expected {wanted}")
-            values[name] = np.asarray(column, np.float64)
+            values[name] = table[name]
         source = f"{table.meta.get('tag', 'A')}: {table.meta.get('source', f'assumed, no source in {Path(path).name}')}"
         try:
             return cls(**values, source=source)

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import difflib
 import re
+import threading
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -129,6 +131,13 @@ def _key(name: str) -> str:
     return key
 
 
+#: What is asked of SIMBAD's tables (tried with astroquery 0.4.11): a star without a V has its place all the same.
+SIMBAD_QUERY = (
+    'SELECT basic.ra, basic.dec, basic.plx_value, basic.sp_type, allfluxes."V" FROM ident JOIN basic '
+    "ON ident.oidref = basic.oid LEFT JOIN allfluxes ON allfluxes.oidref = basic.oid WHERE ident.id = '{}'"
+)
+
+
 def _from_simbad(text: str, name: str | None) -> Target:
     """Ask SIMBAD, for so many seconds."""
     try:
@@ -138,11 +147,9 @@ def _from_simbad(text: str, name: str | None) -> Target:
             f"target {shortened(text)} is not in the embedded list and astroquery is missing, expected coordinates, or "
             "`pip install 'mauvecl[names]'`"
         ) from None
-    service = Simbad()
-    service.timeout = TIMEOUT_S
+    query = SIMBAD_QUERY.format(text.strip().replace("'", "''"))
     try:
-        service.add_votable_fields("V", "plx_value", "sp_type")
-        table = service.query_object(text)
+        table = _within(TIMEOUT_S, lambda: Simbad.query_tap(query))
     except Exception as error:  # the network fails in many ways
         raise InputError(
             f"target {shortened(text)} is not in the embedded list and SIMBAD did not answer within {TIMEOUT_S:g} s "
@@ -160,5 +167,27 @@ def _from_simbad(text: str, name: str | None) -> Target:
     if ra is None or dec is None:
         raise InputError(f"target {shortened(text)} has no coordinates in SIMBAD, expected another name")
     distance = None if parallax is None or parallax <= 0 else 1000 / parallax
-    kind = str(row["sp_type"]) or None
+    kind = None if np.ma.is_masked(row["sp_type"]) else str(row["sp_type"]).strip() or None
     return Target(name or text.strip(), ra, dec, "SIMBAD", distance, number("V"), kind)
+
+
+def _within(seconds: float, ask: Callable[[], Any]) -> Any:
+    """What a function returns, if it does so in time: requests of astroquery wait for ever where nothing answers."""
+    found: list[Any] = []
+    failed: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            found.append(ask())
+        except Exception as error:
+            failed.append(error)
+
+    # Not waited for at exit.
+    thread = threading.Thread(target=run, daemon=True)
+    thread.start()
+    thread.join(seconds)
+    if failed:
+        raise failed[0]
+    if not found:
+        raise TimeoutError
+    return found[0]

@@ -22,8 +22,8 @@ TRUSTED_D = 14.0
 #: Days from the epoch from which "auto" takes the mean orbit: by then drag may have moved the satellite by a tenth of
 #: an orbit (assumption; see `along_track_km`).
 MEAN_FROM_D = 60.0
-#: Along-track error of public elements at their epoch, km, and its growth, km a day, in low orbit (Vallado & Cefola
-#: 2012, IAC-12-C1.6.12: about 1 km at epoch and 1-3 km a day).
+#: Along-track error of public elements near their epoch, km (about one in low orbit: Kelso 2007, AAS 07-127), and its
+#: growth, km a day (1 to 3: documentation of the package sgp4).
 AT_EPOCH_KM, PER_DAY_KM = 1.0, 2.0
 #: By how much the drag of the days to come may differ from that of the elements (assumption: the density of the upper
 #: atmosphere follows the Sun, and halves or doubles within weeks).

@@ -1,114 +1,25 @@
-"""When targets can be seen: limits, windows, and how long by day and month."""
+"""When targets can be seen: windows, and how long by day and month."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
 from . import constraints as must
 from .constraints import Flags
 from .earth import Vectors
+from .limits import Limits
 from .orbit import Track
 from .radiation import proton_map
 
-EclipseRule = Literal["any", "only", "never"]
 #: One limit: which targets some steps leave, (steps or 1, k or 1).
 Rule = Callable[[slice], Flags]
 #: Steps looked at together, so that what is held for a hundred targets stays in some tens of MB.
 CHUNK = 1 << 16
-
-
-@dataclass(frozen=True)
-class Limits:
-    """What must hold for a target to be observed. None of Mauve's own limits is public: all are assumptions.
-
-    Attributes
-    ----------
-    earth_limb_deg, sun_deg, moon_deg : float or None
-        Least angles from the Earth's limb, the Sun and the Moon; None is no limit.
-    declination_deg : (low, high) or None
-        Field of regard.
-    normal_cone_deg : float or None
-        Field of regard as a cone about the orbit's normal, on either side.
-    eclipse : {"any", "only", "never"}
-        Whether to observe in the Earth's shadow.
-    proton_flux : float or None
-        Largest flux of trapped protons above 10 MeV, cm^-2 s^-1: the South Atlantic Anomaly.
-    anomaly : tuple of (longitude, latitude), deg
-        A polygon of one's own in place of the map.
-    shortest_s : float
-        Shorter windows are left out.
-    duty_cycle : float
-        Share of a window in which the star is exposed.
-    """
-
-    earth_limb_deg: float | None = 25.0
-    sun_deg: float | None = 46.0
-    moon_deg: float | None = 25.0
-    declination_deg: tuple[float, float] | None = (-46.4, 31.8)
-    normal_cone_deg: float | None = None
-    eclipse: EclipseRule = "any"
-    proton_flux: float | None = 10.0
-    anomaly: tuple[tuple[float, float], ...] = ()
-    shortest_s: float = 0.0
-    duty_cycle: float = 1.0
-
-    def __post_init__(self) -> None:
-        for name, most in (("earth_limb_deg", 90), ("sun_deg", 180), ("moon_deg", 180), ("normal_cone_deg", 180)):
-            value = getattr(self, name)
-            if value is not None and not 0 <= value <= most:
-                raise InputError(f"{name} = {value}, expected 0 to {most}, or none")
-        if self.declination_deg is not None:
-            low, high = self.declination_deg
-            if not -90 <= low < high <= 90:
-                raise InputError(f"declination_deg = {low:g} to {high:g}, expected two rising values within -90 to 90")
-        if self.eclipse not in ("any", "only", "never"):
-            raise InputError(f"eclipse = {self.eclipse!r}, expected any, only or never")
-        if self.proton_flux is not None and not self.proton_flux > 0:
-            raise InputError(f"proton_flux = {self.proton_flux}, expected > 0 or none")
-        if self.anomaly and (len(self.anomaly) < 3 or not np.isfinite(self.anomaly).all()):
-            raise InputError(f"anomaly is a polygon of {len(self.anomaly)} corners, expected at least 3, finite")
-        if not (np.isfinite(self.shortest_s) and self.shortest_s >= 0):
-            raise InputError(f"shortest_s = {self.shortest_s}, expected >= 0")
-        if not 0 < self.duty_cycle <= 1:
-            raise InputError(f"duty_cycle = {self.duty_cycle}, expected above 0, at most 1")
-
-    @property
-    def assumptions(self) -> list[tuple[str, str, str]]:
-        """Each limit in force: its name, its value, where the default is from."""
-        return [
-            (field.name, _text(getattr(self, field.name)), SOURCES[field.name])
-            for field in fields(self)
-            if getattr(self, field.name) not in (None, ())
-        ]
-
-
-_UVEX = "assumption, borrowed from UVEX (m4opt's definition of that mission); Mauve's own is not public"
-#: Where the defaults are from.
-SOURCES = {
-    "earth_limb_deg": _UVEX,
-    "sun_deg": _UVEX,
-    "moon_deg": _UVEX,
-    "declination_deg": "assumption, field of regard in a talk of 2024, before launch; the flown orbit's is not public",
-    "normal_cone_deg": "assumption: such a cone of 39.1 deg gives the field of regard of the talk of 2024",
-    "eclipse": "assumption: observing is allowed in sunlight and shadow alike",
-    "proton_flux": "assumption: no exposures above this flux of protons beyond 10 MeV (AP8 at solar maximum, 510 km)",
-    "anomaly": "a polygon of one's own in place of the map of protons",
-    "shortest_s": "assumption: no time is lost to pointing and acquisition",
-    "duty_cycle": "assumption: the whole window is exposed; the share that Mauve reaches is not public",
-}
-
-
-def _text(value: object) -> str:
-    if isinstance(value, tuple):
-        return " ".join(_text(one) for one in value)
-    return f"{value:g}" if isinstance(value, float) else str(value)
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,6 +11,7 @@ import astropy.units as u
 import numpy as np
 from numpy.typing import NDArray
 
+from ..doors import public
 from ..errors import InputError
 from ..quantities import number
 from .helioecliptic import HelioEcliptic, helioecliptic
@@ -26,6 +27,7 @@ Lookup = Literal["bilinear", "nearest"]
 RANGE_MAG_ARCSEC2 = (5.0, 35.0)
 
 
+@public
 @dataclass(frozen=True)
 class Sky:
     """Zodiacal light of one brightness over the field of view.

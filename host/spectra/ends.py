@@ -212,7 +212,7 @@ def means(wavelength: Float, flux: Float, edges: Float) -> Float:
 
 
 def extended(
-    name: str, wavelength: Float, flux: Float, template: str, beyond: Float, shape: Float
+    name: str, wavelength: Float, flux: Float, extension: str, beyond: Float, shape: Float
 ) -> tuple[Float, Float, tuple[str, ...]]:
     """A spectrum with another's ends where that one reaches farther, scaled to it at the join, which is told.
 
@@ -220,7 +220,7 @@ def extended(
     ----------
     name : str
     wavelength, flux : ndarray, shape (n,)
-    template : str
+    extension : str
         The other's name.
     beyond, shape : ndarray, shape (m,)
         Its wavelengths, nm, and fluxes.
@@ -241,10 +241,10 @@ def extended(
         more = beyond < end if blue else beyond > end
         if not more.any():
             continue
-        join, own, other = _join(name, wavelength, flux, template, beyond, shape, blue)
+        join, own, other = _join(name, wavelength, flux, extension, beyond, shape, blue)
         added = shape[more] * (own / other)
         told.append(
-            f"{'below' if blue else 'above'} {end:g} nm it is continued by {template}, scaled by {own / other:.4g} to "
+            f"{'below' if blue else 'above'} {end:g} nm it is continued by {extension}, scaled by {own / other:.4g} to "
             f"agree at {join[0]:g}-{join[1]:g} nm"
         )
         wavelength, flux = (
@@ -252,17 +252,17 @@ def extended(
             if blue
             else (np.append(wavelength, beyond[more]), np.append(flux, added))
         )
-    return wavelength, flux, tuple(told) or (f"its extension {template} reaches no farther and is not used",)
+    return wavelength, flux, tuple(told) or (f"its extension {extension} reaches no farther and is not used",)
 
 
 def _join(
-    name: str, wavelength: Float, flux: Float, template: str, beyond: Float, shape: Float, blue: bool
+    name: str, wavelength: Float, flux: Float, extension: str, beyond: Float, shape: Float, blue: bool
 ) -> tuple[Float, float, float]:
     """The range in which two spectra are compared, as wide as the first one's noise asks, and their means there."""
     low, high = max(wavelength[0], beyond[0]), min(wavelength[-1], beyond[-1])
     if not low < high:
         raise InputError(
-            f"spectrum {name} spans {wavelength[0]:g}-{wavelength[-1]:g} nm and its extension {template} "
+            f"spectrum {name} spans {wavelength[0]:g}-{wavelength[-1]:g} nm and its extension {extension} "
             f"{beyond[0]:g}-{beyond[-1]:g} nm, expected them to overlap"
         )
     noise = point_noise(flux)
@@ -274,6 +274,6 @@ def _join(
         if own > JOIN_ERRORS * error and other > 0.0 and np.isfinite(own / other):
             return join, own, other
     raise InputError(
-        f"spectrum {name} and its extension {template} have mean fluxes of {own:g} and {other:g} at "
+        f"spectrum {name} and its extension {extension} have mean fluxes of {own:g} and {other:g} at "
         f"{join[0]:g}-{join[1]:g} nm, expected light in both to scale by"
     )

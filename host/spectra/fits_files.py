@@ -144,8 +144,8 @@ def _text(header: Any, key: str) -> str:
 def _named(primary: Any, header: Any, name: str) -> str:
     for key in ("TARGNAME", "TARGETID", "OBJECT"):
         for one in (primary, header):
-            if found := _text(one, key)[:80]:
-                return found
+            if title := _text(one, key)[:80]:
+                return title
     return name
 
 
@@ -174,9 +174,8 @@ def _table(hdu: Any, primary: Any, name: str, origin: str, asked: Sequence[str])
     header = hdu.header
     if _text(header, "ZIMAGE") == "True":
         raise InputError("holds a compressed image, expected a table with WAVELENGTH and FLUX")
-    columns = hdu.columns
-    names = [str(one) for one in columns.names]
-    given = [(one.unit or "").strip() or None for one in columns]
+    names = [str(one) for one in hdu.columns.names]
+    given = [(one.unit or "").strip() or None for one in hdu.columns]
     # The whole file's unit stands for the flux where its column has none (SDSS).
     whole = _text(primary, "BUNIT") or _text(header, "BUNIT") or None
     ucds = " ".join(_text(header, f"TUCD{k + 1}") for k in range(len(names)) if _text(header, f"TUCD{k + 1}"))
@@ -185,7 +184,7 @@ def _table(hdu: Any, primary: Any, name: str, origin: str, asked: Sequence[str])
         value = header.get(f"TNULL{place + 1}")
         return value if isinstance(value, int | float) and not isinstance(value, bool) else None
 
-    found = columns_of(
+    columns = columns_of(
         names,
         given,
         lambda k: hdu.data.field(names[k]),
@@ -197,9 +196,9 @@ def _table(hdu: Any, primary: Any, name: str, origin: str, asked: Sequence[str])
         notes=_notes(primary, header, origin),
         none=none,
     )
-    if found.flux_unit is None and whole is not None:
-        return Columns(**{**found.__dict__, "flux_unit": whole})
-    return found
+    if columns.flux_unit is None and whole is not None:
+        return Columns(**{**columns.__dict__, "flux_unit": whole})
+    return columns
 
 
 def _image(hdu: Any, primary: Any, name: str, origin: str, asked: Sequence[str]) -> Columns:

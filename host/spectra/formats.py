@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING
 
 from ..errors import InputError
 from ..files.bounded import read_bytes, shortened, unpacked
-from .columns import Columns, ReadSpectrum, spectrum_of
 
 if TYPE_CHECKING:
     import astropy.units as u
 
-__all__ = ["ReadSpectrum", "read_spectrum", "without_columns"]
+    from .columns import Columns, ReadSpectrum
 
 
 def without_columns(path: str | Path) -> tuple[Path, tuple[str, ...]]:
@@ -48,6 +47,8 @@ def read_spectrum(
         If there is no such file, or it holds no spectrum, or several.
     """
     import numpy as np
+
+    from .columns import spectrum_of
 
     try:
         place, asked = without_columns(path)

@@ -78,8 +78,8 @@ def read_text(text: str, name: str, origin: str, asked: Sequence[str], wavelengt
     words = "\n".join(header)
     stated: list[str | None] = [None, None]
     for source in (_own_units(names, units, wave, value), words):
-        found = stated_units(source, wavelength=wavelength and not stated[0], flux=flux and not stated[1])
-        stated = [old or new for old, new in zip(stated, found, strict=True)]
+        more = stated_units(source, wavelength=wavelength and not stated[0], flux=flux and not stated[1])
+        stated = [old or new for old, new in zip(stated, more, strict=True)]
     return Columns(
         numbers(values[:, 0], "wavelength"),
         numbers(values[:, 1], "flux"),

@@ -9,19 +9,12 @@ from importlib.resources import files
 from typing import TYPE_CHECKING
 
 from ..errors import InputError
+from ..files.ecsv import Numbers, parse_numbers
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
 _LIBRARY = files("mauvecl.host.stars") / "library"
-
-
-def _read(*path: str) -> Table:
-    from astropy.table import Table
-
-    table = Table.read(_LIBRARY.joinpath(*path).read_text(encoding="utf-8"), format="ascii.ecsv")
-    # Empty text comes back masked.
-    return table.filled("") if table.has_masked_values else table
 
 
 @cache
@@ -53,9 +46,13 @@ def library_table() -> Table:
         Columns name, alias, spectral_type, star, origin, citation, licence, treatment, uv_quality, kept (all text; the
         last is "embedded" or "yours").
     """
+    from astropy.table import Table
+
     from . import own_stars
 
-    table = _read("index.ecsv")
+    table = Table.read(_LIBRARY.joinpath("index.ecsv").read_text(encoding="utf-8"), format="ascii.ecsv")
+    # Empty text comes back masked.
+    table = table.filled("")
     table.remove_columns(["file", "source_file"])
     table["kept"] = "embedded"
     for star in own_stars.kept():
@@ -100,11 +97,15 @@ def find(name: str) -> dict[str, str]:
 
 
 @lru_cache(8)
-def spectrum_table(file: str) -> Table:
+def spectrum_table(file: str) -> Numbers:
     """A library spectrum: columns wavelength (nm) and flux (erg s-1 cm-2 A-1)."""
-    return _read("spectra", file)
+    return _numbers("spectra", file)
 
 
-def band_table(file: str) -> Table:
+def band_table(file: str) -> Numbers:
     """A photometric band: columns wavelength (nm) and throughput (per photon)."""
-    return _read("bands", file)
+    return _numbers("bands", file)
+
+
+def _numbers(folder: str, file: str) -> Numbers:
+    return parse_numbers(_LIBRARY.joinpath(folder, file).read_text(encoding="utf-8"), f"library file {file}")

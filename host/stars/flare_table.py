@@ -93,8 +93,8 @@ def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
     lower = {str(column).strip().lower(): column for column in table.colnames}
 
     def column(names: tuple[str, ...], unit: str) -> np.ndarray | None:
-        found = next((lower[one] for one in names if one in lower), None)
-        return None if found is None else _numbers(table[found], f"{name}: the column {found!r}", unit)
+        title = next((lower[one] for one in names if one in lower), None)
+        return None if title is None else _numbers(table[title], f"{name}: the column {title!r}", unit)
 
     amplitudes = column(AMPLITUDES, "")
     if amplitudes is None:
@@ -109,14 +109,14 @@ def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
         raise InputError(
             f"{name}: the amplitude of flare {row} is {amplitudes[row]:g}, expected a relative rise above 0"
         )
-    found = QTable({"amplitude": amplitudes})
+    flares = QTable({"amplitude": amplitudes})
     for title, names in (("start", STARTS), ("stop", STOPS)):
         times = column(names, "d")
         if times is not None:
-            found[title] = times
-            found[title].unit = "d"
-    found["amplitude"].info.description = "relative rise above the quiescent flux, in the band of the light curve"
-    return found
+            flares[title] = times
+            flares[title].unit = "d"
+    flares["amplitude"].info.description = "relative rise above the quiescent flux, in the band of the light curve"
+    return flares
 
 
 def _numbers(column: Any, named: str, unit: str) -> np.ndarray:

@@ -21,8 +21,6 @@ from pathlib import Path
 from typing import IO, TYPE_CHECKING
 from urllib.parse import urljoin, urlsplit
 
-import numpy as np
-
 from ..errors import InputError
 from ..files.bounded import limit_bytes, read_bytes, shortened
 from ..files.ecsv import read_ecsv
@@ -32,6 +30,7 @@ from ..spectra.formats import without_columns
 from ..version import VERSION
 
 if TYPE_CHECKING:
+    import numpy as np
     from astropy.table import Table
 
     from .source import Source
@@ -104,6 +103,8 @@ def spectrum(star: OwnStar) -> tuple[np.ndarray, np.ndarray]:
     InputError
         If the file is not as it was kept.
     """
+    import numpy as np
+
     table = _read(star.path)
     wavelength, flux = (np.asarray(table[name], float) for name in ("wavelength", "flux"))
     if _digest(wavelength, flux) != table.meta["spectrum_sha256"]:

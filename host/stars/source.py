@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..content import ByContent
+from ..doors import public
 from ..errors import InputError
 from ..plotting import picture
 from ..quantities import number
@@ -40,6 +41,7 @@ if TYPE_CHECKING:
 BRIGHTEST_V, SUN_V = -2.0, (-27.3, -26.2)
 
 
+@public
 @dataclass(frozen=True, eq=False)
 class Source(ByContent):
     """A stellar spectrum at the telescope.
@@ -129,8 +131,8 @@ class Source(ByContent):
         table = catalogue.spectrum_table(entry["file"])
         noisy = entry["noisy_below_nm"]
         return cls(
-            np.asarray(table["wavelength"], float),
-            np.asarray(table["flux"], float),
+            table["wavelength"],
+            table["flux"],
             entry["name"],
             f"{entry['origin']}; {entry['citation']}",
             (
@@ -170,11 +172,9 @@ class Source(ByContent):
         InputError
             If the file is missing, unreadable or holds no usable spectrum.
         """
-        found = read_spectrum(Path(path), wavelength_unit=wavelength_unit, flux_unit=flux_unit)
-        star = cls._made(
-            found.wavelength_nm, found.flux_flam, found.name, found.origin, found.notes, found.told, extend
-        )
-        unscaled = found.unscaled or star._too_bright()
+        read = read_spectrum(Path(path), wavelength_unit=wavelength_unit, flux_unit=flux_unit)
+        star = cls._made(read.wavelength_nm, read.flux_flam, read.name, read.origin, read.notes, read.told, extend)
+        unscaled = read.unscaled or star._too_bright()
         return replace(star, unscaled=unscaled) if unscaled else star
 
     @classmethod
@@ -281,6 +281,10 @@ class Source(ByContent):
         import astropy.units as u
         from synphot.units import FLAM
 
+        if not hasattr(spectrum, "waveset"):
+            raise InputError(
+                f"the spectrum is of the type {type(spectrum).__name__}, expected a SourceSpectrum of synphot"
+            )
         own = spectrum.waveset
         if own is None:
             raise InputError(f"{name} has no wavelengths of its own, expected a spectrum with a waveset")
@@ -297,6 +301,8 @@ class Source(ByContent):
     @classmethod
     def from_specutils(cls, spectrum: Any, *, name: str = "specutils spectrum") -> Self:
         """A one-dimensional specutils Spectrum with units."""
+        if not (hasattr(spectrum, "spectral_axis") and hasattr(spectrum, "flux")):
+            raise InputError(f"the spectrum is of the type {type(spectrum).__name__}, expected a Spectrum of specutils")
         axis, flux = spectrum.spectral_axis, spectrum.flux
         if flux.ndim != 1:
             raise InputError(f"{name} has shape {flux.shape}, expected one spectrum")
@@ -307,7 +313,14 @@ class Source(ByContent):
 
     def to_synphot(self) -> Any:
         """The spectrum as a synphot SourceSpectrum, linear between its points."""
-        return bands.synphot_spectrum(self.wavelength_nm, self.flux_flam)
+        import astropy.units as u
+        from synphot import Empirical1D, SourceSpectrum
+        from synphot.units import FLAM, PHOTLAM, convert_flux
+
+        at = self.wavelength_nm * u.nm
+        photons = convert_flux(at, self.flux_flam * FLAM, PHOTLAM)
+        # Negative fluxes are measured noise; without this they become zero.
+        return SourceSpectrum(Empirical1D, points=at, lookup_table=photons, keep_neg=True)
 
     def to_specutils(self) -> Any:
         """The spectrum as a specutils Spectrum (needs the extra ``spectra``)."""

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from mauvecl.host.content import ByContent
 from mauvecl.host.plotting import picture
+from mauvecl.study.labels import titled
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -16,6 +19,19 @@ if TYPE_CHECKING:
 
     from mauvecl.host.expectation import Expectation
     from mauvecl.study.study import Study
+
+
+@dataclass(frozen=True, eq=False)
+class InCell:
+    """One star in one cell of the sweep."""
+
+    label: str
+    at: Mapping[str, float | str]
+
+    @property
+    def title(self) -> str:
+        """The star and what is swept, for pictures."""
+        return titled(self.label, self.at)
 
 
 class Answer(ByContent, ABC):

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Any
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.parsed import read_text
+from mauvecl.host.files.whole import write_whole
 from mauvecl.host.version import VERSION
-from mauvecl.runs.durable import write_whole
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -138,7 +138,7 @@ def write_record(
         record["devices"] = [asdict(device) for device in devices]
         record["kernels"] = (pool or opened).kernel_digest  # type: ignore[union-attr]
         if pool is not None:
-            record["shares"] = asdict(pool.standing)
+            record["shards"] = asdict(pool.standing)
         told = "not run on this device and version: mauvecl selftest"
         record["selftest"] = [last(device) or told for device in devices]
     stale: list[Path] = []

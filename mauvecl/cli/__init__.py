@@ -1,1 +1,1 @@
-"""The command line: `app` puts the verbs together; the others hold some verbs each, their flags, and their running."""
+"""The command line: `app` puts the verbs together; the rest is what they share, from flags to failures."""

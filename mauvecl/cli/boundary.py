@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     import typer
 
 #: Exit codes beside 0; 70 and 74 as sysexits.h has them, those above 128 as shells count signals.
-FOUND: Final = 1
+FAULTY: Final = 1
 BAD_INPUT: Final = 2
 UNFORESEEN: Final = 70
 OUTPUT_FULL: Final = 74
@@ -27,7 +27,7 @@ INTERRUPTED: Final = 130
 READER_GONE: Final = 141
 #: What `--help` says of them.
 EXIT_CODES = (
-    f"Exit codes: 0 done, {FOUND} a check found something, {BAD_INPUT} bad input, {UNFORESEEN} an unforeseen failure "
+    f"Exit codes: 0 done, {FAULTY} a check found a fault, {BAD_INPUT} bad input, {UNFORESEEN} an unforeseen failure "
     f"(a fault of mauvecl; a file with its traceback is named), {OUTPUT_FULL} standard output cannot be written, "
     f"{INTERRUPTED} interrupted, {READER_GONE} the reader of standard output went away, 143 terminated."
 )

@@ -83,7 +83,7 @@ class Meter:
     def _retries(self) -> str:
         """What a pool tells beside that, where a device failed."""
         retries = 0 if self.standing is None else self.standing().retries
-        return f", {retries} shares counted again" if retries else ""
+        return f", {retries} parts counted again" if retries else ""
 
     def _draw(self, done: int, total: int) -> None:
         from rich.console import Console

@@ -41,8 +41,8 @@ def question_values(study: Study, *, detects: bool) -> None:
     """
     from mauvecl.host.instrument.places import find_instrument
     from mauvecl.host.ranges import check_amplitude, check_exposure, check_magnitude, check_temperature
-    from mauvecl.host.stars.bands import known_band
-    from mauvecl.results.fap import check_fap
+    from mauvecl.host.stars.band_names import known_band
+    from mauvecl.results.requests.fap import check_fap
     from mauvecl.statistics.names import check_statistic
 
     for star in study.star:

@@ -49,7 +49,7 @@ class Session:
     resume, restart : bool
         What is to become of an unfinished run that is there.
     keep_after : float, optional
-        Seconds after which finished shares are kept on the disk; as `Checkpoint` has it by default.
+        Seconds after which finished parts of the work are kept on the disk; as `Checkpoint` has it by default.
     insist : bool
         Begin what would never end, or not fit.
     opened : Device, optional
@@ -125,13 +125,10 @@ class Session:
             stack.enter_context(told_of_interrupts(lambda: self._kept(checkpoint)))
             stack.enter_context(checkpoint)
             self.say(checkpoint.messages)
-            if self.pictures:
-                # Half a second that would be waited for at the end; devices leave one thread idle meanwhile.
-                threading.Thread(target=_load_matplotlib, name="mauvecl-load", daemon=True).start()
             stack.enter_context(self.meter)
             workers = stack.enter_context(working(self.device, self.cluster))
             progress = self.meter if unit == "realisations" else None
-            self._pool = Pool(workers, checkpoint=checkpoint, progress=progress)
+            self._pool = Pool(workers, checkpoint=checkpoint, progress=progress, meanwhile=self._load)
             self.meter.standing = lambda: self._pool.standing
             yield self._pool
             if checkpoint.damaged:
@@ -139,6 +136,15 @@ class Session:
                     [f"{checkpoint.damaged} files of {str(checkpoint.folder)!r} were damaged and are drawn again."]
                 )
         self._checkpoint = checkpoint
+
+    def _load(self) -> None:
+        """What tables and pictures are made with: half a second that would be waited for at the end."""
+        import astropy.table  # noqa: F401
+
+        from mauvecl.pictures.style import available, pyplot
+
+        if self.pictures and available():
+            pyplot()
 
     def metered(self, unit: str) -> Meter:
         """Progress in a unit, to be used in a `with` block."""
@@ -150,8 +156,8 @@ class Session:
         kept = checkpoint.kept
         if not kept:
             return "nothing was written, and nothing is half written"
-        shares = f"{kept} share{'s' if kept > 1 else ''} of the work"
-        return f"{shares} kept in {str(checkpoint.folder)!r}, and the same command with --resume goes on from there"
+        parts = f"{kept} part{'s' if kept > 1 else ''} of the work"
+        return f"{parts} kept in {str(checkpoint.folder)!r}, and the same command with --resume goes on from there"
 
     def say(self, lines: Sequence[str]) -> None:
         """Tell the reader, unless standard output is for JSON alone."""
@@ -208,37 +214,37 @@ class Session:
         if self._pool is not None and not self._lost:
             self._checkpoint.forget()
 
-    def answer(self, found: Answer, show: Callable[[], None]) -> None:
+    def answer(self, answer: Answer, show: Callable[[], None]) -> None:
         """Tell an answer and leave its files.
 
         Parameters
         ----------
-        found : Answer
+        answer : Answer
         show : callable
             Prints its tables.
         """
-        self.say(found.messages)
+        self.say(answer.messages)
         with told_of_interrupts(self._written):
-            self._leave_all(found)
+            self._leave_all(answer)
         if self.as_json:
-            self.print_json(found.as_json())
+            self.print_json(answer.as_json())
             return
         show()
-        self.say(found.remarks)
+        self.say(answer.remarks)
         self.finish()
 
-    def _leave_all(self, found: Answer) -> None:
+    def _leave_all(self, answer: Answer) -> None:
         """Tables, documents and pictures of an answer, then the run's record."""
-        for name, table in found.files.items():
+        for name, table in answer.files.items():
             self.write(table, name)
-        for name, content in found.documents.items():
+        for name, content in answer.documents.items():
             self.leave(partial(self._document, name, content))
         if self.draws_pictures:
             from mauvecl.host.plotting import picture
 
-            for name, (function, *given) in found.pictures.items():
+            for name, (function, *given) in answer.pictures.items():
                 self.leave(partial(picture, function, *given, self.folder / f"{name}.png"))
-        self.record(found.study, found.inputs, [*found.messages, *found.remarks])
+        self.record(answer.study, answer.inputs, [*answer.messages, *answer.remarks])
 
     def _written(self) -> str:
         """What an interruption while files are written leaves."""
@@ -258,13 +264,6 @@ class Session:
         if self.files and not self.quiet:
             names = ", ".join(path.name for path in self.files)
             self.say([f"Wrote {names} to {self.folder}/ in {time.perf_counter() - self.started:.1f} s."])
-
-
-def _load_matplotlib() -> None:
-    from mauvecl.pictures.style import available, pyplot
-
-    if available():
-        pyplot()
 
 
 @contextmanager

@@ -37,12 +37,12 @@ def count(text: str, flag: str) -> int:
     try:
         exact = Decimal(text)
         # More digits than any count has would take for ever to write out.
-        found = int(exact) if exact.is_finite() and exact.adjusted() < 40 else None
+        whole = int(exact) if exact.is_finite() and exact.adjusted() < 40 else None
     except InvalidOperation:
-        exact, found = Decimal(0), None
-    if found is None or found != exact:
+        exact, whole = Decimal(0), None
+    if whole is None or whole != exact:
         raise InputError(f"{flag} {shortened(text)}, expected a whole number, such as 1000000 or 1e6")
-    return found
+    return whole
 
 
 def several(texts: Sequence[str], flag: str, read: Callable[[str, str], Any]) -> list[Any]:
@@ -76,11 +76,11 @@ def as_text(kind: Any) -> tuple[Any, str, Callable[[str, str], Any] | None]:
 
 
 def _within(text: str, flag: str, *, read: Callable[[str, str], Any], low: float | None, high: float | None) -> Any:
-    found = read(text, flag)
-    if (low is not None and not found >= low) or (high is not None and not found <= high):
+    value = read(text, flag)
+    if (low is not None and not value >= low) or (high is not None and not value <= high):
         reach = f"at least {low:g}" if high is None else f"{low:g} to {high:g}"
         raise InputError(f"{flag} {shortened(text)}, expected {reach}")
-    return found
+    return value
 
 
 def axis_of(text: str, flag: str) -> dict[str, Any]:
@@ -95,14 +95,14 @@ def axis_of(text: str, flag: str) -> dict[str, Any]:
     parts = text.split(":")
     try:
         quantity, start, stop, steps, *rest = parts
-        found = {"quantity": quantity, "start": float(start), "stop": float(stop), "steps": int(steps)}
+        axis = {"quantity": quantity, "start": float(start), "stop": float(stop), "steps": int(steps)}
     except ValueError as error:
         raise InputError(
             f"{flag} {text!r}, expected quantity:start:stop:steps, with :log behind it if wanted, or quantity=a,b,c"
         ) from error
     if rest not in ([], ["log"]):
         raise InputError(f"{flag} {text!r} ends in {':'.join(rest)!r}, expected log or nothing")
-    return found | {"log": bool(rest)}
+    return axis | {"log": bool(rest)}
 
 
 def gap_of(text: str) -> tuple[float, float]:

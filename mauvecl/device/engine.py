@@ -13,27 +13,28 @@ from mauvecl.device.opened import Device
 from mauvecl.device.program import DeviceError, DeviceRecord, devices
 from mauvecl.device.stares import Stares
 from mauvecl.device.tiles import Progress, Tile, Tiles
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.stares.requests import StaresRequest
-from mauvecl.noise.comparison import TEMPLATE, Comparison
+from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.drawing import Drawing, DrawingWords
 from mauvecl.noise.scene import BATCH, prepare
-from mauvecl.results.channels import plan_channels
-from mauvecl.results.detection import Detection
-from mauvecl.results.fap import Tails
-from mauvecl.results.hypotheses import Hypotheses
-from mauvecl.results.requests import (
+from mauvecl.results.counts.tally import TailSamples, Tally
+from mauvecl.results.detection.detection import Detection
+from mauvecl.results.requests.channels import plan_channels
+from mauvecl.results.requests.fap import Tails
+from mauvecl.results.requests.hypotheses import Hypotheses
+from mauvecl.results.requests.requests import (
     Countable,
     DetectRequest,
     RealiseRequest,
-    Share,
+    Shard,
     SnrRequest,
     checked,
     expectation_of,
 )
 from mauvecl.results.snr import Counts, SnrResult, elements, observers
 from mauvecl.results.sums import Arrays, DetectionSums, SnrSums, packed_detection, packed_snr
-from mauvecl.results.tally import TailSamples, Tally
 from mauvecl.statistics.linear import Linear
 from mauvecl.statistics.names import USUAL_STATISTICS
 from mauvecl.statistics.nuisances import Nuisances, known
@@ -44,6 +45,7 @@ if TYPE_CHECKING:
 __all__ = ["DeviceError", "DeviceRecord", "Engine", "devices"]
 
 
+@public
 class Engine:
     """Draws realisations on an OpenCL device and reduces them there.
 
@@ -218,17 +220,17 @@ class Engine:
         """
         request = SnrRequest(expectation, realisations, seed, start, Drawing(**drawing))
         sums = SnrSums(request)
-        sums.add(0, packed_snr(self._snr(request, Share(0, request.start, request.realisations))))
+        sums.add(0, packed_snr(self._snr(request, Shard(0, request.start, request.realisations))))
         return sums.answer()
 
-    def count(self, request: Countable, share: Share, *, out: NDArray[Any] | None = None) -> Arrays:
-        """What a share of a request comes to, as `sums` adds it up.
+    def count(self, request: Countable, shard: Shard, *, out: NDArray[Any] | None = None) -> Arrays:
+        """What a shard of a request comes to, as `sums` adds it up.
 
         Parameters
         ----------
         request : DetectRequest, SnrRequest, RealiseRequest or StaresRequest
-        share : Share
-            `shards.shares` cuts requests into them.
+        shard : Shard
+            `shards.shards` cuts requests into them.
         out : ndarray, optional
             As for `realise`.
 
@@ -239,25 +241,25 @@ class Engine:
         """
         match request:
             case DetectRequest():
-                return packed_detection(*self._detection(request, share))
+                return packed_detection(*self._detection(request, shard))
             case SnrRequest():
-                return packed_snr(self._snr(request, share))
+                return packed_snr(self._snr(request, shard))
             case RealiseRequest():
                 x, seed = request.expectation, request.seed
                 how = request.drawing.words
-                rows = self.realise(x, start=share.start, count=share.count, seed=seed, out=out, **how)
+                rows = self.realise(x, start=shard.start, count=shard.count, seed=seed, out=out, **how)
                 return {"rows": rows}
             case StaresRequest():
-                return Stares(self.opened, tiles=self._tiles).reduced(request, share)
+                return Stares(self.opened, tiles=self._tiles).reduced(request, shard)
         raise TypeError(f"{type(request).__name__}, expected a request")
 
-    def _snr(self, request: SnrRequest, share: Share) -> Counts:
+    def _snr(self, request: SnrRequest, shard: Shard) -> Counts:
         self.opened.check_process()
         scene, observed = request.scene, elements(request.expectation)
         counts = Counts(scene.n_pixel, len(observed))
         with scene_launches(self.opened, scene, request.seed, chunk=ELEMENT_CHUNK) as launches:
             launches.observe(observers(request.expectation, scene), observed)
-            self._tiles.over(share.start, share.count, 0, lambda tile, done: launches.histogram(tile, counts))
+            self._tiles.over(shard.start, shard.count, 0, lambda tile, done: launches.histogram(tile, counts))
             launches.flush_counts(counts)
         return counts
 
@@ -270,7 +272,7 @@ class Engine:
         seed: int,
         statistics: Sequence[str | Linear] = USUAL_STATISTICS,
         start: int = 0,
-        comparison: Comparison = TEMPLATE,
+        comparison: Comparison = NOISE_FREE,
         tails: Tails = "counted",
         nuisances: Nuisances | Mapping[str, float] | None = None,
         **drawing: Unpack[DrawingWords],
@@ -280,7 +282,7 @@ class Engine:
         Parameters
         ----------
         quiet : Expectation
-            The star without a flare; its mean is the template.
+            The star without a flare; its mean is the reference.
         flares : sequence of Expectation, or one
             The same star, instrument and exposure with flares; without any only the null is drawn.
         realisations : int
@@ -294,7 +296,7 @@ class Engine:
         mode, recipe, processes, first_frame
             See `Drawing`.
         comparison : Comparison
-            What is subtracted, and by whose variances; the template and the model's by default.
+            What is subtracted, and by whose variances; its expectation and the model's variances by default.
         tails : {"counted", "sampled"}
             Thresholds beyond what is drawn: refused, or by importance sampling (`tails.tail`).
         nuisances : Nuisances or mapping of str to float, optional
@@ -311,15 +313,15 @@ class Engine:
         sums, each = DetectionSums(request), request.realisations
         total = request.parts * each
         for part in range(request.parts):
-            share = Share(part, request.start, each)
-            sums.add(part, packed_detection(*self._detection(request, share, before=part * each, total=total)))
+            shard = Shard(part, request.start, each)
+            sums.add(part, packed_detection(*self._detection(request, shard, before=part * each, total=total)))
         return sums.answer()
 
     def _detection(
-        self, request: DetectRequest, share: Share, *, before: int = 0, total: int | None = None
+        self, request: DetectRequest, shard: Shard, *, before: int = 0, total: int | None = None
     ) -> tuple[Tally, list[TailSamples | None]]:
         self.opened.check_process()
-        plan, scene = request.plans[share.part]
+        plan, scene = request.plans[shard.part]
         tally, samples = Tally(plan.grids), plan.tails()
         with detection_launches(self.opened, scene, request.seed, plan, request.hypotheses) as launches:
 
@@ -328,9 +330,9 @@ class Engine:
                 launches.tally(tile, tally)
                 for grid, kept in zip(tally.grids, samples, strict=True):
                     if kept is not None:
-                        kept.add(launches.channel(tile, grid.channel), share.start + done)
+                        kept.add(launches.channel(tile, grid.channel), shard.start + done)
 
-            self._tiles.over(share.start, share.count, 4 * plan.n_rows, work, before=before, total=total)
+            self._tiles.over(shard.start, shard.count, 4 * plan.n_rows, work, before=before, total=total)
             launches.flush(tally)
         return tally, samples
 
@@ -343,7 +345,7 @@ class Engine:
         count: int,
         seed: int,
         statistics: Sequence[str | Linear] = USUAL_STATISTICS,
-        comparison: Comparison = TEMPLATE,
+        comparison: Comparison = NOISE_FREE,
         nuisances: Nuisances | Mapping[str, float] | None = None,
         **drawing: Unpack[DrawingWords],
     ) -> NDArray[np.float32]:

@@ -9,8 +9,8 @@ import numpy as np
 from mauvecl.device.launches import Launches
 from mauvecl.device.opened import VECTORS, Device
 from mauvecl.noise.scene import BATCH, Scene
-from mauvecl.results.channels import ChannelPlan
-from mauvecl.results.hypotheses import Hypotheses
+from mauvecl.results.requests.channels import ChannelPlan
+from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.statistics.paper import Paper
 
 #: Vectors of realisations that one work-item follows where it sums more than chi-squared: registers hold no more sums.

@@ -203,10 +203,10 @@ def kernel_cache() -> KernelCache:
             break
     else:
         raise OSError(f"no folder for compiled kernels can be written to with {ROOM >> 20} MiB to spare")
-    found = KernelCache(base if _writable(base) else None, work)
+    store = KernelCache(base if _writable(base) else None, work)
     # PoCL's own threads may still write when Python ends; what they leave is swept up by a later process.
-    atexit.register(found.close)
-    return found
+    atexit.register(store.close)
+    return store
 
 
 def _writable(folder: Path) -> bool:

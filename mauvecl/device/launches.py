@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -13,8 +15,8 @@ from mauvecl.device.tiles import Tile
 from mauvecl.noise import layout
 from mauvecl.noise.pixels import PIXEL_BLOCK
 from mauvecl.noise.scene import Scene
+from mauvecl.results.counts.tally import Grid, Tally
 from mauvecl.results.snr import Counts
-from mauvecl.results.tally import Grid, Tally
 
 if TYPE_CHECKING:
     from mauvecl.device.program import Variant
@@ -23,10 +25,10 @@ if TYPE_CHECKING:
 MOST_COUNTED = 2**25
 #: Raw spectra looked at together on the host.
 PIECE = 4096
-#: Kernels of a detection, the first where more is compared than the template.
+#: Kernels of a detection, the first where more is compared than the expectation.
 COMPARED, DETECTION = ("sums", "comparison", "tally", "marginal"), ("sums", "statistics", "tally", "marginal")
 #: Work-items to an element or channel of a histogram, on a device of many.
-SHARES = 1024
+ITEMS = 1024
 
 
 class Launches:
@@ -84,15 +86,35 @@ class Launches:
 
     def _room(self, name: str, size: int) -> Any:
         """A buffer of at least so many bytes, kept from launch to launch."""
-        found = self._named.get(name)
-        if found is None or found.size < size:
-            if found is not None:
-                self._buffers.remove(found)
-                found.release()
-            found = self._cl.Buffer(self._device.context, self._cl.mem_flags.READ_WRITE, size)
-            self._named[name] = found
-            self._buffers.append(found)
-        return found
+        buffer = self._named.get(name)
+        if buffer is None or buffer.size < size:
+            if buffer is not None:
+                self._buffers.remove(buffer)
+                buffer.release()
+            buffer = self._cl.Buffer(self._device.context, self._cl.mem_flags.READ_WRITE, size)
+            self._named[name] = buffer
+            self._buffers.append(buffer)
+        return buffer
+
+    @contextlib.contextmanager
+    def _into(self, name: str, out: NDArray[Any]) -> Iterator[Any]:
+        """A buffer of which `out` holds the content at the end; a processor's own memory needs no copy."""
+        if self._device.record.kind != "cpu":
+            buffer = self._room(name, out.nbytes)
+            yield buffer
+            self._cl.enqueue_copy(self._queue, out, buffer)
+            return
+        flags = self._cl.mem_flags
+        buffer = self._cl.Buffer(self._device.context, flags.WRITE_ONLY | flags.USE_HOST_PTR, hostbuf=out)
+        try:
+            yield buffer
+            mapped, _ = self._cl.enqueue_map_buffer(
+                self._queue, buffer, self._cl.map_flags.READ, 0, out.shape, out.dtype
+            )
+            mapped.base.release(self._queue)
+            self._queue.finish()
+        finally:
+            buffer.release()
 
     def _launch(self, name: str, items: tuple[int, ...], *arguments: Any) -> None:
         if name not in self._kernels:
@@ -116,30 +138,11 @@ class Launches:
         ndarray of uint32, shape (tile.wanted,)
             Frames of any pixel cut off at zero or saturation.
         """
-        flags = self._cl.mem_flags
         clipped = np.empty(tile.wanted, np.uint32)
-        counts = self._room("clipped", clipped.nbytes)
-        # A processor's own memory needs no copy.
-        shared = self._device.record.kind == "cpu"
-        if shared:
-            rows = self._cl.Buffer(self._device.context, flags.WRITE_ONLY | flags.USE_HOST_PTR, hostbuf=out)
-        else:
-            rows = self._room("rows", out.nbytes)
-        try:
-            items = (tile.size // self.variant.width,)
+        counts, items = self._room("clipped", clipped.nbytes), (tile.size // self.variant.width,)
+        with self._into("rows", out) as rows:
             self._launch("realise", items, *self._arguments, *tile.address(), *tile.rows(), counts, rows)
-            if shared:
-                mapped, _ = self._cl.enqueue_map_buffer(
-                    self._queue, rows, self._cl.map_flags.READ, 0, out.shape, out.dtype
-                )
-                mapped.base.release(self._queue)
-            else:
-                self._cl.enqueue_copy(self._queue, out, rows)
-            self._cl.enqueue_copy(self._queue, clipped, counts)
-            self._queue.finish()
-        finally:
-            if shared:
-                rows.release()
+        self._cl.enqueue_copy(self._queue, clipped, counts)
         return clipped
 
     def observe(self, observers: NDArray[np.void], elements: NDArray[np.void]) -> None:
@@ -156,7 +159,7 @@ class Launches:
     def histogram(self, tile: Tile, counts: Counts) -> None:
         """Count each pixel's DN and each element's S/N of a tile on the device."""
         width = self.variant.width
-        items = (self._n_element,) if width > 1 else (self._n_element, min(tile.wanted, SHARES))
+        items = (self._n_element,) if width > 1 else (self._n_element, min(tile.wanted, ITEMS))
         self._launch(
             "histogram",
             items,
@@ -243,7 +246,7 @@ class Launches:
         """
         scene = self._scene
         more = map(self.upload, (beyond(scene.estimates), bands, finished, scales, scale_end))
-        self._weighing = [self.upload(scene.templates), *self._weighing, *more, np.uint32(scales.shape[1])]
+        self._weighing = [self.upload(scene.references), *self._weighing, *more, np.uint32(scales.shape[1])]
         self._rows += len(scales)
 
     def statistics(self, tile: Tile) -> None:
@@ -272,16 +275,16 @@ class Launches:
     def tally(self, tile: Tile, tally: Tally) -> None:
         """Add a tile's channels to the histograms and integer sums on the device."""
         count = len(tally.grids)
-        shares = 1 if self.variant.width > 1 else SHARES
+        items = 1 if self.variant.width > 1 else ITEMS
         if "grids" not in self._named:
             self._named["grids"] = self.upload(Grid.pack(tally.grids))
             self._named["histogram"] = self.upload(np.zeros((count, layout.BINS), np.uint32))
-            self._named["sums"] = self.upload(np.zeros((count, shares, 2), np.int64))
+            self._named["sums"] = self.upload(np.zeros((count, items, 2), np.int64))
             self._named["outside"] = self.upload(np.zeros(count, np.uint32))
         named = self._named
         self._launch(
             "tally",
-            (count,) if shares == 1 else (count, shares),
+            (count,) if items == 1 else (count, items),
             *tile.rows(),
             np.uint32(tile.size),
             named["values"],
@@ -304,11 +307,11 @@ class Launches:
             return
         self._cl.enqueue_copy(self._queue, self._named["outside"], np.zeros_like(outside))
         for index in np.flatnonzero(outside):
-            found = tally.add_far(int(index), self.channel(tile, tally.grids[index].channel))
-            if found != outside[index]:
+            outlying = tally.add_far(int(index), self.channel(tile, tally.grids[index].channel))
+            if outlying != outside[index]:
                 raise DeviceError(
                     f"{self._device.name} has {outside[index]} values outside a histogram where the host has "
-                    f"{found}, expected the same arithmetic"
+                    f"{outlying}, expected the same arithmetic"
                 )
 
     def flush(self, tally: Tally) -> None:

@@ -67,7 +67,7 @@ class Device:
         return program.digest("\n".join(self.programs))
 
     def kernel(self, rooms: tuple[str, ...], variant: Variant, name: str) -> Any:
-        """A kernel of the built program of some templates; both are made once."""
+        """A kernel of the built program of some sources; both are made once."""
         source = program.render(rooms, variant)
         if source not in self._programs:
             self._programs[source] = program.build(self.context, source)

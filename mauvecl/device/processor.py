@@ -39,12 +39,12 @@ def unknown(device: Any) -> bool:
 
 def level(flags: frozenset[str]) -> str:
     """The highest level of the x86-64 psABI that a processor with these flags has."""
-    found = "x86-64"
+    best = "x86-64"
     for name, needed in LEVELS.items():
         if not flags.issuperset(needed):
             break
-        found = name
-    return found
+        best = name
+    return best
 
 
 @cache

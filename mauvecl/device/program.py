@@ -60,7 +60,7 @@ class DeviceRecord:
 
 @dataclass(frozen=True)
 class Variant:
-    """What the templates are rendered for; no value of a study is among it."""
+    """What kernels are rendered for; no value of a study is among it."""
 
     width: int
     vector_forms: bool
@@ -92,7 +92,7 @@ class Variant:
 
     @property
     def compared(self) -> bool:
-        """Whether more is compared than the template by the model's variances."""
+        """Whether more is compared than the expectation by the model's variances."""
         return self.pair or self.noisy or self.estimated or self.slots > 0
 
 
@@ -138,21 +138,21 @@ def _devices() -> list[Any]:
         platforms = cl.get_platforms()
     except cl.Error:
         platforms = []
-    found = []
+    handles = []
     for platform in platforms:
         try:
-            found += platform.get_devices()
+            handles += platform.get_devices()
         except cl.Error:
             continue
-    if not found:
+    if not handles:
         raise DeviceError(
             "no OpenCL device found: install PoCL with `pip install 'pyopencl[pocl]'` or a driver for your device"
         )
-    for device in found:
+    for device in handles:
         if device.platform.name == POCL:
             processor.give_name(device)
     # PoCL on the CPU first: it is the default.
-    return sorted(found, key=lambda d: (d.platform.name != POCL, "cpu" not in _kind(d)))
+    return sorted(handles, key=lambda d: (d.platform.name != POCL, "cpu" not in _kind(d)))
 
 
 def _kind(device: Any) -> str:
@@ -221,12 +221,12 @@ def choose_device(wanted: str | None) -> tuple[Any, DeviceRecord]:
 
 @cache
 def render(rooms: tuple[str, ...], variant: Variant) -> str:
-    """The OpenCL C source of these templates, after the shared ones.
+    """The OpenCL C source of these files, after the shared ones.
 
     Parameters
     ----------
     rooms : tuple of str
-        Template names without their ending, such as ``("statistics",)``.
+        Names of kernel sources without their ending, such as ``("statistics",)``.
     variant : Variant
         Widths and switches.
     """
@@ -259,7 +259,7 @@ def render(rooms: tuple[str, ...], variant: Variant) -> str:
     structs = layout.c_structs()
 
     def make() -> str:
-        parts = (str(_template(text).render(**values)) for text in texts)
+        parts = (str(_parsed(text).render(**values)) for text in texts)
         return "\n".join((f"/* mauvecl {VERSION} */", structs, *parts))
 
     # Rendering takes longer than starting a kernel that is built already.
@@ -267,7 +267,7 @@ def render(rooms: tuple[str, ...], variant: Variant) -> str:
 
 
 @cache
-def _template(text: str) -> Any:
+def _parsed(text: str) -> Any:
     # Heavy to import.
     from mako.template import Template
 

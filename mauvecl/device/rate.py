@@ -47,7 +47,7 @@ def measured(*, measure: bool = True) -> list[dict[str, Any]]:
     DeviceError
         If there is no device at all.
     """
-    found = []
+    rates = []
     for number, record in enumerate(devices()):
         rate, error = None, ""
         if measure:
@@ -55,5 +55,5 @@ def measured(*, measure: bool = True) -> list[dict[str, Any]]:
                 rate = chi2_rate(Engine(str(number)))
             except DeviceError as failure:
                 error = str(failure).splitlines()[0]
-        found.append(asdict(record) | {"rate": rate, "error": error})
-    return found
+        rates.append(asdict(record) | {"rate": rate, "error": error})
+    return rates

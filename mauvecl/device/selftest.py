@@ -19,16 +19,15 @@ from mauvecl.device.probes import Probes
 from mauvecl.device.program import SAME_BITS
 from mauvecl.host.expectation import Expectation
 from mauvecl.host.version import VERSION
-from mauvecl.noise import layout
-from mauvecl.noise import twin as reference
+from mauvecl.noise import layout, twin
 from mauvecl.noise.comparison import Comparison
 from mauvecl.noise.processes import CosmicRays, Processes, Uniform
 from mauvecl.noise.scene import Scene, prepare
-from mauvecl.results import twin as reference_sums
-from mauvecl.results.channels import ChannelPlan, plan_channels
-from mauvecl.results.hypotheses import Hypotheses
+from mauvecl.results import twin as sums_twin
+from mauvecl.results.counts.tally import Tally
+from mauvecl.results.requests.channels import ChannelPlan, plan_channels
+from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.results.snr import Counts, elements, observers
-from mauvecl.results.tally import Tally
 from mauvecl.statistics.nuisances import known
 from mauvecl.statistics.registry import STATISTICS
 
@@ -56,7 +55,7 @@ class Check:
 
     name: str
     passed: bool
-    found: str
+    result: str
 
 
 def toy(
@@ -127,7 +126,7 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
         },
     ),
 }
-#: Statistics that the fast kernel knows, where nothing but the template is compared.
+#: Statistics that the fast kernel knows, where nothing but the expectation is compared.
 FAST = tuple(name for name, one in STATISTICS.items() if not one.paired)
 #: Across the boundary of the counter's first word.
 START, COUNT, SEED = 2**40 - 13, 40, 2**63 + 20_261_121
@@ -144,8 +143,8 @@ def digests(engine: Engine, name: str) -> dict[str, str]:
         engine.statistic_values(quiet, [flare], count=COUNT, statistics=names, **place, **how)
         for names in (_asked(how), _asked(how, FAST))
     )
-    found = engine.detect(quiet, [flare], realisations=COUNT, statistics=_asked(how, FAST), **place, **how)
-    null = found.distribution("chi2")
+    detection = engine.detect(quiet, [flare], realisations=COUNT, statistics=_asked(how, FAST), **place, **how)
+    null = detection.distribution("chi2")
     return {
         "raw": _digest(raw.astype(np.int64), clipped),
         "statistics": _digest(values.view(np.uint32)),
@@ -161,12 +160,12 @@ def twin_digests(name: str) -> dict[str, str]:
     quiet, flare = toy(**options), toy(flare=0.3, **options)
     scene, index = prepare([quiet], **_laid_out(how)), np.arange(START, START + COUNT, dtype=np.uint64)
     both = prepare([quiet, flare], **_laid_out(how))
-    raw = reference.realise(scene, index, SEED)
-    clipped = reference.clipped(scene, index, SEED)
-    seen = reference_sums.histograms(scene, observers(quiet, scene), elements(quiet), index, SEED)
+    raw = twin.realise(scene, index, SEED)
+    clipped = twin.clipped(scene, index, SEED)
+    seen = sums_twin.histograms(scene, observers(quiet, scene), elements(quiet), index, SEED)
     values, plan = _statistics(name, both)
     tally = Tally(plan.grids[plan.keys.index(("chi2", "null", 0)) :][:1])
-    counts, sums, _ = reference_sums.tally(values, tally.packed)
+    counts, sums, _ = sums_twin.tally(values, tally.packed)
     tally.add(counts, sums, COUNT)
     tally.add_far(0, values[tally.grids[0].channel])
     null = tally.distribution(0)
@@ -184,13 +183,13 @@ def _statistics(name: str, scene: Scene) -> tuple[NDArray[np.float32], ChannelPl
     options, how = CASES[name]
     quiet, flare = toy(**options), toy(flare=0.3, **options)
     unknown = known(how.get("nuisances"), quiet)
-    found = Hypotheses(quiet, (flare,), _asked(how), scene, nuisances=unknown)
-    plan = plan_channels(found, range(1), first=True)
+    hypotheses = Hypotheses(quiet, (flare,), _asked(how), scene, nuisances=unknown)
+    plan = plan_channels(hypotheses, range(1), first=True)
     index = np.arange(START, START + COUNT, dtype=np.uint64)
-    smoothed = reference_sums.Smoothed.of(found, plan) if len(plan.scales) else None
+    smoothed = sums_twin.Smoothed.of(hypotheses, plan) if len(plan.scales) else None
     paired = "chi2_pair" in _asked(how)
-    sums = reference_sums.statistics(scene, index, SEED, plan, pair=paired, smoothed=smoothed)
-    return reference_sums.marginalise(sums, plan.subtractions), plan
+    sums = sums_twin.statistics(scene, index, SEED, plan, pair=paired, smoothed=smoothed)
+    return sums_twin.marginalise(sums, plan.subtractions), plan
 
 
 def _drawing(how: dict[str, Any]) -> dict[str, Any]:
@@ -221,10 +220,10 @@ def _histograms(counts: Counts) -> str:
 
 
 def _digest(*arrays: NDArray[Any]) -> str:
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     for array in arrays:
-        found.update(np.ascontiguousarray(array).tobytes())
-    return found.hexdigest()[:12]
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()[:12]
 
 
 def known_answers(engine: Engine) -> Check:
@@ -238,8 +237,8 @@ def known_answers(engine: Engine) -> Check:
 def twins(engine: Engine) -> Iterator[Check]:
     """Every branch of every kernel against the twin."""
     for name in CASES:
-        ours, twin = digests(engine, name), twin_digests(name)
-        differ = [part for part in ours if ours[part] != twin[part]]
+        ours, slow = digests(engine, name), twin_digests(name)
+        differ = [part for part in ours if ours[part] != slow[part]]
         if not differ:
             passed, text = True, "digests " + " ".join(ours.values())
         elif engine.device.promise == SAME_BITS:
@@ -255,11 +254,11 @@ def _nearly(engine: Engine, name: str) -> tuple[bool, str]:
     quiet, flare = toy(**options), toy(flare=0.3, **options)
     index = np.arange(START, START + COUNT, dtype=np.uint64)
     raw = engine.realise(quiet, start=START, count=COUNT, seed=SEED, **_drawing(how)).astype(np.int64)
-    off = np.abs(raw - reference.realise(prepare([quiet], **_laid_out(how)), index, SEED))
+    off = np.abs(raw - twin.realise(prepare([quiet], **_laid_out(how)), index, SEED))
     share = float(np.mean(off > 0))
     ours = engine.statistic_values(quiet, [flare], start=START, count=COUNT, seed=SEED, statistics=_asked(how), **how)
-    twin = _statistics(name, prepare([quiet, flare], **_laid_out(how)))[0]
-    apart = float(np.max(np.abs(ours - twin).max(axis=1) / np.maximum(twin.std(axis=1), 1e-3)))
+    slow = _statistics(name, prepare([quiet, flare], **_laid_out(how)))[0]
+    apart = float(np.max(np.abs(ours - slow).max(axis=1) / np.maximum(slow.std(axis=1), 1e-3)))
     return (
         bool(off.max() <= 1 and share < 1e-2 and apart < 0.2),
         f"weaker promise: {share:.2g} of counts off, by {off.max()} DN at most; statistics by {apart:.2g} sigma",
@@ -282,9 +281,9 @@ def pearson(counts: NDArray[np.int64], probability: NDArray[np.float64]) -> floa
 
 def counts_of(engine: Engine, x: Expectation, realisations: int, recipe: Any) -> tuple[NDArray[np.int64], int]:
     """Histogram of raw counts over all pixels, which are alike, and the count of its first bin."""
-    found = engine.snr(x, realisations=realisations, seed=SEED, recipe=recipe)
-    first = int(found.scene.base_dn[0, 0]) - layout.OBSERVER_BINS // 2
-    return found.counts.pixel.sum(axis=0), first
+    signal = engine.snr(x, realisations=realisations, seed=SEED, recipe=recipe)
+    first = int(signal.scene.base_dn[0, 0]) - layout.OBSERVER_BINS // 2
+    return signal.counts.pixel.sum(axis=0), first
 
 
 def exact_counts(x: Expectation, first: int) -> NDArray[np.float64]:
@@ -325,10 +324,10 @@ def closed_forms(engine: Engine) -> Iterator[Check]:
     # The root's curvature moves the mean by about noise over eight signals of an element, 2 % here.
     worst = float(np.abs(z).max())
     yield Check("S/N per element, closed form", bool(worst < 0.03 + 5 / np.sqrt(n)), f"means within {worst:.3f} sigma")
-    found = engine.detect(quiet, [flare], realisations=n, seed=SEED, statistics=tuple(STATISTICS))
+    detection = engine.detect(quiet, [flare], realisations=n, seed=SEED, statistics=tuple(STATISTICS))
     for statistic in STATISTICS:
         for which in (None, 0):
-            ours, theory = found.distribution(statistic, which), found.closed_form(statistic, which)
+            ours, theory = detection.distribution(statistic, which), detection.closed_form(statistic, which)
             error = (ours.mean - theory.mean) / (theory.std / np.sqrt(n))
             name = f"{statistic}, mean {'with a flare' if which is not None else 'without'}"
             yield Check(f"{name}, closed form", bool(abs(error) < 5), f"{error:+.1f} standard errors")
@@ -346,10 +345,10 @@ def run(engine: Engine, told: Callable[[Check], None] = lambda check: None) -> l
     """All checks; `told` hears of each as it ends."""
     from mauvecl.device.selftest_stares import stares
 
-    found: list[Check] = []
+    checks: list[Check] = []
 
     def note(check: Check) -> None:
-        found.append(check)
+        checks.append(check)
         told(check)
 
     note(known_answers(engine))
@@ -357,7 +356,7 @@ def run(engine: Engine, told: Callable[[Check], None] = lambda check: None) -> l
         for check in group(engine):
             note(check)
     note(tiles(engine))
-    return found
+    return checks
 
 
 def keep(engine: Engine, checks: list[Check], seconds: float) -> None:

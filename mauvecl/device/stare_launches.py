@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from mauvecl.device.launches import Launches, beyond
 from mauvecl.device.opened import Device
+from mauvecl.device.program import Variant
 from mauvecl.device.tiles import TILE_BYTES, Tile
 from mauvecl.lightcurve.stares.requests import Method
 from mauvecl.lightcurve.stares.scene import Flares, StareScene
@@ -127,18 +128,22 @@ class StareLaunches(Launches):
             out[..., begin : begin + size] = host[..., tile.start : tile.stop].transpose(1, 3, 2, 0)
 
     def _by_cumulants(self, tile: Tile, out: Floats, row: int) -> None:
-        """All frames of each stare; a processor's own memory needs no copy."""
-        flags, first = self._cl.mem_flags, tile.first + tile.start
-        kernel = self._device.kernel(("stare", "stare_sums"), self.variant, "stare_sums")
-        shared = self._device.record.kind == "cpu"
-        if shared:
-            values = self._cl.Buffer(self._device.context, flags.WRITE_ONLY | flags.USE_HOST_PTR, hostbuf=out)
-            place = (out.shape[1], row)
-        else:
-            values = self._room("values", out[:, : tile.wanted].nbytes)
-            place = (tile.wanted, 0)
-        each = FRAMES_EACH if self.variant.width > 1 else 1
-        try:
+        """All frames of each stare."""
+        self._in_frames("stare_sums", self.variant, self._own, tile, out, row)
+
+    def glow(self, tile: Tile, out: Floats, row: int) -> None:
+        """What flares put into a tile's frames need, shape (1, n_stare, n_statistic + 1, n_padded_frame)."""
+        self._in_frames("stare_glow", replace(self.variant, in_time=True), [], tile, out, row)
+
+    def _in_frames(self, name: str, variant: Variant, own: list[Any], tile: Tile, out: Floats, row: int) -> None:
+        """One kernel whose lanes are frames."""
+        first, each = tile.first + tile.start, FRAMES_EACH if variant.width > 1 else 1
+        kernel = self._device.kernel(("stare", name), variant, name)
+        # Other memory holds this tile alone.
+        own_memory = self._device.record.kind == "cpu"
+        place = (out.shape[1], row) if own_memory else (tile.wanted, 0)
+        host = out if own_memory else np.empty((len(out), tile.wanted, *out.shape[2:]), np.float32)
+        with self._into("values", host) as values:
             kernel(
                 self._queue,
                 (tile.wanted, -(-out.shape[3] // each)),
@@ -148,20 +153,9 @@ class StareLaunches(Launches):
                 np.uint32(first & 0xFFFFFFFF),
                 np.uint32(first >> 32),
                 np.uint32(each),
-                *self._own,
+                *own,
                 *map(np.uint32, place),
                 values,
             )
-            if shared:
-                mapped, _ = self._cl.enqueue_map_buffer(
-                    self._queue, values, self._cl.map_flags.READ, 0, out.shape, out.dtype
-                )
-                mapped.base.release(self._queue)
-                self._queue.finish()
-            else:
-                host = np.empty((self._scenarios, tile.wanted, *out.shape[2:]), np.float32)
-                self._cl.enqueue_copy(self._queue, host, values)
-                out[:, row : row + tile.wanted] = host
-        finally:
-            if shared:
-                values.release()
+        if not own_memory:
+            out[:, row : row + tile.wanted] = host

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from mauvecl.device.opened import Device
 from mauvecl.device.stare_launches import StareLaunches
 from mauvecl.device.tiles import Progress, Tile, Tiles
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.stares.components import Components
 from mauvecl.lightcurve.stares.requests import Arrays, Kept, Method, StaresRequest, joined
@@ -18,7 +19,7 @@ from mauvecl.lightcurve.stares.scene import Flares, StareScene, padded_frames
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.lightcurve.stares.sums import check_sums
 from mauvecl.noise.processes import CosmicRays
-from mauvecl.results.requests import Share
+from mauvecl.results.requests.requests import Shard
 
 Floats = NDArray[np.float32]
 
@@ -26,6 +27,7 @@ Floats = NDArray[np.float32]
 REDUCED_BYTES = 4 * 2**20
 
 
+@public
 class Stares:
     """Draws stares on an OpenCL device.
 
@@ -132,28 +134,28 @@ class Stares:
                 launches.draw(tile, out, done)
 
             self._tiles.over(first, count, out[:, 0].nbytes, work)
-        found = np.moveaxis(out[..., : stare.n_frames], 2, 3)
-        return found[0] if amplitudes is None else found
+        frames = np.moveaxis(out[..., : stare.n_frames], 2, 3)
+        return frames[0] if amplitudes is None else frames
 
-    def reduced(self, request: StaresRequest, share: Share | None = None) -> Arrays:
-        """What is kept of a request's stares, or of a share of them, which are drawn and reduced a few at a time.
+    def reduced(self, request: StaresRequest, shard: Shard | None = None) -> Arrays:
+        """What is kept of a request's stares, or of a shard of them, which are drawn and reduced a few at a time.
 
         Parameters
         ----------
         request : StaresRequest
-        share : Share, optional
+        shard : Shard, optional
 
         Returns
         -------
         dict of str to ndarray
-            What the request's reduction gives, joined; of a share with its ``start``, as `StareSums` takes it.
+            What the request's reduction gives, joined; of a shard with its ``start``, as `StareSums` takes it.
 
         Raises
         ------
         InputError
             As `frames`.
         """
-        there = share or Share(0, request.start, request.realisations)
+        there = shard or Shard(0, request.start, request.realisations)
         _check(there.start, there.count, request.seed, request.method)
         components, stare, reduction = request.components, request.stare, request.reduction or Kept()
         how = (request.seed, request.method, request.cosmic_rays)
@@ -165,23 +167,28 @@ class Stares:
         alone = 1 if request.method == "cumulants" else self.opened.width
         piece = max(alone, REDUCED_BYTES // each // alone * alone)
         room = np.empty(each * piece // 4, np.float32)
+        beside = np.empty((1, piece, shape[0] + 1, shape[1]) if request.glow else 0, np.float32)
         with self._launches(components, stare, request.flares, *how) as launches:
 
             def work(tile: Tile, done: int) -> None:
-                found = []
+                reduced = []
                 for few in tile.pieces(piece):
                     out = room[: each * few.wanted // 4].reshape(-1, few.wanted, *shape)
                     first = few.first + few.start
                     launches.give(request.flares.part(first - request.start, few.wanted))
                     launches.draw(few, out, 0)
                     values = np.moveaxis(out[..., : stare.n_frames], 2, 3)[scenarios]
-                    found.append(dict(reduction(values, first)))
+                    more = []
+                    if request.glow:
+                        launches.glow(few, beside, 0)
+                        more = [np.moveaxis(beside[0, : few.wanted, :, : stare.n_frames], 1, 2)]
+                    reduced.append(dict(reduction(values, first, *more)))
                 # A tile that fails half way is drawn again.
-                parts.extend(found)
+                parts.extend(reduced)
 
             self._tiles.over(there.start, there.count, each, work)
-        found = joined(parts, adds=reduction.adds)
-        return found | {"start": np.array(there.start)} if share else found
+        kept = joined(parts, adds=reduction.adds)
+        return kept | {"start": np.array(there.start)} if shard else kept
 
     def _launches(
         self,

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal, Self
+from typing import Self
 
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import count
-
-Variances = Literal["model", "estimated"]
 
 #: Quiescent exposures that one stack may hold.
 MOST_EXPOSURES = 1000
 
 
+@public
 @dataclass(frozen=True)
 class Comparison:
     """The quiescent spectrum that is subtracted, and the variances that are divided by.
@@ -21,7 +21,7 @@ class Comparison:
     Attributes
     ----------
     exposures : int
-        Noisy quiescent exposures whose mean is subtracted; 0 for the noise-free template.
+        Noisy quiescent exposures whose mean is subtracted; 0 for their expectation, which has no noise.
     estimated : bool
         Variances from the counts themselves, as an observer must, or from the model.
     """
@@ -39,7 +39,7 @@ class Comparison:
         Parameters
         ----------
         reference : str
-            ``"template"``, ``"exposure"`` or ``"stack:n"`` with n of 1 and more exposures.
+            ``"template"``, the expectation itself; ``"exposure"`` or ``"stack:n"`` with n of 1 and more exposures.
         variances : {"model", "estimated"}
 
         Raises
@@ -52,13 +52,13 @@ class Comparison:
         return cls(_exposures(reference), variances == "estimated")
 
     @property
-    def share(self) -> float:
-        """Variance of what is subtracted, as a share of one exposure's."""
+    def added_variance(self) -> float:
+        """Variance of what is subtracted, in that of one exposure."""
         return 1.0 / self.exposures if self.exposures else 0.0
 
     @property
     def plain(self) -> bool:
-        """Whether nothing but the template and the model's variances is needed."""
+        """Whether nothing but the expectation and the model's variances is needed."""
         return not (self.exposures or self.estimated)
 
 
@@ -73,5 +73,5 @@ def _exposures(reference: str) -> int:
     )
 
 
-#: The noise-free template and the model's variances.
-TEMPLATE = Comparison()
+#: The expectation, and the model's variances.
+NOISE_FREE = Comparison()

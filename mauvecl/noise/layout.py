@@ -29,6 +29,7 @@ STREAMS = {
     "stare_unknown": 16,
     "stare_frame": 17,
     "stare_sums": 18,
+    "stare_glow": 19,
 }
 #: Added to the stream for the draws of a reference exposure.
 REFERENCE = 64
@@ -51,7 +52,7 @@ JOB = np.dtype(
         ("cosmic_bits", "u4"),
         ("cosmic_low", "i4"),
         ("reference_count", "u4"),
-        ("reference_share", "f4"),
+        ("reference_weight", "f4"),
         ("pair_scale", "f4"),
     ]
 )
@@ -60,8 +61,8 @@ JOB = np.dtype(
 PIXEL = np.dtype([("used", "f4"), ("element_end", "u4"), ("four_uneven", "u4"), ("cosmic_gain", "f4")])
 
 #: One scenario in one pixel, read in every inner loop: coefficients of the draw as a polynomial of z, the whole DN
-#: that separate `nearest`'s result from the template's, the template's inverse variance, and twice that times the
-#: template's fraction of a DN.
+#: that separate `nearest`'s result from the reference's, the reference's inverse variance, and twice that times the
+#: reference's fraction of a DN.
 LEVEL = np.dtype(
     [
         ("c0", "f4"),
@@ -76,8 +77,8 @@ LEVEL = np.dtype(
 )
 
 #: One scenario in one pixel, read where needed: whole DN of one draw's mean that the kernels leave out, zero and
-#: saturation as `nearest` sees them, whole DN from the sum of draws to the template, and, at an element's last pixel,
-#: the template's fraction of a DN and inverse variance summed over the element.
+#: saturation as `nearest` sees them, whole DN from the sum of draws to the reference, and, at an element's last pixel,
+#: the reference's fraction of a DN and inverse variance summed over the element.
 EDGE = np.dtype(
     [
         ("base", "i4"),
@@ -127,7 +128,7 @@ RESPONSE = np.dtype(
 OBSERVER = np.dtype([("net_offset", "f4"), ("gain", "f4"), ("variance", "f4"), ("bin_shift", "u4")])
 
 #: How an observer estimates a variance in one pixel of a scenario: net = x + net_offset, variance = gain max(net, 0) +
-#: variance; and the template's fraction of a DN, zero where noisy exposures take its place.
+#: variance; and the reference's fraction of a DN, zero where noisy exposures take its place.
 ESTIMATE = np.dtype([("net_offset", "f4"), ("gain", "f4"), ("variance", "f4"), ("fraction", "f4")])
 
 #: A resolution element: its pixels, the sky subtracted of their sum, DN, and the grid of its S/N's histogram.

@@ -82,14 +82,14 @@ def _both_of_a_pair(chosen: NDArray[np.bool_]) -> NDArray[np.bool_]:
     return np.repeat(pairs.reshape(-1, 2).all(axis=1), 2)[: chosen.size]
 
 
-def estimate(out: NDArray[np.void], template: Expectation, fraction: Float, mean_sum: Float) -> None:
+def estimate(out: NDArray[np.void], reference: Expectation, fraction: Float, mean_sum: Float) -> None:
     """How an observer who knows the detector estimates variances; padding has some, to divide by."""
-    n_pixel, known = template.wavelength_nm.size, template.read_noise_dn**2 + template.dark_variance_dn2 + 1 / 12
+    n_pixel, known = reference.wavelength_nm.size, reference.read_noise_dn**2 + reference.dark_variance_dn2 + 1 / 12
     out["variance"] = 1.0
     out["fraction"] = fraction
-    out["net_offset"][:n_pixel] = mean_sum - template.n_frames * (template.bias_dn + template.dark_dn)
-    out["gain"][:n_pixel] = template.gain_dn_per_electron
-    out["variance"][:n_pixel] = np.maximum(template.n_frames * known, NO_VARIANCE)
+    out["net_offset"][:n_pixel] = mean_sum - reference.n_frames * (reference.bias_dn + reference.dark_dn)
+    out["gain"][:n_pixel] = reference.gain_dn_per_electron
+    out["variance"][:n_pixel] = np.maximum(reference.n_frames * known, NO_VARIANCE)
 
 
 def respond(out: NDArray[np.void], x: Expectation, c: Cumulants, factors: Factors) -> None:

@@ -133,7 +133,7 @@ def table_set(means: Iterable[float], tables: list[AliasTable]) -> tuple[list[Al
 
     Returns
     -------
-    found : list of AliasTable
+    each : list of AliasTable
         For each mean, its table; equal means share one.
     starts : list of int
         Where each mean's table starts.

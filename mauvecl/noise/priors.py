@@ -1,30 +1,35 @@
-"""Distributions of what is not known exactly, and the tables by which the device draws from them."""
+"""Distributions of what is not known exactly.
+
+A study holds them long before anything is asked of them: numpy is loaded where it is.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import TYPE_CHECKING
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import number
-from mauvecl.noise import layout
 
-Float = NDArray[np.float64]
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    Float = NDArray[np.float64]
 
 #: Standard deviations from a normal's mean beyond which logarithms of its tail lose the digits of its shape.
 FURTHEST = 1e5
 
 
 def _make_plain(prior: object, *names: str) -> None:
-    """Values of a prior that came with a unit as plain numbers."""
+    """Values of a prior as plain numbers, also those that came with a unit."""
     for name in names:
         value = getattr(prior, name)
-        if hasattr(value, "unit"):
-            unit = "" if value.unit.is_unity() or value.unit.physical_type == "dimensionless" else "deg_C"
-            object.__setattr__(prior, name, number(f"{name} of a prior", value, unit))
+        unit = getattr(value, "unit", None)
+        kind = "deg_C" if unit is not None and unit.physical_type == "temperature" and name != "sd" else ""
+        plain = number(f"{name} of a prior", value, kind, expected="a finite number")
+        if unit is not None:
+            object.__setattr__(prior, name, plain)
 
 
 @dataclass(frozen=True)
@@ -36,11 +41,13 @@ class Uniform:
 
     def __post_init__(self) -> None:
         _make_plain(self, "low", "high")
-        if not (np.isfinite(self.low) and np.isfinite(self.high) and self.low <= self.high):
-            raise InputError(f"a uniform prior from {self.low:g} to {self.high:g}, expected low <= high, both finite")
+        if not self.low <= self.high:
+            raise InputError(f"a uniform prior from {self.low:g} to {self.high:g}, expected low <= high")
 
     def quantile(self, below: Float, above: Float | None = None) -> Float:
         """The values that the prior stays below with these probabilities; see `Normal.quantile`."""
+        import numpy as np
+
         from_low = self.low + (self.high - self.low) * below
         if above is None:
             return np.asarray(from_low)
@@ -57,14 +64,13 @@ class Normal:
     high: float
 
     def __post_init__(self) -> None:
-        _make_plain(self, "mean", "low", "high")
-        if not (self.sd > 0 and np.isfinite([self.mean, self.sd, self.low, self.high]).all() and self.low < self.high):
+        _make_plain(self, "mean", "sd", "low", "high")
+        if not (self.sd > 0 and self.low < self.high):
             raise InputError(
                 f"a normal prior of mean {self.mean:g}, sd {self.sd:g}, cut at {self.low:g} and {self.high:g}, "
-                "expected sd > 0 and low < high, all finite"
+                "expected sd > 0 and low < high"
             )
-        with np.errstate(over="ignore"):
-            away = max(np.float64(self.low) - self.mean, np.float64(self.mean) - self.high) / self.sd
+        away = max(self.low - self.mean, self.mean - self.high) / self.sd
         if away > FURTHEST:
             raise InputError(
                 f"a normal prior of mean {self.mean:g} and sd {self.sd:g} is cut at {self.low:g} and {self.high:g}, "
@@ -80,7 +86,7 @@ class Normal:
         above : ndarray, same shape, optional
             1 - below, where that would lose digits.
         """
-        # Loaded here: a study holds priors long before anything is asked of them.
+        import numpy as np
         from scipy import special
 
         above = 1.0 - below if above is None else above
@@ -95,41 +101,3 @@ class Normal:
 
 
 Prior = Uniform | Normal
-
-
-def nodes() -> Float:
-    """Probabilities between an end of a prior and its median, those of the device's table.
-
-    Returns
-    -------
-    ndarray, shape (layout.PRIOR_NODES,)
-        Octaves from 2**-56 to 1/2, each cut into 2**PRIOR_BITS cells; the last once more, for a word that float32
-        rounds up.
-    """
-    cells = 2**layout.PRIOR_BITS
-    number = np.arange(layout.PRIOR_NODES - 1)
-    probability = np.ldexp(1.0 + (number % cells) / cells, number // cells - layout.PRIOR_FINEST)
-    return np.append(probability, probability[-1])
-
-
-def table_of(prior: Prior, change: Callable[[Float], Float]) -> tuple[NDArray[np.float32], float]:
-    """What the device draws of a prior: its values from both ends to the median.
-
-    Parameters
-    ----------
-    prior : Prior
-    change : callable
-        From the prior's values to a factor on light or dark, less one.
-
-    Returns
-    -------
-    table : ndarray of float32, shape (2 * PRIOR_NODES,)
-        Factors at `nodes` from the low end, then from the high end, over the factor at the median, less one: float32
-        resolves the spread of a prior however narrow, and however far from one.
-    centre : float
-        The factor at the median, less one.
-    """
-    tail = nodes()
-    values = change(np.append(prior.quantile(tail, 1.0 - tail), prior.quantile(1.0 - tail, tail)))
-    centre = float(change(prior.quantile(np.array([0.5])))[0])
-    return ((values - centre) / (1.0 + centre)).astype(np.float32), centre

@@ -1,6 +1,6 @@
 """Optional noise processes, each with a stream of its own, all off unless asked for.
 
-What they draw is unknown to the observer: templates and variances stay those of the expectation.
+What they draw is unknown to the observer: references and variances stay those of the expectation.
 """
 
 from __future__ import annotations
@@ -11,10 +11,12 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import count, number
 from mauvecl.noise import layout
-from mauvecl.noise.priors import Normal, Prior, Uniform, table_of
+from mauvecl.noise.prior_tables import table_of
+from mauvecl.noise.priors import Normal, Prior, Uniform
 from mauvecl.noise.varied import VARIED, Conditions, Modulated
 
 __all__ = ["NONE", "CosmicRays", "Factors", "Normal", "Prior", "Processes", "Uniform"]
@@ -22,6 +24,7 @@ __all__ = ["NONE", "CosmicRays", "Factors", "Normal", "Prior", "Processes", "Uni
 Float = NDArray[np.float64]
 
 
+@public
 @dataclass(frozen=True)
 class CosmicRays:
     """Hits by charged particles; the defaults are assumptions (INSTRUMENT.md: outside the South Atlantic Anomaly).
@@ -94,6 +97,7 @@ class CosmicRays:
         return np.maximum(np.fft.irfft(spectrum, size)[: most * high + 1], 0.0)
 
 
+@public
 @dataclass(frozen=True)
 class Processes:
     """Which optional processes act.
@@ -165,7 +169,7 @@ class Factors:
     Attributes
     ----------
     tables : ndarray of float32, shape (n_modulation, 2 * layout.PRIOR_NODES)
-        See `priors.table_of`.
+        See `prior_tables.table_of`.
     light, dark, sky : float
         Factors of priors at their medians, which the tables are relative to.
     light_ends, dark_ends, sky_ends : tuple of float, shape (2,)

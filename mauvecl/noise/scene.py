@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mauvecl.noise import layout, pixels
 from mauvecl.noise.choice import Choice, check_reach, choose
-from mauvecl.noise.comparison import TEMPLATE, Comparison
+from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.cumulants import polynomial
 from mauvecl.noise.drawing import Drawing, DrawingWords
 from mauvecl.noise.poisson import AliasTable, table_of
@@ -59,17 +59,17 @@ class Scene:
     priors : ndarray of float32, shape (n_modulation, 2 * PRIOR_NODES)
     medians : tuple of float, shape (3,)
         Factors on light, dark and sky of priors at their medians.
-    templates : ndarray of uint32, shape (n_scenario,)
+    references : ndarray of uint32, shape (n_scenario,)
         For each scenario the one whose mean and variance it is compared with.
     fraction : ndarray, shape (n_scenario, n_padded)
-        Template rounded to whole DN less the template; zero where noisy exposures take its place.
+        Reference rounded to whole DN less the reference; zero where noisy exposures take its place.
     estimates : ndarray of layout.ESTIMATE, shape (n_scenario, n_padded)
         Empty where variances are the model's.
     comparison : Comparison
     base_dn : ndarray of int64, shape (n_scenario, n_pixel)
         Whole DN of one draw's mean that the kernels leave out.
     used : ndarray of bool, shape (n_pixel,)
-        Pixels that enter the statistics: those no template saturates.
+        Pixels that enter the statistics: those no reference saturates.
     """
 
     n_pixel: int
@@ -90,7 +90,7 @@ class Scene:
     tables: NDArray[np.uint32]
     priors: NDArray[np.float32]
     medians: tuple[float, float, float]
-    templates: NDArray[np.uint32]
+    references: NDArray[np.uint32]
     fraction: Float
     estimates: NDArray[np.void]
     comparison: Comparison
@@ -110,7 +110,7 @@ class Scene:
     def constants(
         self, weights: NDArray[np.float32], linear_end: NDArray[np.uint32], pixels_end: NDArray[np.uint32]
     ) -> NDArray[np.float32]:
-        """What the template's fractions add to each sum: chi-squared per scenario, then each linear statistic.
+        """What the reference's fractions add to each sum: chi-squared per scenario, then each linear statistic.
 
         Sums of resolution elements hold them already.
 
@@ -124,7 +124,7 @@ class Scene:
         return np.array([*chi2, *linear], np.float32)
 
     def part(self, scenarios: Sequence[int]) -> Scene:
-        """The same scene with some of its scenarios, in the order given; their templates must be among them."""
+        """The same scene with some of its scenarios, in the order given; their references must be among them."""
         chosen = list(scenarios)
         job = self.job.copy()
         job["scenario_count"] = len(chosen)
@@ -132,16 +132,16 @@ class Scene:
             name: array[chosen] if len(array := getattr(self, name)) else array
             for name in ("levels", "edges", "photon_counts", "responses", "fraction", "estimates", "base_dn")
         }
-        templates = np.array([chosen.index(t) for t in self.templates[chosen]], np.uint32)
-        return replace(self, job=job, templates=templates, **per_scenario)
+        references = np.array([chosen.index(t) for t in self.references[chosen]], np.uint32)
+        return replace(self, job=job, references=references, **per_scenario)
 
 
 def prepare(
     scenarios: Sequence[Expectation],
     drawing: Drawing | None = None,
     *,
-    templates: Sequence[int] | None = None,
-    comparison: Comparison = TEMPLATE,
+    references: Sequence[int] | None = None,
+    comparison: Comparison = NOISE_FREE,
     first_group: int = 0,
     **words: Unpack[DrawingWords],
 ) -> Scene:
@@ -153,7 +153,7 @@ def prepare(
         On one instrument and exposure.
     drawing : Drawing, optional
         Or its fields by their names.
-    templates : sequence of int, optional
+    references : sequence of int, optional
         For each scenario the quiescent one it is compared with; the first for all by default.
     comparison : Comparison
         What is subtracted, and by whose variances.
@@ -170,7 +170,7 @@ def prepare(
     quiet = scenarios[0]
     factors = drawing.processes.factors(quiet.conditions)
     choice = choose(scenarios, drawing, factors)
-    compared = np.zeros(len(scenarios), np.uint32) if templates is None else np.array(templates, np.uint32)
+    compared = np.zeros(len(scenarios), np.uint32) if references is None else np.array(references, np.uint32)
     used = ~np.any([scenarios[t].saturated for t in np.unique(compared)], axis=0)
     n_pixel, tables = used.size, list[AliasTable]()
 
@@ -198,7 +198,7 @@ def prepare(
         tables=np.concatenate([np.zeros(0, np.uint32), *(t.entries for t in tables)]).astype(np.uint32),
         priors=factors.tables,
         medians=(factors.light, factors.dark, factors.sky),
-        templates=compared,
+        references=compared,
         comparison=comparison,
         used=used,
         **vars(arrays),
@@ -273,7 +273,7 @@ class _PerScenario:
         self,
         k: int,
         x: Expectation,
-        template: Expectation,
+        reference: Expectation,
         choice: Choice,
         comparison: Comparison,
         used: NDArray[np.bool_],
@@ -281,19 +281,19 @@ class _PerScenario:
         """What scenario k is compared with."""
         base, n_pixel = self.base_dn[k], used.size
         level, edge, fraction = self.levels[k, :n_pixel], self.edges[k, :n_pixel], self.fraction[k, :n_pixel]
-        mean_sum = template.recorded_dn
+        mean_sum = reference.recorded_dn
         whole = (x.n_frames // choice.each) * base - np.rint(mean_sum)
         if not comparison.exposures:
             fraction[:] = np.rint(mean_sum) - mean_sum
         level["shift"] = layout.MAGIC - whole
-        variance = noisier(comparison) * template.variance_dn2
+        variance = noisier(comparison) * reference.variance_dn2
         level["inverse_variance"] = used / variance
         level["twice"] = 2.0 * fraction * level["inverse_variance"]
         edge["base"], edge["whole"] = base, whole
         edge["low"] = layout.MAGIC - base
         edge["high"] = layout.MAGIC + (x.highest_dn - base)
         if comparison.estimated:
-            pixels.estimate(self.estimates[k], template, self.fraction[k], np.rint(mean_sum))
+            pixels.estimate(self.estimates[k], reference, self.fraction[k], np.rint(mean_sum))
         ends = pixels.element_ends(x)
         element_variance = np.bincount(x.element, variance * used)
         with np.errstate(divide="ignore"):
@@ -303,7 +303,7 @@ class _PerScenario:
 
 def noisier(comparison: Comparison) -> float:
     """By how much what is subtracted adds its noise to the null's variance."""
-    return 1.0 + comparison.share
+    return 1.0 + comparison.added_variance
 
 
 def _job(
@@ -321,7 +321,7 @@ def _job(
     job["pixel_count"], job["padded_count"], job["scenario_count"] = n_pixel, pixels.padded(n_pixel), len(scenarios)
     job["draw_count"], job["frame_count"] = quiet.n_frames if choice.frames else 1, quiet.n_frames
     job["first_frame"], job["first_group"] = drawing.first_frame, first_group
-    job["reference_count"], job["reference_share"] = comparison.exposures, comparison.share
+    job["reference_count"], job["reference_weight"] = comparison.exposures, comparison.added_variance
     job["pair_scale"] = noisier(comparison) / 2.0
     rays = drawing.processes.cosmic_rays
     if rays is not None:

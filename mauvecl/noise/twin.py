@@ -254,16 +254,16 @@ def _responding(
     third = fma(light, r["light_third"], dark * r["dark_third"])
     fourth = fma(light, r["light_fourth"], dark * r["dark_fourth"])
     with np.errstate(invalid="ignore", divide="ignore"):  # padded pixels have no variance
-        sd, share, zz = np.sqrt(variance), third / variance, z * z
+        sd, skew, zz = np.sqrt(variance), third / variance, z * z
         curve = fourth * fma(zz, np.float32(0.041666668), np.float32(-0.125))
-        curve = curve - third * share * fma(zz, np.float32(0.055555556), np.float32(-0.1388889))
+        curve = curve - third * skew * fma(zz, np.float32(0.055555556), np.float32(-0.1388889))
         cubic = curve / (variance * sd)
-        v = fma(z, sd + cubic, fma(share, fma(zz, np.float32(0.16666667), np.float32(-0.16666667)), c0))
+        v = fma(z, sd + cubic, fma(skew, fma(zz, np.float32(0.16666667), np.float32(-0.16666667)), c0))
         if quartic:
             fifth = fma(light, r["light_fifth"], dark * r["dark_fifth"])
             even = fifth * _quartic(zz, 0.008333334, -0.05, 0.025)
-            even = even - share * fourth * _quartic(zz, 0.041666668, -0.20833333, 0.083333336)
-            even = even + share * share * third * _quartic(zz, 0.037037037, -0.16358025, 0.052469134)
+            even = even - skew * fourth * _quartic(zz, 0.041666668, -0.20833333, 0.083333336)
+            even = even + skew * skew * third * _quartic(zz, 0.037037037, -0.16358025, 0.052469134)
             v = v + even / (variance * variance)
     out: Floats = v + fma(light_change, r["light"], dark_change * r["dark"])
     return out

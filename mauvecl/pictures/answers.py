@@ -29,8 +29,8 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.host.expectation import Expectation
-    from mauvecl.results.detection import Detection
-    from mauvecl.results.roc import Roc
+    from mauvecl.results.detection.detection import Detection
+    from mauvecl.results.detection.roc import Roc
     from mauvecl.results.snr import SnrResult
 
 #: A star: title, findings, and its flares' names.
@@ -48,17 +48,17 @@ def detection(stars: Sequence[Shown], fap: float, path: str | Path | None = None
         figure, axes = plt.subplots(
             rows * len(stars), columns, figsize=(COLUMN * columns, 2.6 * rows * len(stars) + 0.4), squeeze=False
         )
-        for k, (title, found, flares) in enumerate(stars):
+        for k, (title, outcome, flares) in enumerate(stars):
             panels = axes[k * rows : (k + 1) * rows]
             for axis, statistic in zip(panels.ravel(), statistics, strict=False):
-                _distributions(axis, found, flares, statistic, fap)
+                _distributions(axis, outcome, flares, statistic, fap)
             for axis in panels.ravel()[len(statistics) :]:
                 axis.set_visible(False)
             for axis in panels[:, 0]:
                 axis.set_ylabel(f"{title}\nrealisations, each peak = 1")
         handles, names = axes[0][0].get_legend_handles_labels()
         legend_below(figure, handles, names)
-        exposures = " and ".join(sorted({f"{found.quiet.exposure_s:g}{UNBROKEN}s" for _, found, _ in stars}))
+        exposures = " and ".join(sorted({f"{outcome.quiet.exposure_s:g}{UNBROKEN}s" for _, outcome, _ in stars}))
         headline(
             figure,
             f"Detection statistics without a flare and with one, {exposures}, "
@@ -67,20 +67,20 @@ def detection(stars: Sequence[Shown], fap: float, path: str | Path | None = None
         return finished(figure, path)
 
 
-def _distributions(axis: Any, found: Detection, flares: Sequence[str], statistic: str, fap: float) -> None:
-    one = found.statistic(statistic)
+def _distributions(axis: Any, outcome: Detection, flares: Sequence[str], statistic: str, fap: float) -> None:
+    one = outcome.statistic(statistic)
     linear = isinstance(one, LinearStatistic)
     shapes: list[tuple[int | None, str, str]] = [(None, NULL, "no flare")]
     shapes += [(k, COLOURS[k % len(COLOURS)], name) for k, name in enumerate(flares)]
     for flare, colour, name in shapes:
-        edges, counts = found.histogram(statistic, flare, bins=120)
+        edges, counts = outcome.histogram(statistic, flare, bins=120)
         middle, height = (edges[1:] + edges[:-1]) / 2, counts / counts.max()
         axis.fill_between(middle, height, step="mid", color=colour, alpha=0.3, linewidth=0)
         axis.step(middle, height, where="mid", color=colour, label=name)
     # Where a statistic is scaled by the flare, each has a threshold of its own.
     own = range(len(flares)) if one.shaped and not linear else range(1)
     for k in own:
-        cut = found.threshold(fap, statistic, template=k).value
+        cut = outcome.threshold(fap, statistic, template=k).value
         colour = COLOURS[k % len(COLOURS)] if len(own) > 1 else "black"
         name = f"threshold, fap {fap:g} per test"
         axis.axvline(cut, color=colour, linewidth=0.9, linestyle="--", label=None if len(own) > 1 else name)
@@ -135,8 +135,8 @@ def spectra(stars: Sequence[Shown], path: str | Path | None = None) -> Any:
         figure, axes = plt.subplots(
             2, len(stars), figsize=(COLUMN * max(len(stars), 1), 5.0), squeeze=False, sharex=True, height_ratios=(3, 2)
         )
-        for (above, below), (title, found, names) in zip(axes.T, stars, strict=True):
-            quiet, flares = found.quiet, found.flares
+        for (above, below), (title, outcome, names) in zip(axes.T, stars, strict=True):
+            quiet, flares = outcome.quiet, outcome.flares
             element, whole = quiet.element_wavelength_nm, _whole(quiet)
             sigma = np.sqrt(quiet.per_element(quiet.variance_dn2))
             for k in reversed(range(len(flares))):

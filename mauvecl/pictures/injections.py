@@ -10,7 +10,7 @@ import numpy as np
 from mauvecl.pictures.style import COLOURS, MOST_COLUMNS, STYLE, finished, pyplot
 
 if TYPE_CHECKING:
-    from mauvecl.answers.inject import InjectAnswer
+    from mauvecl.answers.stares.inject import InjectAnswer
 
 #: What the axes of sizes are called.
 SIZES = {
@@ -24,10 +24,10 @@ MOST_CURVES = 6
 CONTOURS = (0.1, 0.5, 0.9)
 
 
-def _panels(found: InjectAnswer) -> tuple[Any, list[Any], list[Any]]:
-    from mauvecl.answers.inject import MOST_DRAWN
+def _panels(answer: InjectAnswer) -> tuple[Any, list[Any], list[Any]]:
+    from mauvecl.answers.stares.inject import MOST_DRAWN
 
-    stars = found.stars[:MOST_DRAWN]
+    stars = answer.stars[:MOST_DRAWN]
     columns = min(len(stars), MOST_COLUMNS)
     rows = -(-len(stars) // columns)
     figure, axes = pyplot().subplots(rows, columns, figsize=(3.6 * columns + 0.8, 3.2 * rows), squeeze=False)
@@ -36,8 +36,8 @@ def _panels(found: InjectAnswer) -> tuple[Any, list[Any], list[Any]]:
     return figure, stars, list(axes.flat)
 
 
-def _titled(figure: Any, found: InjectAnswer) -> None:
-    choice, flare = found.study.search, found.study.flare
+def _titled(figure: Any, answer: InjectAnswer) -> None:
+    choice, flare = answer.study.search, answer.study.flare
     figure.suptitle(
         f"Flares of {flare.temperature_k:g} K, {choice.false_alarms:g} false alarms per star-{choice.per}; nominal "
         "throughput",
@@ -45,17 +45,17 @@ def _titled(figure: Any, found: InjectAnswer) -> None:
     )
 
 
-def maps(found: InjectAnswer, path: str | Path | None) -> Any:
+def maps(answer: InjectAnswer, path: str | Path | None) -> Any:
     """Completeness over half-width and size, one panel per star; the figure where no path is given."""
     with pyplot().rc_context(STYLE):
-        figure, stars, axes = _panels(found)
+        figure, stars, axes = _panels(answer)
         mesh = None
         for star, axis in zip(stars, axes, strict=False):
-            x, y, z = np.array(star.found.half_widths_s), star.found.sizes, star.found.completeness.T
+            x, y, z = np.array(star.injected.half_widths_s), star.injected.sizes, star.injected.completeness.T
             axis.set(xscale="log", yscale="log", xlabel="half-width (s)", ylabel=SIZES[star.sizes.of], title=star.title)
             if x.size < 2:
                 # One half-width has no width to be drawn with.
-                axis.plot(star.found.completeness[0], y)
+                axis.plot(star.injected.completeness[0], y)
                 axis.set(xscale="linear", xlabel="completeness")
                 continue
             mesh = axis.pcolormesh(_edges(x), _edges(y), z, cmap="cividis", vmin=0, vmax=1)
@@ -63,24 +63,24 @@ def maps(found: InjectAnswer, path: str | Path | None) -> Any:
             axis.clabel(lines, fmt=lambda level: f"{100 * level:g} %", fontsize=7)
         if mesh is not None:
             figure.colorbar(mesh, ax=axes, label="completeness")
-        _titled(figure, found)
+        _titled(figure, answer)
         return finished(figure, path)
 
 
-def energies(found: InjectAnswer, path: str | Path | None) -> Any:
+def energies(answer: InjectAnswer, path: str | Path | None) -> Any:
     """Recovered over injected energy of found flares over half-width and size; the figure where no path is given."""
     with pyplot().rc_context(STYLE):
-        figure, stars, axes = _panels(found)
+        figure, stars, axes = _panels(answer)
         mesh = None
         for star, axis in zip(stars, axes, strict=False):
-            x, y = np.array(star.found.half_widths_s), star.found.sizes
+            x, y = np.array(star.injected.half_widths_s), star.injected.sizes
             axis.set(xscale="log", yscale="log", xlabel="half-width (s)", ylabel=SIZES[star.sizes.of], title=star.title)
             if x.size > 1:
                 z = np.log10(star.fitted.energy_ratio.T)
                 mesh = axis.pcolormesh(_edges(x), _edges(y), z, cmap="RdBu_r", vmin=-0.3, vmax=0.3)
         if mesh is not None:
             figure.colorbar(mesh, ax=axes, label="recovered over injected energy, median (dex)")
-        _titled(figure, found)
+        _titled(figure, answer)
         return finished(figure, path)
 
 
@@ -90,12 +90,12 @@ def _edges(middles: Any) -> Any:
     return np.concatenate([[middles[0] / steps[0]], middles[:-1] * steps, [middles[-1] * steps[-1]]])
 
 
-def curves(found: InjectAnswer, path: str | Path | None) -> Any:
+def curves(answer: InjectAnswer, path: str | Path | None) -> Any:
     """Completeness over size at some half-widths, with 95 % intervals; the figure where no path is given."""
     with pyplot().rc_context(STYLE):
-        figure, stars, axes = _panels(found)
+        figure, stars, axes = _panels(answer)
         for star, axis in zip(stars, axes, strict=False):
-            f = star.found
+            f = star.injected
             picked = np.unique(np.linspace(0, len(f.half_widths_s) - 1, MOST_CURVES).round().astype(int))
             for k, colour in zip(picked, COLOURS, strict=False):
                 axis.fill_between(
@@ -108,5 +108,5 @@ def curves(found: InjectAnswer, path: str | Path | None) -> Any:
                 xscale="log", xlabel=SIZES[star.sizes.of], ylabel="completeness", ylim=(-0.02, 1.02), title=star.title
             )
         axes[0].legend(title="half-width")
-        _titled(figure, found)
+        _titled(figure, answer)
         return finished(figure, path)

@@ -25,11 +25,11 @@ from mauvecl.study.labels import titled
 from mauvecl.study.quantities import QUANTITIES
 
 if TYPE_CHECKING:
-    from mauvecl.answers.exposures import ExposureResult
-    from mauvecl.answers.gaussian import GaussianReport
-    from mauvecl.answers.limits import LimitResult
-    from mauvecl.answers.maps import MapResult
-    from mauvecl.answers.snr import SnrAnswer
+    from mauvecl.answers.detection.gaussian import GaussianReport
+    from mauvecl.answers.detection.maps import MapResult
+    from mauvecl.answers.limits.limits import LimitResult
+    from mauvecl.answers.signal.exposures import ExposureResult
+    from mauvecl.answers.signal.snr import SnrAnswer
     from mauvecl.host.expectation import Expectation
 
 
@@ -37,20 +37,20 @@ if TYPE_CHECKING:
 STROKES = (":", "--", "-", "-.")
 
 
-def detection_map(found: MapResult, path: str | Path | None) -> Any:
+def detection_map(answer: MapResult, path: str | Path | None) -> Any:
     """Detection probability over two quantities, one panel per statistic; the figure where no path is given."""
     plt = pyplot()
-    question = found.study.map
+    question = answer.study.map
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(
-            1, len(found.statistics), figsize=(COLUMN * len(found.statistics) + 0.5, 3.4), squeeze=False, sharey=True
+            1, len(answer.statistics), figsize=(COLUMN * len(answer.statistics) + 0.5, 3.4), squeeze=False, sharey=True
         )
         lines = {}
         x, y = (
             np.arange(len(values)) if isinstance(values[0], str) else np.array(values, float)
-            for values in (found.x, found.y)
+            for values in (answer.x, answer.y)
         )
-        for axis, statistic, probability in zip(axes[0], found.statistics, found.probability, strict=True):
+        for axis, statistic, probability in zip(axes[0], answer.statistics, answer.probability, strict=True):
             mesh = axis.pcolormesh(x, y, probability, cmap="cividis", vmin=0, vmax=1, shading="nearest")
             if min(probability.shape) > 1:
                 # Lines lie close where a map is steep: told apart by their strokes, and by no words among them.
@@ -59,7 +59,7 @@ def detection_map(found: MapResult, path: str | Path | None) -> Any:
                 axis.contour(x, y, probability, levels=levels, colors="white", linewidths=2.4)
                 axis.contour(x, y, probability, levels=levels, colors="black", linewidths=1.2, linestyles=strokes)
                 lines = {f"{100 * level:g} %": stroke for level, stroke in zip(levels, strokes, strict=True)}
-            for which, values, place in (("x", found.x, x), ("y", found.y, y)):
+            for which, values, place in (("x", answer.x, x), ("y", answer.y, y)):
                 described = getattr(question, which)
                 if isinstance(values[0], str):
                     getattr(axis, f"set_{which}ticks")(place, values)
@@ -74,23 +74,23 @@ def detection_map(found: MapResult, path: str | Path | None) -> Any:
             shown = [plt.Line2D([], [], color="black", linewidth=1.2, linestyle=stroke) for stroke in lines.values()]
             legend_below(figure, shown, [f"detected in {name}" for name in lines])
         names = {question.x.quantity, question.y.quantity}
-        exposure = "" if "exposure" in names else f", {found.study.observation.exposure_s:g} s"
-        flare = "" if "amplitude" in names else f", flare of {100 * found.study.flare.amplitudes[0]:g} %"
+        exposure = "" if "exposure" in names else f", {answer.study.observation.exposure_s:g} s"
+        flare = "" if "amplitude" in names else f", flare of {100 * answer.study.flare.amplitudes[0]:g} %"
         headline(
             figure,
-            f"{found.star}{exposure}{flare}, false-alarm probability {found.study.run.fap:g} per test; nominal "
+            f"{answer.star}{exposure}{flare}, false-alarm probability {answer.study.run.fap:g} per test; nominal "
             "throughput",
         )
         return finished(figure, path)
 
 
-def limits(found: LimitResult, path: str | Path | None) -> Any:
+def limits(answer: LimitResult, path: str | Path | None) -> Any:
     """Detection probability at every simulated value, and the limits; the figure where no path is given."""
     plt = pyplot()
-    of, power = found.study.limit.of, found.study.limit.power
+    of, power = answer.study.limit.of, answer.study.limit.power
     with plt.rc_context(STYLE):
-        figure, axis = plt.subplots(figsize=(COLUMN, 3.0 + 0.17 * len(found.limits)))
-        for k, limit in enumerate(found.limits):
+        figure, axis = plt.subplots(figsize=(COLUMN, 3.0 + 0.17 * len(answer.limits)))
+        for k, limit in enumerate(answer.limits):
             colour, marker = COLOURS[k % len(COLOURS)], "osD^vPX"[k // len(COLOURS) % 7]
             points = sorted((*limit.points, limit.check), key=lambda p: p.value)
             p = [point.probability for point in points]
@@ -113,10 +113,10 @@ def limits(found: LimitResult, path: str | Path | None) -> Any:
             axis.set_xscale("log")
         axis.set(xlabel=QUANTITIES[of].axis, ylabel="detection probability", ylim=(-0.02, 1.02))
         plain_numbers(axis)
-        exposure = "" if of == "exposure" else f", {found.study.observation.exposure_s:g}{UNBROKEN}s"
+        exposure = "" if of == "exposure" else f", {answer.study.observation.exposure_s:g}{UNBROKEN}s"
         headline(
             figure,
-            f"Limits at a power of {power:g}{exposure}, false-alarm probability {found.study.run.fap:g} per test; "
+            f"Limits at a power of {power:g}{exposure}, false-alarm probability {answer.study.run.fap:g} per test; "
             "points: simulated, 95 %; lines: Gaussian noise; nominal throughput",
         )
         legend_below(figure, *axis.get_legend_handles_labels())
@@ -133,10 +133,10 @@ ORIGINS = {
 }
 
 
-def noise_budgets(found: SnrAnswer, path: str | Path | None = None) -> Any:
+def noise_budgets(answer: SnrAnswer, path: str | Path | None = None) -> Any:
     """Noise of a pixel by origin against wavelength, one panel per star and cell, as the paper's figure has it."""
-    each = len(found.study.cells())
-    observed = [(star, star.result.expectation) for star in found.stars]
+    each = len(answer.study.cells())
+    observed = [(star, star.result.expectation) for star in answer.stars]
     named = [(star.title if star.at else f"{star.title}, {x.exposure_s:g} s", x) for star, x in observed]
     return noise_budget(named, each=each, path=path)
 
@@ -169,21 +169,21 @@ def noise_budget(observed: Sequence[tuple[str, Expectation]], *, each: int = 1, 
         return finished(figure, path)
 
 
-def snr_sweep(found: SnrAnswer, path: str | Path | None = None) -> Any:
+def snr_sweep(answer: SnrAnswer, path: str | Path | None = None) -> Any:
     """S/N of some elements against what is swept first, a line for each value of the rest."""
-    from mauvecl.answers.exposures import place_of
+    from mauvecl.answers.signal.exposures import place_of
 
     plt = pyplot()
-    first = found.study.sweep.axes[0].quantity
-    shown = found.stars[0].shown_nm
-    tables = [star.result.element for star in found.stars]
+    first = answer.study.sweep.axes[0].quantity
+    shown = answer.stars[0].shown_nm
+    tables = [star.result.element for star in answer.stars]
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(
             1, len(shown), figsize=(COLUMN if len(shown) == 1 else 2.6 * len(shown), 3.2), squeeze=False, sharey=True
         )
         for axis, wavelength in zip(axes[0], shown, strict=True):
             lines: dict[str, list[tuple[Any, Any]]] = {}
-            for star, table in zip(found.stars, tables, strict=True):
+            for star, table in zip(answer.stars, tables, strict=True):
                 name = star.label if first != "magnitude" else star.label.split(" V = ")[0]
                 rest = titled(name, {k: v for k, v in star.at.items() if k != first})
                 row = table[place_of(star.result.expectation, wavelength, "element")]
@@ -210,12 +210,12 @@ def snr_sweep(found: SnrAnswer, path: str | Path | None = None) -> Any:
         return finished(figure, path)
 
 
-def gaussian(found: GaussianReport, path: str | Path | None) -> Any:
+def gaussian(answer: GaussianReport, path: str | Path | None) -> Any:
     """How far each promise of the usual formula holds in every cell; the figure where no path is given."""
     from matplotlib.ticker import MaxNLocator
 
     plt = pyplot()
-    cells = found.cells
+    cells = answer.cells
     # Column, what it is, what is promised, and the least that an axis shows to either side of it.
     panels = (
         ("snr_off_by", "mean S/N\nless formula", 0.0, 0.1),
@@ -237,23 +237,23 @@ def gaussian(found: GaussianReport, path: str | Path | None) -> Any:
             axis.set_xlabel(text)
             axis.xaxis.set_major_locator(MaxNLocator(3, prune="both"))
             axis.grid(axis="y", linewidth=0.3)
-        axes[0].set_yticks(rows, [titled(s.label, s.at) for s in found.signal.stars])
+        axes[0].set_yticks(rows, [titled(s.label, s.at) for s in answer.signal.stars])
         axes[0].invert_yaxis()
         headline(figure, "The root-of-N formula beside the simulation; grey: as promised; nominal throughput")
         return finished(figure, path)
 
 
-def exposures(found: ExposureResult, path: str | Path | None) -> Any:
+def exposures(answer: ExposureResult, path: str | Path | None) -> Any:
     """S/N against exposure for each star, which grows with the root of it; the figure where no path is given."""
     plt = pyplot()
     with plt.rc_context(STYLE):
-        figure, axis = plt.subplots(figsize=(COLUMN, 2.9 + 0.17 * len(found.exposures)))
-        for k, e in enumerate(found.exposures):
+        figure, axis = plt.subplots(figsize=(COLUMN, 2.9 + 0.17 * len(answer.exposures)))
+        for k, e in enumerate(answer.exposures):
             colour = COLOURS[k % len(COLOURS)]
             x = np.geomspace(e.exposure_s / e.frames, 4 * e.exposure_s, 50)
             axis.plot(x, e.snr * np.sqrt(x / e.exposure_s), color=colour, label=f"{e.star}: {e.exposure_s:g} s")
             axis.plot([e.exposure_s], [e.snr], "o", color=colour, ms=5)
-        first = found.exposures[0]
+        first = answer.exposures[0]
         axis.axhline(first.wanted, color=NULL, linestyle="--", linewidth=1)
         axis.set(xscale="log", yscale="log", xlabel="exposure (s)", ylabel=f"S/N per {first.per}")
         plain_numbers(axis)

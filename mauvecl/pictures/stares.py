@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.stare import Searched
+from mauvecl.answers.stares.stare import Searched
 from mauvecl.pictures.style import COLOURS, NULL, STYLE, finished, pyplot
 
 if TYPE_CHECKING:
-    from mauvecl.answers.stare import StareAnswer, StarStare
+    from mauvecl.answers.stares.stare import StareAnswer, StarStare
 
 Float = NDArray[np.float64]
 #: Points of a light curve, and rows of a dynamic spectrum, at most: more are means of several frames.
@@ -44,9 +44,9 @@ def light_curves(one: StarStare, path: str | Path | None = None) -> Any:
             for flare in one.flares:
                 axis.axvline(flare.event.peak_s / scale, color=NULL, linewidth=0.5, linestyle=":")
             if isinstance(one.searched, Searched):
-                found = [float(alarm.recovered.peak_s[0]) / scale for alarm in one.searched.alarms]
-                top = [1.0] * len(found)
-                axis.plot(found, top, "v", color=COLOURS[4], markersize=4, transform=axis.get_xaxis_transform())
+                peaks = [float(alarm.recovered.peak_s[0]) / scale for alarm in one.searched.alarms]
+                top = [1.0] * len(peaks)
+                axis.plot(peaks, top, "v", color=COLOURS[4], markersize=4, transform=axis.get_xaxis_transform())
             axis.set_title(light.bands[k])
             axis.set_ylabel("relative light")
         axes[-1, 0].set_xlabel(f"time from the start of the stare ({unit})")

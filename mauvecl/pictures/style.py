@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from mauvecl.host.errors import InputError
+from mauvecl.host.files.whole import write_whole
 from mauvecl.host.plotting import AXES
-from mauvecl.runs.durable import write_whole
 
 #: Okabe and Ito's colours, which colour-blind readers can tell apart (jfly.uni-koeln.de/color).
 COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7", "#000000")
@@ -178,7 +178,14 @@ def finished(figure: Any, path: str | Path | None) -> Any:
     pyplot().close(figure)
     if path is None:
         return figure
-    drawn, place = io.BytesIO(), Path(path)
-    figure.figure.savefig(drawn, format=place.suffix[1:] or None)
+    drawn, place, whole = io.BytesIO(), Path(path), figure.figure
+    if place.suffix == ".png":
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+        # As savefig makes it, which draws each picture twice.
+        whole.set_dpi(pyplot().rcParams["savefig.dpi"])
+        FigureCanvasAgg(whole).print_png(drawn)  # type: ignore[no-untyped-call]
+    else:
+        whole.savefig(drawn, format=place.suffix[1:] or None)
     write_whole(place, drawn.getbuffer())
     return place

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 from mauvecl.host.content import ByContent
 from mauvecl.host.errors import InputError
 from mauvecl.host.plotting import picture
+from mauvecl.host.tables import tabled, telling
 from mauvecl.noise import layout
 from mauvecl.noise.scene import Scene
 from mauvecl.noise.twin import Floats, fma
-from mauvecl.results.far import Sparse
+from mauvecl.results.counts.far import Sparse
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -210,10 +211,9 @@ class SnrResult(ByContent):
 
         table = self._table("pixel", x.wavelength_nm, x.snr(), snr)
         frames = self.counts.n * x.n_frames
-        for name, column in (("clipped_low", 0), ("clipped_high", 1)):
-            table[name] = self.counts.clipped[:, column] / frames
-            table[name].info.description = "share of frames cut off at this end: zero or saturation"
-        return table
+        table["clipped_low"], table["clipped_high"] = self.counts.clipped.T / frames
+        cut = "share of frames cut off at this end: zero or saturation"
+        return telling(table, {"clipped_low": cut, "clipped_high": cut})
 
     @property
     def element(self) -> QTable:
@@ -246,9 +246,6 @@ class SnrResult(ByContent):
         snr: Callable[[NDArray[np.intp], NDArray[np.number]], NDArray[np.float64]],
     ) -> QTable:
         """A row for each pixel or element; `snr` of those, at places between the edges of bins, which are whole."""
-        import astropy.units as u
-        from astropy.table import QTable
-
         counts = self.counts.pixel if kind == "pixel" else self.counts.element
         numbers, every = (
             np.arange(layout.OBSERVER_BINS + 1) - layout.OBSERVER_BINS // 2,
@@ -265,27 +262,25 @@ class SnrResult(ByContent):
             for i, (c, e) in enumerate(zip(cumulative, edges, strict=True))
         ])  # fmt: skip
         for i in spread_out:
-            filled, found = self.counts.filled(kind, i)
+            filled, held = self.counts.filled(kind, i)
             middle = snr(i, filled + 0.5)
-            mean[i] = found @ middle / self.counts.n
-            std[i] = np.sqrt(found @ (middle - mean[i]) ** 2 / self.counts.n)
+            mean[i] = held @ middle / self.counts.n
+            std[i] = np.sqrt(held @ (middle - mean[i]) ** 2 / self.counts.n)
             ends = np.column_stack([snr(i, filled), snr(i, filled + 1)]).ravel()
-            quantiles[i] = np.interp(np.array(PERCENTAGES) / 100, steps_of(found) / self.counts.n, ends)
-        table = QTable()
-        table["wavelength"] = wavelength_nm * u.nm
-        table["expected"] = expected
-        table["mean"] = mean
-        table["std"] = std
-        for i, percentage in enumerate(PERCENTAGES):
-            table[f"q{percentage:g}"] = quantiles[:, i]
-        table["expected"].info.description = "closed-form S/N of the mean spectrum"
-        table["mean"].info.description = "mean S/N of the realisations"
-        table["std"].info.description = "standard deviation of the S/N of the realisations"
-        table.meta["realisations"] = self.counts.n
-        table.meta["exposure_s"] = self.expectation.exposure_s
-        table.meta["name"] = self.expectation.name
-        table.meta["signal"] = self.expectation.signal
-        return table
+            quantiles[i] = np.interp(np.array(PERCENTAGES) / 100, steps_of(held) / self.counts.n, ends)
+        return tabled(
+            (
+                ("wavelength", wavelength_nm, "", "nm"),
+                ("expected", expected, "closed-form S/N of the mean spectrum"),
+                ("mean", mean, "mean S/N of the realisations"),
+                ("std", std, "standard deviation of the S/N of the realisations"),
+                *((f"q{percentage:g}", quantiles[:, i]) for i, percentage in enumerate(PERCENTAGES)),
+            ),
+            realisations=self.counts.n,
+            exposure_s=self.expectation.exposure_s,
+            name=self.expectation.name,
+            signal=self.expectation.signal,
+        )
 
 
 def _quantiles(cumulative: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[np.float64]:

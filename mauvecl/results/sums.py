@@ -1,4 +1,4 @@
-"""Shares of a request: packed where they were counted, added up where they are wanted, exactly."""
+"""Shards of a request: packed where they were counted, added up where they are wanted, exactly."""
 
 from __future__ import annotations
 
@@ -8,37 +8,37 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.results.detection import Detection
-from mauvecl.results.far import FarCounts
-from mauvecl.results.requests import DetectRequest, SnrRequest
+from mauvecl.results.counts.far import FarCounts
+from mauvecl.results.counts.tally import TailSamples, Tally
+from mauvecl.results.detection.detection import Detection
+from mauvecl.results.requests.requests import DetectRequest, SnrRequest
 from mauvecl.results.snr import Counts, SnrResult, elements, observers
-from mauvecl.results.tally import TailSamples, Tally
 
 Arrays = dict[str, NDArray[Any]]
 
 
 def packed_detection(tally: Tally, samples: Sequence[TailSamples | None]) -> Arrays:
-    """One share of a detection as arrays."""
-    share = _sparse("counts", tally.counts)
-    share["sums"] = np.array([[str(value) for value in row] for row in tally.sums])
-    share["n"] = np.array(tally.n)
+    """One shard of a detection as arrays."""
+    shard = _sparse("counts", tally.counts)
+    shard["sums"] = np.array([[str(value) for value in row] for row in tally.sums])
+    shard["n"] = np.array(tally.n)
     for number, far in enumerate(tally.far):
-        beyond = far.found()
+        beyond = far.frozen()
         if beyond.n or beyond.undefined:
-            share |= _spread(f"far-{number}", beyond.keys, beyond.counts)
-            share[f"far-{number}-sums"] = np.array([str(x) for x in (beyond.first, beyond.second, beyond.undefined)])
+            shard |= _spread(f"far-{number}", beyond.keys, beyond.counts)
+            shard[f"far-{number}-sums"] = np.array([str(x) for x in (beyond.first, beyond.second, beyond.undefined)])
     for number, kept in enumerate(samples):
         if kept is not None:
-            share[f"values-{number}"], share[f"realisations-{number}"] = kept.values, kept.realisations
-    return share
+            shard[f"values-{number}"], shard[f"realisations-{number}"] = kept.values, kept.realisations
+    return shard
 
 
 def packed_snr(counts: Counts) -> Arrays:
-    """One share of an S/N as arrays."""
-    share = _sparse("pixel", counts.pixel) | _sparse("element", counts.element)
+    """One shard of an S/N as arrays."""
+    shard = _sparse("pixel", counts.pixel) | _sparse("element", counts.element)
     for name, far in counts.far.items():
-        share |= _spread(f"far-{name}", far.keys, far.counts)
-    return share | {"clipped": counts.clipped, "n": np.array(counts.n)}
+        shard |= _spread(f"far-{name}", far.keys, far.counts)
+    return shard | {"clipped": counts.clipped, "n": np.array(counts.n)}
 
 
 class DetectionSums:
@@ -48,26 +48,23 @@ class DetectionSums:
         self._request = request
         self._sums = [(Tally(plan.grids), plan.tails()) for plan, _ in request.plans]
 
-    def add(self, part: int, share: Arrays) -> None:
-        """Add a share of one part."""
+    def add(self, part: int, shard: Arrays) -> None:
+        """Add a shard of one part."""
         tally, samples = self._sums[part]
-        sums = np.array([[int(value) for value in row] for row in share["sums"]], object)
-        tally.add(_dense("counts", share, tally.counts.shape), sums, int(share["n"]))
+        sums = np.array([[int(value) for value in row] for row in shard["sums"]], object)
+        tally.add(_dense("counts", shard, tally.counts.shape), sums, int(shard["n"]))
         for number, far in enumerate(tally.far):
-            if f"far-{number}" in share:
-                first, second, undefined = (int(value) for value in share[f"far-{number}-sums"])
-                far.merge(FarCounts(*_gathered(f"far-{number}", share), first, second, undefined))
+            if f"far-{number}" in shard:
+                first, second, undefined = (int(value) for value in shard[f"far-{number}-sums"])
+                far.merge(FarCounts(*_gathered(f"far-{number}", shard), first, second, undefined))
         for number, kept in enumerate(samples):
             if kept is not None:
-                kept.merge(share[f"values-{number}"], share[f"realisations-{number}"])
+                kept.merge(shard[f"values-{number}"], shard[f"realisations-{number}"])
 
     def answer(self) -> Detection:
-        """The answer, once all shares have come."""
+        """The answer, once all shards have come."""
         asked = self._request
-        h = asked.hypotheses
-        detection = Detection(
-            h.quiet, h.flares, h.asked, h.scene, asked.realisations, asked.tails, asked.seed, nuisances=h.nuisances
-        )
+        detection = Detection.of(asked.hypotheses, asked.realisations, asked.tails, asked.seed)
         for (plan, _), (tally, samples) in zip(asked.plans, self._sums, strict=True):
             detection.collect(plan, tally, samples)
         return detection
@@ -80,16 +77,16 @@ class SnrSums:
         self._request, self._elements = request, elements(request.expectation)
         self._counts = Counts(request.scene.n_pixel, len(self._elements))
 
-    def add(self, part: int, share: Arrays) -> None:
-        """Add a share."""
+    def add(self, part: int, shard: Arrays) -> None:
+        """Add a shard."""
         counts = self._counts
-        pixel, element = _dense("pixel", share, counts.pixel.shape), _dense("element", share, counts.element.shape)
-        counts.add(pixel, element, share["clipped"], int(share["n"]))
+        pixel, element = _dense("pixel", shard, counts.pixel.shape), _dense("element", shard, counts.element.shape)
+        counts.add(pixel, element, shard["clipped"], int(shard["n"]))
         for name, far in counts.far.items():
-            far.add(*_gathered(f"far-{name}", share))
+            far.add(*_gathered(f"far-{name}", shard))
 
     def answer(self) -> SnrResult:
-        """The answer, once all shares have come."""
+        """The answer, once all shards have come."""
         x, scene = self._request.expectation, self._request.scene
         return SnrResult(x, scene, observers(x, scene), self._elements, self._counts)
 
@@ -106,19 +103,19 @@ def _spread(name: str, keys: NDArray[np.int64], counts: NDArray[np.int64]) -> Ar
     return {f"{name}-first": keys[:1], f"{name}-steps": _narrow(steps), name: _narrow(counts)}
 
 
-def _gathered(name: str, share: Arrays) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+def _gathered(name: str, shard: Arrays) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """Keys and counts."""
-    first = share[f"{name}-first"]
-    keys = np.cumsum(np.concatenate([first, share[f"{name}-steps"].astype(np.int64)]), dtype=np.int64)
-    return keys, share[name].astype(np.int64)
+    first = shard[f"{name}-first"]
+    keys = np.cumsum(np.concatenate([first, shard[f"{name}-steps"].astype(np.int64)]), dtype=np.int64)
+    return keys, shard[name].astype(np.int64)
 
 
 def _narrow(values: NDArray[np.int64]) -> NDArray[np.unsignedinteger]:
     return values.astype(np.min_scalar_type(int(values.max(initial=0))))
 
 
-def _dense(name: str, share: Arrays, shape: tuple[int, ...]) -> NDArray[np.int64]:
+def _dense(name: str, shard: Arrays, shape: tuple[int, ...]) -> NDArray[np.int64]:
     counts = np.zeros(int(np.prod(shape)), np.int64)
-    keys, values = _gathered(name, share)
+    keys, values = _gathered(name, shard)
     counts[keys] = values
     return counts.reshape(shape)

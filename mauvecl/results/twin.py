@@ -15,8 +15,8 @@ from mauvecl.results.snr import Counts
 from mauvecl.statistics.paper import Paper
 
 if TYPE_CHECKING:
-    from mauvecl.results.channels import ChannelPlan
-    from mauvecl.results.hypotheses import Hypotheses
+    from mauvecl.results.requests.channels import ChannelPlan
+    from mauvecl.results.requests.hypotheses import Hypotheses
 
 
 def statistics(
@@ -50,29 +50,29 @@ def statistics(
     weights, linear_end, pixels_end = plan.weights, plan.linear_end, plan.pixels_end
     constants = scene.constants(weights, linear_end, pixels_end)
     estimated, exposures = scene.comparison.estimated, scene.comparison.exposures
-    share, scale = scene.job["reference_share"], scene.job["pair_scale"]
+    added, scale = scene.job["reference_weight"], scene.job["pair_scale"]
     out = np.zeros((fixed * n_scenario + len(weights), len(realisation)), np.float32)
-    x = _above_template(scene, observed(scene, realisation, seed))
+    x = _above_reference(scene, observed(scene, realisation, seed))
     drawn = max(exposures, 1) if exposures or pair or smoothed is not None else 0
     others = [
-        _above_template(scene, observed(scene, realisation, seed, exposure=layout.REFERENCE, number=number))
+        _above_reference(scene, observed(scene, realisation, seed, exposure=layout.REFERENCE, number=number))
         for number in range(drawn)
     ]
     finished = []
     begin = 0
     for k in range(n_scenario):
-        t = int(scene.templates[k])
+        t = int(scene.references[k])
         raw, level = x[k], scene.levels[k]
         y: Floats = raw
         variance: Floats = np.zeros_like(raw)
         if exposures:
             total = np.sum([other[t] for other in others], axis=0, dtype=np.float32)
-            y = fma(total, -share, raw)
+            y = fma(total, -added, raw)
         if estimated:
             estimate = scene.estimates[k]
             variance = _variance(raw, estimate)
             if exposures:
-                variance = np.add(variance, share * _variance(total * share, estimate), dtype=np.float32)
+                variance = np.add(variance, added * _variance(total * added, estimate), dtype=np.float32)
             y = np.add(y, estimate["fraction"][:, None], dtype=np.float32)
         parts = [np.zeros(len(realisation), np.float32) for _ in range(4)]
         for p, pixel in enumerate(scene.pixels):
@@ -154,11 +154,11 @@ class Smoothed:
     scale_end: NDArray[np.uint32]
 
     @classmethod
-    def of(cls, found: Hypotheses, plan: ChannelPlan) -> Smoothed:
+    def of(cls, hypotheses: Hypotheses, plan: ChannelPlan) -> Smoothed:
         """Of a detection's channels."""
-        smoothing = Paper().smoothing(found.setting)
-        rows = np.zeros((len(smoothing.rows), len(found.scene.pixels)), np.float32)
-        rows[:, : found.scene.n_pixel] = smoothing.rows
+        smoothing = Paper().smoothing(hypotheses.setting)
+        rows = np.zeros((len(smoothing.rows), len(hypotheses.scene.pixels)), np.float32)
+        rows[:, : hypotheses.scene.n_pixel] = smoothing.rows
         return cls(rows, plan.scales, plan.scale_end)
 
     def sums(self, difference: Floats, k: int) -> list[Floats]:
@@ -174,7 +174,7 @@ class Smoothed:
         return out
 
 
-def _above_template(scene: Scene, counts: NDArray[np.int64]) -> NDArray[np.float32]:
+def _above_reference(scene: Scene, counts: NDArray[np.int64]) -> NDArray[np.float32]:
     above = counts.astype(np.float32)
     if scene.frames:
         return np.asarray(above + scene.edges["whole"][:, :, None])

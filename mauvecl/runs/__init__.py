@@ -1,1 +1,1 @@
-"""Work cut into shares: who counts them, and what is kept for a resume."""
+"""Work cut into shards: who counts them, and what is kept for a resume."""

@@ -1,6 +1,6 @@
-"""What a long run has counted so far, kept so that it can go on after any end: one file per share, never changed.
+"""What a long run has counted so far, kept so that it can go on after any end: one file per shard, never changed.
 
-A file is named by the request's fingerprint and the share's range, written whole or not at all, and ends in its own
+A file is named by the request's fingerprint and the shard's range, written whole or not at all, and ends in its own
 digest; so it says by itself whether it can be used. Requests follow from the study and from earlier answers alone, so
 a run that is started again asks the same and finds what is there.
 """
@@ -27,8 +27,9 @@ import numpy as np
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import read_bytes
 from mauvecl.host.files.parsed import json_data, read_text
+from mauvecl.host.files.whole import UNFINISHED, write_whole
 from mauvecl.host.version import VERSION
-from mauvecl.runs.durable import UNFINISHED, alone, differing_keys, write_whole
+from mauvecl.runs.durable import alone, differing_keys
 from mauvecl.runs.shards import FORM
 
 if TYPE_CHECKING:
@@ -36,15 +37,15 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
 FOLDER, MANIFEST = "checkpoint", "manifest.json"
-#: What shares are called: fingerprint, part, start, count.
-SHARE_NAME = re.compile(r"[0-9a-f]{32}-[0-9]+-[0-9]+-[0-9]+\.npz")
-#: Shares are held back so long before the first is written: short runs leave no files.
+#: What shards are called: fingerprint, part, start, count.
+SHARD_NAME = re.compile(r"[0-9a-f]{32}-[0-9]+-[0-9]+-[0-9]+\.npz")
+#: Shards are held back so long before the first is written: short runs leave no files.
 PATIENCE_S = 20.0
 DIGEST_BYTES = 32
 
 
 class Checkpoint:
-    """Shares of one run, in a folder; use it in a `with` block.
+    """Shards of one run, in a folder; use it in a `with` block.
 
     Parameters
     ----------
@@ -63,8 +64,8 @@ class Checkpoint:
 
     Attributes
     ----------
-    found, damaged : int
-        Shares taken from files so far, and files that could not be used.
+    resumed, damaged : int
+        Shards taken from files so far, and files that could not be used.
     messages : list of str
         What the user must be told.
     """
@@ -82,7 +83,7 @@ class Checkpoint:
     ) -> None:
         self.parent, self.folder, self.verb, self.study = folder, folder / FOLDER, verb, study
         self._resume, self._restart, self._patience_s, self._is_held = resume, restart, patience_s, held
-        self.found = self.damaged = 0
+        self.resumed = self.damaged = 0
         self.messages: list[str] = []
         self._held: list[tuple[str, Arrays]] = []
         self._lock = threading.Lock()
@@ -137,7 +138,7 @@ class Checkpoint:
         except (OSError, ValueError, KeyError, TypeError):
             # Files are named by what they answer: those of another study are never asked for.
             self.messages.append(
-                f"The manifest of {str(self.folder)!r} was damaged or missing and is written anew; the shares that "
+                f"The manifest of {str(self.folder)!r} was damaged or missing and is written anew; the shards that "
                 "belong to this study are used."
             )
             self._write_manifest()
@@ -156,7 +157,7 @@ class Checkpoint:
             )
 
     def get(self, name: str) -> Arrays | None:
-        """A share that was counted before, or None."""
+        """A shard that was counted before, or None."""
         path = self.folder / f"{name}.npz"
         try:
             data = path.read_bytes()
@@ -164,7 +165,7 @@ class Checkpoint:
             if _named(name, body) != digest:
                 raise ValueError
             with np.load(io.BytesIO(body)) as arrays:
-                share = {key: arrays[key] for key in arrays.files}
+                shard = {key: arrays[key] for key in arrays.files}
         except FileNotFoundError:
             return None
         except (OSError, ValueError, KeyError, zipfile.BadZipFile):
@@ -172,11 +173,11 @@ class Checkpoint:
                 self.damaged += 1
             return None
         with self._lock:
-            self.found += 1
-        return share
+            self.resumed += 1
+        return shard
 
-    def put(self, name: str, share: Arrays) -> None:
-        """Keep a share; on the disk once the run has lasted `patience_s`.
+    def put(self, name: str, shard: Arrays) -> None:
+        """Keep a shard; on the disk once the run has lasted `patience_s`.
 
         Raises
         ------
@@ -184,7 +185,7 @@ class Checkpoint:
             If it cannot be written.
         """
         with self._lock:
-            self._held.append((name, share))
+            self._held.append((name, shard))
             self._write_held(only_if_late=not self._written)
 
     def _write_held(self, *, only_if_late: bool = False) -> None:
@@ -194,16 +195,16 @@ class Checkpoint:
             self._write_manifest()
             self._written = True
         while self._held:
-            name, share = self._held[0]
+            name, shard = self._held[0]
             body = io.BytesIO()
-            np.savez(body, **share)  # type: ignore[arg-type]
+            np.savez(body, **shard)  # type: ignore[arg-type]
             data = body.getvalue()
             write_whole(self.folder / f"{name}.npz", data, _named(name, data))
             self._held.pop(0)
 
     @property
     def kept(self) -> int:
-        """Files of shares that are there."""
+        """Files of shards that are there."""
         return sum(1 for path in self._files() if path.suffix == ".npz")
 
     def forget(self) -> None:
@@ -220,16 +221,16 @@ class Checkpoint:
             If there is a manifest of something else.
         """
         names = sorted(os.listdir(self.folder)) if self.folder.is_dir() else []
-        shares = [name for name in names if SHARE_NAME.fullmatch(name)]
-        if MANIFEST in names and not shares and not _is_ours(self.folder / MANIFEST):
+        shards = [name for name in names if SHARD_NAME.fullmatch(name)]
+        if MANIFEST in names and not shards and not _is_ours(self.folder / MANIFEST):
             raise InputError(f"{str(self.folder / MANIFEST)!r} is not mauvecl's, expected another output folder")
-        yield from (self.folder / name for name in names if name in shares or name == MANIFEST)
+        yield from (self.folder / name for name in names if name in shards or name == MANIFEST)
 
     def _remove(self) -> None:
         """Remove its own files, and its folder where nothing else is in it."""
         for path in [*self._files(), *self.folder.glob(f"{UNFINISHED}*")]:
             name = path.name.removeprefix(UNFINISHED)
-            if name == MANIFEST or SHARE_NAME.fullmatch(name):
+            if name == MANIFEST or SHARD_NAME.fullmatch(name):
                 path.unlink(missing_ok=True)
         with contextlib.suppress(OSError):
             self.folder.rmdir()

@@ -18,11 +18,12 @@ from urllib.parse import urlsplit
 from numpy.typing import NDArray
 
 from mauvecl.device.program import DeviceError, DeviceRecord
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import is_file, json_data, read_text
 from mauvecl.host.version import VERSION
-from mauvecl.results.requests import Countable, Share
+from mauvecl.results.requests.requests import Countable, Shard
 from mauvecl.results.sums import Arrays
 from mauvecl.runs.pool import Stopped
 
@@ -34,7 +35,7 @@ if TYPE_CHECKING:
 
 #: Seconds to find a scheduler, and then a first worker.
 PATIENCE_S, WORKER_PATIENCE_S = 30.0, 120.0
-#: A share is sent out so often before the run ends: workers die by twos and threes on a cluster that is taken back.
+#: A shard is sent out so often before the run ends: workers die by twos and threes on a cluster that is taken back.
 TRIES = 8
 #: Seconds between two looks at how many workers there are; requests kept with the workers at a time.
 RECOUNT_S, REQUESTS = 5.0, 32
@@ -42,6 +43,7 @@ RECOUNT_S, REQUESTS = 5.0, 32
 THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
 
 
+@public
 class DaskWorkers:
     """Workers of a Dask cluster, each with an engine of its own.
 
@@ -118,16 +120,16 @@ class DaskWorkers:
         self,
         request: Countable,
         key: str,
-        share: Share,
+        shard: Shard,
         tick: Callable[[int], None],
         out: NDArray[Any] | None = None,
     ) -> Future[Arrays]:
-        """Have a share counted by whichever worker is free; raw spectra travel, and `out` stays as it is."""
+        """Have a shard counted by whichever worker is free; raw spectra travel, and `out` stays as it is."""
         awaited: Future[Arrays] = Future()
-        self._send(awaited, request, key, share, 1)
+        self._send(awaited, request, key, shard, 1)
         return awaited
 
-    def _send(self, awaited: Future[Arrays], request: Countable, key: str, share: Share, tried: int) -> None:
+    def _send(self, awaited: Future[Arrays], request: Countable, key: str, shard: Shard, tried: int) -> None:
         with self._lock:
             if self._closing:
                 awaited.set_exception(Stopped())
@@ -138,21 +140,21 @@ class DaskWorkers:
                     self._given[key] = self._client.submit(_keep, request, key=f"mauvecl-request-{key}")
                     if len(self._given) > REQUESTS:
                         del self._given[next(iter(self._given))]
-                name = f"mauvecl-{key}-{share.name}-{tried}"
-                sent = self._client.submit(_count, self._given[key], share, self._device, key=name, pure=False)
+                name = f"mauvecl-{key}-{shard.name}-{tried}"
+                sent = self._client.submit(_count, self._given[key], shard, self._device, key=name, pure=False)
             except (OSError, RuntimeError) as error:
                 # Dask raises either where its client has lost the scheduler.
                 awaited.set_exception(self._gone().with_traceback(error.__traceback__))
                 return
             self._sent[sent] = awaited
-        sent.add_done_callback(partial(self._came, awaited, request, key, share, tried))
+        sent.add_done_callback(partial(self._came, awaited, request, key, shard, tried))
 
     def _came(
         self,
         awaited: Future[Arrays],
         request: Countable,
         key: str,
-        share: Share,
+        shard: Shard,
         tried: int,
         sent: DaskFuture[Any],
     ) -> None:
@@ -169,8 +171,8 @@ class DaskWorkers:
             if known or tried == TRIES:
                 told = error if known else f"{error or 'the scheduler is gone'}"
                 awaited.set_exception(
-                    DeviceError(f"cluster {self._where} failed at realisations {share.start} to "
-                                f"{share.start + share.count - 1}: {told}")
+                    DeviceError(f"cluster {self._where} failed at realisations {shard.start} to "
+                                f"{shard.start + shard.count - 1}: {told}")
                 )  # fmt: skip
             elif sent.status in ("cancelled", "lost") and self._client.status != "running":
                 awaited.set_exception(self._gone())
@@ -180,13 +182,13 @@ class DaskWorkers:
                     if error is None:
                         # The request itself was lost with its worker.
                         self._given.pop(key, None)
-                self._send(awaited, request, key, share, tried + 1)
+                self._send(awaited, request, key, shard, tried + 1)
         except BaseException as error:
             if not awaited.done():
                 awaited.set_exception(error)
 
     def stop(self) -> None:
-        """Take back what was sent out; a worker of another machine ends the share in its hands."""
+        """Take back what was sent out; a worker of another machine ends the shard in its hands."""
         with self._lock:
             self._closing = True
             sent, self._sent = self._sent, {}
@@ -196,7 +198,7 @@ class DaskWorkers:
             awaited.set_exception(Stopped())
         with contextlib.suppress(OSError, RuntimeError, TimeoutError):
             self._client.cancel(list(sent))
-        # Those of this machine need not end the share in their hands, which takes seconds.
+        # Those of this machine need not end the shard in their hands, which takes seconds.
         for nanny in getattr(self._client.cluster, "workers", {}).values():
             nanny.auto_restart = False
             if nanny.pid is not None:
@@ -225,7 +227,7 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
             if not (number.isdecimal() and len(number) <= 4 and 1 <= int(number) <= 1024):
                 raise InputError(f"--cluster {where!r}, expected local:N with N from 1 to 1024")
             threads = max((os.cpu_count() or 1) // int(number), 1)
-            # Deaths are counted and shares sent out again here, so that they are told.
+            # Deaths are counted and shards sent out again here, so that they are told.
             how = {"distributed.scheduler.allowed-failures": 0, "distributed.admin.tick.limit": "1h"}
             # Nothing to look at by HTTP, which asks nobody who they are.
             how |= {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
@@ -331,9 +333,9 @@ def _introduce(device: str | None, dask_worker: Any = None) -> tuple[str, Device
         return VERSION, _engine_here(device, dask_worker.state.nthreads).device
 
 
-def _count(request: Countable, share: Share, device: str | None) -> Arrays:
+def _count(request: Countable, shard: Shard, device: str | None) -> Arrays:
     from distributed import get_worker
 
     with _one_at_a_time:
         engine = _engine_here(device, get_worker().state.nthreads)
-        return engine.count(request, share)
+        return engine.count(request, shard)

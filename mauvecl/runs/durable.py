@@ -1,4 +1,4 @@
-"""Files that are whole or not there, writers that are alone, and what differs between two studies."""
+"""Writers that are alone in their folder, and what differs between two studies."""
 
 from __future__ import annotations
 
@@ -10,9 +10,6 @@ from pathlib import Path
 from typing import Any
 
 from mauvecl.host.errors import InputError
-from mauvecl.host.files.whole import UNFINISHED, write_whole
-
-__all__ = ["UNFINISHED", "alone", "differing_keys", "write_whole"]
 
 
 @contextlib.contextmanager

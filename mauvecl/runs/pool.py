@@ -1,4 +1,4 @@
-"""Many engines as one: requests cut into shares, counted by whoever is free, kept as they come, added up exactly."""
+"""Many engines as one: requests cut into shards, counted by whoever is free, kept as they come, added up exactly."""
 
 from __future__ import annotations
 
@@ -14,22 +14,25 @@ from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 from numpy.typing import NDArray
 
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
+from mauvecl.device.stares import Stares
 from mauvecl.device.tiles import Progress
+from mauvecl.host.doors import public
+from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import count as whole
 from mauvecl.lightcurve.stares.requests import StaresRequest, StareSums
-from mauvecl.results.requests import Countable, DetectRequest, RealiseRequest, Share, SnrRequest
+from mauvecl.results.requests.requests import Countable, DetectRequest, RealiseRequest, Shard, SnrRequest
 from mauvecl.results.sums import Arrays, DetectionSums, SnrSums
-from mauvecl.runs.shards import fingerprint, shares
+from mauvecl.runs.shards import fingerprint, shards
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
-    from mauvecl.results.detection import Detection
+    from mauvecl.results.detection.detection import Detection
     from mauvecl.results.snr import SnrResult
     from mauvecl.runs.checkpoint import Checkpoint
 
-#: A share is tried so often before the run ends with what went wrong.
+#: A shard is tried so often before the run ends with what went wrong.
 TRIES = 3
-#: Shares under way for each worker: one in hand and one waiting.
+#: Shards under way for each worker: one in hand and one waiting.
 AHEAD = 2
 #: Items of `together` under way beyond the workers: what one needs is prepared while the devices count others.
 PREPARED = 1
@@ -42,11 +45,11 @@ Answer = TypeVar("Answer")
 
 
 class Stopped(Exception):  # noqa: N818
-    """Raised between two tiles of a share that nobody waits for any longer."""
+    """Raised between two tiles of a shard that nobody waits for any longer."""
 
 
 class Workers(Protocol):
-    """Who counts shares."""
+    """Who counts shards."""
 
     @property
     def count(self) -> int:
@@ -54,7 +57,7 @@ class Workers(Protocol):
 
     @property
     def retries(self) -> int:
-        """Shares that had to be counted again so far."""
+        """Shards that had to be counted again so far."""
 
     @property
     def first(self) -> Engine | None:
@@ -67,11 +70,11 @@ class Workers(Protocol):
         self,
         request: Countable,
         key: str,
-        share: Share,
+        shard: Shard,
         tick: Callable[[int], None],
         out: NDArray[Any] | None = None,
     ) -> Future[Arrays]:
-        """Have a share counted; `tick` may be called with realisations done of it.
+        """Have a shard counted; `tick` may be called with realisations done of it.
 
         Raw spectra go into `out` where a worker of this process draws them.
         """
@@ -83,6 +86,7 @@ class Workers(Protocol):
         """Let go of everything."""
 
 
+@public
 class LocalWorkers:
     """The OpenCL devices of this machine, in a thread each.
 
@@ -131,17 +135,17 @@ class LocalWorkers:
         self,
         request: Countable,
         key: str,
-        share: Share,
+        shard: Shard,
         tick: Callable[[int], None],
         out: NDArray[Any] | None = None,
     ) -> Future[Arrays]:
-        """Count a share, as soon as a device is free."""
-        return self._threads.submit(self._count, request, share, tick, out)
+        """Count a shard, as soon as a device is free."""
+        return self._threads.submit(self._count, request, shard, tick, out)
 
     def _count(
         self,
         request: Countable,
-        share: Share,
+        shard: Shard,
         tick: Callable[[int], None],
         out: NDArray[Any] | None,
     ) -> Arrays:
@@ -151,7 +155,7 @@ class LocalWorkers:
         try:
             for tried in range(1, TRIES + 1):
                 try:
-                    return self._engines[place].count(request, share, out=out)
+                    return self._engines[place].count(request, shard, out=out)
                 except Exception as error:
                     engine = self._engines[place]
                     launch = isinstance(error, engine.opened.cl.Error)
@@ -159,12 +163,12 @@ class LocalWorkers:
                         raise
                     if tried == TRIES:
                         raise DeviceError(
-                            f"{engine.device_name} failed {TRIES} times at realisations {share.start} to "
-                            f"{share.start + share.count - 1} ({error}), expected a device that works"
+                            f"{engine.device_name} failed {TRIES} times at realisations {shard.start} to "
+                            f"{shard.start + shard.count - 1} ({error}), expected a device that works"
                         ) from error
                     with self._lock:
                         self.retries += 1
-                    # Nothing of a failed launch is trusted: a new context, and the share from its beginning.
+                    # Nothing of a failed launch is trusted: a new context, and the shard from its beginning.
                     self._engines[place] = self._made(place)
             raise AssertionError
         finally:
@@ -189,22 +193,23 @@ class Standing:
     ----------
     done, total : int
         Realisations, of all requests known or announced.
-    shares, of : int
-        Shares done, of all requests known.
+    shards, of : int
+        Shards done, of all requests known.
     retries : int
-        Shares that were counted again, because a device failed or a worker died.
+        Shards that were counted again, because a device failed or a worker died.
     resumed : int
         Of the realisations done, those taken from a checkpoint.
     """
 
     done: int
     total: int
-    shares: int
+    shards: int
     of: int
     retries: int
     resumed: int
 
 
+@public
 class Pool:
     """Answers what an `Engine` answers, with all workers, and the same to the last bit.
 
@@ -213,9 +218,11 @@ class Pool:
     workers : Workers, optional
         The default device of this machine unless told otherwise.
     checkpoint : Checkpoint, optional
-        Where shares are kept, and looked for.
+        Where shards are kept, and looked for.
     progress : callable, optional
         Called as ``progress(done, total)`` in realisations of all requests known so far; may raise to stop the work.
+    meanwhile : callable, optional
+        Done once, in a thread of its own, as soon as devices are busy: what would keep them waiting before.
     """
 
     def __init__(
@@ -224,11 +231,16 @@ class Pool:
         *,
         checkpoint: Checkpoint | None = None,
         progress: Progress | None = None,
+        meanwhile: Callable[[], None] | None = None,
     ) -> None:
-        self.workers = workers or LocalWorkers()
+        if workers is not None and not hasattr(workers, "submit"):
+            kind = type(workers).__name__
+            raise InputError(f"the workers are of the type {kind}, expected LocalWorkers or DaskWorkers")
+        self.workers = LocalWorkers() if workers is None else workers
+        self._meanwhile = meanwhile
         self.checkpoint, self._progress = checkpoint, progress
         self._lock = threading.RLock()
-        self._done = self._total = self._shares = self._of = self._resumed = self._expected = 0
+        self._done = self._total = self._shards = self._of = self._resumed = self._expected = 0
         self._partly: dict[str, int] = {}
         self._stopping = False
 
@@ -257,7 +269,7 @@ class Pool:
         """How far the work is."""
         partly = sum(self._partly.values())
         total = max(self._total, self._expected)
-        return Standing(self._done + partly, total, self._shares, self._of, self.workers.retries, self._resumed)
+        return Standing(self._done + partly, total, self._shards, self._of, self.workers.retries, self._resumed)
 
     def detect(self, quiet: Expectation, flares: Sequence[Expectation] | Expectation, **how: Any) -> Detection:
         """As `Engine.detect`, with the same keywords."""
@@ -284,8 +296,8 @@ class Pool:
     ) -> NDArray[Any]:
         """As `Engine.realise`, with the same keywords, by one worker; several calls at a time keep all of them busy."""
         request = RealiseRequest.of(expectation, count, **how)
-        share = Share(0, request.start, request.realisations)
-        future = self.workers.submit(request, uuid.uuid4().hex, share, lambda done: None, out)
+        shard = Shard(0, request.start, request.realisations)
+        future = self.workers.submit(request, uuid.uuid4().hex, shard, lambda done: None, out)
         rows: NDArray[Any] = future.result()["rows"]
         if out is None or rows is out:
             return rows
@@ -294,50 +306,53 @@ class Pool:
 
     def _add_up(self, request: Divided, sums: Sums) -> None:
         key = fingerprint(request)
-        todo = shares(request)
+        todo = shards(request)
         with self._lock:
-            self._total += sum(share.count for share in todo)
+            self._total += sum(shard.count for shard in todo)
             self._of += len(todo)
         self._told()
-        waiting: dict[Future[Arrays], Share] = {}
-        for share in todo:
-            name = f"{key}-{share.name}"
+        waiting: dict[Future[Arrays], Shard] = {}
+        for shard in todo:
+            name = f"{key}-{shard.name}"
             known = None if self.checkpoint is None else self.checkpoint.get(name)
             if known is not None:
-                sums.add(share.part, known)
-                self._finished(name, share, resumed=True)
+                sums.add(shard.part, known)
+                self._finished(name, shard, resumed=True)
                 continue
             if self._stopping:
                 raise Stopped
             while len(waiting) >= self.workers.count * AHEAD:
                 self._collect(sums, key, waiting)
             tick = partial(self._tick, name)
-            waiting[self.workers.submit(request, key, share, tick)] = share
+            waiting[self.workers.submit(request, key, shard, tick)] = shard
         while waiting:
             self._collect(sums, key, waiting)
 
-    def _collect(self, sums: Sums, key: str, waiting: dict[Future[Arrays], Share]) -> None:
+    def _collect(self, sums: Sums, key: str, waiting: dict[Future[Arrays], Shard]) -> None:
         finished, _ = wait(waiting, return_when=FIRST_COMPLETED)
         for future in finished:
-            share = waiting.pop(future)
+            shard = waiting.pop(future)
             counted = future.result()
-            sums.add(share.part, counted)
-            name = f"{key}-{share.name}"
+            sums.add(shard.part, counted)
+            name = f"{key}-{shard.name}"
             if self.checkpoint is not None:
                 self.checkpoint.put(name, counted)
-            self._finished(name, share)
+            self._finished(name, shard)
 
     def _tick(self, name: str, done: int) -> None:
         with self._lock:
             self._partly[name] = done
+            aside, self._meanwhile = self._meanwhile, None
+        if aside is not None:
+            threading.Thread(target=aside, name="mauvecl-aside", daemon=True).start()
         self._told()
 
-    def _finished(self, name: str, share: Share, *, resumed: bool = False) -> None:
+    def _finished(self, name: str, shard: Shard, *, resumed: bool = False) -> None:
         with self._lock:
             self._partly.pop(name, None)
-            self._done += share.count
-            self._shares += 1
-            self._resumed += share.count if resumed else 0
+            self._done += shard.count
+            self._shards += 1
+            self._resumed += shard.count if resumed else 0
         self._told()
 
     def _told(self) -> None:
@@ -346,7 +361,7 @@ class Pool:
             self._progress(standing.done, standing.total)
 
 
-def together(engine: Engine | Pool, work: Callable[[Item], Answer], items: Iterable[Item]) -> Iterator[Answer]:
+def together(engine: Engine | Pool | Stares, work: Callable[[Item], Answer], items: Iterable[Item]) -> Iterator[Answer]:
     """What `work` makes of each item, in their order; by a pool some at a time, so that devices need not wait."""
     if not isinstance(engine, Pool):
         yield from map(work, items)

@@ -1,4 +1,4 @@
-"""Requests cut into shares, whatever counts them, and the fingerprints that shares are kept under."""
+"""Requests cut into shards, whatever counts them, and the fingerprints that shards are kept under."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from typing import Any
 
 import numpy as np
 
-from mauvecl.results.requests import Asked, Divisible, Share
+from mauvecl.results.requests.requests import Asked, Divisible, Shard
 
-#: What a share holds, and how: raised with every change, so that none of an older form is ever added.
+#: What a shard holds, and how: raised with every change, so that none of an older form is ever added.
 FORM = 2
-#: Realisations times pixels times scenarios of one share, about: some seconds of a processor's work.
-SHARE = 2**34
-#: Shares of one part of a request, about, at most: larger requests have larger shares, so that one process can add up
+#: Realisations times pixels times scenarios of one shard, about: some seconds of a processor's work.
+SHARD = 2**34
+#: Shards of one part of a request, about, at most: larger requests have larger shards, so that one process can add up
 #: what a thousand count.
 MOST = 2**13
 
 
-def shares(request: Divisible) -> list[Share]:
-    """All shares of a request: cut at multiples of a power of two, whatever counts them."""
-    wanted = max(SHARE // request.work, request.realisations // MOST)
+def shards(request: Divisible) -> list[Shard]:
+    """All shards of a request: cut at multiples of a power of two, whatever counts them."""
+    wanted = max(SHARD // request.work, request.realisations // MOST)
     size = 1 << (max(wanted, request.least).bit_length() - 1)
     first, end = request.start, request.start + request.realisations
     cuts = [first, *range(first - first % size + size, end, size), end]
-    return [Share(part, a, b - a) for part in range(request.parts) for a, b in itertools.pairwise(cuts)]
+    return [Shard(part, a, b - a) for part in range(request.parts) for a, b in itertools.pairwise(cuts)]
 
 
 #: What describes an input and does not change a draw.
@@ -37,7 +37,7 @@ _TOLD = ("provenance", "messages")
 def fingerprint(request: Asked) -> str:
     """Sha256 of everything in a request that its answer depends on, to the last bit.
 
-    Realisations are left out: the same shares are counted of more of them.
+    Realisations are left out: the same shards are counted of more of them.
     """
     digest = hashlib.sha256(f"form {FORM}".encode())
     _feed(digest, request, leave=("realisations", "start", "tails"))

@@ -23,7 +23,7 @@ class Chi2(QuadraticStatistic):
     """Sum over pixels of the squared difference over its variance."""
 
     name = "chi2"
-    definition: ClassVar[str] = "sum over pixels of (observed - template)^2 / variance"
+    definition: ClassVar[str] = "sum over pixels of (observed - reference)^2 / variance"
     label: ClassVar[str] = "chi2 over pixels"
     kernel_sum: ClassVar[str | None] = "chi2"
 

@@ -148,31 +148,31 @@ class Mixture:
     Attributes
     ----------
     parts : tuple of QuadraticForm or Gaussian
-    shares : ndarray, shape (n,)
+    weights : ndarray, shape (n,)
         Probability of each.
     """
 
     parts: tuple[QuadraticForm | Gaussian, ...]
-    shares: NDArray[np.float64]
+    weights: NDArray[np.float64]
 
     @cached_property
     def mean(self) -> float:
-        return float(self.shares @ [part.mean for part in self.parts])
+        return float(self.weights @ [part.mean for part in self.parts])
 
     @cached_property
     def std(self) -> float:
-        return float(np.sqrt(self.shares @ [part.std**2 + (part.mean - self.mean) ** 2 for part in self.parts]))
+        return float(np.sqrt(self.weights @ [part.std**2 + (part.mean - self.mean) ** 2 for part in self.parts]))
 
     @cached_property
     def third(self) -> float:
         """Third central moment."""
         away = [part.mean - self.mean for part in self.parts]
         each = [part.third + 3.0 * d * part.std**2 + d**3 for part, d in zip(self.parts, away, strict=True)]
-        return float(self.shares @ each)
+        return float(self.weights @ each)
 
     def sf(self, value: float) -> float:
         """Probability of exceeding `value`."""
-        return min(float(self.shares @ [part.sf(value) for part in self.parts]), 1.0)
+        return min(float(self.weights @ [part.sf(value) for part in self.parts]), 1.0)
 
     def isf(self, probability: float) -> float:
         """The value exceeded with this probability, 0 < probability < 1."""

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.content import ByContent
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.statistics.statistic import Float, LinearStatistic, Setting
 
@@ -63,15 +64,16 @@ class UvExcess(LinearStatistic):
         return np.asarray(setting.used & (wavelength >= UV_NM[0]) & (wavelength <= UV_NM[1]))
 
 
+@public
 @dataclass(frozen=True, eq=False)
 class Linear(ByContent, LinearStatistic):
-    """A statistic of one's own: the sum over pixels of weight times (observed - template), DN of the exposure.
+    """A statistic of one's own: the sum over pixels of weight times (observed - reference), DN of the exposure.
 
     Attributes
     ----------
     name : str
     weights : ndarray, shape (n_pixel,)
-        Per DN; pixels that a template saturates are left out.
+        Per DN; pixels that a reference saturates are left out.
     """
 
     name: str

@@ -1,4 +1,7 @@
-"""Names of the statistics, for whoever asks for some; `registry` has what is behind them, and takes longer to load."""
+"""Names of the statistics, and of what they are marginalised over, for whoever asks for some.
+
+`registry` and `nuisances` have what is behind them, and take longer to load.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,13 @@ from mauvecl.host.errors import InputError
 STATISTIC_NAMES = ("chi2", "chi2_element", "chi2_pair", "matched", "uv_excess", "paper")
 #: Computed where nobody names any.
 USUAL_STATISTICS = ("chi2", "chi2_element", "matched")
+#: Spectra of the unknowns that a setting brings along, and the unit of their amplitudes.
+NUISANCES = {
+    "dark": "detector temperature, deg C",
+    "light": "throughput, pointing or the star's own level, relative",
+    "sky": "brightness of the sky, relative",
+    "tilt": "colour of the response, relative at 200 and 700 nm",
+}
 
 
 def check_statistic(name: str) -> None:

@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.content import ByContent
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
+from mauvecl.statistics.names import NUISANCES
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -23,15 +25,9 @@ Float = NDArray[np.float64]
 
 #: Half of the output's range, over which `tilt` counts, and its middle, nm.
 TILT_NM, MIDDLE_NM = 250.0, 450.0
-#: Spectra of the unknowns that a setting brings along, and the unit of their amplitudes.
-NUISANCES = {
-    "dark": "detector temperature, deg C",
-    "light": "throughput, pointing or the star's own level, relative",
-    "sky": "brightness of the sky, relative",
-    "tilt": "colour of the response, relative at 200 and 700 nm",
-}
 
 
+@public
 @dataclass(frozen=True, eq=False)
 class Nuisances(ByContent):
     """Unknown amplitudes of known spectra.
@@ -50,6 +46,12 @@ class Nuisances(ByContent):
     sd: Float
 
     def __post_init__(self) -> None:
+        shapes = np.shape(self.spectra), np.shape(self.sd)
+        if len(shapes[0]) != 2 or shapes[0][:1] != shapes[1] or shapes[1] != (len(self.names),):
+            raise InputError(
+                f"{len(self.names)} names of unknowns, spectra of the shape {shapes[0]} and standard deviations of the "
+                f"shape {shapes[1]}, expected one spectrum and one standard deviation for each name"
+            )
         for name, spectrum, sd in zip(self.names, self.spectra, self.sd, strict=True):
             if not np.isfinite(spectrum).all():
                 raise InputError(f"the spectrum of the unknown {name!r} is not finite everywhere, expected numbers")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 from mauvecl.statistics.distributions import QuadraticForm
 
 if TYPE_CHECKING:
+    from scipy.sparse import csr_array
+
     from mauvecl.host.expectation import Expectation
 
 Float = NDArray[np.float64]
@@ -25,6 +27,8 @@ STEPS_PER_SIGMA = 2
 POINTS = 8
 #: Where they do not give its mean to this share, every pixel is taken.
 WORST = 1e-4
+#: Modes whose variance is below this share of the largest one's are rounding.
+LEAST = 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,15 +70,16 @@ class Smoothing:
         sigma = SMOOTHING_NM / np.sqrt(8 * np.log(2)) / float(np.median(np.diff(x.wavelength_nm)))
         step = max(int(sigma / STEPS_PER_SIGMA), 1)
         rows = _rows(n, sigma)
-        smoothing = cls(*_places(n, step), sigma, rows[_places(n, step)[0]] * used)
-        if step == 1 or all(smoothing._follows(flare, rows * used) for flare in flares or (x,)):
+        centres, between = _places(n, step)
+        smoothing = cls(centres, between, sigma, rows[centres].toarray() * used)
+        if step == 1 or all(smoothing._follows(flare, used) for flare in flares or (x,)):
             return smoothing
-        return cls(np.arange(n), np.eye(n), sigma, rows * used)
+        return cls(np.arange(n), np.eye(n), sigma, rows.toarray() * used)
 
-    def _follows(self, flare: Expectation, rows: Float) -> bool:
+    def _follows(self, flare: Expectation, used: NDArray[np.bool_]) -> bool:
         """Whether the sum over every pixel comes out on average, by weights of which none is negative."""
-        scale, each = self.scale(flare), self._each(flare)
-        whole, ours = (factor @ (part**2 @ flare.variance_dn2) for factor, part in ((each, rows), (scale, self.rows)))
+        scale, squares = self.scale(flare), _squares(used.size, self.sigma) @ (used * flare.variance_dn2)
+        whole, ours = float(self._each(flare) @ squares), float(scale @ squares[self.centres])
         return bool((scale >= 0).all() and abs(ours - whole) <= WORST * whole)
 
     def _each(self, flare: Expectation) -> Float:
@@ -90,8 +95,12 @@ class Smoothing:
 
     def form(self, scale: Float, delta: Float, variance: Float) -> QuadraticForm:
         """The distribution of the sum for Gaussian noise of a mean and variance per pixel."""
-        weight, modes = self.modes(scale, variance)
-        return QuadraticForm(weight, modes @ delta / np.sqrt(weight))
+        if not delta.any():
+            weight = np.linalg.eigvalsh(self._covariance(scale, variance))
+            weight = weight[weight > LEAST * weight[-1]]
+            return QuadraticForm(weight, np.zeros(weight.size))
+        weight, vectors = self._decomposed(scale, variance)
+        return QuadraticForm(weight, (np.sqrt(scale) * (self._sparse @ delta)) @ vectors / np.sqrt(weight))
 
     def modes(self, scale: Float, variance: Float) -> tuple[Float, Float]:
         """What the sum is made of: independent normals' variances, and the weights of the pixels in each.
@@ -101,10 +110,26 @@ class Smoothing:
         weight : ndarray, shape (n_mode,)
         modes : ndarray, shape (n_mode, n_pixel)
         """
-        half = np.sqrt(scale)[:, None] * self.rows
-        values, vectors = np.linalg.eigh((half * variance) @ half.T)
-        kept = values > 1e-10 * values[-1]
-        return values[kept], vectors[:, kept].T @ half
+        weight, vectors = self._decomposed(scale, variance)
+        return weight, vectors.T @ (np.sqrt(scale)[:, None] * self.rows)
+
+    def _decomposed(self, scale: Float, variance: Float) -> tuple[Float, Float]:
+        """The modes' variances, and the weights of the centres in each, shape (n_centre, n_mode)."""
+        values, vectors = np.linalg.eigh(self._covariance(scale, variance))
+        kept = values > LEAST * values[-1]
+        return values[kept], vectors[:, kept]
+
+    def _covariance(self, scale: Float, variance: Float) -> Float:
+        """Of the smoothed values times the roots of their factors, shape (n_centre, n_centre)."""
+        half = self._sparse * np.sqrt(scale)[:, None]
+        return np.asarray(((half * variance) @ half.T).toarray())
+
+    @cached_property
+    def _sparse(self) -> csr_array:
+        """`rows`: most of them are zeros."""
+        from scipy.sparse import csr_array
+
+        return csr_array(self.rows)
 
     def bands(self, n_padded: int, chunk: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
         """The weights chunk by chunk of pixels, for centres under way, and how many are finished with each chunk.
@@ -159,10 +184,15 @@ def _places(n: int, step: int) -> tuple[NDArray[np.int64], Float]:
 
 
 @lru_cache(maxsize=2)
-def _rows(n: int, sigma: float) -> Float:
+def _rows(n: int, sigma: float) -> csr_array:
     """Weights of the pixels in the smoothed spectrum at each pixel; kept, for they take a tenth of a second."""
     from scipy.ndimage import gaussian_filter1d
+    from scipy.sparse import csr_array
 
-    rows = np.asarray(gaussian_filter1d(np.eye(n), sigma, axis=0, mode="nearest"))
-    rows.setflags(write=False)
-    return rows
+    return csr_array(gaussian_filter1d(np.eye(n), sigma, axis=0, mode="nearest"))
+
+
+@lru_cache(maxsize=2)
+def _squares(n: int, sigma: float) -> csr_array:
+    """Their squares."""
+    return _rows(n, sigma).power(2)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
-from mauvecl.noise.comparison import TEMPLATE, Comparison
+from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.drawn import Drawn
 from mauvecl.statistics.distributions import Form, Gaussian, Mixture, QuadraticForm
 from mauvecl.statistics.nuisances import Nuisances, joined
@@ -30,7 +30,7 @@ class Setting:
     Attributes
     ----------
     quiet : Expectation
-        The star without a flare: the template, and the model of the variances.
+        The star without a flare: the reference, and the model of the variances.
     used : ndarray of bool, shape (n_pixel,)
         Pixels that count.
     comparison : Comparison
@@ -45,11 +45,15 @@ class Setting:
 
     quiet: Expectation
     used: NDArray[np.bool_]
-    comparison: Comparison = TEMPLATE
+    comparison: Comparison = NOISE_FREE
     flares: Sequence[Expectation] = ()
     nuisances: Nuisances | None = None
     drawn: Drawn | None = None
-    _kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False)
+    _kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # What is remembered is known by where it lies in this process's memory.
+        return vars(self) | {"_kept": {}}
 
     @property
     def integrates(self) -> bool:
@@ -82,6 +86,27 @@ class Tilt:
     per_sigma: float = 1.0
 
 
+@dataclass(frozen=True, eq=False)
+class Odds:
+    """What a statistic makes of one flare, for Gaussian noise.
+
+    Attributes
+    ----------
+    null, seen : Form
+        Its distribution without and with the flare.
+    threshold : float
+    """
+
+    null: Form
+    seen: Form
+    threshold: float
+
+    @property
+    def probability(self) -> float:
+        """Of detection."""
+        return self.seen.sf(self.threshold)
+
+
 class Statistic(ABC):
     """One detection statistic; it holds no data, so that one object serves every detection.
 
@@ -105,13 +130,13 @@ class Statistic(ABC):
     #: Whether it can be marginalised over what is unknown.
     marginal: ClassVar[bool] = True
 
-    def share(self, setting: Setting) -> float:
-        """Variance of what is subtracted, as a share of one exposure's."""
-        return 1.0 if self.paired else setting.comparison.share
+    def added_variance(self, setting: Setting) -> float:
+        """Variance of what is subtracted, in that of one exposure."""
+        return 1.0 if self.paired else setting.comparison.added_variance
 
     def variance(self, setting: Setting) -> Float:
         """Of a pixel's difference without a flare, DN^2, shape (n_pixel,)."""
-        return np.asarray((1.0 + self.share(setting)) * setting.quiet.variance_dn2)
+        return np.asarray((1.0 + self.added_variance(setting)) * setting.quiet.variance_dn2)
 
     def check(self, setting: Setting) -> None:
         """Refuse a setting in which the statistic says nothing.
@@ -144,8 +169,19 @@ class Statistic(ABC):
         exposures are subtracted, which share the factors of a realisation.
         """
         delta = np.where(setting.used, observed.recorded_light_dn - setting.quiet.recorded_light_dn, 0.0)
-        true = observed.variance_dn2 + self.share(setting) * setting.quiet.variance_dn2
+        true = observed.variance_dn2 + self.added_variance(setting) * setting.quiet.variance_dn2
         return self.as_drawn(setting, observed, delta, true, flare, estimated=setting.comparison.estimated)
+
+    def odds(self, setting: Setting, flare: Expectation, fap: float) -> Odds:
+        """Closed forms without and with a flare, and the threshold of a false-alarm probability between them."""
+        shape = flare if self.shaped else None
+
+        def cut() -> tuple[Form, float]:
+            null = self.closed_form(setting, setting.quiet, shape)
+            return null, null.isf(fap)
+
+        null, threshold = cut() if self.shaped else setting.remembered(f"cut of {self.name} at {fap!r}", cut)
+        return Odds(null, self.closed_form(setting, flare, shape), threshold)
 
     def as_drawn(
         self,
@@ -176,7 +212,7 @@ class Statistic(ABC):
         for node in nodes:
             shift, more = node.on(observed)
             parts.append(self.form(setting, delta + shift * setting.used, true + more, flare, scatter=rows))
-        return parts[0] if len(parts) == 1 else Mixture(tuple(parts), np.array([node.share for node in nodes]))
+        return parts[0] if len(parts) == 1 else Mixture(tuple(parts), np.array([node.probability for node in nodes]))
 
     @abstractmethod
     def dof(self, setting: Setting) -> int:
@@ -265,14 +301,14 @@ class LinearStatistic(Statistic):
         variance = self.variance(setting) * setting.used
         sought = variance * weights
         rows = setting.nuisances.rows(variance, setting.nuisances.spectra * setting.used)
-        found = weights - (rows @ sought) @ rows
-        power = float(found @ sought)
+        left = weights - (rows @ sought) @ rows
+        power = float(left @ sought)
         if power <= 1e-10 * float(weights @ sought):
             raise InputError(
                 f"statistic {self.name!r} looks for what cannot be told from {joined(setting.nuisances.names)}, "
                 "expected fewer unknowns or smaller standard deviations"
             )
-        return np.asarray(found / np.sqrt(power) if self.normalised else found)
+        return np.asarray(left / np.sqrt(power) if self.normalised else left)
 
     def dof(self, setting: Setting) -> int:
         return 1

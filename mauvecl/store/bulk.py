@@ -13,9 +13,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
+from mauvecl.host.files.whole import UNFINISHED, write_whole
 from mauvecl.host.quantities import count as whole
-from mauvecl.runs.durable import UNFINISHED, alone, write_whole
+from mauvecl.runs.durable import alone
 from mauvecl.runs.pool import Pool, together
 from mauvecl.store.export import Selection, export
 from mauvecl.store.form import CRC_BYTES, Chunk, Store, StoredScene, crc, digest
@@ -32,6 +34,7 @@ TOGETHER, WRITERS = 4, 2
 MOST_MISSING = 100_000
 
 
+@public
 def draw(
     study: Study, scene: StoredScene, engine: Engine | Pool, start: int, count: int, out: NDArray[Any] | None = None
 ) -> NDArray[Any]:
@@ -64,6 +67,7 @@ def draw(
     return rows
 
 
+@public
 def realise(
     study: Study,
     path: str | Path,
@@ -101,6 +105,7 @@ def realise(
     return store
 
 
+@public
 def realise_file(
     study: Study,
     file: str | Path,
@@ -150,6 +155,7 @@ def _complete(store: Store, engine: Engine | Pool, resume: bool, restart: bool, 
     _fill(store, todo, engine, progress)
 
 
+@public
 def forget(path: str | Path) -> None:
     """Remove a store.
 
@@ -267,6 +273,7 @@ def state(store: Store, chunk: Chunk) -> str:
     return "good" if digest(data) == known else "foreign"
 
 
+@public
 def verify(
     path: str | Path,
     engine: Engine | Pool | None = None,
@@ -374,6 +381,7 @@ def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
             yield Fault(name, seen, repair)
 
 
+@public
 def read(path: str | Path, scene: str = "star-1/quiescent") -> Any:
     """The spectra of one array, read from the disk when looked at.
 

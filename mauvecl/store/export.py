@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
+from mauvecl.host.files.whole import UNFINISHED, write_whole
 from mauvecl.host.version import VERSION
-from mauvecl.runs.durable import UNFINISHED, write_whole
 from mauvecl.store.description import CALIBRATION, COMMON_DRAWS, NOMINAL
 from mauvecl.store.form import Store, StoredScene
 

@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import read_bytes
 from mauvecl.host.files.parsed import toml
-from mauvecl.runs.durable import UNFINISHED, differing_keys, write_whole
+from mauvecl.host.files.whole import UNFINISHED, write_whole
+from mauvecl.runs.durable import differing_keys
 from mauvecl.store.description import describe, study_in
 from mauvecl.study.labels import label, titled
 from mauvecl.study.study import Study
@@ -181,12 +182,12 @@ class Store:
         InputError
             If there is none.
         """
-        found = next((scene for scene in self.scenes if scene.path == path), None)
-        if found is None:
+        known = next((scene for scene in self.scenes if scene.path == path), None)
+        if known is None:
             raise InputError(
                 f"no array {path!r} in {self.path.name}, expected one of {', '.join(s.path for s in self.scenes)}"
             )
-        return found
+        return known
 
     @property
     def rows(self) -> int:

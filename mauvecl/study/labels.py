@@ -75,9 +75,9 @@ def stacked(parts: Iterable[tuple[Mapping[str, float | str], QTable]], **meta: o
     shared = {k: v for k, v in tables[0].meta.items() if all(k in t.meta and t.meta[k] == v for t in tables)}
     for table in tables:
         table.meta = {}
-    found = vstack(tables)
-    found.meta |= shared | meta
-    return described(found)
+    whole = vstack(tables)
+    whole.meta |= shared | meta
+    return described(whole)
 
 
 def titled(name: str, at: Mapping[str, float | str]) -> str:

@@ -6,19 +6,19 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field, model_validator
 
 from mauvecl.host.files.bounded import shortened
 from mauvecl.noise.usual import USUAL
-from mauvecl.statistics.nuisances import Nuisances, spectrum_of
 from mauvecl.study.sections import Part
-from mauvecl.study.weights import at_pixels, read_spectrum
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from mauvecl.host.expectation import Expectation
     from mauvecl.noise.processes import Processes
+    from mauvecl.statistics.nuisances import Nuisances
 
 
 def _spread(given: Any) -> Any:
@@ -60,6 +60,10 @@ class OwnNuisance(Part):
         InputError
             For a file or points that hold no spectrum.
         """
+        import numpy as np
+
+        from mauvecl.study.weights import at_pixels, read_spectrum
+
         if self.file is not None:
             return read_spectrum(name, self.file, wavelength_nm)
         return at_pixels(f"points of {shortened(name)}", "DN", np.array(self.points), wavelength_nm)
@@ -86,6 +90,8 @@ class NuisanceChoice(Part):
         InputError
             For a file that cannot be read, or a spectrum that changes no pixel.
         """
+        from mauvecl.statistics.nuisances import Nuisances
+
         sd: dict[str, float] = {}
         if self.usual:
             sd |= usual_spreads(quiet)
@@ -109,4 +115,6 @@ class NuisanceChoice(Part):
 
 def usual_spreads(quiet: Expectation) -> dict[str, float]:
     """Standard deviations of the documented set; without a sky, that of the sky is left out."""
+    from mauvecl.statistics.nuisances import spectrum_of
+
     return {u.nuisance: u.sd for u in USUAL if spectrum_of(u.nuisance, quiet).any()}

@@ -15,10 +15,10 @@ from mauvecl.host.files.text_table import read_text_table
 from mauvecl.study.sections import Part
 
 if TYPE_CHECKING:
+    from mauvecl.host.orbit.limits import Limits
     from mauvecl.host.orbit.moments import Moments
     from mauvecl.host.orbit.names import Target
     from mauvecl.host.orbit.orbit import Orbit
-    from mauvecl.host.orbit.visibility import Limits
     from mauvecl.lightcurve.flares.rates import Rates
     from mauvecl.lightcurve.search.completeness import DurationLaw
     from mauvecl.study.study import Study
@@ -30,7 +30,7 @@ MOST_TARGETS = 500
 
 
 class LimitsText(Part):
-    """What must hold for a target to be seen; "none" is no limit. See `host.orbit.visibility.Limits`."""
+    """What must hold for a target to be seen; "none" is no limit. See `host.orbit.limits.Limits`."""
 
     earth_limb_deg: Limit = 25.0
     sun_deg: Limit = 46.0
@@ -60,7 +60,7 @@ class LimitsText(Part):
 
     def limits(self) -> Limits:
         """As the host takes them."""
-        from mauvecl.host.orbit.visibility import Limits
+        from mauvecl.host.orbit.limits import Limits
 
         given = {name: getattr(self, name) for name in type(self).model_fields}
         found: dict[str, Any] = {name: None if value == "none" else value for name, value in given.items()}
@@ -224,6 +224,9 @@ class PlanQuestion(Part):
         See `lightcurve.completeness.DurationLaw`.
     completeness : {"injections", "closed form"}
         By flares put into drawn noise and searched for, or at once, for white noise.
+    along_orbit : bool
+        Whether each target's frames have the temperature and the hits by particles that the orbit gives them; those of
+        the study otherwise.
     injections : int
         Of each half-width.
     best_months : int
@@ -237,6 +240,7 @@ class PlanQuestion(Part):
     exponent: Annotated[float, Field(ge=0, lt=1)] = 0.39
     scatter_dex: Annotated[float, Field(ge=0, le=2)] = 0.3
     completeness: Literal["injections", "closed form"] = "injections"
+    along_orbit: bool = True
     injections: Annotated[int, Field(ge=20, le=1_000_000)] = 100
     best_months: Annotated[int, Field(ge=1, le=12)] = 3
     report: Literal["pdf", "html"] = "pdf"

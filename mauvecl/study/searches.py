@@ -1,37 +1,22 @@
-"""A study's search for flares and the flares that are injected: sections, and the survey that they make of a star."""
+"""A study's search for flares, and the flares that are injected, as data; `surveys` makes of them what is done."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, model_validator
 
-from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.flares.shapes import shape_of
-from mauvecl.lightcurve.search.bank import HALF_WIDTHS_S, WINDOW_S, Bank, Level
-from mauvecl.lightcurve.search.null import Per, per_day
-from mauvecl.lightcurve.search.recovery import Fit
-from mauvecl.lightcurve.search.survey import Survey
-from mauvecl.lightcurve.search.templates import RANK, TEMPERATURES_K, Templates, frame_nuisances
-from mauvecl.lightcurve.stares.components import Components
+from mauvecl.lightcurve.usual import HALF_WIDTHS_S, RANK, WINDOW_S, Per, check_shape, per_day
 from mauvecl.study.nuisances import Spread
 from mauvecl.study.sections import Part
-from mauvecl.study.stares import energy_scale, stare_of
 
 if TYPE_CHECKING:
-    from mauvecl.host.expectation import Expectation
-    from mauvecl.host.stars.source import Source
+    from mauvecl.lightcurve.search.bank import Bank, Level
     from mauvecl.lightcurve.stares.stare import Stare
-    from mauvecl.study.sections import Star
     from mauvecl.study.study import Study
 
 #: Orbits over which a level with the orbit's cycle is fitted: fewer cannot tell the cycle from a flare of minutes.
 CYCLE_ORBITS = 3.0
-#: Smallest and largest flare of a map that is not told, in sizes that the search finds half of.
-AROUND = (0.3, 3.0)
 
 Positive = Annotated[float, Field(gt=0)]
 
@@ -82,7 +67,7 @@ class SearchChoice(Part):
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
-        shape_of(self.shape)
+        check_shape(self.shape)
         if list(self.half_widths_s) != sorted(set(self.half_widths_s)):
             raise ValueError(f"search.half_widths_s = {list(self.half_widths_s)}, expected ascending times")
         if self.slope and not self.offset:
@@ -94,8 +79,20 @@ class SearchChoice(Part):
         """False alarms per star-day."""
         return per_day(self.false_alarms, self.per)
 
+    def white_bank(self, frame_s: float) -> Bank:
+        """For one sum of each frame and no curves, as closed forms take it."""
+        import numpy as np
+
+        from mauvecl.lightcurve.flares.shapes import shape_of
+        from mauvecl.lightcurve.search.bank import Bank, Level
+
+        level = Level(self.offset, self.slope, False, WINDOW_S if self.window_s is None else self.window_s)
+        return Bank(self.half_widths_s, np.ones((1, 1)), shape_of(self.shape), frame_s, level)
+
     def level(self, stare: Stare, orbit_s: float) -> Level:
         """What is unknown of the level in a stare."""
+        from mauvecl.lightcurve.search.bank import Level
+
         cycle = self.cycle if self.cycle is not None else any("cosine" in u.name for u in stare.unknowns)
         window = self.window_s if self.window_s is not None else CYCLE_ORBITS * orbit_s if cycle else WINDOW_S
         return Level(self.offset, self.slope, cycle, window)
@@ -157,152 +154,11 @@ class InjectionQuestion(Part):
     @property
     def half_widths_s(self) -> tuple[float, ...]:
         """Half-widths injected."""
+        import numpy as np
+
         if self.widths == 1:
             return (self.half_width_low_s,)
         return tuple(float(w) for w in np.geomspace(self.half_width_low_s, self.half_width_high_s, self.widths))
-
-
-@dataclass(frozen=True, eq=False)
-class Surveyed:
-    """A star of a study, as it is stared at and searched.
-
-    Attributes
-    ----------
-    source : Source
-    quiet : Expectation
-        One frame.
-    templates : Templates
-    survey : Survey
-        With the study's flare as the only one of its components.
-    """
-
-    source: Source
-    quiet: Expectation
-    templates: Templates
-    survey: Survey
-
-    @property
-    def fit(self) -> Fit:
-        """How what is found is fitted."""
-        return Fit(self.survey.bank, self.templates)
-
-    @property
-    def unit_snr(self) -> float:
-        """S/N of one frame for the study's flare with an amplitude of one, shape and level aside."""
-        x = self.survey.components
-        unit = np.zeros(3 + x.n_flares)
-        unit[:3], unit[3] = 1.0, 1.0
-        return float(np.linalg.norm(x.means(unit)))
-
-
-def surveyed(study: Study, star: Star) -> Surveyed:
-    """What a study's stare and search come to for one of its stars.
-
-    Raises
-    ------
-    InputError
-        For anything in the study that cannot be.
-    """
-    source, stare = star.source(), stare_of(study)
-    choice = study.search
-    frames = study.model_copy(
-        update={"observation": study.observation.model_copy(update={"exposure_s": stare.frame_s})}
-    )
-    kelvin = (*TEMPERATURES_K, study.flare.temperature_k)
-    quiet, electrons = flare_electrons(frames, source, kelvin)
-    nuisances = frame_nuisances(quiet, stare, choice.spreads())
-    templates = Templates.of(
-        quiet,
-        electrons[:-1] * quiet.gain_dn_per_electron,
-        TEMPERATURES_K,
-        nuisances=nuisances,
-        rank=choice.sums,
-    )
-    level = choice.level(stare, study.stare.orbit_s)
-    bank = Bank(
-        choice.half_widths_s, templates.directions[list(templates.chosen)], shape_of(choice.shape), stare.frame_s, level
-    )
-    survey = Survey(Components(quiet, electrons[-1:], templates.weights), stare, bank)
-    if level.cycle and not len(survey.curves if survey.curves is not None else ()):
-        raise InputError("search.cycle without a curve, expected unknown cycles in the stare")
-    return Surveyed(source, quiet, templates, survey)
-
-
-def flare_electrons(study: Study, source: Source, kelvin: tuple[float, ...]) -> tuple[Expectation, NDArray[np.float64]]:
-    """One frame of a star, and the electrons that flares of one amplitude add to it, (n_temperature, n_pixel)."""
-    # A flare that takes the place of photosphere is as linear in its amplitude, but not up to one.
-    unit = 1.0 if study.flare.geometry == "added" else 0.01
-    each = [study.model_copy(update={"flare": study.flare.model_copy(update={"temperature_k": k})}) for k in kelvin]
-    quiet, *flaring = study.expect([source, *(one.flaring(source, unit) for one in each)])
-    return quiet, np.array([(x.source_electrons - quiet.source_electrons) / unit for x in flaring])
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """What the sizes of flares are, for one star: amplitude x half-width^power x per_unit.
-
-    Attributes
-    ----------
-    of : str
-    power : int
-    per_unit : float
-        Size of a flare of one amplitude and a half-width of 1 s.
-    """
-
-    of: Size
-    power: int
-    per_unit: float
-
-    @classmethod
-    def chosen(cls, study: Study, star: Star, source: Source) -> Sizes:
-        """By a study.
-
-        Raises
-        ------
-        InputError
-            For energies of a star of unknown size.
-        """
-        asked = study.injections.of
-        flare = study.flare
-        bolometric = energy_scale(study, star, source, "bolometric", flare.temperature_k)
-        if asked is None:
-            asked = "amplitude" if bolometric is None else "energy"
-        if asked == "amplitude":
-            return cls("amplitude", 0, 1.0)
-        area = shape_of(study.search.shape).equivalent_duration
-        if asked == "duration":
-            return cls("duration", 1, area)
-        kind: Any = "bolometric" if asked == "energy" else "band"
-        scale = energy_scale(study, star, source, kind, flare.temperature_k)
-        if scale is None:
-            raise InputError(
-                f"injections.of = {asked!r} at {source.name} of unknown size, expected the star's distance_pc or "
-                "radius_rsun and effective_temperature_k"
-            )
-        return cls(asked, 1, area * scale.erg_per_s)
-
-    def of_amplitude(self, amplitude: Any, half_width_s: Any) -> Any:
-        """The size of amplitudes and half-widths, broadcast together."""
-        return amplitude * half_width_s**self.power * self.per_unit
-
-    def amplitude(self, size: Any, half_width_s: Any) -> Any:
-        """The amplitude of sizes."""
-        return size / (half_width_s**self.power * self.per_unit)
-
-
-def sizes_of(study: Study, sizes: Sizes, unit_snr: float, threshold: float) -> NDArray[np.float64]:
-    """The sizes that a study injects, ascending; around what half are found of where the study does not tell."""
-    asked = study.injections
-    widths = np.array([asked.half_width_low_s, asked.half_width_high_s])
-    frames = widths / study.load_instrument().frame_s
-    # S/N of a known flare on a known level: (A / sigma) sqrt(square integral x half-width), of no more than its frames.
-    amplitude = threshold / unit_snr / np.sqrt(shape_of(study.search.shape).square_integral * frames)
-    half = sizes.of_amplitude(amplitude, widths)
-    low = AROUND[0] * half.min() if asked.low is None else asked.low
-    high = AROUND[1] * half.max() if asked.high is None else asked.high
-    if not low < high:
-        raise InputError(f"injections from {low:.3g} to {high:.3g}, expected low below high")
-    return np.geomspace(low, high, asked.sizes)
 
 
 def without_usual_search(data: dict[str, Any], study: Study) -> None:

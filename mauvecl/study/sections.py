@@ -5,9 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationInfo, create_model, field_validator, model_validator
+from pydantic import Field, ValidationInfo, create_model, field_validator, model_validator
 
 from mauvecl.host.quantities import is_quantity, numbers, unit_of
+from mauvecl.host.records import Record
 from mauvecl.host.sky import DEFAULT_SKY
 from mauvecl.noise.varied import VARIED
 from mauvecl.statistics.names import STATISTIC_NAMES, USUAL_STATISTICS
@@ -16,7 +17,8 @@ if TYPE_CHECKING:
     from mauvecl.host.sky.zodiacal import Sky
     from mauvecl.host.stars.source import Source
     from mauvecl.noise.comparison import Comparison
-    from mauvecl.noise.processes import Prior, Processes
+    from mauvecl.noise.priors import Prior
+    from mauvecl.noise.processes import CosmicRays, Processes
 
 
 def plain(key: str, given: Any) -> Any:
@@ -25,6 +27,8 @@ def plain(key: str, given: Any) -> Any:
         return numbers(key, given, unit_of(key)).tolist()
     if isinstance(given, list | tuple) and any(map(is_quantity, given)):
         return [plain(key, one) for one in given]
+    if hasattr(given, "tolist"):
+        return given.tolist()
     if hasattr(given, "utc") and hasattr(given, "isot"):
         return str(given.utc.isot)
     if hasattr(given, "icrs") and hasattr(given, "to_string"):
@@ -32,10 +36,8 @@ def plain(key: str, given: Any) -> Any:
     return given
 
 
-class Part(BaseModel):
-    """A section: frozen, and strict about its keys."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
+class Part(Record):
+    """A section of a study."""
 
     @field_validator("*", mode="before")
     @classmethod
@@ -83,18 +85,20 @@ class Star(Part):
         from mauvecl.host.stars.source import Source
 
         if self.library is not None:
-            found = Source.from_library(self.library)
+            source = Source.from_library(self.library)
         else:
-            found = Source.read(
+            source = Source.read(
                 self.file or "", wavelength_unit=self.wavelength_unit, flux_unit=self.flux_unit, extend=self.extend
             )
         if self.effective_temperature_k is not None:
-            found = replace(found, temperature_k=self.effective_temperature_k)
+            source = replace(source, temperature_k=self.effective_temperature_k)
         if self.bin_nm is not None:
-            found = found.binned(self.bin_nm)
+            source = source.binned(self.bin_nm)
         if self.ebv is not None:
-            found = found.reddened(self.ebv)
-        return found if self.magnitude is None else found.at_magnitude(self.magnitude, self.band, self.magnitude_system)
+            source = source.reddened(self.ebv)
+        if self.magnitude is None:
+            return source
+        return source.at_magnitude(self.magnitude, self.band, self.magnitude_system)
 
 
 class Flare(Part):
@@ -171,7 +175,7 @@ class PriorText(Part):
 
     def prior(self) -> Prior:
         """As the engine takes it."""
-        from mauvecl.noise.processes import Normal, Uniform
+        from mauvecl.noise.priors import Normal, Uniform
 
         if self.normal is not None and self.between is not None:
             return Normal(*self.normal, *self.between)
@@ -186,6 +190,17 @@ class Rays(Part):
     electrons: tuple[float, float] = (500.0, 1000.0)
     weights: tuple[float, ...] | None = None
 
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        self.rays()
+        return self
+
+    def rays(self) -> CosmicRays:
+        """As the engine takes them."""
+        from mauvecl.noise.processes import CosmicRays
+
+        return CosmicRays(**self.model_dump())
+
 
 #: The rays, and one key for each thing that a prior may be put on.
 _keys: Any = {"cosmic_rays": (Rays | None, None)} | dict.fromkeys(VARIED, (PriorText | None, None))
@@ -194,16 +209,11 @@ _keys: Any = {"cosmic_rays": (Rays | None, None)} | dict.fromkeys(VARIED, (Prior
 class NoiseProcesses(create_model("_Priors", __base__=Part, **_keys)):  # type: ignore[misc]
     """Optional noise processes, all off unless named; see `processes.VARIED` and `processes.CosmicRays`."""
 
-    @model_validator(mode="after")
-    def _possible(self) -> Self:
-        self.processes()
-        return self
-
     def processes(self) -> Processes:
         """As the engine takes them."""
-        from mauvecl.noise.processes import CosmicRays, Processes
+        from mauvecl.noise.processes import Processes
 
-        rays = None if self.cosmic_rays is None else CosmicRays(**self.cosmic_rays.model_dump())
+        rays = None if self.cosmic_rays is None else self.cosmic_rays.rays()
         given = {name: getattr(self, name) for name in VARIED}
         return Processes(rays, **{name: None if text is None else text.prior() for name, text in given.items()})
 

@@ -21,10 +21,10 @@ def subtype(spectral_type: str) -> float:
     InputError
         If it does not begin with a class from O to M.
     """
-    found = _TYPE.match(spectral_type)
-    if not found:
+    matched = _TYPE.match(spectral_type)
+    if not matched:
         raise InputError(f"spectral type {shortened(spectral_type)}, expected one from O to M, such as M3V")
-    return 10.0 * CLASSES.index(found[1]) + (5.0 if found[2] is None else float(found[2]))
+    return 10.0 * CLASSES.index(matched[1]) + (5.0 if matched[2] is None else float(matched[2]))
 
 
 def nearest_spectrum(spectral_type: str) -> str:

@@ -1,42 +1,27 @@
-"""A study's stare and the flares in it: frames, gaps, what changes slowly, what is unknown; times, sizes, shapes."""
+"""A study's stare and the flares in it, as data: frames, gaps, what changes slowly, what is unknown; times and sizes.
+
+`staring` makes of it what is observed, and takes longer to load.
+"""
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-import numpy as np
 from pydantic import Field, model_validator
 
 from mauvecl.host.errors import InputError
-from mauvecl.host.files.bounded import shortened
-from mauvecl.lightcurve.flares.energies import EnergyScale, amplitude_of, amplitude_of_peak
-from mauvecl.lightcurve.flares.events import Cooling, Event, coefficients, temperatures_of
-from mauvecl.lightcurve.flares.shapes import Shape, TableShape, shape_of
-from mauvecl.lightcurve.stares.curves import ORBIT_S, Curve, Sinusoid, Table
-from mauvecl.lightcurve.stares.observed import Staring
-from mauvecl.lightcurve.stares.stare import CHANGING, Stare
+from mauvecl.lightcurve.usual import ORBIT_S, check_shape
 from mauvecl.study.sections import Part
-from mauvecl.study.weights import read_columns
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
-    from mauvecl.host.stars.source import Source
-    from mauvecl.lightcurve.stares.stare import Changing
-    from mauvecl.study.sections import Star
+    from mauvecl.lightcurve.flares.shapes import Shape
+    from mauvecl.lightcurve.stares.curves import Curve
     from mauvecl.study.study import Study
 
 #: One orbit in whole frames, s.
 ORBIT_FRAMES_S = 5680.0
-#: What `nuisances.usual` draws of a stare, each with the reasons of `noise.usual.USUAL`: a thermal cycle of the orbit,
-#: light lost by pointing in each frame (uniform 0-5 %), the sky's level; and the star's own slow change, an assumption.
-USUAL_STARE: dict[str, dict[str, float]] = {
-    "jitters": {"light": 0.05 / 12**0.5},
-    "offsets": {"sky": 0.1},
-    "drifts": {"star": 0.01},
-    "cycles": {"temperature": 0.5},
-}
 
 
 class CurveText(Part):
@@ -66,6 +51,11 @@ class CurveText(Part):
         InputError
             For a file or points that are no curve.
         """
+        import numpy as np
+
+        from mauvecl.lightcurve.stares.curves import Sinusoid, Table
+        from mauvecl.study.weights import read_columns
+
         if self.amplitude is not None:
             return Sinusoid(self.amplitude, orbit_s if self.period_s is None else self.period_s, self.phase)
         columns = np.array(self.points) if self.file is None else read_columns(f"curve of {name}", "values", self.file)
@@ -100,7 +90,7 @@ class StareQuestion(Part):
 
     @model_validator(mode="after")
     def _possible(self) -> Self:
-        shape_of(self.shape)
+        check_shape(self.shape)
         if self.orbit_gap_s >= self.orbit_s:
             raise ValueError(
                 f"stare.orbit_gap_s = {self.orbit_gap_s:g} of an orbit of {self.orbit_s:g} s, expected a shorter gap"
@@ -114,7 +104,7 @@ class StareQuestion(Part):
         """The gaps that are named, and the end of every orbit."""
         every = [*self.gaps]
         if self.orbit_gap_s:
-            orbits = int(np.ceil(self.duration_s / self.orbit_s))
+            orbits = math.ceil(self.duration_s / self.orbit_s)
             every += [((n + 1) * self.orbit_s - self.orbit_gap_s, (n + 1) * self.orbit_s) for n in range(orbits)]
         return every
 
@@ -164,188 +154,19 @@ class EventText(Part):
         if self.shape is not None and self.shape_file is not None:
             raise ValueError("an event has both shape and shape_file, expected one of them")
         if self.shape is not None:
-            shape_of(self.shape)
+            check_shape(self.shape)
         return self
 
     def form(self, usual: str) -> Shape:
         """Its shape."""
+        from mauvecl.host.files.bounded import shortened
+        from mauvecl.lightcurve.flares.shapes import TableShape, shape_of
+        from mauvecl.study.weights import read_columns
+
         if self.shape_file is None:
             return shape_of(self.shape or usual)
         columns = read_columns("flare shape", "values", self.shape_file)
         return TableShape(columns[:, 0], columns[:, 1], self.shape_file.stem, shortened(self.shape_file.name))
-
-
-def stare_of(study: Study) -> Stare:
-    """A study's stare: its frames, with everything that is known and unknown of them.
-
-    Raises
-    ------
-    InputError
-        For a stare that cannot be, or processes that a stare has in a form of its own.
-    """
-    processes = study.processes.processes()
-    if processes.modulations:
-        name, _ = processes.modulations[0]
-        raise InputError(
-            f"processes.{name} is of single exposures, expected jitters, offsets, drifts or cycles of [stare]"
-        )
-    q, instrument = study.stare, study.load_instrument()
-    spreads: dict[str, dict[Changing, float]] = {
-        how: {of: getattr(q, how)[of] for of in CHANGING if of in getattr(q, how)}
-        for how in ("jitters", "offsets", "drifts", "cycles")
-    }
-    if study.nuisances.usual:
-        for how, usual in USUAL_STARE.items():
-            spreads[how] = {**usual, **spreads[how]}  # type: ignore[dict-item]
-
-    def curve(name: str) -> Curve | None:
-        text: CurveText | None = getattr(q, name)
-        return None if text is None else text.curve(name, q.orbit_s)
-
-    what: dict[str, Any] = {name: curve(name) for name in ("variability", "throughput", "sky")} | spreads
-    what["orbit_s"] = q.orbit_s
-    if q.along_orbit:
-        return _along(study, instrument.frame_s, what)
-    return Stare.of(
-        q.duration_s,
-        frame_s=instrument.frame_s,
-        gaps=q.all_gaps(),
-        temperature_c=instrument.temperature_c,
-        thermal=curve("thermal"),
-        **what,
-    )
-
-
-def _along(study: Study, frame_s: float, what: dict[str, Any]) -> Stare:
-    """The stare as the orbit gives it, at the one target of the study's ``orbit`` from its start on.
-
-    Raises
-    ------
-    InputError
-        If there is not one target, or the study tells gaps or a thermal curve as well.
-    """
-    from mauvecl.study.orbits import targets_of
-
-    q, o = study.stare, study.orbit
-    if q.gaps or q.orbit_gap_s or q.thermal is not None:
-        raise InputError("stare.along_orbit beside gaps or a thermal curve, expected the orbit to give them")
-    targets = targets_of(study)
-    if len(targets) != 1:
-        raise InputError(f"stare.along_orbit with {len(targets)} targets, expected one in orbit.targets")
-    return Stare.along(o.orbit(), targets[0], o.start, q.duration_s, frame_s=frame_s, limits=o.limits.limits(), **what)
-
-
-def staring_of(study: Study, star: Star) -> tuple[Staring, list[Event]]:
-    """A star of a study, its stare and its flares, and what frames are made of; the flares beside it.
-
-    Raises
-    ------
-    InputError
-        For anything of it that cannot be.
-    """
-    source, stare = star.source(), stare_of(study)
-    events = events_of(study, star, source)
-    kelvin = temperatures_of(events)
-    frames = study.model_copy(
-        update={"observation": study.observation.model_copy(update={"exposure_s": stare.frame_s})}
-    )
-    # A flare that takes the place of photosphere is as linear in its amplitude, but not up to one.
-    unit = 1.0 if study.flare.geometry == "added" else 0.01
-    flares = [
-        frames.model_copy(update={"flare": study.flare.model_copy(update={"temperature_k": float(k)})}) for k in kelvin
-    ]
-    quiet, *flaring = frames.expect([source, *(one.flaring(source, unit) for one in flares)])
-    electrons = [(x.source_electrons - quiet.source_electrons) / unit for x in flaring]
-    spectra = np.reshape(electrons, (kelvin.size, quiet.wavelength_nm.size))
-    return Staring(quiet, stare, spectra, coefficients(events, stare.start_s, stare.frame_s, kelvin)), events
-
-
-def orbit_lines(study: Study) -> list[str]:
-    """What must be told of the orbit that a study's stare is along, if it is."""
-    from mauvecl.host.orbit.moments import DAY_S, Moments
-
-    if not study.stare.along_orbit:
-        return []
-    o = study.orbit
-    moments = Moments(o.start, study.stare.duration_s / DAY_S, study.load_instrument().frame_s)
-    assumed = (
-        "Limits, temperatures and windows of a stare along the orbit are assumptions; stray light is not modelled."
-    )
-    return [*o.orbit().messages(moments), assumed]
-
-
-def energy_scale(
-    study: Study, star: Star, source: Source, kind: Literal["bolometric", "band"], flare_k: float
-) -> EnergyScale | None:
-    """What a second of equivalent duration comes to for a star; None where its size and distance are unknown.
-
-    By radius and temperature where the study has them, by its distance otherwise.
-    """
-    hot = flare_k if kind == "bolometric" else None
-    if star.radius_rsun is not None and star.effective_temperature_k is not None:
-        return EnergyScale.of_blackbody(
-            star.radius_rsun, star.effective_temperature_k, band=study.flare.band, flare_k=hot
-        )
-    if star.distance_pc is not None:
-        return EnergyScale.of_star(source, star.distance_pc, band=study.flare.band, flare_k=hot)
-    return None
-
-
-def energy_of(
-    study: Study, star: Star, source: Source, event: Event, kind: Literal["bolometric", "band"]
-) -> float | None:
-    """Energy of a flare at a star, erg; None where the star's size and distance are unknown."""
-    if energy_scale(study, star, source, kind, event.hottest_k) is None:
-        return None
-
-    def scale_of(kelvin: float) -> EnergyScale:
-        scale = energy_scale(study, star, source, kind, kelvin)
-        assert scale is not None
-        return scale
-
-    return event.bolometric_energy(scale_of)
-
-
-def events_of(study: Study, star: Star, source: Source) -> list[Event]:
-    """A study's flares at one of its stars: its `events`, or one of each energy or amplitude, evenly over the stare.
-
-    Raises
-    ------
-    InputError
-        For an energy where neither the star's size nor its distance is known, or a flare that cannot be.
-    """
-    texts = study.events or _spread(study)
-    return [_event(study, star, source, text) for text in texts]
-
-
-def _spread(study: Study) -> Sequence[EventText]:
-    q = study.stare
-    sizes = [{"energy_erg": e} for e in q.energies_erg] or [{"amplitude": a} for a in study.flare.amplitudes]
-    # As much before the first as from one to the next.
-    step = q.duration_s / (len(sizes) + 1)
-    return [EventText(peak_s=step * (n + 1), **size) for n, size in enumerate(sizes)]
-
-
-def _event(study: Study, star: Star, source: Source, text: EventText) -> Event:
-    shape, flare = text.form(study.stare.shape), study.flare
-    half = study.stare.half_width_s if text.half_width_s is None else text.half_width_s
-    kelvin = flare.temperature_k if text.temperature_k is None else text.temperature_k
-    temperature = kelvin if text.cooling is None else Cooling(kelvin, text.cooling.end_k, text.cooling.fold_s)
-    amplitude = flare.amplitudes[0] if text.amplitude is None else text.amplitude
-    if text.peak is not None:
-        amplitude = amplitude_of_peak(text.peak, shape)
-    elif text.equivalent_duration_s is not None:
-        amplitude = amplitude_of(text.equivalent_duration_s, half, shape)
-    elif text.energy_erg is not None:
-        # Any energy is linear in the amplitude.
-        one = energy_of(study, star, source, Event(text.peak_s, half, 1.0, temperature, shape), text.energy)
-        if one is None:
-            raise InputError(
-                f"a flare of {text.energy_erg:g} erg at {source.name} of unknown size, expected the star's distance_pc "
-                "or radius_rsun and effective_temperature_k"
-            )
-        amplitude = text.energy_erg / one
-    return Event(text.peak_s, half, amplitude, temperature, shape)
 
 
 def check_sweep(study: Study) -> None:

@@ -8,10 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import Field, ValidationError, model_validator
 
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import possible, read_text, toml
 from mauvecl.host.quantities import number
+from mauvecl.host.records import sentence
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.study.orbits import OrbitQuestion, PlanQuestion, find_plan_files, without_usual_plan
 from mauvecl.study.quantities import QUANTITIES
@@ -27,7 +29,7 @@ from mauvecl.study.questions import (
 from mauvecl.study.searches import InjectionQuestion, SearchChoice, without_usual_search
 from mauvecl.study.sections import STAR_KEYS, Flare, NoiseProcesses, Observation, Part, Run, SkyLight, Star, Unknowns
 from mauvecl.study.stares import EventText, StareQuestion, find_curves, without_usual
-from mauvecl.study.study_text import find_files, in_table, put, sentence, study_of, toml_value
+from mauvecl.study.study_text import find_files, in_table, put, study_of, toml_value
 
 if TYPE_CHECKING:
     import astropy.units as u
@@ -36,11 +38,13 @@ if TYPE_CHECKING:
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.source import Source
     from mauvecl.noise.processes import Prior
+    from mauvecl.statistics.statistic import Setting
 
 #: The paper's two stars.
 PAPER_STARS = (Star(library="K3V", magnitude=3.7), Star(library="G2V", magnitude=7.4))
 
 
+@public
 class Study(Part):
     """Everything that an answer depends on; the default is the paper's question.
 
@@ -216,9 +220,9 @@ class Study(Part):
         """The instrument with what the study changes of it: its ``changes``, and the detector's temperature."""
         from mauvecl.host.instrument.instrument import Instrument
 
-        found, o = Instrument.load(self.observation.instrument), self.observation
+        instrument, o = Instrument.load(self.observation.instrument), self.observation
         changes = o.changes | ({} if o.temperature_c is None else {"temperature_c": o.temperature_c})
-        return found.with_(**changes) if changes else found
+        return instrument.with_(**changes) if changes else instrument
 
     def with_instrument(self, changes: Mapping[str, Any]) -> Self:
         """The study with some values of the instrument changed; see `Instrument.with_`."""
@@ -270,20 +274,20 @@ class Study(Part):
             If nothing is left unknown, and draws are asked for.
         """
         stated = {*self.observation.changes, *(() if self.observation.temperature_c is None else ("temperature_c",))}
-        found = {name: prior for name, prior in self.unknowns.priors().items() if name not in stated}
-        if self.unknowns.draws and not found:
+        priors = {name: prior for name, prior in self.unknowns.priors().items() if name not in stated}
+        if self.unknowns.draws and not priors:
             raise InputError("everything is known of the instrument, expected a prior, or unknowns.draws = 0")
-        return found
+        return priors
 
     def cells(self) -> list[tuple[dict[str, float | str], Self]]:
         """The values that the study sweeps over, and the study at each; itself where it sweeps over nothing."""
-        found = []
+        cells = []
         for values in self.sweep.cells():
             study = self.model_copy(update={"sweep": Sweep()})
             for quantity, value in values.items():
                 study = study.at(quantity, value)
-            found.append((values, study))
-        return found
+            cells.append((values, study))
+        return cells
 
     @property
     def drawing(self) -> dict[str, Any]:
@@ -306,6 +310,15 @@ class Study(Part):
         how = {"realisations": run.realisations, "statistics": run.statistics, "tails": run.tails}
         marginal = {"nuisances": self.nuisances.marginalised(quiet)}
         return self.drawing | how | marginal | {"comparison": run.comparison()}
+
+    def setting(self, quiet: Expectation, *flares: Expectation) -> Setting:
+        """What statistics look at, for closed forms: nothing is laid out for a draw."""
+        from mauvecl.noise.drawn import Drawn
+        from mauvecl.statistics.statistic import Setting
+
+        unknown = self.nuisances.marginalised(quiet)
+        drawn = Drawn.by(self.drawing["processes"], quiet) if unknown else None
+        return Setting(quiet, ~quiet.saturated, self.run.comparison(), flares, unknown, drawn)
 
     def expectations(self, star: Star) -> list[Expectation]:
         """A star without a flare, then with each of the flares."""

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import difflib
 import hashlib
 import tomllib
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args
-
-from pydantic import BaseModel, ValidationError
+from typing import Any
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import read_bytes, shortened
 from mauvecl.host.files.ecsv import read_ecsv
-from mauvecl.host.files.parsed import parsing, read_text, shown, toml
+from mauvecl.host.files.parsed import parsing, read_text, toml
 from mauvecl.host.spectra.formats import without_columns
 
 
@@ -113,34 +110,3 @@ def put(data: Any, path: list[str], value: Any, text: str) -> None:
             f"--set {shortened(text)}: {shortened('.'.join(parents))} holds no keys, expected one that does"
         )
     data[last] = value
-
-
-def sentence(model: type[BaseModel], error: ValidationError) -> str:
-    """The first fault as: key = value, what was expected."""
-    first = error.errors()[0]
-    path = [str(part) for part in first["loc"]]
-    key = ".".join(path) or "study"
-    if first["type"] == "extra_forbidden":
-        fields = list(_fields(model, path[:-1]))
-        near = difflib.get_close_matches(path[-1], fields, n=1)
-        expected = f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(fields)}"
-        return f"unknown key {shortened(key)}, {expected}"
-    if first["type"] == "value_error":
-        return str(first["ctx"]["error"])
-    told = first["msg"].removeprefix("Input should be ")
-    value = f"{key} = {shown(first['input'])}"
-    return f"{value}: {told.lower()}" if told == first["msg"] else f"{value}, expected {told}"
-
-
-def _fields(model: type[BaseModel], path: list[str]) -> Any:
-    for part in path:
-        if not part.isdigit():
-            model = _model_in(model.model_fields[part].annotation) or model
-    return model.model_fields
-
-
-def _model_in(annotation: Any) -> type[BaseModel] | None:
-    """The model in a type such as `Star | None` or `tuple[Star, ...]`."""
-    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-        return annotation
-    return next((model for part in get_args(annotation) if (model := _model_in(part))), None)

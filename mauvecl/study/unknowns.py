@@ -1,7 +1,7 @@
 """What is unknown of the instrument, and the same with a flare and without: drawn from priors, and averaged over.
 
-An observer measures the instrument, and takes template and threshold from it; while a proposal is written it is
-unknown. So each draw of the unknown values has its own template and threshold, and a detection probability is the
+An observer measures the instrument, and takes reference and threshold from it; while a proposal is written it is
+unknown. So each draw of the unknown values has its own reference and threshold, and a detection probability is the
 average.
 """
 
@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.host.errors import InputError
-from mauvecl.results.fap import FEWEST_IN_TAIL
+from mauvecl.results.requests.fap import FEWEST_IN_TAIL
 from mauvecl.statistics.intervals import CONFIDENCE, Interval
 
 if TYPE_CHECKING:
@@ -41,7 +41,7 @@ class DrawnStudies:
     names : tuple of str
     values : ndarray, shape (n_draw, n_name)
     studies : tuple of Study
-        The study on each draw's instrument, nothing unknown any more, with its share of the realisations.
+        The study on each draw's instrument, nothing unknown any more, with its part of the realisations.
     """
 
     names: tuple[str, ...]
@@ -64,7 +64,7 @@ def drawn(study: Study) -> DrawnStudies:
     even = sequence.random(asked.draws)
     values = np.column_stack([prior.quantile(even[:, k]) for k, prior in enumerate(priors.values())])
     area = study.load_instrument().collecting_area_cm2
-    run = study.run.model_copy(update={"realisations": share_of_realisations(study)})
+    run = study.run.model_copy(update={"realisations": realisations_each(study)})
     certain = study.model_copy(update={"unknowns": type(asked)(), "run": run})
     studies = []
     for row in values:
@@ -81,20 +81,20 @@ def drawn(study: Study) -> DrawnStudies:
     return DrawnStudies(tuple(priors), values, tuple(studies))
 
 
-def share_of_realisations(study: Study) -> int:
+def realisations_each(study: Study) -> int:
     """Realisations for each draw: as many in all as asked for, but enough to count each draw's threshold."""
     run = study.run
     fewest = int(np.ceil(FEWEST_IN_TAIL / run.fap)) if run.tails == "counted" else 1000
     return max(run.realisations // study.unknowns.draws, fewest)
 
 
-def average(found: Sequence[Interval]) -> Interval:
+def average(intervals: Sequence[Interval]) -> Interval:
     """The mean of probabilities over draws of the unknown, with 95 % for their own errors and the number of draws.
 
     Draws are even, so that the interval, made for independent ones, errs on the wide side.
     """
-    values = np.array([p.value for p in found])
-    own = np.array([p.high - p.low for p in found]) / 2
+    values = np.array([p.value for p in intervals])
+    own = np.array([p.high - p.low for p in intervals]) / 2
     reach = float(special.ndtri(0.5 + CONFIDENCE / 2))
     spread = values.std(ddof=1) / np.sqrt(values.size) if values.size > 1 else 0.0
     half = float(np.hypot(reach * spread, np.sqrt(np.sum(own**2)) / values.size))
@@ -130,8 +130,8 @@ def shares(draws: DrawnStudies, outcome: Float) -> dict[str, float]:
             # So many orders have exactly these before it.
             weight = 1.0 / (len(names) * math.comb(len(names) - 1, len(some)))
             share[k] += weight * (explained[tuple(sorted((*some, k)))] - value)
-    found = {names[k]: float(share[k]) for k in np.argsort(-share)}
-    return found | {REST: 1.0 - explained[tuple(range(len(names)))]}
+    parts = {names[k]: float(share[k]) for k in np.argsort(-share)}
+    return parts | {REST: 1.0 - explained[tuple(range(len(names)))]}
 
 
 def _explained(x: Float, y: Float) -> float:

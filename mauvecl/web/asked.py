@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.answers.campaigns.visible import visible
-from mauvecl.answers.detect import DetectAnswer, detect
-from mauvecl.answers.inject import InjectAnswer, inject
-from mauvecl.answers.limits import limiting_magnitude
-from mauvecl.answers.maps import MapResult, detection_map
-from mauvecl.answers.snr import SnrAnswer, snr
+from mauvecl.answers.detection.detect import DetectAnswer, detect
+from mauvecl.answers.detection.maps import MapResult, detection_map
+from mauvecl.answers.limits.limits import limiting_magnitude
+from mauvecl.answers.signal.snr import SnrAnswer, snr
+from mauvecl.answers.stares.inject import InjectAnswer, inject
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -46,12 +46,12 @@ def map_around(study: Study, pool: Pool) -> MapResult:
     return detection_map(Study.build(data, "page"), pool)
 
 
-def completeness(study: Study) -> InjectAnswer:
+def completeness(study: Study, pool: Pool) -> InjectAnswer:
     """What a search of a stare of one orbit finds, coarsely."""
     data = study.model_dump()
     data["injections"] |= INJECTED
     data["search"] |= {"nulls": 0}
-    return inject(Study.build(data, "page"), threads=1)
+    return inject(Study.build(data, "page"), pool)
 
 
 def _detection(study: Study, pool: Pool) -> dict[str, Any]:
@@ -60,15 +60,17 @@ def _detection(study: Study, pool: Pool) -> dict[str, Any]:
 
 def _visible(study: Study) -> dict[str, Any]:
     """The answer with its tables, which are dear to make and looked at again and again."""
-    found = visible(study)
-    return {"visible": found, "seen": {name: getattr(found, name) for name in ("table", "months", "by_day")}}
+    answer = visible(study)
+    return {"visible": answer, "seen": {name: getattr(answer, name) for name in ("table", "months", "by_day")}}
 
 
-#: What may be simulated, by name: what is then found, by name.
+#: What may be computed on demand, by name: what is then known, by name.
 SIMULATED: dict[str, Callable[[Study, Pool], dict[str, Any]]] = {
     "detection": _detection,
     "limit": lambda study, pool: {"limit": limiting_magnitude(study, pool)},
     "map": lambda study, pool: {"map": map_around(study, pool)},
-    "completeness": lambda study, pool: {"completeness": completeness(study)},
+    "completeness": lambda study, pool: {"completeness": completeness(study, pool)},
     "visible": lambda study, pool: _visible(study),
 }
+#: Those that draw by the pool.
+DRAWING = {"detection", "limit", "map"}

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from mauvecl.web.closed import Closed, between, percent
-from mauvecl.web.tabs.tab import Found
+from mauvecl.web.tabs.tab import Answers
 
 #: Part of the sentence that tells what the throughput is; it stands on the page once.
 NOMINAL = "The throughput is nominal"
@@ -15,7 +15,7 @@ NOMINAL = "The throughput is nominal"
 THROUGHPUT = 0.3
 
 
-def card(closed: Closed, found: Found) -> dict[str, Any]:
+def card(closed: Closed, answers: Answers) -> dict[str, Any]:
     """What the card shows of an answer.
 
     Returns
@@ -25,15 +25,15 @@ def card(closed: Closed, found: Found) -> dict[str, Any]:
         kinds; ``simulated``, names of what is simulated.
     """
     q, x = closed.question, closed.quiet
-    cut, chance, interval, facts = closed.cut, closed.chance, f"in closed form{_spread(closed)}", []
-    if "detection" in found:
-        (row,) = (row for row in found["detection"].table if row["statistic"] == q.statistic)
+    cut, chance, interval, facts = closed.odds.threshold, closed.chance, f"in closed form{_spread(closed)}", []
+    if "detection" in answers:
+        (row,) = (row for row in answers["detection"].table if row["statistic"] == q.statistic)
         cut, chance = float(row["threshold"]), float(row["probability"])
         interval = f"{between(row['low'], row['high'])}, of {q.realisations.number:,} simulated"
         facts.append(("Closed form", percent(closed.chance)))
     facts += [
         ("Threshold", f"{cut:.4g}"),
-        ("Expected with flare", f"{closed.expected:.4g}"),
+        ("Expected with flare", f"{closed.odds.seen.mean:.4g}"),
         ("Best S/N per pixel", f"{x.snr().max():.3g}"),
         ("Best S/N per element", f"{x.snr_per_element().max():.3g}"),
     ]
@@ -41,7 +41,7 @@ def card(closed: Closed, found: Found) -> dict[str, Any]:
         f"chance to detect {closed.words}, by the statistic {q.statistic} at a false-alarm probability of {q.fap:g} "
         "per test"
     )
-    notes = [(m, "danger" if m.startswith("SATURATED") else "info") for m in _messages(closed, found)]
+    notes = [(m, "danger" if m.startswith("SATURATED") else "info") for m in _messages(closed, answers)]
     return {
         "shown": percent(chance),
         "value": None if chance != chance else chance,
@@ -49,7 +49,7 @@ def card(closed: Closed, found: Found) -> dict[str, Any]:
         "words": words,
         "facts": facts,
         "notes": notes,
-        "simulated": sorted(name for name in found if name not in ("snr", "draw", "seen")),
+        "simulated": sorted(name for name in answers if name not in ("snr", "draw", "seen")),
     }
 
 
@@ -57,10 +57,10 @@ def _spread(closed: Closed) -> str:
     """What the throughput's uncertainty makes of a chance."""
     if closed.slow or closed.chance != closed.chance:
         return ""
-    low, high = np.sort(closed.chances(np.array([1 - THROUGHPUT, 1 + THROUGHPUT]), np.ones(1), sky=True)[0])
-    return f"; {between(low, high)} if the throughput is {100 * THROUGHPUT:g} % lower or higher"
+    ends = [odds.probability for much in (-1, 1) for odds in closed.at(1 + much * THROUGHPUT, np.ones(1), sky=True)]
+    return f"; {between(min(ends), max(ends))} if the throughput is {100 * THROUGHPUT:g} % lower or higher"
 
 
-def _messages(closed: Closed, found: Found) -> list[str]:
-    simulated = found["detection"].messages if "detection" in found else []
+def _messages(closed: Closed, answers: Answers) -> list[str]:
+    simulated = answers["detection"].messages if "detection" in answers else []
     return [m for m in dict.fromkeys([*simulated, *closed.messages]) if not m.startswith(NOMINAL)]

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.unknown_cost import cost_lines, marginal_lines, unknown_cost
+from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
 from mauvecl.host.errors import InputError
+from mauvecl.statistics.distributions import Gaussian, Mixture
 from mauvecl.statistics.registry import STATISTICS
-from mauvecl.statistics.statistic import Setting
 from mauvecl.study.labels import told
 from mauvecl.web.fields import star_words
 from mauvecl.web.smooth import Smooth
@@ -21,7 +21,7 @@ from mauvecl.web.smooth import Smooth
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
     from mauvecl.host.stars.source import Source
-    from mauvecl.statistics.distributions import Form
+    from mauvecl.statistics.statistic import Odds
     from mauvecl.study.study import Study
     from mauvecl.web.question import Question
 
@@ -39,10 +39,8 @@ class Closed:
     light : tuple of Source
         The star at the telescope, without and with the flare.
     quiet, flare : Expectation
-    null_form, seen_form : Form
-        The asked statistic for Gaussian noise, without and with the flare.
-    cut : float
-        The threshold.
+    odds : Odds
+        Of the asked statistic, for Gaussian noise.
     chance : float
         Probability of detection; NaN where the flare saturates every pixel that counts.
     """
@@ -52,9 +50,7 @@ class Closed:
     light: tuple[Source, Source]
     quiet: Expectation
     flare: Expectation
-    null_form: Form
-    seen_form: Form
-    cut: float
+    odds: Odds
     chance: float
 
     @classmethod
@@ -77,31 +73,23 @@ class Closed:
         star = study.star[0].source() if q.uploaded is None else q.uploaded.at_magnitude(q.magnitude, q.band)
         light = star, study.flaring(star, study.flare.amplitudes[0])
         quiet, flare = study.expect(list(light))
-        one, used = STATISTICS[q.statistic], ~quiet.saturated
-        if not used.any():
+        one, setting = STATISTICS[q.statistic], study.setting(quiet, flare)
+        if not setting.used.any():
             raise InputError(f"every pixel of {quiet.name} is saturated, expected a fainter star")
-        setting = Setting(quiet, used, study.run.comparison(), (flare,), study.nuisances.marginalised(quiet))
         one.check(setting)
-        shape = flare if one.shaped else None
-        null, seen = (one.closed_form(setting, x, shape) for x in (quiet, flare))
-        cut = null.isf(q.fap)
-        chance = float("nan") if flare.saturated[used].all() else seen.sf(cut)
-        return cls(q, study, light, quiet, flare, null, seen, cut, chance)
+        odds = one.odds(setting, flare, q.fap)
+        chance = float("nan") if flare.saturated[setting.used].all() else odds.probability
+        return cls(q, study, light, quiet, flare, odds, chance)
 
     @cached_property
     def null(self) -> Smooth:
         """The statistic without a flare, for pictures."""
-        return Smooth(self.null_form)
+        return Smooth(self.odds.null)
 
     @cached_property
     def seen(self) -> Smooth:
         """The statistic with the flare, for pictures."""
-        return Smooth(self.seen_form)
-
-    @property
-    def expected(self) -> float:
-        """The statistic's mean with the flare."""
-        return self.seen_form.mean
+        return Smooth(self.odds.seen)
 
     @cached_property
     def messages(self) -> list[str]:
@@ -120,13 +108,13 @@ class Closed:
             f"in {x.exposure_s:g} s ({frames})"
         )
 
-    def chances(self, lights: Float, rises: Float, *, sky: bool = False) -> Float:
-        """Detection probabilities in closed form with other light, shape (n_rise, n_light): light is linear.
+    def at(self, light: float, rises: Float, *, sky: bool = False) -> list[Odds]:
+        """The odds with other light, which is linear; none where the star saturates every pixel.
 
         Parameters
         ----------
-        lights : ndarray, shape (n_light,)
-            Factors on the light of star and flare.
+        light : float
+            Factor on the light of star and flare.
         rises : ndarray, shape (n_rise,)
             Factors on the flare's amplitude.
         sky : bool
@@ -134,28 +122,18 @@ class Closed:
         """
         q, base = self.question, self.quiet
         one, rise = STATISTICS[q.statistic], self.flare.source_electrons - base.source_electrons
-        found = np.zeros((rises.size, lights.size))
-        for i, light in enumerate(lights):
-            behind = base.sky_electrons * (light if sky else 1.0)
-            quiet = replace(base, source_electrons=light * base.source_electrons, sky_electrons=behind)
-            used = ~quiet.saturated
-            if not used.any():
-                continue
-            unknown = self.study.nuisances.marginalised(quiet)
-            setting = Setting(quiet, used, self.study.run.comparison(), nuisances=unknown)
-            cut = None
-            for j, more in enumerate(rises):
-                flare = replace(quiet, source_electrons=light * (base.source_electrons + more * rise))
-                shape = flare if one.shaped else None
-                if cut is None or one.shaped:
-                    cut = one.closed_form(setting, quiet, shape).isf(q.fap)
-                found[j, i] = one.closed_form(setting, flare, shape).sf(cut)
-        return found
+        behind = base.sky_electrons * (light if sky else 1.0)
+        quiet = replace(base, source_electrons=light * base.source_electrons, sky_electrons=behind)
+        setting = self.study.setting(quiet)
+        if not setting.used.any():
+            return []
+        electrons = (light * (base.source_electrons + more * rise) for more in rises)
+        return [one.odds(setting, replace(quiet, source_electrons=light), q.fap) for light in electrons]
 
     @property
     def slow(self) -> bool:
-        """Whether closed forms take too long for many of them."""
-        return self.question.statistic == "paper"
+        """Whether closed forms take too long for many of them: sums of squares, integrated over what is drawn."""
+        return isinstance(self.odds.null, Mixture) and not isinstance(self.odds.null.parts[0], Gaussian)
 
     @property
     def excess(self) -> tuple[Float, Float]:

@@ -35,10 +35,10 @@ def local(address: str) -> bool:
     if not address.strip():
         raise InputError("--address '' is empty, expected one such as 127.0.0.1, ::1 or 0.0.0.0")
     try:
-        found = {str(info[4][0]).split("%")[0] for info in socket.getaddrinfo(address, None, type=socket.SOCK_STREAM)}
+        known = {str(info[4][0]).split("%")[0] for info in socket.getaddrinfo(address, None, type=socket.SOCK_STREAM)}
     except (OSError, UnicodeError) as error:
         raise InputError(f"--address {shortened(address)} is unknown here, expected one such as 127.0.0.1") from error
-    return all(ipaddress.ip_address(one).is_loopback for one in found)
+    return all(ipaddress.ip_address(one).is_loopback for one in known)
 
 
 def netloc(address: str, port: int) -> str:
@@ -126,8 +126,8 @@ class Door(Matcher):
 
     def match(self, request: HTTPServerRequest) -> dict[str, Any] | None:
         """Why a request is refused, or None."""
-        found = self._foreign(request) or self._too_many(request)
-        return None if found is None else {"target_kwargs": {"status": found[0], "why": found[1]}}
+        refused = self._foreign(request) or self._too_many(request)
+        return None if refused is None else {"target_kwargs": dict(zip(("status", "why"), refused, strict=True))}
 
     def _foreign(self, request: HTTPServerRequest) -> tuple[int, str] | None:
         """A name that was bent to this machine, or a page of another server."""

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
     from mauvecl.web.closed import Closed
     from mauvecl.web.question import Question
-    from mauvecl.web.tabs.tab import Found, Tab
+    from mauvecl.web.tabs.tab import Answers, Tab
 
 PYTHON = """from mauvecl import Engine, Study, detect
 
@@ -26,8 +26,8 @@ study = Study.build(
     {data},
     "page",
 )
-found = detect(study, Engine())
-print(found.table)
+answer = detect(study, Engine())
+print(answer.table)
 """
 
 
@@ -44,7 +44,7 @@ def study_file(study: Study, name: str) -> tuple[str, bytes]:
     return f"{name}.zip", out.getvalue()
 
 
-def as_file(tab: Tab, name: str, ending: str, closed: Closed, found: Found) -> tuple[str, bytes]:
+def as_file(tab: Tab, name: str, ending: str, closed: Closed, answers: Answers) -> tuple[str, bytes]:
     """A table of a tab, or the study that gives it again, with the name of its file.
 
     Parameters
@@ -54,7 +54,7 @@ def as_file(tab: Tab, name: str, ending: str, closed: Closed, found: Found) -> t
         Of the tab's `files`.
     ending : {"ecsv", "fits", "study"}
     closed : Closed
-    found : mapping
+    answers : mapping
         Answers that are simulated, by name.
 
     Raises
@@ -67,13 +67,13 @@ def as_file(tab: Tab, name: str, ending: str, closed: Closed, found: Found) -> t
     if name not in tab.files or ending not in ("ecsv", "fits", "study"):
         raise InputError(f"{tab.title} has no file {name[:40]!r}.{ending[:10]}, expected one of its own")
     wanted = tab.files[name]
-    if wanted is not None and wanted not in found:
+    if wanted is not None and wanted not in answers:
         raise InputError(f"no {name} is computed yet, expected a simulation first")
     if ending == "study":
-        return study_file(tab.study(name, closed, found), f"mauvecl-{name}")
+        return study_file(tab.study(name, closed, answers), f"mauvecl-{name}")
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / f"mauvecl-{name}.{ending}"
-        write_table(tab.table(name, closed, found), path)
+        write_table(tab.table(name, closed, answers), path)
         return path.name, path.read_bytes()
 
 
@@ -113,6 +113,8 @@ def as_command(question: Question) -> str:
         words += ["--set", f"nuisances.own.own.points=[{points}]"]
     if q.see.strip():
         words += ["--set", f"orbit.targets={json.dumps([q.see.strip()])}"]
+    if q.signal != "net":
+        words += ["--set", f"observation.signal={q.signal}"]
     if q.realisations.tails != "counted":
         words += ["--set", f"run.tails={q.realisations.tails}"]
     return shlex.join(words)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
-from mauvecl.host.stars.bands import ALIASES
+from mauvecl.host.stars.band_names import ALIASES
 from mauvecl.host.stars.catalogue import embedded, library_table
 from mauvecl.statistics.registry import STATISTICS
 
@@ -81,10 +81,10 @@ def points(text: str) -> tuple[tuple[float, float], ...] | None:
     pairs = [pair.split() for pair in text.split(",") if text.strip()]
     if any(len(pair) != 2 for pair in pairs):
         raise InputError(f"{shortened(text)} is no spectrum, expected pairs of nm and DN with commas between them")
-    found = tuple((float(number(nm)), float(number(dn))) for nm, dn in pairs)
-    if any(low >= high for (low, _), (high, _) in itertools.pairwise(found)):
+    spectrum = tuple((float(number(nm)), float(number(dn))) for nm, dn in pairs)
+    if any(low >= high for (low, _), (high, _) in itertools.pairwise(spectrum)):
         raise InputError(f"{shortened(text)} does not ascend in nm, expected pairs of nm and DN that do")
-    return found
+    return spectrum
 
 
 class Draws(NamedTuple):
@@ -227,6 +227,11 @@ FIELDS = {
         "Payload", "mauve", Choice(("mauve", "mauve-electrons")),
         "mauve as its paper has it, or with the dark current counted in electrons.",
     ),
+    "signal": Field(
+        "Counted as signal", "net", Choice(("net", "paper")),
+        "In the S/N: the light of the star alone (net), or that of the sky too, as in the MauveSim paper. It moves no "
+        "detection.",
+    ),
     "sky": Field("Sky", "brightness", Choice(SKIES), "Zodiacal light behind the star."),
     "sky_brightness": Field(
         "Sky brightness", "22.1", Number(10, 30), "Of the zodiacal light, V magnitudes per square arc second.",
@@ -271,7 +276,7 @@ ASKED = ("star", "magnitude", "band", "amplitude_percent", "exposure_s")
 ADVANCED = {
     "Detection": ("fap", "statistic", "realisations", "seed"),
     "Flare and detector": ("flare_temperature_k", "temperature_c", "instrument"),
-    "Sky": ("sky", "sky_brightness", "target", "time"),
+    "Sky": ("sky", "sky_brightness", "target", "time", "signal"),
     "Unknown": ("unknown", "own_unknown"),
     "Visibility": ("see",),
 }

@@ -37,6 +37,7 @@ class Ink:
     total: str
     threshold: str
     own: str
+    pins: tuple[str, ...]
 
     def __getitem__(self, name: str) -> str:
         return str(getattr(self, name))
@@ -46,14 +47,18 @@ INKS = {
     "light": Ink(
         text="#1b2733", grid="#dde3ea", ground="#ffffff", star="#0072B2", flare="#D55E00", sky="#009E73",
         drawn="#6b7785", dark="#7b4ea3", read="#B8860B", bias="#A65082", total="#1b2733", threshold="#1b2733",
-        own="#C2185B",
+        own="#C2185B", pins=("#A21CAF", "#7C4A03", "#0E7490"),
     ),
     "dark": Ink(
         text="#e6ebf1", grid="#34404d", ground="#182029", star="#56B4E9", flare="#FF8C42", sky="#2fc79a",
         drawn="#9aa7b5", dark="#b99be0", read="#F0C040", bias="#E39BC9", total="#e6ebf1", threshold="#e6ebf1",
-        own="#ff6fa3",
+        own="#ff6fa3", pins=("#F0ABFC", "#D9AE76", "#67E8F9"),
     ),
 }  # fmt: skip
+
+
+#: How lines of pinned scenarios are broken: lengths drawn and left out.
+DASHES = ([6, 3], [9, 3, 2, 3], [2, 2])
 
 
 class Canvas:
@@ -133,6 +138,17 @@ class Canvas:
         source = self.source(name, "x", "y")
         made = self.plot.scatter("x", "y", source=source, size=size, color=self.ink[colour], **how)
         return self._told(made, called, colour, "dot", show)
+
+    def pinned(self, *columns: str, step: bool = False) -> None:
+        """A line for each scenario that may be pinned, of columns x and y unless others are named."""
+        columns = columns or ("x", "y")
+        kind: Any = self.plot.multi_line if "xs" in columns else self.plot.line
+        if step:
+            kind = partial(self.plot.step, mode="center")
+        for k, (colour, dash) in enumerate(zip(self.ink.pins, DASHES, strict=True)):
+            made = kind(*columns, source=self.source(f"pin {k}", *columns), color=colour, line_width=2, line_dash=dash)
+            made.name, made.tags = f"pinned {k + 1}", ["pins"]
+            self.legend.append((made.name, colour, " ".join(map(str, dash)), "pins"))
 
     def own_point(self, called: str = "your question") -> Any:
         """The question's own point."""

@@ -52,12 +52,12 @@ def read_limited(content: bytes) -> Source:
         answer = _read_apart(content)
     finally:
         _turns.release()
-    with np.load(io.BytesIO(answer), allow_pickle=False) as found:
-        words = json.loads(str(found["words"]))
+    with np.load(io.BytesIO(answer), allow_pickle=False) as read:
+        words = json.loads(str(read["words"]))
         measured = words["measured_nm"]
         return Source(
-            found["wavelength"],
-            found["flux"],
+            read["wavelength"],
+            read["flux"],
             words["name"],
             words["origin"],
             tuple(words["notes"]),

@@ -28,6 +28,7 @@ class Question:
     exposure_s: float
     temperature_c: float
     instrument: str
+    signal: str
     sky: str
     sky_brightness: float
     target: str
@@ -89,6 +90,7 @@ class Question:
                 "exposure_s": self.exposure_s,
                 "temperature_c": self.temperature_c,
                 "instrument": self.instrument,
+                "signal": self.signal,
             },
             "sky": skies[self.sky],
             "nuisances": {"usual": self.unknown == "the usual", "own": own},

@@ -55,6 +55,7 @@ def front() -> bytes:
     from mako.lookup import TemplateLookup
 
     from mauvecl.web import fields
+    from mauvecl.web.figures import DASHES, INKS
     from mauvecl.web.state import SEEN
     from mauvecl.web.tabs import TABS
     from mauvecl.web.upload import MOST_UPLOADED
@@ -75,11 +76,15 @@ def front() -> bytes:
         "seen": {name: field.first for name, field in SEEN.items()},
         "tabs": {
             tab.name: {
-                "pictures": [{"name": p.name, "sets": p.sets, "logs": list(p.logs)} for p in tab.pictures],
+                "pictures": [
+                    {"name": p.name, "sets": p.sets, "logs": list(p.logs), "pins": p.pins, "alike": p.alike}
+                    for p in tab.pictures
+                ],
                 "files": dict(tab.files),
             }
             for tab in TABS.values()
         },
+        "pins": {theme: [*zip(ink.pins, DASHES, strict=True)] for theme, ink in INKS.items()},
         "most_uploaded": MOST_UPLOADED,
         "unused": UNUSED,
     }
@@ -93,8 +98,8 @@ def front() -> bytes:
 
 def _digest() -> str:
     """Of all parts, so that browsers keep none that is old."""
-    found = [packed(content)[1] for path in sorted(_FOLDER.iterdir()) if (content := asset(path.name)) is not None]
-    return hashlib.sha256("".join(found).encode()).hexdigest()[:12]
+    each = [packed(content)[1] for path in sorted(_FOLDER.iterdir()) if (content := asset(path.name)) is not None]
+    return hashlib.sha256("".join(each).encode()).hexdigest()[:12]
 
 
 @cache

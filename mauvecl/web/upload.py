@@ -65,9 +65,9 @@ def read_pairs(name: str, content: bytes) -> Points:
         text = content.decode("utf-8")
     except UnicodeDecodeError as error:
         raise InputError(f"{shortened(name)} is no text, expected two columns, nm and DN") from error
-    found = columns(f"upload {shortened(name)}", text)
-    if found.ndim != 2 or found.shape[1] != 2 or not 2 <= len(found) <= MOST_PAIRS:
+    pairs = columns(f"upload {shortened(name)}", text)
+    if pairs.ndim != 2 or pairs.shape[1] != 2 or not 2 <= len(pairs) <= MOST_PAIRS:
         raise InputError(f"{shortened(name)} has other rows, expected 2 to {MOST_PAIRS} of two numbers, nm and DN")
-    if not np.isfinite(found).all() or (np.diff(found[:, 0]) <= 0).any():
+    if not np.isfinite(pairs).all() or (np.diff(pairs[:, 0]) <= 0).any():
         raise InputError(f"{shortened(name)} does not ascend in nm, expected rows that do")
-    return tuple((float(nm), float(dn)) for nm, dn in found)
+    return tuple((float(nm), float(dn)) for nm, dn in pairs)

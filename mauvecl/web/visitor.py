@@ -9,7 +9,7 @@ import logging
 import tempfile
 import time
 from collections import OrderedDict
-from collections.abc import Callable, Coroutine, Mapping
+from collections.abc import Callable, Coroutine
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor
 from functools import partial
 from pathlib import Path
@@ -22,7 +22,7 @@ from mauvecl.device.program import DeviceError
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.version import VERSION
-from mauvecl.web.asked import SIMULATED
+from mauvecl.web.asked import DRAWING, SIMULATED
 from mauvecl.web.card import card
 from mauvecl.web.closed import Closed
 from mauvecl.web.downloads import as_command, as_file, as_python, study_file
@@ -35,6 +35,7 @@ from mauvecl.web.work import Cancelled, Job, reading
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
     from mauvecl.web.question import Points
+    from mauvecl.web.tabs.tab import Answers, Tab
 
 log = logging.getLogger(__name__)
 
@@ -78,7 +79,7 @@ class Visitor(WebSocketHandler):
         self._coming: tuple[int, str, str] | None = None
         self._uploads: dict[str, Any] = {}
         self._closed: tuple[tuple[Any, ...], Closed] | None = None
-        self._found: OrderedDict[tuple[Any, ...], dict[str, Any]] = OrderedDict()
+        self._answers: OrderedDict[tuple[Any, ...], dict[str, Any]] = OrderedDict()
         self._files: OrderedDict[tuple[Any, ...], tuple[str, bytes]] = OrderedDict()
         self._folder = tempfile.TemporaryDirectory(prefix="mauvecl-page-")
 
@@ -156,18 +157,15 @@ class Visitor(WebSocketHandler):
         if state.faults:
             self.tell(**told)
             return
-        try:
+
+        async def answer() -> None:
             closed = await self._beside(partial(self.closed, state))
-            found = self._found.get(self._key(state), {})
-            self.tell(**told, answer=await self._beside(partial(card, closed, found)))
+            answers = self._answers.get(self._key(state), {})
+            self.tell(**told, answer=await self._beside(partial(card, closed, answers)))
             if self._next is None:
-                tab = TABS.get(str(asked.get("tab")), next(iter(TABS.values())))
-                self.tell(n=n, **await self._beside(partial(shown, tab.name, closed, found)))
-        except InputError as error:
-            self.tell(**told, refused=str(error))
-        except Exception:
-            log.exception("no answer")
-            self.tell(**told, refused=OWN_FAULT)
+                self.tell(n=n, **await self._beside(partial(shown, str(asked.get("tab")), closed, answers)))
+
+        await self._or_why(answer(), **told)
 
     def closed(self, state: State) -> Closed:
         """The closed forms of a question; the last one's are remembered."""
@@ -187,10 +185,40 @@ class Visitor(WebSocketHandler):
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
+    def _give(self, work: Coroutine[Any, Any, None], **told: Any) -> None:
+        """Do something that the page may ask for several times, but not without end."""
+        if len(self._tasks) < MOST_TASKS:
+            self._begin(self._or_why(work, **told))
+            return
+        work.close()
+        self.tell(**told, refused="too much is asked for at once, expected one thing after the other")
+
+    async def _or_why(self, work: Coroutine[Any, Any, None], **told: Any) -> None:
+        """Do something, or tell why not: what was asked is wrong, or the page itself is."""
+        try:
+            await work
+        except (InputError, DeviceError) as error:
+            self.tell(**told, refused=str(error))
+        except Exception:
+            log.exception("no answer")
+            self.tell(**told, refused=OWN_FAULT)
+
     @staticmethod
     async def _beside(work: Callable[[], Any]) -> Any:
         """Do something beside the event loop."""
         return await asyncio.get_running_loop().run_in_executor(_closed_forms, work)
+
+    def _ask_pinned(self, asked: dict[str, Any]) -> None:
+        """What a tab's pictures show of a scenario beside the question."""
+        n = asked.get("n", 0)
+        self._give(self._pinned(n, self.state(asked.get("link", "")), str(asked.get("tab"))), n=n, pins={})
+
+    async def _pinned(self, n: int, state: State, name: str) -> None:
+        tab = tab_of(name)
+        pictures = [picture for picture in tab.pictures if picture.pins]
+        closed = await self._beside(partial(Closed.of, state.question(), Path(self._folder.name)))
+        drawn = await self._beside(lambda: {p.name: p.drawn(closed, {}).sources[p.pins] for p in pictures})
+        self.tell(n=n, pins={name: {c: packed(v) for c, v in columns.items()} for name, columns in drawn.items()})
 
     # Draws and simulations
 
@@ -208,48 +236,39 @@ class Visitor(WebSocketHandler):
         def came(future: Future[Any]) -> None:
             if self._closed is None or self._closed[1] is not closed or future.cancelled() or future.exception():
                 return
-            found = self._found.get(self._key(state), {}) | {"draw": future.result()}
-            self.tell(n=asked.get("n", 0), **shown(str(asked.get("tab")), closed, found))
+            answers = self._answers.get(self._key(state), {}) | {"draw": future.result()}
+            self.tell(n=asked.get("n", 0), **shown(str(asked.get("tab")), closed, answers))
 
         self._when_done(self._drawing, came)
 
     def _ask_simulate(self, asked: dict[str, Any]) -> None:
         """Simulate, tell how far it is, and answer."""
-        self._begin(self._simulate(asked))
-
-    async def _simulate(self, asked: dict[str, Any]) -> None:
         n, kind, state = asked.get("n", 0), asked.get("kind"), self.state(asked.get("link", ""))
         if self.job is not None or kind not in SIMULATED or state.faults:
             self.tell(n=n, ended="", refused="there is a simulation already, or nothing to simulate")
             return
+        self._begin(self._or_why(self._simulate(n, kind, state), n=n, ended=""))
+
+    async def _simulate(self, n: int, kind: str, state: State) -> None:
         key = self._key(state)
-        try:
-            closed = await self._beside(partial(self.closed, state))
-            if self.job is not None:
-                raise InputError("there is a simulation already, expected its end first")
-            job = self.job = Job(partial(SIMULATED[kind], closed.study))
-        except InputError as error:
-            self.tell(n=n, ended="", refused=str(error))
-            return
+        closed = await self._beside(partial(self.closed, state))
+        if self.job is not None:
+            raise InputError("there is a simulation already, expected its end first")
+        job = self.job = Job(partial(SIMULATED[kind], closed.study), drawing=kind in DRAWING)
         done = asyncio.wrap_future(job.future)
         try:
             while not (await asyncio.wait([done], timeout=LOOK_S))[0]:
                 standing = job.standing
-                share = standing.done / standing.total if standing is not None and standing.total else 0.0
-                self.tell(n=n, progress=min(share, 1.0), told=job.told)
-            kept = self._found.setdefault(key, {})
+                done_part = standing.done / standing.total if standing is not None and standing.total else 0.0
+                self.tell(n=n, progress=min(done_part, 1.0), told=job.told)
+            kept = self._answers.setdefault(key, {})
             kept |= done.result()
-            self._found.move_to_end(key)
-            while len(self._found) > MOST_KEPT:
-                self._found.popitem(last=False)
+            self._answers.move_to_end(key)
+            while len(self._answers) > MOST_KEPT:
+                self._answers.popitem(last=False)
             self.tell(n=n, ended=f"Done: {job.told}.", kind=kind)
         except (Cancelled, CancelledError, asyncio.CancelledError):
             self.tell(n=n, ended="Cancelled.")
-        except (InputError, DeviceError) as error:
-            self.tell(n=n, ended="", refused=str(error))
-        except Exception:
-            log.exception("a simulation failed")
-            self.tell(n=n, ended="", refused=OWN_FAULT)
         finally:
             self.job = None
 
@@ -296,30 +315,23 @@ class Visitor(WebSocketHandler):
         future.add_done_callback(lambda future: loop.call_soon_threadsafe(came, future))
 
     def _ask_file(self, asked: dict[str, Any]) -> None:
-        if len(self._tasks) >= MOST_TASKS:
-            self.tell(n=asked.get("n", 0), refused="too many files are asked for at once, expected one", file="")
-            return
-        self._begin(self._file(asked))
+        n = asked.get("n", 0)
+        which = (str(asked.get(word)) for word in ("tab", "name", "ending"))
+        self._give(self._file(n, self.state(asked.get("link", "")), *which), n=n, file="")
 
-    async def _file(self, asked: dict[str, Any]) -> None:
-        n, state = asked.get("n", 0), self.state(asked.get("link", ""))
-        tab, name, ending = (str(asked.get(word)) for word in ("tab", "name", "ending"))
-        try:
-            file, content = await self._beside(partial(self.file, state, tab, name, ending))
-            self.tell(content, n=n, file=file)
-        except InputError as error:
-            self.tell(n=n, refused=str(error), file="")
-        except Exception:
-            log.exception("a download failed")
-            self.tell(n=n, refused=OWN_FAULT, file="")
+    async def _file(self, n: int, state: State, tab: str, name: str, ending: str) -> None:
+        file, content = await self._beside(partial(self.file, state, tab, name, ending))
+        self.tell(content, n=n, file=file)
 
     def file(self, state: State, tab: str, name: str, ending: str) -> tuple[str, bytes]:
         """A table, or a study, of what is asked; the last ones are remembered."""
         closed, key = self.closed(state), self._key(state)
-        found = self._found.get(key, {})
-        which = key, tab, name, ending, tuple(found)
+        answers = self._answers.get(key, {})
+        which = key, tab, name, ending, tuple(answers)
         if which not in self._files:
-            made = as_file(TABS[tab], name, ending, closed, found) if tab in TABS else study_file(closed.study, "study")
+            made = (
+                as_file(TABS[tab], name, ending, closed, answers) if tab in TABS else study_file(closed.study, "study")
+            )
             self._files[which] = made
             while len(self._files) > MOST_KEPT:
                 self._files.popitem(last=False)
@@ -339,18 +351,23 @@ class Visitor(WebSocketHandler):
         )  # fmt: skip
 
 
-def shown(name: str, closed: Closed, found: Mapping[str, Any]) -> dict[str, Any]:
+def tab_of(name: str) -> Tab:
+    """A tab by its name, or the first."""
+    return TABS.get(name, next(iter(TABS.values())))
+
+
+def shown(name: str, closed: Closed, answers: Answers) -> dict[str, Any]:
     """What a tab shows, as messages hold it."""
-    tab = TABS.get(name, next(iter(TABS.values())))
+    tab = tab_of(name)
     pictures = {}
     for picture in tab.pictures:
-        drawn = picture.drawn(closed, found)
+        drawn = picture.drawn(closed, answers)
         sources = {
             source: {column: packed(values) for column, values in columns.items()}
             for source, columns in drawn.sources.items()
         }
         pictures[picture.name] = {"text": drawn.text, "sources": sources, "props": drawn.props}
-    return {"tab": tab.name, "pictures": pictures, "rows": tab.rows(closed, found)}
+    return {"tab": tab.name, "pictures": pictures, "rows": tab.rows(closed, answers)}
 
 
 def packed(values: Any) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import threading
 import time
 from collections.abc import Callable
@@ -29,6 +30,12 @@ class Cancelled(Exception):  # noqa: N818
     """The visitor has asked for the end."""
 
 
+def _strike(thread: int | None, with_what: type[BaseException] | None) -> None:
+    """Raise an exception in a thread at its next step of Python, or take it back."""
+    given = None if with_what is None else ctypes.py_object(with_what)
+    ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread or 0), given)
+
+
 def _engine(progress: Callable[[int, int], None]) -> Engine:
     """This thread's engine, which tells this job's progress, from whatever thread counts."""
     if not hasattr(_own, "engine"):
@@ -47,10 +54,15 @@ class Job:
     ----------
     ask : callable
         Makes the answer with a pool.
+    drawing : bool
+        Whether it draws: it then ends between two tiles. What draws nothing asks nobody, and ends wherever it is.
     """
 
     ask: Callable[[Pool], Any]
+    drawing: bool = True
     _cancelled: threading.Event = field(default_factory=threading.Event)
+    _lock: threading.Lock = field(default_factory=threading.Lock)
+    _thread: int | None = None
     _pool: Pool | None = None
     _started: float | None = None
 
@@ -58,6 +70,19 @@ class Job:
         self.future: Future[Any] = _threads.submit(self._run)
 
     def _run(self) -> Any:
+        if self.drawing:
+            return self._asked()
+        with self._lock:
+            self._thread = threading.get_ident()
+        try:
+            return self._asked()
+        finally:
+            # A strike that has not come yet would meet whatever this thread does next.
+            with self._lock:
+                _strike(self._thread, None)
+                self._thread = None
+
+    def _asked(self) -> Any:
         self._check()
         self._started = time.monotonic()
         workers = LocalWorkers([None], make=lambda device, progress: _engine(progress))
@@ -69,8 +94,12 @@ class Job:
             raise Cancelled
 
     def cancel(self) -> None:
-        """Stop between two tiles, or before it begins."""
-        self._cancelled.set()
+        """Stop between two tiles, wherever nothing is drawn, or before it begins."""
+        with self._lock:
+            again = self._cancelled.is_set()
+            self._cancelled.set()
+            if self._thread is not None and not again:
+                _strike(self._thread, Cancelled)
         self.future.cancel()
 
     @property
@@ -91,6 +120,6 @@ class Job:
         left = f", {(s.total - s.done) / rate:.0f} s left" if rate and s.total > s.done else ""
         return (
             f"{s.done:,} of {s.total:,} realisations, {rate:,.0f} a second{left}"
-            + (f", {s.shares} of {s.of} shares" if s.of > 1 else "")
+            + (f", {s.shards} of {s.of} parts" if s.of > 1 else "")
             + (f", {s.retries} counted again" if s.retries else "")
         )

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mauvecl.answers.exposures import exposure_for, snr_at
+from mauvecl.answers.signal.exposures import exposure_for, snr_at
 from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError
 from mauvecl.study.study import Study

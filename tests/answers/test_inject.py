@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 from commands import run
 
-from mauvecl.answers.inject import inject
+from mauvecl.answers.stares.inject import inject
+from mauvecl.device.engine import Engine
 from mauvecl.device.stares import Stares
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.search.injected import InjectedShares
+from mauvecl.lightcurve.search.injected import Injected
 from mauvecl.runs.checkpoint import Checkpoint
+from mauvecl.runs.pool import LocalWorkers, Pool
 from mauvecl.statistics.intervals import clopper_pearson
 from mauvecl.study.study import Study
 
@@ -47,7 +49,7 @@ def test_tables(found):
     assert (cells["completeness_low"] <= cells["completeness"]).all()
     assert (cells["completeness"] <= cells["completeness_high"]).all()
     # More energy is found more often, at every half-width: the draws are common.
-    assert (np.diff(star.found.completeness, axis=1) >= 0).all()
+    assert (np.diff(star.injected.completeness, axis=1) >= 0).all()
     assert str(cells["size"].unit) == "erg"
     limits = found.table
     assert (limits["e50"] < limits["e90"]).all()
@@ -76,20 +78,24 @@ class Stop(Exception):  # noqa: N818
 
 
 @pytest.mark.long
-def test_resume_gives_the_same(found, stares, tmp_path):
-    """Some positions kept, the others drawn later: the same to the last bit."""
+def test_resume_gives_the_same(found, tmp_path):
+    """Some peaks kept, the others drawn later by two devices of different form: the same to the last bit."""
 
     def stop(done, total):
         if done > total / 3:
             raise Stop
 
     with pytest.raises(Stop), Checkpoint(tmp_path, "inject", study(), patience_s=0) as checkpoint:
-        inject(study(), stares, checkpoint=checkpoint, progress=stop, threads=1)
+        inject(study(), Pool(checkpoint=checkpoint), progress=stop)
+    widths = iter((16, 1))
+    workers = LocalWorkers([None, "0"], make=lambda device, progress: Engine(device, width=next(widths)))
     with Checkpoint(tmp_path, "inject", study(), patience_s=0, resume=True) as checkpoint:
-        again = inject(study(), stares, checkpoint=checkpoint)
-        assert checkpoint.found >= 2
-    assert (again.stars[0].found.critical == found.stars[0].found.critical).all()
+        again = inject(study(), Pool(workers, checkpoint=checkpoint))
+        assert checkpoint.resumed >= 3, "the null, and two peaks"
+    workers.close()
+    assert (again.stars[0].injected.critical == found.stars[0].injected.critical).all()
     assert np.array_equal(again.stars[0].fitted.energy_ratio, found.stars[0].fitted.energy_ratio, equal_nan=True)
+    assert again.stars[0].simulated == found.stars[0].simulated
 
 
 @pytest.mark.long
@@ -102,7 +108,7 @@ def test_sweep_over_magnitude_and_temperature(stares):
     quick = {"count": 30, "positions": 3, "fitted": 0, "widths": 2, "of": "amplitude"}
     answer = inject(study(sweep={"axes": axes}, injections=quick, search={"nulls": 0}), stares)
     assert dict(answer.stars[0].at) == {"magnitude": 6.0, "flare_temperature": 8000.0}
-    half = np.array([star.found.limit(0.5, None).value for star in answer.stars]).reshape(2, 2)
+    half = np.array([star.injected.limit(0.5, None).value for star in answer.stars]).reshape(2, 2)
     assert (half[1] > 1.5 * half[0]).all()
     # Hotter flares of the same amplitude have more ultraviolet light.
     assert (half[:, 1] < half[:, 0]).all()
@@ -121,20 +127,32 @@ def test_search_that_leaves_out_a_cycle_is_told(stares):
     assert not known.messages[0].startswith("FALSE ALARMS")
 
 
+def test_rays_and_saturation(stares):
+    """Cosmic rays are drawn where the study has them, and hide flares; flares that saturate are told."""
+    quick = {"count": 10, "positions": 2, "fitted": 0, "widths": 1, "sizes": 2, "low": 1e33, "high": 1e39}
+    plain, struck = (
+        inject(study(injections=quick, search={"nulls": 5}, stare={"duration_s": 2500.0, "gaps": []}, **more), stares)
+        for more in ({}, {"processes": {"cosmic_rays": {"rate_per_cm2_s": 100.0}}})
+    )
+    assert struck.stars[0].simulated.value >= plain.stars[0].simulated.value
+    assert (struck.stars[0].injected.critical != plain.stars[0].injected.critical).all()
+    assert any(m.startswith("SATURATED: flares of G2V") for m in plain.messages)
+
+
 def test_intervals_widen_where_positions_differ():
     """Binomial where all positions are alike, of the positions alone where each finds all or nothing."""
     rng = np.random.default_rng(2)
-    alike = InjectedShares((1.0,), np.array([0.5]), np.ones((1, 1)), rng.random((1, 20, 100)))
+    alike = Injected((1.0,), np.array([0.5]), np.ones((1, 1)), rng.random((1, 20, 100)))
     exact = clopper_pearson(round(alike.completeness[0, 0] * 2000), 2000)
     assert alike.completeness_high[0, 0] - alike.completeness_low[0, 0] < 1.6 * (exact.high - exact.low)
     whole = np.repeat(rng.random((1, 20, 1)), 100, axis=2)
-    apart = InjectedShares((1.0,), np.array([0.5]), np.ones((1, 1)), whole)
+    apart = Injected((1.0,), np.array([0.5]), np.ones((1, 1)), whole)
     assert apart.completeness_high[0, 0] - apart.completeness_low[0, 0] > 0.35
     # Quantiles have the same: of 2000 even draws the median is known to 0.022 each way.
     half = alike.limit(0.5, 0)
     assert half.low < 0.5 < half.high
     assert half.high - half.low < 0.08
-    never = InjectedShares((1.0,), np.array([0.5]), np.ones((1, 1)), np.full((1, 4, 5), np.inf))
+    never = Injected((1.0,), np.array([0.5]), np.ones((1, 1)), np.full((1, 4, 5), np.inf))
     assert never.limit(0.5, 0).value == np.inf
     assert never.never(0) == 1.0
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
-from mauvecl.answers.assumptions import what_matters
-from mauvecl.answers.limit_search import LimitSearch
-from mauvecl.answers.limits import limiting_magnitude, shortest_exposure, smallest_amplitude
+from mauvecl.answers.limits.assumptions import what_matters
+from mauvecl.answers.limits.limits import limiting_magnitude, shortest_exposure, smallest_amplitude
+from mauvecl.answers.limits.search import LimitSearch
 from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError
 from mauvecl.statistics.intervals import Interval

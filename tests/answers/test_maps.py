@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from astropy.table import QTable
 
-from mauvecl.answers.maps import detection_map
+from mauvecl.answers.detection.maps import detection_map
 from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError
 from mauvecl.study.study import Study

@@ -11,11 +11,14 @@ from mauvecl import Study, plan
 from mauvecl.answers.campaigns.plan import PlanAnswer
 from mauvecl.answers.campaigns.plan_text import SUMMARY, summary_rows, target_lines
 from mauvecl.answers.campaigns.planned import Looked
+from mauvecl.answers.campaigns.planned_injections import question_of
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.flares.rates import davenport2019
 from mauvecl.lightcurve.search.completeness import Completeness
+from mauvecl.lightcurve.stares.along import stare_along
 from mauvecl.study.orbits import read_targets
 from mauvecl.study.spectral_types import nearest_spectrum, subtype
+from mauvecl.study.staring import stare_of
 
 #: Injections take ten seconds a target.
 QUICK = {"completeness": "closed form"}
@@ -137,6 +140,36 @@ def test_completeness_as_an_argument(study: Study) -> None:
     mean = answer.table["expected"][0]
     # Rates of one's own have no scatter: Poisson's alone.
     assert [answer.table["low"][0], answer.table["high"][0]] == stats.poisson.ppf([0.025, 0.975], mean).tolist()
+
+
+def test_conditions_are_those_of_stares_along_the_orbit() -> None:
+    """Temperature and hits while a target is seen, beside the frames of the same orbit; both change the noise."""
+    base = [
+        "plan.targets=[{name='GJ 205'}]",
+        "orbit.days=3",
+        "orbit.start=2026-10-01",
+        "plan.completeness='closed form'",
+    ]
+    study = Study().with_settings(base)
+    looked = plan(study).planned[0].looked
+    assert looked.conditions is not None
+    along = stare_along(study.orbit.orbit(), "GJ 205", "2026-10-01", 3 * 86_400.0, frame_s=60.0)
+    # The plan begins in balance, the stare with its past.
+    assert looked.conditions.temperature_c == pytest.approx(along.stare.temperature_c.mean(), abs=0.2)
+    assert looked.hits_per_cm2_s == pytest.approx(along.mean_hits_per_cm2_s, rel=1e-9)
+    assert looked.quiet.conditions["temperature_c"] == looked.conditions.temperature_c
+    injected = question_of(study, looked)
+    stare = stare_of(injected)
+    assert 13 < stare.temperature_c.min() < stare.temperature_c.mean() - 0.5 < stare.temperature_c.max() - 1 < 20
+    assert injected.processes.cosmic_rays.rate_per_cm2_s == looked.hits_per_cm2_s
+
+    still = plan(study.with_settings(["plan.along_orbit=false", "observation.temperature_c=21"]))
+    assert still.stars["temperature"][0].value == 21.0
+    assert still.stars["hits"][0].value == 0.0
+    hot = study.with_settings(["observation.temperature_c=21"])
+    rays = hot.with_settings(["processes.cosmic_rays.electrons=[5000, 10000]"])
+    signals = [float(plan(one).stars["signal_per_frame"][0]) for one in (rays, hot)]
+    assert signals[0] < 0.9 * signals[1] < 0.9 * still.stars["signal_per_frame"][0] < 0.9 * looked.signal_per_frame
 
 
 def test_more_light_finds_smaller_flares(study: Study) -> None:

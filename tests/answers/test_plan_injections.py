@@ -7,7 +7,7 @@ from mauvecl import Study
 from mauvecl.answers.campaigns.plan import plan
 from mauvecl.answers.campaigns.planned import Looked, closed_form
 from mauvecl.answers.campaigns.planned_injections import found_share, question_of
-from mauvecl.answers.inject import inject
+from mauvecl.answers.stares.inject import inject
 from mauvecl.lightcurve.flares.rates import PowerLaw
 from mauvecl.lightcurve.search.completeness import Completeness, DurationLaw
 from mauvecl.lightcurve.search.yields import fit_power_law, recovered_per_day
@@ -60,8 +60,8 @@ def test_campaigns_close_through_the_search() -> None:
     form = plan(study, kept).planned[0].completeness
     assert form is not None
     star, law = inject(question_of(study, seen[0])).stars[0], study.plan.law()
-    widths = np.array(star.found.half_widths_s)
-    first, second = (star.found.critical[:, :, k::2].reshape(widths.size, -1) for k in (0, 1))
+    widths = np.array(star.injected.half_widths_s)
+    first, second = (star.injected.critical[:, :, k::2].reshape(widths.size, -1) for k in (0, 1))
     energy = 10 ** np.arange(28.0, 38.0, 0.05)
     table = Completeness(energy, found_share(first, widths, energy, law), "bolometric", "injections")
     # A bank of several temperatures has a higher threshold than one sum; 200 injections leave some per cent.

@@ -12,11 +12,11 @@ from astropy.io import fits
 from astropy.table import QTable
 from commands import ended, run
 
-from mauvecl.answers.stare import StareAnswer, stare
+from mauvecl.answers.stares.stare import StareAnswer, stare
 from mauvecl.device.engine import Engine
 from mauvecl.device.stares import Stares
 from mauvecl.host.errors import InputError
-from mauvecl.study.stares import stare_of
+from mauvecl.study.staring import stare_of
 from mauvecl.study.study import Study
 
 #: A G2V star for five minutes with a gap and a flare.

@@ -14,11 +14,11 @@ from answers import twice
 from commands import ended, run
 from scenes import instrument
 
-from mauvecl.answers.detect import detect
-from mauvecl.answers.limits import limiting_magnitude
-from mauvecl.answers.maps import detection_map
-from mauvecl.answers.unknown_cost import cost_lines, marginal_lines, unknown_cost
-from mauvecl.answers.unknown_table import power, unknown_table
+from mauvecl.answers.detection.detect import detect
+from mauvecl.answers.detection.maps import detection_map
+from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
+from mauvecl.answers.detection.unknown_table import power, unknown_table
+from mauvecl.answers.limits.limits import limiting_magnitude
 from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import expect
@@ -26,7 +26,7 @@ from mauvecl.host.sky.zodiacal import Sky
 from mauvecl.host.stars.source import Source
 from mauvecl.noise.scene import prepare
 from mauvecl.noise.usual import USUAL
-from mauvecl.results.requests import DetectRequest
+from mauvecl.results.requests.requests import DetectRequest
 from mauvecl.statistics.nuisances import Nuisances
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.study.study import Study
@@ -77,7 +77,7 @@ def test_every_answer_says_what_unknowns_cost(engine: Engine) -> None:
         plain, other = (ask(s, engine) for s in (small, marginal))
         for answer in (plain, other):
             assert len([m for m in answer.messages if m.startswith("What unknowns cost")]) == 1
-        assert any("marginalised over dark +-0.1 deg C" in m for m in other.messages)
+        assert any("marginalised over the dark level (+-0.1 deg C)" in m for m in other.messages)
         assert "[nuisances]" in other.table.meta["study"]
         assert "[nuisances]" not in plain.table.meta["study"]
     # What is marginalised detects less.
@@ -253,9 +253,9 @@ def test_the_table_and_its_picture(tmp_path: Path) -> None:
     """METHODS section 7's row again, and the smallest amplitude has the power asked for."""
     found = unknown_table(study())
     rows = {row["unknown"]: row for row in found.table}
-    assert rows["dark +-0.1 deg C"]["marginalised"] == pytest.approx(3.06, rel=0.01)
-    assert rows["dark and light, free"]["marginalised"] == pytest.approx(3.05, rel=0.01)
-    assert rows["light +-1 %"]["plain"] == pytest.approx(4.12, rel=0.01)
+    assert rows["the dark level (+-0.1 deg C)"]["marginalised"] == pytest.approx(3.06, rel=0.01)
+    assert rows["the dark level (free) and the light level (free)"]["marginalised"] == pytest.approx(3.05, rel=0.01)
+    assert rows["the light level (+-1 %)"]["plain"] == pytest.approx(4.12, rel=0.01)
     for name, row in rows.items():
         snr = row["marginalised"] * found.smallest("G2V V = 7.4 (Vega = 0)", name) / row["amplitude"]
         assert power(np.array([snr]), 1e-3)[0] == pytest.approx(0.9)

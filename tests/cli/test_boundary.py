@@ -213,7 +213,7 @@ def test_chains_of_instruments_have_an_end(tmp_path: Path) -> None:
     "content", ["[" * 100_000, "null", "[]", '{"attributes": []}', '{"attributes": {"study": "a = 1e999"}}']
 )
 def test_manifests_that_are_none(content: str, tmp_path: Path) -> None:
-    """RecursionError of nested JSON. Alone it is someone else's file; beside shares it was ours and is damaged."""
+    """RecursionError of nested JSON. Alone it is someone else's file; beside shards it was ours and is damaged."""
     for folder, name in (("store", "zarr.json"), ("run/checkpoint", "manifest.json")):
         (tmp_path / folder).mkdir(parents=True)
         (tmp_path / folder / name).write_text(content)

@@ -15,8 +15,8 @@ from astropy.io import fits
 from astropy.table import QTable
 from commands import run, started
 
-from mauvecl.answers.detect import detect
-from mauvecl.answers.simulate import simulate
+from mauvecl.answers.detection.detect import detect
+from mauvecl.answers.signal.simulate import simulate
 from mauvecl.device.engine import Engine
 from mauvecl.noise.processes import CosmicRays, Normal, Processes, Uniform
 from mauvecl.statistics.registry import STATISTICS
@@ -192,7 +192,7 @@ def test_a_study_may_ask_for_processes(tmp_path: Path, engine: Engine) -> None:
     assert study.drawing == {"mode": "auto", "recipe": "joint", "processes": processes}
     (tmp_path / "again.toml").write_text(study.toml())
     assert Study.read(tmp_path / "again.toml") == study
-    found = detect(study, engine).stars[0].found
+    found = detect(study, engine).stars[0].detection
     quiet, *flares = study.expectations(study.star[0])
     wanted = engine.detect(quiet, flares, realisations=2000, seed=1, processes=processes)
     np.testing.assert_array_equal(found.distribution("chi2", 0).counts, wanted.distribution("chi2", 0).counts)
@@ -437,11 +437,11 @@ def test_bad_studies_are_a_sentence(text: str, sentence: str, tmp_path: Path) ->
     assert len(done.stderr.splitlines()) == 1
 
 
-#: The command line with small shares, so that a run of a second has several; shares change no answer.
-SMALL_SHARES = [
+#: The command line with small shards, so that a run of a second has several; shards change no answer.
+SMALL_SHARDS = [
     sys.executable,
     "-c",
-    "import mauvecl.runs.shards as s; s.SHARE = 2**27; from mauvecl.cli.app import main; main()",
+    "import mauvecl.runs.shards as s; s.SHARD = 2**27; from mauvecl.cli.app import main; main()",
 ]
 LONG = (
     "detect",
@@ -462,10 +462,10 @@ LONG = (
 @pytest.mark.long
 def test_stopped_and_resumed_as_if_never_stopped(tmp_path: Path) -> None:
     """Ctrl-C, the end of a batch job, kill -9: each next run goes on, and the last writes the tables of one alone."""
-    command, shares, kept = [*SMALL_SHARES, *LONG, "--resume", "--keep-after", "0"], tmp_path / "out" / "checkpoint", 0
+    command, shards, kept = [*SMALL_SHARDS, *LONG, "--resume", "--keep-after", "0"], tmp_path / "out" / "checkpoint", 0
 
     def counted() -> int:
-        return sum(int(path.stem.split("-")[-1]) for path in shares.glob("[!.]*.npz"))
+        return sum(int(path.stem.split("-")[-1]) for path in shards.glob("[!.]*.npz"))
 
     for stop in (signal.SIGINT, signal.SIGTERM, signal.SIGKILL):
         process = subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
@@ -482,8 +482,8 @@ def test_stopped_and_resumed_as_if_never_stopped(tmp_path: Path) -> None:
         kept = counted()
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    assert json.loads((tmp_path / "out" / "run.json").read_text())["shares"]["resumed"] == kept
-    assert not shares.exists()
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["shards"]["resumed"] == kept
+    assert not shards.exists()
     alone = tmp_path / "alone"
     alone.mkdir()
     run(*LONG, folder=alone)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -12,13 +13,28 @@ from typing import Any
 import pytest
 from commands import started
 from typer.main import get_command
+from typer.testing import CliRunner
 
+from mauvecl.cli import flags
 from mauvecl.cli.app import app
+from mauvecl.cli.verbs import injections, orbits
+from mauvecl.host.errors import InputError
+from mauvecl.study.study import Study
 
 VERBS: dict[str, Any] = {
     name: verb
     for top, found in get_command(app).commands.items()  # type: ignore[attr-defined]
     for name, verb in {top: found, **{f"{top} {k}": v for k, v in getattr(found, "commands", {}).items()}}.items()
+}
+
+#: Every flag of a study, by its name.
+FLAGS: dict[str, flags.Flag] = {
+    name: one
+    for room in (flags, injections, orbits)
+    for group in vars(room).values()
+    if isinstance(group, dict)
+    for name, one in group.items()
+    if isinstance(one, flags.Flag)
 }
 
 
@@ -29,13 +45,48 @@ def test_help_teaches_by_an_example(name: str) -> None:
     assert all(p.help for p in VERBS[name].params if getattr(p, "opts", None) and p.param_type_name == "option")
 
 
+def test_the_list_of_verbs_is_whole() -> None:
+    """The first sentence of each fits into 80 columns: none ends in dots."""
+    shown = CliRunner().invoke(app, ["--help"], env={"COLUMNS": "80"}).output
+    assert "Commands:" in shown
+    assert "..." not in shown.partition("Commands:")[2]
+
+
+@pytest.mark.parametrize("name", VERBS)
+def test_defaults_that_help_tells_are_those_of_the_study(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each verb without arguments, up to the study that it would answer."""
+    asked: list[Study] = []
+
+    def noted(study: Study, **_: Any) -> None:
+        asked.append(study)
+        raise InputError("noted")
+
+    monkeypatch.setattr("mauvecl.cli.foresight.question_values", noted)
+    flags = {p.name: p.help for p in VERBS[name].params if p.param_type_name == "option"}
+    if "settings" not in flags and "set" not in flags:
+        return
+    CliRunner().invoke(app, [name])
+    for flag, text in flags.items():
+        one, told = FLAGS.get(flag), re.search(r"\[([^][]*)\]\.$", text or "")
+        if one is None or told is None or not one.section:
+            continue
+        value: Any = asked[0]
+        for key in (*one.section.split("."), one.key):
+            value = getattr(value, key)
+        number = re.match(r"-?[\d.]+", told[1])
+        if number and isinstance(value, int | float):
+            assert float(number[0]) == value, flag
+        elif isinstance(value, str):
+            assert value in told[1], flag
+
+
 def test_the_same_word_means_the_same_everywhere() -> None:
-    """A flag has one help text, whatever the verb."""
+    """A flag has one help text, whatever the verb; only its default differs."""
     said: dict[str, set[str]] = {}
     for verb in VERBS.values():
         for parameter in verb.params:
             if parameter.param_type_name == "option" and parameter.name != "help":
-                said.setdefault(parameter.opts[0], set()).add(parameter.help)
+                said.setdefault(parameter.opts[0], set()).add(re.sub(r" \[[^][]*\]\.$", "", parameter.help))
     several = {flag: texts for flag, texts in said.items() if len(texts) > 1}
     assert not several
     assert len(said) > 40
@@ -51,7 +102,6 @@ def test_bash_completes_verbs_and_flags(tmp_path: Path) -> None:
         assert wanted in done.stdout.split(), done
 
 
-@pytest.mark.long
 def test_pipes_get_no_colour_and_errors_their_own_way(tmp_path: Path) -> None:
     plain = started("library", folder=tmp_path, TERM="xterm-256color")
     assert "\x1b" not in plain.stdout + plain.stderr
@@ -88,45 +138,47 @@ def test_quiet_prints_no_progress_and_no_files(tmp_path: Path) -> None:
     assert "matched" in quiet.stdout
 
 
-#: Takes a tenth of a second and more to load, and tells nobody that a value cannot be.
-HEAVY = ("astropy", "matplotlib", "pyopencl", "scipy.optimize", "scipy.special", "ssl", "synphot")
-
-
-#: Each with its exit code.
-MISTAKES = {
-    "--version": 0,
-    "detect --magnitude 99": 2,
-    "detect --amplitude -1": 2,
-    "detect --star G22V": 2,
-    "detect --star missing.txt": 2,
-    "detect --statistic chi3": 2,
-    "limit --exposure 0": 2,
-    "map --x magnitude": 2,
-    "snr --instrument mauv": 2,
-    "gaussian --fap 1e-9": 2,
-    "exposure missing.toml": 2,
-    "realise --band Q": 2,
-}
-#: Each in a copy of one process that has only begun.
-LOADING = """
-import os, sys
+#: Takes a twentieth of a second and more to load, and tells nobody that a value cannot be.
+HEAVY = ("astropy", "erfa", "matplotlib", "numpy", "pyopencl", "scipy", "ssl", "synphot", "zarr")
+MISTAKES = [
+    ["detect", "--magnitude", "99"],
+    ["detect", "--amplitude", "-1"],
+    ["detect", "--exposure", "fifty"],
+    ["detect", "--star", "G22V"],
+    ["detect", "--star", "missing.txt"],
+    ["detect", "--statistic", "chi3"],
+    ["detect", "--nuisance", "dark=-1"],
+    ["detect", "--set", "processes.jitter.uniform=[1, 0]"],
+    ["detect", "--no-such-flag"],
+    ["limit", "--exposure", "0"],
+    ["map", "--x", "magnitude"],
+    ["snr", "--instrument", "mauv"],
+    ["gaussian", "--fap", "1e-9"],
+    ["exposure", "missing.toml"],
+    ["realise", "--band", "Q"],
+    ["stare", "--shape", "davenport"],
+    ["inject", "--set", "search.slope=true", "--set", "search.offset=false"],
+    ["visible", "--set", "orbit.limits.sun_deg=181"],
+]
+#: Runs command lines one after the other in one process, and tells after each what it has loaded.
+TRIED = """
+import json, sys
 from mauvecl.cli.app import main
-for words in {words!r}:
-    if os.fork() == 0:
-        sys.argv, code = ["mauvecl", *words.split()], 0
-        try:
-            main()
-        except SystemExit as end:
-            code = end.code or 0
-        print("told", words, code, *(name for name in {heavy!r} if name in sys.modules), sep="|", flush=True)
-        os._exit(0)
-    os.wait()
+for words in json.loads(sys.argv[1]):
+    sys.argv = ["mauvecl", *words]
+    try:
+        main()
+    except SystemExit as end:
+        print(json.dumps([end.code, [name for name in HEAVY if name in sys.modules]]))
 """
 
 
 def test_nothing_large_is_loaded_for_a_mistake(tmp_path: Path) -> None:
     """What a user waits for after a typing error is imports, and nothing else: none of those that take long."""
-    code = LOADING.format(words=tuple(MISTAKES), heavy=HEAVY)
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path)
-    told = [line.split("|")[1:] for line in done.stdout.splitlines() if line.startswith("told|")]
-    assert told == [[words, str(code)] for words, code in MISTAKES.items()], done
+    code = TRIED.replace("HEAVY", repr(HEAVY))
+    asked = [["--version"], *MISTAKES]
+    done = subprocess.run(
+        [sys.executable, "-c", code, json.dumps(asked)], capture_output=True, text=True, cwd=tmp_path, check=True
+    )
+    told = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("[")]
+    assert list(zip(asked, told, strict=True)) == [(words, [0 if words == ["--version"] else 2, []]) for words in asked]

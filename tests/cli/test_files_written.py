@@ -139,7 +139,7 @@ def test_one_process_writes_a_folder_from_beginning_to_end(tmp_path: Path, monke
         pass
 
 
-SHARE = f"{hashlib.md5(b'').hexdigest()}-0-0-4096.npz"
+SHARD = f"{hashlib.md5(b'').hexdigest()}-0-0-4096.npz"
 
 
 @pytest.mark.parametrize("how", [{"restart": True}, {"resume": True}, {}])
@@ -150,11 +150,11 @@ def test_a_folder_called_checkpoint_is_not_ours_by_its_name(tmp_path: Path, how:
     for name in ("epoch-1.pt", "mine.npz", "deep/keep", ".unfinished-mine"):
         (theirs / name).write_text("keep me")
     with Checkpoint(tmp_path, "detect", small(), patience_s=0.0, **how) as checkpoint:
-        checkpoint.put(SHARE.removesuffix(".npz"), {})
+        checkpoint.put(SHARD.removesuffix(".npz"), {})
         assert checkpoint.kept == 1
     with pytest.raises(InputError, match="holds an unfinished run"), Checkpoint(tmp_path, "detect", small()):
         pass
-    (theirs / f".unfinished-{SHARE}").write_text("killed while it was written")
+    (theirs / f".unfinished-{SHARD}").write_text("killed while it was written")
     with Checkpoint(tmp_path, "detect", small(), resume=True) as checkpoint:
         checkpoint.forget()
     assert sorted(str(p.relative_to(theirs)) for p in theirs.rglob("*") if p.is_file()) == [
@@ -181,7 +181,7 @@ def test_another_programs_manifest_is_kept(tmp_path: Path, how: dict[str, bool])
 def test_a_restart_waits_for_no_one(tmp_path: Path) -> None:
     """What another process holds is not looked at, let alone removed."""
     with Checkpoint(tmp_path, "detect", small(), patience_s=0.0) as checkpoint:
-        checkpoint.put(SHARE.removesuffix(".npz"), {})
+        checkpoint.put(SHARD.removesuffix(".npz"), {})
         for how in ({"restart": True}, {"resume": True}):
             with (
                 pytest.raises(InputError, match="is being written by another process"),

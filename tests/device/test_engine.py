@@ -22,14 +22,14 @@ from mauvecl.device.selftest import toy
 from mauvecl.host.errors import InputError
 from mauvecl.host.instrument.pixel_map import PixelMap
 from mauvecl.noise import twin as reference
-from mauvecl.noise.comparison import TEMPLATE, Comparison
+from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.processes import CosmicRays, Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare
 from mauvecl.results import twin as reference_sums
-from mauvecl.results.channels import ChannelPlan, plan_channels
-from mauvecl.results.requests import DetectRequest
+from mauvecl.results.counts.tally import Tally
+from mauvecl.results.requests.channels import ChannelPlan, plan_channels
+from mauvecl.results.requests.requests import DetectRequest
 from mauvecl.results.snr import elements, observers
-from mauvecl.results.tally import Tally
 from mauvecl.statistics.registry import STATISTICS
 
 RAYS = CosmicRays(rate_per_cm2_s=200.0)
@@ -179,7 +179,7 @@ def check_statistics(engine: Engine, name: str) -> None:
     (quiet, *flares), how = case(name)
     kind = {"start": START, "seed": SEED, **how}
     found = engine.detect(quiet, flares, realisations=INDEX.size, statistics=tuple(STATISTICS), **kind)
-    plan, values = _twin(name, TEMPLATE)
+    plan, values = _twin(name, NOISE_FREE)
     fast = ("chi2", "chi2_element", "matched", "uv_excess")
     alone = engine.statistic_values(quiet, flares, count=INDEX.size, statistics=fast, **kind)
     same = [row for row in range(len(alone)) if row % 3 != 2 or row >= 9]
@@ -321,10 +321,10 @@ def test_tiles_change_no_bit(engine: Engine, tile: int) -> None:
     (quiet, *flares), _ = case("stack")
     whole = engine.detect(quiet, flares, realisations=3001, start=77, seed=6, statistics=tuple(STATISTICS))
     parts = Engine(tile=tile).detect(quiet, flares, realisations=3001, start=77, seed=6, statistics=tuple(STATISTICS))
-    for key, distribution in whole._found.items():
-        np.testing.assert_array_equal(distribution.counts, parts._found[key].counts)
-        assert distribution.far.equals(parts._found[key].far)
-        assert (distribution.mean, distribution.std) == (parts._found[key].mean, parts._found[key].std)
+    for key, distribution in whole._distributions.items():
+        np.testing.assert_array_equal(distribution.counts, parts._distributions[key].counts)
+        assert distribution.far.equals(parts._distributions[key].far)
+        assert (distribution.mean, distribution.std) == (parts._distributions[key].mean, parts._distributions[key].std)
 
 
 THREADS = """

@@ -12,8 +12,8 @@ from mauvecl.device.engine import Engine
 from mauvecl.noise.processes import Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare
 from mauvecl.results import twin
-from mauvecl.results.channels import plan_channels
-from mauvecl.results.detection import Detection
+from mauvecl.results.requests.channels import plan_channels
+from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.statistics.linear import Linear
 from mauvecl.statistics.nuisances import Nuisances
 
@@ -40,8 +40,8 @@ def test_every_marginalised_statistic_is_the_twins(any_width: Engine, exposure: 
         quiet, flares, start=int(INDEX[0]), count=INDEX.size, seed=SEED, statistics=asked, nuisances=sd
     )
     scene = prepare([quiet, *flares])
-    found = Detection(quiet, tuple(flares), asked, scene, INDEX.size, nuisances=Nuisances.of(quiet, sd))
-    plan = plan_channels(found, range(len(flares)), first=True)
+    hypotheses = Hypotheses(quiet, tuple(flares), asked, scene, nuisances=Nuisances.of(quiet, sd))
+    plan = plan_channels(hypotheses, range(len(flares)), first=True)
     sums = twin.statistics(scene, INDEX, SEED, plan, pair=False)
     np.testing.assert_array_equal(values, twin.marginalise(sums, plan.subtractions))
     # What is taken away matters.
@@ -119,7 +119,7 @@ def test_closed_forms_integrate_over_what_is_drawn(engine: Engine, case: str) ->
 
 
 def test_requests_carry_what_is_unknown(engine: Engine) -> None:
-    from mauvecl.results.requests import DetectRequest
+    from mauvecl.results.requests.requests import DetectRequest
     from mauvecl.runs.shards import fingerprint
 
     quiet, flare = star(amplitudes=(0.24,))

@@ -83,7 +83,7 @@ def test_the_weaker_promise_is_kept_and_marked(
     weak.opened.record = replace(weak.device, promise=WEAKER)
     checks = list(selftest.twins(weak))
     assert [check.name for check in checks if not check.passed] == []
-    marked = [check for check in checks if "weaker promise" in check.found]
+    marked = [check for check in checks if "weaker promise" in check.result]
     assert len(marked) == sum(not check.passed for check in strict) > 0
 
 

@@ -1,19 +1,26 @@
 """Visibility: closed forms of circular orbits, other definitions of the same limits, windows and how they add up."""
 
+import sys
+import threading
+import types
+from collections.abc import Callable
+
 import numpy as np
 import pytest
+from astropy.table import Table
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.orbit import constraints as must
 from mauvecl.host.orbit.conditions import Particles, Thermal
 from mauvecl.host.orbit.earth import direction, unit
+from mauvecl.host.orbit.limits import Limits
 from mauvecl.host.orbit.moments import Moments
 from mauvecl.host.orbit.names import Target
 from mauvecl.host.orbit.orbit import Orbit, circular
 from mauvecl.host.orbit.radiation import proton_map
 from mauvecl.host.orbit.season import elongation_deg, zodiacal_light
-from mauvecl.host.orbit.visibility import Limits, Visibility
+from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.host.sky.helioecliptic import helioecliptic, offline
 from mauvecl.host.sky.zodiacal import zodiacal_brightness
 
@@ -250,27 +257,64 @@ def test_names_in_any_writing() -> None:
     assert Target.of("19h22m00s -11d12m00s").ra_deg == pytest.approx(290.5)
 
 
+def _simbad(monkeypatch: pytest.MonkeyPatch, query_tap: Callable[[str], object]) -> None:
+    """A SIMBAD in the place of the network's: astroquery's where it is installed, one of the same form elsewhere."""
+    try:
+        from astroquery.simbad import SimbadClass
+    except ImportError:
+        package, module = types.ModuleType("astroquery"), types.ModuleType("astroquery.simbad")
+        module.Simbad = types.SimpleNamespace(query_tap=query_tap)  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, "astroquery", package)
+        monkeypatch.setitem(sys.modules, "astroquery.simbad", module)
+    else:
+        monkeypatch.setattr(SimbadClass, "query_tap", lambda _, query, **__: query_tap(query))
+
+
+def test_simbad(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Columns of its TAP service: degrees, mas; what it does not have is masked; blanks, quotes."""
+    asked = []
+
+    def answer(query: str) -> Table:
+        asked.append(query)
+        names, rows = ("ra", "dec", "plx_value", "sp_type", "V"), [(10.5, -3.25, 50.0, " K2V ", 7.5)]
+        if "HD 2" in query:
+            rows = [(1.0, 2.0, 0.0, "", 0.0)]
+        table = Table(rows=[] if "HD 3" in query else rows, names=names, masked=True, dtype=(*"fff", "O", "f"))
+        if "HD 2" in query:
+            for column in ("plx_value", "sp_type", "V"):
+                table[column].mask = True
+        return table
+
+    _simbad(monkeypatch, answer)
+    star = Target.of("Barnard's other star", simbad=True)
+    assert (star.ra_deg, star.dec_deg, star.distance_pc, star.magnitude, star.spectral_type, star.source) == (
+        10.5, -3.25, 20.0, 7.5, "K2V", "SIMBAD",
+    )  # fmt: skip
+    assert "ident.id = 'Barnard''s other star'" in asked[0]
+    bare = Target.of("HD 2", simbad=True, name="mine")
+    assert (bare.name, bare.distance_pc, bare.magnitude, bare.spectral_type) == ("mine", None, None, None)
+    with pytest.raises(InputError, match="unknown to SIMBAD"):
+        Target.of("HD 3", simbad=True)
+
+
 def test_no_network_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
-    """With astroquery and a network that fails, and without astroquery."""
-    import sys
-    import types
+    """With a network that fails, one that never answers, and without astroquery."""
+    from mauvecl.host.orbit import names
 
-    class Simbad:
-        timeout = 0.0
+    def fails(_: str) -> None:
+        raise ConnectionError("no route to host")
 
-        def add_votable_fields(self, *_: str) -> None:
-            pass
-
-        def query_object(self, _: str) -> None:
-            assert self.timeout == 10.0
-            raise ConnectionError("no route to host")
-
-    monkeypatch.setitem(sys.modules, "astroquery", types.ModuleType("astroquery"))
-    simbad = types.ModuleType("astroquery.simbad")
-    simbad.Simbad = Simbad  # type: ignore[attr-defined]
-    monkeypatch.setitem(sys.modules, "astroquery.simbad", simbad)
-    with pytest.raises(InputError, match="did not answer within 10 s"):
-        Target.of("HD 1", simbad=True)
+    with monkeypatch.context() as patch:
+        _simbad(patch, fails)
+        with pytest.raises(InputError, match=r"did not answer within 10 s \(ConnectionError\)"):
+            Target.of("HD 1", simbad=True)
+    with monkeypatch.context() as patch:
+        done = threading.Event()
+        _simbad(patch, lambda _: done.wait(60))
+        patch.setattr(names, "TIMEOUT_S", 0.1)
+        with pytest.raises(InputError, match=r"within 0.1 s \(TimeoutError\)"):
+            Target.of("HD 1", simbad=True)
+        done.set()
     monkeypatch.setitem(sys.modules, "astroquery.simbad", None)
     with pytest.raises(InputError, match=r"mauvecl\[names\]"):
         Target.of("HD 1", simbad=True)

@@ -11,7 +11,8 @@ import pytest
 from mauvecl.device.probes import Probes
 from mauvecl.host.errors import InputError
 from mauvecl.noise import twin as reference
-from mauvecl.noise.priors import Normal, Prior, Uniform, nodes
+from mauvecl.noise.prior_tables import nodes
+from mauvecl.noise.priors import Normal, Prior, Uniform
 from mauvecl.noise.processes import Factors, Processes
 
 CONDITIONS = {"temperature_c": 21.0, "dark_slope_per_c": 0.0684, "light_loss": 0.34, "pointing_loss": 0.02}

@@ -5,8 +5,9 @@ from __future__ import annotations
 from functools import cache
 
 import numpy as np
+from scenes import instrument
 
-from mauvecl import Instrument, Sky, Source, expect
+from mauvecl import Sky, Source, expect
 from mauvecl.lightcurve.flares.shapes import SHAPES
 from mauvecl.lightcurve.search.bank import Bank, Level
 from mauvecl.lightcurve.search.survey import Survey
@@ -19,20 +20,20 @@ KNOWN = Level(offset=False, slope=False, window_s=0.0)
 
 
 @cache
-def spectra(star, magnitude, kelvin=TEMPERATURES_K):
-    """One frame of a quiescent star, and DN that flares of one amplitude add."""
+def spectra(star, magnitude, kelvin=TEMPERATURES_K, *, part=False):
+    """One frame of a quiescent star, and DN that flares of one amplitude add; of some 200 pixels alone."""
     source = Source.from_library(star).at_magnitude(magnitude)
-    mauve, sky = Instrument.load("mauve"), Sky.of_brightness(22.1)
+    mauve, sky = instrument(part=part), Sky.of_brightness(22.1)
     quiet, *flares = (
         expect(s, mauve, exposure=5, sky=sky) for s in (source, *(source.flaring(1.0, k) for k in kelvin))
     )
     return quiet, np.array([flare.light_dn - quiet.light_dn for flare in flares])
 
 
-def survey(stare, level, widths, *, star="G2V", magnitude=7.4, more=None, kelvin=10_000.0):
+def survey(stare, level, widths, *, star="G2V", magnitude=7.4, more=None, kelvin=10_000.0, part=False):
     """A star's survey and templates; the only flare spectrum is of `kelvin`."""
-    quiet, flares = spectra(star, magnitude)
-    _, one = spectra(star, magnitude, (kelvin,))
+    quiet, flares = spectra(star, magnitude, part=part)
+    _, one = spectra(star, magnitude, (kelvin,), part=part)
     templates = Templates.of(quiet, flares, TEMPERATURES_K, nuisances=frame_nuisances(quiet, stare, more))
     components = Components(quiet, one / quiet.gain_dn_per_electron, templates.weights)
     bank = Bank(widths, templates.directions[list(templates.chosen)], DAVENPORT, 5.0, level)

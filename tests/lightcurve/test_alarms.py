@@ -7,8 +7,8 @@ import pytest
 
 from mauvecl.lightcurve.flares.events import Event, coefficients
 from mauvecl.lightcurve.search.alarms import LEFT_BEHIND, alarms
-from mauvecl.study.searches import Surveyed, surveyed
 from mauvecl.study.study import Study
+from mauvecl.study.surveys import Surveyed, surveyed
 
 #: One false alarm in a star-month at 4.91, by importance sampling, and so 5e-6 in an orbit at 6.
 THRESHOLD = 6.0

@@ -5,10 +5,11 @@ import pytest
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.orbit.conditions import Thermal
+from mauvecl.host.orbit.limits import Limits
 from mauvecl.host.orbit.moments import Moments
 from mauvecl.host.orbit.names import Target
 from mauvecl.host.orbit.orbit import Orbit
-from mauvecl.host.orbit.visibility import Limits, Visibility
+from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.lightcurve.stares.along import OrbitStare, stare_along
 from mauvecl.lightcurve.stares.stare import Stare
 
@@ -73,7 +74,7 @@ def test_the_constructor_of_stares(orbit: Orbit, night: OrbitStare) -> None:
 
 def test_a_studys_stare(orbit: Orbit, night: OrbitStare) -> None:
     from mauvecl import Study
-    from mauvecl.study.stares import orbit_lines, stare_of
+    from mauvecl.study.staring import orbit_lines, stare_of
 
     study = Study().with_settings(
         ["stare.along_orbit=true", f"stare.duration_s={HOURS * 3600}", "orbit.targets=['eps Eri']",

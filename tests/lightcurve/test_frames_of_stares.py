@@ -7,8 +7,9 @@ import pytest
 from scipy.integrate import quad
 
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.stares.curves import ORBIT_S, Sinusoid, Table
+from mauvecl.lightcurve.stares.curves import Sinusoid, Table
 from mauvecl.lightcurve.stares.stare import Stare, StareUnknown
+from mauvecl.lightcurve.usual import ORBIT_S
 
 
 def test_frames_and_gaps():

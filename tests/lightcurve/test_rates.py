@@ -127,12 +127,6 @@ def test_yield_with_scatter() -> None:
     assert [found.low, found.high] == pytest.approx(np.quantile(draws, [0.025, 0.975]), rel=0.03, abs=1)
 
 
-def test_threshold_of_a_search() -> None:
-    """TIME.md, section 4: the largest value of a day of white noise has its median at 3.73, and 4.67 at 99 %."""
-    assert search_threshold(-np.log(0.5)) == pytest.approx(3.73, abs=0.05)
-    assert search_threshold(-np.log(0.99)) == pytest.approx(4.67, abs=0.05)
-
-
 def test_gain_of_a_flare_in_a_long_stretch() -> None:
     """Far from the ends it is sqrt(.72148 t_half / 5 s): TIME.md, section 4; taking off a line costs little."""
     widths, gain = _gains(shape_of("davenport2014"), 20_000.0, 5.0)

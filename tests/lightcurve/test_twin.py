@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
@@ -14,10 +15,12 @@ from mauvecl.device.stares import Stares
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.stares import twin
 from mauvecl.lightcurve.stares.components import Components
+from mauvecl.lightcurve.stares.requests import StaresRequest
 from mauvecl.lightcurve.stares.scene import Flares, StareScene
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.lightcurve.stares.sums import SumTable
 from mauvecl.noise.processes import CosmicRays
+from mauvecl.results.requests.requests import Shard
 
 SEED = 2**63 + 12345
 #: Around the boundary of the counter's first word.
@@ -109,3 +112,30 @@ def test_a_split_changes_no_bit(engine: Engine, method: Any) -> None:
     gapped = Stare.of(110.0, temperature_c=components.quiet.conditions["temperature_c"], gaps=[(20.0, 60.0)])
     both = [Stares(engine.opened).frames(components, s, None, count=2, **how) for s in (gapless, gapped)]
     np.testing.assert_array_equal(both[0][:, gapped.numbers], both[1])
+
+
+@dataclass(frozen=True)
+class Beside:
+    """Statistics, and what flares need beside them, as they are."""
+
+    adds: ClassVar[bool] = False
+
+    def __call__(self, values: np.ndarray, first: int, glow: np.ndarray) -> dict[str, np.ndarray]:
+        return {"values": values.copy(), "glow": glow.copy()}
+
+
+@pytest.mark.parametrize("method", ["pixels", "cumulants"])
+@pytest.mark.parametrize("name", ["plain", "all that wobbles", "unknown alone"])
+def test_what_flares_need_is_the_twins(stares: Stares, name: str, method: Any) -> None:
+    """Normals of their own, the light that the frames have; whatever share of the stares is drawn."""
+    components, stare, *_ = case(name)
+    asked = StaresRequest(
+        components, stare, COUNT, SEED, start=FIRST, method=method, reduction=Beside(), glow=True
+    )  # fmt: skip
+    found = stares.reduced(asked)
+    numbers, frames = np.arange(FIRST, FIRST + COUNT, dtype=np.uint64), range(stare.n_frames)
+    np.testing.assert_array_equal(found["glow"], twin.glow(StareScene.of(components, stare), numbers, frames, SEED))
+    whole = stares.frames(components, stare, first=FIRST, count=COUNT, seed=SEED, method=method)
+    np.testing.assert_array_equal(found["values"], whole)
+    part = stares.reduced(asked, Shard(0, FIRST + 5, 21))
+    np.testing.assert_array_equal(part["glow"], found["glow"][5:26])

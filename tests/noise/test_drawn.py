@@ -57,7 +57,7 @@ def test_nodes_are_a_distribution(weighted: bool) -> None:
     found = Drawn.of(prepare([quiet], processes=how))
     assert found is not None
     nodes, rows = found.nodes(quiet, weighted=weighted)
-    share = np.array([node.share for node in nodes])
+    share = np.array([node.probability for node in nodes])
     assert share.sum() == pytest.approx(1.0, abs=1e-12)
     for name in ("light", "dark", "sky"):
         assert share @ [getattr(node, name) for node in nodes] == pytest.approx(found.spreads[name].mean, rel=1e-4)

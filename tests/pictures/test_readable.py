@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
@@ -13,16 +15,16 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 
 from mauvecl.answers.answer import Answer
-from mauvecl.answers.detect import detect
-from mauvecl.answers.exposures import exposure_for
-from mauvecl.answers.gaussian import gaussian_report
-from mauvecl.answers.limits import limiting_magnitude
-from mauvecl.answers.maps import detection_map
-from mauvecl.answers.simulate import simulate
-from mauvecl.answers.snr import snr
+from mauvecl.answers.detection.detect import detect
+from mauvecl.answers.detection.gaussian import gaussian_report
+from mauvecl.answers.detection.maps import detection_map
+from mauvecl.answers.limits.limits import limiting_magnitude
+from mauvecl.answers.signal.exposures import exposure_for
+from mauvecl.answers.signal.simulate import simulate
+from mauvecl.answers.signal.snr import snr
 from mauvecl.device.engine import Engine
 from mauvecl.host.plotting import picture
-from mauvecl.pictures.style import COLUMN
+from mauvecl.pictures.style import COLUMN, STYLE, finished, headline, legend_below, pyplot
 from mauvecl.study.study import Study
 
 FEW = ("run.realisations=2000", "run.fap=0.1")
@@ -121,4 +123,24 @@ def test_a_flare_that_is_detected_is_seen(engine: Engine) -> None:
     (line,) = [line for line in figure.axes[1].lines if len(line.get_ydata()) > 2]
     assert 3.0 < max(line.get_ydata()) < 6.0
     # The last element of the spectrum is a part of one, and is left out.
-    assert line.get_xdata()[-1] < answer.stars[0].found.quiet.element_wavelength_nm[-1]
+    assert line.get_xdata()[-1] < answer.stars[0].detection.quiet.element_wavelength_nm[-1]
+
+
+def test_a_picture_is_what_savefig_makes_of_it(tmp_path: Path) -> None:
+    """Drawn once, where savefig draws twice; to the last byte."""
+    plt = pyplot()
+
+    def made() -> Any:
+        figure, axes = plt.subplots(1, 2, figsize=(5, 2.5))
+        axes[0].loglog([1, 20, 3000], [3, 0.1, 70], label="one")
+        axes[1].plot([0, 1], [1e5, 2e5], label="other")
+        axes[1].set(xlabel="tau", ylabel=r"$10^{-3}$ DN")
+        legend_below(figure, *axes[0].get_legend_handles_labels())
+        headline(figure, "A title that is so long that it takes two lines above both of these panels, as some do")
+        return figure
+
+    twice = io.BytesIO()
+    with plt.rc_context(STYLE):
+        made().savefig(twice, format="png")
+        once = finished(made(), tmp_path / "once.png")
+    assert once.read_bytes() == twice.getvalue()

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mauvecl.answers.detect import detect
+from mauvecl.answers.detection.detect import detect
 from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError
-from mauvecl.results.campaign import campaign, per_test
+from mauvecl.results.detection.campaign import campaign, per_test
 from mauvecl.study.study import Study
 
 

@@ -8,7 +8,7 @@ from scenes import instrument, star
 
 from mauvecl.device.engine import Engine
 from mauvecl.noise.comparison import Comparison
-from mauvecl.results.departures import Departure, departures
+from mauvecl.results.detection.departures import Departure, departures
 from mauvecl.statistics.registry import STATISTICS
 
 N = 500_000

@@ -15,9 +15,9 @@ from mauvecl.host.expectation import expect
 from mauvecl.host.sky.zodiacal import Sky
 from mauvecl.host.stars.source import Source
 from mauvecl.results import twin as reference_sums
-from mauvecl.results.detection import Detection
-from mauvecl.results.roc import Roc
-from mauvecl.results.tally import Distribution, Grid, Tally
+from mauvecl.results.counts.tally import Distribution, Grid, Tally
+from mauvecl.results.detection.detection import Detection
+from mauvecl.results.detection.roc import Roc
 from mauvecl.statistics.linear import Linear, Matched
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.statistics.statistic import Setting

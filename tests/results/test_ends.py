@@ -16,10 +16,10 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise.comparison import Comparison
 from mauvecl.noise.processes import CosmicRays, Normal, Processes, Uniform
-from mauvecl.results.channels import plan_channels
-from mauvecl.results.detection import Detection
+from mauvecl.results.counts.tally import Distribution
+from mauvecl.results.detection.detection import Detection
+from mauvecl.results.requests.channels import plan_channels
 from mauvecl.results.snr import PERCENTAGES
-from mauvecl.results.tally import Distribution
 from mauvecl.statistics.intervals import central_counts
 from mauvecl.statistics.linear import Linear
 from mauvecl.statistics.registry import STATISTICS

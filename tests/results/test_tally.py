@@ -12,8 +12,8 @@ from scipy import stats
 from mauvecl.host.errors import InputError
 from mauvecl.noise import layout
 from mauvecl.results import twin as reference_sums
-from mauvecl.results.roc import Roc
-from mauvecl.results.tally import Distribution, Grid, Tally
+from mauvecl.results.counts.tally import Distribution, Grid, Tally
+from mauvecl.results.detection.roc import Roc
 
 
 def distribution(values: np.ndarray, grid: Grid) -> Distribution:
@@ -167,7 +167,7 @@ def test_order_and_pieces_change_nothing() -> None:
     whole.add_far(0, values)
     for piece in np.split(values[::-1], [1, 7, 5000, 5001]):
         parts.add_far(0, piece)
-    ours, theirs = whole.far[0].found(), parts.far[0].found()
+    ours, theirs = whole.far[0].frozen(), parts.far[0].frozen()
     assert ours.equals(theirs)
     inside = np.abs(np.rint(values.astype(float) * 2048) + 0.5) < 65532
     assert ours.first == sum(Fraction(float(x)) for x in values[~inside]) * 2**149

@@ -30,12 +30,12 @@ from mauvecl.device.engine import DeviceError, Engine
 from mauvecl.device.stares import Stares
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
-from mauvecl.results.requests import RealiseRequest, Share
+from mauvecl.results.requests.requests import RealiseRequest, Shard
 from mauvecl.runs.cluster import DaskWorkers
 from mauvecl.runs.pool import Pool, Stopped, together
 from mauvecl.store import bulk
 
-pytestmark = [pytest.mark.long, pytest.mark.usefixtures("small_shares")]
+pytestmark = [pytest.mark.long, pytest.mark.usefixtures("small_shards")]
 
 
 @pytest.fixture(scope="module")
@@ -52,7 +52,7 @@ def test_two_processes_give_one_answer(workers: DaskWorkers, engine: Engine, sce
     assert workers.count == 2
     same(pool.detect(quiet, flares, realisations=N, seed=5), engine.detect(quiet, flares, realisations=N, seed=5))
     same_snr(pool.snr(quiet, realisations=N, seed=5), engine.snr(quiet, realisations=N, seed=5))
-    assert pool.standing.shares == 16
+    assert pool.standing.shards == 16
     assert [device.name for device in pool.devices] == [engine.device.name] * 2
 
 
@@ -63,13 +63,13 @@ def test_stares_by_two_processes(workers: DaskWorkers, engine: Engine) -> None:
 
 
 def test_a_worker_killed_in_mid_run(workers: DaskWorkers, engine: Engine, scene: list[Expectation]) -> None:
-    """SIGKILL to a process that is counting: its share is counted by another, and the answer keeps its bits."""
+    """SIGKILL to a process that is counting: its shard is counted by another, and the answer keeps its bits."""
     quiet, *flares = scene
     n, pids = 150_000, list(workers._client.run(os.getpid).values())
     pool = Pool(workers)
 
     def kill() -> None:
-        while pool.standing.shares < 10:
+        while pool.standing.shards < 10:
             time.sleep(0.005)
         os.kill(pids[0], signal.SIGKILL)
 
@@ -79,7 +79,7 @@ def test_a_worker_killed_in_mid_run(workers: DaskWorkers, engine: Engine, scene:
     killer.join()
     same(found, engine.detect(quiet, flares, realisations=n, seed=6))
     assert pids[0] not in workers._client.run(os.getpid).values()
-    assert pool.standing.retries >= 1, "the share in its hands was counted again"
+    assert pool.standing.retries >= 1, "the shard in its hands was counted again"
 
 
 def greeted(port: int, context: ssl.SSLContext | None) -> bool:
@@ -130,7 +130,7 @@ def test_a_mistake_on_a_worker_is_a_sentence(workers: DaskWorkers) -> None:
     (bright,) = star(magnitude=-0.7, payload=instrument(part=True))
     impossible = RealiseRequest.of(bright, 10, seed=1, mode="stacked")
     with pytest.raises(DeviceError, match=r"failed at realisations 0 to 9: mode = 'stacked' cannot clip"):
-        workers.submit(impossible, "key", Share(0, 0, 10), lambda done: None).result()
+        workers.submit(impossible, "key", Shard(0, 0, 10), lambda done: None).result()
     assert workers.retries == before
 
 
@@ -153,7 +153,7 @@ class Silent:
 
 
 def test_whoever_waits_is_woken_at_the_end(scene: list[Expectation], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whatever Dask does: threads that wait for shares, for spectra, and for each other end at once."""
+    """Whatever Dask does: threads that wait for shards, for spectra, and for each other end at once."""
     monkeypatch.setattr("mauvecl.runs.cluster._client", lambda where, distributed: nullcontext(Silent()))
     monkeypatch.setattr(Silent, "run", lambda *given, **how: {}, raising=False)
     monkeypatch.setattr(Silent, "wait_for_workers", lambda *given, **how: None, raising=False)
@@ -191,7 +191,7 @@ def test_an_interrupted_cluster_ends_in_order(stop: signal.Signals, tmp_path: Pa
 
     Ctrl-C in a terminal reaches the whole process group: workers are not of it, or what they build is cut off aloud.
     """
-    script = "import mauvecl.runs.shards as s; s.SHARE = 2**27; from mauvecl.cli.app import main; main()"
+    script = "import mauvecl.runs.shards as s; s.SHARD = 2**27; from mauvecl.cli.app import main; main()"
     words = [
         "detect",
         "--star",
@@ -217,8 +217,8 @@ def test_an_interrupted_cluster_ends_in_order(stop: signal.Signals, tmp_path: Pa
         text=True,
         start_new_session=True,
     )
-    shares = tmp_path / "out" / "checkpoint"
-    while not list(shares.glob("[!.]*.npz")):
+    shards = tmp_path / "out" / "checkpoint"
+    while not list(shards.glob("[!.]*.npz")):
         time.sleep(0.01)
         assert run.poll() is None
     workers = [child for child in psutil.Process(run.pid).children() if "spawn_main" in " ".join(child.cmdline())]
@@ -234,12 +234,12 @@ def test_an_interrupted_cluster_ends_in_order(stop: signal.Signals, tmp_path: Pa
     assert run.returncode == {signal.SIGINT: 130, signal.SIGTERM: 143}[stop]
     assert len(errors.splitlines()) == 1, errors
     assert "kept in 'out/checkpoint', and the same command with --resume goes on from there" in errors
-    kept = sum(int(p.stem.split("-")[-1]) for p in shares.glob("[!.]*.npz"))
+    kept = sum(int(p.stem.split("-")[-1]) for p in shards.glob("[!.]*.npz"))
     if stop == signal.SIGTERM:
         return
     done = subprocess.run([*command, "--resume"], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
-    assert json.loads((tmp_path / "out" / "run.json").read_text())["shares"]["resumed"] == kept > 0
+    assert json.loads((tmp_path / "out" / "run.json").read_text())["shards"]["resumed"] == kept > 0
 
 
 @contextmanager
@@ -314,7 +314,7 @@ def test_a_scheduler_that_dies(tmp_path: Path, scene: list[Expectation]) -> None
         pool = Pool(workers)
 
         def kill() -> None:
-            while pool.standing.shares < 5:
+            while pool.standing.shards < 5:
                 time.sleep(0.005)
             scheduler.kill()
 

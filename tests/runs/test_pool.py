@@ -1,4 +1,4 @@
-"""Shares of a request: whoever counts them, in whatever order, however often, they add up to the engine's answer."""
+"""Shards of a request: whoever counts them, in whatever order, however often, they add up to the engine's answer."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ import pytest
 from answers import N, same, same_snr, small
 from scenes import instrument, star
 
-from mauvecl.answers.detect import detect
-from mauvecl.answers.limits import limiting_magnitude
-from mauvecl.answers.maps import detection_map
-from mauvecl.answers.snr import snr
+from mauvecl.answers.detection.detect import detect
+from mauvecl.answers.detection.maps import detection_map
+from mauvecl.answers.limits.limits import limiting_magnitude
+from mauvecl.answers.signal.snr import snr
 from mauvecl.device.engine import DeviceError, Engine
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise.comparison import Comparison
 from mauvecl.noise.drawing import Drawing
 from mauvecl.noise.processes import Processes, Uniform
-from mauvecl.results.detection import Detection
-from mauvecl.results.requests import DetectRequest, Share, SnrRequest
+from mauvecl.results.detection.detection import Detection
+from mauvecl.results.requests.requests import DetectRequest, Shard, SnrRequest
 from mauvecl.results.sums import Arrays
 from mauvecl.runs import shards
 from mauvecl.runs.checkpoint import Checkpoint, _digest_of
@@ -38,11 +38,11 @@ from mauvecl.runs.shards import fingerprint
 from mauvecl.statistics.linear import Linear
 from mauvecl.study.study import Study
 
-pytestmark = pytest.mark.usefixtures("small_shares")
+pytestmark = pytest.mark.usefixtures("small_shards")
 
 
 class Shuffled(LocalWorkers):
-    """Answers shares late, in another order, and through the form they travel in."""
+    """Answers shards late, in another order, and through the form they travel in."""
 
     def __init__(self, engine: Engine, seed: int) -> None:
         super().__init__([None], make=lambda device, progress: engine)
@@ -54,7 +54,7 @@ class Shuffled(LocalWorkers):
         return 4
 
     def submit(
-        self, request: Any, key: str, share: Share, tick: Callable[[int], None], out: Any = None
+        self, request: Any, key: str, shard: Shard, tick: Callable[[int], None], out: Any = None
     ) -> Future[Arrays]:
         sent = pickle.loads(pickle.dumps(request))
         wait = self._random.uniform(0.0, 0.05)
@@ -62,7 +62,7 @@ class Shuffled(LocalWorkers):
         def work() -> Arrays:
             time.sleep(wait)
             with self._alone:
-                found = self.first.count(sent, share)
+                found = self.first.count(sent, shard)
             time.sleep(wait)
             return dict(pickle.loads(pickle.dumps(found)))
 
@@ -77,9 +77,9 @@ def test_any_order_gives_the_engines_answer(engine: Engine, scene: list[Expectat
     pool = Pool(Shuffled(engine, 3))
     same(pool.detect(quiet, flares, **how), engine.detect(quiet, flares, **how))
     assert (
-        pool.standing.shares
+        pool.standing.shards
         == pool.standing.of
-        == len(shards.shares(DetectRequest(quiet, tuple(flares), N, 5, ("chi2",), start=start)))
+        == len(shards.shards(DetectRequest(quiet, tuple(flares), N, 5, ("chi2",), start=start)))
     )
     same_snr(
         pool.snr(quiet, realisations=N, seed=5, start=start),
@@ -133,13 +133,13 @@ class Failing:
         self._engine, self._fails, self._calls = engine, fails, calls
         self.opened, self.device, self.device_name = engine.opened, engine.device, engine.device_name
 
-    def count(self, request: Any, share: Share, **more: Any) -> Arrays:
+    def count(self, request: Any, shard: Shard, **more: Any) -> Arrays:
         self._calls.append(len(self._calls))
         if self._calls[-1] in self._fails:
-            # Half of the share is counted already when it fails.
-            self._engine.count(request, replace(share, count=share.count // 2))
+            # Half of the shard is counted already when it fails.
+            self._engine.count(request, replace(shard, count=shard.count // 2))
             raise self.opened.cl.RuntimeError("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES", -5, "")
-        return self._engine.count(request, share, **more)
+        return self._engine.count(request, shard, **more)
 
 
 def test_a_failed_launch_is_counted_again(engine: Engine, scene: list[Expectation]) -> None:
@@ -188,7 +188,7 @@ def test_every_study_gives_the_same_table(
 
 
 def test_fingerprints_tell_requests_apart(scene: list[Expectation]) -> None:
-    """Everything that changes an answer changes the name of its shares, and nothing else does."""
+    """Everything that changes an answer changes the name of its shards, and nothing else does."""
     quiet, *flares = scene
     base = DetectRequest(quiet, tuple(flares), N, 5, ("chi2", "matched"))
     brighter = replace(flares[1], source_electrons=np.nextafter(flares[1].source_electrons, np.inf))
@@ -211,23 +211,23 @@ def test_fingerprints_tell_requests_apart(scene: list[Expectation]) -> None:
         assert fingerprint(same_one) == names[0]
 
 
-def test_shares_do_not_depend_on_the_number_of_realisations(scene: list[Expectation]) -> None:
-    """All but the last: so a longer run finds the shares of a shorter one."""
+def test_shards_do_not_depend_on_the_number_of_realisations(scene: list[Expectation]) -> None:
+    """All but the last: so a longer run finds the shards of a shorter one."""
     quiet, *flares = scene
-    short, long = (shards.shares(DetectRequest(quiet, tuple(flares), n, 5, ("chi2",))) for n in (N, 10 * N))
+    short, long = (shards.shards(DetectRequest(quiet, tuple(flares), n, 5, ("chi2",))) for n in (N, 10 * N))
     assert short[:-1] == long[: len(short) - 1]
-    for request_shares, n in ((short, N), (long, 10 * N)):
-        assert sum(share.count for share in request_shares) == n
+    for request_shards, n in ((short, N), (long, 10 * N)):
+        assert sum(shard.count for shard in request_shards) == n
 
 
-def test_large_requests_have_larger_shares(scene: list[Expectation], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_requests_have_larger_shards(scene: list[Expectation], monkeypatch: pytest.MonkeyPatch) -> None:
     """So that there are never more than one process can add up."""
-    monkeypatch.setattr(shards, "SHARE", 2**34)
+    monkeypatch.setattr(shards, "SHARD", 2**34)
     for n in (10**6, 10**9, 10**12, 10**15):
-        found = shards.shares(DetectRequest(scene[0], tuple(scene[1:]), n, 5, ("chi2",)))
+        found = shards.shards(DetectRequest(scene[0], tuple(scene[1:]), n, 5, ("chi2",)))
         assert len(found) <= 2 * shards.MOST + 1
-        assert sum(share.count for share in found) == n
-        assert all(share.count & (share.count - 1) == 0 for share in found[:-1])
+        assert sum(shard.count for shard in found) == n
+        assert all(shard.count & (shard.count - 1) == 0 for shard in found[:-1])
 
 
 def interrupting(after: int) -> Callable[[int, int], None]:
@@ -272,7 +272,7 @@ def test_what_is_unfinished_is_not_overwritten(tmp_path: Path, engine: Engine) -
 
 
 def test_counts_of_another_form_are_refused(tmp_path: Path, engine: Engine) -> None:
-    """As an older version left them; also where the manifest is lost, none of its shares is added."""
+    """As an older version left them; also where the manifest is lost, none of its shards is added."""
     with pytest.raises(KeyboardInterrupt):
         at_work(tmp_path, engine, interrupting(10_000))
     path = tmp_path / "checkpoint" / "manifest.json"
@@ -298,7 +298,7 @@ def test_two_runs_in_one_folder(tmp_path: Path, engine: Engine) -> None:
 
 
 @pytest.mark.parametrize("place", [0, 20, -1])
-def test_a_flipped_byte_in_a_share(tmp_path: Path, engine: Engine, place: int) -> None:
+def test_a_flipped_byte_in_a_shard(tmp_path: Path, engine: Engine, place: int) -> None:
     with pytest.raises(KeyboardInterrupt):
         at_work(tmp_path, engine, interrupting(20_000))
     first, *_ = sorted((tmp_path / "checkpoint").glob("*.npz"))
@@ -312,7 +312,7 @@ def test_a_flipped_byte_in_a_share(tmp_path: Path, engine: Engine, place: int) -
     same(found, engine.detect(quiet, flares, realisations=N, seed=5))
 
 
-def test_a_share_in_anothers_place(tmp_path: Path, engine: Engine) -> None:
+def test_a_shard_in_anothers_place(tmp_path: Path, engine: Engine) -> None:
     with pytest.raises(KeyboardInterrupt):
         at_work(tmp_path, engine, interrupting(20_000))
     first, second, *_ = sorted((tmp_path / "checkpoint").glob("*.npz"))
@@ -348,7 +348,7 @@ def test_short_runs_leave_no_files(tmp_path: Path, engine: Engine) -> None:
 
 
 def test_clocks_may_jump(tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Wall time runs backwards and leaps; neither shares nor progress care."""
+    """Wall time runs backwards and leaps; neither shards nor progress care."""
     from mauvecl.cli.console import Meter
 
     leaps = iter(np.resize([1e9, -1e9, 0.0, 5e9], 100_000))
@@ -380,7 +380,18 @@ def test_a_full_disk_stops_with_a_sentence_and_loses_nothing(
     same(found, engine.detect(quiet, flares, realisations=N, seed=5))
 
 
-def test_progress_tells_shares_and_what_was_resumed(tmp_path: Path, engine: Engine) -> None:
+def test_what_is_done_meanwhile_begins_once_and_not_before_the_devices() -> None:
+    quiet, *flares = small().expectations(small().star[0])
+    begun: list[int] = []
+    pool = Pool(LocalWorkers(), meanwhile=lambda: begun.append(pool.standing.of))
+    assert begun == []
+    for _ in range(2):
+        pool.detect(quiet, flares, realisations=N, seed=5)
+    (of,) = begun
+    assert of > 0
+
+
+def test_progress_tells_shards_and_what_was_resumed(tmp_path: Path, engine: Engine) -> None:
     with pytest.raises(KeyboardInterrupt):
         at_work(tmp_path, engine, interrupting(20_000))
     told: list[tuple[int, int]] = []
@@ -389,7 +400,7 @@ def test_progress_tells_shares_and_what_was_resumed(tmp_path: Path, engine: Engi
     assert told[-1] == (N, N)
     assert [done for done, _ in told] == sorted(done for done, _ in told)
     s = pool.standing
-    assert (s.shares, s.of, s.retries) == (8, 8, 0)
+    assert (s.shards, s.of, s.retries) == (8, 8, 0)
 
 
 def test_answers_keep_their_order_and_errors_end_the_rest(engine: Engine) -> None:

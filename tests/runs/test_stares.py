@@ -1,4 +1,4 @@
-"""A run of stares in shares: whoever draws them, whatever is kept of them, they join to the same bits."""
+"""A run of stares in shards: whoever draws them, whatever is kept of them, they join to the same bits."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from mauvecl.runs import shards
 from mauvecl.runs.checkpoint import Checkpoint
 from mauvecl.runs.pool import LocalWorkers, Pool, Stopped
 
-pytestmark = pytest.mark.usefixtures("small_shares")
+pytestmark = pytest.mark.usefixtures("small_shards")
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class Above:
 
 @pytest.mark.parametrize("method", ["pixels", "cumulants"])
 @pytest.mark.parametrize("reduction", [None, Largest(), Above(500.0)])
-def test_shares_join_to_the_same_bits(engine: Engine, method: Any, reduction: Any) -> None:
+def test_shards_join_to_the_same_bits(engine: Engine, method: Any, reduction: Any) -> None:
     """Two engines of different form, in the form that requests travel in, against one call."""
     asked = request(method, reduction=reduction)
     widths = iter((16, 1))
@@ -61,7 +61,7 @@ def test_shares_join_to_the_same_bits(engine: Engine, method: Any, reduction: An
     pool = Pool(workers)
     found = pool.stares(pickle.loads(pickle.dumps(asked)))
     workers.close()
-    assert pool.standing.shares == len(shards.shares(asked)) == 5, "cut at multiples of 64, and where the word ends"
+    assert pool.standing.shards == len(shards.shards(asked)) == 5, "cut at multiples of 64, and where the word ends"
     whole = Stares(engine.opened).frames(
         asked.components,
         asked.stare,
@@ -84,9 +84,9 @@ def test_a_run_goes_on_where_it_stopped(engine: Engine, tmp_path: Path) -> None:
     asked, study = request(reduction=Largest()), small()
 
     class Stopping(LocalWorkers):
-        def __init__(self, shares: int) -> None:
+        def __init__(self, shards: int) -> None:
             super().__init__([None], make=lambda device, progress: engine)
-            self.left = shares
+            self.left = shards
 
         def submit(self, *given: Any, **more: Any) -> Any:
             self.left -= 1
@@ -99,8 +99,8 @@ def test_a_run_goes_on_where_it_stopped(engine: Engine, tmp_path: Path) -> None:
     with Checkpoint(tmp_path, "inject", study, resume=True) as kept:
         workers = Stopping(99)
         found = Pool(workers, checkpoint=kept).stares(asked)
-        assert 1 <= kept.found < 5
-        assert kept.found + 99 - workers.left == 5, "none was drawn twice"
+        assert 1 <= kept.resumed < 5
+        assert kept.resumed + 99 - workers.left == 5, "none was drawn twice"
     for name, values in Pool(Stopping(99)).stares(asked).items():
         np.testing.assert_array_equal(found[name], values)
 

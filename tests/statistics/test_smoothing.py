@@ -101,5 +101,5 @@ def test_words_that_are_none(words: tuple[str, ...]) -> None:
     with pytest.raises(InputError, match="expected"):
         Comparison.of(*words)
     assert Comparison.of("stack:5", "estimated") == Comparison(5, True)
-    assert Comparison.of("exposure").share == 1.0
+    assert Comparison.of("exposure").added_variance == 1.0
     assert Comparison.of().plain

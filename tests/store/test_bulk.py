@@ -23,7 +23,7 @@ from typer.testing import CliRunner
 from mauvecl.cli.app import app
 from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError
-from mauvecl.runs import durable
+from mauvecl.host.files import whole
 from mauvecl.runs.durable import alone
 from mauvecl.store import bulk
 from mauvecl.store import form as store
@@ -256,7 +256,7 @@ def test_a_kill_at_every_step_of_writing(tmp_path: Path, monkeypatch: pytest.Mon
             return wrapped
 
         def run(path: Path = path, mortal: Any = mortal) -> None:
-            durable.os.fsync = mortal(os.fsync)  # type: ignore[attr-defined]
+            whole.os.fsync = mortal(os.fsync)  # type: ignore[attr-defined]
             Path.replace = mortal(Path.replace)  # type: ignore[method-assign]
             Store.note = mortal(Store.note)  # type: ignore[method-assign]
             bulk.realise(study(200), path, Painter())  # type: ignore[arg-type]

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from mauvecl.answers.detect import detect
+from mauvecl.answers.detection.detect import detect
 from mauvecl.cli.app import app
 from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError
@@ -60,14 +60,14 @@ def test_the_sky_is_common_to_both_hypotheses(engine: Engine) -> None:
     ]
     asked = study({"library": "G2V"}).with_settings(settings)
     net, paper = (
-        detect(asked.with_settings([f"observation.signal='{word}'"]), engine).stars[0].found
+        detect(asked.with_settings([f"observation.signal='{word}'"]), engine).stars[0].detection
         for word in ("net", "paper")
     )
     for statistic in ("chi2", "matched"):
         for flare in (None, 0):
             one, other = (found.distribution(statistic, flare) for found in (net, paper))
             np.testing.assert_array_equal(one.counts, other.counts)
-    bright = detect(asked.with_settings(["sky.surface_brightness=14.6"]), engine).stars[0].found
+    bright = detect(asked.with_settings(["sky.surface_brightness=14.6"]), engine).stars[0].detection
     seen, drowned = (found.detection_probability(0.01, "matched")[0].value for found in (net, bright))
     assert drowned < seen
     # Without a flare nothing is seen of it: five standard errors of 200 alarms.

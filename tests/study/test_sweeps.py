@@ -10,14 +10,14 @@ import pytest
 from scenes import instrument, star
 from scipy import stats
 
-from mauvecl.answers.assumptions import what_matters
-from mauvecl.answers.detect import detect
-from mauvecl.answers.exposures import exposure_for
-from mauvecl.answers.gaussian import ONE_SIGMA, beyond, coverage, gaussian_report
-from mauvecl.answers.limits import limiting_magnitude
-from mauvecl.answers.maps import detection_map
-from mauvecl.answers.simulate import simulate
-from mauvecl.answers.snr import snr
+from mauvecl.answers.detection.detect import detect
+from mauvecl.answers.detection.gaussian import ONE_SIGMA, beyond, coverage, gaussian_report
+from mauvecl.answers.detection.maps import detection_map
+from mauvecl.answers.limits.assumptions import what_matters
+from mauvecl.answers.limits.limits import limiting_magnitude
+from mauvecl.answers.signal.exposures import exposure_for
+from mauvecl.answers.signal.simulate import simulate
+from mauvecl.answers.signal.snr import snr
 from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError
 from mauvecl.study.study import PAPER_BUDGETS, Study

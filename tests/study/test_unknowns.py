@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mauvecl.answers.limit_search import LimitSearch, MarginalLimitSearch
-from mauvecl.answers.limits import limiting_magnitude
-from mauvecl.answers.maps import detection_map
+from mauvecl.answers.detection.maps import detection_map
+from mauvecl.answers.limits.limits import limiting_magnitude
+from mauvecl.answers.limits.search import LimitSearch, MarginalLimitSearch
 from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError
 from mauvecl.statistics.intervals import Interval

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.answers.answer import Answer
+from mauvecl.answers.campaigns.conditions import Met
 from mauvecl.answers.campaigns.planned import (
     NOTHING,
     CompletenessOf,
@@ -20,10 +21,13 @@ from mauvecl.answers.campaigns.planned import (
     star_of,
 )
 from mauvecl.answers.campaigns.visible import VisibleAnswer, visible
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.search.completeness import DAY_S
+from mauvecl.host.orbit.conditions import PARTICLES_SOURCE, THERMAL_SOURCE
+from mauvecl.lightcurve.search.null import DAY_S
 from mauvecl.lightcurve.search.yields import Yield, recovered_per_day
 from mauvecl.study.labels import described, stacked, told
+from mauvecl.study.sections import Rays
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -101,6 +105,8 @@ class PlanAnswer(Answer):
         table["sky"] = [float("nan") if one.sky is None else one.sky for one in rows] * u.mag / u.arcsec**2
         table["signal_per_frame"] = [one.signal_per_frame for one in rows]
         table["energy_per_second"] = [one.scale.erg_per_s for one in rows] * u.erg / u.s
+        table["temperature"] = [one.quiet.conditions["temperature_c"] for one in rows] * u.deg_C
+        table["hits"] = [one.hits_per_cm2_s for one in rows] / u.cm**2 / u.s
         table["window"] = [one.window_s / 60 for one in rows] * u.min
         table["saturated"] = [int(one.quiet.saturated.sum()) for one in rows]
         table["rates"] = [one.no_rates if one.rates is None else one.rates.source for one in self.planned]
@@ -169,10 +175,16 @@ class PlanAnswer(Answer):
                 "assumption; energies are those of all its light, spread alike in all directions",
             ),
             ("noise of a stare", "white", "beside what the study says is unknown of a stare; see completeness"),
+            *self._along_orbit,
             (
                 "false alarms",
                 f"{self.study.search.false_alarms:g} per {self.study.search.per} of exposure",
-                "sets the threshold; of noise, not of cosmic rays that look like flares",
+                "sets the threshold; of noise, not of hits by particles that look like flares",
+            ),
+            (
+                "stars known by name",
+                "V, spectral type",
+                "V of the Hipparcos catalogue (variable stars to 0.2 mag), rounded types (to some two subtypes)",
             ),
             (
                 "spectra",
@@ -183,6 +195,18 @@ class PlanAnswer(Answer):
         rows += [(f"flare rates of {one.name}", one.rates.source, _measured(one)) for one in self.planned if one.rates]
         rows += [(f"completeness of {one.name}", "", one.completeness.how) for one in self.planned if one.completeness]
         return Table(rows=rows, names=("assumption", "value", "source"))
+
+    @property
+    def _along_orbit(self) -> list[tuple[str, str, str]]:
+        if not self.study.plan.along_orbit:
+            return [("temperature and particles", "the study's", "the same for all targets")]
+        rays = Rays() if self.study.processes.cosmic_rays is None else self.study.processes.cosmic_rays
+        low, high = rays.electrons
+        return [
+            ("temperature", "along the orbit", THERMAL_SOURCE),
+            ("hits by particles", "along the orbit", PARTICLES_SOURCE),
+            ("charge of a hit", f"{low:g} to {high:g} electrons in one pixel", "assumption; adds to the noise"),
+        ]
 
     @property
     def tables(self) -> dict[str, Table]:
@@ -257,6 +281,8 @@ STAR_COLUMNS = {
     "sky": "zodiacal light behind it, median over the days on which it is seen",
     "signal_per_frame": "S/N of one frame with a flare of amplitude 1",
     "energy_per_second": "bolometric energy of a second of equivalent duration",
+    "temperature": "of the detector, mean while it is seen",
+    "hits": "of cosmic rays and trapped protons, mean while it is seen",
     "window": "median stretch in which it is seen",
     "saturated": "pixels left out since they saturate",
     "recovered_per_day": "flares recovered in a day of exposure",
@@ -270,6 +296,7 @@ def _measured(one: Planned) -> str:
     return f"published for {low:.2g} to {high:.2g} erg, bolometric; scatter {one.rates.scatter_dex:g} dex (assumption)"
 
 
+@public
 def plan(
     study: Study,
     completeness: CompletenessOf | None = None,
@@ -309,11 +336,12 @@ def plan(
     seen = visible(study)
     names, hours = seen.visibility.by_month()
     completeness = completeness or _completeness(study)
+    met = Met.along(seen.visibility.track) if study.plan.along_orbit else None
     found: list[Planned] = []
     for k, (text, star, target) in enumerate(zip(study.plan.targets, stars, seen.targets, strict=True)):
         if progress is not None:
             progress(k, len(stars))
-        looked = looked_of(study, text, star, target, seen, k)
+        looked = looked_of(study, text, star, target, seen, k, met)
         exposed = float(seen.visibility.hours[k])
         observed = exposed if study.plan.hours is None else min(exposed, study.plan.hours)
         order = np.argsort(-hours[:, k], kind="stable")[: study.plan.best_months]

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.answers.campaigns.conditions import Conditions, Met, hits_variance_dn2
 from mauvecl.host.errors import InputError
 from mauvecl.host.orbit.names import Target
 from mauvecl.lightcurve.flares.energies import EnergyScale
@@ -45,6 +46,10 @@ class Looked:
         Median length of a stretch; 0 where it is never seen.
     sky : float or None
         Zodiacal light behind it, V mag arcsec^-2, as `quiet` has it; the study's sky where it is None.
+    conditions : Conditions or None
+        Of the orbit while it is seen; the study's where it is None.
+    hits_per_cm2_s : float
+        By particles.
     """
 
     target: Target
@@ -54,6 +59,8 @@ class Looked:
     scale: EnergyScale
     window_s: float
     sky: float | None = None
+    conditions: Conditions | None = None
+    hits_per_cm2_s: float = 0.0
 
 
 #: Of a star that saturates every pixel.
@@ -116,8 +123,7 @@ def closed_form(study: Study, looked: Looked) -> Completeness:
         looked.scale,
         window_s=looked.window_s,
         false_alarms_per_day=study.search.rate,
-        frame_s=looked.quiet.frame_s,
-        shape=study.search.shape,
+        bank=study.search.white_bank(looked.quiet.frame_s),
         law=study.plan.law(),
     )
 
@@ -157,21 +163,40 @@ def star_of(study: Study, text: PlanTarget) -> Star:
     return Star(library=library, **given)
 
 
-def looked_of(study: Study, text: PlanTarget, star: Star, target: Target, seen: VisibleAnswer, k: int) -> Looked:
+def looked_of(
+    study: Study, text: PlanTarget, star: Star, target: Target, seen: VisibleAnswer, k: int, met: Met | None = None
+) -> Looked:
     """One frame of a target, and what a flare adds to it."""
     if text.spectral_type is not None:
         target = replace(target, spectral_type=text.spectral_type)
-    sky = sky_behind(seen, k)
-    one = study.at("exposure", study.load_instrument().frame_s)
-    if sky is not None:
-        one = one.model_copy(update={"sky": SkyLight(surface_brightness=sky)})
-    source = star.source()
-    quiet, flare = one.expect([source, one.flaring(source, SMALL)])
-    assert star.distance_pc is not None
-    scale = EnergyScale.of_star(source, star.distance_pc, band=study.flare.band, flare_k=study.flare.temperature_k)
+    conditions = None if met is None else met.of(seen.visibility, k, study.orbit.orbit().elements.period_s)
     lengths = seen.windows[k].length_s
     window = float(np.median(lengths)) if lengths.size else 0.0
-    return Looked(target, star, quiet, frame_signal(quiet, flare, SMALL), scale, window, sky)
+    sky, source = sky_behind(seen, k), star.source()
+    one = stared_at(study.at("exposure", study.load_instrument().frame_s), star, sky, conditions)
+    quiet, flare = one.expect([source, one.flaring(source, SMALL)])
+    rays = one.processes.cosmic_rays
+    hits = None if rays is None else hits_variance_dn2(rays, quiet)
+    signal = frame_signal(quiet, flare, SMALL, added_variance_dn2=hits)
+    assert star.distance_pc is not None
+    scale = EnergyScale.of_star(source, star.distance_pc, band=study.flare.band, flare_k=study.flare.temperature_k)
+    return Looked(
+        target, star, quiet, signal, scale, window, sky, conditions, 0.0 if rays is None else rays.rate_per_cm2_s
+    )
+
+
+def stared_at(study: Study, star: Star, sky: float | None, conditions: Conditions | None) -> Study:
+    """The study with one star, the sky behind it, and what the orbit does to its frames."""
+    changes: dict[str, Any] = {"star": (star,)}
+    if sky is not None:
+        changes["sky"] = SkyLight(surface_brightness=sky)
+    if conditions is not None:
+        rays = conditions.rays(study.processes.cosmic_rays)
+        changes["processes"] = study.processes.model_copy(update={"cosmic_rays": rays})
+        if study.observation.temperature_c is None:
+            at = {"temperature_c": conditions.temperature_c}
+            changes["observation"] = study.observation.model_copy(update=at)
+    return study.model_copy(update=changes)
 
 
 def sky_behind(seen: VisibleAnswer, k: int) -> float | None:

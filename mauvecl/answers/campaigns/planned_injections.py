@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.campaigns.planned import Looked
-from mauvecl.answers.inject import inject
+from mauvecl.answers.campaigns.planned import Looked, stared_at
+from mauvecl.answers.stares.inject import inject
 from mauvecl.lightcurve.flares.rates import BOLOMETRIC
 from mauvecl.lightcurve.search.completeness import PER_DECADE, Completeness, DurationLaw
 from mauvecl.study.searches import InjectionQuestion
-from mauvecl.study.sections import SkyLight
+from mauvecl.study.stares import CurveText
 from mauvecl.study.study import Study
 
 Float = NDArray[np.float64]
@@ -45,26 +47,31 @@ def injected(study: Study, looked: Looked) -> Completeness:
         f"{study.search.false_alarms:g} false alarms per {study.search.per}"
     )
     energy = 10 ** np.arange(24.0, 40.0, 1 / PER_DECADE)
-    widths = np.array(star.found.half_widths_s)
-    share = found_share(star.found.critical.reshape(widths.size, -1), widths, energy, study.plan.law())
+    widths = np.array(star.injected.half_widths_s)
+    share = found_share(star.injected.critical.reshape(widths.size, -1), widths, energy, study.plan.law())
     return Completeness(energy, share, BOLOMETRIC, how)
 
 
 def question_of(study: Study, looked: Looked) -> Study:
-    """What is asked of `inject`: the target's star, its sky, its stretches."""
+    """What is asked of `inject`: the target's star, its sky, its stretches, what the orbit does to its frames."""
     orbit_s = study.orbit.orbit().elements.period_s
     gap = max(orbit_s - looked.window_s, 0.0)
-    stare = study.stare.model_copy(
-        update={"duration_s": ORBITS * orbit_s, "orbit_s": orbit_s, "orbit_gap_s": gap, "gaps": ()}
-    )
-    search = study.search.model_copy(update={"nulls": 0})
+    changes: dict[str, Any] = {
+        "duration_s": ORBITS * orbit_s, "orbit_s": orbit_s, "orbit_gap_s": gap, "gaps": (), "along_orbit": False,
+    }  # fmt: skip
+    if looked.conditions is not None and study.stare.thermal is None:
+        changes["thermal"] = CurveText(points=looked.conditions.swings(ORBITS, orbit_s))
     injections = InjectionQuestion(
         of="energy", sizes=2, widths=WIDTHS, half_width_low_s=WIDTH_RANGE_S[0], half_width_high_s=WIDTH_RANGE_S[1],
         count=study.plan.injections, positions=min(POSITIONS, study.plan.injections), fitted=0,
     )  # fmt: skip
-    sky = study.sky if looked.sky is None else SkyLight(surface_brightness=looked.sky)
-    return study.model_copy(
-        update={"star": (looked.star,), "stare": stare, "search": search, "injections": injections, "sky": sky}
+    one = stared_at(study, looked.star, looked.sky, looked.conditions)
+    return one.model_copy(
+        update={
+            "stare": study.stare.model_copy(update=changes),
+            "search": study.search.model_copy(update={"nulls": 0}),
+            "injections": injections,
+        }
     )
 
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.campaigns.calendars import Entry, calendar_bytes
+from mauvecl.host.doors import public
 from mauvecl.host.orbit.bodies import Bodies
 from mauvecl.host.orbit.moments import DAY_S, Moments
 from mauvecl.host.orbit.names import Target
@@ -273,6 +274,7 @@ DESCRIPTIONS = {
 }
 
 
+@public
 def visible(study: Study) -> VisibleAnswer:
     """When a study's targets are seen.
 

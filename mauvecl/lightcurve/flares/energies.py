@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
-from mauvecl.host.quantities import takes_quantities
 from mauvecl.host.ranges import FLARE_TEMPERATURES_K
 from mauvecl.host.stars.bands import band as find_band
 from mauvecl.host.stars.flare import blackbody
@@ -33,7 +33,7 @@ Weighted = Literal["energy", "photons"]
 POINTS = 20_001
 
 
-@takes_quantities
+@public
 @dataclass(frozen=True)
 class EnergyScale:
     """What a second of equivalent duration in a band comes to.
@@ -55,7 +55,6 @@ class EnergyScale:
     how: str
 
     @classmethod
-    @takes_quantities
     def of_blackbody(
         cls,
         radius_rsun: float,
@@ -98,7 +97,6 @@ class EnergyScale:
         )
 
     @classmethod
-    @takes_quantities
     def of_star(
         cls,
         source: Source,
@@ -140,12 +138,10 @@ class EnergyScale:
             name, "bolometric", sphere * share * STEFAN_BOLTZMANN * flare_k**4, f"{told}, flare of {flare_k:g} K"
         )
 
-    @takes_quantities
     def energy(self, equivalent_duration_s: float) -> float:
         """Energy of an equivalent duration, erg."""
         return equivalent_duration_s * self.erg_per_s
 
-    @takes_quantities
     def equivalent_duration(self, energy_erg: float) -> float:
         """Equivalent duration of an energy, s.
 

@@ -9,8 +9,8 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
-from mauvecl.host.quantities import takes_quantities, takes_quantities_of
 from mauvecl.host.ranges import FLARE_TEMPERATURES_K
 from mauvecl.lightcurve.flares.energies import EnergyScale, amplitude_of, amplitude_of_peak, equivalent_duration
 from mauvecl.lightcurve.flares.shapes import SHAPES, Shape, shape_of
@@ -29,7 +29,7 @@ LARGEST_AMPLITUDE = 1e6
 SAME_K = 0.5
 
 
-@takes_quantities
+@public
 @dataclass(frozen=True)
 class Cooling:
     """A temperature that falls from the peak on: end + (peak - end) exp(-(t - t_peak) / fold); before it, the peak's.
@@ -52,7 +52,6 @@ class Cooling:
                 f"temperatures from {low:g} to {high:g} K, the end no hotter than the peak, and a time above 0"
             )
 
-    @takes_quantities
     def at(self, since_peak_s: Float) -> Float:
         """Temperature, K, shape of the time."""
         cooled = np.exp(-np.maximum(since_peak_s, 0.0) / self.fold_s)
@@ -64,7 +63,7 @@ class Cooling:
         return self.peak_k - self.end_k < SAME_K
 
 
-@takes_quantities_of(temperature="K")
+@public
 @dataclass(frozen=True)
 class Event:
     """One flare.
@@ -109,7 +108,6 @@ class Event:
                 raise InputError(f"flare temperature = {self.temperature:g} K, expected {low:g} to {high:g} K")
 
     @classmethod
-    @takes_quantities_of(temperature="K")
     def of_peak(
         cls,
         peak: float,
@@ -123,7 +121,6 @@ class Event:
         return cls(peak_s, half_width_s, amplitude_of_peak(peak, shape), temperature, shape)
 
     @classmethod
-    @takes_quantities_of(temperature="K")
     def of_equivalent_duration(
         cls,
         equivalent_duration_s: float,
@@ -139,7 +136,6 @@ class Event:
         return cls(peak_s, half_width_s, amplitude_of(equivalent_duration_s, half_width_s, shape), temperature, shape)
 
     @classmethod
-    @takes_quantities_of(temperature="K")
     def of_energy(
         cls,
         energy_erg: float,

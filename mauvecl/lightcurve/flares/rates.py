@@ -312,7 +312,7 @@ def fiducial2018(quiescent_si_iv_erg_s: float) -> PowerLaw:
     )  # fmt: skip
 
 
-#: Mass and age that stand for a type where a star's own are not known (assumption; masses by `dwarfs`).
+#: Mass and age that stand for a type where a star's own are not known (assumption).
 TYPICAL = {"G": (0.95, 1000.0), "K": (0.75, 1000.0), "M": (0.4, 1000.0)}
 
 

@@ -11,17 +11,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
+from mauvecl.lightcurve.usual import WINDOW_S
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.flares.shapes import Shape
 
 Float = NDArray[np.float64]
 
-#: Half-widths that a search looks for unless told, s: a factor of 1.86 apart, so that flares of 10 to 1800 s lose at
-#: most 1.3 % of S/N.
-HALF_WIDTHS_S = (12.0, 22.0, 42.0, 77.0, 144.0, 267.0, 496.0, 923.0, 1720.0)
-#: Time over which a level is taken for a straight line unless told, s: a third of an orbit; an assumption.
-WINDOW_S = 1800.0
 #: Half-widths of a template before and after its peak that a window holds at least.
 LEAD, TAIL = 5.0, 10.0
 #: Onsets are tried at least so many to a half-width, and in each half of a frame where that is not fine enough.

@@ -7,21 +7,24 @@ from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy import stats
+from scipy import optimize, stats
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.lightcurve.flares.energies import EnergyScale
 from mauvecl.lightcurve.flares.shapes import Shape, shape_of
+from mauvecl.lightcurve.search.bank import Bank
+from mauvecl.lightcurve.search.null import DAY_S
+from mauvecl.lightcurve.search.trials import Trials
+from mauvecl.lightcurve.usual import HALF_WIDTHS_S as BANK_S
 
 Float = NDArray[np.float64]
 
-#: Independent tests of a bank of filters per frame of 5 s (TIME.md section 4: .41 to .48 in white noise).
-TESTS_PER_FRAME = 0.45
 #: Energies of a table, per decade, and half-widths and peak times that the closed form looks at.
 PER_DECADE, WIDTHS, PEAKS = 20, 40, 24
 HALF_WIDTHS_S = (2.0, 20_000.0)
-DAY_S = 86_400.0
+#: Thresholds that are answered, sigma.
+THRESHOLDS = (2.0, 20.0)
 
 
 @dataclass(frozen=True)
@@ -120,8 +123,7 @@ class Completeness:
         *,
         window_s: float,
         false_alarms_per_day: float,
-        frame_s: float = 5.0,
-        shape: Shape | str = "davenport2014",
+        bank: Bank | None = None,
         law: DurationLaw | None = None,
     ) -> Self:
         """A bank of matched filters in stretches of one length, in closed form.
@@ -129,7 +131,7 @@ class Completeness:
         In each stretch an offset and a slope are not known, so that of a flare only what differs from a straight line
         counts; its peak may be anywhere in the stretch. A flare whose own S/N is less than half of the threshold is
         taken for lost. The noise of the flare's own light is left out, as is what a bank loses between its templates
-        (some 1 %).
+        (some 1 %), and what its several temperatures add to the threshold.
 
         Parameters
         ----------
@@ -141,8 +143,8 @@ class Completeness:
             Length of a stretch without a gap.
         false_alarms_per_day : float
             Of a day of frames: sets the threshold.
-        frame_s : float
-        shape : Shape or str
+        bank : Bank, optional
+            Its shape, half-widths and level; `default_bank` unless given.
         law : DurationLaw, optional
         """
         if scale.kind != "bolometric":
@@ -150,15 +152,15 @@ class Completeness:
         for name, value in (("signal_per_frame", signal_per_frame), ("window_s", window_s)):
             if not (np.isfinite(value) and value > 0):
                 raise InputError(f"{name} = {value}, expected above 0")
-        law, found = law or DurationLaw(), shape_of(shape)
-        threshold = search_threshold(false_alarms_per_day, frame_s)
-        widths, gain = _gains(found, window_s, frame_s)
+        law, bank = law or DurationLaw(), bank or default_bank()
+        threshold = search_threshold(false_alarms_per_day, bank)
+        widths, gain = _gains(bank.shape, window_s, bank.frame_s)
         # From energies that no stretch shows to those that every one does.
         log_energy = np.arange(24.0, 40.0, 1 / PER_DECADE)
         nodes, weights = np.polynomial.hermite_e.hermegauss(15)
         half = law.half_width(10**log_energy)[:, None] * 10 ** (law.scatter_dex * nodes)
         duration = scale.equivalent_duration(1.0) * 10**log_energy
-        amplitude = duration[:, None] / (half * found.equivalent_duration)
+        amplitude = duration[:, None] / (half * bank.shape.equivalent_duration)
         place = np.clip(np.log(half / widths[0]) / np.log(widths[-1] / widths[0]), 0, 1) * (WIDTHS - 1)
         i = np.minimum(place.astype(int), WIDTHS - 2)
         # Between half-widths the logarithm of the gain is taken as a line.
@@ -170,23 +172,43 @@ class Completeness:
         p = np.where(signal > threshold / 2, stats.norm.sf(threshold - signal), 0.0).mean(axis=-1)
         probability = p @ (weights / weights.sum())
         how = (
-            f"closed form of a bank of matched filters, {found.name}, threshold {threshold:.2f} sigma for "
+            f"closed form of a bank of matched filters, {bank.shape.name}, threshold {threshold:.2f} sigma for "
             f"{false_alarms_per_day:g} false alarms a day, stretches of {window_s / 60:.0f} min"
         )
         return cls(10**log_energy, np.clip(probability, 0, 1), "bolometric", how)
 
 
-def search_threshold(false_alarms_per_day: float, frame_s: float = 5.0) -> float:
-    """Where a bank's largest value is cut for so many false alarms in a day of frames, sigma of white noise."""
+def default_bank(shape: Shape | str = "davenport2014", frame_s: float = 5.0) -> Bank:
+    """That of a search which is not told otherwise, of one sum of each frame."""
+    return Bank(BANK_S, np.ones((1, 1)), shape_of(shape), frame_s)
+
+
+def search_threshold(false_alarms_per_day: float, bank: Bank | None = None) -> float:
+    """Where a bank's largest value is cut for so many false alarms in a day of frames, sigma of white noise.
+
+    By `Trials`: some 1 % above the threshold of as many alarms at one a day, less farther out.
+
+    Raises
+    ------
+    InputError
+        For a rate that is not above 0, or that no threshold of 2 to 20 sigma has.
+    """
     if not (np.isfinite(false_alarms_per_day) and false_alarms_per_day > 0):
         raise InputError(f"false_alarms_per_day = {false_alarms_per_day}, expected above 0")
-    tests = TESTS_PER_FRAME * DAY_S / frame_s
-    if false_alarms_per_day >= tests:
-        raise InputError(f"false_alarms_per_day = {false_alarms_per_day:g}, expected fewer than {tests:g} tests a day")
-    return float(stats.norm.isf(false_alarms_per_day / tests))
+    trials = Trials.of(bank or default_bank())
+
+    def over(threshold: float) -> float:
+        return float(np.log(trials.per_second(threshold) * DAY_S / false_alarms_per_day))
+
+    if over(THRESHOLDS[0]) < 0 or over(THRESHOLDS[1]) > 0:
+        most, least = (trials.per_second(u) * DAY_S for u in THRESHOLDS)
+        raise InputError(f"false_alarms_per_day = {false_alarms_per_day:g}, expected {least:.2g} to {most:.3g}")
+    return float(optimize.brentq(over, *THRESHOLDS, xtol=1e-9))
 
 
-def frame_signal(quiet: Expectation, flare: Expectation, amplitude: float = 1.0) -> float:
+def frame_signal(
+    quiet: Expectation, flare: Expectation, amplitude: float = 1.0, *, added_variance_dn2: Float | None = None
+) -> float:
     """S/N of one frame with a flare of amplitude 1 against the quiescent star, by weights light / variance.
 
     Parameters
@@ -195,12 +217,15 @@ def frame_signal(quiet: Expectation, flare: Expectation, amplitude: float = 1.0)
         One frame each; pixels that saturate without a flare are left out.
     amplitude : float
         That of the flare.
+    added_variance_dn2 : ndarray, shape (n_pixel,), optional
+        Beside what is expected: of hits by particles.
     """
     if quiet.n_frames != 1 or flare.n_frames != 1:
         raise InputError(f"expectations of {quiet.n_frames} and {flare.n_frames} frames, expected one frame each")
     light = (flare.source_electrons - quiet.source_electrons) * quiet.gain_dn_per_electron / amplitude
+    variance = quiet.unsaturated_variance_dn2 + (0.0 if added_variance_dn2 is None else added_variance_dn2)
     used = ~quiet.saturated
-    return float(np.sqrt(np.sum(light[used] ** 2 / quiet.unsaturated_variance_dn2[used])))
+    return float(np.sqrt(np.sum(light[used] ** 2 / variance[used])))
 
 
 def _gains(shape: Shape, window_s: float, frame_s: float) -> tuple[Float, Float]:

@@ -10,9 +10,8 @@ with a spread that does not grow with u (Adler, Blanchet & Liu 2012, doi 10.1214
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import scipy
@@ -25,10 +24,7 @@ if TYPE_CHECKING:
     from mauvecl.lightcurve.search.search import Search
 
 Float = NDArray[np.float64]
-Per = Literal["day", "month", "year"]
 
-#: Star-days in each: of the Julian year, a twelfth of it a month.
-DAYS: dict[Per, float] = {"day": 1.0, "month": 365.25 / 12, "year": 365.25}
 DAY_S = 86_400.0
 #: Thresholds at which importance sampling is done; between them the logarithm of the number of independent templates is
 #: a parabola.
@@ -42,21 +38,6 @@ MOST_LIKELY = 0.7
 NULL_KEY = 0x6E756C6C
 #: Alarms that a counted threshold rests on at least.
 FEWEST_ALARMS = 10
-
-
-def per_day(false_alarms: float, per: Per) -> float:
-    """False alarms per star-day.
-
-    Raises
-    ------
-    InputError
-        For a number that is not above 0, or another unit.
-    """
-    if per not in DAYS:
-        raise InputError(f"false alarms per {per!r}, expected per {', '.join(DAYS)}")
-    if not (np.isfinite(false_alarms) and false_alarms > 0):
-        raise InputError(f"false alarms = {false_alarms:g} per {per}, expected a number above 0")
-    return false_alarms / DAYS[per]
 
 
 @dataclass(frozen=True, eq=False)
@@ -101,23 +82,6 @@ class Counted:
         low, high = central_counts(n, 1 - alarmed)
         places = np.clip([round(n * (1 - alarmed)), low, high], 0, n - 1)
         return Interval(*(float(self.maxima[k]) for k in places))
-
-
-def counted(search: Search, draw: Callable[[int, int], NDArray[Any]], count: int, *, batch: int = 64) -> Counted:
-    """The null as drawn.
-
-    Parameters
-    ----------
-    search : Search
-    draw : callable
-        ``draw(first, count)`` gives the sums of stares first to first + count - 1, shape (count, n_frame, n_sum).
-    count : int
-        Stares.
-    batch : int
-        Stares drawn at once.
-    """
-    parts = [search.largest(draw(i, min(batch, count - i))).maximum for i in range(0, count, batch)]
-    return Counted(np.sort(np.concatenate(parts)), search.stare.observed_s / DAY_S)
 
 
 def in_a_row(values: NDArray[Any], points: int, sigma: float) -> NDArray[np.bool_]:

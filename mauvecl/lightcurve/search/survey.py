@@ -6,20 +6,22 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import combinations_with_replacement
 from math import factorial
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.lightcurve.search.null import DAY_S
 from mauvecl.lightcurve.search.search import Search
+from mauvecl.lightcurve.stares.requests import StaresRequest
+from mauvecl.lightcurve.stares.sums import method_for
 
 if TYPE_CHECKING:
-    from typing import Any
-
     from mauvecl.lightcurve.search.bank import Bank
     from mauvecl.lightcurve.stares.components import Components
-    from mauvecl.lightcurve.stares.stare import Changing, Stare
+    from mauvecl.lightcurve.stares.stare import Stare
+    from mauvecl.lightcurve.usual import Changing
+    from mauvecl.noise.processes import CosmicRays
 
 Float = NDArray[np.float64]
 
@@ -27,8 +29,6 @@ Float = NDArray[np.float64]
 LEAST_CURVE = 1e-6
 #: S/N over a window from which on what is neglected would raise false alarms.
 SEEN = 0.3
-#: Numbers of drawn stares that are held at once.
-NUMBERS = 2**24
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,15 +118,40 @@ class Survey:
         """Sums as drawn less what is known, (..., n_frame, n_sum)."""
         return np.asarray(sums - self.known, np.float32)
 
-    @property
-    def batch(self) -> int:
-        """Stares that are drawn at once."""
-        return int(np.clip(NUMBERS // (self.stare.n_frames * self.components.n_statistics), 1, 64))
+    def null(self, count: int, seed: int, cosmic_rays: CosmicRays | None = None) -> StaresRequest:
+        """Stares without a flare, and the largest value of each."""
+        largest = Largest(self.bank, self.stare, self.curves, self.variance, self.known)
+        method = method_for(self.components, self.stare, cosmic_rays)
+        return StaresRequest(
+            self.components, self.stare, count, seed, method=method, cosmic_rays=cosmic_rays, reduction=largest
+        )
 
     def of_days(self, days: float) -> Survey:
         """The same with the first star-days of the stare alone, where it is longer."""
         n = int(days * DAY_S / self.stare.frame_s)
         return self if self.stare.n_frames <= n else replace(self, stare=part_of(self.stare, slice(0, n)))
+
+
+@dataclass(frozen=True, eq=False)
+class Largest:
+    """The largest value of each stare that is drawn."""
+
+    adds: ClassVar[bool] = False
+
+    bank: Bank
+    stare: Stare
+    curves: Float | None
+    variance: Float
+    known: Float
+
+    @cached_property
+    def search(self) -> Search:
+        """The bank on the stare's frames."""
+        return Search(self.bank, self.stare, self.curves, self.variance)
+
+    def __call__(self, values: NDArray[np.float32], first: int) -> dict[str, NDArray[Any]]:
+        """As ``maximum``, shape (n_stare,)."""
+        return {"maximum": self.search.largest(np.asarray(values - self.known, np.float32)).maximum}
 
 
 def part_of(stare: Stare, part: slice) -> Stare:

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
+from mauvecl.lightcurve.usual import RANK
 from mauvecl.statistics.nuisances import Nuisances, joined
 
 if TYPE_CHECKING:
@@ -26,8 +27,6 @@ Float = NDArray[np.float64]
 
 #: Temperatures that a search looks for unless told, K: from the first to the last, a factor of 1.034 apart.
 TEMPERATURES_K = tuple(float(t) for t in np.geomspace(6_000.0, 30_000.0, 49).round(-1))
-#: Sums of a frame.
-RANK = 3
 #: Angle between neighbouring flares of a bank, in the space of whitened sums: the one between them loses 1 - cos of
 #: half of it, 0.3 % of S/N.
 ANGLE = 0.15

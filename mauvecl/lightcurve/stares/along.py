@@ -11,10 +11,11 @@ from numpy.typing import NDArray
 from mauvecl.host.errors import InputError
 from mauvecl.host.orbit.conditions import Particles, Thermal
 from mauvecl.host.orbit.constraints import sunlight
+from mauvecl.host.orbit.limits import Limits
 from mauvecl.host.orbit.moments import DAY_S, Moments
 from mauvecl.host.orbit.names import Target
 from mauvecl.host.orbit.orbit import Orbit, Track
-from mauvecl.host.orbit.visibility import Limits, Visibility
+from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.lightcurve.stares.stare import MOST_FRAMES, Stare
 
 Float = NDArray[np.float64]

@@ -7,17 +7,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
-from mauvecl.host.quantities import takes_quantities
+from mauvecl.lightcurve.usual import ORBIT_S
 
 Float = NDArray[np.float64]
 
-#: Period of the flown orbit, s: 94.635 min, from the mean motion of 15.21638735 revolutions a day in the public
-#: elements of NORAD 66756, epoch 2026 day 257.
-ORBIT_S = 86_400.0 / 15.21638735
 
-
-@takes_quantities
+@public
 @dataclass(frozen=True)
 class Sinusoid:
     """amplitude * sin(2 pi t / period + phase).

@@ -1,8 +1,8 @@
-"""Stares as a request: cut into shares of stares, drawn and reduced by whoever is free, joined exactly."""
+"""Stares as a request: cut into shards of stares, drawn and reduced by whoever is free, joined exactly."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, ClassVar, Literal, Protocol
@@ -14,7 +14,7 @@ from mauvecl.lightcurve.stares.components import Components
 from mauvecl.lightcurve.stares.scene import Flares
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.noise.processes import CosmicRays
-from mauvecl.results.requests import Asked
+from mauvecl.results.requests.requests import Asked
 
 Arrays = dict[str, NDArray[Any]]
 Method = Literal["pixels", "cumulants"]
@@ -27,24 +27,23 @@ REDUCED = 500
 class Reduction(Protocol):
     """What is kept of stares: a frozen dataclass, so that it travels and can be told from others.
 
+    It is called as ``reduction(values, first)``, and gives arrays by name for stares `first` and on, each looked at by
+    itself. ``values`` are float32, (n_stare, n_frame, n_statistic), with scenarios one axis more in front; they are
+    valid during the call. Where the request has `glow` it is called as ``reduction(values, first, glow)``, with another
+    array of the shape (n_stare, n_frame, n_statistic + 1).
+
     Attributes
     ----------
     adds : bool
         Whether what is kept are whole numbers that add up over stares; otherwise arrays are joined along their first
-        axis, with an entry for each stare.
+        axis, stares in their order.
     """
 
-    adds: bool
+    adds: ClassVar[bool]
 
-    def __call__(self, values: NDArray[np.float32], first: int) -> Mapping[str, NDArray[Any]]:
-        """What is kept of stares `first` and on, each looked at by itself.
-
-        Parameters
-        ----------
-        values : ndarray of float32, shape (n_stare, n_frame, n_statistic)
-            With scenarios one axis more in front; valid during the call.
-        first : int
-        """
+    @property
+    def __call__(self) -> Callable[..., Mapping[str, NDArray[Any]]]:
+        """See the class."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +58,9 @@ class StaresRequest(Asked):
         Number of the first.
     reduction : Reduction, optional
         By default statistics are kept as they are.
+    glow : bool
+        Whether the reduction also takes what flares put into the frames need: a normal for each statistic, for their
+        own photons, and the factor on all light as drawn, less one.
     """
 
     components: Components
@@ -71,6 +73,7 @@ class StaresRequest(Asked):
     method: Method = "cumulants"
     cosmic_rays: CosmicRays | None = None
     reduction: Reduction | None = None
+    glow: bool = False
     #: Where rows of flares and amplitudes are counted from, where they differ from stare to stare.
     rows_from: int = field(init=False, default=0)
 
@@ -113,13 +116,13 @@ class StareSums:
         self._adds = (request.reduction or Kept()).adds
         self._found: dict[int, Arrays] = {}
 
-    def add(self, part: int, share: Arrays) -> None:
-        """Add a share."""
-        rest = dict(share)
+    def add(self, part: int, shard: Arrays) -> None:
+        """Add a shard."""
+        rest = dict(shard)
         self._found[int(rest.pop("start"))] = rest
 
     def answer(self) -> Arrays:
-        """All of it, once all shares have come; stares in their order."""
+        """All of it, once all shards have come; stares in their order."""
         return joined([self._found[start] for start in sorted(self._found)], adds=self._adds)
 
 

@@ -5,14 +5,15 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, Literal, Self, get_args
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
-from mauvecl.host.quantities import takes_quantities
-from mauvecl.lightcurve.stares.curves import ORBIT_S, Curve, Sinusoid
+from mauvecl.lightcurve.stares.curves import Curve, Sinusoid
+from mauvecl.lightcurve.usual import CHANGING, ORBIT_S, Changing
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -20,10 +21,6 @@ if TYPE_CHECKING:
     from mauvecl.host.orbit.orbit import Orbit
 
 Float = NDArray[np.float64]
-#: What changes from frame to frame: the star's own level without its flares; the throughput for all light, of star,
-#: flare and sky; the sky's brightness; the detector's temperature.
-Changing = Literal["star", "light", "sky", "temperature"]
-CHANGING: tuple[Changing, ...] = get_args(Changing)
 #: Unit of each, for messages and tables.
 CHANGING_UNITS: dict[Changing, str] = {"star": "", "light": "", "sky": "", "temperature": "deg C"}
 #: Frames of a stare, at most: twenty years of 5 s, five bytes of a frame number.
@@ -58,7 +55,7 @@ class StareUnknown:
         _check_spread(self.name, self.of, self.sd)
 
 
-@takes_quantities
+@public
 @dataclass(frozen=True, eq=False)
 class Stare:
     """Frames of one star, one after the other with gaps between them; arrays are read-only.
@@ -139,7 +136,6 @@ class Stare:
         return named + [(unknown.name, unknown.curve) for unknown in self.unknowns]
 
     @classmethod
-    @takes_quantities
     def of(
         cls,
         duration_s: float,
@@ -220,7 +216,6 @@ class Stare:
         )
 
     @classmethod
-    @takes_quantities
     def along(cls, orbit: Orbit, target: Target | str, start: str, duration_s: float, **how: Any) -> Stare:
         """As the orbit gives it: frames while the target is seen, the detector's temperature through sun and shadow.
 

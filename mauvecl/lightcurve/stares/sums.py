@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from dataclasses import dataclass
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,11 @@ from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.stares.components import STEADY, Components
 from mauvecl.lightcurve.stares.scene import Flares, StareScene, unique
 from mauvecl.noise.cumulants import expansion_error
+
+if TYPE_CHECKING:
+    from mauvecl.lightcurve.stares.requests import Method
+    from mauvecl.lightcurve.stares.stare import Stare
+    from mauvecl.noise.processes import CosmicRays
 
 Float = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -121,6 +126,17 @@ def check_sums(scene: StareScene, flares: Flares) -> None:
                 f"pixel {pixel} of {x.name} scatters by {sd[pixel]:.2g} DN, too little for its rounding to be noise, "
                 "expected method 'pixels'"
             )
+
+
+def method_for(components: Components, stare: Stare, rays: CosmicRays | None = None) -> Method:
+    """How frames without flares are drawn: by cumulants where these describe them, pixel by pixel elsewhere."""
+    scene = StareScene.of(components, stare, rays)
+    try:
+        check_sums(scene, Flares.of(components, stare, None, None, 1))
+        SumTable.of(components)
+    except InputError:
+        return "pixels"
+    return "cumulants"
 
 
 def _over_sd(components: Components) -> list[Float]:

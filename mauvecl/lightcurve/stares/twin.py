@@ -57,6 +57,22 @@ def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int) -> dic
     }
 
 
+def glow(scene: StareScene, numbers: Numbers, frames: Iterable[int], seed: int) -> Floats:
+    """Beside the statistics of frames: a normal for each, for a flare's own photons; the factor on all light less one.
+
+    Returns
+    -------
+    ndarray of float32, shape (n_stare, n_frame, n_statistic + 1)
+    """
+    out = []
+    for frame in frames:
+        z: list[Floats] = []
+        for group in range(-(-len(scene.weights) // 4)):
+            z += four_normals(twin.words_at(numbers, int(scene.numbers[frame]), "stare_glow", group, seed))
+        out.append([*z[: len(scene.weights)], strengths(scene, numbers, frame, seed)["light"]])
+    return np.moveaxis(np.array(out), (0, 1, 2), (1, 2, 0))
+
+
 def _coefficients(scene: StareScene, flares: Flares, frame: int, scenario: int, light: Floats) -> list[Floats]:
     """Of the flare spectra, shape (n_stare,) each."""
     given = flares.rows[:, :, frame] * (scene.known[6, frame] * flares.amplitudes[scenario][:, None])
@@ -103,14 +119,14 @@ def _count(scene: StareScene, p: int, z: Floats, met: dict[str, Floats], flare: 
         fourth = fma(light, m["photon_fourth"], fourth)
         fifth = fma(light, m["photon_fifth"], fifth)
     zz, sd, each = z * z, np.sqrt(variance), one / variance
-    share = third * each
+    skew = third * each
     curve = fourth * fma(zz, np.float32(0.041666668), np.float32(-0.125))
-    curve = curve - third * share * fma(zz, np.float32(0.055555556), np.float32(-0.1388889))
+    curve = curve - third * skew * fma(zz, np.float32(0.055555556), np.float32(-0.1388889))
     even = fifth * _quartic(zz, 0.008333334, -0.05, 0.025)
-    even = even - share * fourth * _quartic(zz, 0.041666668, -0.20833333, 0.083333336)
-    even = even + share * share * third * _quartic(zz, 0.037037037, -0.16358025, 0.052469134)
+    even = even - skew * fourth * _quartic(zz, 0.041666668, -0.20833333, 0.083333336)
+    even = even + skew * skew * third * _quartic(zz, 0.037037037, -0.16358025, 0.052469134)
     straight = fma(curve * each, sd * each, sd)
-    v = fma(z, straight, fma(share, fma(zz, np.float32(0.16666667), np.float32(-0.16666667)), m["rest"]))
+    v = fma(z, straight, fma(skew, fma(zz, np.float32(0.16666667), np.float32(-0.16666667)), m["rest"]))
     return np.asarray(fma(even * each, each, v) + fma(dark, m["dark"], light))
 
 

@@ -1,5 +1,7 @@
 // Scenarios that are pinned, side by side, and what was simulated; the browser's tab keeps them.
 
+import {dashed} from "./pictures.js"
+
 const MOST = 8
 const KEY = "mauvecl-compare"
 const ROWS = [
@@ -16,9 +18,10 @@ function element(tag, text, more = {}) {
 }
 
 export class Compare {
-  // open(link): show a scenario again.
-  constructor(open) {
-    this.open = open
+  // pins: how pinned scenarios are drawn, by theme; open(link): show a scenario again; changed(): others are pinned.
+  constructor(pins, open, changed) {
+    Object.assign(this, {pins, open, changed})
+    window.addEventListener("mauvecl-theme", () => this.show())
     try {
       this.kept = JSON.parse(sessionStorage.getItem(KEY)) ?? {pinned: [], history: []}
     } catch {
@@ -32,6 +35,13 @@ export class Compare {
     this.keep()
   }
 
+  // Those that pictures show, by their slots: a scenario keeps its colour as long as it is pinned.
+  get drawn() {
+    const slots = this.pins.light.map((_, k) => this.kept.pinned.find(one => one.slot === k))
+    const others = this.kept.pinned.filter(one => !slots.includes(one))
+    return slots.map((one, slot) => one ?? (others.length ? Object.assign(others.shift(), {slot}) : undefined))
+  }
+
   ran(scenario) {
     this.kept.history = [scenario, ...this.kept.history.filter(one => one.link !== scenario.link)].slice(0, 20)
     this.keep()
@@ -42,6 +52,7 @@ export class Compare {
       sessionStorage.setItem(KEY, JSON.stringify(this.kept))
     } catch { /* not kept */ }
     this.show()
+    this.changed()
   }
 
   button(text, called, act) {
@@ -52,6 +63,7 @@ export class Compare {
 
   show() {
     const {pinned, history} = this.kept
+    const drawn = this.drawn, look = this.pins[document.documentElement.dataset.theme]
     const box = document.getElementById("pinned")
     if (pinned.length) {
       const table = element("table", null)
@@ -61,6 +73,11 @@ export class Compare {
         made.append(element("th", head, {scope: "row"}), ...cells)
         table.append(made)
       }
+      row("Drawn as", pinned.map(one => {
+        const slot = drawn.indexOf(one), cell = element("td", slot < 0 ? "not drawn" : `pinned ${slot + 1} `)
+        if (slot >= 0) cell.insertAdjacentHTML("beforeend", dashed(look[slot][0], look[slot][1].join(" ")))
+        return cell
+      }))
       row("Detected", pinned.map(one => {
         const cell = element("td", null)
         cell.append(element("strong", one.shown))

@@ -71,6 +71,8 @@
 if name == "realisations":
     count, _, tails = option.partition(" ")
     option = f"{int(count):,}" + (", sampled tails" if tails else "")
+elif name == "signal":
+    option = {"net": "the star (net)", "paper": "star and sky (paper)"}[option]
 %>${option}</%def>
 <a class="skip" href="#answer">To the answer</a>
 <header>
@@ -178,6 +180,9 @@ ${control(name)}
 % if any(p for p in tab.pictures if p.name in ("excess", "recorded", "telescope", "snr", "budget")):
 <label><input type="checkbox" data-marks="marks" checked> spectral lines</label>
 <label><input type="checkbox" data-marks="more marks"> H alpha</label>
+% endif
+% if any(p.pins for p in tab.pictures):
+<label data-beside hidden><input type="checkbox" data-marks="pins" checked> pinned scenarios</label>
 % endif
 </div>
 <div class="wide rows" tabindex="0" role="region" aria-label="Table of ${tab.title}" hidden></div>

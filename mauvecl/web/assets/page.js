@@ -30,7 +30,8 @@ class Page {
       this.changed(last, other)
     }, (field, file) => this.upload(field, file))
     this.pictures = new Pictures(words, given => this.enter(given), (name, blob) => this.give(name, blob))
-    this.compare = new Compare(link => { this.follow(link); this.changed(true, true) })
+    this.beside = new Map()
+    this.compare = new Compare(words.pins, link => { this.follow(link); this.changed(true, true) }, () => this.pinned())
     this.wire()
     this.follow(window.location.search)
     this.live = new Live(version => this.back(version), code => this.lost(code))
@@ -166,10 +167,31 @@ class Page {
   async draw(told) {
     this.card.rows(told.tab, told.rows)
     await this.pictures.put(told.pictures)
+    this.pinned()
     if (this.answer === null) return
     this.card.fresh(told.tab)
     clearTimeout(this.soon)
     if (DRAWN.has(told.tab) && !told.draws) this.soon = setTimeout(() => this.drawOne(), DRAW_MS)
+  }
+
+  // Pinned scenarios in the pictures of this tab; what they show is asked for once.
+  pinned() {
+    const name = this.seen.tab, tab = words.tabs[name]
+    const pins = this.compare.drawn
+    for (const box of document.querySelectorAll("[data-beside]")) box.hidden = !pins.some(Boolean)
+    if (!tab.pictures.some(picture => picture.pins)) return
+    for (const pin of pins.filter(Boolean)) {
+      const key = `${name} ${pin.link}`
+      if (this.beside.has(key) || !this.live?.open) continue
+      this.beside.set(key, {})
+      const n = this.live.ask("pinned", {link: pin.link, tab: name}, told => {
+        this.live.done(n)
+        this.beside.set(key, told.pins ?? {})
+        this.pinned()
+      })
+    }
+    const known = pins.map(pin => pin && {entered: pin.entered, columns: this.beside.get(`${name} ${pin.link}`) ?? {}})
+    this.pictures.pin(tab, known, this.fields.entered)
   }
 
   drawOne() {

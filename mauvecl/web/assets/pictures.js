@@ -13,14 +13,20 @@ function unpacked(column) {
   return [ndarray(values, {dtype: "float32", shape: column.shape.slice(1)})]
 }
 
+const line = (colour, dashes) => `<path d="M0 5h16" stroke="${colour}" stroke-width="2.5" stroke-dasharray="${dashes}"/>`
+const swatch = shape => `<svg aria-hidden="true" viewBox="0 0 16 10">${shape}</svg>`
+// How a line is drawn, small.
+export const dashed = (colour, dashes) => swatch(line(colour, dashes))
+
 class Picture {
-  constructor(pictures, {name, sets, logs}) {
-    Object.assign(this, {pictures, name, sets})
+  constructor(pictures, {name, sets, logs, pins, alike}) {
+    Object.assign(this, {pictures, name, sets, pins, alike})
     this.frame = byId(`figure-${name}`)
     this.logs = new Set(logs.filter(axis => axis !== axis.toLowerCase()).map(axis => axis.toLowerCase()))
     this.wanted = new Set([""])
     this.made = null
     this.drawn = null
+    this.pinned = []
     for (const box of this.frame.querySelectorAll("[data-log]")) {
       box.addEventListener("change", () => {
         this.logs[box.checked ? "add" : "delete"](box.dataset.log)
@@ -85,13 +91,25 @@ class Picture {
   }
 
   fill() {
-    for (const [name, columns] of Object.entries(this.drawn.sources)) {
-      const data = {}
-      for (const [column, values] of Object.entries(columns)) data[column] = unpacked(values)
-      this.models.get(name).data = data
+    for (const [name, columns] of Object.entries(this.drawn.sources)) this.columns(name, columns)
+    if (this.pins) {
+      const none = Object.fromEntries(Object.keys(this.drawn.sources[this.pins]).map(column => [column, []]))
+      for (const slot of this.pictures.slots.keys()) this.columns(`pin ${slot}`, this.pinned[slot] ?? none)
     }
     for (const [name, props] of Object.entries(this.drawn.props)) this.models.get(name).setv(props)
     this.some()
+  }
+
+  columns(name, columns) {
+    const data = {}
+    for (const [column, values] of Object.entries(columns)) data[column] = unpacked(values)
+    this.models.get(name).data = data
+  }
+
+  // Scenarios beside the question, by their slots: columns of each, or nothing.
+  pin(pinned) {
+    this.pinned = pinned
+    if (this.models && this.drawn) this.fill()
   }
 
   // What is asked for shows; so do the marks that all pictures share.
@@ -106,15 +124,16 @@ class Picture {
 
   legend(entries) {
     const svg = (colour, form) => {
+      if (/^\d/.test(form)) return dashed(colour, form)
       const shape = {
-        line: `<path d="M0 5h16" stroke="${colour}" stroke-width="2.5"/>`,
-        dash: `<path d="M0 5h16" stroke="${colour}" stroke-width="2" stroke-dasharray="4 3"/>`,
+        line: line(colour, "none"),
+        dash: line(colour, "4 3"),
         band: `<rect width="16" height="10" fill="${colour}" fill-opacity=".4"/>`,
         bars: `<rect width="16" height="10" fill="${colour}" fill-opacity=".5"/>`,
         bar: `<rect width="16" height="10" fill="${colour}"/>`,
         dot: `<circle cx="8" cy="5" r="4" fill="${colour}"/>`,
       }[form]
-      return `<svg aria-hidden="true" viewBox="0 0 16 10">${shape}</svg>`
+      return swatch(shape)
     }
     this.frame.querySelector(".legend").replaceChildren(...entries.map(([called, colour, form, show]) => {
       const item = document.createElement("li")
@@ -136,7 +155,8 @@ class Picture {
     }
     for (const item of this.frame.querySelectorAll(".legend li")) {
       const {shows, called} = item.dataset
-      item.hidden = empty.has(called) || (shows !== "" && shows !== "if any" && !this.wanted.has(shows))
+      const asked = shows === "" || shows === "if any" || this.wanted.has(shows) || this.pictures.marks.has(shows)
+      item.hidden = empty.has(called) || !asked
     }
   }
 
@@ -153,7 +173,8 @@ export class Pictures {
     this.version = words.version
     this.give = give
     this.set = set
-    this.marks = new Set(["marks"])
+    this.marks = new Set(["marks", "pins"])
+    this.slots = words.pins.light
     this.ranges = new Set()
     this.shown = null
     this.all = {}
@@ -174,6 +195,15 @@ export class Pictures {
 
   put(pictures) {
     return Promise.all(Object.entries(pictures).map(([name, drawn]) => this.all[name].put(drawn)))
+  }
+
+  // Scenarios beside the question, by their slots: what is entered in each, and columns for each picture.
+  pin(tab, pinned, entered) {
+    for (const {name, pins, alike} of tab.pictures) {
+      if (!pins) continue
+      const fits = one => one && alike.every(field => one.entered[field] === entered[field])
+      this.all[name].pin(pinned.map(one => fits(one) ? one.columns[name] : null))
+    }
   }
 
   // All pictures over wavelengths show the same ones.

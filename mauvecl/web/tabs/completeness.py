@@ -8,7 +8,7 @@ import numpy as np
 
 from mauvecl.web.closed import percent, short
 from mauvecl.web.figures import Canvas
-from mauvecl.web.tabs.tab import Drawn, Found, Picture, Tab
+from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -37,18 +37,18 @@ class Shares(Picture):
         canvas.rule("own", "amplitude of your question", "x", "own")
         return canvas
 
-    def drawn(self, closed: Closed, found: Found) -> Drawn:
+    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
         sources: dict[str, Any] = {}
         for k in range(len(COLOURS)):
             sources |= {f"band {k}": {"x": [], "low": [], "high": []}, f"line {k}": {"x": [], "y": []}}
         own = {"own": {"location": closed.question.amplitude_percent}}
-        if "completeness" not in found:
+        if "completeness" not in answers:
             text = (
                 "Nothing is injected yet: Inject flares puts flares of several lengths and sizes into a stare of one "
                 "orbit, and searches it at one false alarm a month."
             )
             return Drawn(text, sources, own)
-        table, parts = found["completeness"].completeness, []
+        table, parts = answers["completeness"].completeness, []
         for k, width in enumerate(np.unique(np.asarray(table["half_width"].value))):
             rows = table[np.asarray(table["half_width"].value) == width]
             x = 100 * np.asarray(rows["amplitude"], float)
@@ -74,13 +74,13 @@ class Completeness(Tab):
     simulations = {"completeness": "Inject flares"}  # noqa: RUF012
     files = {"completeness": "completeness", "limits": "completeness"}  # noqa: RUF012
 
-    def table(self, name: str, closed: Closed, found: Found) -> Table:
-        return found["completeness"].tables[name]
+    def table(self, name: str, closed: Closed, answers: Answers) -> Table:
+        return answers["completeness"].tables[name]
 
-    def rows(self, closed: Closed, found: Found) -> list[list[str]]:
-        if "completeness" not in found:
+    def rows(self, closed: Closed, answers: Answers) -> list[list[str]]:
+        if "completeness" not in answers:
             return []
-        table = found["completeness"].table
+        table = answers["completeness"].table
         rows = [["half-width of the flare", "half are found at", "90 % are found at"]]
         for row in table:
             width = float(getattr(row["half_width"], "value", row["half_width"]))
@@ -88,6 +88,6 @@ class Completeness(Tab):
             rows.append([called, *(f"{100 * float(row[name]):.3g} %" for name in ("e50", "e90"))])
         return rows
 
-    def study(self, name: str, closed: Closed, found: Found) -> Study:
-        study: Study = found["completeness"].study
+    def study(self, name: str, closed: Closed, answers: Answers) -> Study:
+        study: Study = answers["completeness"].study
         return study

@@ -9,7 +9,7 @@ import numpy as np
 from mauvecl.statistics.registry import label
 from mauvecl.web.closed import percent
 from mauvecl.web.figures import Canvas, strips
-from mauvecl.web.tabs.tab import Drawn, Found, Picture, Tab
+from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -21,6 +21,7 @@ class Excess(Picture):
     """Flare minus quiet in standard deviations of the noise."""
 
     name, title = "excess", "Flare minus quiet, in sigma of the noise"
+    pins = "element"
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         canvas = Canvas(ink, "wavelength (nm)", "sigma of the noise", logs, wavelength=True)
@@ -29,10 +30,11 @@ class Excess(Picture):
         canvas.dots("drawn", "drawn exposure", "drawn", size=5)
         canvas.line("pixel", "expected per pixel", "sky", line_width=1.2)
         told = canvas.line("element", "expected per element of 10.5 nm", "flare", step=True, line_width=2.2)
+        canvas.pinned(step=True)
         canvas.tooltips(told, ("wavelength (nm)", "x"), ("sigma per element", "y"))
         return canvas
 
-    def drawn(self, closed: Closed, found: Found) -> Drawn:
+    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
         x = closed.quiet
         pixel, element = closed.excess
         sources: dict[str, Any] = {
@@ -42,8 +44,8 @@ class Excess(Picture):
             "drawn": {"x": [], "y": []},
             "saturated": strips(x.wavelength_nm, x.saturated | closed.flare.saturated),
         }
-        if "draw" in found:
-            raw = np.where(x.saturated, 0.0, found["draw"] - x.recorded_dn)
+        if "draw" in answers:
+            raw = np.where(x.saturated, 0.0, answers["draw"] - x.recorded_dn)
             noise = np.sqrt(x.per_element(np.where(x.saturated, 0.0, x.variance_dn2)))
             shown = np.divide(x.per_element(raw), noise, out=np.full(noise.size, np.nan), where=noise > 0)
             sources["drawn"] = {"x": x.element_wavelength_nm, "y": shown}
@@ -62,6 +64,7 @@ class Distributions(Picture):
 
     name, title = "distributions", "The statistic without and with the flare"
     logs = ("y",)
+    pins, alike = "flare", ("statistic",)
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         how = {"y_range": (1e-4, 1.5)} if "y" in logs else {"y_range": (0, 1.06)}
@@ -79,11 +82,12 @@ class Distributions(Picture):
             canvas.legend.pop()
             told = canvas.line(name, called, colour, line_width=2)
             canvas.tooltips(told, ("statistic", "x"), ("density", "y"))
+        canvas.pinned()
         canvas.rule("threshold", "threshold", "x")
         return canvas
 
-    def drawn(self, closed: Closed, found: Found) -> Drawn:
-        q, cut, chance = closed.question, closed.cut, closed.chance
+    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
+        q, cut, chance = closed.question, closed.odds.threshold, closed.chance
         sources: dict[str, Any] = {}
         for name, form in (("null", closed.null), ("flare", closed.seen)):
             edges = np.linspace(form.mean - 5 * form.std, form.mean + 5 * form.std, 161)
@@ -95,13 +99,13 @@ class Distributions(Picture):
             sources[f"{name} area"] = {"x": middle, "low": np.full(middle.size, 1e-9), "high": density}
         empty: dict[str, Any] = {"left": [], "right": [], "top": []}
         sources |= {"null bars": empty, "flare bars": empty}
-        if "detection" in found:
-            (star,) = found["detection"].stars
+        if "detection" in answers:
+            (star,) = answers["detection"].stars
             for name, flare in (("null bars", None), ("flare bars", 0)):
-                edges, counts = star.found.histogram(q.statistic, flare, bins=80)
+                edges, counts = star.detection.histogram(q.statistic, flare, bins=80)
                 sources[name] = {"left": edges[:-1], "right": edges[1:], "top": counts / max(counts.max(), 1)}
-            cut = star.found.threshold(q.fap, q.statistic).value
-            (row,) = (row for row in found["detection"].table if row["statistic"] == q.statistic)
+            cut = star.detection.threshold(q.fap, q.statistic).value
+            (row,) = (row for row in answers["detection"].table if row["statistic"] == q.statistic)
             chance = float(row["probability"])
         text = (
             f"Without a flare {q.statistic} lies at {closed.null.mean:.4g} ± {closed.null.std:.3g}, with it at "
@@ -116,6 +120,7 @@ class Trade(Picture):
 
     name, title = "roc", "Receiver operating characteristic"
     sets = "fap=x"
+    pins = "closed form"
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         canvas = Canvas(
@@ -124,11 +129,12 @@ class Trade(Picture):
         )  # fmt: skip
         canvas.band("simulated", "simulated, 95 %", "drawn", alpha=0.4)
         told = canvas.line("closed form", "closed form", "flare", line_width=2)
+        canvas.pinned()
         canvas.own_point()
         canvas.tooltips(told, ("false-alarm probability", "x"), ("detection probability", "y"))
         return canvas
 
-    def drawn(self, closed: Closed, found: Found) -> Drawn:
+    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
         q = closed.question
         faps = np.logspace(-6, 0, 121)[:-1]
         chances = closed.seen.sf(closed.null.isf(faps))
@@ -137,8 +143,8 @@ class Trade(Picture):
             "own": {"x": [q.fap], "y": [closed.chance]},
             "simulated": {"x": [], "low": [], "high": []},
         }
-        if "detection" in found:
-            curve = found["detection"].stars[0].found.roc(q.statistic).table()
+        if "detection" in answers:
+            curve = answers["detection"].stars[0].detection.roc(q.statistic).table()
             seen = np.asarray(curve["fap"], float) > 0
             columns = {"x": "fap", "low": "probability_low", "high": "probability_high"}
             sources["simulated"] = {to: np.asarray(curve[name], float)[seen] for to, name in columns.items()}
@@ -160,12 +166,12 @@ class Detection(Tab):
     simulations = {"detection": "Simulate"}  # noqa: RUF012
     files = {"detection": "detection", "roc": "detection"}  # noqa: RUF012
 
-    def table(self, name: str, closed: Closed, found: Found) -> Table:
-        answer = found["detection"]
+    def table(self, name: str, closed: Closed, answers: Answers) -> Table:
+        answer = answers["detection"]
         return answer.table if name == "detection" else answer.roc
 
-    def rows(self, closed: Closed, found: Found) -> list[list[str]]:
-        if "detection" not in found:
+    def rows(self, closed: Closed, answers: Answers) -> list[list[str]]:
+        if "detection" not in answers:
             return []
         heads = ["statistic", "mean with flare", "threshold", "detected", "95 % interval", "closed form"]
         return [heads] + [
@@ -173,5 +179,5 @@ class Detection(Tab):
                 str(row["statistic"]), f"{row['mean']:.5g}", f"{row['threshold']:.5g}", percent(row["probability"]),
                 f"{percent(row['low'])} to {percent(row['high'])}", percent(row["closed_form_probability"]),
             ]
-            for row in found["detection"].table
+            for row in answers["detection"].table
         ]  # fmt: skip

@@ -7,16 +7,17 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy import special
+from scipy.interpolate import PchipInterpolator
 
-from mauvecl.statistics.registry import STATISTICS
-from mauvecl.statistics.statistic import LinearStatistic
 from mauvecl.web.closed import percent
 from mauvecl.web.figures import Canvas
-from mauvecl.web.tabs.tab import Drawn, Found, Picture, Tab
+from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
+    from mauvecl.statistics.statistic import Odds
     from mauvecl.study.study import Study
     from mauvecl.web.closed import Closed
 
@@ -24,14 +25,17 @@ Float = NDArray[np.float64]
 
 #: Ends of the pictures: magnitudes, and amplitudes in per cent; they stay, whatever is asked.
 MAGNITUDES, PERCENTS = (2.0, 14.0), (0.1, 100.0)
-#: Columns and rows of a map in closed form where the statistic is a weighted sum, and where it is not.
-STEPS = {True: (33, 19), False: (13, 7)}
-LEVELS = (0.1, 0.5, 0.9)
+#: Columns and rows of a map in closed form; between them what varies evenly is interpolated.
+STEPS = 9, 5
+#: A curve begins with so many points; distances are halved so many times where it changes by more than this.
+FIRST, HALVINGS, CHANGE = 9, 5, 0.25
+#: Standard deviations beside the threshold beyond which all is seen, or nothing.
+FARTHEST = 6.0
 
 
-def chances(closed: Closed, magnitudes: Float, rises: Float) -> Float:
-    """`Closed.chances` at magnitudes, shape (n_rise, n_magnitude)."""
-    return closed.chances(10 ** (-0.4 * (magnitudes - closed.question.magnitude)), rises)
+def odds(closed: Closed, magnitude: float, rises: Float) -> list[Odds]:
+    """`Closed.at` a magnitude."""
+    return closed.at(10 ** (-0.4 * (magnitude - closed.question.magnitude)), rises)
 
 
 def _key(closed: Closed) -> tuple[Any, ...]:
@@ -45,10 +49,10 @@ def _key(closed: Closed) -> tuple[Any, ...]:
 
 
 class _Kept:
-    """A question that is known by what its map depends on."""
+    """A question that is known by what its map, or its curve, depends on."""
 
-    def __init__(self, closed: Closed) -> None:
-        self.closed, self.key = closed, _key(closed)
+    def __init__(self, closed: Closed, *more: float) -> None:
+        self.closed, self.key = closed, (*_key(closed), *more)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Kept) and self.key == other.key
@@ -57,13 +61,56 @@ class _Kept:
         return hash(self.key)
 
 
+def probits(p: Float) -> Float:
+    """Probabilities as places on a normal's axis, where they are smooth; those that round to 0 or 1 at its ends."""
+    return np.asarray(special.ndtri(np.clip(p, 1e-15, 1 - 1e-15)))
+
+
+def probit(p: Any) -> Float:
+    """A probability's place on a normal's axis; those that round to 0 or 1 are at its ends."""
+    return np.asarray(special.ndtri(np.clip(p, 1e-15, 1 - 1e-15)))
+
+
+@lru_cache(maxsize=32)
+def _curve(kept: _Kept) -> tuple[Float, Float]:
+    """Magnitudes and probabilities, computed at more of them where they change."""
+
+    def exact(magnitudes: Float) -> list[float]:
+        each = (odds(kept.closed, magnitude, np.ones(1)) for magnitude in magnitudes)
+        return [one[0].probability if one else 0.0 for one in each]
+
+    x = np.linspace(*MAGNITUDES, FIRST)
+    y = np.array(exact(x))
+    for _ in range(HALVINGS):
+        steep = np.nonzero(np.abs(np.diff(y)) > CHANGE)[0]
+        new = (x[steep] + x[steep + 1]) / 2
+        x, y = np.insert(x, steep + 1, new), np.insert(y, steep + 1, exact(new))
+    fine = np.linspace(*MAGNITUDES, 241)
+    return fine, np.asarray(special.ndtr(PchipInterpolator(x, probit(y))(fine)))
+
+
 @lru_cache(maxsize=32)
 def _map(kept: _Kept) -> tuple[Float, Float, Float]:
-    """Magnitudes, amplitudes in per cent, and probabilities."""
-    closed = kept.closed
-    columns, rows = STEPS[isinstance(STATISTICS[closed.question.statistic], LinearStatistic)]
-    x, y = np.linspace(*MAGNITUDES, columns), np.geomspace(*PERCENTS, rows)
-    return x, y, chances(closed, x, y / closed.question.amplitude_percent)
+    """Magnitudes, logarithms of amplitudes in per cent, and probabilities.
+
+    Interpolated are the logarithm of the flare's part of the statistic, and the threshold, both in standard deviations;
+    and what the probit of the probability has beside their difference.
+    """
+    (columns, rows), (low, high) = STEPS, np.log10(PERCENTS)
+    x, y = np.linspace(*MAGNITUDES, columns), np.linspace(low, high, rows)
+    known = np.full((3, rows, columns), np.nan)
+    for i, magnitude in enumerate(x):
+        for j, one in enumerate(odds(kept.closed, magnitude, 10**y / kept.closed.question.amplitude_percent)):
+            part, cut = one.seen.mean - one.null.mean, one.threshold - one.null.mean
+            known[:2, j, i] = np.log(max(part, 1e-9 * cut) / one.seen.std), cut / one.seen.std
+            off = (part - cut) / one.seen.std
+            if abs(off) < FARTHEST:
+                known[2, j, i] = probit(one.probability) - off
+    # A saturated star shows nothing, and far from the threshold the rest does not matter.
+    known = np.where(np.isnan(known), np.array([-30.0, 0.0, 0.0])[:, None, None], known)
+    fine = np.linspace(*MAGNITUDES, 97), np.linspace(low, high, 61)
+    part, cut, rest = PchipInterpolator(y, PchipInterpolator(x, known, axis=2)(fine[0]), axis=1)(fine[1])
+    return *fine, np.asarray(special.ndtr(np.exp(part) - cut + rest))
 
 
 class Curve(Picture):
@@ -71,25 +118,26 @@ class Curve(Picture):
 
     name, title = "limit", "How faint a star: this flare is detected"
     sets = "magnitude=x"
+    pins, alike = "closed form", ("band",)
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         canvas = Canvas(ink, "magnitude", "detection probability", logs, x_range=MAGNITUDES, y_range=(-0.03, 1.05))
         told = canvas.line("closed form", "closed form", "flare", line_width=2)
         canvas.rule("power", "wanted: 90 %", "y")
         canvas.dots("simulated", "simulated", "drawn", size=8)
+        canvas.pinned()
         canvas.own_point()
         canvas.tooltips(told, ("magnitude", "x"), ("detected", "y"))
         return canvas
 
-    def drawn(self, closed: Closed, found: Found) -> Drawn:
+    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
         q, power = closed.question, closed.study.limit.power
         empty: dict[str, Any] = {"x": [], "y": []}
         sources: dict[str, Any] = {"closed form": empty, "simulated": empty}
         sources["own"] = {"x": [q.magnitude], "y": [closed.chance]}
         text = f"The closed form of {q.statistic} takes too long for a curve: simulate it."
         if not closed.slow:
-            x = np.linspace(*MAGNITUDES, 2 * STEPS[isinstance(STATISTICS[q.statistic], LinearStatistic)][0] - 1)
-            y = chances(closed, x, np.ones(1))[0]
+            x, y = _curve(_Kept(closed, q.amplitude_percent))
             sources["closed form"] = {"x": x, "y": y}
             seen = np.nonzero(y >= power)[0]
             last = int(seen[-1]) if seen.size else -1
@@ -101,8 +149,8 @@ class Curve(Picture):
             else:
                 part = (y[last] - power) / (y[last] - y[last + 1])
                 text += f"to {q.band} = {x[last] + part * (x[last + 1] - x[last]):.2f}, in closed form."
-        if "limit" in found:
-            limits = [one for one in found["limit"].limits if one.statistic == q.statistic]
+        if "limit" in answers:
+            limits = [one for one in answers["limit"].limits if one.statistic == q.statistic]
             points = [(p.value, p.probability.value) for one in limits for p in (*one.points, one.check)]
             sources["simulated"] = dict(zip(("x", "y"), np.array(points).T, strict=True))
             text += "".join(
@@ -117,6 +165,7 @@ class Map(Picture):
 
     name, title = "map", "How faint a star, how small a flare"
     sets = "magnitude=x,amplitude_percent=10^y"
+    pins, alike = "half", ("band",)
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         from bokeh.models import FixedTicker, LinearColorMapper
@@ -128,15 +177,15 @@ class Map(Picture):
         mapper = LinearColorMapper(palette="Cividis256", low=0, high=1)
         plot.image("image", "x", "y", "dw", "dh", source=canvas.source("map", "image", "x", "y", "dw", "dh"),
                    color_mapper=mapper)  # fmt: skip
-        lines = plot.multi_line(
-            "xs", "ys", source=canvas.source("contours", "xs", "ys"), line_color="#ffffff", line_width=1.4
-        )
-        lines.name = "contours"
+        for name, width in (("contours", 1.2), ("half", 2.2)):
+            source = canvas.source(name, "xs", "ys")
+            plot.multi_line("xs", "ys", source=source, line_color="#ffffff", line_width=width).name = name
         cells = plot.scatter(
             "x", "y", source=canvas.source("simulated", "x", "y", "p"), size=10, marker="square",
             fill_color={"field": "p", "transform": mapper}, line_color="#ffffff",
         )  # fmt: skip
         cells.name = "simulated"
+        canvas.pinned("xs", "ys")
         canvas.own_point()
         plot.yaxis.ticker = FixedTicker(ticks=[-1, 0, 1, 2])
         plot.yaxis.major_label_overrides = {-1: "0.1 %", 0: "1 %", 1: "10 %", 2: "100 %"}
@@ -148,29 +197,34 @@ class Map(Picture):
             ),
             "right",
         )  # fmt: skip
-        canvas.legend += [("10, 50 and 90 % in closed form", "#b8c0c8", "line", ""),
+        canvas.legend += [("10, 50 (bold) and 90 % in closed form", "#b8c0c8", "line", ""),
                           ("simulated", "#8a8678", "dot", "if any")]  # fmt: skip
         return canvas
 
-    def drawn(self, closed: Closed, found: Found) -> Drawn:
+    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
         q = closed.question
         sources: dict[str, Any] = {
             "own": {"x": [q.magnitude], "y": [np.log10(q.amplitude_percent)]},
             "simulated": {"x": [], "y": [], "p": []},
             "map": {"image": [], "x": [], "y": [], "dw": [], "dh": []},
             "contours": {"xs": [], "ys": []},
+            "half": {"xs": [], "ys": []},
         }
         text = f"The closed form of {q.statistic} takes too long for a map: simulate it."
         if not closed.slow:
             x, y, p = _map(_Kept(closed))
-            sources |= {"map": _image(x, np.log10(y), p), "contours": _contours(x, np.log10(y), p)}
+            sources |= {
+                "map": _image(x, y, p),
+                "contours": _contours(x, y, p, 0.1, 0.9),
+                "half": _contours(x, y, p, 0.5),
+            }
             share = 100 * float(np.mean(p >= 0.5))
             text = (
                 f"At least half of the flares are detected in {share:.0f} % of the map, which spans {q.band} = "
                 f"{MAGNITUDES[0]:g} to {MAGNITUDES[1]:g} and amplitudes of {PERCENTS[0]:g} to {PERCENTS[1]:g} %."
             )
-        if "map" in found:
-            got = found["map"]
+        if "map" in answers:
+            got = answers["map"]
             at_x, at_y = np.meshgrid(np.array(got.x, float), np.log10(100 * np.array(got.y, float)))
             sources["simulated"] = {"x": at_x.ravel(), "y": at_y.ravel(), "p": got.probability[0].ravel()}
             text += f" {at_x.size} cells are simulated."
@@ -178,23 +232,18 @@ class Map(Picture):
 
 
 def _image(x: Float, y: Float, p: Float) -> dict[str, Any]:
-    """Cells around the points at which probabilities are known, finer by straight lines between."""
-    from scipy.interpolate import RegularGridInterpolator
-
-    fine_x, fine_y = np.linspace(x[0], x[-1], 97), np.linspace(y[0], y[-1], 61)
-    between = RegularGridInterpolator((y, x), p)
-    shown = between(tuple(np.meshgrid(fine_y, fine_x, indexing="ij")))
-    half_x, half_y = 0.5 * (fine_x[1] - fine_x[0]), 0.5 * (fine_y[1] - fine_y[0])
+    """Cells around the points at which probabilities are known."""
+    half_x, half_y = 0.5 * (x[1] - x[0]), 0.5 * (y[1] - y[0])
     return {
-        "image": [shown], "x": [x[0] - half_x], "y": [y[0] - half_y], "dw": [x[-1] - x[0] + 2 * half_x],
+        "image": [p], "x": [x[0] - half_x], "y": [y[0] - half_y], "dw": [x[-1] - x[0] + 2 * half_x],
         "dh": [y[-1] - y[0] + 2 * half_y],
     }  # fmt: skip
 
 
-def _contours(x: Float, y: Float, p: Float) -> dict[str, Any]:
+def _contours(x: Float, y: Float, p: Float, *levels: float) -> dict[str, Any]:
     from contourpy import contour_generator
 
-    lines: list[Any] = [line for level in LEVELS for line in contour_generator(x, y, p).lines(level)]
+    lines: list[Any] = [line for level in levels for line in contour_generator(x, y, p).lines(level)]
     return {"xs": [line[:, 0].tolist() for line in lines], "ys": [line[:, 1].tolist() for line in lines]}
 
 
@@ -207,11 +256,11 @@ class Limit(Tab):
     simulations = {"limit": "Simulate the limit", "map": "Simulate the map"}  # noqa: RUF012
     files = {"limit": "limit", "map": "map"}  # noqa: RUF012
 
-    def table(self, name: str, closed: Closed, found: Found) -> Table:
-        return found[name].table
+    def table(self, name: str, closed: Closed, answers: Answers) -> Table:
+        return answers[name].table
 
-    def rows(self, closed: Closed, found: Found) -> list[list[str]]:
-        if "limit" not in found:
+    def rows(self, closed: Closed, answers: Answers) -> list[list[str]]:
+        if "limit" not in answers:
             return []
         heads = ["statistic", "limiting magnitude", "95 % interval", "closed form", "simulated again there"]
         return [heads] + [
@@ -219,9 +268,9 @@ class Limit(Tab):
                 one.statistic, f"{one.value.value:.3f}", f"{one.value.low:.3f} to {one.value.high:.3f}",
                 f"{one.closed_form:.3f}", percent(one.check.probability.value),
             ]
-            for one in found["limit"].limits
+            for one in answers["limit"].limits
         ]  # fmt: skip
 
-    def study(self, name: str, closed: Closed, found: Found) -> Study:
-        study: Study = found[name].study
+    def study(self, name: str, closed: Closed, answers: Answers) -> Study:
+        study: Study = answers[name].study
         return study

@@ -8,7 +8,7 @@ import numpy as np
 
 from mauvecl.study.labels import label, stacked
 from mauvecl.web.figures import Canvas
-from mauvecl.web.tabs.tab import Drawn, Found, Picture, Tab
+from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -30,6 +30,7 @@ class Budget(Picture):
 
     name, title = "budget", "Noise of a pixel by origin"
     logs = ("Y",)
+    pins = "total"
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         canvas = Canvas(ink, "wavelength (nm)", "DN rms in the exposure", logs, wavelength=True)
@@ -39,9 +40,10 @@ class Budget(Picture):
             told = canvas.line(name, called, colour, line_width=2, **how)
             lines = (("wavelength (nm)", "x"),) if name == "total" else ()
             canvas.tooltips(told, *lines, (f"{called} (DN)", "y"))
+        canvas.pinned()
         return canvas
 
-    def drawn(self, closed: Closed, found: Found) -> Drawn:
+    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
         x, table = closed.quiet, closed.quiet.noise_budget()
         values = {name: np.asarray(table[name].value) for name in PARTS}
         # Logarithms show nothing of zero.
@@ -63,7 +65,7 @@ class Noise(Tab):
     pictures = (Budget(),)
     files = {"noise-budget": None}  # noqa: RUF012
 
-    def table(self, name: str, closed: Closed, found: Found) -> Table:
+    def table(self, name: str, closed: Closed, answers: Answers) -> Table:
         """As `mauvecl snr` writes it; nothing of it is drawn."""
         study = closed.study
         parts = [({"star": label(study.star[0], closed.quiet)}, closed.quiet.noise_budget())]

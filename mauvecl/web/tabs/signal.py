@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.web.figures import Canvas, strips
-from mauvecl.web.tabs.tab import Drawn, Found, Picture, Tab
+from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -20,6 +20,7 @@ class SignalToNoise(Picture):
 
     name, title = "snr", "Signal to noise without a flare"
     logs = ("y",)
+    pins = "element"
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         canvas = Canvas(ink, "wavelength (nm)", "S/N", logs, wavelength=True)
@@ -27,11 +28,12 @@ class SignalToNoise(Picture):
         canvas.saturated()
         pixel = canvas.line("pixel", "per pixel", "sky")
         element = canvas.line("element", "per element of 10.5 nm", "star", line_width=2)
+        canvas.pinned()
         canvas.tooltips(element, ("wavelength (nm)", "x"), ("S/N per element", "y"))
         canvas.tooltips(pixel, ("S/N per pixel", "y"))
         return canvas
 
-    def drawn(self, closed: Closed, found: Found) -> Drawn:
+    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
         x = closed.quiet
         pixel, element = x.snr(), x.snr_per_element()
         sources: dict[str, Any] = {
@@ -40,8 +42,8 @@ class SignalToNoise(Picture):
             "spread": {"x": [], "low": [], "high": []},
             "saturated": strips(x.wavelength_nm, x.saturated),
         }
-        if "snr" in found:
-            table = found["snr"].element
+        if "snr" in answers:
+            table = answers["snr"].element
             wavelength = table["wavelength"].to_value("nm")
             sources["spread"] = {"x": wavelength, "low": np.asarray(table["q2.5"]), "high": np.asarray(table["q97.5"])}
         best = int(np.argmax(element))
@@ -61,5 +63,5 @@ class Signal(Tab):
     simulations = {"detection": "Simulate"}  # noqa: RUF012
     files = {"snr": "detection"}  # noqa: RUF012
 
-    def table(self, name: str, closed: Closed, found: Found) -> Table:
-        return found["snr"].element
+    def table(self, name: str, closed: Closed, answers: Answers) -> Table:
+        return answers["snr"].element

@@ -8,7 +8,7 @@ import numpy as np
 
 from mauvecl.web.closed import short
 from mauvecl.web.figures import Canvas, strips
-from mauvecl.web.tabs.tab import Drawn, Found, Picture, Tab
+from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -21,6 +21,7 @@ class Recorded(Picture):
 
     name, title = "recorded", "One exposure, less bias and dark"
     logs = ("y",)
+    pins = "flare"
     shows = {"pedestals": "Bias and dark"}  # noqa: RUF012
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
@@ -33,11 +34,12 @@ class Recorded(Picture):
         canvas.line("bias", "bias", "bias", show="pedestals")
         told = canvas.line("star", "star", "star", line_width=2)
         flare = canvas.line("flare", "star with flare", "flare", line_width=2)
+        canvas.pinned()
         canvas.tooltips(told, ("wavelength (nm)", "x"), ("star (DN)", "y"))
         canvas.tooltips(flare, ("with flare (DN)", "y"))
         return canvas
 
-    def drawn(self, closed: Closed, found: Found) -> Drawn:
+    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
         x, y = closed.quiet, closed.flare
         w, gain = x.wavelength_nm, x.n_frames * x.gain_dn_per_electron
         sky, spread = gain * x.sky_electrons, 1.96 * np.sqrt(y.variance_dn2)
@@ -51,7 +53,7 @@ class Recorded(Picture):
             "dark": {"x": w, "y": x.n_frames * x.dark_dn},
             "bias": {"x": w, "y": x.n_frames * x.bias_dn},
             "spread": {"x": w, "low": recorded - spread, "high": recorded + spread},
-            "drawn": {"x": w, "y": found["draw"] - pedestal} if "draw" in found else {"x": [], "y": []},
+            "drawn": {"x": w, "y": answers["draw"] - pedestal} if "draw" in answers else {"x": [], "y": []},
             "saturated": strips(w, x.saturated | y.saturated),
         }
         peak = int(np.argmax(flare))
@@ -67,16 +69,18 @@ class Telescope(Picture):
 
     name, title = "telescope", "Spectrum at the telescope"
     logs = ("Y",)
+    pins = "flare"
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         canvas = Canvas(ink, "wavelength (nm)", "flux (erg / s / cm² / Å)", logs, wavelength=True)
         flare = canvas.line("flare", "star with flare", "flare")
         star = canvas.line("star", "star", "star")
+        canvas.pinned()
         canvas.tooltips(star, ("wavelength (nm)", "x"), ("star", "y"))
         canvas.tooltips(flare, ("with flare", "y"))
         return canvas
 
-    def drawn(self, closed: Closed, found: Found) -> Drawn:
+    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
         star, flare = closed.light
         shown = (star.wavelength_nm >= 190) & (star.wavelength_nm <= 710)
         w = star.wavelength_nm[shown]
@@ -95,8 +99,8 @@ class Spectrum(Tab):
     pictures = (Recorded(), Telescope())
     files = {"observation": None}  # noqa: RUF012
 
-    def table(self, name: str, closed: Closed, found: Found) -> Table:
+    def table(self, name: str, closed: Closed, answers: Answers) -> Table:
         """One observation with the flare, taken apart."""
-        from mauvecl.answers.simulate import simulate
+        from mauvecl.answers.signal.simulate import simulate
 
         return simulate(closed.study, flaring=True).observations[1][2]

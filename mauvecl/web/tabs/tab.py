@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from mauvecl.web.closed import Closed
 
 #: Answers that are simulated, by name: of one question.
-Found = Mapping[str, Any]
+Answers = Mapping[str, Any]
 
 
 @dataclass
@@ -51,6 +51,10 @@ class Picture(ABC):
         Parts that are hidden until asked for, by tag of their models, with what they are called.
     sets : str
         Fields that a click on the picture sets, with the axis that gives each, as in "magnitude=x".
+    pins : str
+        The source whose columns are shown of pinned scenarios, too; none where they are not.
+    alike : tuple of str
+        Fields that a scenario must have in common with the question to be shown beside it.
     """
 
     name: ClassVar[str]
@@ -58,13 +62,15 @@ class Picture(ABC):
     logs: ClassVar[tuple[str, ...]] = ()
     shows: ClassVar[Mapping[str, str]] = {}
     sets: ClassVar[str] = ""
+    pins: ClassVar[str] = ""
+    alike: ClassVar[tuple[str, ...]] = ()
 
     @abstractmethod
     def figure(self, ink: Any, logs: frozenset[str]) -> Any:
         """An empty Bokeh figure in a theme's colours, with these axes logarithmic."""
 
     @abstractmethod
-    def drawn(self, closed: Closed, found: Found) -> Drawn:
+    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
         """Its data."""
 
 
@@ -89,14 +95,14 @@ class Tab(ABC):
     #: Tables that can be taken along, with the simulation that each needs, or none.
     files: ClassVar[Mapping[str, str | None]] = {}
 
-    def table(self, name: str, closed: Closed, found: Found) -> Table:
+    def table(self, name: str, closed: Closed, answers: Answers) -> Table:
         """One of `files`."""
         raise NotImplementedError
 
-    def rows(self, closed: Closed, found: Found) -> list[list[str]]:
+    def rows(self, closed: Closed, answers: Answers) -> list[list[str]]:
         """A small table as text, its first row the heads; none where there is nothing to tell."""
         return []
 
-    def study(self, name: str, closed: Closed, found: Found) -> Study:
+    def study(self, name: str, closed: Closed, answers: Answers) -> Study:
         """The study that gives one of `files` again."""
         return closed.study

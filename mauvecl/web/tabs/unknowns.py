@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from scipy import special
 
-from mauvecl.answers.unknown_cost import unknown_cost
+from mauvecl.answers.detection.unknown_cost import spoken, unknown_cost
 from mauvecl.noise.usual import USUAL
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.web.closed import percent
 from mauvecl.web.figures import Canvas
-from mauvecl.web.tabs.tab import Drawn, Found, Picture, Tab
+from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
 
 if TYPE_CHECKING:
     from mauvecl.web.closed import Closed
@@ -25,11 +25,9 @@ Row = tuple[str, float, float]
 @lru_cache(maxsize=4)
 def costs(closed: Closed) -> tuple[float, list[Row]]:
     """The matched S/N of the flare with everything known, and with each unknown alone and together."""
-    choices = {f"{u.nuisance} ({u.marginalised.partition(':')[0]})": {u.nuisance: _spread(u.sd)} for u in USUAL}
-    chosen = {name: NuisanceChoice.model_validate(given) for name, given in choices.items()}
+    alone = [NuisanceChoice.model_validate({u.nuisance: _spread(u.sd)}) for u in USUAL] + [NuisanceChoice(tilt="free")]
+    chosen = {spoken(choice).removeprefix("the "): choice for choice in alone}
     chosen["all the usual together"] = NuisanceChoice(usual=True)
-    tilt = NuisanceChoice(tilt="free")
-    chosen["colour of the response (free)"] = tilt
     if closed.study.nuisances.own:
         chosen["your own spectrum"] = NuisanceChoice(own=closed.study.nuisances.own)
     rows, known = list[Row](), 0.0
@@ -71,7 +69,7 @@ class Cost(Picture):
         plot.x_range.start = 0
         return canvas
 
-    def drawn(self, closed: Closed, found: Found) -> Drawn:
+    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
         known, rows = costs(closed)
         names = [name for name, *_ in rows][::-1]
         columns: dict[str, Any] = {"name": names}
@@ -95,7 +93,7 @@ class Unknown(Tab):
     )
     pictures = (Cost(),)
 
-    def rows(self, closed: Closed, found: Found) -> list[list[str]]:
+    def rows(self, closed: Closed, answers: Answers) -> list[list[str]]:
         known, rows = costs(closed)
         fap = closed.question.fap
         heads = ["unknown", "S/N, not looked for", "S/N, marginalised", "then detected"]

@@ -8,7 +8,7 @@ import numpy as np
 
 from mauvecl.web.closed import short
 from mauvecl.web.figures import Canvas
-from mauvecl.web.tabs.tab import Drawn, Found, Picture, Tab
+from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -28,16 +28,16 @@ class Hours(Picture):
         canvas.tooltips(told, ("day", "x"), ("hours", "y"))
         return canvas
 
-    def drawn(self, closed: Closed, found: Found) -> Drawn:
+    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
         orbit = closed.study.orbit
         sources: dict[str, Any] = {"area": {"x": [], "low": [], "high": []}, "hours": {"x": [], "y": []}}
-        if "visible" not in found:
+        if "visible" not in answers:
             named = ", ".join(orbit.targets)
             if named:
                 return Drawn(f"When {named} is seen is not looked up yet: press Find when.", sources)
             text = "No target is named yet. Name one under Advanced, Visibility, such as eps Eri, and press Find when."
             return Drawn(text, sources)
-        table = found["seen"]["by_day"]
+        table = answers["seen"]["by_day"]
         hours = np.asarray(table["hours"].to_value("h"))
         day = np.arange(hours.size)
         sources = {
@@ -63,12 +63,12 @@ class Visibility(Tab):
     simulations = {"visible": "Find when"}  # noqa: RUF012
     files = {"visible": "visible", "months": "visible", "days": "visible"}  # noqa: RUF012
 
-    def table(self, name: str, closed: Closed, found: Found) -> Table:
-        return found["seen"][{"visible": "table", "months": "months", "days": "by_day"}[name]]
+    def table(self, name: str, closed: Closed, answers: Answers) -> Table:
+        return answers["seen"][{"visible": "table", "months": "months", "days": "by_day"}[name]]
 
-    def rows(self, closed: Closed, found: Found) -> list[list[str]]:
-        if "visible" not in found:
+    def rows(self, closed: Closed, answers: Answers) -> list[list[str]]:
+        if "visible" not in answers:
             return []
-        table = found["seen"]["months"]
+        table = answers["seen"]["months"]
         (target,) = (name for name in table.colnames if name != "month")
         return [["month", *map(str, table["month"])], ["hours", *(f"{h:.0f}" for h in table[target].to_value("h"))]]

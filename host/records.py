@@ -1,0 +1,82 @@
+"""Records that pydantic validates: whatever is wrong with a value ends in one sentence."""
+
+from __future__ import annotations
+
+import difflib
+from typing import TYPE_CHECKING, Any, cast, get_args
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from .errors import InputError
+from .files.bounded import shortened
+from .files.parsed import shown
+
+if TYPE_CHECKING:
+    from pydantic._internal._model_construction import ModelMetaclass
+else:
+    ModelMetaclass = type(BaseModel)
+
+
+class _Told(ModelMetaclass):
+    """Validation inside another record goes past `__call__`, so that the outer one names the whole place."""
+
+    def __call__(cls, *args: Any, **values: Any) -> Any:  # noqa: N805
+        try:
+            return super().__call__(*args, **values)
+        except ValidationError as error:
+            raise InputError(f"{cls.__name__}: {sentence(cast(type[BaseModel], cls), error)}") from None
+
+
+class Record(BaseModel, metaclass=_Told):
+    """Frozen, and strict about its keys."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        try:
+            super().__setattr__(name, value)
+        except ValidationError:
+            raise InputError(
+                f"{type(self).__name__}.{name} is not set in place, expected a changed copy: with_, with_settings, at"
+            ) from None
+
+
+def sentence(model: type[BaseModel], error: ValidationError) -> str:
+    """The first fault as: key = value, what was expected."""
+    first = error.errors()[0]
+    path = [str(part) for part in first["loc"]]
+    key = ".".join(path) or model.__name__.lower()
+    if first["type"] == "extra_forbidden":
+        fields = list(_fields(model, path[:-1]))
+        near = difflib.get_close_matches(path[-1], fields, n=1)
+        expected = f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(fields)}"
+        return f"unknown key {shortened(key)}, {expected}"
+    if first["type"] == "missing":
+        return f"{key!r} is missing, expected a value"
+    if first["type"] == "value_error":
+        told = str(first["ctx"]["error"])
+        field = _fields(model, path[:-1]).get(path[-1]) if path else None
+        # Records name what is theirs; what reads a single value may not know which.
+        own = field is None or _model_in(field.annotation) is not None or path[-1] in told
+        return told if own else f"{key}: {told}"
+    told = first["msg"].removeprefix("Input should be ")
+    value = f"{key} = {shown(first['input'])}"
+    if first["type"] in ("too_long", "too_short"):
+        return f"{value}, expected {told.partition('should have ')[2].partition(' after')[0]}"
+    if first["type"] == "path_type":
+        return f"{value}, expected a path"
+    return f"{value}: {told.lower()}" if told == first["msg"] else f"{value}, expected {told}"
+
+
+def _fields(model: type[BaseModel], path: list[str]) -> Any:
+    for part in path:
+        if part in model.model_fields:
+            model = _model_in(model.model_fields[part].annotation) or model
+    return model.model_fields
+
+
+def _model_in(annotation: Any) -> type[BaseModel] | None:
+    """The model in a type such as `Star | None` or `tuple[Star, ...]`."""
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        return annotation
+    return next((model for part in get_args(annotation) if (model := _model_in(part))), None)

@@ -1,0 +1,328 @@
+"""Would a study's flares be seen: every star, in every cell of the sweep."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mauvecl.answers.answer import Answer, InCell
+from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
+from mauvecl.host.doors import public
+from mauvecl.host.errors import InputError
+from mauvecl.results.detection.campaign import campaign, per_test
+from mauvecl.results.detection.departures import departure_table
+from mauvecl.results.detection.detection import Detection
+from mauvecl.results.detection.paper import PAPER_G2V, WHY, reconstruct
+from mauvecl.results.requests.fap import check_fap, countable
+from mauvecl.runs.pool import Pool, together
+from mauvecl.statistics.distributions import QuadraticForm
+from mauvecl.statistics.linear import Linear, Matched
+from mauvecl.statistics.statistic import Setting
+from mauvecl.study.labels import label, put_first, stacked, told
+from mauvecl.study.sections import Star
+from mauvecl.study.study import PAPER_STARS, Study
+from mauvecl.study.weights import read_weights
+
+if TYPE_CHECKING:
+    from astropy.table import QTable, Table
+
+    from mauvecl.device.engine import Engine
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.study.questions import CampaignQuestion
+
+
+#: Stars, or cells of a sweep, in one picture.
+MOST_DRAWN = 6
+
+
+@dataclass(frozen=True, eq=False)
+class StarDetection(InCell):
+    """One star in one cell of the sweep."""
+
+    amplitudes: tuple[float, ...]
+    detection: Detection
+
+    @property
+    def shown(self) -> tuple[str, Detection, list[str]]:
+        """Title, findings and names of the flares, as pictures take them."""
+        return self.title, self.detection, [f"flare {100 * amplitude:g} %" for amplitude in self.amplitudes]
+
+
+@dataclass(eq=False)
+class DetectAnswer(Answer):
+    """What `mauvecl detect` answers.
+
+    Attributes
+    ----------
+    study : Study
+    stars : list of StarDetection
+        Every star in every cell of the sweep.
+    messages : list of str
+        What the reader must be told, worst first.
+    paper : list of str
+        The comparison with the paper's values, where the study holds its G2V star.
+    """
+
+    study: Study
+    stars: list[StarDetection]
+    messages: list[str] = field(default_factory=list)
+    paper: list[str] = field(default_factory=list)
+
+    @cached_property
+    def table(self) -> QTable:
+        """One row per star, cell, flare and statistic."""
+        return self._together(self._detections)
+
+    @cached_property
+    def departures(self) -> QTable:
+        """One row per star, cell and statistic, and flare where its shape matters: see `departures.Departure`.
+
+        Empty where thresholds are not counted.
+        """
+        return self._together(self._departures)
+
+    @property
+    def roc(self) -> QTable:
+        """Every receiver operating characteristic, with its area; see `roc.Roc`."""
+        return self._together(_rocs)
+
+    @property
+    def tails(self) -> QTable:
+        """The extremes of every null (amplitude 0) and flare, with their realisations."""
+        return self._together(_tails)
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        """Detections, departures from the closed form, ROC and extremes."""
+        return {"detection": self.table, "departures": self.departures, "roc": self.roc, "tails": self.tails}
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        return [x for star in self.stars for x in (star.detection.quiet, *star.detection.flares)]
+
+    @property
+    def pictures(self) -> dict[str, tuple[Any, ...]]:
+        """Null and flare distributions of every statistic, and spectra; more stars would be too small to read."""
+        shown = [star.shown for star in self.stars[:MOST_DRAWN]]
+        return {"detection": ("answers.detection", shown, self.study.run.fap), "spectra": ("answers.spectra", shown)}
+
+    @property
+    def remarks(self) -> list[str]:
+        """The comparison with the paper's values."""
+        return self.paper
+
+    def as_json(self) -> dict[str, Any]:
+        from mauvecl.answers.report import rows
+
+        tables = {"rows": rows(self.table), "departures": rows(self.departures)}
+        return {"messages": self.messages, "paper": self.paper} | tables
+
+    def _detections(self, star: StarDetection) -> QTable:
+        table = star.detection.table(self.study.run.fap)
+        table.remove_column("name")
+        amplitudes = np.repeat(star.amplitudes, len(star.detection.statistics))
+        table.add_column(amplitudes, name="amplitude", index=0)
+        table["amplitude"].info.description = f"relative rise of the photons in the band {self.study.flare.band}"
+        return table
+
+    def _departures(self, star: StarDetection) -> QTable:
+        return departure_table(star.detection, star.amplitudes, self.study.run.fap)
+
+    def _together(self, table_of: Callable[[StarDetection], QTable]) -> QTable:
+        parts = []
+        for star in self.stars:
+            # A flare's amplitude has its own column.
+            swept = {name: value for name, value in star.at.items() if name != "amplitude"}
+            parts.append(({"star": star.label, **swept}, table_of(star)))
+        return stacked(parts, study=self.study.text())
+
+
+def _rocs(star: StarDetection) -> QTable:
+    from astropy.table import vstack
+
+    parts = []
+    for statistic in star.detection.statistics:
+        for flare, amplitude in enumerate(star.amplitudes):
+            curve = star.detection.roc(statistic, flare).table()
+            for name in ("area", "area_low", "area_high"):
+                curve[name] = curve.meta.pop(name)
+            curve["area"].info.description = "under the curve; 95 % interval by DeLong's method"
+            put_first(curve, {"statistic": statistic, "amplitude": amplitude})
+            parts.append(curve)
+    return vstack(parts)
+
+
+def _tails(star: StarDetection) -> QTable:
+    from astropy.table import vstack
+
+    parts = []
+    for statistic in star.detection.statistics:
+        for flare, amplitude in enumerate(star.amplitudes):
+            kept = [(amplitude, star.detection.tail_samples(statistic, flare))]
+            if star.detection.statistic(statistic).shaped or flare == 0:
+                kept.append((0.0, star.detection.tail_samples(statistic, template=flare)))
+            for name, table in kept:
+                put_first(table, {"statistic": statistic, "amplitude": name, "template": amplitude})
+                parts.append(table)
+    samples = vstack(parts)
+    samples.meta["seed"] = star.detection.seed
+    return samples
+
+
+@public
+def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
+    """Null and flare distributions of every star of a study, in every cell of its sweep.
+
+    Raises
+    ------
+    InputError
+        For anything in the study that cannot be.
+    """
+    # Everything is looked at before anything is drawn: bad input shows at once.
+    run = study.run
+    check_fap(run.fap, run.realisations, run.tails)
+    prepared = [(at, cell, star, cell.expectations(star)) for at, cell in study.cells() for star in cell.star]
+    campaign_told = [text for _, cell, _, (quiet, *_) in prepared for text in _campaign(cell, quiet)]
+
+    def answered(one: tuple[Mapping[str, float | str], Study, Star, list[Expectation]]) -> StarDetection:
+        at, cell, star, (quiet, *flares) = one
+        how = cell.detecting(quiet)
+        own = [read_weights(name, path, quiet.wavelength_nm) for name, path in run.weights.items()]
+        how["statistics"] = (*run.statistics, *own, *_other_templates(cell, star, quiet))
+        detection = engine.detect(quiet, flares, seed=run.seed, **how)
+        return StarDetection(label(star, quiet), at, cell.flare.amplitudes, detection)
+
+    if isinstance(engine, Pool):
+        engine.expect(len(prepared) * run.realisations)
+    stars: list[StarDetection] = []
+    paper: list[str] = []
+    for star in together(engine, answered, prepared):
+        if not stars:
+            # What is drawn nothing for is computed while the devices count the next star.
+            paper = _paper(study, [group for *_, group in prepared])
+        stars.append(star)
+    costs = [text for (_, cell, *_), one in zip(prepared, stars, strict=True) for text in _template_costs(cell, one)]
+    answer = DetectAnswer(study, stars)
+    blinding = [f"{text[:-1]} ({star.title})." for star in stars for text in star.detection.messages]
+    messages = [*blinding, *told([x for *_, group in prepared for x in group])]
+    if not countable(run.fap, run.realisations):
+        messages.append(
+            f"Thresholds at a false-alarm probability of {run.fap:g} come from importance sampling, right to "
+            f"{100 * answer.table['fap_error'].max():.1f} % of it: {run.realisations} realisations leave fewer than "
+            "100 beyond them."
+        )
+    unknown = [
+        unknown_cost(f"{star.label}, flare of {100 * amplitude:g} %", star.detection.quiet, flare, cell)
+        for (_, cell, *_), star in zip(prepared, stars, strict=True)
+        for amplitude, flare in zip(star.amplitudes, star.detection.flares, strict=True)
+    ]
+    last = [*_few_terms(stars), *marginal_lines(study), *cost_lines(unknown, study)]
+    answer.messages = list(dict.fromkeys([*messages, *campaign_told, *costs, *last]))
+    answer.paper = paper
+    return answer
+
+
+def _few_terms(stars: Sequence[StarDetection]) -> list[str]:
+    """How few pixels' worth of noise the paper's own sum holds."""
+    forms = [
+        star.detection.closed_form("paper", template=flare)
+        for star in stars
+        if "paper" in star.detection.statistics
+        for flare in range(len(star.amplitudes))
+    ]
+    terms = [form.effective_terms for form in forms if isinstance(form, QuadraticForm)]
+    if not terms:
+        return []
+    few, many = (f"{end:.1f}" for end in (min(terms), max(terms)))
+    return [
+        f"The paper's sum over {stars[0].detection.dof('paper')} pixels scatters like one of "
+        f"{few if few == many else f'{few} to {many}'} independent squares: its faintest pixels make most of it."
+    ]
+
+
+def _other_templates(study: Study, star: Star, quiet: Expectation) -> list[Linear]:
+    """Matched statistics that look for flares of other temperatures than the study's."""
+    filters = []
+    for temperature in study.run.template_temperatures_k:
+        source = star.source()
+        other = study.at("flare_temperature", temperature)
+        (shape,) = other.expect([other.flaring(source, study.flare.amplitudes[0])])
+        setting = Setting(quiet, ~quiet.saturated, study.run.comparison())
+        filters.append(Linear(f"matched {temperature:g} K", Matched().weights_per_dn(setting, shape)))
+    return filters
+
+
+def _template_costs(study: Study, star: StarDetection) -> list[str]:
+    """What looking for the wrong temperature costs, for Gaussian noise."""
+    detection, lines = star.detection, []
+    for temperature in study.run.template_temperatures_k:
+        right = Matched().closed_form(detection.setting, detection.flares[0], detection.flares[0]).mean
+        name = f"matched {temperature:g} K"
+        kept = detection.closed_form(name, 0).mean / detection.closed_form(name).std / right if right else 0.0
+        lines.append(
+            f"{star.label}: looking for a flare of {temperature:g} K in one of {study.flare.temperature_k:g} K keeps "
+            f"{100 * kept:.1f} % of the matched statistic's S/N."
+        )
+    return lines
+
+
+def _campaign(study: Study, quiet: Expectation) -> list[str]:
+    """What one test's false-alarm probability means for the campaign that the study names."""
+    asked = study.campaign
+    if asked.frames is None:
+        return []
+    many = campaign(study.run.fap, asked.frames, quiet.n_frames, step=asked.step, seed=study.run.seed)
+    text = (
+        f"A campaign of {asked.frames} frames makes {many.tests} tests: at {many.fap:g} per test "
+        f"{many.expected:.3g} false alarms are expected, and the chance of any is {many.independent:.3g} if tests "
+        f"are independent, at most {many.at_most:.3g}"
+    )
+    if many.overlapping is not None:
+        o = many.overlapping
+        text += f"; with the overlap of its stacks {o.value:.3g} [{o.low:.3g}, {o.high:.3g}] for a linear statistic"
+    return [text + ".", *_wanted(asked, many.tests, quiet.n_frames, study.run.seed)]
+
+
+def _wanted(asked: CampaignQuestion, tests: int, stack: int, seed: int) -> list[str]:
+    """What a test may have for the campaign's wanted values."""
+    lines = []
+    if asked.fap is not None and asked.frames is not None:
+        one = per_test(asked.fap, asked.frames, stack, step=asked.step, seed=seed)
+        text = (
+            f"For a chance of {asked.fap:g} of any false alarm in the campaign each of its {tests} tests may have "
+            f"{one.independent:.4g} if they are independent, {one.at_least:.4g} whatever they are"
+        )
+        if one.overlapping is not None:
+            o = one.overlapping
+            text += f", and with the overlap of its stacks {o.value:.3g} [{o.low:.3g}, {o.high:.3g}]"
+        lines.append(f"{text}: `--fap {one.at_least:.4g}`.")
+    if asked.alarms is not None:
+        if not asked.alarms < tests:
+            raise InputError(f"campaign.alarms = {asked.alarms:g} of {tests} tests, expected fewer than tests")
+        lines.append(
+            f"For {asked.alarms:g} false alarms expected in the campaign each of its {tests} tests may have "
+            f"{asked.alarms / tests:.4g}, whatever their dependence: `--fap {asked.alarms / tests:.4g}`."
+        )
+    return lines
+
+
+def _paper(study: Study, prepared: list[list[Expectation]]) -> list[str]:
+    """The paper's G2V values beside their reconstruction and the calibrated ones."""
+    if PAPER_STARS[1] not in study.star or study.observation.exposure_s != 50.0 or study.sweep.axes:
+        return []
+    quiet, *flares = prepared[study.star.index(PAPER_STARS[1])]
+    lines = []
+    for amplitude, flare in zip(study.flare.amplitudes, flares, strict=True):
+        if amplitude not in PAPER_G2V:
+            continue
+        chi2, reduced = PAPER_G2V[amplitude]
+        ours = reconstruct(quiet, flare)
+        lines.append(
+            f"G2V, {100 * amplitude:g} % flare: the paper has chi2 = {chi2:g}, reduced {reduced:g}; "
+            f"reconstructed here {ours.value:.2f} ({ours.low:.2f}-{ours.high:.2f})"
+        )
+    return [*lines, WHY] if lines else []

@@ -1,0 +1,266 @@
+"""Where the usual root-of-N formula is wrong, and by how much, over magnitude and exposure.
+
+The formula promises three things: the S/N of a spectrum, that the true signal lies within one estimated standard
+deviation of the observed one in 68.27 % of all spectra, and the false-alarm probability of a threshold.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from mauvecl.answers.answer import Answer
+from mauvecl.answers.detection.detect import DetectAnswer, detect
+from mauvecl.answers.signal.snr import SnrAnswer, snr
+from mauvecl.host.doors import public
+from mauvecl.host.tables import telling
+from mauvecl.noise.cumulants import Cumulants
+from mauvecl.results.snr import steps_of
+from mauvecl.study.labels import described
+from mauvecl.study.quantities import UNITS
+from mauvecl.study.questions import Axis, Sweep
+from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    from astropy.table import QTable, Table
+
+    from mauvecl.device.engine import Engine
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.results.snr import SnrResult
+    from mauvecl.runs.pool import Pool
+
+#: Share of normal values within one standard deviation.
+ONE_SIGMA = float(special.ndtr(1.0) - special.ndtr(-1.0))
+#: Standard errors beyond which a difference is told, and how many of them a 95 % interval is wide.
+SURE, ERRORS_IN_INTERVAL = 4, 3.92
+#: A false-alarm probability further below the promised one is as wrong as this.
+SMALLEST_RATIO = 1e-3
+#: What the columns are, of an element and of a cell.
+PROMISED = {
+    "expected": "S/N by the formula",
+    "mean": "mean S/N of the realisations",
+    "error": "standard error of the mean",
+    "bias": "mean over expected S/N, less one",
+    "coverage": "share of 1-sigma intervals of its pixels that hold the truth; 0.6827 promised",
+}
+WORST = {
+    "best_snr": "largest S/N per element by the formula",
+    "snr_off_by": "largest significant (4 standard errors) difference of the mean S/N from it; 0 if none",
+    "at_nm": "where",
+    "coverage_low": "smallest share of 1-sigma intervals that hold the truth, of all elements",
+    "coverage_high": "largest",
+    "five_sigma_above": "how often a pixel lies 5 sigma above its mean, over the normal 2.9e-7; the most",
+    "five_sigma_below": "how often a pixel lies 5 sigma below its mean, over the normal 2.9e-7; the least",
+    "probability_off_by": "largest significant difference of a detection probability from the closed form",
+    "fap_ratio": "most wrong false-alarm probability over the promised one; 1 if none differs",
+}
+#: Looked at where a study sweeps over nothing.
+GRID = Sweep(
+    axes=(
+        Axis(quantity="magnitude", values=(4.0, 6.0, 8.0, 10.0, 12.0)),
+        Axis(quantity="exposure", values=(5.0, 50.0, 600.0)),
+    )
+)
+
+
+def coverage(result: SnrResult) -> NDArray[np.float64]:
+    """Share of realisations whose observed signal plus or minus its estimated noise holds the true one.
+
+    Returns
+    -------
+    ndarray, shape (n_pixel,)
+        The estimate is the observer's: photons as seen, dark and read noise as known. Interpolated within bins of the
+        counts' histogram, 1/64 of a standard deviation or less.
+    """
+    seen = result.observers[: result.scene.n_pixel]
+    signal = result.expectation.light_dn
+    gain, known = seen["gain"].astype(float), seen["variance"].astype(float)
+    # Ends of the observed signals whose interval reaches the true one: net -+ sqrt(gain max(net, 0) + known) = signal.
+    root = np.sqrt(gain**2 / 4 + gain * signal + known)
+    high = signal + gain / 2 + root
+    low = signal + gain / 2 - root
+    low = np.where(low < 0, signal - np.sqrt(known), low)
+    width = 2.0 ** seen["bin_shift"].astype(float)
+    shares = np.empty(signal.size)
+    for p in range(signal.size):
+        filled, counts = result.counts.filled("pixel", p)
+        edges = width[p] * np.column_stack([filled, filled + 1]).ravel() - 0.5
+        ends = np.interp([low[p], high[p]], edges + float(seen["net_offset"][p]), steps_of(counts) / result.counts.n)
+        shares[p] = ends[1] - ends[0]
+    return shares
+
+
+def beyond(x: Expectation, sigmas: float) -> NDArray[np.float64]:
+    """Probability that a pixel's exposure exceeds its mean by so many standard deviations, shape (n_pixel,).
+
+    Parameters
+    ----------
+    x : Expectation
+    sigmas : float
+        Below zero: that it falls short of it by as many.
+
+    Notes
+    -----
+    By the saddle point (Lugannani & Rice 1980, doi 10.2307/1426607) of Gaussian and Poisson parts together; right to
+    3e-3 of the probability. For normal noise it would be the same in every pixel.
+    """
+    c = Cumulants.of(x, x.n_frames)
+    photons = np.where(c.photon_step > 0, c.photons, 0.0)
+    parts = ((c.photon_step, photons), (c.dark_step, c.dark_dn / c.dark_step))
+
+    def cumulants(u: NDArray[np.float64]) -> tuple[NDArray[np.float64], ...]:
+        """Of the deviation from the mean: the generating function and its first two derivatives at u."""
+        value, first, second = c.gaussian * u**2 / 2, c.gaussian * u, c.gaussian.copy()
+        for step, mean in parts:
+            value = value + mean * (np.expm1(step * u) - step * u)
+            first = first + mean * step * np.expm1(step * u)
+            second = second + mean * step**2 * np.exp(step * u)
+        return value, first, second
+
+    sd = np.sqrt(c.variance)
+    goal, u = sigmas * sd, sigmas / sd
+    for _ in range(50):
+        _, first, second = cumulants(u)
+        u = u - (first - goal) / second
+    value, _, second = cumulants(u)
+    w, v = np.sqrt(2 * (u * goal - value)), np.abs(u) * np.sqrt(second)
+    return np.asarray(special.ndtr(-w) + np.exp(-(w**2) / 2) / np.sqrt(2 * np.pi) * (1 / v - 1 / w))
+
+
+def _promises(result: SnrResult) -> QTable:
+    """The formula's S/N and intervals beside the simulation's, one row per resolution element."""
+    table = result.element["wavelength", "expected", "mean", "std"]
+    x = result.expectation
+    table["error"] = table["std"] / np.sqrt(result.counts.n)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        table["bias"] = table["mean"] / table["expected"] - 1.0
+    table["coverage"] = x.per_element(coverage(result)) / x.per_element(np.ones(x.wavelength_nm.size))
+    return telling(table, PROMISED)
+
+
+@dataclass(eq=False)
+class GaussianReport(Answer):
+    """What `gaussian_report` answers.
+
+    Attributes
+    ----------
+    study : Study
+    signal : SnrAnswer
+    detection : DetectAnswer
+    """
+
+    study: Study
+    signal: SnrAnswer
+    detection: DetectAnswer
+
+    @property
+    def messages(self) -> list[str]:
+        return self.detection.messages
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        """The worst of each promise, each element's, each threshold's."""
+        return {"gaussian": self.cells, "elements": self.elements, "thresholds": self.thresholds}
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        return self.signal.inputs
+
+    @property
+    def pictures(self) -> dict[str, tuple[Any, ...]]:
+        """The promises over what is swept."""
+        return {"gaussian": ("plans.gaussian", self)}
+
+    @cached_property
+    def elements(self) -> QTable:
+        """One row per star, cell and resolution element: what the formula promises and what the simulation finds."""
+        return self.signal.together(_promises)
+
+    @property
+    def thresholds(self) -> QTable:
+        """One row per star, cell and statistic: false-alarm probabilities at the formula's thresholds, and why."""
+        return self.detection.departures
+
+    @cached_property
+    def cells(self) -> QTable:
+        """One row per star and cell: the worst of each promise."""
+        import astropy.units as u
+        from astropy.table import QTable
+
+        tables = [_by_star(t, len(self.signal.stars)) for t in (self.elements, self.thresholds, self.detection.table)]
+        rows = [
+            {"star": star.label, **star.at} | _of_signal(star.result, elements) | _of_thresholds(tested, flares)
+            for star, elements, tested, flares in zip(self.signal.stars, *tables, strict=True)
+        ]
+        table = QTable(rows=rows)
+        for axis in self.study.sweep.axes:
+            if axis.quantity in UNITS:
+                table[axis.quantity] = table[axis.quantity] * u.Unit(UNITS[axis.quantity])
+        table.meta |= {"fap": self.study.run.fap, "study": self.study.text()}
+        return described(telling(table, WORST))
+
+
+def _by_star(table: QTable, stars: int) -> list[QTable]:
+    """Equal parts of a table, in order."""
+    each = len(table) // stars
+    return [table[k * each : (k + 1) * each] for k in range(stars)]
+
+
+def _of_signal(result: SnrResult, elements: QTable) -> dict[str, float]:
+    """The worst of a star's S/N, and of the intervals made of it."""
+    sure = elements[np.abs(elements["mean"] - elements["expected"]) > SURE * elements["error"]]
+    worst = sure[np.argmax(np.abs(sure["mean"] - sure["expected"]))] if len(sure) else None
+    x, rare = result.expectation, special.ndtr(-5.0)
+    return {
+        "best_snr": float(elements["expected"].max()),
+        "snr_off_by": 0.0 if worst is None else float(worst["mean"] - worst["expected"]),
+        "at_nm": np.nan if worst is None else float(worst["wavelength"].value),
+        "coverage_low": float(elements["coverage"].min()),
+        "coverage_high": float(elements["coverage"].max()),
+        "five_sigma_above": float((beyond(x, 5.0) / rare).max()),
+        "five_sigma_below": float((beyond(x, -5.0) / rare).min()),
+    }
+
+
+def _of_thresholds(tested: QTable, flares: QTable) -> dict[str, float | str]:
+    """The worst of a star's false-alarm and detection probabilities."""
+    off = tested[tested["differs"]]
+    wrong = off[np.argmax(np.abs(np.log(np.maximum(off["ratio"], SMALLEST_RATIO))))] if len(off) else None
+    missed = flares["probability"] - flares["closed_form_probability"]
+    # The threshold's own error is in the interval.
+    sure = np.abs(missed) > (flares["high"] - flares["low"]) * SURE / ERRORS_IN_INTERVAL
+    missed = np.where(sure, missed, 0.0)
+    return {
+        "fap_ratio": 1.0 if wrong is None else float(wrong["ratio"]),
+        "statistic": "" if wrong is None else str(wrong["statistic"]),
+        "why": "" if wrong is None else str(wrong["why"]),
+        "probability_off_by": float(missed[np.argmax(np.abs(missed))]),
+    }
+
+
+@public
+def gaussian_report(study: Study, engine: Engine | Pool | None = None) -> GaussianReport:
+    """The usual formula beside the simulation, over magnitude and exposure or what else the study sweeps.
+
+    Parameters
+    ----------
+    study : Study
+        Without a sweep: magnitudes from 4 to 12, exposures of 5, 50 and 600 s.
+    engine : Engine or Pool, optional
+
+    Raises
+    ------
+    InputError
+        For anything in the study that cannot be.
+    """
+    from mauvecl.device.engine import Engine as Default
+
+    engine = engine or Default()
+    if not study.sweep.axes:
+        study = study.model_copy(update={"sweep": GRID})
+    return GaussianReport(study, snr(study, engine), detect(study, engine))

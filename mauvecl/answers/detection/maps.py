@@ -1,0 +1,271 @@
+"""Detection probability over two quantities, all cells on common draws."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.answers.answer import Answer
+from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
+from mauvecl.host.doors import public
+from mauvecl.host.tables import tabled
+from mauvecl.results.requests.fap import check_fap
+from mauvecl.statistics.intervals import Interval
+from mauvecl.study.labels import described, label, told
+from mauvecl.study.quantities import UNITS
+from mauvecl.study.study import Study
+from mauvecl.study.unknowns import average, drawn, shares
+
+if TYPE_CHECKING:
+    from astropy.table import QTable, Table
+
+    from mauvecl.device.engine import Engine
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.runs.pool import Pool
+
+#: Quantities of the flare alone: cells that differ in them share their quiescent star, and one launch.
+OF_FLARE = ("amplitude", "flare_temperature")
+
+
+@dataclass(frozen=True, eq=False)
+class MapResult(Answer):
+    """What `detection_map` answers, for the study's first star.
+
+    Attributes
+    ----------
+    study : Study
+    star : str
+    x, y : tuple
+        Values of both axes.
+    statistics : tuple of str
+    probability, low, high, closed_form : ndarray, shape (n_statistic, n_y, n_x)
+        Detection probability, its 95 % interval with the threshold's own, and the same for Gaussian noise; NaN where
+        every pixel saturates.
+    messages : list of str
+    shares : dict of dict of float
+        By statistic, where the map is averaged over what is unknown: the share of the variance of its mean probability
+        that each unknown explains, the largest first.
+    quiet : Expectation, optional
+        The star of the first cell.
+    """
+
+    study: Study
+    star: str
+    x: tuple[float | str, ...]
+    y: tuple[float | str, ...]
+    statistics: tuple[str, ...]
+    probability: NDArray[np.float64]
+    low: NDArray[np.float64]
+    high: NDArray[np.float64]
+    closed_form: NDArray[np.float64]
+    messages: list[str]
+    shares: dict[str, dict[str, float]] = field(default_factory=dict)
+    quiet: Expectation | None = None
+
+    @property
+    def table(self) -> QTable:
+        """One row per cell and statistic."""
+        s, j, i = (index.ravel() for index in np.indices(self.probability.shape))
+        axes = ((self.study.map.x, self.x, i), (self.study.map.y, self.y, j))
+        table = tabled(
+            (
+                *((a.quantity, np.array(values)[at], "", UNITS.get(a.quantity, "")) for a, values, at in axes),
+                ("statistic", np.array(self.statistics)[s]),
+                ("probability", self.probability.ravel(), "detection probability"),
+                ("low", self.low.ravel(), "its 95 % interval, lower end, with the threshold's own"),
+                ("high", self.high.ravel(), "its 95 % interval, upper end, with the threshold's own"),
+                ("closed_form", self.closed_form.ravel(), "the same for Gaussian noise"),
+            ),
+            star=self.star,
+            fap=self.study.run.fap,
+            realisations=self.study.run.realisations,
+            study=self.study.text(),
+        )
+        return described(table)
+
+    ENDINGS = ("ecsv", "fits")
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        """The one table."""
+        return {"map": self.table}
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        """The star without a flare in the first cell."""
+        return [] if self.quiet is None else [self.quiet]
+
+    @property
+    def pictures(self) -> dict[str, tuple[Any, ...]]:
+        """One panel per statistic, with contours at the study's powers."""
+        return {"map": ("plans.detection_map", self)}
+
+
+@public
+def detection_map(
+    study: Study, engine: Engine | Pool | None = None, *, progress: Callable[[int, int], None] | None = None
+) -> MapResult:
+    """Detection probability of the study's first star and flare over its map's axes.
+
+    Parameters
+    ----------
+    study : Study
+        Its ``map`` names the axes; what no axis names stays as the study has it.
+    engine : Engine or Pool, optional
+    progress : callable, optional
+        Called as ``progress(done, total)`` in cells.
+
+    Raises
+    ------
+    InputError
+        For anything in the study that cannot be.
+    """
+    from mauvecl.device.engine import Engine as Default
+
+    engine = engine or Default()
+    check_fap(study.run.fap, study.run.realisations, study.run.tails)
+    study = study.model_copy(update={"star": study.star[:1]}).at("amplitude", study.flare.amplitudes[0])
+    axes = study.map.x, study.map.y
+    x, y = (axis.points() for axis in axes)
+    unknown = drawn(study) if study.unknowns.draws else None
+    studies = (study,) if unknown is None else unknown.studies
+    seen: list[Expectation] = []
+    maps = []
+    for number, one in enumerate(studies):
+
+        def told_of(done: int, number: int = number) -> None:
+            if progress is not None:
+                cells = len(x) * len(y)
+                progress(number * cells + done, len(studies) * cells)
+
+        maps.append(_map(one, x, y, engine, seen, told_of))
+    values, parts = maps[0], {}
+    if unknown is not None:
+        values = _averaged(maps)
+        for s, statistic in enumerate(study.run.statistics):
+            means = [float(np.nanmean(one["probability"][s])) for one in maps]
+            parts[statistic] = shares(unknown, np.array(means))
+    quiet = seen[0]
+    names = {axis.quantity for axis in axes}
+    star = study.star[0]
+    if "magnitude" in names:
+        star = star.model_copy(update={"magnitude": None})
+    return MapResult(
+        study=study,
+        star="stars of the axis" if "star" in names else label(star, quiet),
+        x=x,
+        y=y,
+        statistics=study.run.statistics,
+        messages=[*_blinded(values["probability"]), *told(seen), *marginal_lines(study), *_cost(study, x, y)],
+        shares=parts,
+        quiet=quiet,
+        **values,
+    )
+
+
+def _cost(study: Study, x: tuple[float | str, ...], y: tuple[float | str, ...]) -> list[str]:
+    """What unknowns cost in the middle of the map."""
+    middle = x[len(x) // 2], y[len(y) // 2]
+    quiet, (flare,) = _expectations(study, [middle])
+    names = (axis.quantity.replace("_", " ") for axis in (study.map.x, study.map.y))
+    at = " and ".join(f"{name} {_shown(value)}" for name, value in zip(names, middle, strict=True))
+    return cost_lines([unknown_cost(f"the cell of {at}", quiet, flare, study)], study)
+
+
+def _shown(value: float | str) -> str:
+    return value if isinstance(value, str) else f"{value:.3g}"
+
+
+def _blinded(probability: NDArray[np.float64]) -> list[str]:
+    """The sentence on cells without a number, if any."""
+    cells = int(np.isnan(probability[0]).sum())
+    if not cells:
+        return []
+    return [f"SATURATED: every pixel that counts saturates in {cells} of {probability[0].size} cells: no number there."]
+
+
+Arrays = dict[str, NDArray[np.float64]]
+
+
+def _map(
+    study: Study,
+    x: tuple[float | str, ...],
+    y: tuple[float | str, ...],
+    engine: Engine | Pool,
+    seen: list[Expectation],
+    told_of: Callable[[int], None],
+) -> Arrays:
+    """The map on one instrument; quiescent stars are added to `seen`."""
+    from mauvecl.runs.pool import together
+
+    shape = (len(study.run.statistics), len(y), len(x))
+    values = {name: np.full(shape, np.nan) for name in ("probability", "low", "high", "closed_form")}
+
+    def filled(cells: list[tuple[int, int]]) -> tuple[Expectation, int]:
+        quiet, flares = _expectations(study, [(x[i], y[j]) for i, j in cells])
+        if not quiet.saturated.all():
+            _fill(values, cells, study, quiet, flares, engine)
+        return quiet, len(cells)
+
+    done = 0
+    for quiet, count in together(engine, filled, _groups(study, x, y)):
+        seen.append(quiet)
+        done += count
+        told_of(done)
+    return values
+
+
+def _averaged(maps: list[Arrays]) -> Arrays:
+    """The mean over draws of the unknown, with its interval; NaN where a draw has none."""
+    values = {name: np.mean([one[name] for one in maps], axis=0) for name in ("probability", "closed_form")}
+    values |= {name: np.full_like(values["probability"], np.nan) for name in ("low", "high")}
+    for at in zip(*np.nonzero(np.isfinite(values["probability"])), strict=True):
+        p = average([Interval(*(float(one[name][at]) for name in ("probability", "low", "high"))) for one in maps])
+        values["low"][at], values["high"][at] = p.low, p.high
+    return values
+
+
+def _groups(study: Study, x: tuple[float | str, ...], y: tuple[float | str, ...]) -> list[list[tuple[int, int]]]:
+    """Cells (i, j) that share a quiescent star."""
+    flare_x, flare_y = (axis.quantity in OF_FLARE for axis in (study.map.x, study.map.y))
+    every = [[(i, j) for i in range(len(x))] for j in range(len(y))]
+    if flare_x and flare_y:
+        return [[cell for row in every for cell in row]]
+    if flare_x:
+        return every
+    if flare_y:
+        return [list(column) for column in zip(*every, strict=True)]
+    return [[cell] for row in every for cell in row]
+
+
+def _expectations(study: Study, cells: list[tuple[float | str, float | str]]) -> tuple[Expectation, list[Expectation]]:
+    """The quiescent star that some cells share, and each cell's flare."""
+    names = study.map.x.quantity, study.map.y.quantity
+    studies = [study.at(names[0], a).at(names[1], b) for a, b in cells]
+    source = studies[0].star[0].source()
+    quiet, *flares = studies[0].expect([source, *(s.flaring(source, s.flare.amplitudes[0]) for s in studies)])
+    return quiet, flares
+
+
+def _fill(
+    values: dict[str, NDArray[np.float64]],
+    cells: list[tuple[int, int]],
+    study: Study,
+    quiet: Expectation,
+    flares: list[Expectation],
+    engine: Engine | Pool,
+) -> None:
+    run = study.run
+    result = engine.detect(quiet, flares, seed=run.seed, **study.detecting(quiet))
+    for s, statistic in enumerate(run.statistics):
+        probabilities = result.detection_probability(run.fap, statistic)
+        for k, ((i, j), p) in enumerate(zip(cells, probabilities, strict=True)):
+            at = (s, j, i)
+            values["probability"][at], values["low"][at], values["high"][at] = p.value, p.low, p.high
+            limit = result.closed_form(statistic, template=k).isf(run.fap)
+            if k not in result.blinding:
+                values["closed_form"][at] = result.closed_form(statistic, k).sf(limit)

@@ -1,0 +1,124 @@
+"""Which unknown limits which star: S/N of every flare under each of several unknowns, by closed forms."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from mauvecl.answers.detection.unknown_cost import Cost, spoken, unknown_cost
+from mauvecl.host.plotting import picture
+from mauvecl.host.tables import telling
+from mauvecl.study.labels import described, label
+from mauvecl.study.nuisances import NuisanceChoice
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.study.study import Study
+
+#: What is looked at where nothing else is named: METHODS' table, and more.
+SHOWN: dict[str, NuisanceChoice] = {
+    spoken(choice): choice
+    for choice in (
+        NuisanceChoice(dark=0.1),
+        NuisanceChoice(light=0.01),
+        NuisanceChoice(dark="free", light="free"),
+        NuisanceChoice(sky=0.1),
+        NuisanceChoice(tilt=0.01),
+    )
+}
+
+DESCRIPTIONS = {
+    "unknown": "what is unknown",
+    "known": "S/N of the matched statistic with everything known",
+    "plain": "the same where it is unknown and the statistic does not know of it",
+    "marginalised": "the same, marginalised",
+    "smallest": "flare amplitude that is detected, marginalised, at the header's power and false alarms",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class UnknownTable:
+    """What `unknown_table` answers.
+
+    Attributes
+    ----------
+    study : Study
+    costs : dict of dict of Cost
+        By (star, amplitude), then by unknown.
+    """
+
+    study: Study
+    costs: dict[tuple[str, float], dict[str, Cost]]
+
+    def smallest(self, star: str, unknown: str | None) -> float:
+        """The flare amplitude detected with the study's power at its false-alarm probability, marginalised.
+
+        Parameters
+        ----------
+        star : str
+        unknown : str or None
+            None for everything known.
+
+        Notes
+        -----
+        S/N grows with the amplitude; the flare's own photon noise is left out.
+        """
+        (amplitude, costs), *_ = ((a, c) for (name, a), c in self.costs.items() if name == star)
+        cost = next(iter(costs.values())) if unknown is None else costs[unknown]
+        snr = cost.known if unknown is None else cost.marginal
+        needed = special.ndtri(self.study.limit.power) - special.ndtri(self.study.run.fap)
+        return float(amplitude * needed / snr) if snr > 0 else float("inf")
+
+    @property
+    def table(self) -> QTable:
+        """One row per star, flare and unknown."""
+        from astropy.table import QTable
+
+        rows = [
+            (star, amplitude, unknown, c.known, c.plain, c.marginal, self.smallest(star, unknown))
+            for (star, amplitude), costs in self.costs.items()
+            for unknown, c in costs.items()
+        ]
+        table = QTable(rows=rows, names=("star", "amplitude", "unknown", "known", "plain", "marginalised", "smallest"))
+        table.meta |= {"fap": self.study.run.fap, "power": self.study.limit.power, "study": self.study.toml()}
+        return described(telling(table, DESCRIPTIONS))
+
+    def _repr_html_(self) -> str:
+        return str(self.table._repr_html_())
+
+    def plot(self, path: str | Path | None = None, *, ax: Any = None) -> object:
+        """Detection probability against amplitude, and the smallest amplitude of each star; needs matplotlib."""
+        return picture("unknowns.unknowns", self, path, ax=ax)
+
+
+def unknown_table(study: Study, unknowns: Mapping[str, NuisanceChoice] = SHOWN) -> UnknownTable:
+    """A study's stars and flares under each of several unknowns.
+
+    Parameters
+    ----------
+    study : Study
+    unknowns : mapping of NuisanceChoice
+        By what they are called.
+    """
+    costs: dict[tuple[str, float], dict[str, Cost]] = {}
+    for star in study.star:
+        quiet, *flares = study.expectations(star)
+        name = label(star, quiet)
+        for amplitude, flare in zip(study.flare.amplitudes, flares, strict=True):
+            costs[name, amplitude] = {
+                unknown: unknown_cost(name, quiet, flare, study.model_copy(update={"nuisances": choice}))
+                for unknown, choice in unknowns.items()
+            }
+    return UnknownTable(study, costs)
+
+
+def power(snr: NDArray[np.float64], fap: float) -> NDArray[np.float64]:
+    """Detection probability of a normal statistic at its own threshold, shape as given."""
+    return np.asarray(special.ndtr(snr + special.ndtri(fap)))

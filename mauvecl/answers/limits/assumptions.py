@@ -1,0 +1,143 @@
+"""How far a limit moves with what is only assumed of the instrument, and which assumption moves it most."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from mauvecl.answers.limits.search import LimitSearch
+from mauvecl.host.doors import public
+from mauvecl.host.tables import tabled
+from mauvecl.noise.processes import Uniform
+from mauvecl.study.labels import described
+from mauvecl.study.sections import Star, Unknowns
+from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from astropy.table import QTable
+
+    from mauvecl.host.instrument.instrument import Instrument
+
+
+@dataclass(frozen=True)
+class Assumption:
+    """One uncertain value of the payload, with both ends of its sensible range (docs: what is nominal)."""
+
+    name: str
+    ends: tuple[str, str]
+    changes: tuple[Mapping[str, Any], Mapping[str, Any]]
+
+
+#: What the uncertain values of the payload are called in tables.
+NAMES = {
+    "temperature_c": "detector temperature (C)",
+    "light_loss": "light loss",
+    "pointing_loss": "pointing loss",
+    "qe_scale": "quantum efficiency, scale",
+    "conversion_uv_per_electron": "charge conversion (uV per electron)",
+    "read_noise_dn": "read noise (DN)",
+}
+
+
+def assumptions(nominal: Instrument) -> tuple[Assumption, ...]:
+    """The uncertain values of the payload and their ranges, those of a study's `Unknowns` to one standard deviation."""
+    rows = []
+    for name, prior in Unknowns().priors().items():
+        ends = (prior.low, prior.high) if isinstance(prior, Uniform) else (prior.mean - prior.sd, prior.mean + prior.sd)
+        # The quantum efficiency scales all light alike, as the area does.
+        key, scale = ("collecting_area_cm2", nominal.collecting_area_cm2) if name == "qe_scale" else (name, 1.0)
+        low, high = ({key: scale * float(f"{end:.12g}")} for end in ends)
+        rows.append(Assumption(NAMES[name], (f"{ends[0]:g}", f"{ends[1]:g}"), (low, high)))
+    dark = Assumption(
+        "dark counts are Poisson in", ("DN", "electrons"), ({"dark_unit": "DN"}, {"dark_unit": "electrons"})
+    )
+    return (*rows, dark)
+
+
+@dataclass(frozen=True)
+class Moved:
+    """A limit with one assumption at either end of its range."""
+
+    star: str
+    amplitude: float
+    statistic: str
+    assumption: Assumption
+    nominal: float
+    at_ends: tuple[float, float]
+
+    @property
+    def span(self) -> float:
+        """How far it moves from end to end."""
+        return abs(self.at_ends[1] - self.at_ends[0])
+
+
+@public
+def what_matters(study: Study) -> QTable:
+    """The closed-form limits of a study with each assumption at both ends of its range, the largest move first.
+
+    Parameters
+    ----------
+    study : Study
+        Its ``limit`` says of what.
+
+    Returns
+    -------
+    QTable
+        One row per star, flare, statistic and assumption.
+
+    Raises
+    ------
+    InputError
+        As `limits.limiting_magnitude`.
+    """
+    amplitudes = (None,) if study.limit.of == "amplitude" else study.flare.amplitudes
+    rows: list[Moved] = []
+    for star in study.star:
+        for amplitude in amplitudes:
+            for statistic in study.run.statistics:
+                rows += sorted(_moves(study, star, amplitude, statistic), key=lambda m: -m.span)
+    of = study.limit.of
+    table = tabled(
+        (
+            ("star", [m.star for m in rows]),
+            ("amplitude", [m.amplitude for m in rows]),
+            ("statistic", [m.statistic for m in rows]),
+            ("assumption", [m.assumption.name for m in rows]),
+            ("low_end", [m.assumption.ends[0] for m in rows]),
+            ("high_end", [m.assumption.ends[1] for m in rows]),
+            (of, [m.nominal for m in rows]),
+            ("at_low_end", [m.at_ends[0] for m in rows]),
+            ("at_high_end", [m.at_ends[1] for m in rows]),
+            ("span", [m.span for m in rows], f"how far the closed-form limit of {of} moves from end to end"),
+        ),
+        power=study.limit.power,
+        fap=study.run.fap,
+        study=study.text(),
+    )
+    for name in (of, "at_low_end", "at_high_end", "span"):
+        table[name].info.format = ".3f"
+    return described(table)
+
+
+def _moves(study: Study, star: Star, amplitude: float | None, statistic: str) -> list[Moved]:
+    question = LimitSearch(study, star, amplitude, statistic)
+    nominal = question.root()
+    moves = []
+    for assumption in assumptions(study.load_instrument()):
+        ends = [
+            LimitSearch(study.with_instrument(change), star, amplitude, statistic).root(near=nominal)
+            for change in assumption.changes
+        ]
+        moves.append(
+            Moved(
+                star=star.library or str(star.file),
+                amplitude=float("nan") if amplitude is None else amplitude,
+                statistic=statistic,
+                assumption=assumption,
+                nominal=nominal,
+                at_ends=(ends[0], ends[1]),
+            )
+        )
+    return moves

@@ -1,0 +1,323 @@
+"""The value of one quantity at which a flare is detected with a wanted probability, with its interval."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mauvecl.answers.answer import Answer
+from mauvecl.answers.detection.unknown_cost import Cost, cost_lines, marginal_lines, unknown_cost
+from mauvecl.answers.limits.search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle
+from mauvecl.host.doors import public
+from mauvecl.host.errors import InputError
+from mauvecl.host.tables import tabled
+from mauvecl.results.requests.fap import check_fap
+from mauvecl.statistics.intervals import Interval
+from mauvecl.study.labels import described, label, stacked, told
+from mauvecl.study.quantities import UNITS
+from mauvecl.study.sections import Star
+from mauvecl.study.study import Study
+from mauvecl.study.unknowns import draws_table
+
+if TYPE_CHECKING:
+    from astropy.table import QTable, Table
+
+    from mauvecl.device.engine import Engine
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.runs.pool import Pool
+
+
+@dataclass(frozen=True)
+class Limit:
+    """One limit.
+
+    Attributes
+    ----------
+    star : str
+    amplitude : float
+        Of the flare; NaN where the amplitude is asked for.
+    of, statistic : str
+    fap, power : float
+    value : Interval
+        With the simulation's own 95 % interval, that of the threshold included.
+    closed_form : float
+        The same for Gaussian noise.
+    check : Point
+        Detection probability at the value, simulated again with another seed.
+    points : tuple of Point
+        What was simulated on the way.
+    curve : tuple of (value, probability)
+        The closed form around the limit.
+    at : mapping
+        What the study sweeps over.
+    unknown : Unknown, optional
+        Where the limit is averaged over what is unknown.
+    messages : tuple of str
+        What saturates at the limit, without the flare and with it.
+    cost : Cost, optional
+        What it costs there not to know all of the instrument.
+    quiet : Expectation, optional
+        The star there, without the flare.
+    """
+
+    star: str
+    amplitude: float
+    of: str
+    statistic: str
+    fap: float
+    power: float
+    value: Interval
+    closed_form: float
+    check: Point
+    points: tuple[Point, ...]
+    curve: tuple[tuple[float, float], ...]
+    at: Mapping[str, float | str] = field(default_factory=dict)
+    unknown: Unknown | None = None
+    messages: tuple[str, ...] = ()
+    cost: Cost | None = None
+    quiet: Expectation | None = field(default=None, compare=False, repr=False)
+
+    @property
+    def agrees(self) -> bool:
+        """Whether the fresh simulation's 95 % interval holds the wanted power."""
+        p = self.check.probability
+        return p.low <= self.power <= p.high
+
+    @property
+    def verdict(self) -> str:
+        """What the fresh simulation says of the limit, in a word.
+
+        "agrees" where its interval holds the wanted power; of whole frames "reaches" where it lies above it; "DIFFERS"
+        where it passes it by more than its own width; nothing between, as chance makes of one in six.
+        """
+        p = self.check.probability
+        if self.agrees:
+            return "agrees"
+        if self.of == "exposure" and p.low > self.power:
+            return "reaches"
+        away = max(p.low - self.power, self.power - p.high)
+        return "DIFFERS" if away > p.high - p.low else ""
+
+
+@dataclass(eq=False)
+class LimitResult(Answer):
+    """What `limiting_magnitude` and its relatives answer.
+
+    Attributes
+    ----------
+    study : Study
+    limits : list of Limit
+    assumptions : QTable, optional
+        How far what is assumed of the instrument moves them (`assumptions.what_matters`).
+    failed : tuple of str
+        Why there is no limit of some of the stars, flares or statistics.
+    """
+
+    study: Study
+    limits: list[Limit] = field(default_factory=list)
+    assumptions: QTable | None = None
+    failed: tuple[str, ...] = ()
+
+    @property
+    def table(self) -> QTable:
+        """One row per star, flare and statistic."""
+        of, rows = self.study.limit.of, self.limits
+        unit = UNITS.get(of, "")
+        columns: list[tuple[object, ...]] = [("star", [r.star for r in rows])]
+        swept = [axis.quantity for axis in self.study.sweep.axes if axis.quantity != "amplitude"]
+        columns += [(name, np.array([r.at[name] for r in rows]), "", UNITS.get(name, "")) for name in swept]
+        if of != "amplitude":
+            columns.append(("amplitude", [r.amplitude for r in rows]))
+        check = "detection probability there, with a fresh seed"
+        columns += [
+            ("statistic", [r.statistic for r in rows]),
+            (of, [r.value.value for r in rows], "where the flare is detected with the wanted probability", unit),
+            ("low", [r.value.low for r in rows], "its 95 % interval, lower end, with the threshold's own", unit),
+            ("high", [r.value.high for r in rows], "its 95 % interval, upper end, with the threshold's own", unit),
+            ("closed_form", [r.closed_form for r in rows], "the same for Gaussian noise", unit),
+            ("check", [r.check.probability.value for r in rows], check),
+            ("check_low", [r.check.probability.low for r in rows], f"{check}; 95 % interval, lower end"),
+            ("check_high", [r.check.probability.high for r in rows], f"{check}; 95 % interval, higher end"),
+        ]
+        if self.study.unknowns.draws:
+            unknowns = [r.unknown for r in rows if r.unknown is not None]
+            low, high = np.array([one.range for one in unknowns]).T
+            most = [next(iter(one.shares.items())) for one in unknowns]
+            columns += [
+                ("unknown_low", low, "central 95 % of the limits over what is unknown, lower end"),
+                ("unknown_high", high, "central 95 % of the limits over what is unknown, upper end"),
+                ("matters_most", [name for name, _ in most]),
+                ("its_share", [share for _, share in most], "share of the limits' variance that this unknown explains"),
+            ]
+        run = {"fap": self.study.run.fap, "realisations": self.study.run.realisations}
+        return described(tabled(columns, power=self.study.limit.power, **run, study=self.study.text()))
+
+    @property
+    def draws(self) -> QTable:
+        """One row per limit and draw of the unknown: its values and the closed-form limit."""
+        parts = []
+        for one in self.limits:
+            assert one.unknown is not None
+            table = draws_table(one.unknown.draws, {self.study.limit.of: one.unknown.limits})
+            amplitude = {} if np.isnan(one.amplitude) else {"amplitude": one.amplitude}
+            swept = {k: v for k, v in one.at.items() if k != "amplitude"}
+            parts.append(({"star": one.star, **swept, **amplitude, "statistic": one.statistic}, table))
+        return stacked(parts, study=self.study.text())
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        """The limits, the draws of what is unknown, and what is assumed, where asked for."""
+        more = {"unknowns": self.draws} if self.study.unknowns.draws else {}
+        return {"limit": self.table} | more | ({} if self.assumptions is None else {"assumptions": self.assumptions})
+
+    @cached_property
+    def inputs(self) -> list[Expectation]:
+        """Each star at its limits."""
+        return [one.quiet for one in self.limits if one.quiet is not None]
+
+    @property
+    def messages(self) -> list[str]:
+        """What holds at the limits, what is told of the stars, and what is unknown."""
+        saturated = dict.fromkeys(text for one in self.limits for text in one.messages)
+        stars = [text for text in told(self.inputs) if not text.startswith("SATURATED")]
+        costs = [one.cost for one in self.limits if one.cost is not None]
+        failed = [f"NO LIMIT: {text}." for text in self.failed]
+        return [*failed, *saturated, *stars, *marginal_lines(self.study), *cost_lines(costs, self.study)]
+
+    @property
+    def pictures(self) -> dict[str, tuple[Any, ...]]:
+        """Detection probability against the quantity: every simulated point and the limits."""
+        return {"limit": ("plans.limits", self)}
+
+    def as_json(self) -> dict[str, Any]:
+        from mauvecl.answers.report import rows
+
+        more = {} if self.assumptions is None else {"assumptions": rows(self.assumptions)}
+        return super().as_json() | more
+
+
+def solve(
+    study: Study,
+    star: Star,
+    amplitude: float | None,
+    statistic: str,
+    engine: Engine | Pool,
+    at: Mapping[str, float | str] | None = None,
+) -> Limit:
+    """One limit: the closed form's root, moved by what is simulated, and simulated again there.
+
+    Averaged over what is unknown of the instrument where the study asks for draws of it.
+
+    Raises
+    ------
+    InputError
+        If the power is not crossed in the range searched, or the false-alarm probability cannot be settled.
+    """
+    check_fap(study.run.fap, study.run.realisations, study.run.tails)
+    kind = MarginalLimitSearch if study.unknowns.draws else LimitSearch
+    question = kind(study, star, amplitude, statistic, engine)
+    # The nominal instrument's root is near, and quickly found.
+    theory = question.root(near=LimitSearch(study, star, amplitude, statistic).root() if study.unknowns.draws else None)
+    value = settle(question, theory)
+    simulated = tuple(question.points)
+    # Another seed, far from any that a user would take for a neighbour.
+    fresh = (study.run.seed + 0x9E3779B97F4A7C15) % 2**64
+    check = Point(value.value, question.simulated(value.value, fresh), fresh)
+    quiet, flare = question.pair(value.value)
+    shown = question.study.star[0]
+    named = star.model_copy(update={"magnitude": None}) if question.of == "magnitude" else shown
+    rise = value.value if question.of == "amplitude" else question.study.flare.amplitudes[0]
+    where = f"{label(named, quiet)} at {question.of} {value.value:.4g}, flare of {100 * rise:.3g} %"
+    return Limit(
+        star=label(named, quiet),
+        amplitude=float("nan") if amplitude is None else amplitude,
+        of=question.of,
+        statistic=statistic,
+        fap=question.fap,
+        power=question.power,
+        value=value,
+        closed_form=theory,
+        check=check,
+        points=simulated,
+        curve=question.curve(value.value),
+        at=at or {},
+        unknown=question.unknown(theory) if isinstance(question, MarginalLimitSearch) else None,
+        messages=tuple(m for m in told([quiet, flare]) if m.startswith("SATURATED")),
+        quiet=quiet,
+        cost=unknown_cost(where, quiet, flare, question.study),
+    )
+
+
+@public
+def limiting_magnitude(
+    study: Study, engine: Engine | Pool | None = None, *, progress: Callable[[int, int], None] | None = None
+) -> LimitResult:
+    """Limits of a study's stars and flares, by every statistic it names.
+
+    Parameters
+    ----------
+    study : Study
+        Its ``limit`` says of what (magnitude, amplitude or exposure) and at which power.
+    engine : Engine or Pool, optional
+    progress : callable, optional
+        Called as ``progress(done, total)`` in limits.
+
+    Raises
+    ------
+    InputError
+        As `solve`, if it holds of every limit; else `LimitResult.failed` tells.
+    """
+    from mauvecl.device.engine import Engine as Default
+    from mauvecl.runs.pool import together
+
+    engine = engine or Default()
+    result = LimitResult(study)
+    if any(axis.quantity == study.limit.of for axis in study.sweep.axes):
+        raise InputError(f"the sweep runs over the {study.limit.of} that is asked for, expected other quantities")
+    asked = [
+        (cell, star, amplitude, statistic, at)
+        for at, cell in study.cells()
+        for star in cell.star
+        for amplitude in ((None,) if study.limit.of == "amplitude" else cell.flare.amplitudes)
+        for statistic in study.run.statistics
+    ]
+
+    def solved(one: tuple[Study, Star, float | None, str, Mapping[str, float | str]]) -> Limit | InputError:
+        cell, star, amplitude, statistic, at = one
+        try:
+            return solve(cell, star, amplitude, statistic, engine, at)
+        except InputError as error:
+            # One star's failure does not lose the others'.
+            return error
+
+    outcomes: list[Limit | InputError] = []
+    for one in together(engine, solved, asked):
+        outcomes.append(one)
+        if progress is not None:
+            progress(len(outcomes), len(asked))
+    errors = [one for one in outcomes if isinstance(one, InputError)]
+    if len(errors) == len(outcomes):
+        raise errors[0]
+    result.limits.extend(one for one in outcomes if isinstance(one, Limit))
+    result.failed = tuple(dict.fromkeys(map(str, errors)))
+    return result
+
+
+@public
+def smallest_amplitude(study: Study, engine: Engine | Pool | None = None) -> LimitResult:
+    """The smallest flare that is detected; as `limiting_magnitude`."""
+    return limiting_magnitude(_asking(study, "amplitude"), engine)
+
+
+@public
+def shortest_exposure(study: Study, engine: Engine | Pool | None = None) -> LimitResult:
+    """The shortest exposure in which the flares are detected; as `limiting_magnitude`."""
+    return limiting_magnitude(_asking(study, "exposure"), engine)
+
+
+def _asking(study: Study, of: str) -> Study:
+    return study.model_copy(update={"limit": study.limit.model_copy(update={"of": of})})

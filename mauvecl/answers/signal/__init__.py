@@ -1,0 +1,1 @@
+"""One observation and its signal to noise: simulate, snr, exposure."""

@@ -1,0 +1,204 @@
+"""The exposure that gives a wanted S/N at a wavelength, and the S/N that an exposure gives."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from mauvecl.answers.answer import Answer
+from mauvecl.host.doors import public
+from mauvecl.host.errors import InputError
+from mauvecl.host.quantities import number
+from mauvecl.host.ranges import DAY_S
+from mauvecl.host.tables import tabled
+from mauvecl.study.labels import described, label, told
+from mauvecl.study.quantities import QUANTITIES
+from mauvecl.study.sections import Star
+from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    import astropy.units as u
+    from astropy.table import QTable, Table
+
+    from mauvecl.host.expectation import Expectation
+
+Per = Literal["pixel", "element"]
+
+
+@dataclass(frozen=True)
+class Exposure:
+    """One answer: whole frames."""
+
+    star: str
+    wavelength_nm: float
+    per: Per
+    wanted: float
+    exposure_s: float
+    frames: int
+    snr: float
+    snr_one_frame_less: float
+    saturated: bool
+
+
+@dataclass(frozen=True)
+class ExposureResult(Answer):
+    """What `exposure_for` answers, one row per star.
+
+    Attributes
+    ----------
+    study : Study
+    exposures : tuple of Exposure
+    messages : tuple of str
+    expectations : tuple of Expectation
+        Each star at its exposure.
+    """
+
+    study: Study
+    exposures: tuple[Exposure, ...]
+    messages: tuple[str, ...]
+    expectations: tuple[Expectation, ...]
+
+    @property
+    def table(self) -> QTable:
+        """One row per star."""
+        columns = (
+            ("star", "star"),
+            ("wavelength", "wavelength_nm", "", "nm"),
+            ("per", "per"),
+            ("wanted", "wanted"),
+            ("exposure", "exposure_s", "the fewest frames whose closed-form S/N reaches the wanted one", "s"),
+            ("frames", "frames"),
+            ("snr", "snr"),
+            ("snr_one_frame_less", "snr_one_frame_less"),
+            ("saturated", "saturated", "whether the pixel, or one of the element, saturates in a single frame"),
+        )
+        made = ((name, [getattr(r, of) for r in self.exposures], *more) for name, of, *more in columns)
+        return described(tabled(made, study=self.study.text()))
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        """The one table."""
+        return {"exposure": self.table}
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        return list(self.expectations)
+
+    @property
+    def pictures(self) -> dict[str, tuple[Any, ...]]:
+        """S/N against exposure, and the answers on it."""
+        return {"exposure": ("plans.exposures", self)}
+
+
+def snr_at(x: Expectation, wavelength_nm: float, per: Per = "element") -> float:
+    """Closed-form S/N of the pixel or 10.5 nm element that holds a wavelength.
+
+    Raises
+    ------
+    InputError
+        If it lies outside the spectrum.
+    """
+    return float((x.snr_per_element() if per == "element" else x.snr())[place_of(x, wavelength_nm, per)])
+
+
+def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
+    """Index of the pixel or element that holds a wavelength.
+
+    Raises
+    ------
+    InputError
+        If it lies outside the spectrum.
+    """
+    if per not in ("pixel", "element"):
+        raise InputError(f"S/N per {per!r}, expected pixel or element")
+    first, last = float(x.wavelength_nm[0]), float(x.wavelength_nm[-1])
+    if not first <= wavelength_nm <= last:
+        raise InputError(f"wavelength = {wavelength_nm:g} nm, expected {first:.1f} to {last:.1f} nm")
+    pixel = int(np.argmin(np.abs(x.wavelength_nm - wavelength_nm)))
+    return int(x.element[pixel]) if per == "element" else pixel
+
+
+@public
+def exposure_for(
+    study: Study, snr: float | None = None, wavelength_nm: u.Quantity | float | None = None, *, per: Per | None = None
+) -> ExposureResult:
+    """The fewest frames whose closed-form S/N at a wavelength reaches a wanted one.
+
+    Parameters
+    ----------
+    study : Study
+        Its exposure does not matter.
+    snr : float, optional
+    wavelength_nm : Quantity, or float in nm, optional
+        In place of those of the study's ``signal``.
+    per : {"element", "pixel"}, optional
+        A resolution element of 10.5 nm, or one pixel.
+
+    Raises
+    ------
+    InputError
+        For an S/N that no exposure up to 1e7 s reaches, or a wavelength outside the spectrum, if it holds of every
+        star; of some it is told by a message.
+    """
+    if wavelength_nm is not None:
+        wavelength_nm = number("wavelength", wavelength_nm, "nm")
+    study = study.with_changes({"signal": {"snr": snr, "wavelength_nm": wavelength_nm, "per": per}}, None, "exposure")
+    snr, wavelength_nm, per = study.signal.snr, study.signal.wavelength_nm, study.signal.per
+    if snr is None or wavelength_nm is None:
+        missing = "S/N" if snr is None else "wavelength"
+        raise InputError(f"no wanted {missing}, expected --snr and --at, or snr and wavelength_nm of a study's signal")
+    answered, failed = [], []
+    for star in study.star:
+        try:
+            answered.append(_one(study, star, snr, wavelength_nm, per))
+        except InputError as error:
+            # One star's failure does not lose the others'.
+            failed.append(error)
+    if not answered:
+        raise failed[0]
+    exposures, seen = zip(*answered, strict=True)
+    long = [f"{e.star} needs more than a day: {np.ceil(e.exposure_s / DAY_S):.0f} exposures of a day at most, added up."
+            for e in exposures if e.exposure_s > DAY_S]  # fmt: skip
+    messages = [*(f"NO ANSWER: {error}." for error in failed), *told(list(seen)), *long]
+    return ExposureResult(study, exposures, tuple(messages), seen)
+
+
+def _one(study: Study, star: Star, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposure, Expectation]:
+    source, frame_s = star.source(), study.load_instrument().frame_s
+
+    (frame,) = study.at("exposure", frame_s).expect([source])
+
+    def after(frames: int) -> Expectation:
+        # As many frames as it takes: they may fill several exposures.
+        return replace(frame, n_frames=frames)
+
+    one = snr_at(after(1), wavelength_nm, per)
+    longest = QUANTITIES["exposure"].high
+    if not one > 0 or (snr / one) ** 2 * frame_s > longest:
+        raise InputError(
+            f"{label(star, frame)} has an S/N of {one:.3g} per {per} at {wavelength_nm:g} nm in one frame, "
+            f"expected enough for {snr:g} within {longest:g} s"
+        )
+    # S/N grows with the root of the frames, to rounding: the neighbours settle it.
+    frames = max(int(np.ceil((snr / one) ** 2)), 1)
+    while frames > 1 and snr_at(after(frames - 1), wavelength_nm, per) >= snr:
+        frames -= 1
+    while snr_at(after(frames), wavelength_nm, per) < snr:
+        frames += 1
+    x = after(frames)
+    place = place_of(x, wavelength_nm, per)
+    here = x.saturated[x.element == place] if per == "element" else x.saturated[[place]]
+    answer = Exposure(
+        star=label(star, x),
+        wavelength_nm=wavelength_nm,
+        per=per,
+        wanted=snr,
+        exposure_s=x.exposure_s,
+        frames=x.n_frames,
+        snr=snr_at(x, wavelength_nm, per),
+        snr_one_frame_less=snr_at(after(frames - 1), wavelength_nm, per) if frames > 1 else 0.0,
+        saturated=bool(here.any()),
+    )
+    return answer, x

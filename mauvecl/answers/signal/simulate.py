@@ -1,0 +1,91 @@
+"""One observation of every star of a study, taken apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from mauvecl.answers.answer import Answer
+from mauvecl.host.doors import public
+from mauvecl.host.plotting import picture
+from mauvecl.host.quantities import count
+from mauvecl.noise.components import components
+from mauvecl.study.labels import described, label, told
+from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    from astropy.table import QTable, Table
+
+    from mauvecl.host.expectation import Expectation
+
+
+@dataclass(eq=False)
+class SimulateAnswer(Answer):
+    """What `mauvecl simulate` answers: one table of components per star and stage."""
+
+    ENDINGS = ("ecsv", "fits")
+
+    study: Study
+    observations: list[tuple[str, Expectation, QTable]]
+    messages: list[str]
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        """One per observation."""
+        return {f"observation-{n}": table for n, (_, _, table) in enumerate(self.observations, 1)}
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        return [x for _, x, _ in self.observations]
+
+    @property
+    def pictures(self) -> dict[str, tuple[Any, ...]]:
+        """One per observation."""
+        return {
+            f"observation-{n}": ("answers.observation", title, table)
+            for n, (title, _, table) in enumerate(self.observations, 1)
+        }
+
+    @property
+    def summary(self) -> list[dict[str, Any]]:
+        """Peak, best closed-form S/N and saturated pixels of each observation."""
+        rows = []
+        for title, x, _ in self.observations:
+            peak = int(x.signal_dn.argmax())
+            rows.append(
+                {
+                    "observation": title,
+                    "frames": x.n_frames,
+                    "peak_nm": float(x.wavelength_nm[peak]),
+                    "peak_dn": float(x.signal_dn[peak]),
+                    "snr_pixel": float(x.snr().max()),
+                    "snr_element": float(x.snr_per_element().max()),
+                    "saturated_pixels": int(x.saturated.sum()),
+                }
+            )
+        return rows
+
+    def as_json(self) -> dict[str, Any]:
+        return {"messages": self.messages, "observations": self.summary}
+
+    def plot(self, path: str | Path | None = None, *, number: int = 0, ax: Any = None) -> Any:
+        """One of the observations and what it is made of; needs matplotlib."""
+        title, _, table = self.observations[number]
+        return picture("answers.observation", title, table, path, ax=ax)
+
+
+@public
+def simulate(study: Study, *, realisation: int = 0, flaring: bool = False) -> SimulateAnswer:
+    """One observation of every star of a study, taken apart; with its flares too where asked."""
+    realisation = count("realisation", realisation)
+    observations, everything = [], []
+    for star in study.star:
+        xs = study.expectations(star) if flaring else study.expect([star.source()])
+        for i, x in enumerate(xs):
+            title = label(star, x) + (f", flare {100 * study.flare.amplitudes[i - 1]:g} %" if i else "")
+            table = components(x, realisation=realisation, seed=study.run.seed, **study.drawing)
+            table.meta["study"] = study.text()
+            observations.append((title, x, described(table)))
+        everything += xs
+    return SimulateAnswer(study, observations, told(everything))

@@ -1,0 +1,151 @@
+"""Signal to noise of a study's stars, over whatever the study sweeps: distributions and noise budgets."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from mauvecl.answers.answer import Answer, InCell
+from mauvecl.answers.signal.exposures import place_of
+from mauvecl.host.doors import public
+from mauvecl.runs.pool import Pool, together
+from mauvecl.study.labels import label, stacked, told
+from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    from astropy.table import QTable, Table
+
+    from mauvecl.device.engine import Engine
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.results.snr import SnrResult
+
+
+#: Wavelengths of the elements that terminal and pictures show, nm; the tables hold all of them.
+SHOWN_NM = (250.0, 300.0, 400.0, 550.0)
+#: Stars, or cells of a sweep, in one picture.
+MOST_DRAWN = 6
+
+
+@dataclass(frozen=True, eq=False)
+class StarSnr(InCell):
+    """One star in one cell of the sweep."""
+
+    result: SnrResult
+    asked_nm: float | None = None
+
+    @property
+    def shown_nm(self) -> list[float]:
+        """The wavelength asked for, or those of `SHOWN_NM` that the spectrum holds."""
+        if self.asked_nm is not None:
+            return [self.asked_nm]
+        first, last = self.result.expectation.wavelength_nm[[0, -1]]
+        return [wavelength for wavelength in SHOWN_NM if first <= wavelength <= last]
+
+
+@dataclass(eq=False)
+class SnrAnswer(Answer):
+    """What `mauvecl snr` answers.
+
+    Attributes
+    ----------
+    study : Study
+    stars : list of StarSnr
+        Every star in every cell of the sweep.
+    messages : list of str
+    """
+
+    study: Study
+    stars: list[StarSnr]
+    messages: list[str]
+
+    @property
+    def pixel(self) -> QTable:
+        """S/N per pixel, one row per star, cell and pixel."""
+        return self.together(lambda result: result.pixel)
+
+    @property
+    def element(self) -> QTable:
+        """S/N per resolution element of 10.5 nm, one row per star, cell and element."""
+        return self.together(lambda result: result.element)
+
+    @property
+    def noise_budget(self) -> QTable:
+        """Noise by origin, DN rms per pixel, one row per star, cell and pixel."""
+        return self.together(lambda result: result.expectation.noise_budget())
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        """S/N per element and per pixel, and the noise by origin."""
+        return {"snr-element": self.element, "snr-pixel": self.pixel, "noise-budget": self.noise_budget}
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        return [star.result.expectation for star in self.stars]
+
+    @property
+    def pictures(self) -> dict[str, tuple[Any, ...]]:
+        """S/N per pixel and element, closed form and realisations; noise by origin; S/N over what is swept."""
+        drawn: dict[str, tuple[Any, ...]] = {}
+        if len(self.stars) <= MOST_DRAWN:
+            drawn["snr"] = ("answers.signal_to_noise", [(s.title, s.result) for s in self.stars])
+        drawn["noise-budget"] = ("plans.noise_budgets", self)
+        if self.study.sweep.axes:
+            drawn["snr-sweep"] = ("plans.snr_sweep", self)
+        return drawn
+
+    def as_json(self) -> dict[str, Any]:
+        from mauvecl.answers.report import rows
+
+        tables = {"snr-element": self.element, "noise-budget": self.noise_budget}
+        return {"messages": self.messages} | {name: rows(table) for name, table in tables.items()}
+
+    def together(self, table_of: Callable[[SnrResult], QTable]) -> QTable:
+        """A table of each star and cell as one, with the star and what is swept in front."""
+        parts = (({"star": star.label, **star.at}, table_of(star.result)) for star in self.stars)
+        return stacked(parts, realisations=self.study.run.realisations, study=self.study.text())
+
+
+@public
+def snr(study: Study, engine: Engine | Pool) -> SnrAnswer:
+    """S/N distributions of every star of a study, without flares, in every cell of its sweep.
+
+    Raises
+    ------
+    InputError
+        For anything in the study that cannot be.
+    """
+    # Everything is looked at before anything is drawn: bad input shows at once.
+    prepared = [
+        (label(star, x), at, x)
+        for at, cell in study.cells()
+        for star in cell.star
+        for x in cell.expect([star.source()])
+    ]
+    run, asked = study.run, study.signal.wavelength_nm
+    if asked is not None:
+        for *_, x in prepared:
+            place_of(x, asked, "element")
+
+    def answered(one: tuple[str, Mapping[str, float | str], Expectation]) -> StarSnr:
+        name, at, x = one
+        return StarSnr(name, at, engine.snr(x, realisations=run.realisations, seed=run.seed, **study.drawing), asked)
+
+    if isinstance(engine, Pool):
+        engine.expect(len(prepared) * run.realisations)
+    stars = list(together(engine, answered, prepared))
+    return SnrAnswer(study, stars, [*told([x for _, _, x in prepared]), *filter(None, map(_cut_off, stars))])
+
+
+def _cut_off(star: StarSnr) -> str:
+    """How many pixels saturation cut off in the simulation, and how often."""
+    result = star.result
+    cut = result.counts.clipped[:, 1]
+    met = cut[cut > 0]
+    if not met.size:
+        return ""
+    share = 100 * met.mean() / (result.counts.n * result.expectation.n_frames)
+    return (
+        f"{star.title}: saturation cut off {met.size} of {cut.size} pixels in the simulation, each of them in "
+        f"{share:.3g} % of its frames on average."
+    )

@@ -1,0 +1,330 @@
+"""Completeness of a search for flares: of injected ones over size and half-width, and how well they are recovered."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import astuple, dataclass, field
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.answers.answer import Answer, InCell
+from mauvecl.host.doors import public
+from mauvecl.host.errors import InputError
+from mauvecl.host.tables import tabled
+from mauvecl.lightcurve.search.injected import Injected
+from mauvecl.lightcurve.search.injections import Injections
+from mauvecl.lightcurve.search.null import DAY_S, Counted, in_a_row_rate, sampled
+from mauvecl.lightcurve.search.recoveries import Fitted, Refit
+from mauvecl.lightcurve.stares.requests import Arrays
+from mauvecl.runs.pool import Pool, together
+from mauvecl.statistics.intervals import Interval
+from mauvecl.study.labels import described, label, stacked, told
+from mauvecl.study.staring import orbit_lines
+from mauvecl.study.study import Study
+from mauvecl.study.surveys import Sizes, Surveyed, sizes_of, surveyed
+
+if TYPE_CHECKING:
+    from astropy.table import QTable, Table
+
+    from mauvecl.device.stares import Stares
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.lightcurve.stares.requests import StaresRequest
+    from mauvecl.study.sections import Star
+
+Float = NDArray[np.float64]
+
+#: Powers at which limits are given.
+POWERS = (0.5, 0.9)
+#: Units of sizes, as astropy reads them.
+SIZE_UNITS = {"amplitude": "", "duration": "s", "energy": "erg", "band_energy": "erg"}
+#: Standard errors of the number of alarms beyond which the two differ.
+DIFFERS = 4.0
+#: Star-days of a stare that importance sampling looks at, at most.
+SAMPLED_DAYS = 2.0
+#: Maps in one picture.
+MOST_DRAWN = 6
+
+
+@dataclass(frozen=True, eq=False)
+class StarCompleteness(InCell):
+    """One star in one cell of the sweep.
+
+    Attributes
+    ----------
+    surveyed : Surveyed
+    sizes : Sizes
+    threshold : Interval
+    simulated : Interval
+        False alarms per star-day of drawn stares at the value `checked`, which a few in ten exceed, with 4 standard
+        errors; NaN where none are drawn.
+    asked : float
+        What it should be there by importance sampling.
+    checked : float
+    saturates : float
+        Amplitude from which on flares saturate a used pixel, which injections leave out.
+    in_a_row : float
+        False alarms per star-day of the common rule in white noise.
+    injected : Injected
+    fitted : Fitted, optional
+    """
+
+    surveyed: Surveyed
+    sizes: Sizes
+    threshold: Interval
+    simulated: Interval
+    asked: float
+    checked: float
+    saturates: float
+    in_a_row: float
+    injected: Injected
+    fitted: Fitted | None
+
+    @property
+    def messages(self) -> list[str]:
+        """Where drawn stares alarm more or less often than normal noise, and where flares saturate."""
+        messages = []
+        if not np.isnan(self.simulated.value) and not self.simulated.low <= self.asked <= self.simulated.high:
+            messages.append(
+                f"FALSE ALARMS of {self.title} are not those of normal noise: {self.simulated.value:.3g} per star-day "
+                f"at {self.checked:.2f} in drawn stares, {self.asked:.3g} by importance sampling: the search does not "
+                "marginalise over what changes in the stare (see [search] frame, cycle, window_s), or set "
+                'search.null = "counted".'
+            )
+        if self.injected.amplitudes.max() > self.saturates:
+            messages.append(
+                f"SATURATED: flares of {self.title} with an amplitude above {self.saturates:.3g} saturate a pixel, "
+                "which injections leave out."
+            )
+        return messages
+
+
+@dataclass(eq=False)
+class InjectAnswer(Answer):
+    """What `mauvecl inject` answers.
+
+    Attributes
+    ----------
+    study : Study
+    stars : list of StarCompleteness
+    messages : list of str
+    """
+
+    study: Study
+    stars: list[StarCompleteness]
+    messages: list[str] = field(default_factory=list)
+
+    @cached_property
+    def table(self) -> QTable:
+        """One row per star, cell of the sweep, and what is found of all half-widths and of each: sizes E50 and E90."""
+        return self._together(_limits)
+
+    @cached_property
+    def completeness(self) -> QTable:
+        """One row per star, cell of the sweep, half-width and size."""
+        return self._together(_cells)
+
+    @cached_property
+    def search(self) -> QTable:
+        """One row per star and cell of the sweep: thresholds, false alarms."""
+        return self._together(_search)
+
+    def _together(self, make: Callable[[StarCompleteness], QTable]) -> QTable:
+        parts = (({**star.at, "star": star.label}, make(star)) for star in self.stars)
+        choice = self.study.search
+        meta = {
+            "false_alarms": f"{choice.false_alarms:g} per star-{choice.per}",
+            "flare": f"{self.study.flare.temperature_k:g} K, {choice.shape}, amplitudes in {self.study.flare.band}",
+            "study": self.study.text(),
+        }
+        return stacked(parts, **meta)
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        """Limits, completeness of every cell, thresholds."""
+        return {"limits": self.table, "completeness": self.completeness, "search": self.search}
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        return [star.surveyed.quiet for star in self.stars]
+
+    @property
+    def pictures(self) -> dict[str, tuple[Any, ...]]:
+        """Maps of completeness, curves over size, and where flares are fitted a map of the energies recovered."""
+        fitted = {"energies": ("injections.energies", self)} if all(star.fitted for star in self.stars) else {}
+        return {"completeness": ("injections.maps", self), "curves": ("injections.curves", self), **fitted}
+
+
+def _limits(star: StarCompleteness) -> QTable:
+    injected, unit = star.injected, SIZE_UNITS[star.sizes.of]
+    every = (None, *range(len(injected.half_widths_s)))
+    widths, told = [np.nan, *injected.half_widths_s], "half-width of the injected flares; NaN for all of them alike"
+    columns: list[tuple[object, ...]] = [("half_width", widths, told, "s")]
+    for power in POWERS:
+        name, limits = f"e{100 * power:.0f}", np.array([astuple(injected.limit(power, k)) for k in every]).T
+        columns += [
+            (name, limits[0], f"{star.sizes.of} at which the completeness is {power:g}", unit),
+            (f"{name}_low", limits[1], "its 95 % interval, lower end", unit),
+            (f"{name}_high", limits[2], "its 95 % interval, upper end", unit),
+        ]
+    text = "share of flares for which no template fits into what is observed"
+    return described(tabled([*columns, ("never", np.array([injected.never(k) for k in every]), text)]))
+
+
+def _cells(star: StarCompleteness) -> QTable:
+    injected, of, unit = star.injected, star.sizes.of, SIZE_UNITS[star.sizes.of]
+    d, s = (index.ravel() for index in np.indices((len(injected.half_widths_s), len(injected.sizes))))
+    columns = [
+        ("half_width", np.array(injected.half_widths_s)[d], "half-width of the injected flares", "s"),
+        ("size", injected.sizes[s], f"{of} of the injected flares", unit),
+        ("amplitude", injected.amplitudes[d, s], "their amplitude: relative rise of the photons in the flare's band"),
+        ("completeness", injected.completeness[d, s], "share of injected flares that the search finds"),
+        ("completeness_low", injected.completeness_low[d, s], "its 95 % interval, lower end"),
+        ("completeness_high", injected.completeness_high[d, s], "its 95 % interval, upper end"),
+        ("injections", np.full(d.size, injected.count)),
+    ]
+    if star.fitted is not None:
+        columns += [(name, getattr(star.fitted, name)[d, s], text) for name, text in Fitted.COLUMNS.items()]
+    return described(tabled(columns))
+
+
+def _search(star: StarCompleteness) -> QTable:
+    s = star.surveyed.survey
+    rows = (
+        ("threshold", star.threshold.value, "S/N from which on a template is an alarm"),
+        ("threshold_low", star.threshold.low, "its 95 % interval, lower end"),
+        ("threshold_high", star.threshold.high, "its 95 % interval, upper end"),
+        ("checked_at", star.checked, "S/N at which drawn stares are held against normal noise"),
+        ("alarms_sampled", star.asked, "false alarms per star-day there, normal noise"),
+        ("alarms_simulated", star.simulated.value, "false alarms per star-day there, drawn stares"),
+        ("alarms_low", star.simulated.low, "lower end: 4 standard errors"),
+        ("alarms_high", star.simulated.high, "upper end: 4 standard errors"),
+        ("in_a_row", star.in_a_row, "false alarms per star-day of the common rule, white noise"),
+        ("templates", s.search.n_filters, "templates of the bank"),
+        ("sums", s.components.n_statistics, "weighted sums of a frame"),
+        ("spectral_loss", float(star.surveyed.templates.loss.max()), "largest share of S/N lost to so few sums"),
+        ("star_days", s.stare.observed_s / DAY_S, "star-days of a stare"),
+    )
+    return described(tabled((name, [value], text) for name, value, text in rows))
+
+
+@public
+def inject(
+    study: Study, engine: Stares | Pool | None = None, *, progress: Callable[[int, int], None] | None = None
+) -> InjectAnswer:
+    """Completeness of a study's search at each of its stars, in every cell of its sweep.
+
+    Parameters
+    ----------
+    study : Study
+    engine : Stares or Pool, optional
+        Who draws; the default device.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in injections; may raise to stop the work.
+
+    Raises
+    ------
+    InputError
+        For anything in the study that cannot be.
+    """
+    idle = next((axis.quantity for axis in study.sweep.axes if axis.quantity in ("amplitude", "exposure")), None)
+    if idle is not None:
+        raise InputError(f"the sweep has the quantity {idle!r}, which injections have none of, expected another")
+    if engine is None:
+        from mauvecl.device.stares import Stares as Default
+
+        engine = Default()
+    cells = [(values, one, star) for values, one in study.cells() for star in one.star]
+    q = study.injections
+    each = q.count * q.sizes * q.widths
+    answer = InjectAnswer(study, [])
+    for number, (values, one, star) in enumerate(cells):
+
+        def told_of(part: float, number: int = number) -> None:
+            if progress is not None:
+                progress(round((number + part) * each), len(cells) * each)
+
+        told_of(0.0)
+        answer.stars.append(_star(one, star, values, engine, told_of))
+    told_of(1.0)
+    answer.messages = [
+        *(text for star in answer.stars for text in star.messages),
+        *told(answer.inputs),
+        *orbit_lines(study),
+    ]
+    return answer
+
+
+def _star(
+    study: Study, star: Star, at: Mapping[str, float | str], engine: Stares | Pool, told_of: Callable[[float], None]
+) -> StarCompleteness:
+    choice, asked, seed = study.search, study.injections, study.run.seed
+    rays = study.processes.processes().cosmic_rays
+    known = surveyed(study, star)
+    survey = known.survey
+    drawn = None
+    if choice.nulls:
+        maxima = _reduced(engine, survey.null(choice.nulls, seed, rays))["maximum"]
+        drawn = Counted(np.sort(maxima), survey.stare.observed_s / DAY_S)
+    short = survey.of_days(SAMPLED_DAYS)
+    tail = sampled(short.search, seed=seed)
+    threshold = (
+        tail.threshold(choice.rate) if choice.null == "sampled" or drawn is None else drawn.threshold(choice.rate)
+    )
+    sizes = Sizes.chosen(study, star, known.source)
+    values = sizes_of(study, sizes, known.unit_snr, threshold.value)
+    positions = min(asked.positions, asked.count)
+    injections = Injections(
+        survey, 0, asked.half_widths_s, threshold.value, seed, positions, -(-asked.count // positions), rays
+    )
+    widths = np.array(injections.half_widths_s)
+    amplitudes = np.asarray(sizes.amplitude(values[None], widths[:, None]))
+    refit = Refit(known.fit, amplitudes, study.flare.temperature_k, -(-asked.fitted // positions))
+
+    def at_one_peak(position: int) -> Arrays:
+        return _reduced(engine, injections.request(position, refit if refit.count else None))
+
+    parts: list[Arrays] = []
+    for part in together(engine, at_one_peak, range(positions)):
+        parts.append(part)
+        told_of(len(parts) / positions)
+    critical = np.stack([part["critical"].T for part in parts], axis=1)
+    # Where a few stares in ten have an alarm, drawn ones say most of whether the two agree.
+    checked, likely, error = tail.likely
+    simulated, expected = _checked(drawn, checked, likely, error, survey.stare.observed_s / short.stare.observed_s)
+    return StarCompleteness(
+        label(star, known.quiet),
+        at,
+        known,
+        sizes,
+        threshold,
+        simulated,
+        expected,
+        checked,
+        injections.saturates,
+        in_a_row_rate(choice.points, choice.sigma, survey.stare.frame_s),
+        Injected(injections.half_widths_s, values, amplitudes, sizes.of_amplitude(critical, widths[:, None, None])),
+        Fitted.of(parts) if refit.count else None,
+    )
+
+
+def _reduced(engine: Stares | Pool, request: StaresRequest) -> Arrays:
+    return engine.stares(request) if isinstance(engine, Pool) else engine.reduced(request)
+
+
+def _checked(
+    drawn: Counted | None, value: float, probability: float, error: float, longer: float
+) -> tuple[Interval, float]:
+    """False alarms per star-day of drawn stares at a value, within 4 standard errors, and what was expected."""
+    if drawn is None:
+        return Interval(np.nan, np.nan, np.nan), float("nan")
+    n = drawn.maxima.size
+    # Drawn stares may be longer than those of importance sampling.
+    none = (1 - probability) ** longer
+    reach = DIFFERS * np.hypot(np.sqrt(none * (1 - none) / n), longer * none / (1 - probability) * error)
+    p = float(np.mean(drawn.maxima >= value))
+    with np.errstate(divide="ignore"):
+        ends = [-np.log1p(-np.clip(x, 0.0, 1.0)) / drawn.days for x in (p, p - reach, p + reach)]
+        return Interval(*(float(x) for x in ends)), float(-np.log(none) / drawn.days)

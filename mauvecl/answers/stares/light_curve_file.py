@@ -1,0 +1,109 @@
+"""A stare as a FITS file: light curve, good time intervals, dynamic spectrum.
+
+The names and units of the first table are those that lightkurve reads without being told (`lightkurve.read`), and with
+it AltaiPony: TIME in days, FLUX, FLUX_ERR, QUALITY, CADENCENO.
+"""
+
+from __future__ import annotations
+
+import io
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mauvecl.host.version import VERSION
+
+if TYPE_CHECKING:
+    from astropy.io import fits
+
+    from mauvecl.answers.stares.stare import StareAnswer, StarStare
+
+DAY_S = 86_400.0
+#: Start of a stare whose study names no time: 2026-01-01, MJD. Any would do.
+NO_TIME_MJD = 61_041
+
+
+def light_curve_file(answer: StareAnswer, number: int = 0) -> bytes:
+    """The file of one star and cell."""
+    from astropy.io import fits
+
+    one = answer.stares[number]
+    when = answer.study.sky.time
+    first, comment = (NO_TIME_MJD, "arbitrary: no time was named") if when is None else (_mjd(when), "start of stare")
+    primary = fits.PrimaryHDU()
+    named: tuple[tuple[str, str | int, str], ...] = (
+        ("OBJECT", one.label, "star, simulated"),
+        ("TELESCOP", "Mauve", "simulated"),
+        ("INSTRUME", one.staring.quiet.instrument, ""),
+        ("CREATOR", f"mauvecl {VERSION}", ""),
+        ("SEED", str(answer.study.run.seed), "of the draws"),
+        ("STARENO", answer.study.stare.number, "number of the stare"),
+    )
+    for key, value, text in named:
+        primary.header[key] = (value, text)
+    hdus = fits.HDUList([primary, _table(one), _intervals(one), *_spectra(one)])
+    stare = one.staring.stare
+    times: tuple[tuple[str, str | float, str], ...] = (
+        ("TIMESYS", "UTC", "at the satellite"),
+        ("MJDREFI", int(first), comment),
+        ("MJDREFF", float(first - int(first)), ""),
+        ("TIMEUNIT", "d", ""),
+        ("TIMEDEL", stare.frame_s / DAY_S, "one frame"),
+        ("EXPOSURE", stare.observed_s / DAY_S, "d in frames"),
+        ("TSTART", 0.0, ""),
+        ("TSTOP", stare.duration_s / DAY_S, ""),
+    )
+    for hdu in hdus[1:3]:
+        for word, number_or_text, text in times:
+            hdu.header[word] = (number_or_text, text)
+    held = io.BytesIO()
+    hdus.writeto(held)
+    return held.getvalue()
+
+
+def _mjd(when: str) -> float:
+    from mauvecl.host.sky.helioecliptic import moment_of
+
+    return float(moment_of(when).utc.mjd)
+
+
+def _table(one: StarStare) -> fits.BinTableHDU:
+    from astropy.io import fits
+
+    stare, light = one.staring.stare, one.light
+    columns: list[tuple[str, str, str | None, Any]] = [
+        ("TIME", "D", "d", stare.middle_s / DAY_S),
+        ("CADENCENO", "J", None, stare.numbers),
+        ("QUALITY", "J", None, one.staring.quality),
+    ]
+    for k, name in enumerate(light.bands):
+        suffix = "" if k == 0 else "_" + name.removesuffix(" nm").replace("-", "_")
+        for column, values in (("FLUX", light.flux), ("FLUX_ERR", light.sd), ("MEAN", light.mean)):
+            columns.append((column + suffix, "E", "adu/s", values[:, k]))
+    made = [fits.Column(name=n, format=form, unit=unit, array=values) for n, form, unit, values in columns]
+    hdu = fits.BinTableHDU.from_columns(made, name="LIGHTCURVE")
+    hdu.header["BANDS"] = ", ".join(light.bands)
+    hdu.header["COMMENT"] = "FLUX: star and sky, bias and known dark taken off. MEAN: the same without noise."
+    hdu.header["COMMENT"] = "TIME: middle of the frame, days after MJDREF. QUALITY 1: saturated pixels. 0: none."
+    return hdu
+
+
+def _intervals(one: StarStare) -> fits.BinTableHDU:
+    from astropy.io import fits
+
+    start, stop = one.staring.stare.gtis.T / DAY_S
+    columns = [fits.Column(name="START", format="D", unit="d", array=start), fits.Column("STOP", "D", "d", array=stop)]
+    return fits.BinTableHDU.from_columns(columns, name="GTI")
+
+
+def _spectra(one: StarStare) -> list[Any]:
+    from astropy.io import fits
+
+    light = one.light
+    images = []
+    for name, values in (("SPECTRUM", light.spectrum), ("SPECTRUM_ERR", light.spectrum_sd)):
+        image = fits.ImageHDU(np.asarray(values, np.float32), name=name)
+        image.header["BUNIT"] = ("adu/s", "of a resolution element; rows are frames")
+        images.append(image)
+    column = fits.Column(name="WAVELENGTH", format="D", unit="nm", array=light.element_nm)
+    return [*images, fits.BinTableHDU.from_columns([column], name="WAVELENGTH")]

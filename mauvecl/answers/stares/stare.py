@@ -1,0 +1,348 @@
+"""One simulated stare at every star of a study: light curves in bands, a spectrum of every frame, the flares in it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mauvecl.answers.answer import Answer, InCell
+from mauvecl.host.doors import public
+from mauvecl.host.errors import InputError
+from mauvecl.host.tables import tabled
+from mauvecl.lightcurve.flares.events import Event, coefficients, temperatures_of
+from mauvecl.lightcurve.search.alarms import Alarm, alarms
+from mauvecl.lightcurve.search.null import sampled
+from mauvecl.lightcurve.stares.observed import Draw, Light, Staring, seen
+from mauvecl.study.labels import described, label, stacked, told
+from mauvecl.study.stares import check_sweep
+from mauvecl.study.staring import energy_of, orbit_lines, stare_of, staring_of
+from mauvecl.study.study import Study
+from mauvecl.study.surveys import surveyed
+
+if TYPE_CHECKING:
+    from astropy.table import QTable, Table
+
+    from mauvecl.device.stares import Stares
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.study.sections import Star
+
+#: Light curves in text, at most; longer ones are in their FITS files alone.
+MOST_ROWS = 100_000
+#: Frames whose spectra are kept, at most: 115 days, 1.2 GB.
+MOST_SHOWN = 2_000_000
+#: Star-days of a stare that the threshold's importance sampling looks at, at most.
+SAMPLED_DAYS = 2.0
+
+
+@dataclass(frozen=True, eq=False)
+class Flaring:
+    """One flare of a stare, with its energies, erg (NaN where the star's size is unknown), and its S/N.
+
+    `snr` is that of a search which knows everything but whether the flare is there.
+    """
+
+    event: Event
+    band_erg: float
+    bolometric_erg: float
+    snr: float
+
+
+@dataclass(frozen=True, eq=False)
+class Searched:
+    """What a search of one stare found, and the threshold that it was searched with.
+
+    Attributes
+    ----------
+    threshold : float
+        By importance sampling of normal noise.
+    alarms : list of Alarm
+        By falling value.
+    bolometric_erg : tuple of float
+        Of each, by its fit; NaN where the star's size is unknown.
+    events : tuple of int
+        The flare put in that each is nearest to, from 1 on, within a half-width and two frames; 0 for none.
+    """
+
+    threshold: float
+    alarms: list[Alarm]
+    bolometric_erg: tuple[float, ...]
+    events: tuple[int, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class StarStare(InCell):
+    """One star in one cell of the sweep; `searched` is a sentence where no search was possible."""
+
+    staring: Staring
+    flares: tuple[Flaring, ...]
+    light: Light
+    searched: Searched | str | None = None
+
+
+@dataclass(eq=False)
+class StareAnswer(Answer):
+    """What `mauvecl stare` answers.
+
+    Attributes
+    ----------
+    study : Study
+    stares : list of StarStare
+        Every star in every cell of the sweep.
+    messages : list of str
+    """
+
+    study: Study
+    stares: list[StarStare]
+    messages: list[str] = field(default_factory=list)
+
+    @property
+    def table(self) -> QTable:
+        """One row per star and cell: frames, gaps, light and noise of a frame, flares."""
+
+        def row(one: StarStare) -> QTable:
+            stare, light, told = one.staring.stare, one.light, one.searched
+            columns: list[tuple[object, ...]] = [
+                ("frames", [stare.n_frames], "frames of the stare"),
+                ("observed", [stare.observed_s], "time in them", "s"),
+                ("intervals", [len(stare.gtis)], "good time intervals: runs of frames without a gap"),
+                ("flux", [float(np.median(light.mean[:, 0]))],
+                 "median net light of a frame, sky included, without bias and dark", "DN / s"),
+                ("frame_noise", [float(np.median(light.sd[:, 0] / light.mean[:, 0]))],
+                 "standard deviation of a frame's own noise, relative to its light"),
+                ("flares", [len(one.flares)], "flares put into it"),
+            ]  # fmt: skip
+            if self.study.stare.search:
+                threshold, alarms = (told.threshold, len(told.alarms)) if isinstance(told, Searched) else (np.nan, -1)
+                columns += [
+                    ("threshold", [threshold], "value of the search's statistic from which on it alarms"),
+                    ("found", [alarms], "flares found; -1: not searched"),
+                ]
+            saturated = int(np.count_nonzero(one.staring.quality))
+            told_of = "frames in which the mean of a used pixel reaches saturation"
+            return tabled([*columns, ("saturated_frames", [saturated], told_of)])
+
+        return self._together(row)
+
+    @property
+    def events(self) -> QTable:
+        """One row per flare: when, how long, how large, how hot, and the S/N of one who looks for just this one."""
+
+        def rows(one: StarStare) -> QTable:
+            flares, events = one.flares, [flare.event for flare in one.flares]
+            numbers = (
+                ("peak_time", [e.peak_s for e in events], "from the start of the stare; tau = 0 of the shape", "s"),
+                ("half_width", [e.half_width_s for e in events], "t_1/2 of the shape's publication", "s"),
+                ("amplitude", [e.amplitude for e in events], "the shape's own, in the flare's band", ""),
+                ("peak", [e.peak for e in events], "highest relative rise of the photons in the flare's band", ""),
+                ("temperature", [e.hottest_k for e in events], "blackbody temperature, at the peak", "K"),
+                ("equivalent_duration", [e.equivalent_duration_s for e in events], "in the flare's band", "s"),
+                ("energy_band", [f.band_erg for f in flares], "in the flare's band; nan: star of unknown size", "erg"),
+                ("energy_bolometric", [f.bolometric_erg for f in flares], "of all of its light", "erg"),
+                ("snr", [f.snr for f in flares], "of one who knows all but whether the flare is there", ""),
+            )
+            shapes = np.array([e.form.name for e in events], dtype="U32")
+            plain = ((name, np.array(values, np.float64), *more) for name, values, *more in numbers)
+            return tabled([*plain, ("shape", shapes)])
+
+        return self._together(rows)
+
+    @property
+    def found(self) -> QTable:
+        """One row per flare that the search found: what it was by a fit, with standard errors, and which was put in."""
+
+        def rows(one: StarStare) -> QTable:
+            searched = one.searched if isinstance(one.searched, Searched) else Searched(np.nan, [], (), ())
+            fits = [alarm.recovered for alarm in searched.alarms]
+            fitted = (
+                ("peak_time", "peak{}_s", "from the start of the stare", "s"),
+                ("amplitude", "amplitude{}", "in the flare's band", ""),
+                ("half_width", "half_width{}_s", "t_1/2 of the search's shape", "s"),
+                ("temperature", "temperature{}_k", "blackbody temperature", "K"),
+                ("equivalent_duration", "equivalent_duration{}_s", "in the flare's band", "s"),
+            )
+            best = "of the search's statistic: S/N of the template that fits best"
+            nearest = "row of the star's flares that it is nearest to, from 1 on; 0: none near"
+            columns: list[tuple[object, ...]] = []
+            for name, key, text, unit in fitted:
+                for end, more in (("", ""), ("_error", "; standard error")):
+                    values = [float(getattr(fit, key.format(end))[0]) for fit in fits]
+                    columns.append((name + end, np.array(values, np.float64), text + more, unit))
+            columns += [
+                ("energy_bolometric", np.array(searched.bolometric_erg, np.float64), "", "erg"),
+                ("value", np.array([alarm.rho for alarm in searched.alarms], np.float64), best),
+                ("event", np.array(searched.events, np.int64), nearest),
+            ]
+            return tabled(columns)
+
+        return self._together(rows)
+
+    def light_curve(self, number: int = 0) -> QTable:
+        """Frames of one star and cell: time, cadence number, quality, and light in every band."""
+        one = self.stares[number]
+        stare, light = one.staring.stare, one.light
+        kinds = (
+            ("flux", light.flux, "net light, bias and known dark taken off"),
+            ("flux_err", light.sd, "standard deviation of its photons, dark and reading"),
+            ("mean", light.mean, "the same without any noise"),
+        )
+        suffixes = ["", *("_" + name.removesuffix(" nm").replace("-", "_") for name in light.bands[1:])]
+        return tabled(
+            [
+                ("time", stare.middle_s, "middle of the frame, from the start of the stare", "s"),
+                ("frame", stare.numbers, "number of the frame, gaps included"),
+                ("quality", one.staring.quality, "1 where the mean of a used pixel reaches saturation"),
+                *(
+                    (column + suffix, values[:, k], f"{name}: {text}", "DN / s")
+                    for k, (name, suffix) in enumerate(zip(light.bands, suffixes, strict=True))
+                    for column, values, text in kinds
+                ),
+            ],
+            **{"star": one.label, "study": self.study.text(), "seed": self.study.run.seed, **one.at},
+        )
+
+    def _together(self, table_of: Callable[[StarStare], QTable]) -> QTable:
+        parts = (({"star": one.label, **one.at}, table_of(one)) for one in self.stares)
+        return stacked(parts, study=self.study.text(), seed=self.study.run.seed)
+
+    @property
+    def tables(self) -> dict[str, Table]:
+        """The stares, their flares, and a light curve of each."""
+        curves = {
+            f"light-curve-{n}": described(self.light_curve(n - 1))
+            for n, one in enumerate(self.stares, 1)
+            if one.staring.stare.n_frames <= MOST_ROWS
+        }
+        found = {"found": self.found} if self.study.stare.search else {}
+        return {"stare": self.table, "events": self.events} | found | curves
+
+    @property
+    def documents(self) -> dict[str, Callable[[], bytes]]:
+        """A FITS file of each star and cell: light curve, good time intervals, dynamic spectrum."""
+        from mauvecl.answers.stares.light_curve_file import light_curve_file
+
+        return {f"light-curve-{n}.fits": partial(light_curve_file, self, n - 1) for n in range(1, len(self.stares) + 1)}
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        return [one.staring.quiet for one in self.stares]
+
+    @property
+    def pictures(self) -> dict[str, tuple[Any, ...]]:
+        """Light curves and dynamic spectrum of each star and cell."""
+        drawn: dict[str, tuple[Any, ...]] = {}
+        for n, one in enumerate(self.stares, 1):
+            drawn[f"light-curve-{n}"] = ("stares.light_curves", one)
+            drawn[f"dynamic-spectrum-{n}"] = ("stares.dynamic_spectrum", one)
+        return drawn
+
+    @property
+    def remarks(self) -> list[str]:
+        long = [one.title for one in self.stares if one.staring.stare.n_frames > MOST_ROWS]
+        return (
+            [f"More than {MOST_ROWS} frames: light curves of {', '.join(long)} are in FITS files alone."]
+            if long
+            else []
+        )
+
+    def as_json(self) -> dict[str, Any]:
+        from mauvecl.answers.report import rows
+
+        tables = {"stares": self.table, "events": self.events} | (
+            {"found": self.found} if self.study.stare.search else {}
+        )
+        return {"messages": self.messages} | {name: rows(table) for name, table in tables.items()}
+
+
+@public
+def stare(study: Study, stares: Stares) -> StareAnswer:
+    """One simulated stare at every star of a study, in every cell of its sweep.
+
+    Parameters
+    ----------
+    study : Study
+        Its section `stare`, `events`, star, flare, sky, observation; `run.seed` and `stare.number` say which stare.
+    stares : Stares
+        Draws it.
+
+    Raises
+    ------
+    InputError
+        For anything in the study that cannot be.
+    """
+    check_sweep(study)
+    # What is swept changes no frame.
+    frames = stare_of(study).n_frames
+    if frames > MOST_SHOWN:
+        raise InputError(f"a stare of {frames} frames, each with a spectrum, expected at most {MOST_SHOWN}")
+    # Everything is looked at before anything is drawn: bad input shows at once.
+    prepared = [(star, at, cell, *staring_of(cell, star)) for at, cell in study.cells() for star in cell.star]
+    found = [_drawn(study, stares, *one) for one in prepared]
+    messages = told([staring.quiet for _, _, _, staring, _ in prepared]) + orbit_lines(study)
+    messages += [one.searched for one in found if isinstance(one.searched, str)]
+    for one in found:
+        cut = int(np.count_nonzero(one.staring.quality))
+        if cut:
+            messages.insert(0, f"SATURATED: {cut} frames of the stare at {one.title}; their quality is 1.")
+    return StareAnswer(study, found, messages)
+
+
+def _drawn(
+    study: Study,
+    stares: Stares,
+    star: Star,
+    at: Mapping[str, float | str],
+    cell: Study,
+    staring: Staring,
+    events: list[Event],
+) -> StarStare:
+    q, rays = study.stare, study.processes.processes().cosmic_rays
+
+    def draw(components: Any) -> Any:
+        return stares.frames(
+            components, staring.stare, staring.flare, first=q.number, count=1, seed=study.run.seed, cosmic_rays=rays
+        )[0]
+
+    light = seen(staring, q.bands_nm, draw)
+    searched = _searched(cell, star, staring, events, draw) if q.search else None
+    return StarStare(label(star, staring.quiet), at, staring, _flares(cell, star, staring, events), light, searched)
+
+
+def _searched(study: Study, star: Star, staring: Staring, events: list[Event], draw: Draw) -> Searched | str:
+    """What the study's search finds, or why it cannot be made."""
+    try:
+        known = surveyed(study, star)
+        survey = replace(known.survey, components=staring.components(known.templates.weights))
+        tail = sampled(survey.of_days(SAMPLED_DAYS).search, seed=study.run.seed)
+        threshold = tail.threshold(study.search.rate).value
+    except InputError as error:
+        return f"{label(star, staring.quiet)} is not searched: {error}."
+    found = alarms(survey, known.templates, draw(survey.components), threshold)
+    energies, nearest = [], []
+    for alarm in found:
+        fit = alarm.recovered
+        kelvin = float(np.nan_to_num(fit.temperature_k[0], nan=study.flare.temperature_k))
+        event = Event(
+            float(fit.peak_s[0]), float(fit.half_width_s[0]), float(fit.amplitude[0]), kelvin, study.search.shape
+        )
+        energy = energy_of(study, star, known.source, event, "bolometric")
+        energies.append(float("nan") if energy is None else energy)
+        away = [abs(one.peak_s - event.peak_s) for one in events]
+        near = int(np.argmin(away)) if away else -1
+        close = near >= 0 and away[near] <= events[near].half_width_s + 2 * staring.stare.frame_s
+        nearest.append(near + 1 if close else 0)
+    return Searched(threshold, found, tuple(energies), tuple(nearest))
+
+
+def _flares(study: Study, star: Star, staring: Staring, events: list[Event]) -> tuple[Flaring, ...]:
+    source, kelvin, frames = star.source(), temperatures_of(events), staring.stare
+    found = []
+    for event in events:
+        energies = [energy_of(study, star, source, event, kind) for kind in ("band", "bolometric")]
+        band, bolometric = (float("nan") if energy is None else energy for energy in energies)
+        own = coefficients([event], frames.start_s, frames.frame_s, kelvin)
+        found.append(Flaring(event, band, bolometric, staring.snr(own)))
+    return tuple(found)

@@ -1,0 +1,121 @@
+"""The study that a verb's flags make of a file, or of the default."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mauvecl.cli.flags import Flag
+    from mauvecl.study.study import Study
+
+
+def study_of(
+    file: Path | None,
+    given: dict[str, Any],
+    flags: Mapping[str, Flag],
+    default: Callable[[dict[str, Any]], Study] | None,
+) -> Study:
+    """A study file, or the default, with the flags on top, and ``--set`` on top of those."""
+    from mauvecl.host.errors import InputError
+    from mauvecl.study.study import Study
+
+    study = Study.read(file) if file is not None else default(given) if default else Study()
+    changes: dict[str, dict[str, Any]] = {"sky": sky_of(given)}
+    setting: dict[tuple[str, str], str] = {}
+    for name, one in flags.items():
+        if one.section:
+            value = given[name]
+            if value is not None:
+                other = setting.setdefault((one.section, one.key), name)
+                if other != name:
+                    raise InputError(
+                        f"--{other} and --{name} are both given, expected one of them: both set {one.section}.{one.key}"
+                    )
+                changes.setdefault(one.section, {})[one.key] = one.convert(value) if one.convert else value
+    if given.get("nuisance"):
+        changes.setdefault("nuisances", {}).update(nuisances_of(study, given["nuisance"]))
+    changed = study.with_changes(changes, stars_of(study, given))
+    return changed.with_settings(given["set"]) if given["set"] else changed
+
+
+def sky_of(given: dict[str, Any]) -> dict[str, Any]:
+    from mauvecl.host.errors import InputError
+
+    if "time" not in given:
+        return {}
+    sky: dict[str, Any] = {"target": given["target"], "time": given["time"]}
+    text = given["sky"]
+    if text is not None and text.strip().lower() == "none":
+        sky["none"] = True
+    elif text is not None:
+        try:
+            sky["surface_brightness"] = float(text)
+        except ValueError as error:
+            raise InputError(f"--sky {text!r}, expected V mag/arcsec^2 or none") from error
+    return sky
+
+
+def nuisances_of(study: Study, texts: list[str]) -> dict[str, Any]:
+    """What is unknown, as words: dark=0.1, or a file's name, as in stray.txt=free."""
+    from mauvecl.host.errors import InputError
+    from mauvecl.host.files.bounded import shortened
+    from mauvecl.statistics.names import NUISANCES
+
+    nuisances: dict[str, Any] = {}
+    own = {name: one.model_dump(exclude_none=True) for name, one in study.nuisances.own.items()}
+    for text in texts:
+        name, _, sd = (part.strip() for part in text.rpartition("="))
+        if not (name and sd):
+            raise InputError(
+                f"--nuisance {shortened(text)}, expected NAME=SD, with a name of {', '.join(NUISANCES)} or a file's, "
+                "and a standard deviation or free"
+            )
+        if name in NUISANCES:
+            nuisances[name] = sd
+        else:
+            own[Path(name).stem] = {"file": Path(name), "sd": sd}
+    return nuisances | ({"own": own} if own else {})
+
+
+def stars_of(study: Study, given: dict[str, Any]) -> list[dict[str, Any]] | None:
+    from mauvecl.host.errors import InputError
+
+    if "star" not in given:
+        return None
+    names, magnitudes = given["star"], given["magnitude"]
+    same = {key: given[key] for key in ("band", "magnitude_system", "ebv", "bin_nm") if given[key] is not None}
+    sizes = {"distance_pc": "distance", "radius_rsun": "radius", "effective_temperature_k": "star_temperature"}
+    same |= {key: given[flag] for key, flag in sizes.items() if given.get(flag) is not None}
+    of_files = {key: given[key] for key in ("wavelength_unit", "flux_unit", "extend") if given[key] is not None}
+    if not (names or magnitudes or same or of_files):
+        return None
+    if names:
+        # A name that is a file's is a file; anything else is looked up in the library.
+        stars: list[dict[str, Any]] = [{"file": name} if _is_file(name) else {"library": name} for name in names]
+    else:
+        stars = [entry.model_dump(exclude_none=True) for entry in study.star]
+    if magnitudes:
+        if len(magnitudes) not in (1, len(stars)):
+            raise InputError(f"{len(magnitudes)} magnitudes for {len(stars)} stars, expected one for all or one each")
+        for entry, value in zip(stars, magnitudes * (len(stars) if len(magnitudes) == 1 else 1), strict=True):
+            entry["magnitude"] = value
+    if of_files and not any("file" in entry for entry in stars):
+        flags = " and ".join("--" + key.replace("_", "-") for key in of_files)
+        raise InputError(f"{flags} without a spectrum file among the stars, expected --star FILE")
+    return [entry | same | (of_files if "file" in entry else {}) for entry in stars]
+
+
+def _is_file(name: str) -> bool:
+    from mauvecl.host.spectra.formats import without_columns
+
+    try:
+        file, _ = without_columns(name)
+        if file.exists():
+            return True
+    except (OSError, ValueError):
+        # What no file name can be is refused as one.
+        return True
+    # "K2.5V" looks like a file's name and is not one.
+    return bool(file.suffix) and not file.suffix[1:].isupper()

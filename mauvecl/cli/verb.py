@@ -1,0 +1,119 @@
+"""A function of a study and a session as a verb of the command line, which takes a study file and flags."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, get_type_hints
+
+from mauvecl.cli.flags import (
+    FEWER,
+    FEWER_DRAWS,
+    OBSERVATION,
+    PICTURES,
+    SETTINGS,
+    TELLING,
+    WORKERS,
+    Flag,
+    StudyFile,
+    output_flag,
+)
+from mauvecl.cli.question import study_of
+from mauvecl.cli.values import as_text
+
+if TYPE_CHECKING:
+    from mauvecl.study.study import Study
+
+
+def takes_study(
+    *groups: Mapping[str, Flag],
+    name: str = "",
+    without: str = "",
+    fewer: bool = False,
+    writes: str = "",
+    default: Callable[[dict[str, Any]], Study] | None = None,
+    draws: bool = True,
+    pictures: bool = True,
+    observation: Mapping[str, Flag] = OBSERVATION,
+) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """Let a verb take a study file and flags, and hand it the study and the session that they make.
+
+    Parameters
+    ----------
+    *groups : mapping of Flag
+        Flags beside those of the observation.
+    name : str
+        The verb's, where it is not the function's.
+    without : str
+        A flag of the observation that the verb does not take.
+    fewer : bool
+        Whether `FEWER` realisations are the default.
+    writes : str
+        Where it writes unless told, where that is no folder of tables.
+    default : callable, optional
+        Makes the study where no file is given, from the flags; the paper's question by default.
+    draws, pictures : bool
+        Whether the verb draws realisations, and pictures.
+    observation : mapping of Flag
+        In place of the flags of an observation. Where one is called `targets`, a table may stand for the study file.
+
+    Returns
+    -------
+    callable
+        A decorator for functions whose first parameters are the study and the session. One named `given` receives the
+        flags; others are options of its own.
+    """
+    every = (observation, *groups, FEWER_DRAWS if fewer else {}, SETTINGS)
+    flags = {key: one for group in every for key, one in group.items() if key != without}
+
+    def decorate(verb: Callable[..., None]) -> Callable[..., None]:
+        called = name or verb.__name__
+        output = output_flag(writes or f"the folder mauvecl-{called}")
+        around = {"output": (output, None)} | TELLING | (PICTURES if pictures else {}) | (WORKERS if draws else {})
+        kinds = get_type_hints(verb, localns={"Study": Any, "Session": Any}, include_extras=True)
+        _, _, *own = inspect.signature(verb).parameters.values()
+
+        def command(study_file: Path | None = None, **values: Any) -> None:
+            from mauvecl.cli.foresight import question_time, question_values
+            from mauvecl.cli.session import Session
+
+            for key, (shown, read) in readers.items():
+                if values.get(key) is not None and not isinstance(values[key], int | float):
+                    values[key] = read(values[key], shown)
+            given = {key: values.pop(key, None) for key in flags}
+            if "targets" in flags and study_file is not None and study_file.suffix.lower() == ".csv":
+                given["targets"], study_file = study_file, None
+            if fewer and study_file is None and given["realisations"] is None:
+                given["realisations"] = FEWER
+            how = {key: values.pop(key, usual) for key, (_, usual) in around.items()}
+            if "given" in kinds:
+                values["given"] = given
+            study = study_of(study_file, given, flags, default)
+            question_values(study, detects="fap" in flags)
+            if draws:
+                question_time(study, **{key: how[key] for key in ("device", "cluster", "insist")})
+            with Session(called, study, **how) as session:
+                verb(study, session, **values)
+
+        named = inspect.Parameter.KEYWORD_ONLY
+        parameters = [
+            inspect.Parameter("study_file", named, default=None, annotation=StudyFile),
+            *(inspect.Parameter(key, named, default=None, annotation=one.kind) for key, one in flags.items()),
+            *(p.replace(kind=named, annotation=kinds[p.name]) for p in own if p.name != "given"),
+            *(inspect.Parameter(key, named, default=usual, annotation=kind) for key, (kind, usual) in around.items()),
+        ]
+        readers = {}
+        for place, parameter in enumerate(parameters):
+            # Numbers come as text: whatever is wrong with one is told in one style.
+            kind, shown, read = as_text(parameter.annotation)
+            if read is not None:
+                readers[parameter.name] = shown or "--" + parameter.name.replace("_", "-"), read
+                default_text = None if parameter.default is None else f"{parameter.default:g}"
+                parameters[place] = parameter.replace(annotation=kind, default=default_text)
+        command.__name__, command.__doc__ = verb.__name__, verb.__doc__
+        command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+        command.__annotations__ = {p.name: p.annotation for p in parameters}
+        return command
+
+    return decorate

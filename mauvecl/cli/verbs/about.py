@@ -1,0 +1,103 @@
+"""The verbs about mauvecl itself: devices, their self-test, what a study may hold."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from mauvecl.cli.flags import DeviceFlag, JsonFlag, QuietFlag
+
+WhereFlag = Annotated[
+    Path | None,
+    typer.Option("--output", "-o", metavar="PATH", help="Where to write [nowhere].", show_default=False),
+]
+
+
+def devices(
+    rate: Annotated[bool, typer.Option("--rate/--no-rate", help="Measure each device for a second.")] = True,
+    as_json: JsonFlag = False,
+) -> None:
+    """OpenCL devices that the kernels can run on, and their rates.
+
+    Promise: which numbers are the same as on every other device.
+    Rate: pixel-realisations per second of the chi2 statistic, two scenarios.
+
+    Example: mauvecl devices
+    """
+    from mauvecl.device.rate import measured
+
+    records = measured() if rate else measured(measure=False)
+    if as_json:
+        print(json.dumps(records, indent=2))
+        return
+    from mauvecl.cli.console import show_table
+
+    cells = [
+        (
+            str(number),
+            f"{record['platform']}: {record['name']}",
+            record["driver"],
+            record["kind"],
+            str(record["compute_units"]),
+            f"{record['global_memory'] / 2**30:.1f}",
+            record["promise"],
+            record["error"] or ("" if record["rate"] is None else f"{record['rate']:.2g} /s"),
+            "default" if record["default"] else "",
+        )
+        for number, record in enumerate(records)
+    ]
+    columns = ("number", "device", "driver", "kind", "units", "GiB", "promise", "rate", "")
+    show_table("OpenCL devices; choose with --device NUMBER or part of a name", columns, cells)
+
+
+def selftest(
+    device: DeviceFlag = None, output: WhereFlag = None, as_json: JsonFlag = False, quiet: QuietFlag = False
+) -> None:
+    """Whether your own device gives what it should.
+
+    Known answers, the slow twin in NumPy, tests of chance and closed forms, in some ten seconds.
+
+    Exit code 1 if a check fails. Later run records on the same device carry the outcome.
+
+    Example: mauvecl selftest
+    """
+    from dataclasses import asdict
+
+    from mauvecl.answers import report
+    from mauvecl.cli.console import Meter, show, show_table
+    from mauvecl.device import selftest
+    from mauvecl.device.engine import Engine
+
+    started = time.perf_counter()
+    folder = None if output is None else report.make_folder(output)
+    with Meter(quiet=quiet or as_json) as meter:
+        engine = Engine(device, progress=meter)
+        checks = selftest.run(engine)
+    seconds = time.perf_counter() - started
+    selftest.keep(engine, checks, seconds)
+    failed = sum(not check.passed for check in checks)
+    if as_json:
+        print(json.dumps(selftest.last(engine.device) or [asdict(check) for check in checks], indent=2))
+    else:
+        cells = [("PASS" if check.passed else "FAIL", check.name, check.result) for check in checks]
+        show_table(f"Self-test of {engine.device_name}, driver {engine.driver}", ("", "check", "found"), cells)
+        outcome = f"{failed} of {len(checks)} checks FAILED" if failed else f"All {len(checks)} checks passed"
+        show([f"{outcome} in {seconds:.0f} s. Promise: {engine.device.promise}."])
+    if folder is not None:
+        report.write_json(selftest.last(engine.device), folder / "selftest.json")
+    if failed:
+        raise typer.Exit(1)
+
+
+def schema() -> None:
+    """The JSON schema of study files, for editors that check TOML.
+
+    Example: mauvecl schema > study.schema.json, and a first line #:schema study.schema.json in the study
+    """
+    from mauvecl.study.study import Study
+
+    print(json.dumps(Study.model_json_schema(), indent=2))

@@ -1,0 +1,184 @@
+"""The verbs of raw spectra in bulk: draw them, verify them, put some into one file."""
+
+from __future__ import annotations
+
+import json
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from mauvecl.cli.flags import BULK, DRAWS, FLARE, SWEEP, DeviceFlag, JsonFlag, QuietFlag
+from mauvecl.cli.verb import takes_study
+
+if TYPE_CHECKING:
+    from mauvecl.cli.session import Session
+    from mauvecl.store.form import Store
+    from mauvecl.study.study import Study
+
+StoreArgument = Annotated[Path, typer.Argument(help="Store that `mauvecl realise` wrote.")]
+RowsFlag = Annotated[
+    str | None,
+    typer.Option(metavar="TEXT", help="Realisations, as in 1000:2000, the last not included.", show_default=False),
+]
+
+
+@takes_study(
+    FLARE,
+    DRAWS,
+    SWEEP,
+    BULK,
+    fewer=True,
+    pictures=False,
+    writes="mauvecl-frames.zarr; also NAME.fits, .h5, .hdf5",
+)
+def realise(study: Study, session: Session) -> None:
+    """Raw spectra in bulk: a Zarr store, or one FITS or HDF5 file.
+
+    One file holds fewer than 4 GiB. An array per star and flare, a row per realisation, with calibration, units and
+    the study. What was written stays: --resume draws what is missing.
+
+    Examples: mauvecl realise study.toml -n 1000000 --output frames.zarr
+
+    mauvecl realise --star G2V --magnitude 7.4 --amplitude 0.24 --exposure 5 -n 1000 --output frames.fits
+    """
+    from mauvecl.cli.foresight import question_room
+    from mauvecl.cli.session import told_of_interrupts, working
+    from mauvecl.host.errors import InputError
+    from mauvecl.store import bulk
+    from mauvecl.store.export import ENDINGS
+    from mauvecl.store.form import Store
+
+    place = session.output or Path("mauvecl-frames.zarr")
+    one_file = place.suffix in ENDINGS
+    if not one_file and place.suffix not in ("", ".zarr"):
+        raise InputError(f"--output {str(place)!r}, expected a name ending in .zarr, {', '.join(ENDINGS)}")
+    folder = bulk.unfinished(place) if one_file else place
+    question_room(Store(folder, study), insist=session.insist)
+    with (
+        told_of_interrupts(lambda: f"what was written to {str(folder)!r} is kept, and --resume draws the rest"),
+        session.metered("spectra") as meter,
+        working(session.device, session.cluster) as workers,
+    ):
+        from mauvecl.runs.pool import Pool
+
+        pool = Pool(workers)
+        meter.standing = lambda: pool.standing
+        draw = bulk.realise_file if one_file else bulk.realise
+        store = draw(study, place, pool, resume=session.resume, restart=session.restart, progress=meter)
+    _tell(store, place, session)
+
+
+def _tell(store: Store, place: Path, session: Session) -> None:
+    from mauvecl.cli.console import show_table
+    from mauvecl.study.labels import told
+
+    messages = told([scene.expectation for scene in store.scenes])
+    session.say(messages)
+    rows = [
+        {
+            "array": scene.path,
+            "star": scene.star,
+            "amplitude": scene.amplitude,
+            "shape": [store.rows, *scene.row],
+            "type": scene.dtype.name,
+        }
+        for scene in store.scenes
+    ]
+    if session.as_json:
+        session.print_json({"messages": messages, "store": str(place), "bytes": store.n_bytes, "arrays": rows})
+        return
+    show_table(
+        f"Raw spectra, DN; seed {store.study.run.seed}. Rows of the same number share their random numbers, rows of "
+        "different number are independent.",
+        ("array", "star", "flare", "shape", "type"),
+        [
+            (row["array"], row["star"], f"{100 * float(str(row['amplitude'])):g} %",
+             " x ".join(str(n) for n in (store.rows, *scene.row)), row["type"])
+            for row, scene in zip(rows, store.scenes, strict=True)
+        ],
+    )  # fmt: skip
+    if not session.quiet:
+        seconds = time.perf_counter() - session.started
+        session.say([f"Wrote {store.n_bytes / 2**20:.0f} MiB to {place} in {seconds:.1f} s."])
+
+
+def verify(
+    store: StoreArgument,
+    repair: Annotated[bool, typer.Option("--repair", help="Draw again what is wrong, to the same bits.")] = False,
+    redraw: Annotated[
+        bool, typer.Option("--redraw", help="Draw every spectrum again and compare, not only digests.")
+    ] = False,
+    rows: RowsFlag = None,
+    device: DeviceFlag = None,
+    as_json: JsonFlag = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Whether a store is as it was written; can repair it.
+
+    Finds flipped bytes, missing and foreign chunks.
+
+    Exit code 1 if anything is wrong and not repaired.
+
+    Example: mauvecl verify frames.zarr --repair
+    """
+    from dataclasses import asdict
+
+    from mauvecl.cli.console import Meter, show, show_table
+    from mauvecl.device.engine import Engine
+    from mauvecl.store import bulk
+
+    engine = Engine(device) if repair or redraw else None
+    with Meter(quiet=quiet or as_json, unit="chunks") as meter:
+        faults = bulk.verify(store, engine, repair=repair, redraw=redraw, rows=_rows_of(rows), progress=meter)
+    left = sum(not fault.mended for fault in faults)
+    if as_json:
+        print(json.dumps([asdict(fault) for fault in faults], indent=2))
+    else:
+        if faults:
+            cells = [(fault.key, fault.state, "repaired" if fault.mended else "") for fault in faults]
+            show_table(f"Not as it was written: {store}", ("file", "what", ""), cells)
+        told = "with what was written" if not redraw else "with what the engine draws"
+        show([f"{len(faults) - left} repaired, {left} left as found." if faults else f"Everything agrees {told}."])
+    if left:
+        raise typer.Exit(1)
+
+
+def export(
+    store: StoreArgument,
+    file: Annotated[Path, typer.Argument(help="Ending in .fits, .h5 or .hdf5.")],
+    array: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--array", metavar="TEXT", help="Such as star-1/flare-2; may be repeated [all].", show_default=False
+        ),
+    ] = None,
+    rows: RowsFlag = None,
+    replace: Annotated[bool, typer.Option("--replace", help="Take the place of what has that name.")] = False,
+    quiet: QuietFlag = False,
+) -> None:
+    """Some of a store as one FITS or HDF5 file.
+
+    Example: mauvecl export frames.zarr some.fits --array star-1/quiescent --rows 0:1000
+    """
+    from mauvecl.cli.console import show
+    from mauvecl.store.export import Selection
+    from mauvecl.store.export import export as write
+    from mauvecl.store.form import Store
+
+    write(Selection.of(Store.open(store), array, _rows_of(rows)), file, replace=replace)
+    if not quiet:
+        show([f"Wrote {file}, {file.stat().st_size / 2**20:.1f} MiB."])
+
+
+def _rows_of(text: str | None) -> tuple[int, int] | None:
+    from mauvecl.host.errors import InputError
+
+    if text is None:
+        return None
+    first, _, stop = text.partition(":")
+    try:
+        return int(first), int(stop)
+    except ValueError as error:
+        raise InputError(f"--rows {text!r}, expected a range such as 1000:2000") from error

@@ -1,0 +1,152 @@
+"""The verbs that look at a star: one observation, its signal to noise, the exposure for a wanted one."""
+
+from __future__ import annotations
+
+import math
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from mauvecl.cli.console import short
+from mauvecl.cli.flags import AT, COUNTED, DRAWS, FLARE, SIGNAL, SWEEP
+from mauvecl.cli.verb import takes_study
+
+if TYPE_CHECKING:
+    from mauvecl.answers.signal.exposures import ExposureResult
+    from mauvecl.answers.signal.simulate import SimulateAnswer
+    from mauvecl.answers.signal.snr import SnrAnswer
+    from mauvecl.cli.session import Session
+    from mauvecl.study.study import Study
+
+
+@takes_study(FLARE, COUNTED, {"seed": DRAWS["seed"]}, draws=False)
+def simulate(
+    study: Study,
+    session: Session,
+    given: dict[str, Any],
+    realisation: Annotated[int, typer.Option(min=0, max=2**63 - 1, help="Which realisation to show.")] = 0,
+) -> None:
+    """One observation, and what it is made of.
+
+    Star, sky, photon noise, dark, bias, read noise, and the closed-form S/N.
+
+    Example: mauvecl simulate --star G2V --magnitude 7.4 --exposure 50 --amplitude 0.24
+    """
+    from mauvecl.answers.signal.simulate import simulate as compute
+
+    answer = compute(study, realisation=realisation, flaring=bool(given["amplitude"]))
+    session.answer(answer, lambda: _show_observations(answer))
+
+
+def _show_observations(answer: SimulateAnswer) -> None:
+    from mauvecl.cli.console import show_table
+
+    show_table(
+        "One observation each (closed-form S/N)",
+        ("observation", "frames", "peak (nm)", "peak signal (DN)", "best S/N pixel", "best S/N element", "saturated"),
+        [
+            (s["observation"], str(s["frames"]), f"{s['peak_nm']:.1f}", f"{s['peak_dn']:.0f}", f"{s['snr_pixel']:.2f}",
+             f"{s['snr_element']:.1f}", str(s["saturated_pixels"]))
+            for s in answer.summary
+        ],
+    )  # fmt: skip
+
+
+def _budgets_or_star(given: dict[str, Any]) -> Study:
+    """The paper's noise budgets where nothing is named, else the paper's stars."""
+    from mauvecl.study.study import PAPER_BUDGETS, Study
+
+    named = any(given[name] for name in ("star", "magnitude", "exposure", "sweep"))
+    return Study() if named else PAPER_BUDGETS
+
+
+@takes_study(DRAWS, COUNTED, AT, SWEEP, fewer=True, default=_budgets_or_star)
+def snr(
+    study: Study,
+    session: Session,
+) -> None:
+    """Signal-to-noise ratios: their distributions, and noise budgets.
+
+    Of each pixel and of each resolution element (10.5 nm).
+
+    The signal is the star's alone: the sky is subtracted, and its photons are noise (`--signal paper`: signal as well).
+
+    Without arguments: the three stars of the paper's noise budgets, 50 s and 600 s.
+
+    Examples: mauvecl snr --star B2IV --magnitude 3.03 --exposure 5
+
+    mauvecl snr --star G2V --sweep magnitude=4,6,8,10 --sweep exposure=5,50,600
+    """
+    from mauvecl.answers.signal.snr import snr as compute
+
+    with session.pool() as engine:
+        answer = compute(study, engine)
+    session.answer(answer, lambda: _show_snr(answer))
+
+
+def _show_snr(answer: SnrAnswer) -> None:
+    """S/N and noise at some wavelengths; all of them are in the files."""
+    from mauvecl.answers.signal.exposures import place_of
+    from mauvecl.cli.console import show_table
+
+    cells, budgets = [], []
+    for star in answer.stars:
+        x, table = star.result.expectation, star.result.element
+        budget = x.noise_budget()
+        name = (star.label, *map(short, star.at.values()))
+        for wavelength in star.shown_nm:
+            row, noise = table[place_of(x, wavelength, "element")], budget[place_of(x, wavelength, "pixel")]
+            cells.append(
+                (*name, f"{row['wavelength'].value:.1f}", f"{row['expected']:.2f}", f"{row['mean']:.2f}",
+                 f"{row['std']:.2f}", f"{row['q2.5']:.2f}", f"{row['q50']:.2f}", f"{row['q97.5']:.2f}")
+            )  # fmt: skip
+            parts = ("source_photon", "zodiacal_photon", "dark", "read", "total")
+            budgets.append((*name, f"{wavelength:g}", *(f"{noise[part].value:.2f}" for part in parts)))
+    swept = tuple(axis.quantity for axis in answer.study.sweep.axes)
+    show_table(
+        "S/N per 10.5 nm element; all of them in the files",
+        ("star", *swept, "nm", "closed form", "mean", "std", "2.5 %", "50 %", "97.5 %"),
+        cells,
+    )
+    show_table(
+        "Noise of a pixel by origin, DN rms",
+        ("star", *swept, "nm", "source photons", "zodiacal photons", "dark", "read", "total"),
+        budgets,
+    )
+
+
+@takes_study(SIGNAL, COUNTED, without="exposure", draws=False)
+def exposure(
+    study: Study,
+    session: Session,
+) -> None:
+    """The shortest exposure with a wanted S/N at a wavelength.
+
+    By the closed form, in whole frames; `mauvecl snr` goes the other way.
+
+    Example: mauvecl exposure --snr 10 --at 300 --star G2V --magnitude 7.4
+    """
+    from mauvecl.answers.signal.exposures import exposure_for
+
+    answer = exposure_for(study)
+    session.answer(answer, lambda: _show_exposures(answer))
+
+
+def _show_exposures(answer: ExposureResult) -> None:
+    from mauvecl.cli.console import show_table
+
+    def floored(snr: float) -> float:
+        # What falls short must not look as if it did not.
+        return math.floor(1000 * snr) / 1000
+
+    wanted = answer.study.signal
+    show_table(
+        f"Exposure for an S/N of {wanted.snr:g} per {wanted.per} at {wanted.wavelength_nm:g} nm "
+        "(closed form, whole frames)",
+        ("star", "exposure (s)", "frames", "S/N", "a frame less", ""),
+        [
+            (e.star, f"{e.exposure_s:.10g}", str(e.frames), f"{e.snr:.3f}", f"{floored(e.snr_one_frame_less):.3f}",
+             "SATURATED" if e.saturated else "")
+            for e in answer.exposures
+        ],
+    )  # fmt: skip

@@ -1,0 +1,43 @@
+"""The verb that serves the page."""
+
+from __future__ import annotations
+
+from importlib.util import find_spec
+from typing import Annotated
+
+import typer
+
+
+def serve(
+    address: Annotated[
+        str, typer.Option(metavar="TEXT", help="Who may come: 127.0.0.1 is this machine alone.")
+    ] = "127.0.0.1",
+    port: Annotated[int, typer.Option(min=1, max=65535, help="Port.")] = 5006,
+    allow_origin: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="TEXT",
+            help="An address that visitors' browsers show, such as https://mauve.example.org; needed where --address "
+            "lets in other machines. May be repeated.",
+            show_default=False,
+        ),
+    ] = None,
+    show: Annotated[bool, typer.Option("--show", help="Open a browser.")] = False,
+) -> None:
+    """A page in your browser: questions, answers, downloads.
+
+    Example: mauvecl serve --show
+    """
+    from mauvecl.host.errors import InputError
+    from mauvecl.host.files.bounded import shortened
+
+    if find_spec("bokeh") is None or find_spec("tornado") is None:
+        raise InputError("Bokeh is missing, expected it for the page: pip install 'mauvecl[web]'")
+    from mauvecl.web.server import serve
+
+    try:
+        serve(address, port, show=show, allowed=allow_origin or ())
+    except OSError as error:
+        raise InputError(
+            f"port {port} of {shortened(address)} cannot be used ({error.strerror}), expected another: --port"
+        ) from error

@@ -1,0 +1,1 @@
+"""Histograms and moments of whole numbers: what a device counted of a statistic or a pixel."""

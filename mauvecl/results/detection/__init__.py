@@ -1,0 +1,1 @@
+"""Detections: thresholds, probabilities, ROC, rare tails, departures from the closed forms, campaigns of many tests."""

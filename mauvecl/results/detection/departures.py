@@ -1,0 +1,254 @@
+"""Where a simulation differs from the closed form for Gaussian noise, by how much, and why."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from mauvecl.host.doors import public
+from mauvecl.host.tables import tabled
+from mauvecl.noise.cumulants import Cumulants
+from mauvecl.results.requests.fap import countable
+from mauvecl.statistics.distributions import Form
+from mauvecl.statistics.intervals import Interval
+from mauvecl.statistics.statistic import LinearStatistic, QuadraticStatistic
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.results.detection.detection import Detection
+
+Float = NDArray[np.float64]
+
+#: A difference of so many standard errors is one.
+SIGNIFICANT = 4.0
+
+
+@dataclass(frozen=True)
+class Departure:
+    """The null of one statistic at the threshold for Gaussian noise.
+
+    Attributes
+    ----------
+    statistic : str
+    template : int
+        The flare whose shape is looked for, or any.
+    threshold : float
+        At the wanted false-alarm probability for Gaussian noise.
+    fap : float
+        The one wanted.
+    simulated : Interval
+        The false-alarm probability that the simulation finds there.
+    skew, rounding, clipping : float
+        Predicted changes of the false-alarm probability there, relative to the one wanted: by the noise's third and
+        fourth cumulants, by the ADC's steps, by its ends.
+    others : tuple of str
+        What the closed form does not know, and no prediction is made for.
+    realisations : int
+    """
+
+    statistic: str
+    template: int
+    threshold: float
+    fap: float
+    simulated: Interval
+    skew: float
+    rounding: float
+    clipping: float
+    others: tuple[str, ...]
+    realisations: int
+
+    @property
+    def ratio(self) -> float:
+        """Simulated over wanted false-alarm probability."""
+        return self.simulated.value / self.fap
+
+    @property
+    def error(self) -> float:
+        """Standard error of the ratio, if the closed form holds."""
+        return float(np.sqrt((1.0 - self.fap) / (self.fap * self.realisations)))
+
+    @property
+    def differs(self) -> bool:
+        """Whether chance does not explain the ratio."""
+        return abs(self.ratio - 1.0) > SIGNIFICANT * self.error
+
+    @property
+    def why(self) -> str:
+        """The largest of the causes where the simulation differs, and nothing elsewhere."""
+        if not self.differs:
+            return ""
+        causes = {"skew of the noise": self.skew, "rounding": self.rounding, "clipping": self.clipping}
+        rest = self.ratio - 1.0 - sum(causes.values())
+        if self.others:
+            causes[" and ".join(self.others)] = rest
+        name, size = max(causes.items(), key=lambda item: abs(item[1]))
+        return name if abs(size) > 0.2 * abs(self.ratio - 1.0) else "unexplained"
+
+
+@public
+def departures(detection: Detection, fap: float) -> list[Departure]:
+    """One row per statistic, and per flare for those that look for a flare's shape.
+
+    Parameters
+    ----------
+    detection : Detection
+    fap : float
+        Wanted, per test.
+
+    Raises
+    ------
+    InputError
+        As `Detection.threshold`, for one that cannot be counted.
+    """
+    scene = detection.scene
+    others = []
+    if scene.comparison.estimated:
+        others.append("variances estimated from the counts")
+    if scene.cosmic:
+        others.append("cosmic rays")
+    if scene.modulations and not detection.setting.integrates:
+        others.append("priors that the reference does not know")
+    elif detection.nuisances is not None and not scene.modulations:
+        others.append("unknowns that are marginalised over and not drawn")
+    digital = _digital(detection.quiet) if scene.clip else None
+    rows = []
+    for statistic in detection.statistics:
+        for template in range(len(detection.flares)) if detection.statistic(statistic).shaped else (0,):
+            null = detection.closed_form(statistic, template=template)
+            cut = null.isf(fap)
+            rounding = clipping = 0.0
+            if digital is not None:
+                rounding = _moved(detection, statistic, template, *digital[0], cut) / fap - 1.0
+                clipping = _moved(detection, statistic, template, *digital[1], cut) / fap - 1.0 - rounding
+            rows.append(
+                Departure(
+                    statistic,
+                    template,
+                    cut,
+                    fap,
+                    detection.false_alarm_probability(cut, statistic, template=template),
+                    _skewed(detection, statistic, template, null, cut) / fap - 1.0,
+                    rounding,
+                    clipping,
+                    tuple(others),
+                    detection.realisations,
+                )
+            )
+    return rows
+
+
+def departure_table(detection: Detection, amplitudes: Sequence[float], fap: float) -> QTable:
+    """The departures of a detection, one row each; none where thresholds cannot be counted.
+
+    Parameters
+    ----------
+    detection : Detection
+    amplitudes : sequence of float
+        Of its flares.
+    fap : float
+    """
+    rows = departures(detection, fap) if countable(fap, detection.realisations) else []
+    shaped = [detection.statistic(d.statistic).shaped for d in rows]
+    numbers = (
+        ("gaussian_threshold", [d.threshold for d in rows], "threshold for Gaussian noise"),
+        ("fap", [d.simulated.value for d in rows], "simulated false-alarm probability there"),
+        ("fap_low", [d.simulated.low for d in rows], "its 95 % interval, lower end"),
+        ("fap_high", [d.simulated.high for d in rows], "its 95 % interval, upper end"),
+        ("ratio", [d.ratio for d in rows], "simulated over wanted false-alarm probability"),
+        ("ratio_error", [d.error for d in rows], "standard error of the ratio"),
+        ("skew", [d.skew for d in rows], "predicted change of the ratio by the noise's skew and kurtosis"),
+        ("rounding", [d.rounding for d in rows], "predicted change of the ratio by the ADC's steps"),
+        ("clipping", [d.clipping for d in rows], "predicted change of the ratio by the ADC's ends"),
+    )
+    differs = np.array([d.differs for d in rows], bool)
+    return tabled(
+        (
+            ("statistic", np.array([d.statistic for d in rows], str)),
+            (
+                "amplitude",
+                np.array([amplitudes[d.template] if s else np.nan for d, s in zip(rows, shaped, strict=True)]),
+            ),
+            *((name, np.array(values, float), text) for name, values, text in numbers),
+            ("differs", differs, "whether chance does not explain the ratio: 4 standard errors"),
+            ("why", np.array([d.why for d in rows], str)),
+        ),
+        fap=fap,
+    )
+
+
+def _skewed(detection: Detection, statistic: str, template: int, null: Form, cut: float) -> float:
+    """False-alarm probability at a threshold with the noise's third and fourth cumulants."""
+    scene, quiet = detection.scene, detection.quiet
+    each = 1 if scene.frames else quiet.n_frames
+    c, draws = Cumulants.of(quiet, each), quiet.n_frames // each
+    one, flare = detection.statistic(statistic), detection.shape(statistic, template)
+    # Of the difference from the mean of some exposures.
+    added = one.added_variance(detection.setting)
+    third, fourth, sixth = (
+        draws * (c.photon_cumulant(r) + c.dark_cumulant(r)) * (1.0 + (-1.0) ** r * added ** (r - 1)) for r in (3, 4, 6)
+    )
+    variance = one.variance(detection.setting)
+    if isinstance(one, LinearStatistic):
+        weights = one.weights_per_dn(detection.setting, flare)
+        sd = float(np.sqrt(weights**2 @ variance))
+        z, skew, excess = cut / null.std, weights**3 @ third / sd**3, weights**4 @ fourth / sd**4
+        # Edgeworth's series (Abramowitz & Stegun 26.2.48).
+        series = skew * (z**2 - 1) / 6 + excess * (z**3 - 3 * z) / 24 + skew**2 * (z**5 - 10 * z**3 + 15 * z) / 72
+        return float(null.sf(cut) + np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) * series)
+    assert isinstance(one, QuadraticStatistic)
+    # Each pixel's own square has more variance and more skew than a normal's.
+    own = one.own(detection.setting, flare)
+    second = null.std**2
+    skewed = null.third
+    more = own**2 @ fourth, own**3 @ (12.0 * fourth * variance + 10.0 * third**2 + sixth)
+    plain, there = (
+        _gamma_sf(cut, null.mean, second + part * float(more[0]), skewed + part * float(more[1])) for part in (0.0, 1.0)
+    )
+    return null.sf(cut) * there / plain
+
+
+def _gamma_sf(value: float, mean: float, variance: float, third: float) -> float:
+    """Probability of exceeding a value, of a shifted gamma distribution with these cumulants."""
+    shape = 4.0 * variance**3 / third**2
+    return float(special.gammaincc(shape, max(shape + (value - mean) / np.sqrt(variance) * np.sqrt(shape), 0.0)))
+
+
+def _moved(detection: Detection, statistic: str, template: int, shift: Float, variance: Float, cut: float) -> float:
+    """False-alarm probability at a threshold if the exposure's counts had another mean and variance, per pixel."""
+    one, used = detection.statistic(statistic), detection.scene.used
+    added = one.added_variance(detection.setting)
+    delta, true = np.where(used, (1.0 - (added > 0)) * shift, 0.0), (1.0 + added) * variance
+    return one.as_drawn(detection.setting, detection.quiet, delta, true, detection.shape(statistic, template)).sf(cut)
+
+
+def _digital(x: Expectation) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
+    """What the ADC does to an exposure's mean and variance, DN, with steps alone and with its low end as well.
+
+    Saturation, the high end, is in the closed forms.
+
+    Returns
+    -------
+    rounded, clipped : (shift, variance), each shape (n_pixel,)
+    """
+    mean, sd = x.mean_raw_dn, np.sqrt(np.maximum(x.unsaturated_variance_dn2 / x.n_frames - 1 / 12, 0.0))
+    recorded = x.recorded_dn / x.n_frames
+    moments = []
+    for low, high in ((-np.inf, float(x.highest_dn)), (0.0, float(x.highest_dn))):
+        shift, variance = np.zeros_like(mean), np.zeros_like(mean)
+        for p, (m, s) in enumerate(zip(mean, sd, strict=True)):
+            # Whole numbers around the mean, the outermost taking all that lies beyond.
+            dn = np.arange(np.floor(m - 9 * s) - 1, np.ceil(m + 9 * s) + 2)
+            below = special.ndtr((dn[:-1] + 0.5 - m) / s) if s > 0 else (dn[:-1] + 0.5 >= m).astype(float)
+            chance = np.diff(below, prepend=0.0, append=1.0)
+            seen = np.clip(dn, low, high)
+            centre = float(chance @ seen)
+            shift[p], variance[p] = centre - recorded[p], chance @ (seen - centre) ** 2
+        moments.append((x.n_frames * shift, x.n_frames * variance))
+    return moments[0], moments[1]

@@ -1,0 +1,290 @@
+"""Thresholds with a known false-alarm probability, and detection probabilities with intervals."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Self
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.host.content import ByContent
+from mauvecl.host.doors import public
+from mauvecl.host.plotting import picture
+from mauvecl.host.quantities import count
+from mauvecl.host.tables import tabled, telling
+from mauvecl.results.counts.tally import Distribution, TailSamples, Tally
+from mauvecl.results.detection.roc import Roc
+from mauvecl.results.requests.channels import ChannelPlan, Key
+from mauvecl.results.requests.fap import Tails, check_fap, countable
+from mauvecl.results.requests.hypotheses import Hypotheses
+from mauvecl.statistics.detection_interval import detection_interval
+from mauvecl.statistics.intervals import Interval, central_counts, clopper_pearson
+from mauvecl.statistics.statistic import LinearStatistic
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.results.detection.tails import Tail
+
+
+@public
+@dataclass(eq=False)
+class Detection(ByContent, Hypotheses):
+    """Null and flare distributions as they were counted; made by `Engine.detect`.
+
+    Parameters and attributes are those of `Hypotheses` and these.
+
+    Attributes
+    ----------
+    realisations : int
+    tails : {"counted", "sampled"}
+        Whether a threshold beyond what was drawn is refused, or found by importance sampling.
+    seed : int
+        Of the draws.
+    """
+
+    realisations: int
+    tails: Tails = "counted"
+    seed: int = 0
+    _tails: dict[tuple[str, int, float], Tail] = field(default_factory=dict, init=False, repr=False, compare=False)
+    _distributions: dict[Key, Distribution] = field(default_factory=dict, init=False, repr=False)
+    _samples: dict[Key, TailSamples] = field(default_factory=dict, init=False, repr=False)
+
+    @classmethod
+    def of(cls, hypotheses: Hypotheses, realisations: int, tails: Tails, seed: int) -> Self:
+        """Of hypotheses as they are: nothing is prepared again, and closed forms that one computes the other has."""
+        made = object.__new__(cls)
+        counts: dict[str, Any] = {"_tails": {}, "_distributions": {}, "_samples": {}}
+        vars(made).update(vars(hypotheses) | counts, realisations=realisations, tails=tails, seed=seed)
+        return made
+
+    def _line(self) -> str:
+        flares, names = len(self.flares), ", ".join(self.statistics)
+        return f"of {self.quiet.name!r}, {flares} flares by {names}, {self.realisations} realisations"
+
+    def collect(self, plan: ChannelPlan, tally: Tally, samples: Sequence[TailSamples | None]) -> None:
+        """Take over the distributions and tails of one batch."""
+        for index, (key, kept) in enumerate(zip(plan.keys, samples, strict=True)):
+            self._distributions[key] = tally.distribution(index)
+            if kept is not None:
+                self._samples[key] = kept
+
+    def distribution(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Distribution:
+        """The simulated distribution of a statistic.
+
+        Parameters
+        ----------
+        statistic : str
+        flare : int, optional
+            Which flare; None for the null.
+        template : int
+            For the null of shaped statistics: the flare whose shape is looked for.
+        """
+        self._check(statistic, flare, template)
+        if flare is None:
+            return self._at(self._null_key(statistic, template))
+        return self._at((statistic, "flare", flare))
+
+    def _at(self, key: Key) -> Distribution:
+        """What was counted; InputError where it has values that are no finite numbers."""
+        statistic, role, flare = key
+        counted = self._distributions[key]
+        of = "without a flare" if role == "null" else f"with flare {flare + 1}"
+        counted.refuse_undefined(f"statistic {statistic!r} {of}")
+        return counted
+
+    def histogram(
+        self, statistic: str, flare: int | None = None, *, template: int = 0, bins: int = 200
+    ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Edges and counts for pictures; parameters as for `distribution`."""
+        return self.distribution(statistic, flare, template=template).histogram(count("bins", bins, low=1))
+
+    def threshold(self, fap: float = 1e-3, statistic: str = "chi2", *, template: int = 0) -> Interval:
+        """The value exceeded with false-alarm probability `fap` in one test.
+
+        Parameters
+        ----------
+        fap : float
+            Per test.
+        statistic : str
+        template : int
+            For shaped statistics: the flare whose shape is looked for.
+
+        Returns
+        -------
+        Interval
+            The simulated upper quantile, rounded up to a bin's edge (1/512 of a standard deviation, or 2**-13 of the
+            value beyond 32 of them), and an order-statistic interval; where tails are sampled and few lie beyond, what
+            importance sampling found.
+
+        Raises
+        ------
+        InputError
+            If fewer than 100 realisations lie beyond and tails are counted: the tail is never extrapolated.
+        """
+        return self._cut(fap, statistic, template)
+
+    def tail(self, fap: float, statistic: str = "chi2", *, template: int = 0) -> Tail | None:
+        """The importance sampling behind a threshold, or None where realisations were counted."""
+        self._check(statistic, None, template)
+        check_fap(fap, self.realisations, self.tails)
+        if countable(fap, self.realisations):
+            return None
+        key = (statistic, self._null(statistic, template), fap)
+        if key not in self._tails:
+            from mauvecl.results.detection.tails import tail
+
+            self._tails[key] = tail(self, fap, statistic, template=template, seed=self.seed)
+        return self._tails[key]
+
+    def false_alarm_probability(self, threshold: float, statistic: str = "chi2", *, template: int = 0) -> Interval:
+        """Fraction of null realisations at or above a threshold, with its interval; the inverse of `threshold`.
+
+        Exact at edges of bins, as thresholds that were counted are; linear within a bin.
+        """
+        null = self.distribution(statistic, template=template)
+        return self._share_above(null, Interval(threshold, threshold, threshold))
+
+    def detection_probability(self, fap: float = 1e-3, statistic: str = "chi2") -> list[Interval]:
+        """For each flare, the fraction of realisations at or above the threshold; NaN for `blinding` ones.
+
+        The interval holds the probability above the true threshold with 95 %: see `intervals.detection_interval`.
+
+        Raises
+        ------
+        InputError
+            As `threshold`.
+        """
+        probabilities = []
+        for flare in range(len(self.flares)):
+            if flare in self.blinding:
+                probabilities.append(Interval(np.nan, np.nan, np.nan))
+                continue
+            cut = self._cut(fap, statistic, flare)
+            counted = self._at((statistic, "flare_on_null_grid", flare))
+            above = [counted.above(value) for value in (cut.value, cut.high, cut.low)]
+            shared = 0.0
+            if countable(fap, self.realisations) and counted.std > 0:
+                # A flare adds what is not correlated with the null; tilted draws are others than the flares'.
+                shared = min(self._at(self._null_key(statistic, flare)).std / counted.std, 1.0)
+            probabilities.append(detection_interval(above, counted.n, fap, shared))
+        return probabilities
+
+    @staticmethod
+    def _share_above(distribution: Distribution, cut: Interval) -> Interval:
+        """The share at or above a threshold; its interval is of whole counts, at the ends of the threshold's own."""
+        value, low, high = (distribution.above(x) for x in (cut.value, cut.high, cut.low))
+        return Interval(
+            value / distribution.n,
+            clopper_pearson(int(np.floor(low)), distribution.n).low,
+            clopper_pearson(int(np.ceil(high)), distribution.n).high,
+        )
+
+    def quantile(
+        self, probability: float, statistic: str = "chi2", flare: int | None = None, *, template: int = 0
+    ) -> Interval:
+        """A quantile of a simulated distribution with its order-statistic interval; others as for `distribution`."""
+        return self.distribution(statistic, flare, template=template).quantile_interval(probability)
+
+    def tail_samples(self, statistic: str = "chi2", flare: int | None = None, *, template: int = 0) -> QTable:
+        """The 1000 largest values of a null or the smallest of a flare, exactly, with their realisations.
+
+        The realisation's number brings its spectrum back: `Engine.realise` with the same seed.
+
+        Returns
+        -------
+        QTable
+            ``realisation`` and ``value``, the most extreme first.
+        """
+        self._check(statistic, flare, template)
+        key: Key = (statistic, "flare", flare) if flare is not None else self._null_key(statistic, template)
+        self._at(key)
+        kept = self._samples[key]
+        told = "of the statistic, as the device computed it"
+        return tabled([("realisation", kept.realisations), ("value", kept.values, told)])
+
+    def roc(self, statistic: str = "chi2", flare: int = 0) -> Roc:
+        """False-alarm probability against detection probability, and the area under the curve."""
+        self._check(statistic, flare)
+        null = self._at(self._null_key(statistic, flare))
+        return Roc.of(null, self._at((statistic, "flare_on_null_grid", flare)))
+
+    def plot(self, path: str | Path | None = None, *, fap: float = 1e-3, ax: Any = None) -> object:
+        """Null and flare distributions by every statistic, with thresholds; needs matplotlib."""
+        flares = [f"flare {k + 1}" for k in range(len(self.flares))]
+        return picture("answers.detection", [(self.quiet.name, self, flares)], fap, path, ax=ax)
+
+    def table(self, fap: float = 1e-3) -> QTable:
+        """One row per flare and statistic: expected and simulated values, threshold and probability.
+
+        Raises
+        ------
+        InputError
+            As `threshold`.
+        """
+        from astropy.table import QTable
+
+        columns = (
+            "name", "statistic", "dof", "expected", "mean", "std", "reduced", "threshold", "threshold_low",
+            "threshold_high", "probability", "low", "high", "closed_form_threshold", "closed_form_probability",
+        )  # fmt: skip
+        probability = {statistic: self.detection_probability(fap, statistic) for statistic in self.statistics}
+        rows = []
+        for flare, x in enumerate(self.flares):
+            for statistic in self.statistics:
+                d, p = self.distribution(statistic, flare), probability[statistic][flare]
+                cut = self.threshold(fap, statistic, template=flare)
+                theory = self.closed_form(statistic, flare)
+                limit = self.closed_form(statistic, template=flare).isf(fap)
+                dof = self.dof(statistic)
+                # A weighted sum has no degrees of freedom to be divided by.
+                reduced = np.nan if isinstance(self.statistic(statistic), LinearStatistic) else d.mean / dof
+                of_flare, power = (theory.mean, d.mean, d.std, reduced), theory.sf(limit)
+                if flare in self.blinding:
+                    of_flare, power = (np.nan,) * 4, np.nan
+                row = (x.name, statistic, dof, *of_flare, cut.value, cut.low, cut.high, p.value, p.low, p.high)
+                rows.append((*row, limit, power))
+        table = QTable(rows=rows, names=columns)
+        tails = [self.tail(fap, s, template=flare) for flare in range(len(self.flares)) for s in self.statistics]
+        binomial = float(np.sqrt((1 - fap) / (fap * self.realisations)))
+        table["fap_error"] = [binomial if tail is None else tail.relative_error for tail in tails]
+        table.meta |= {"fap": fap, "realisations": self.realisations, "exposure_s": self.quiet.exposure_s}
+        table.meta["tails"] = "counted" if countable(fap, self.realisations) else "importance sampling"
+        return telling(table, DESCRIPTIONS)
+
+    def _null_key(self, statistic: str, template: int) -> Key:
+        return statistic, "null", self._null(statistic, template)
+
+    def _null(self, statistic: str, template: int) -> int:
+        return template if self.statistic(statistic).shaped else 0
+
+    def _cut(self, fap: float, statistic: str, template: int) -> Interval:
+        """The threshold: as it was sampled, or the null's lowest edges with so many at or above them."""
+        sampled = self.tail(fap, statistic, template=template)
+        if sampled is not None:
+            return sampled.threshold
+        null = self._at(self._null_key(statistic, template))
+        n_low, n_high = central_counts(null.n, fap)
+        wanted = (int(np.floor(fap * null.n * (1 + 1e-12))), n_high, max(n_low - 1, 0))
+        return Interval(*map(null.edge_with_at_most, wanted))
+
+
+DESCRIPTIONS = {
+    "dof": "degrees of freedom without a flare",
+    "expected": "closed-form mean with the flare",
+    "mean": "simulated mean with the flare",
+    "std": "simulated standard deviation with the flare",
+    "reduced": "simulated mean over degrees of freedom; none for weighted sums",
+    "threshold": "simulated threshold at the false-alarm probability, per test",
+    "threshold_low": "its 95 % interval, lower end",
+    "threshold_high": "its 95 % interval, upper end",
+    "probability": "detection probability at that threshold",
+    "low": "its 95 % interval, lower end, the threshold's error included",
+    "high": "its 95 % interval, upper end, the threshold's error included",
+    "closed_form_threshold": "threshold for Gaussian noise",
+    "closed_form_probability": "detection probability for Gaussian noise",
+    "fap_error": "relative standard error of the false-alarm probability at the threshold",
+}

@@ -1,0 +1,98 @@
+"""Receiver operating characteristics of simulated distributions, with intervals."""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import special
+
+from mauvecl.host.plotting import picture
+from mauvecl.host.tables import tabled
+from mauvecl.statistics.intervals import CONFIDENCE, Interval, clopper_pearson
+
+if TYPE_CHECKING:
+    from astropy.table import QTable
+
+    from mauvecl.results.counts.tally import Distribution
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Roc:
+    """False-alarm probability against detection probability, from the lowest threshold to the highest.
+
+    Attributes
+    ----------
+    threshold, fap, probability : ndarray, shape (n,)
+        At edges of bins; those between which nothing lies are left out.
+    realisations : int
+        Of the null, and of the flare.
+    area : Interval
+        The probability that a flare's value exceeds a null's, ties counted half, with DeLong's interval.
+    """
+
+    threshold: Float
+    fap: Float
+    probability: Float
+    realisations: int
+    area: Interval
+
+    @classmethod
+    def of(cls, null: Distribution, flare: Distribution) -> Roc:
+        """From two histograms on one grid.
+
+        Notes
+        -----
+        The area's variance is that of DeLong et al. (1988, doi 10.2307/2531595) for null and flare drawn apart. Here
+        they share their draws, so that the interval errs on the wide side. Without any overlap the lower end is
+        Clopper and Pearson's for as many pairs as there are realisations.
+        """
+        # Bins of both that hold anything; those of one grid are the same.
+        lower, first = np.unique(np.concatenate([null.bins[0], flare.bins[0]]), return_index=True)
+        upper = np.concatenate([null.bins[1], flare.bins[1]])[first]
+        share, above = np.zeros((2, lower.size)), np.zeros((2, lower.size + 1))
+        for i, d in enumerate((null, flare)):
+            counts = np.zeros(lower.size, np.int64)
+            counts[np.searchsorted(lower, d.bins[0])] = d.bins[2]
+            share[i] = counts / d.n
+            # Whole numbers above each edge, so that the ends of the curve are 1 and 0.
+            above[i, :-1] = counts[::-1].cumsum()[::-1] / d.n
+        beaten, beating = 1.0 - above[0, :-1] + 0.5 * share[0], above[1, :-1] - 0.5 * share[1]
+        area = float(np.clip(share[1] @ beaten, 0.0, 1.0))
+        spread = [float(c @ (values - area) ** 2) for c, values in ((share[1], beaten), (share[0], beating))]
+        reach = float(special.ndtri(0.5 + CONFIDENCE / 2)) * float(np.sqrt(spread[0] / flare.n + spread[1] / null.n))
+        low, high = max(area - reach, 0.0), min(area + reach, 1.0)
+        if null.bins[0][-1] < flare.bins[0][0] or flare.bins[0][-1] < null.bins[0][0]:
+            area = float(round(area))
+            n = min(null.n, flare.n)
+            sure = clopper_pearson(round(area) * n, n)
+            low, high = sure.low, sure.high
+        return cls(np.append(lower[0], upper), above[0], above[1], null.n, Interval(area, low, high))
+
+    def plot(self, path: str | Path | None = None, *, name: str = "", ax: Any = None) -> object:
+        """Detection probability against false-alarm probability; needs matplotlib."""
+        return picture("answers.roc", [(name, self)], path, ax=ax)
+
+    def table(self, rows: int = 200) -> QTable:
+        """Some rows of the curve, both probabilities with their Clopper-Pearson intervals; the area in the meta data.
+
+        Parameters
+        ----------
+        rows : int
+            At most so many, even in the logarithm of the false-alarm probability; the ends are always there.
+        """
+        n = self.realisations
+        wanted = np.append(np.geomspace(1.0, 1.0 / n, max(rows - 1, 1)), 0.0)
+        chosen = np.unique(np.minimum(np.searchsorted(-self.fap, -wanted), self.fap.size - 1))
+        columns: list[tuple[object, ...]] = [("threshold", self.threshold[chosen])]
+        for name, what, chance in (("fap", "false-alarm", self.fap), ("probability", "detection", self.probability)):
+            values, low, high = np.array([astuple(clopper_pearson(round(p * n), n)) for p in chance[chosen]]).T
+            text = f"{what} probability{' per test' * (name == 'fap')}, with a 95 % Clopper-Pearson interval"
+            columns += [(name, values, text), (f"{name}_low", low), (f"{name}_high", high)]
+        area = dict(zip(("area", "area_low", "area_high"), astuple(self.area), strict=True))
+        return tabled(columns, realisations=n, **area)

@@ -1,0 +1,217 @@
+"""What is asked of an engine, as data: no answer, no counts. A worker anywhere makes the same of it.
+
+A shard is a range of realisations of one part of a request. What is counted of it holds whole numbers, and extremes
+with their realisations, so that shards may be counted in any order, on any device, and twice; `sums` adds them up.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields
+from functools import cached_property
+from typing import Any, ClassVar, Protocol, Self
+
+from mauvecl.host.errors import InputError
+from mauvecl.host.expectation import Expectation
+from mauvecl.host.quantities import count
+from mauvecl.noise.comparison import NOISE_FREE, Comparison
+from mauvecl.noise.drawing import AUTOMATIC, Drawing, DrawingWords
+from mauvecl.noise.scene import BATCH, Scene, prepare
+from mauvecl.results.requests.channels import ChannelPlan, plan_channels
+from mauvecl.results.requests.fap import Tails
+from mauvecl.results.requests.hypotheses import Hypotheses
+from mauvecl.statistics.linear import Linear
+from mauvecl.statistics.names import USUAL_STATISTICS
+from mauvecl.statistics.nuisances import Nuisances, known
+
+
+@dataclass(frozen=True)
+class Shard:
+    """Realisations start to start + count - 1 of one part of a request."""
+
+    part: int
+    start: int
+    count: int
+
+    @property
+    def name(self) -> str:
+        """For files and messages."""
+        return f"{self.part}-{self.start}-{self.count}"
+
+
+def expectation_of(what: str, given: Any) -> Expectation:
+    """The expectation that is given, or one sentence for what is none.
+
+    Raises
+    ------
+    InputError
+    """
+    if not isinstance(given, Expectation):
+        kind = type(given).__name__
+        raise InputError(
+            f"{what} is of the type {kind}, expected an Expectation, as `expect(source, instrument)` makes"
+        )
+    return given
+
+
+def checked(realisations: Any, seed: Any, start: Any) -> dict[str, int]:
+    """The numbers of a request, whole.
+
+    Raises
+    ------
+    InputError
+        For what is no whole number, or impossible.
+    """
+    number = count("realisations", realisations, low=1)
+    return {
+        "realisations": number,
+        "seed": count("seed", seed, high=2**64 - 1),
+        "start": count("start", start, high=2**63 - 1 - number),
+    }
+
+
+class Asked:
+    """What travels to a worker: the question without anything made of it."""
+
+    least: ClassVar[int] = 2**12
+
+    @classmethod
+    def of(cls, *what: Any, **how: Any) -> Self:
+        """With the fields of a `Drawing` among the keywords."""
+        words = {name: how.pop(name) for name in DrawingWords.__annotations__ if name in how}
+        return cls(*what, **how | {"drawing": Drawing(**words)})
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {each.name: getattr(self, each.name) for each in fields(self)}  # type: ignore[arg-type]
+
+
+class _Drawn(Asked):
+    """Realisations of expectations: whatever was given for a number is whole, and an expectation is one."""
+
+    def __post_init__(self) -> None:
+        given = vars(self)
+        for name, value in checked(given["realisations"], given["seed"], given["start"]).items():
+            object.__setattr__(self, name, value)
+        self._check_stars()
+
+    def _check_stars(self) -> None:
+        expectation_of("what is drawn", vars(self)["expectation"])
+
+
+@dataclass(frozen=True, eq=False)
+class DetectRequest(_Drawn):
+    """What `Engine.detect` takes; parameters as there."""
+
+    quiet: Expectation
+    flares: tuple[Expectation, ...]
+    realisations: int
+    seed: int
+    statistics: Sequence[str | Linear] = USUAL_STATISTICS
+    start: int = 0
+    drawing: Drawing = AUTOMATIC
+    comparison: Comparison = NOISE_FREE
+    tails: Tails = "counted"
+    nuisances: Nuisances | Mapping[str, float] | None = None
+
+    def _check_stars(self) -> None:
+        # One flare needs no list of its own.
+        flares = (self.flares,) if isinstance(self.flares, Expectation) else tuple(self.flares)
+        expectation_of("the quiescent star", self.quiet)
+        for number, flare in enumerate(flares):
+            expectation_of(f"flare {number + 1}", flare)
+        object.__setattr__(self, "flares", flares)
+        if isinstance(self.statistics, str | Linear):
+            object.__setattr__(self, "statistics", (self.statistics,))
+        object.__setattr__(self, "nuisances", known(self.nuisances, self.quiet))
+
+    @cached_property
+    def hypotheses(self) -> Hypotheses:
+        """What is drawn, and what is computed of it."""
+        scene = prepare([self.quiet, *self.flares], self.drawing, comparison=self.comparison)
+        nuisances = known(self.nuisances, self.quiet)
+        return Hypotheses(self.quiet, self.flares, self.statistics, scene, nuisances=nuisances)
+
+    @cached_property
+    def plans(self) -> list[tuple[ChannelPlan, Scene]]:
+        """What each part's launches compute: as many flares at a time as one launch holds."""
+        scene, count = self.hypotheses.scene, len(self.flares)
+        size = BATCH[scene.frames] - 1
+        batches = [range(i, min(i + size, count)) for i in range(0, count, size)] or [range(0)]
+        return [
+            (plan_channels(self.hypotheses, batch, first=number == 0), scene.part([0, *(k + 1 for k in batch)]))
+            for number, batch in enumerate(batches)
+        ]
+
+    @property
+    def parts(self) -> int:
+        """Launches of different kind."""
+        return len(self.plans)
+
+    @property
+    def work(self) -> int:
+        """Pixels times scenarios."""
+        return self.hypotheses.scene.n_pixel * max(len(scene.levels) for _, scene in self.plans)
+
+
+@dataclass(frozen=True, eq=False)
+class SnrRequest(_Drawn):
+    """What `Engine.snr` takes; parameters as there."""
+
+    expectation: Expectation
+    realisations: int
+    seed: int
+    start: int = 0
+    drawing: Drawing = AUTOMATIC
+
+    parts = 1
+
+    @cached_property
+    def scene(self) -> Scene:
+        """What is drawn."""
+        return prepare([self.expectation], self.drawing)
+
+    @property
+    def work(self) -> int:
+        """Pixels."""
+        return self.scene.n_pixel
+
+
+@dataclass(frozen=True, eq=False)
+class RealiseRequest(_Drawn):
+    """What `Engine.realise` takes; parameters as there. One shard: callers ask for as much as travels well."""
+
+    expectation: Expectation
+    realisations: int
+    seed: int
+    start: int = 0
+    drawing: Drawing = AUTOMATIC
+
+
+#: What a worker can be asked.
+Countable = Asked
+
+
+class Divisible(Protocol):
+    """What is cut into shards.
+
+    Attributes
+    ----------
+    realisations, start : int
+    parts : int
+        Launches of different kind.
+    work : int
+        About pixels times scenarios of one realisation.
+    least : int
+        Realisations of a shard, at least: a power of two.
+    """
+
+    @property
+    def realisations(self) -> int: ...
+    @property
+    def start(self) -> int: ...
+    @property
+    def parts(self) -> int: ...
+    @property
+    def work(self) -> int: ...
+    @property
+    def least(self) -> int: ...
