@@ -242,12 +242,15 @@ class Search:
     def _levelled(self, sums: NDArray[Any]) -> NDArray[Any]:
         """The sums less their level over the whole stare, which every window marginalises over: for precision alone."""
         y = np.moveaxis(sums, 2, 1)
-        if not self._terms:
-            return y
+        return np.asarray(y - (y @ self._level_span) @ self._level_span.T) if self._terms else y
+
+    @cached_property
+    def _level_span(self) -> Float:
+        """Orthonormal columns that span every level of the stare, (n_frame, n)."""
         time = (self._at - self._at.mean()) / max(self.n_grid, 1)
         columns = np.array([time**power * self._series[series][self._at] for power, series in self._terms])
-        level, *_ = np.linalg.lstsq(columns.T, y.reshape(-1, y.shape[2]).T.astype(np.float64), rcond=None)
-        return np.asarray(y - (columns.T @ level).T.reshape(y.shape))
+        span, size, _ = np.linalg.svd(columns.T, full_matrices=False)
+        return np.asarray(span[:, size > 1e-12 * size[0]])
 
     def _level(self, template: Template, spectra: list[NDArray[Any]]) -> list[Single]:
         """The data's correlation with each term of the level, shape (n_stare, n_sum, n_onset)."""
