@@ -29,7 +29,7 @@ test: .venv/test.stamp
 lint: .venv/test.stamp .venv/lint.stamp
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/lint-imports
+	$(BIN)/lint-imports --no-cache
 	$(BIN)/mypy
 
 # While editing: what can be known in two minutes on two cores. Types are checked beside the tests.

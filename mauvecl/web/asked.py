@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.answers.campaigns.plan import PlanAnswer, plan
 from mauvecl.answers.campaigns.visible import visible
 from mauvecl.answers.detection.detect import DetectAnswer, detect
 from mauvecl.answers.detection.maps import MapResult, detection_map
@@ -54,6 +55,14 @@ def completeness(study: Study, pool: Pool) -> InjectAnswer:
     return inject(Study.build(data, "page"), pool)
 
 
+def planned(study: Study) -> PlanAnswer:
+    """What a campaign on the target would find, without injections."""
+    data = study.model_dump()
+    data["plan"] |= {"targets": [{"name": name} for name in study.orbit.targets], "completeness": "closed form"}
+    data["orbit"]["targets"] = ()
+    return plan(Study.build(data, "page"))
+
+
 def _detection(study: Study, pool: Pool) -> dict[str, Any]:
     return dict(zip(("detection", "snr"), detect_and_snr(study, pool), strict=True))
 
@@ -71,6 +80,7 @@ SIMULATED: dict[str, Callable[[Study, Pool], dict[str, Any]]] = {
     "map": lambda study, pool: {"map": map_around(study, pool)},
     "completeness": lambda study, pool: {"completeness": completeness(study, pool)},
     "visible": lambda study, pool: _visible(study),
+    "plan": lambda study, pool: {"plan": planned(study)},
 }
 #: Those that draw by the pool.
 DRAWING = {"detection", "limit", "map"}

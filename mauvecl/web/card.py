@@ -11,6 +11,8 @@ from mauvecl.web.tabs.tab import Answers
 
 #: Part of the sentence that tells what the throughput is; it stands on the page once.
 NOMINAL = "The throughput is nominal"
+#: Answers whose messages are shown; those of others stand among them.
+TOLD = ("detection", "completeness", "visible", "plan")
 #: Sensible relative uncertainty of the nominal throughput (assumed; see the documentation's page on what is nominal).
 THROUGHPUT = 0.3
 
@@ -41,7 +43,8 @@ def card(closed: Closed, answers: Answers) -> dict[str, Any]:
         f"chance to detect {closed.words}, by the statistic {q.statistic} at a false-alarm probability of {q.fap:g} "
         "per test"
     )
-    notes = [(m, "danger" if m.startswith("SATURATED") else "info") for m in _messages(closed, answers)]
+    # What is grave begins in capitals.
+    notes = [(m, "danger" if m.partition(":")[0].isupper() else "info") for m in _messages(closed, answers)]
     return {
         "shown": percent(chance),
         "value": None if chance != chance else chance,
@@ -62,5 +65,5 @@ def _spread(closed: Closed) -> str:
 
 
 def _messages(closed: Closed, answers: Answers) -> list[str]:
-    simulated = answers["detection"].messages if "detection" in answers else []
-    return [m for m in dict.fromkeys([*simulated, *closed.messages]) if not m.startswith(NOMINAL)]
+    of_answers = [m for name in TOLD if name in answers for m in answers[name].messages]
+    return [m for m in dict.fromkeys([*of_answers, *closed.messages]) if not m.startswith(NOMINAL)]

@@ -112,7 +112,7 @@ def as_command(question: Question) -> str:
         points = ", ".join(f"[{nm!r}, {dn!r}]" for nm, dn in q.own_unknown)
         words += ["--set", f"nuisances.own.own.points=[{points}]"]
     if q.see.strip():
-        words += ["--set", f"orbit.targets={json.dumps([q.see.strip()])}"]
+        words += ["--set", f"orbit.targets={json.dumps([q.see.strip()])}", "--set", f"plan.hours={q.hours!r}"]
     if q.signal != "net":
         words += ["--set", f"observation.signal={q.signal}"]
     if q.realisations.tails != "counted":

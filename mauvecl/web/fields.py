@@ -22,7 +22,7 @@ REALISATIONS, SAMPLED = (10_000, 100_000, 1_000_000, 4_000_000), (100_000, 1_000
 UNKNOWN = ("nothing", "the usual")
 SKIES = ("brightness", "target and time", "none")
 #: What may be simulated on the page.
-SIMULATIONS = ("detection", "limit", "map", "completeness", "visible")
+SIMULATIONS = ("detection", "limit", "map", "completeness", "visible", "plan")
 #: Characters of a field that are looked at.
 MOST_CHARACTERS = 200
 
@@ -263,6 +263,10 @@ FIELDS = {
         "When it can be seen is on the tab Visibility: a name such as eps Eri or AU Mic, or coordinates such as "
         "53.23 -9.46.",
     ),
+    "hours": Field(
+        "Hours of the campaign", "100", Number(1, 8760),
+        "How long the target is observed, at most: what would be found is on the tab Plan.", "h", Slider(10, 1000, 10),
+    ),
     "realisations": Field(
         "Realisations", "100000",
         Choice((*map(str, REALISATIONS), *(f"{count} sampled" for count in SAMPLED)), draws),
@@ -278,7 +282,7 @@ ADVANCED = {
     "Flare and detector": ("flare_temperature_k", "temperature_c", "instrument"),
     "Sky": ("sky", "sky_brightness", "target", "time", "signal"),
     "Unknown": ("unknown", "own_unknown"),
-    "Visibility": ("see",),
+    "Visibility and plan": ("see", "hours"),
 }
 #: Fields that ask for something under one sky only.
 ASKED_UNDER = {"sky_brightness": "brightness", "target": "target and time", "time": "target and time"}

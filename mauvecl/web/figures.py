@@ -37,28 +37,29 @@ class Ink:
     total: str
     threshold: str
     own: str
+    lengths: tuple[str, ...]
     pins: tuple[str, ...]
 
     def __getitem__(self, name: str) -> str:
-        return str(getattr(self, name))
+        return str(getattr(self, name, name))
 
 
 INKS = {
     "light": Ink(
         text="#1b2733", grid="#dde3ea", ground="#ffffff", star="#0072B2", flare="#D55E00", sky="#009E73",
         drawn="#6b7785", dark="#7b4ea3", read="#B8860B", bias="#A65082", total="#1b2733", threshold="#1b2733",
-        own="#C2185B", pins=("#A21CAF", "#7C4A03", "#0E7490"),
+        own="#C2185B", lengths=("#E8801F", "#B34700", "#5C2200"), pins=("#A21CAF", "#7C4A03", "#0E7490"),
     ),
     "dark": Ink(
         text="#e6ebf1", grid="#34404d", ground="#182029", star="#56B4E9", flare="#FF8C42", sky="#2fc79a",
         drawn="#9aa7b5", dark="#b99be0", read="#F0C040", bias="#E39BC9", total="#e6ebf1", threshold="#e6ebf1",
-        own="#ff6fa3", pins=("#F0ABFC", "#D9AE76", "#67E8F9"),
+        own="#ff6fa3", lengths=("#FF8C42", "#FFBE8A", "#FFE8D6"), pins=("#F0ABFC", "#D9AE76", "#67E8F9"),
     ),
 }  # fmt: skip
 
 
 #: How lines of pinned scenarios are broken: lengths drawn and left out.
-DASHES = ([6, 3], [9, 3, 2, 3], [2, 2])
+DASHES = ("6 3", "9 3 2 3", "2 2")
 
 
 class Canvas:
@@ -87,7 +88,7 @@ class Canvas:
         plot = figure(
             x_axis_label=x,
             y_axis_label=y,
-            x_axis_type="log" if "x" in logs else "linear",
+            x_axis_type=how.pop("x_axis_type", "log" if "x" in logs else "linear"),
             y_axis_type="auto" if named else "log" if "y" in logs else "linear",
             sizing_mode="stretch_both",
             min_height=60,
@@ -139,16 +140,16 @@ class Canvas:
         made = self.plot.scatter("x", "y", source=source, size=size, color=self.ink[colour], **how)
         return self._told(made, called, colour, "dot", show)
 
-    def pinned(self, *columns: str, step: bool = False) -> None:
-        """A line for each scenario that may be pinned, of columns x and y unless others are named."""
-        columns = columns or ("x", "y")
-        kind: Any = self.plot.multi_line if "xs" in columns else self.plot.line
-        if step:
-            kind = partial(self.plot.step, mode="center")
+    def pinned(self, kind: Any = None, *columns: str, halo: str = "") -> None:
+        """A line for each scenario that may be pinned, of columns x and y or as named; tabs have the key."""
+        columns, kind = columns or ("x", "y"), kind or self.plot.line
         for k, (colour, dash) in enumerate(zip(self.ink.pins, DASHES, strict=True)):
-            made = kind(*columns, source=self.source(f"pin {k}", *columns), color=colour, line_width=2, line_dash=dash)
-            made.name, made.tags = f"pinned {k + 1}", ["pins"]
-            self.legend.append((made.name, colour, " ".join(map(str, dash)), "pins"))
+            source, name = self.source(f"pin {k}", *columns), f"pinned {k + 1}"
+            looks: list[dict[str, Any]] = [{"line_color": colour, "line_width": 2, "line_dash": dash}]
+            if halo:
+                looks.insert(0, {"line_color": halo, "line_width": 5})
+            for look in looks:
+                kind(*columns, source=source, name=name, tags=["pins"], **look)
 
     def own_point(self, called: str = "your question") -> Any:
         """The question's own point."""

@@ -41,6 +41,7 @@ class Question:
     unknown: str
     own_unknown: Points
     see: str
+    hours: float
     seed: int
     uploaded: Source | None = None
 
@@ -82,7 +83,8 @@ class Question:
             "none": {"none": True},
         }
         own = {"own": {"points": self.own_unknown}} if self.own_unknown else {}
-        orbit = {"orbit": {"targets": [self.see.strip()]}} if self.see.strip() else {}
+        seen = {"orbit": {"targets": [self.see.strip()]}, "plan": {"hours": self.hours}}
+        orbit = seen if self.see.strip() else {}
         return orbit | {
             "star": [star],
             "flare": {"amplitudes": [self.amplitude_percent / 100.0], "temperature_k": self.flare_temperature_k},

@@ -84,7 +84,7 @@ def front() -> bytes:
             }
             for tab in TABS.values()
         },
-        "pins": {theme: [*zip(ink.pins, DASHES, strict=True)] for theme, ink in INKS.items()},
+        "pins": {theme: list(zip(ink.pins, DASHES, strict=True)) for theme, ink in INKS.items()},
         "most_uploaded": MOST_UPLOADED,
         "unused": UNUSED,
     }

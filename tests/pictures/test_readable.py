@@ -58,7 +58,7 @@ def drawn(answer: Answer) -> Iterator[tuple[str, Any, Any]]:
     """Name, figure and renderer of each picture."""
     with mpl.rc_context():
         for name, (function, *given) in answer.pictures.items():
-            figure = picture(function, *given, None)
+            figure = picture(function, *given, path=None)
             canvas = FigureCanvasAgg(figure)
             canvas.draw()
             yield name, figure, canvas.get_renderer()  # type: ignore[no-untyped-call]
@@ -119,7 +119,7 @@ def test_everything_is_inside_and_apart(case: str, engine: Engine) -> None:
 def test_a_flare_that_is_detected_is_seen(engine: Engine) -> None:
     """The 5 % flare, hidden in the noise of a pixel, rises to four sigma of an element beneath."""
     answer = detect(Study().with_settings([*FEW, ONE, "flare.amplitudes=[0.05]", ONLY]), engine)
-    figure = picture(*answer.pictures["spectra"], None)
+    figure = picture(*answer.pictures["spectra"], path=None)
     (line,) = [line for line in figure.axes[1].lines if len(line.get_ydata()) > 2]
     assert 3.0 < max(line.get_ydata()) < 6.0
     # The last element of the spectrum is a part of one, and is left out.

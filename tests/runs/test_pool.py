@@ -87,6 +87,7 @@ def test_any_order_gives_the_engines_answer(engine: Engine, scene: list[Expectat
     )
 
 
+@pytest.mark.long
 def test_many_flares_noisy_references_and_processes(engine: Engine) -> None:
     """Several launches to a request, and everything that a request can carry."""
     quiet, *flares = star(amplitudes=tuple(np.linspace(0.01, 0.3, 17)), payload=instrument(part=True))

@@ -11,6 +11,7 @@ import sys
 import time
 import zipfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -433,7 +434,7 @@ def test_notices_are_sentences_that_can_be_put_away(page: Page) -> None:
     answerless(page)
 
 
-def test_limit_and_map(page: Page, tmp_path: Path) -> None:
+def test_limit_and_map(page: Page) -> None:
     tab(page, "Limit and map")
     simulate(page, "Simulate the map")
     page.get_by_text("64 cells are simulated").wait_for()
@@ -441,9 +442,7 @@ def test_limit_and_map(page: Page, tmp_path: Path) -> None:
     table = QTable.read(io.BytesIO(content), format="ascii.ecsv")
     assert len(table) == 64
     assert table["closed_form"].min() < 0.5 < table["closed_form"].max()
-    (tmp_path / "map.toml").write_bytes(download(page, "map (study)"))
-    run(tmp_path, "map", "map.toml")
-    assert (tmp_path / "out" / "map.ecsv").read_bytes() == content
+    assert b"\n[map.x]\n" in download(page, "map (study)")
 
 
 def test_scenarios_side_by_side(page: Page) -> None:
@@ -453,13 +452,32 @@ def test_scenarios_side_by_side(page: Page) -> None:
     page.get_by_role("button", name="Pin", exact=True).click()
     second = page.locator("#chance").inner_text()
     tab(page, "Compare")
-    row = page.locator("#pinned tr").first.inner_text().split()
+    row = page.locator("#pinned tr", has_text="Detected").inner_text().split()
     assert first.split()[0] in row
     assert second.split()[0] in row
     page.reload()
     settled(page)
     page.get_by_role("button", name="Open scenario 1").click()
     until(page, lambda: page.locator("#chance").inner_text() == first)
+    # In the pictures, too: in their own colours, which are those of the table and the key.
+    strokes = "paths => paths.map(path => path.getAttribute('stroke'))"
+    colours = page.locator("#pinned .swatch path").evaluate_all(strokes)
+    assert len(set(colours)) == 2
+    for name, picture in (("Detection", "excess"), ("S/N", "snr"), ("Limit and map", "map")):
+        tab(page, name)
+        models = f"page.pictures.all.{picture}.models"
+        filled = f"[0, 1, 2].map(k => Object.values({models}?.get(`pin ${{k}}`).data ?? {{}})[0]?.length > 0)"
+        until(page, partial(lambda script: page.evaluate(script) == [True, True, False], filled))
+        lines = f"page.pictures.all.{picture}.plot.renderers.filter(r => r.name?.startsWith('pinned'))"
+        drawn = page.evaluate(f"{lines}.map(r => r.glyph.line_color.value)")
+        assert [colour for colour in drawn if colour != "#ffffff"][:2] == colours
+        key = page.locator(f"#panel-{page.evaluate('page.seen.tab')} .beside")
+        assert key.locator("path").evaluate_all(strokes) == colours
+        assert "2: G2V, V = 8, 2 %, 50 s" in key.inner_text()
+    # What is left keeps its colour.
+    tab(page, "Compare")
+    page.get_by_role("button", name="Remove scenario 1").click()
+    assert page.locator("#pinned .swatch path").get_attribute("stroke") == colours[1]
 
 
 def test_command_and_program_are_offered(page: Page) -> None:
@@ -475,8 +493,11 @@ def test_nobody_is_kept_out(browser: Browser, server: Server, theme: str) -> Non
     page = fresh(browser, server.address, color_scheme=theme)
     page.evaluate(axe.read_text())
 
-    def look(where: str) -> None:
-        found = page.evaluate("axe.run(document, {resultTypes: ['violations']})")["violations"]
+    # The whole page once, then what a tab brings; of the dark only the colours are others.
+    rules = "{resultTypes: ['violations']}" if theme == "light" else "{runOnly: ['color-contrast']}"
+
+    def look(where: str, part: str = "html") -> None:
+        found = page.evaluate(f"axe.run('{part}', {rules})")["violations"]
         grave = [
             (one["id"], [node["html"][:200] for node in one["nodes"]][:3])
             for one in found
@@ -490,7 +511,8 @@ def test_nobody_is_kept_out(browser: Browser, server: Server, theme: str) -> Non
         page.locator(f"#panel-{name}").wait_for()
         settled(page)
         page.wait_for_timeout(200)
-        look(name)
+        look(name, f"#panel-{name}")
+    look("page")
     if theme == "light":
         page.get_by_role("button", name="Pin", exact=True).click()
         look("pinned")

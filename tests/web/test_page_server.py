@@ -551,6 +551,10 @@ COMMANDS = {
     "visible": ("visible", [], "visible.ecsv"),
     "months": ("visible", [], "months.ecsv"),
     "days": ("visible", [], "days.ecsv"),
+    "plan": ("plan", [], "plan.ecsv"),
+    "stars": ("plan", [], "stars.ecsv"),
+    "energies": ("plan", [], "energies.ecsv"),
+    "assumptions": ("plan", [], "assumptions.ecsv"),
 }
 assert COMMANDS.keys() == {name for tab in TABS.values() for name in tab.files}
 
@@ -572,7 +576,7 @@ def test_every_table_is_the_same_bytes_on_the_command_line(served: Any, tmp_path
         for tab in TABS.values():
             for name in tab.files:
                 _, table = await talk.file(link=link, tab=tab.name, name=name, ending="ecsv")
-                own = tab.name if name in ("limit", "map", "completeness", "limits") else ""
+                own = tab.name if tab.name in ("limit", "completeness", "plan") else ""
                 file, study = await talk.file(link=link, tab=own, name=name, ending="study")
                 assert file.endswith(".zip")
                 found[name] = table, study

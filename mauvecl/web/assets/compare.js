@@ -35,6 +35,19 @@ export class Compare {
     this.keep()
   }
 
+  // What is drawn how, in a few words, for a picture's reader.
+  key() {
+    const look = this.pins[document.documentElement.dataset.theme]
+    return this.drawn.flatMap((one, slot) => {
+      if (!one) return []
+      const {star, band, magnitude, amplitude_percent, exposure_s} = one.entered
+      const told = element("span", null)
+      told.innerHTML = dashed(...look[slot])
+      told.append(`${slot + 1}: ${star}, ${band} = ${magnitude}, ${amplitude_percent} %, ${exposure_s} s`)
+      return told
+    })
+  }
+
   // Those that pictures show, by their slots: a scenario keeps its colour as long as it is pinned.
   get drawn() {
     const slots = this.pins.light.map((_, k) => this.kept.pinned.find(one => one.slot === k))
@@ -75,7 +88,7 @@ export class Compare {
       }
       row("Drawn as", pinned.map(one => {
         const slot = drawn.indexOf(one), cell = element("td", slot < 0 ? "not drawn" : `pinned ${slot + 1} `)
-        if (slot >= 0) cell.insertAdjacentHTML("beforeend", dashed(look[slot][0], look[slot][1].join(" ")))
+        if (slot >= 0) cell.insertAdjacentHTML("beforeend", dashed(...look[slot]))
         return cell
       }))
       row("Detected", pinned.map(one => {

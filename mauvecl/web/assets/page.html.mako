@@ -143,6 +143,9 @@ ${control(name)}
 % for k, tab in enumerate(tabs.values()):
 <div role="tabpanel" id="panel-${tab.name}" aria-labelledby="tab-${tab.name}"${"" if k == 0 else " hidden"}>
 <p class="about">${tab.about}</p>
+% if any(p.pins for p in tab.pictures):
+<div class="beside" hidden><label><input type="checkbox" data-marks="pins" checked> Pinned</label></div>
+% endif
 <div class="pictures${" one" if len(tab.pictures) == 1 else ""}">
 % for picture in tab.pictures:
 <figure id="figure-${picture.name}" data-picture="${picture.name}">
@@ -181,9 +184,6 @@ ${control(name)}
 <label><input type="checkbox" data-marks="marks" checked> spectral lines</label>
 <label><input type="checkbox" data-marks="more marks"> H alpha</label>
 % endif
-% if any(p.pins for p in tab.pictures):
-<label data-beside hidden><input type="checkbox" data-marks="pins" checked> pinned scenarios</label>
-% endif
 </div>
 <div class="wide rows" tabindex="0" role="region" aria-label="Table of ${tab.title}" hidden></div>
 % if tab.files:
@@ -191,7 +191,7 @@ ${control(name)}
 % for name in tab.files:
 <button type="button" data-file="${name}" data-ending="ecsv" disabled>${name} (ecsv)</button>
 <button type="button" data-file="${name}" data-ending="fits" disabled>${name} (fits)</button>
-% if name in ("limit", "map", "completeness"):
+% if name in tab.simulations and name != "detection":
 <button type="button" data-file="${name}" data-ending="study" disabled>${name} (study)</button>
 % endif
 % endfor

@@ -178,7 +178,10 @@ class Page {
   pinned() {
     const name = this.seen.tab, tab = words.tabs[name]
     const pins = this.compare.drawn
-    for (const box of document.querySelectorAll("[data-beside]")) box.hidden = !pins.some(Boolean)
+    for (const box of document.querySelectorAll(".beside")) {
+      box.hidden = !pins.some(Boolean)
+      box.replaceChildren(box.firstElementChild, ...this.compare.key())
+    }
     if (!tab.pictures.some(picture => picture.pins)) return
     for (const pin of pins.filter(Boolean)) {
       const key = `${name} ${pin.link}`
@@ -212,7 +215,7 @@ class Page {
     byId("pin").disabled = !ready
     byId("study").disabled = !ready
     for (const button of document.querySelectorAll("[data-simulate]")) {
-      const lacks = button.dataset.simulate === "visible" && !this.fields.entered.see.trim()
+      const lacks = ["visible", "plan"].includes(button.dataset.simulate) && !this.fields.entered.see.trim()
       button.disabled = !ready || busy || lacks
     }
     for (const tab of Object.values(words.tabs)) {

@@ -13,8 +13,8 @@ function unpacked(column) {
   return [ndarray(values, {dtype: "float32", shape: column.shape.slice(1)})]
 }
 
-const line = (colour, dashes) => `<path d="M0 5h16" stroke="${colour}" stroke-width="2.5" stroke-dasharray="${dashes}"/>`
-const swatch = shape => `<svg aria-hidden="true" viewBox="0 0 16 10">${shape}</svg>`
+const line = (colour, dashes) => `<path d="M0 5h22" stroke="${colour}" stroke-width="2.5" stroke-dasharray="${dashes}"/>`
+const swatch = shape => `<svg aria-hidden="true" class="swatch" viewBox="0 0 22 10">${shape}</svg>`
 // How a line is drawn, small.
 export const dashed = (colour, dashes) => swatch(line(colour, dashes))
 
@@ -124,14 +124,13 @@ class Picture {
 
   legend(entries) {
     const svg = (colour, form) => {
-      if (/^\d/.test(form)) return dashed(colour, form)
       const shape = {
         line: line(colour, "none"),
         dash: line(colour, "4 3"),
-        band: `<rect width="16" height="10" fill="${colour}" fill-opacity=".4"/>`,
-        bars: `<rect width="16" height="10" fill="${colour}" fill-opacity=".5"/>`,
-        bar: `<rect width="16" height="10" fill="${colour}"/>`,
-        dot: `<circle cx="8" cy="5" r="4" fill="${colour}"/>`,
+        band: `<rect width="22" height="10" fill="${colour}" fill-opacity=".4"/>`,
+        bars: `<rect width="22" height="10" fill="${colour}" fill-opacity=".5"/>`,
+        bar: `<rect width="22" height="10" fill="${colour}"/>`,
+        dot: `<circle cx="11" cy="5" r="4" fill="${colour}"/>`,
       }[form]
       return swatch(shape)
     }
@@ -146,7 +145,7 @@ class Picture {
     this.some()
   }
 
-  // The legend holds what is there to be seen.
+  // The legend holds what is there to be seen; what is not there yet has its room, so that nothing jumps.
   some() {
     const empty = new Set()
     for (const renderer of this.plot?.renderers ?? []) {
@@ -155,8 +154,8 @@ class Picture {
     }
     for (const item of this.frame.querySelectorAll(".legend li")) {
       const {shows, called} = item.dataset
-      const asked = shows === "" || shows === "if any" || this.wanted.has(shows) || this.pictures.marks.has(shows)
-      item.hidden = empty.has(called) || !asked
+      item.hidden = shows !== "" && shows !== "if any" && !this.wanted.has(shows)
+      item.classList.toggle("absent", empty.has(called))
     }
   }
 

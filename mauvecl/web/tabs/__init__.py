@@ -7,6 +7,7 @@ from mauvecl.web.tabs.completeness import Completeness
 from mauvecl.web.tabs.detection import Detection
 from mauvecl.web.tabs.limit import Limit
 from mauvecl.web.tabs.noise import Noise
+from mauvecl.web.tabs.plan import Plan
 from mauvecl.web.tabs.signal import Signal
 from mauvecl.web.tabs.spectrum import Spectrum
 from mauvecl.web.tabs.tab import Tab
@@ -16,5 +17,16 @@ from mauvecl.web.tabs.visibility import Visibility
 #: By name, in the order of the page.
 TABS: dict[str, Tab] = {
     one.name: one
-    for one in (Detection(), Spectrum(), Signal(), Noise(), Limit(), Unknown(), Completeness(), Visibility(), Compare())
+    for one in (
+        Detection(),
+        Spectrum(),
+        Signal(),
+        Noise(),
+        Limit(),
+        Unknown(),
+        Completeness(),
+        Visibility(),
+        Plan(),
+        Compare(),
+    )
 }

@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
     from mauvecl.web.closed import Closed
 
-#: Half-widths of the flares, shortest first: as many as there are lines.
-COLOURS = ("star", "sky", "flare")
+#: Half-widths of the flares: as many as there are lines.
+LENGTHS = ("shortest", "middle", "longest")
 
 
 class Shares(Picture):
@@ -27,9 +27,14 @@ class Shares(Picture):
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         canvas = Canvas(
-            ink, "peak amplitude of the flare (%)", "found", logs | {"x"}, x_range=(0.01, 100), y_range=(-0.03, 1.05)
+            ink,
+            "peak amplitude of the flare (%)",
+            "share of flares found",
+            logs | {"x"},
+            x_range=(0.01, 100),
+            y_range=(-0.03, 1.05),
         )
-        for k, (called, colour) in enumerate(zip(("shortest", "middle", "longest"), COLOURS, strict=True)):
+        for k, (called, colour) in enumerate(zip(LENGTHS, ink.lengths, strict=True)):
             canvas.band(f"band {k}", f"{called} flares", colour)
             canvas.legend.pop()
             told = canvas.line(f"line {k}", f"{called} flares", colour, line_width=2)
@@ -39,7 +44,7 @@ class Shares(Picture):
 
     def drawn(self, closed: Closed, answers: Answers) -> Drawn:
         sources: dict[str, Any] = {}
-        for k in range(len(COLOURS)):
+        for k in range(len(LENGTHS)):
             sources |= {f"band {k}": {"x": [], "low": [], "high": []}, f"line {k}": {"x": [], "y": []}}
         own = {"own": {"location": closed.question.amplitude_percent}}
         if "completeness" not in answers:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -30,7 +31,7 @@ class Excess(Picture):
         canvas.dots("drawn", "drawn exposure", "drawn", size=5)
         canvas.line("pixel", "expected per pixel", "sky", line_width=1.2)
         told = canvas.line("element", "expected per element of 10.5 nm", "flare", step=True, line_width=2.2)
-        canvas.pinned(step=True)
+        canvas.pinned(partial(canvas.plot.step, mode="center"))
         canvas.tooltips(told, ("wavelength (nm)", "x"), ("sigma per element", "y"))
         return canvas
 

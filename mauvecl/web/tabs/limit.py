@@ -185,7 +185,7 @@ class Map(Picture):
             fill_color={"field": "p", "transform": mapper}, line_color="#ffffff",
         )  # fmt: skip
         cells.name = "simulated"
-        canvas.pinned("xs", "ys")
+        canvas.pinned(plot.multi_line, "xs", "ys", halo="#ffffff")
         canvas.own_point()
         plot.yaxis.ticker = FixedTicker(ticks=[-1, 0, 1, 2])
         plot.yaxis.major_label_overrides = {-1: "0.1 %", 0: "1 %", 1: "10 %", 2: "100 %"}

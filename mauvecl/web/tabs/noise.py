@@ -30,7 +30,7 @@ class Budget(Picture):
 
     name, title = "budget", "Noise of a pixel by origin"
     logs = ("Y",)
-    pins = "total"
+    pins = "source_photon"
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
         canvas = Canvas(ink, "wavelength (nm)", "DN rms in the exposure", logs, wavelength=True)
@@ -61,7 +61,7 @@ class Noise(Tab):
     """Where the noise comes from."""
 
     name, title = "noise", "Noise"
-    about = "Where the noise comes from, pixel by pixel, without a flare."
+    about = "Where the noise comes from, pixel by pixel, without a flare; of pinned scenarios the photons of the star."
     pictures = (Budget(),)
     files = {"noise-budget": None}  # noqa: RUF012
 

@@ -54,17 +54,17 @@ class Cost(Picture):
     name, title = "cost", "What each unknown costs: the flare's S/N by the matched statistic"
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
-        canvas = Canvas(ink, "S/N of the flare (matched statistic)", "", logs, y_range=["nothing"])
+        canvas = Canvas(ink, "S/N of the flare", "", logs, y_range=["nothing"])
         source = canvas.source("bars", "name", "plain", "marginal", "known")
         plot: Any = canvas.plot
-        for column, called, colour, width in (
-            ("known", "everything known", "star", 0.85),
-            ("marginal", "marginalised over it", "flare", 0.55),
-            ("plain", "unknown, and not looked for", "drawn", 0.2),
+        for column, called, colour, width, alpha, form in (
+            ("known", "everything known", "flare", 0.85, 0.35, "band"),
+            ("marginal", "marginalised over it", "flare", 0.55, 1.0, "bar"),
+            ("plain", "unknown, and not looked for", "text", 0.2, 1.0, "bar"),
         ):
-            made = plot.hbar("name", right=column, height=width, source=source, color=ink[colour])
-            made.name = called
-            canvas.legend.append((called, ink[colour], "bar", ""))
+            how = {"color": ink[colour], "alpha": alpha, "name": called}
+            made = plot.hbar("name", right=column, height=width, source=source, **how)
+            canvas.legend.append((called, ink[colour], form, ""))
             canvas.tooltips(made, (called, column), mode="hline")
         plot.x_range.start = 0
         return canvas

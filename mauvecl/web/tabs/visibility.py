@@ -22,10 +22,11 @@ class Hours(Picture):
     name, title = "hours", "Hours in which the target is seen, day by day"
 
     def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
-        canvas = Canvas(ink, "days from the start", "hours in the day", logs, x_range=(0, 365), y_range=(-0.5, 24.5))
+        canvas = Canvas(ink, "", "hours in the day", logs, x_axis_type="datetime", y_range=(-0.5, 24.5))
         canvas.band("area", "hours seen", "star", alpha=0.3)
+        canvas.legend.pop()
         told = canvas.line("hours", "hours seen, day by day", "star", line_width=1.2)
-        canvas.tooltips(told, ("day", "x"), ("hours", "y"))
+        canvas.tooltips(told, ("hours", "y"))
         return canvas
 
     def drawn(self, closed: Closed, answers: Answers) -> Drawn:
@@ -35,11 +36,12 @@ class Hours(Picture):
             named = ", ".join(orbit.targets)
             if named:
                 return Drawn(f"When {named} is seen is not looked up yet: press Find when.", sources)
-            text = "No target is named yet. Name one under Advanced, Visibility, such as eps Eri, and press Find when."
+            text = "No target is named yet. Name one under Advanced, such as eps Eri, and press Find when."
             return Drawn(text, sources)
         table = answers["seen"]["by_day"]
         hours = np.asarray(table["hours"].to_value("h"))
-        day = np.arange(hours.size)
+        # Milliseconds, as browsers count time.
+        day = (np.datetime64(orbit.start, "ms") + np.arange(hours.size) * np.timedelta64(1, "D")).astype(float)
         sources = {
             "area": {"x": day, "low": np.zeros(hours.size), "high": hours},
             "hours": {"x": day, "y": hours},

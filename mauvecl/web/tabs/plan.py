@@ -1,0 +1,120 @@
+"""What a campaign on a target would find: flares recovered and expected."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mauvecl.web.closed import percent, short
+from mauvecl.web.figures import Canvas
+from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+    from mauvecl.study.study import Study
+    from mauvecl.web.closed import Closed
+
+#: Ends of the pictures, erg: they stay, whatever is asked.
+ENERGIES = (1e28, 1e37)
+
+
+def _columns(answers: Answers) -> tuple[Any, Any, Any]:
+    """Energies, the share recovered at each, and how many flares of it or more there are in the campaign."""
+    table, (star,) = answers["plan"].by_energy, answers["plan"].planned
+    columns = (table["energy"].to_value("erg"), table["recovered"], table["rate_above"].to_value("1 / h") * star.hours)
+    energy, recovered, above = (np.asarray(column, float) for column in columns)
+    return energy, recovered, above
+
+
+def _energy(value: Any) -> str:
+    """As a reader has it."""
+    return f"{value.value:.2g} erg" if np.isfinite(value) else "no energy"
+
+
+class Recovered(Picture):
+    """Share of flares that the search recovers, over their energy."""
+
+    name, title = "recovered", "Share of flares that the search recovers"
+
+    def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
+        name = "bolometric energy of the flare (erg)"
+        canvas = Canvas(ink, name, "share recovered", logs | {"x"}, x_range=ENERGIES, y_range=(-0.03, 1.05))
+        told = canvas.line("recovered", "share recovered", "flare", line_width=2)
+        canvas.tooltips(told, ("energy (erg)", "x"), ("recovered", "y"))
+        return canvas
+
+    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
+        if "plan" not in answers:
+            text = "Nothing is planned yet: name a target under Advanced, such as eps Eri, and press Plan."
+            return Drawn(text, {"recovered": {"x": [], "y": []}})
+        (row,) = answers["plan"].table
+        energy, recovered, _ = _columns(answers)
+        half, most = (_energy(row[name]) for name in ("E50", "E90"))
+        text = f"Of the flares of {row['target']} half are recovered at {half}, 90 % at {most}."
+        return Drawn(text, {"recovered": {"x": energy, "y": recovered}})
+
+
+class Expected(Picture):
+    """Flares in the campaign, and those recovered, of an energy or more."""
+
+    name, title = "expected", "Flares of so much energy or more in the campaign"
+
+    def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
+        name = "bolometric energy of the flare (erg)"
+        canvas = Canvas(ink, name, "flares", logs | {"x", "y"}, x_range=ENERGIES, y_range=(1e-3, 1e4))
+        canvas.line("all", "all of them", "star", line_width=2)
+        told = canvas.line("found", "recovered", "flare", line_width=2)
+        canvas.tooltips(told, ("energy (erg)", "x"), ("recovered", "y"))
+        return canvas
+
+    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
+        if "plan" not in answers:
+            return Drawn("Nothing is planned yet.", {name: {"x": [], "y": []} for name in ("all", "found")})
+        (row,) = answers["plan"].table
+        energy, recovered, above = _columns(answers)
+        # Each step of the rate is recovered as at its middle.
+        parts = (above[:-1] - above[1:]) * (recovered[:-1] + recovered[1:]) / 2
+        found = np.append(np.cumsum(parts[::-1])[::-1], 0.0) + above[-1] * recovered[-1]
+        text = f"{row['target']} is observed for {short(row['hours'].value)} h; "
+        known = np.isfinite(row["expected"])
+        text += f"{row['expected']:.3g} flares are expected to be recovered." if known else "no rates are known."
+        columns = {"all": {"x": energy, "y": above}, "found": {"x": energy, "y": np.where(found > 0, found, np.nan)}}
+        return Drawn(text, columns)
+
+
+class Plan(Tab):
+    """What a campaign would find."""
+
+    name, title = "plan", "Plan"
+    about = (
+        "What a campaign on the target of Visibility would find: hours, energies recovered, flares expected. Star and "
+        "flare rates are the target's own; completeness is in closed form, and assumptions have a table."
+    )
+    pictures = (Recovered(), Expected())
+    simulations = {"plan": "Plan"}  # noqa: RUF012
+    files = dict.fromkeys(("plan", "stars", "energies", "assumptions"), "plan")
+
+    def table(self, name: str, closed: Closed, answers: Answers) -> Table:
+        tables: dict[str, Table] = answers["plan"].tables
+        return tables[name]
+
+    def rows(self, closed: Closed, answers: Answers) -> list[list[str]]:
+        if "plan" not in answers:
+            return []
+        (row,) = answers["plan"].table
+        flares = "no rates known"
+        if np.isfinite(row["expected"]):
+            flares = f"{row['expected']:.3g}; 95 % of campaigns: {row['low']} to {row['high']}"
+        told = {
+            "target": str(row["target"]), "hours": short(row["hours"].value), "half recovered at": _energy(row["E50"]),
+            "90 % recovered at": _energy(row["E90"]), "flares expected": flares,
+            "at least one": percent(row["at_least_one"]), "false alarms": f"{row['false_alarms']:.2g}",
+            "best months": str(row["best_months"]),
+        }  # fmt: skip
+        return [[*told], [*told.values()]]
+
+    def study(self, name: str, closed: Closed, answers: Answers) -> Study:
+        study: Study = answers["plan"].study
+        return study
