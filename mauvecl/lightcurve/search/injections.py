@@ -226,14 +226,14 @@ class Injecting:
             for column, place in zip(critical[part].T, self.places, strict=True):
                 if len(place.filters):
                     column[:] = self._critical(place, self.values(place, drawn))[drawn.rows]
-        found: dict[str, NDArray[Any]] = {"critical": critical}
+        kept: dict[str, NDArray[Any]] = {"critical": critical}
         if self.refit is not None:
             # One stare at a time: a fit knows nothing of what is fitted beside it.
             these = range(min(len(values), max(0, self.start + self.refit.count - first)))
             each = [self._fitted(self.drawn(values[k : k + 1], glow[k : k + 1]), self.refit) for k in these]
             none = np.zeros((0, *self.refit.amplitudes.shape), np.float32)
-            found |= {name: np.array([one[name] for one in each]) if each else none for name in KEPT}
-        return found
+            kept |= {name: np.array([one[name] for one in each]) if each else none for name in KEPT}
+        return kept
 
     def drawn(self, values: Single, glow: Single, row: int = 0, block: int = 0) -> Drawn:
         """A few stares, from a row of a block on that is filled up with zeros."""
