@@ -166,8 +166,8 @@ class Page {
 
   async draw(told) {
     this.card.rows(told.tab, told.rows)
-    await this.pictures.put(told.pictures)
     this.pinned()
+    await this.pictures.put(told.pictures)
     if (this.answer === null) return
     this.card.fresh(told.tab)
     clearTimeout(this.soon)
