@@ -3,9 +3,9 @@
 python bench/verbs.py [--output bench/results/verbs.ecsv] [--repeats 3]
 
 Each verb runs in a process of its own with its kernels built. The seconds of its kernels are those between a request's
-beginning and its end on the device; what they alone would need is the CPU time of these requests over the cores, as if
-nothing else ran; what a host does beside them at the same time counts in it. Judge by ratios, and on an idle
-machine: others stretch wall time, and leave CPU time nearly alone; the table tells the machine's load.
+beginning and its end on the device; what they alone would need is the CPU time of these requests over the cores,
+without what other threads of Python do beside them. Judge by ratios, and on an idle machine: others stretch wall time,
+and leave CPU time nearly alone; the table tells the machine's load.
 """
 
 from __future__ import annotations
@@ -39,20 +39,31 @@ CASES: dict[str, tuple[list[str], float, float]] = {
 
 #: Runs a command line and notes the seconds of its requests to the device; told on the last line of standard error.
 CHILD = """
-import json, resource, sys, time
-def cpu():
-    used = resource.getrusage(resource.RUSAGE_SELF)
-    return used.ru_utime + used.ru_stime
+import json, sys, threading, time
+ended = []
+run = threading.Thread.run
+def running(thread):
+    try:
+        run(thread)
+    finally:
+        ended.append((thread, time.thread_time()))
+threading.Thread.run = running
+def aside():
+    # CPU time of Python's other threads, those that have ended too.
+    gone = dict(ended)
+    living = [t.ident for t in threading.enumerate() if t not in gone and t is not threading.current_thread()]
+    clocks = [time.clock_gettime(time.pthread_getcpuclockid(i)) for i in living]
+    return sum(clocks) + sum(gone.values())
 sys.argv = ["mauvecl", *json.loads(sys.argv[1])]
 found = {"kernel": 0.0, "alone": 0.0}
 def watched(inner):
     def count(self, *given, **more):
-        wall, before = time.perf_counter(), cpu()
+        wall, before = time.perf_counter(), time.process_time() - aside()
         try:
             return inner(self, *given, **more)
         finally:
             found["kernel"] += time.perf_counter() - wall
-            found["alone"] += cpu() - before
+            found["alone"] += time.process_time() - aside() - before
     return count
 class Watch:
     # Modules are left to be loaded when the command asks for them.
@@ -73,7 +84,7 @@ from mauvecl.cli.app import main
 try:
     main()
 finally:
-    found["cpu"] = cpu()
+    found["cpu"] = time.process_time()
     print(json.dumps(found), file=sys.stderr)
 """
 
@@ -101,7 +112,7 @@ def write(rows: list[tuple[object, ...]], output: Path, repeats: int) -> None:
         ("wall", f"of the command as it is typed; the best of {repeats}"),
         ("cpu", "of all threads"),
         ("kernels", "wall time of its requests to the device, one after the other"),
-        ("kernels_alone", "CPU time of these requests over the cores"),
+        ("kernels_alone", "CPU time of these requests alone, over the cores"),
         ("ratio", "wall over what the kernels alone would need"),
     ):
         table[column].info.description = text
@@ -127,7 +138,6 @@ def main() -> None:
             # The first of several builds what is not in the cache.
             runs = [measured(words, folder) for _ in range(asked.repeats)]
             best = min(runs, key=lambda run: run["wall"])
-            # What hosts do beside the kernels at the same time is in it: it errs on the large side.
             alone = best["alone"] / cores if best["alone"] else np.nan
             rows.append(
                 (

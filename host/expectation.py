@@ -185,7 +185,7 @@ class Expectation(ByContent):
 
     def plot(self, path: str | Path | None = None, *, ax: Any = None) -> Any:
         """Mean signal with its noise against wavelength, saved under a path or drawn in axes; needs matplotlib."""
-        return picture("inputs.expectation", self, path, ax=ax)
+        return picture("inputs.expectation", self, path=path, ax=ax)
 
     @property
     def exposure_s(self) -> float:

@@ -13,15 +13,15 @@ from .quantities import shown
 AXES: ContextVar[Any] = ContextVar("axes", default=None)
 
 
-def picture(name: str, *given: Any, ax: Any = None) -> Any:
+def picture(name: str, *given: Any, ax: Any = None, **named: Any) -> Any:
     """A figure, or the path it was saved under.
 
     Parameters
     ----------
     name : str
         Module and function in `mauvecl.pictures`, such as ``"answers.detection"``.
-    *given
-        What the function takes.
+    *given, **named
+        What the function takes, such as the `path` that it is saved under.
     ax : matplotlib Axes, optional
         Drawn into instead, and handed back; a picture of several panels takes their place.
 
@@ -35,7 +35,7 @@ def picture(name: str, *given: Any, ax: Any = None) -> Any:
     module, _, function = name.rpartition(".")
     before = AXES.set(ax)
     try:
-        drawn = getattr(import_module(f"mauvecl.pictures.{module}"), function)(*given)
+        drawn = getattr(import_module(f"mauvecl.pictures.{module}"), function)(*given, **named)
     finally:
         AXES.reset(before)
     return drawn if ax is None else ax

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
+from functools import cache
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -22,10 +23,10 @@ def tabled(columns: Iterable[tuple[Any, ...]], **meta: object) -> QTable:
     import numpy as np
     from astropy.table import QTable
 
-    table = QTable()
+    table, units = QTable(), cache(u.Unit)
     for name, values, *more in columns:
         text, unit = (*more, "", "")[:2]
-        table[name] = np.asarray(values) * u.Unit(unit) if unit else values
+        table[name] = np.asarray(values) * units(unit) if unit else values
         table[name].info.description = text or None
     table.meta |= meta
     return table

@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import subprocess
-from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pytest
 from scenes import instrument, star
-from xdist.scheduler import LoadScopeScheduling
 
 from mauvecl.device.engine import Engine
 from mauvecl.host.expectation import Expectation
@@ -49,24 +47,6 @@ def scene() -> list[Expectation]:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Long tests first, so that none is left when the others have ended, and the page's before all."""
-    items.sort(key=lambda item: (item.path.name != "test_page.py", item.get_closest_marker("long") is None))
-
-
-class Together(LoadScopeScheduling):
-    """Tests of a file with fixtures for all of it stay in one process, which makes them once; others go anywhere."""
-
-    def _split_scope(self, nodeid: str) -> str:
-        file = nodeid.split("::")[0]
-        return file if shares_fixtures(self.config.rootpath / file) else nodeid
-
-
-@cache
-def shares_fixtures(file: Path) -> bool:
-    return 'scope="module"' in file.read_text(encoding="utf-8")
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Together:
-    config.option.loadscopereorder = False
-    return Together(config, log)
+    """Files with long tests first, so that none is left when the others have ended, and the page's before all."""
+    long = {item.path for item in items if item.get_closest_marker("long")}
+    items.sort(key=lambda item: (item.path.name != "test_page.py", item.path not in long))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from mauvecl.device.engine import Engine
 from mauvecl.host.files import whole
 from mauvecl.study.study import Study
 
@@ -43,8 +44,11 @@ def flip(path: Path, place: int = 100) -> None:
     path.write_bytes(data)
 
 
-class Painter:
+class Painter(Engine):
     """Draws nothing by chance and needs no OpenCL: rows that tell their number, for tests that fork."""
+
+    def __init__(self) -> None:
+        """Without a device."""
 
     def realise(
         self, x: Any, *, start: int, count: int, seed: int, out: NDArray[Any] | None = None, **how: Any

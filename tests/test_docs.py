@@ -43,7 +43,11 @@ TUTORIAL = ROOT / "docs" / "tutorial.md"
 PAGES = [page for page in all_pages() if blocks(page, "python") and page.name not in APART]
 
 
-@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(p, marks=pytest.mark.long) if p.name == "flares-in-time.md" else p for p in PAGES],
+    ids=lambda page: page.name,
+)
 def test_python_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """In a folder with a study, and after the tutorial, as a reader comes to the other pages."""
     monkeypatch.chdir(tmp_path)

@@ -38,8 +38,8 @@ FREE = ("Any", "object", "dict[str, Any]", "str")
 #: Made by functions that are tried, with fields of their own names; and what is a part of the engine's inner side.
 MADE = ("Detection", "Expectation", "Instrument", "Study", "Stare")
 INNER = (
-    "Detection.collect", "Detection.of", "DaskWorkers", "DaskWorkers.", "LocalWorkers.submit", "Engine.count", "Linear.", "Shape.",
-    "TableShape.", "Nuisances.rows", "Nuisances.finite", "Processes.factors", "Normal.quantile", "Uniform.quantile",
+    "Detection.collect", "Detection.of", "DaskWorkers", "LocalWorkers.submit", "Engine.count", "Linear.", "TableShape.",
+    "Nuisances.rows", "Nuisances.finite", "Processes.factors", "Normal.quantile", "Uniform.quantile",
     "Stares.", "Pool.stares", "Sinusoid.mean_over", "PixelMap.over", "Instrument.per_pixel", "Stare.along",
     "Engine.realise_and_count", "Study.detecting", "bulk.unfinished", "bulk.state", "bulk.draw",
 )  # fmt: skip

@@ -3,12 +3,14 @@
     python tools/build_library.py [FOLDER]
 
 The packages are downloaded with pip into a temporary folder and never installed; a FOLDER that holds their wheels
-saves the download. Reading the bands needs h5py besides what mauvecl needs. Spectra are averaged over bins
+saves the download. A wheel of another digest is refused, and `inputs.ecsv` tells which file of which wheel each
+spectrum and band is from. Reading the bands needs h5py besides what mauvecl needs. Spectra are averaged over bins
 (exactly, as piecewise-linear functions), which conserves flux; Mauve's resolution is twenty times coarser.
 """
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 import subprocess
 import sys
@@ -27,6 +29,16 @@ from scipy.interpolate import make_interp_spline
 
 LIBRARY = Path(__file__).parents[1] / "host" / "stars" / "library"
 PACKAGES = {"EXOSIMS": "3.6.6", "pyphot": "2.1.0", "speclite": "1.0.0"}
+#: SHA-256 of their wheels as PyPI has them.
+WHEELS = {
+    "EXOSIMS": "09238a29e7df461d2f65327bcf03f5521f0165992c43d97a6bfc79280637ad29",
+    "pyphot": "3565abb5bcdfe268f1c821425a277872376fa3928c70514b8294ec41cae6b9a2",
+    "speclite": "4bc8cb7f718b347e0ce566cb5ed341684c8efebe4a77f2a49aabe8ee085465d7",
+}
+UNKNOWN = (
+    "What the packages' authors did to the files that archives and papers publish (MAST's high-level science products, "
+    "CALSPEC, the bands' papers), and the digests of those, are not known here."
+)
 #: What the licence of each covers here, and where it is at home.
 COVERED = {
     "EXOSIMS": (
@@ -184,15 +196,45 @@ def entries() -> list[Spectrum]:
     return found
 
 
+def wheel_of(package: str) -> str:
+    """The name of a package's wheel."""
+    return f"{package.lower()}-{PACKAGES[package]}-py3-none-any.whl"
+
+
+def digest(file: Path) -> str:
+    """SHA-256 of a file."""
+    return hashlib.sha256(file.read_bytes()).hexdigest()
+
+
+def write_inputs(source: Path) -> None:
+    """Which file of which wheel each spectrum and band is from, with digests."""
+    rows = []
+    for entry in entries():
+        rows.append((f"spectrum {entry.name}", "pyphot" if entry.file.startswith("pyphot") else "EXOSIMS", entry.file))
+    for name, (node, *_) in BANDS.items():
+        own = f"speclite/data/filters/{node}.ecsv"
+        found = ("speclite", own) if (source / own).exists() else ("pyphot", "pyphot/libs/new_filters.hd5")
+        rows.append((f"band {name}", *found))
+    table = Table(
+        rows=[(what, package, wheel_of(package), file, digest(source / file)) for what, package, file in rows],
+        names=("entry", "package", "wheel", "file", "sha256"),
+        meta={"wheels": WHEELS, "homes": {name: home for name, (_, home) in COVERED.items()}, "unknown": UNKNOWN},
+    )
+    table.write(LIBRARY / "inputs.ecsv", format="ascii.ecsv", overwrite=True)
+
+
 def fetch(folder: Path, given: Path | None) -> None:
     """Unpack the packages into a folder, from given wheels or from a download, without installing them."""
     for name, version in PACKAGES.items():
         if given:
-            shutil.copy(given / f"{name.lower()}-{version}-py3-none-any.whl", folder)
+            shutil.copy(given / wheel_of(name), folder)
             continue
         command = [sys.executable, "-m", "pip", "download", "--quiet", "--no-deps", "--only-binary", ":all:"]
         subprocess.run([*command, "--dest", str(folder), f"{name}=={version}"], check=True)
-    for wheel in folder.glob("*.whl"):
+    for name in PACKAGES:
+        wheel = folder / wheel_of(name)
+        if digest(wheel) != WHEELS[name]:
+            raise SystemExit(f"{wheel.name} has the SHA-256 {digest(wheel)}, expected {WHEELS[name]}")
         with zipfile.ZipFile(wheel) as archive:
             wanted = ("TargetList", "pyphot/libs", "bessell-B", "licenses/LICENSE")
             archive.extractall(folder, [m for m in archive.namelist() if any(part in m for part in wanted)])
@@ -332,6 +374,7 @@ def main(given: Path | None = None) -> None:
             write_band(name, source)
         for name in PACKAGES:
             write_licence(name, source)
+        write_inputs(source)
     Table(rows=rows).write(LIBRARY / "index.ecsv", format="ascii.ecsv", overwrite=True)
     size = sum(path.stat().st_size for path in LIBRARY.rglob("*.ecsv"))
     print(f"{len(rows)} spectra, {len(BANDS)} bands, {size / 1e6:.2f} MB")

@@ -96,9 +96,9 @@ def parse_numbers(text: str, what: str) -> Numbers:
 
     lines = text.splitlines()
     check_header(lines, what)
-    found = _plain_numbers(lines)
-    if found is not None:
-        return found
+    numbers = _plain_numbers(lines)
+    if numbers is not None:
+        return numbers
     table = parse_ecsv(text, what)
     for name in table.colnames:
         if table[name].dtype.kind not in "iuf" or np.ma.is_masked(table[name]) or table[name].ndim != 1:

@@ -51,8 +51,8 @@ class Bodies:
                 # One step more at either end: a cubic is poorest there.
                 nodes = low + step_d * np.arange(int(np.ceil((days[-1] - low) / step_d)) + 3)
                 times = as_time(midnight, nodes)
-                found = get_sun(times) if body == "sun" else get_body(body, times)
-                return np.asarray(CubicSpline(nodes, found.cartesian.xyz.to_value("km").T)(days))
+                body_there = get_sun(times) if body == "sun" else get_body(body, times)
+                return np.asarray(CubicSpline(nodes, body_there.cartesian.xyz.to_value("km").T)(days))
 
             sun, moon = between(SUN_STEP_D, "sun"), between(MOON_STEP_D, "moon")
             middle = as_time(midnight, days[[days.size // 2]])[0]

@@ -56,8 +56,8 @@ class Thermal:
         end = self.shadow_c + (self.sunlit_c - self.shadow_c) * sunlight
         keep = float(np.exp(-step_s / self.time_constant_s))
         start = float(end.mean()) if start_c is None else start_c
-        found, _ = lfilter([1 - keep], [1, -keep], end, zi=[keep * start])
-        return np.asarray(found)
+        temperature, _ = lfilter([1 - keep], [1, -keep], end, zi=[keep * start])
+        return np.asarray(temperature)
 
 
 @dataclass(frozen=True)

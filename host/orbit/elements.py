@@ -136,8 +136,8 @@ def _check(line: str, number: int) -> None:
     """A line's form and checksum: the sum of its digits, with 1 for a minus, modulo 10."""
     if len(line) < 69 or not line.isascii() or not line.startswith(f"{number} "):
         raise InputError(f"orbital elements {shortened(line)}, expected line {number} with 69 characters")
-    found = sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10
-    if line[68] != str(found):
+    checksum = sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10
+    if line[68] != str(checksum):
         raise InputError(
-            f"orbital elements {shortened(line)} end in the checksum {line[68]!r}, expected {found}: one is wrong"
+            f"orbital elements {shortened(line)} end in the checksum {line[68]!r}, expected {checksum}: one is wrong"
         )

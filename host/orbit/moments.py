@@ -74,9 +74,9 @@ class Moments:
     @cached_property
     def seconds(self) -> NDArray[np.float64]:
         """Middles of the steps since the start, s, (n,)."""
-        found = np.asarray((np.arange(self.n, dtype=np.float64) + 0.5) * float(self.step_s))
-        found.setflags(write=False)
-        return found
+        middles = np.asarray((np.arange(self.n, dtype=np.float64) + 0.5) * float(self.step_s))
+        middles.setflags(write=False)
+        return middles
 
     @property
     def julian(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -102,15 +102,15 @@ def _list() -> Table:
 @cache
 def _names() -> dict[str, Target]:
     """Every name, without blanks and case, to its star."""
-    found = {}
+    stars = {}
     for row in _list():
         star = Target(
             str(row["name"]), float(row["ra"]), float(row["dec"]), "embedded list (Hipparcos, I/311)",
             float(row["distance"]), float(row["V"]), str(row["spectral_type"]),
         )  # fmt: skip
         for name in (star.name, *str(row["other_names"]).split(",")):
-            found[_key(name)] = star
-    return found
+            stars[_key(name)] = star
+    return stars
 
 
 def target_table() -> Table:
@@ -173,12 +173,12 @@ def _from_simbad(text: str, name: str | None) -> Target:
 
 def _within(seconds: float, ask: Callable[[], Any]) -> Any:
     """What a function returns, if it does so in time: requests of astroquery wait for ever where nothing answers."""
-    found: list[Any] = []
+    answers: list[Any] = []
     failed: list[BaseException] = []
 
     def run() -> None:
         try:
-            found.append(ask())
+            answers.append(ask())
         except Exception as error:
             failed.append(error)
 
@@ -188,6 +188,6 @@ def _within(seconds: float, ask: Callable[[], Any]) -> Any:
     thread.join(seconds)
     if failed:
         raise failed[0]
-    if not found:
+    if not answers:
         raise TimeoutError
-    return found[0]
+    return answers[0]

@@ -130,9 +130,9 @@ class Visibility:
         names, place = np.unique(month, return_inverse=True)
         starts = np.searchsorted(np.floor(days).astype(int), np.arange(day.size))
         per_day = np.add.reduceat(self.seen, starts, axis=0, dtype=np.int64) * self._step_h
-        found = np.zeros((names.size, len(self.target)))
-        np.add.at(found, place, per_day)
-        return [str(name) for name in names], found
+        hours = np.zeros((names.size, len(self.target)))
+        np.add.at(hours, place, per_day)
+        return [str(name) for name in names], hours
 
     def by_orbit(self, k: int) -> NDArray[np.float64]:
         """Minutes of exposure in each orbit, from one ascending node to the next, (n_orbit,); the ends may be parts."""
@@ -152,30 +152,30 @@ def in_shadow(track: Track) -> Flags:
 
 def _rules(track: Track, target: Vectors, limits: Limits) -> dict[str, Rule]:
     """The limits in force, each as a function of a slice of steps."""
-    at, bodies, found = track.position_km, track.bodies, dict[str, Rule]()
+    at, bodies, rules = track.position_km, track.bodies, dict[str, Rule]()
     if (earth := limits.earth_limb_deg) is not None:
-        found["earth_limb"] = lambda part: must.clear_of_earth(at[part], target, earth)
+        rules["earth_limb"] = lambda part: must.clear_of_earth(at[part], target, earth)
     if (sun := limits.sun_deg) is not None:
-        found["sun"] = lambda part: must.clear_of_sun(bodies.sun[part], target, sun)
+        rules["sun"] = lambda part: must.clear_of_sun(bodies.sun[part], target, sun)
     if (moon := limits.moon_deg) is not None:
-        found["moon"] = lambda part: must.clear_of_moon(bodies.moon_km[part], at[part], target, moon)
+        rules["moon"] = lambda part: must.clear_of_moon(bodies.moon_km[part], at[part], target, moon)
     if (regard := limits.declination_deg) is not None:
         inside = must.in_declinations(target, *regard)
-        found["declination"] = lambda part: inside[None, :]
+        rules["declination"] = lambda part: inside[None, :]
     if (cone := limits.normal_cone_deg) is not None:
-        found["normal_cone"] = lambda part: (
+        rules["normal_cone"] = lambda part: (
             must.in_cone(track.normal[part], target, cone) | must.in_cone(-track.normal[part], target, cone)
         )
     if limits.eclipse != "any":
         allowed = in_shadow(track) == (limits.eclipse == "only")
-        found["eclipse"] = lambda part: allowed[part, None]
+        rules["eclipse"] = lambda part: allowed[part, None]
     if limits.anomaly or limits.proton_flux is not None:
         if limits.anomaly:
             outside = ~must.in_polygon(*track.below_deg, np.array(limits.anomaly))
         else:
             outside = proton_map().at(*track.below_deg) <= (limits.proton_flux or 0.0)
-        found["anomaly"] = lambda part: outside[part, None]
-    return found
+        rules["anomaly"] = lambda part: outside[part, None]
+    return rules
 
 
 def _drop_short(seen: Flags, step_s: float, shortest_s: float) -> None:

@@ -350,7 +350,7 @@ class Source(ByContent):
 
     def plot(self, path: str | Path | None = None, *, ax: Any = None) -> Any:
         """Flux against wavelength, saved under a path or drawn in axes; needs matplotlib."""
-        return picture("inputs.source", self, path, ax=ax)
+        return picture("inputs.source", self, path=path, ax=ax)
 
     def _line(self) -> str:
         span = f"{self.name!r}, {self.wavelength_nm[0]:.0f}-{self.wavelength_nm[-1]:.0f} nm"

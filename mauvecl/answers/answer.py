@@ -85,7 +85,7 @@ class Answer(ByContent, ABC):
     def plot(self, path: str | Path | None = None, *, ax: Any = None) -> Any:
         """The first of its pictures, saved where a path is given; needs matplotlib."""
         name, *given = next(iter(self.pictures.values()))
-        return picture(name, *given, path, ax=ax)
+        return picture(name, *given, path=path, ax=ax)
 
     def write(self, folder: str | Path) -> list[Path]:
         """Every table, and the study that gives them again.

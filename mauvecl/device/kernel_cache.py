@@ -59,6 +59,7 @@ class KernelCache:
         self.store = (base or work) / "store"
         self._folders: dict[str, str] = {}
         self._published: dict[str, int] = {}
+        self._grown = False
 
     def restore(self, key: str) -> bool:
         """Bring a program's files back from the store, if all of them are as they were put there."""
@@ -126,6 +127,7 @@ class KernelCache:
     def remember(self, key: str, text: str) -> None:
         """Keep a text under its own digest; whatever prevents it is no fault of the run."""
         path = self.store / f"{key}.txt"
+        self._grown = True
         with contextlib.suppress(OSError):
             self.store.mkdir(parents=True, exist_ok=True)
             new = path.with_name(f".{key}-{secrets.token_hex(8)}")
@@ -136,7 +138,10 @@ class KernelCache:
         """Put what was built since into the store, and keep that to its size."""
         self._keep()
         with contextlib.suppress(OSError):
-            self._prune()
+            # Looking through the store takes a tenth of a second, at the end of each run.
+            if self._grown:
+                self._prune()
+                self._grown = False
 
     def _keep(self) -> None:
         """Put what was built since into the store; whatever prevents it is no fault of the run."""
@@ -150,6 +155,7 @@ class KernelCache:
                     self._published[key] = len(files)
 
     def _put(self, key: str, folder: str, files: list[Path]) -> None:
+        self._grown = True
         self.store.mkdir(parents=True, exist_ok=True)
         new = Path(tempfile.mkdtemp(prefix=".new-", dir=self.store))
         try:

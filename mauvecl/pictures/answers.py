@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,13 +13,11 @@ from mauvecl.pictures.style import (
     COLUMN,
     MOST_COLUMNS,
     NULL,
-    STYLE,
     UNBROKEN,
-    finished,
+    drawn,
     headline,
     legend_below,
     plain_numbers,
-    pyplot,
 )
 from mauvecl.statistics.registry import label
 from mauvecl.statistics.statistic import LinearStatistic
@@ -37,34 +34,33 @@ if TYPE_CHECKING:
 Shown = tuple[str, "Detection", Sequence[str]]
 
 
-def detection(stars: Sequence[Shown], fap: float, path: str | Path | None = None) -> Any:
+@drawn
+def detection(plt: Any, stars: Sequence[Shown], fap: float) -> Any:
     """Null and flare distributions: a row per star, a column per statistic."""
-    plt = pyplot()
     first = stars[0][1]
     statistics = first.statistics
     columns = min(len(statistics), MOST_COLUMNS)
     rows = -(-len(statistics) // columns)
-    with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(
-            rows * len(stars), columns, figsize=(COLUMN * columns, 2.6 * rows * len(stars) + 0.4), squeeze=False
-        )
-        for k, (title, outcome, flares) in enumerate(stars):
-            panels = axes[k * rows : (k + 1) * rows]
-            for axis, statistic in zip(panels.ravel(), statistics, strict=False):
-                _distributions(axis, outcome, flares, statistic, fap)
-            for axis in panels.ravel()[len(statistics) :]:
-                axis.set_visible(False)
-            for axis in panels[:, 0]:
-                axis.set_ylabel(f"{title}\nrealisations, each peak = 1")
-        handles, names = axes[0][0].get_legend_handles_labels()
-        legend_below(figure, handles, names)
-        exposures = " and ".join(sorted({f"{outcome.quiet.exposure_s:g}{UNBROKEN}s" for _, outcome, _ in stars}))
-        headline(
-            figure,
-            f"Detection statistics without a flare and with one, {exposures}, "
-            f"{first.realisations:,} realisations each; nominal throughput",
-        )
-        return finished(figure, path)
+    figure, axes = plt.subplots(
+        rows * len(stars), columns, figsize=(COLUMN * columns, 2.6 * rows * len(stars) + 0.4), squeeze=False
+    )
+    for k, (title, outcome, flares) in enumerate(stars):
+        panels = axes[k * rows : (k + 1) * rows]
+        for axis, statistic in zip(panels.ravel(), statistics, strict=False):
+            _distributions(axis, outcome, flares, statistic, fap)
+        for axis in panels.ravel()[len(statistics) :]:
+            axis.set_visible(False)
+        for axis in panels[:, 0]:
+            axis.set_ylabel(f"{title}\nrealisations, each peak = 1")
+    handles, names = axes[0][0].get_legend_handles_labels()
+    legend_below(figure, handles, names)
+    exposures = " and ".join(sorted({f"{outcome.quiet.exposure_s:g}{UNBROKEN}s" for _, outcome, _ in stars}))
+    headline(
+        figure,
+        f"Detection statistics without a flare and with one, {exposures}, "
+        f"{first.realisations:,} realisations each; nominal throughput",
+    )
+    return figure
 
 
 def _distributions(axis: Any, outcome: Detection, flares: Sequence[str], statistic: str, fap: float) -> None:
@@ -109,61 +105,59 @@ def _distributions(axis: Any, outcome: Detection, flares: Sequence[str], statist
     axis.set_xlabel(label(statistic))
 
 
-def roc(curves: Sequence[tuple[str, Roc]], path: str | Path | None = None) -> Any:
+@drawn
+def roc(plt: Any, curves: Sequence[tuple[str, Roc]]) -> Any:
     """Receiver operating characteristics with their areas."""
-    plt = pyplot()
-    with plt.rc_context(STYLE):
-        figure, axis = plt.subplots(figsize=(3.6, 2.9))
-        for colour, (name, curve) in zip(COLOURS, curves, strict=False):
-            table = curve.table()
-            seen = np.asarray(table["fap"]) > 0
-            text = f"{name}: area {curve.area.value:.4f}"
-            axis.semilogx(table["fap"][seen], table["probability"][seen], color=colour, label=text)
-            axis.fill_between(
-                table["fap"][seen], table["probability_low"][seen], table["probability_high"][seen], color=colour,
-                alpha=0.3, linewidth=0,
-            )  # fmt: skip
-        axis.set(xlabel="false-alarm probability per test", ylabel="detection probability", ylim=(0, 1.02))
-        axis.legend(loc="lower right")
-        return finished(figure, path)
+    figure, axis = plt.subplots(figsize=(3.6, 2.9))
+    for colour, (name, curve) in zip(COLOURS, curves, strict=False):
+        table = curve.table()
+        seen = np.asarray(table["fap"]) > 0
+        text = f"{name}: area {curve.area.value:.4f}"
+        axis.semilogx(table["fap"][seen], table["probability"][seen], color=colour, label=text)
+        axis.fill_between(
+            table["fap"][seen], table["probability_low"][seen], table["probability_high"][seen], color=colour,
+            alpha=0.3, linewidth=0,
+        )  # fmt: skip
+    axis.set(xlabel="false-alarm probability per test", ylabel="detection probability", ylim=(0, 1.02))
+    axis.legend(loc="lower right")
+    return figure
 
 
-def spectra(stars: Sequence[Shown], path: str | Path | None = None) -> Any:
+@drawn
+def spectra(plt: Any, stars: Sequence[Shown]) -> Any:
     """Mean spectra per second with the noise of a pixel; beneath, what flares add, in sigma of an element's noise."""
-    plt = pyplot()
-    with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(
-            2, len(stars), figsize=(COLUMN * max(len(stars), 1), 5.0), squeeze=False, sharex=True, height_ratios=(3, 2)
-        )
-        for (above, below), (title, outcome, names) in zip(axes.T, stars, strict=True):
-            quiet, flares = outcome.quiet, outcome.flares
-            element, whole = quiet.element_wavelength_nm, _whole(quiet)
-            sigma = np.sqrt(quiet.per_element(quiet.variance_dn2))
-            for k in reversed(range(len(flares))):
-                x, colour = flares[k], COLOURS[k % len(COLOURS)]
-                above.plot(x.wavelength_nm, x.signal_dn / x.exposure_s, color=colour, label=names[k])
-                risen = x.per_element(x.signal_dn - quiet.signal_dn) / sigma
-                below.plot(element[whole], risen[whole], color=colour)
-            mean, noise = quiet.signal_dn / quiet.exposure_s, np.sqrt(quiet.variance_dn2) / quiet.exposure_s
-            above.fill_between(
-                quiet.wavelength_nm, mean - noise, mean + noise, color=NULL, alpha=0.35, linewidth=0,
-                label="1 sigma of a pixel",
-            )  # fmt: skip
-            above.plot(quiet.wavelength_nm, mean, color="black", linestyle="--", label="no flare")
-            above.set_title(f"{title}, {quiet.exposure_s:g} s")
-            below.axhline(1.0, color=NULL, linewidth=0.8, linestyle="--")
-            # A hundredth of a sigma is nothing.
-            below.set_yscale("log")
-            below.set_ylim(bottom=max(below.get_ylim()[0], 0.03))
-            plain_numbers(below)
-            below.set_xlabel("wavelength (nm)")
-            below.set_xlim(200, 700)
-        axes[0][0].set_ylabel("net signal (DN s$^{-1}$ pixel$^{-1}$)")
-        axes[1][0].set_ylabel("flare less quiet\n(sigma per 10.5 nm)")
-        handles, shown = axes[0][0].get_legend_handles_labels()
-        legend_below(figure, handles, shown)
-        headline(figure, "Mean spectra as Mauve would see them; nominal throughput, not a flight calibration")
-        return finished(figure, path)
+    figure, axes = plt.subplots(
+        2, len(stars), figsize=(COLUMN * max(len(stars), 1), 5.0), squeeze=False, sharex=True, height_ratios=(3, 2)
+    )
+    for (above, below), (title, outcome, names) in zip(axes.T, stars, strict=True):
+        quiet, flares = outcome.quiet, outcome.flares
+        element, whole = quiet.element_wavelength_nm, _whole(quiet)
+        sigma = np.sqrt(quiet.per_element(quiet.variance_dn2))
+        for k in reversed(range(len(flares))):
+            x, colour = flares[k], COLOURS[k % len(COLOURS)]
+            above.plot(x.wavelength_nm, x.signal_dn / x.exposure_s, color=colour, label=names[k])
+            risen = x.per_element(x.signal_dn - quiet.signal_dn) / sigma
+            below.plot(element[whole], risen[whole], color=colour)
+        mean, noise = quiet.signal_dn / quiet.exposure_s, np.sqrt(quiet.variance_dn2) / quiet.exposure_s
+        above.fill_between(
+            quiet.wavelength_nm, mean - noise, mean + noise, color=NULL, alpha=0.35, linewidth=0,
+            label="1 sigma of a pixel",
+        )  # fmt: skip
+        above.plot(quiet.wavelength_nm, mean, color="black", linestyle="--", label="no flare")
+        above.set_title(f"{title}, {quiet.exposure_s:g} s")
+        below.axhline(1.0, color=NULL, linewidth=0.8, linestyle="--")
+        # A hundredth of a sigma is nothing.
+        below.set_yscale("log")
+        below.set_ylim(bottom=max(below.get_ylim()[0], 0.03))
+        plain_numbers(below)
+        below.set_xlabel("wavelength (nm)")
+        below.set_xlim(200, 700)
+    axes[0][0].set_ylabel("net signal (DN s$^{-1}$ pixel$^{-1}$)")
+    axes[1][0].set_ylabel("flare less quiet\n(sigma per 10.5 nm)")
+    handles, shown = axes[0][0].get_legend_handles_labels()
+    legend_below(figure, handles, shown)
+    headline(figure, "Mean spectra as Mauve would see them; nominal throughput, not a flight calibration")
+    return figure
 
 
 def _whole(x: Expectation) -> NDArray[np.bool_]:
@@ -172,9 +166,9 @@ def _whole(x: Expectation) -> NDArray[np.bool_]:
     return np.asarray(pixels >= np.median(pixels) - 1)
 
 
-def observation(title: str, table: QTable, path: str | Path | None = None) -> Any:
+@drawn
+def observation(plt: Any, title: str, table: QTable) -> Any:
     """One raw spectrum and what it is made of, as the paper's figure of components."""
-    plt = pyplot()
     panels = (
         ("raw", "raw spectrum"),
         ("source", "star"),
@@ -185,55 +179,53 @@ def observation(title: str, table: QTable, path: str | Path | None = None) -> An
         ("read_noise", "read noise"),
     )
     wavelength = table["wavelength"].to_value("nm")
-    with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(len(panels), 1, figsize=(7.2, 9.5), sharex=True)
-        for i, (axis, (name, text)) in enumerate(zip(axes, panels, strict=True)):
-            axis.plot(wavelength, table[name].value, color=COLOURS[i % len(COLOURS)], linewidth=0.7)
-            axis.set_title(f"({'abcdefg'[i]}) {text}")
-            axis.set_ylabel("DN")
-        axes[-1].set_xlabel("wavelength (nm)")
-        axes[-1].set_xlim(200, 700)
-        headline(figure, f"{title}: one observation of {table.meta['exposure_s']:g} s; nominal throughput")
-        return finished(figure, path)
+    figure, axes = plt.subplots(len(panels), 1, figsize=(7.2, 9.5), sharex=True)
+    for i, (axis, (name, text)) in enumerate(zip(axes, panels, strict=True)):
+        axis.plot(wavelength, table[name].value, color=COLOURS[i % len(COLOURS)], linewidth=0.7)
+        axis.set_title(f"({'abcdefg'[i]}) {text}")
+        axis.set_ylabel("DN")
+    axes[-1].set_xlabel("wavelength (nm)")
+    axes[-1].set_xlim(200, 700)
+    headline(figure, f"{title}: one observation of {table.meta['exposure_s']:g} s; nominal throughput")
+    return figure
 
 
-def signal_to_noise(stars: Sequence[tuple[str, SnrResult | Expectation]], path: str | Path | None = None) -> Any:
+@drawn
+def signal_to_noise(plt: Any, stars: Sequence[tuple[str, SnrResult | Expectation]]) -> Any:
     """S/N per pixel and per resolution element: closed form, and the spread of realisations where there are some."""
     from mauvecl.results.snr import SnrResult
 
-    plt = pyplot()
-    with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(len(stars), 2, figsize=(7.6, 2.6 * len(stars) + 0.4), squeeze=False, sharex=True)
-        for row, (title, result) in zip(axes, stars, strict=True):
-            x, pixel, element = (
-                (result.expectation, result.pixel, result.element)
-                if isinstance(result, SnrResult)
-                else (result, None, None)
-            )
-            whole = _whole(x)
-            for axis, what, wavelength, expected, table in (
-                (row[0], "per pixel", x.wavelength_nm, x.snr(), pixel),
-                (
-                    row[1],
-                    "per 10.5 nm element",
-                    x.element_wavelength_nm[whole],
-                    x.snr_per_element()[whole],
-                    None if element is None else element[whole],
-                ),
-            ):
-                for low, high, alpha, text in (("q2.5", "q97.5", 0.25, "95 %"), ("q16", "q84", 0.45, "68 %")):
-                    if table is not None:
-                        axis.fill_between(
-                            wavelength, table[low], table[high], color=COLOURS[0], alpha=alpha, linewidth=0,
-                            label=f"{text} of realisations",
-                        )  # fmt: skip
-                axis.plot(wavelength, expected, color="black", linewidth=0.9, label="closed form")
-                axis.set_ylabel(f"S/N {what}")
-                axis.set_title(title if f"{x.exposure_s:g} s" in title else f"{title}, {x.exposure_s:g} s")
-                axis.set_xlim(200, 700)
-        handles, names = axes[0][0].get_legend_handles_labels()
-        legend_below(figure, handles, names)
-        headline(figure, "S/N of one exposure; nominal throughput, not a flight calibration")
-        for axis in axes[-1]:
-            axis.set_xlabel("wavelength (nm)")
-        return finished(figure, path)
+    figure, axes = plt.subplots(len(stars), 2, figsize=(7.6, 2.6 * len(stars) + 0.4), squeeze=False, sharex=True)
+    for row, (title, result) in zip(axes, stars, strict=True):
+        x, pixel, element = (
+            (result.expectation, result.pixel, result.element)
+            if isinstance(result, SnrResult)
+            else (result, None, None)
+        )
+        whole = _whole(x)
+        for axis, what, wavelength, expected, table in (
+            (row[0], "per pixel", x.wavelength_nm, x.snr(), pixel),
+            (
+                row[1],
+                "per 10.5 nm element",
+                x.element_wavelength_nm[whole],
+                x.snr_per_element()[whole],
+                None if element is None else element[whole],
+            ),
+        ):
+            for low, high, alpha, text in (("q2.5", "q97.5", 0.25, "95 %"), ("q16", "q84", 0.45, "68 %")):
+                if table is not None:
+                    axis.fill_between(
+                        wavelength, table[low], table[high], color=COLOURS[0], alpha=alpha, linewidth=0,
+                        label=f"{text} of realisations",
+                    )  # fmt: skip
+            axis.plot(wavelength, expected, color="black", linewidth=0.9, label="closed form")
+            axis.set_ylabel(f"S/N {what}")
+            axis.set_title(title if f"{x.exposure_s:g} s" in title else f"{title}, {x.exposure_s:g} s")
+            axis.set_xlim(200, 700)
+    handles, names = axes[0][0].get_legend_handles_labels()
+    legend_below(figure, handles, names)
+    headline(figure, "S/N of one exposure; nominal throughput, not a flight calibration")
+    for axis in axes[-1]:
+        axis.set_xlabel("wavelength (nm)")
+    return figure

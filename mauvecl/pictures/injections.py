@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.pictures.style import COLOURS, MOST_COLUMNS, STYLE, finished, pyplot
+from mauvecl.pictures.style import COLOURS, MOST_COLUMNS, STYLE, finished, headline, pyplot
 
 if TYPE_CHECKING:
     from mauvecl.answers.stares.inject import InjectAnswer
@@ -38,10 +38,11 @@ def _panels(answer: InjectAnswer) -> tuple[Any, list[Any], list[Any]]:
 
 def _titled(figure: Any, answer: InjectAnswer) -> None:
     choice, flare = answer.study.search, answer.study.flare
-    figure.suptitle(
-        f"Flares of {flare.temperature_k:g} K, {choice.false_alarms:g} false alarms per star-{choice.per}; nominal "
+    alarms = "false alarm" if choice.false_alarms == 1 else "false alarms"
+    headline(
+        figure,
+        f"Flares of {flare.temperature_k:g} K, {choice.false_alarms:g} {alarms} per star-{choice.per}; nominal "
         "throughput",
-        fontsize=9,
     )
 
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.pictures.style import COLOURS, NULL, STYLE, finished, pyplot
+from mauvecl.pictures.style import COLOURS, NULL, drawn
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -29,130 +28,118 @@ OPTICS = {
 }
 
 
-def source(star: Source, path: str | Path | None = None) -> Any:
+@drawn
+def source(plt: Any, star: Source) -> Any:
     """A spectrum where Mauve sees it."""
-    plt = pyplot()
     inside = (star.wavelength_nm >= RANGE_NM[0]) & (star.wavelength_nm <= RANGE_NM[1])
-    with plt.rc_context(STYLE):
-        figure, axis = plt.subplots(figsize=(3.6, 2.7))
-        axis.plot(star.wavelength_nm[inside], star.flux_flam[inside], color=COLOURS[0], linewidth=0.8)
-        axis.set(xlabel=WAVELENGTH, ylabel=FLUX, xlim=RANGE_NM, title=", ".join([star.name, *star.history]))
-        return finished(figure, path)
+    figure, axis = plt.subplots(figsize=(3.6, 2.7))
+    axis.plot(star.wavelength_nm[inside], star.flux_flam[inside], color=COLOURS[0], linewidth=0.8)
+    axis.set(xlabel=WAVELENGTH, ylabel=FLUX, xlim=RANGE_NM, title=", ".join([star.name, *star.history]))
+    return figure
 
 
-def expectation(x: Expectation, path: str | Path | None = None) -> Any:
+@drawn
+def expectation(plt: Any, x: Expectation) -> Any:
     """Mean signal of an exposure, with its noise."""
-    plt = pyplot()
     table = x.table
     w, mean, noise = (table[name].value for name in ("wavelength", "signal", "noise"))
-    with plt.rc_context(STYLE):
-        figure, axis = plt.subplots(figsize=(3.6, 2.7))
-        axis.fill_between(
-            w, mean - noise, mean + noise, color=NULL, alpha=0.35, linewidth=0, label="1 sigma of a pixel"
-        )
-        axis.plot(w, mean, color=COLOURS[0], linewidth=0.9, label="mean signal")
-        axis.set(xlabel=WAVELENGTH, ylabel="DN per pixel", xlim=(w[0], w[-1]), title=f"{x.name}, {x.exposure_s:g} s")
-        axis.legend()
-        return finished(figure, path)
+    figure, axis = plt.subplots(figsize=(3.6, 2.7))
+    axis.fill_between(w, mean - noise, mean + noise, color=NULL, alpha=0.35, linewidth=0, label="1 sigma of a pixel")
+    axis.plot(w, mean, color=COLOURS[0], linewidth=0.9, label="mean signal")
+    axis.set(xlabel=WAVELENGTH, ylabel="DN per pixel", xlim=(w[0], w[-1]), title=f"{x.name}, {x.exposure_s:g} s")
+    axis.legend()
+    return figure
 
 
-def magnitudes(source: Source, values: Sequence[float], band: str = "V", path: str | Path | None = None) -> Any:
+@drawn
+def magnitudes(plt: Any, source: Source, values: Sequence[float], band: str = "V") -> Any:
     """A spectrum at several magnitudes: the paper's figure of the rescaled HD 37202."""
-    plt = pyplot()
-    with plt.rc_context(STYLE):
-        figure, axis = plt.subplots(figsize=(3.6, 2.7))
-        for colour, value in zip(COLOURS, values, strict=False):
-            star = source.at_magnitude(value, band)
-            axis.semilogy(star.wavelength_nm, star.flux_flam, color=colour, label=f"{band} = {value:g}")
-        axis.set(xlabel=WAVELENGTH, ylabel=FLUX, xlim=RANGE_NM, title=source.name)
-        axis.legend()
-        return finished(figure, path)
+    figure, axis = plt.subplots(figsize=(3.6, 2.7))
+    for colour, value in zip(COLOURS, values, strict=False):
+        star = source.at_magnitude(value, band)
+        axis.semilogy(star.wavelength_nm, star.flux_flam, color=colour, label=f"{band} = {value:g}")
+    axis.set(xlabel=WAVELENGTH, ylabel=FLUX, xlim=RANGE_NM, title=source.name)
+    axis.legend()
+    return figure
 
 
-def zodiacal(source: Source, sky: Sky, instrument: Instrument, path: str | Path | None = None) -> Any:
+@drawn
+def zodiacal(plt: Any, source: Source, sky: Sky, instrument: Instrument) -> Any:
     """A spectrum with zodiacal light, and the light alone: the paper's figure of the residual."""
-    plt = pyplot()
     light = sky.spectrum(instrument.field_of_view_arcsec2)
-    with plt.rc_context(STYLE):
-        figure, (above, below) = plt.subplots(2, 1, figsize=(3.6, 4.0), sharex=True)
-        added = 0.0 if light is None else np.interp(source.wavelength_nm, light.wavelength_nm, light.flux_flam)
-        above.plot(source.wavelength_nm, source.flux_flam + added, color=COLOURS[3], label="with zodiacal light")
-        above.plot(source.wavelength_nm, source.flux_flam, color=COLOURS[0], linestyle="--", label="star alone")
-        above.set(ylabel=FLUX, title=source.name)
-        above.legend()
-        if light is not None:
-            below.plot(light.wavelength_nm, light.flux_flam, color=COLOURS[2])
-        below.set(xlabel=WAVELENGTH, ylabel=FLUX, xlim=RANGE_NM, title=f"difference: {sky.description}")
-        return finished(figure, path)
+    figure, (above, below) = plt.subplots(2, 1, figsize=(3.6, 4.0), sharex=True)
+    added = 0.0 if light is None else np.interp(source.wavelength_nm, light.wavelength_nm, light.flux_flam)
+    above.plot(source.wavelength_nm, source.flux_flam + added, color=COLOURS[3], label="with zodiacal light")
+    above.plot(source.wavelength_nm, source.flux_flam, color=COLOURS[0], linestyle="--", label="star alone")
+    above.set(ylabel=FLUX, title=source.name)
+    above.legend()
+    if light is not None:
+        below.plot(light.wavelength_nm, light.flux_flam, color=COLOURS[2])
+    below.set(xlabel=WAVELENGTH, ylabel=FLUX, xlim=RANGE_NM, title=f"difference: {sky.description}")
+    return figure
 
 
-def convolved(source: Source, instrument: Instrument, path: str | Path | None = None) -> Any:
+@drawn
+def convolved(plt: Any, source: Source, instrument: Instrument) -> Any:
     """A spectrum and the same through the line function: the paper's figure of the convolution.
 
     Light alone is shown: the line function acts on what the optics and the detector would see all of.
     """
     from mauvecl.host.response import electrons_per_second
 
-    plt = pyplot()
     w = instrument.wavelength_nm
     seen = electrons_per_second(instrument, source.wavelength_nm, source.flux_flam)
     flat = electrons_per_second(instrument, source.wavelength_nm, np.ones_like(source.flux_flam))
-    with plt.rc_context(STYLE):
-        figure, axis = plt.subplots(figsize=(3.6, 2.7))
-        axis.plot(source.wavelength_nm, source.flux_flam, color=COLOURS[1], linewidth=0.8, label="as given")
-        # Relative to a flat spectrum: the line function's effect without the efficiencies'.
-        axis.plot(w, seen / flat, color=COLOURS[2], label="through Mauve's line function")
-        top = 1.1 * float((seen / flat).max())
-        axis.set(xlabel=WAVELENGTH, ylabel=FLUX, xlim=RANGE_NM, ylim=(0, top), title=source.name)
-        axis.legend()
-        return finished(figure, path)
+    figure, axis = plt.subplots(figsize=(3.6, 2.7))
+    axis.plot(source.wavelength_nm, source.flux_flam, color=COLOURS[1], linewidth=0.8, label="as given")
+    # Relative to a flat spectrum: the line function's effect without the efficiencies'.
+    axis.plot(w, seen / flat, color=COLOURS[2], label="through Mauve's line function")
+    top = 1.1 * float((seen / flat).max())
+    axis.set(xlabel=WAVELENGTH, ylabel=FLUX, xlim=RANGE_NM, ylim=(0, top), title=source.name)
+    axis.legend()
+    return figure
 
 
-def efficiencies(instrument: Instrument, path: str | Path | None = None) -> Any:
+@drawn
+def efficiencies(plt: Any, instrument: Instrument) -> Any:
     """Each optical element's efficiency: the paper's figure of the payload's components."""
-    plt = pyplot()
     w = np.linspace(*RANGE_NM, 501)
-    with plt.rc_context(STYLE):
-        figure, axis = plt.subplots(figsize=(3.6, 2.9))
-        for colour, (name, text) in zip(COLOURS, OPTICS.items(), strict=False):
-            axis.plot(w, 100 * getattr(instrument, name).at(w), color=colour, label=text)
-        axis.set(xlabel=WAVELENGTH, ylabel="efficiency (%)", xlim=RANGE_NM, ylim=(0, 105))
-        axis.set_title(f"{instrument.name}: nominal, some of it assumed")
-        axis.legend(ncols=2)
-        return finished(figure, path)
+    figure, axis = plt.subplots(figsize=(3.6, 2.9))
+    for colour, (name, text) in zip(COLOURS, OPTICS.items(), strict=False):
+        axis.plot(w, 100 * getattr(instrument, name).at(w), color=colour, label=text)
+    axis.set(xlabel=WAVELENGTH, ylabel="efficiency (%)", xlim=RANGE_NM, ylim=(0, 105))
+    axis.set_title(f"{instrument.name}: nominal, some of it assumed")
+    axis.legend(ncols=2)
+    return figure
 
 
-def throughput(instrument: Instrument, path: str | Path | None = None) -> Any:
+@drawn
+def throughput(plt: Any, instrument: Instrument) -> Any:
     """Quantum efficiency, and the end-to-end throughput with it: the paper's figure of both."""
-    plt = pyplot()
     w = np.linspace(*RANGE_NM, 501)
-    with plt.rc_context(STYLE):
-        figure, (above, below) = plt.subplots(2, 1, figsize=(3.6, 4.0), sharex=True)
-        above.plot(w, 100 * instrument.quantum_efficiency(w), color=COLOURS[0])
-        above.set(ylabel="quantum efficiency (%)", title=f"{instrument.name}: nominal, not a flight calibration")
-        below.plot(w, 100 * instrument.throughput(w), color=COLOURS[4])
-        spread = 100 * instrument.throughput(w)
-        below.fill_between(
-            w, np.where(w < 250, 0.5, 0.7) * spread, np.where(w < 250, 1.5, 1.3) * spread, color=NULL, alpha=0.25,
-            linewidth=0, label="sensible uncertainty",
-        )  # fmt: skip
-        below.set(xlabel=WAVELENGTH, ylabel="throughput with it (%)", xlim=RANGE_NM)
-        below.legend()
-        return finished(figure, path)
+    figure, (above, below) = plt.subplots(2, 1, figsize=(3.6, 4.0), sharex=True)
+    above.plot(w, 100 * instrument.quantum_efficiency(w), color=COLOURS[0])
+    above.set(ylabel="quantum efficiency (%)", title=f"{instrument.name}: nominal, not a flight calibration")
+    below.plot(w, 100 * instrument.throughput(w), color=COLOURS[4])
+    spread = 100 * instrument.throughput(w)
+    below.fill_between(
+        w, np.where(w < 250, 0.5, 0.7) * spread, np.where(w < 250, 1.5, 1.3) * spread, color=NULL, alpha=0.25,
+        linewidth=0, label="sensible uncertainty",
+    )  # fmt: skip
+    below.set(xlabel=WAVELENGTH, ylabel="throughput with it (%)", xlim=RANGE_NM)
+    below.legend()
+    return figure
 
 
-def flares(source: Source, amplitudes: Sequence[float], path: str | Path | None = None) -> Any:
+@drawn
+def flares(plt: Any, source: Source, amplitudes: Sequence[float]) -> Any:
     """A star's spectrum at several stages of a flare: the paper's figures of the inputs."""
-    plt = pyplot()
-    with plt.rc_context(STYLE):
-        figure, axis = plt.subplots(figsize=(3.6, 2.7))
-        for k in reversed(range(len(amplitudes))):
-            star = source.flaring(amplitudes[k])
-            text = f"flare {100 * amplitudes[k]:g} %"
-            axis.plot(star.wavelength_nm, star.flux_flam, color=COLOURS[k % len(COLOURS)], linewidth=0.8, label=text)
-        axis.plot(
-            source.wavelength_nm, source.flux_flam, color="black", linestyle="--", linewidth=0.8, label="no flare"
-        )
-        axis.set(xlabel=WAVELENGTH, ylabel=FLUX, xlim=RANGE_NM, title=source.name)
-        axis.legend()
-        return finished(figure, path)
+    figure, axis = plt.subplots(figsize=(3.6, 2.7))
+    for k in reversed(range(len(amplitudes))):
+        star = source.flaring(amplitudes[k])
+        text = f"flare {100 * amplitudes[k]:g} %"
+        axis.plot(star.wavelength_nm, star.flux_flam, color=COLOURS[k % len(COLOURS)], linewidth=0.8, label=text)
+    axis.plot(source.wavelength_nm, source.flux_flam, color="black", linestyle="--", linewidth=0.8, label="no flare")
+    axis.set(xlabel=WAVELENGTH, ylabel=FLUX, xlim=RANGE_NM, title=source.name)
+    axis.legend()
+    return figure

@@ -4,131 +4,190 @@ from __future__ import annotations
 
 import io
 import textwrap
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.campaigns.plan_text import SUMMARY, SUMMARY_TABLE, heading, summary_rows, target_lines
+from mauvecl.answers.campaigns.plan_text import LEGEND, SUMMARY, heading, summary_rows, target_lines
 from mauvecl.host.version import VERSION
 from mauvecl.pictures.style import COLOURS, NULL, STYLE, finished, pyplot
 
 if TYPE_CHECKING:
     from mauvecl.answers.campaigns.plan import PlanAnswer
 
-#: A4, inches.
-PAGE = (8.27, 11.69)
-#: Rows of text on a page.
-LINES = 66
+#: A4, and its margin, inches.
+PAGE, MARGIN = (8.27, 11.69), 0.6
+#: Width of a letter over its size, about, by which lines are broken; distance of lines over their size.
+LETTER, LINE = 0.5, 1.4
+#: Where columns of the summary begin, and of the assumptions, as parts of the width between the margins.
+SUMMARY_AT = (0.0, 0.17, 0.25, 0.36, 0.45, 0.54, 0.63, 0.71, 0.78, 0.87)
+ASSUMED_AT = (0.0, 0.24, 0.5)
 
 
-def overview(found: PlanAnswer, path: str | Path | None) -> Any:
+def overview(answer: PlanAnswer, path: str | Path | None) -> Any:
     """Flares expected of each target with 95 % of campaigns, and E50 to E90."""
     plt = pyplot()
-    n = len(found.planned)
     with plt.rc_context(STYLE):
-        figure, (left, right) = plt.subplots(1, 2, figsize=(7.4, 0.24 * n + 1.5), sharey=True)
-        for k, one in enumerate(found.planned):
-            if one.found is not None and one.found.high > 0:
-                # A logarithmic axis has no zero.
-                least = max(one.found.low, 0.05)
-                left.plot([least, max(one.found.high, least)], [k, k], color=COLOURS[0], linewidth=2.5, alpha=0.5)
-                left.plot([max(one.found.expected, 0.05)], [k], "o", color=COLOURS[0], ms=4)
-            ends = [one.energy_at(0.5), one.energy_at(0.9)]
-            if np.isfinite(ends[0]):
-                right.plot(ends, [k, k], color=COLOURS[4], linewidth=2.5, alpha=0.5)
-                right.plot(ends[:1], [k], "o", color=COLOURS[4], ms=4)
-        left.set(xscale="log", xlabel="flares recovered", xlim=(0.05, None))
-        left.set_title("expected; 95 % of campaigns")
-        right.set(xscale="log", xlabel="bolometric energy (erg)")
-        right.set_title("E50 (dot) to E90")
-        left.set_yticks(range(n), [f"{one.name} ({one.hours:.0f} h)" for one in found.planned], fontsize=8)
-        left.set_ylim(n - 0.5, -0.5)
+        figure, axes = plt.subplots(1, 2, figsize=(7.4, 0.24 * len(answer.planned) + 1.5), sharey=True)
+        _overview(axes, answer)
         return finished(figure, path)
 
 
-def pdf_bytes(found: PlanAnswer) -> bytes:
+def overview_png(answer: PlanAnswer) -> bytes:
+    """The same as PNG."""
+    plt = pyplot()
+    with plt.rc_context(STYLE):
+        figure = overview(answer, None)
+        return _png(plt, figure)
+
+
+def _overview(axes: Any, answer: PlanAnswer) -> None:
+    left, right = axes
+    n = len(answer.planned)
+    for k, one in enumerate(answer.planned):
+        if one.recovered is not None and one.recovered.high > 0:
+            # A logarithmic axis has no zero.
+            least = max(one.recovered.low, 0.05)
+            left.plot([least, max(one.recovered.high, least)], [k, k], color=COLOURS[0], linewidth=2.5, alpha=0.5)
+            left.plot([max(one.recovered.expected, 0.05)], [k], "o", color=COLOURS[0], ms=4)
+        ends = [one.energy_at(0.5), one.energy_at(0.9)]
+        if np.isfinite(ends[0]):
+            right.plot(ends, [k, k], color=COLOURS[4], linewidth=2.5, alpha=0.5)
+            right.plot(ends[:1], [k], "o", color=COLOURS[4], ms=4)
+    left.set(xscale="log", xlabel="flares recovered", xlim=(0.05, None))
+    left.set_title("expected (dot); 95 % of campaigns")
+    right.set(xscale="log", xlabel="bolometric energy (erg)")
+    right.set_title("E50 (dot) to E90")
+    left.set_yticks(range(n), [f"{one.name} ({one.hours:.0f} h)" for one in answer.planned], fontsize=8)
+    left.set_ylim(n - 0.5, -0.5)
+
+
+def pdf_bytes(answer: PlanAnswer) -> bytes:
     """The report as PDF: the summary, a page for each target, every assumption."""
     from matplotlib.backends.backend_pdf import PdfPages
 
     plt, made = pyplot(), io.BytesIO()
     # Without a date the same plan is the same file.
-    about = {"Title": f"Mauve: {heading(found)}", "Creator": f"mauvecl {VERSION}", "CreationDate": None}
+    about = {"Title": f"Mauve: {heading(answer)}", "Creator": f"mauvecl {VERSION}", "CreationDate": None}
     with plt.rc_context(STYLE | {"pdf.fonttype": 42}), PdfPages(made, metadata=about) as pages:
-        drawn = [*_summary(plt, found), *(_target(plt, found, k) for k in range(len(found.planned)))]
-        for figure in [*drawn, *_assumptions(plt, found)]:
+        targets = [_target(plt, answer, k) for k in range(len(answer.planned))]
+        for figure in [*_summary(plt, answer), *targets, *_assumptions(plt, answer)]:
             pages.savefig(figure)
             plt.close(figure)
     return made.getvalue()
 
 
-def target_png(found: PlanAnswer, k: int) -> bytes:
+def target_png(answer: PlanAnswer, k: int) -> bytes:
     """The pictures of one target as PNG."""
-    plt, made = pyplot(), io.BytesIO()
+    plt = pyplot()
     with plt.rc_context(STYLE):
         figure = plt.figure(figsize=(7.4, 5.4))
-        _panels(figure, found, k)
-        figure.savefig(made, format="png", dpi=110)
-        plt.close(figure)
+        _panels(figure, answer, k)
+        return _png(plt, figure)
+
+
+def _png(plt: Any, figure: Any) -> bytes:
+    made = io.BytesIO()
+    figure.savefig(made, format="png", dpi=110)
+    plt.close(figure)
     return made.getvalue()
 
 
-def _summary(plt: Any, found: PlanAnswer) -> list[Any]:
-    rows = summary_rows(found)
-    lines = [f"Mauve: {heading(found)}", f"mauvecl {VERSION}; numbers are those of {SUMMARY_TABLE}", ""]
-    lines += _columns([SUMMARY, *rows])
-    lines += ["", *(line for message in found.messages for line in [*textwrap.wrap(message, 108), ""])]
-    return _text_pages(plt, lines, 7.0)
+class Sheets:
+    """Text from the top of a page down, on as many pages as it takes."""
+
+    def __init__(self, plt: Any) -> None:
+        self._plt = plt
+        self.pages: list[Any] = []
+        self.left_in = 0.0
+
+    def line(self, cells: Sequence[tuple[float, str]], size: float, **how: Any) -> None:
+        """Cells side by side, each wrapped up to the next one's place, which is a part of the width."""
+        edges = [*(place for place, _ in cells[1:]), 1.0]
+        width = PAGE[0] - 2 * MARGIN
+        wrapped = []
+        for (place, text), end in zip(cells, edges, strict=True):
+            letters = max(8, int((end - place) * width * 72 / (LETTER * size)) - 1)
+            wrapped.append((MARGIN + place * width, textwrap.wrap(text, letters) or [""]))
+        height = max(len(lines) for _, lines in wrapped) * size * LINE / 72
+        y = self.take(height)
+        for x, lines in wrapped:
+            self.pages[-1].text(x / PAGE[0], y / PAGE[1], "\n".join(lines), fontsize=size, va="top", linespacing=LINE,
+                                parse_math=False, **how)  # fmt: skip
+
+    def rule(self) -> None:
+        """A line across the page."""
+        y = self.take(0.06) / PAGE[1]
+        ends = (MARGIN / PAGE[0], 1 - MARGIN / PAGE[0])
+        self.pages[-1].add_artist(self._plt.Line2D(ends, (y, y), color=NULL, linewidth=0.5))
+
+    def take(self, height_in: float) -> float:
+        """So much of a page, a new one where the last has less left; its top, inches from the bottom."""
+        if not self.pages or self.left_in < height_in:
+            self.pages.append(self._plt.figure(figsize=PAGE, layout="none"))
+            self.left_in = PAGE[1] - 2 * MARGIN
+        top = MARGIN + self.left_in
+        self.left_in -= height_in
+        return top
 
 
-def _assumptions(plt: Any, found: PlanAnswer) -> list[Any]:
-    lines = ["What is assumed (assumptions.ecsv)", ""]
-    for name, value, source in found.assumptions:
-        told = ": ".join(part for part in (str(name), str(value)) if part)
-        lines += [*textwrap.wrap(told, 108), *textwrap.wrap(str(source), 104, initial_indent="    ",
-                                                            subsequent_indent="    "), ""]  # fmt: skip
-    return _text_pages(plt, lines, 7.0)
+def _summary(plt: Any, answer: PlanAnswer) -> list[Any]:
+    sheets = Sheets(plt)
+    sheets.line([(0.0, "Mauve: yields of a campaign")], 15)
+    sheets.line([(0.0, f"{heading(answer)}; mauvecl {VERSION}")], 9)
+    sheets.take(0.1)
+    for number, row in enumerate([SUMMARY, *summary_rows(answer)]):
+        sheets.line(list(zip(SUMMARY_AT, row, strict=True)), 7, weight="normal" if number else "bold")
+        sheets.rule()
+    sheets.take(0.05)
+    sheets.line([(0.0, LEGEND)], 7, color=NULL)
+    height = 0.2 * len(answer.planned) + 1.3
+    if height < PAGE[1] - 2 * MARGIN:
+        top = sheets.take(height)
+        bottom, size = (top - height + 0.55) / PAGE[1], (height - 0.95) / PAGE[1]
+        left = sheets.pages[-1].add_axes((0.24, bottom, 0.32, size))
+        right = sheets.pages[-1].add_axes((0.6, bottom, 0.32, size), sharey=left)
+        right.tick_params(labelleft=False)
+        _overview((left, right), answer)
+    for message in answer.messages:
+        sheets.line([(0.0, message)], 8)
+        sheets.take(0.08)
+    return sheets.pages
 
 
-def _columns(rows: list[tuple[str, ...]]) -> list[str]:
-    """Rows of text with blanks between columns."""
-    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
-    text = ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    return [text[0], "-" * max(map(len, text)), *text[1:]]
+def _assumptions(plt: Any, answer: PlanAnswer) -> list[Any]:
+    sheets = Sheets(plt)
+    sheets.line([(0.0, "What is assumed")], 14)
+    sheets.line([(0.0, "Rows of assumptions.ecsv.")], 8, color=NULL)
+    sheets.take(0.1)
+    for row in answer.assumptions:
+        sheets.line([(place, str(cell)) for place, cell in zip(ASSUMED_AT, row, strict=True)], 7)
+        sheets.rule()
+    return sheets.pages
 
 
-def _text_pages(plt: Any, lines: list[str], size: float) -> list[Any]:
-    """Lines of one width on as many pages as they need, smaller where a line is long."""
-    found = []
-    longest = max(map(len, lines))
-    for first in range(0, len(lines), LINES):
-        figure = plt.figure(figsize=PAGE)
-        # A letter is some 0.6 of its size wide; 7.3 inches are there.
-        figure.text(0.06, 0.96, "\n".join(lines[first : first + LINES]), family="monospace", va="top",
-                    fontsize=min(size, 7.3 * 72 / (0.605 * longest)), linespacing=1.45, parse_math=False)  # fmt: skip
-        found.append(figure)
-    return found
-
-
-def _target(plt: Any, found: PlanAnswer, k: int) -> Any:
+def _target(plt: Any, answer: PlanAnswer, k: int) -> Any:
     figure = plt.figure(figsize=PAGE)
     words, pictures = figure.subfigures(2, 1, height_ratios=[1, 1.35])
-    words.text(0.07, 0.95, found.planned[k].name, fontsize=14, va="top", parse_math=False)
-    words.text(0.93, 0.95, heading(found), fontsize=8, va="top", ha="right", color=NULL)
-    y = 0.84
-    for name, value, where in target_lines(found, k):
-        told = textwrap.wrap(value, 66) or [""]
+    words.text(0.07, 0.95, answer.planned[k].name, fontsize=14, va="top", parse_math=False)
+    words.text(0.93, 0.95, heading(answer), fontsize=8, va="top", ha="right", color=NULL)
+    y = 0.86
+    for name, value, where in target_lines(answer, k):
+        told = textwrap.wrap(value, 48) or [""]
         words.text(0.07, y, name, fontsize=8, va="top")
         words.text(0.33, y, "\n".join(told), fontsize=8, va="top", parse_math=False)
         words.text(0.93, y, where, fontsize=6.5, va="top", ha="right", color=NULL)
-        y -= 0.048 * len(told)
-    _panels(pictures, found, k)
+        y -= 0.044 * len(told)
+    if answer.planned[k].seen_h > 0:
+        _panels(pictures, answer, k)
     return figure
 
 
-def _panels(figure: Any, found: PlanAnswer, k: int) -> None:
+def _panels(figure: Any, answer: PlanAnswer, k: int) -> None:
     """Hours a day with elongation, hours by month, and recovered share with the rate by energy."""
-    one, seen = found.planned[k], found.seen
+    one, seen = answer.planned[k], answer.seen
     top, bottom = figure.subplots(2, 1)
     days = np.arange(len(seen.days))
     top.fill_between(days, seen.visibility.by_day(k), step="mid", color=COLOURS[1], linewidth=0)

@@ -12,13 +12,11 @@ from mauvecl.pictures.style import (
     COLOURS,
     COLUMN,
     NULL,
-    STYLE,
     UNBROKEN,
-    finished,
+    drawn,
     headline,
     legend_below,
     plain_numbers,
-    pyplot,
 )
 from mauvecl.statistics.registry import label
 from mauvecl.study.labels import titled
@@ -37,90 +35,88 @@ if TYPE_CHECKING:
 STROKES = (":", "--", "-", "-.")
 
 
-def detection_map(answer: MapResult, path: str | Path | None) -> Any:
-    """Detection probability over two quantities, one panel per statistic; the figure where no path is given."""
-    plt = pyplot()
+@drawn
+def detection_map(plt: Any, answer: MapResult) -> Any:
+    """Detection probability over two quantities, one panel per statistic."""
     question = answer.study.map
-    with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(
-            1, len(answer.statistics), figsize=(COLUMN * len(answer.statistics) + 0.5, 3.4), squeeze=False, sharey=True
-        )
-        lines = {}
-        x, y = (
-            np.arange(len(values)) if isinstance(values[0], str) else np.array(values, float)
-            for values in (answer.x, answer.y)
-        )
-        for axis, statistic, probability in zip(axes[0], answer.statistics, answer.probability, strict=True):
-            mesh = axis.pcolormesh(x, y, probability, cmap="cividis", vmin=0, vmax=1, shading="nearest")
-            if min(probability.shape) > 1:
-                # Lines lie close where a map is steep: told apart by their strokes, and by no words among them.
-                levels = sorted(question.contours)
-                strokes = [STROKES[k % len(STROKES)] for k in range(len(levels))]
-                axis.contour(x, y, probability, levels=levels, colors="white", linewidths=2.4)
-                axis.contour(x, y, probability, levels=levels, colors="black", linewidths=1.2, linestyles=strokes)
-                lines = {f"{100 * level:g} %": stroke for level, stroke in zip(levels, strokes, strict=True)}
-            for which, values, place in (("x", answer.x, x), ("y", answer.y, y)):
-                described = getattr(question, which)
-                if isinstance(values[0], str):
-                    getattr(axis, f"set_{which}ticks")(place, values)
-                elif described.log:
-                    getattr(axis, f"set_{which}scale")("log")
-            axis.set_xlabel(QUANTITIES[question.x.quantity].axis)
-            axis.set_title(label(statistic))
-            plain_numbers(axis)
-        axes[0][0].set_ylabel(QUANTITIES[question.y.quantity].axis)
-        figure.colorbar(mesh, ax=list(axes[0]), label="detection probability")
-        if lines:
-            shown = [plt.Line2D([], [], color="black", linewidth=1.2, linestyle=stroke) for stroke in lines.values()]
-            legend_below(figure, shown, [f"detected in {name}" for name in lines])
-        names = {question.x.quantity, question.y.quantity}
-        exposure = "" if "exposure" in names else f", {answer.study.observation.exposure_s:g} s"
-        flare = "" if "amplitude" in names else f", flare of {100 * answer.study.flare.amplitudes[0]:g} %"
-        headline(
-            figure,
-            f"{answer.star}{exposure}{flare}, false-alarm probability {answer.study.run.fap:g} per test; nominal "
-            "throughput",
-        )
-        return finished(figure, path)
-
-
-def limits(answer: LimitResult, path: str | Path | None) -> Any:
-    """Detection probability at every simulated value, and the limits; the figure where no path is given."""
-    plt = pyplot()
-    of, power = answer.study.limit.of, answer.study.limit.power
-    with plt.rc_context(STYLE):
-        figure, axis = plt.subplots(figsize=(COLUMN, 3.0 + 0.17 * len(answer.limits)))
-        for k, limit in enumerate(answer.limits):
-            colour, marker = COLOURS[k % len(COLOURS)], "osD^vPX"[k // len(COLOURS) % 7]
-            points = sorted((*limit.points, limit.check), key=lambda p: p.value)
-            p = [point.probability for point in points]
-            error = [[q.value - q.low for q in p], [q.high - q.value for q in p]]
-            flare = "" if np.isnan(limit.amplitude) else f", {100 * limit.amplitude:g} %"
-            text = f"{limit.star}{flare}, {limit.statistic}: {limit.value.value:.4g}"
-            axis.errorbar(
-                [point.value for point in points],
-                [q.value for q in p],
-                error,
-                fmt=marker,
-                ms=4,
-                color=colour,
-                label=text,
-            )
-            axis.plot(*zip(*sorted(limit.curve), strict=True), color=colour, linewidth=0.9)
-            axis.axvspan(limit.value.low, limit.value.high, color=colour, alpha=0.25, linewidth=0)
-        axis.axhline(power, color="black", linewidth=0.8, linestyle="--")
-        if of != "magnitude":
-            axis.set_xscale("log")
-        axis.set(xlabel=QUANTITIES[of].axis, ylabel="detection probability", ylim=(-0.02, 1.02))
+    figure, axes = plt.subplots(
+        1, len(answer.statistics), figsize=(COLUMN * len(answer.statistics) + 0.5, 3.4), squeeze=False, sharey=True
+    )
+    lines = {}
+    x, y = (
+        np.arange(len(values)) if isinstance(values[0], str) else np.array(values, float)
+        for values in (answer.x, answer.y)
+    )
+    for axis, statistic, probability in zip(axes[0], answer.statistics, answer.probability, strict=True):
+        mesh = axis.pcolormesh(x, y, probability, cmap="cividis", vmin=0, vmax=1, shading="nearest")
+        if min(probability.shape) > 1:
+            # Lines lie close where a map is steep: told apart by their strokes, and by no words among them.
+            levels = sorted(question.contours)
+            strokes = [STROKES[k % len(STROKES)] for k in range(len(levels))]
+            axis.contour(x, y, probability, levels=levels, colors="white", linewidths=2.4)
+            axis.contour(x, y, probability, levels=levels, colors="black", linewidths=1.2, linestyles=strokes)
+            lines = {f"{100 * level:g} %": stroke for level, stroke in zip(levels, strokes, strict=True)}
+        for which, values, place in (("x", answer.x, x), ("y", answer.y, y)):
+            described = getattr(question, which)
+            if isinstance(values[0], str):
+                getattr(axis, f"set_{which}ticks")(place, values)
+            elif described.log:
+                getattr(axis, f"set_{which}scale")("log")
+        axis.set_xlabel(QUANTITIES[question.x.quantity].axis)
+        axis.set_title(label(statistic))
         plain_numbers(axis)
-        exposure = "" if of == "exposure" else f", {answer.study.observation.exposure_s:g}{UNBROKEN}s"
-        headline(
-            figure,
-            f"Limits at a power of {power:g}{exposure}, false-alarm probability {answer.study.run.fap:g} per test; "
-            "points: simulated, 95 %; lines: Gaussian noise; nominal throughput",
+    axes[0][0].set_ylabel(QUANTITIES[question.y.quantity].axis)
+    figure.colorbar(mesh, ax=list(axes[0]), label="detection probability")
+    if lines:
+        shown = [plt.Line2D([], [], color="black", linewidth=1.2, linestyle=stroke) for stroke in lines.values()]
+        legend_below(figure, shown, [f"detected in {name}" for name in lines])
+    names = {question.x.quantity, question.y.quantity}
+    exposure = "" if "exposure" in names else f", {answer.study.observation.exposure_s:g} s"
+    flare = "" if "amplitude" in names else f", flare of {100 * answer.study.flare.amplitudes[0]:g} %"
+    headline(
+        figure,
+        f"{answer.star}{exposure}{flare}, false-alarm probability {answer.study.run.fap:g} per test; nominal "
+        "throughput",
+    )
+    return figure
+
+
+@drawn
+def limits(plt: Any, answer: LimitResult) -> Any:
+    """Detection probability at every simulated value, and the limits."""
+    of, power = answer.study.limit.of, answer.study.limit.power
+    figure, axis = plt.subplots(figsize=(COLUMN, 3.0 + 0.17 * len(answer.limits)))
+    for k, limit in enumerate(answer.limits):
+        colour, marker = COLOURS[k % len(COLOURS)], "osD^vPX"[k // len(COLOURS) % 7]
+        points = sorted((*limit.points, limit.check), key=lambda p: p.value)
+        p = [point.probability for point in points]
+        error = [[q.value - q.low for q in p], [q.high - q.value for q in p]]
+        flare = "" if np.isnan(limit.amplitude) else f", {100 * limit.amplitude:g} %"
+        text = f"{limit.star}{flare}, {limit.statistic}: {limit.value.value:.4g}"
+        axis.errorbar(
+            [point.value for point in points],
+            [q.value for q in p],
+            error,
+            fmt=marker,
+            ms=4,
+            color=colour,
+            label=text,
         )
-        legend_below(figure, *axis.get_legend_handles_labels())
-        return finished(figure, path)
+        axis.plot(*zip(*sorted(limit.curve), strict=True), color=colour, linewidth=0.9)
+        axis.axvspan(limit.value.low, limit.value.high, color=colour, alpha=0.25, linewidth=0)
+    axis.axhline(power, color="black", linewidth=0.8, linestyle="--")
+    if of != "magnitude":
+        axis.set_xscale("log")
+    axis.set(xlabel=QUANTITIES[of].axis, ylabel="detection probability", ylim=(-0.02, 1.02))
+    plain_numbers(axis)
+    exposure = "" if of == "exposure" else f", {answer.study.observation.exposure_s:g}{UNBROKEN}s"
+    headline(
+        figure,
+        f"Limits at a power of {power:g}{exposure}, false-alarm probability {answer.study.run.fap:g} per test; "
+        "points: simulated, 95 %; lines: Gaussian noise; nominal throughput",
+    )
+    legend_below(figure, *axis.get_legend_handles_labels())
+    return figure
 
 
 #: Noise by origin, in the colours of the paper's figure as far as colour-blind readers can tell them apart.
@@ -141,80 +137,78 @@ def noise_budgets(answer: SnrAnswer, path: str | Path | None = None) -> Any:
     return noise_budget(named, each=each, path=path)
 
 
-def noise_budget(observed: Sequence[tuple[str, Expectation]], *, each: int = 1, path: str | Path | None = None) -> Any:
+@drawn
+def noise_budget(plt: Any, observed: Sequence[tuple[str, Expectation]], *, each: int = 1) -> Any:
     """Noise of a pixel by origin against wavelength: titles and expectations, in so many columns."""
-    plt = pyplot()
     stars = len(observed) // each
-    with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(
-            stars, each, figsize=(COLUMN * min(each, 6), 2.3 * stars + 0.7), squeeze=False, sharex=True, sharey="col"
-        )
-        for k, (title, x) in enumerate(observed):
-            axis, budget = axes[k % stars][k // stars], x.noise_budget()
-            for name, (text, colour) in ORIGINS.items():
-                axis.plot(budget["wavelength"].value, budget[name].value, color=colour, label=text, linewidth=1.0)
-            axis.set_title(title)
-            axis.set_yscale("log")
-            axis.set_xlim(200, 700)
-        # Zodiacal light can be far below everything else.
-        for axis in axes.ravel():
-            axis.set_ylim(bottom=max(axis.get_ylim()[0], axis.get_ylim()[1] * 1e-4))
-        for axis in axes[:, 0]:
-            axis.set_ylabel("noise (DN rms per pixel)")
-        for axis in axes[-1]:
-            axis.set_xlabel("wavelength (nm)")
-        handles, names = axes[0][0].get_legend_handles_labels()
-        legend_below(figure, handles, names)
-        headline(figure, "Noise budgets; nominal throughput, not a flight calibration")
-        return finished(figure, path)
+    figure, axes = plt.subplots(
+        stars, each, figsize=(COLUMN * min(each, 6), 2.3 * stars + 0.7), squeeze=False, sharex=True, sharey="col"
+    )
+    for k, (title, x) in enumerate(observed):
+        axis, budget = axes[k % stars][k // stars], x.noise_budget()
+        for name, (text, colour) in ORIGINS.items():
+            axis.plot(budget["wavelength"].value, budget[name].value, color=colour, label=text, linewidth=1.0)
+        axis.set_title(title)
+        axis.set_yscale("log")
+        axis.set_xlim(200, 700)
+    # Zodiacal light can be far below everything else.
+    for axis in axes.ravel():
+        axis.set_ylim(bottom=max(axis.get_ylim()[0], axis.get_ylim()[1] * 1e-4))
+    for axis in axes[:, 0]:
+        axis.set_ylabel("noise (DN rms per pixel)")
+    for axis in axes[-1]:
+        axis.set_xlabel("wavelength (nm)")
+    handles, names = axes[0][0].get_legend_handles_labels()
+    legend_below(figure, handles, names)
+    headline(figure, "Noise budgets; nominal throughput, not a flight calibration")
+    return figure
 
 
-def snr_sweep(answer: SnrAnswer, path: str | Path | None = None) -> Any:
+@drawn
+def snr_sweep(plt: Any, answer: SnrAnswer) -> Any:
     """S/N of some elements against what is swept first, a line for each value of the rest."""
     from mauvecl.answers.signal.exposures import place_of
 
-    plt = pyplot()
     first = answer.study.sweep.axes[0].quantity
     shown = answer.stars[0].shown_nm
     tables = [star.result.element for star in answer.stars]
-    with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(
-            1, len(shown), figsize=(COLUMN if len(shown) == 1 else 2.6 * len(shown), 3.2), squeeze=False, sharey=True
-        )
-        for axis, wavelength in zip(axes[0], shown, strict=True):
-            lines: dict[str, list[tuple[Any, Any]]] = {}
-            for star, table in zip(answer.stars, tables, strict=True):
-                name = star.label if first != "magnitude" else star.label.split(" V = ")[0]
-                rest = titled(name, {k: v for k, v in star.at.items() if k != first})
-                row = table[place_of(star.result.expectation, wavelength, "element")]
-                lines.setdefault(rest, []).append((star.at[first], row))
-            for k, (name, points) in enumerate(lines.items()):
-                x = [value for value, _ in points]
-                low, high = ([max(row[q], 1e-3) for _, row in points] for q in ("q2.5", "q97.5"))
-                colour = COLOURS[k % len(COLOURS)]
-                axis.fill_between(x, low, high, color=colour, alpha=0.25, linewidth=0)
-                axis.plot(x, [row["expected"] for _, row in points], "o-", color=colour, ms=3, label=name)
-            axis.set_yscale("log")
-            if first == "exposure":
-                axis.set_xscale("log")
-            axis.set_title(f"{wavelength:g} nm")
-            axis.set_xlabel(QUANTITIES[first].axis)
-        # One scale for all of them, once all are drawn.
-        axes[0][0].set_ylim(bottom=0.1)
-        for axis in axes[0]:
-            plain_numbers(axis)
-        axes[0][0].set_ylabel("S/N per 10.5 nm element")
-        handles, names = axes[0][0].get_legend_handles_labels()
-        legend_below(figure, handles, names)
-        headline(figure, "S/N: closed form, and 95 % of realisations; nominal throughput")
-        return finished(figure, path)
+    figure, axes = plt.subplots(
+        1, len(shown), figsize=(COLUMN if len(shown) == 1 else 2.6 * len(shown), 3.2), squeeze=False, sharey=True
+    )
+    for axis, wavelength in zip(axes[0], shown, strict=True):
+        lines: dict[str, list[tuple[Any, Any]]] = {}
+        for star, table in zip(answer.stars, tables, strict=True):
+            name = star.label if first != "magnitude" else star.label.split(" V = ")[0]
+            rest = titled(name, {k: v for k, v in star.at.items() if k != first})
+            row = table[place_of(star.result.expectation, wavelength, "element")]
+            lines.setdefault(rest, []).append((star.at[first], row))
+        for k, (name, points) in enumerate(lines.items()):
+            x = [value for value, _ in points]
+            low, high = ([max(row[q], 1e-3) for _, row in points] for q in ("q2.5", "q97.5"))
+            colour = COLOURS[k % len(COLOURS)]
+            axis.fill_between(x, low, high, color=colour, alpha=0.25, linewidth=0)
+            axis.plot(x, [row["expected"] for _, row in points], "o-", color=colour, ms=3, label=name)
+        axis.set_yscale("log")
+        if first == "exposure":
+            axis.set_xscale("log")
+        axis.set_title(f"{wavelength:g} nm")
+        axis.set_xlabel(QUANTITIES[first].axis)
+    # One scale for all of them, once all are drawn.
+    axes[0][0].set_ylim(bottom=0.1)
+    for axis in axes[0]:
+        plain_numbers(axis)
+    axes[0][0].set_ylabel("S/N per 10.5 nm element")
+    handles, names = axes[0][0].get_legend_handles_labels()
+    legend_below(figure, handles, names)
+    headline(figure, "S/N: closed form, and 95 % of realisations; nominal throughput")
+    return figure
 
 
-def gaussian(answer: GaussianReport, path: str | Path | None) -> Any:
-    """How far each promise of the usual formula holds in every cell; the figure where no path is given."""
+@drawn
+def gaussian(plt: Any, answer: GaussianReport) -> Any:
+    """How far each promise of the usual formula holds in every cell."""
     from matplotlib.ticker import MaxNLocator
 
-    plt = pyplot()
     cells = answer.cells
     # Column, what it is, what is promised, and the least that an axis shows to either side of it.
     panels = (
@@ -223,40 +217,38 @@ def gaussian(answer: GaussianReport, path: str | Path | None) -> Any:
         ("five_sigma_above", "pixels 5 sigma above,\nover normal", 1.0, 0.5),
         ("fap_ratio", "false alarms\nover promised", 1.0, 0.2),
     )
-    with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(1, len(panels), figsize=(2 * COLUMN, 0.22 * len(cells) + 1.5), sharey=True)
-        rows = np.arange(len(cells))
-        for axis, (column, text, promised, least) in zip(axes, panels, strict=True):
-            if column == "coverage_low":
-                axis.hlines(rows, cells["coverage_low"], cells["coverage_high"], color=COLOURS[0], linewidth=3)
-            else:
-                axis.plot(cells[column], rows, "o", color=COLOURS[0], ms=4)
-            axis.axvline(promised, color=NULL, linewidth=1)
-            low, high = axis.get_xlim()
-            axis.set_xlim(min(low, promised - least), max(high, promised + least))
-            axis.set_xlabel(text)
-            axis.xaxis.set_major_locator(MaxNLocator(3, prune="both"))
-            axis.grid(axis="y", linewidth=0.3)
-        axes[0].set_yticks(rows, [titled(s.label, s.at) for s in answer.signal.stars])
-        axes[0].invert_yaxis()
-        headline(figure, "The root-of-N formula beside the simulation; grey: as promised; nominal throughput")
-        return finished(figure, path)
+    figure, axes = plt.subplots(1, len(panels), figsize=(2 * COLUMN, 0.22 * len(cells) + 1.5), sharey=True)
+    rows = np.arange(len(cells))
+    for axis, (column, text, promised, least) in zip(axes, panels, strict=True):
+        if column == "coverage_low":
+            axis.hlines(rows, cells["coverage_low"], cells["coverage_high"], color=COLOURS[0], linewidth=3)
+        else:
+            axis.plot(cells[column], rows, "o", color=COLOURS[0], ms=4)
+        axis.axvline(promised, color=NULL, linewidth=1)
+        low, high = axis.get_xlim()
+        axis.set_xlim(min(low, promised - least), max(high, promised + least))
+        axis.set_xlabel(text)
+        axis.xaxis.set_major_locator(MaxNLocator(3, prune="both"))
+        axis.grid(axis="y", linewidth=0.3)
+    axes[0].set_yticks(rows, [titled(s.label, s.at) for s in answer.signal.stars])
+    axes[0].invert_yaxis()
+    headline(figure, "The root-of-N formula beside the simulation; grey: as promised; nominal throughput")
+    return figure
 
 
-def exposures(answer: ExposureResult, path: str | Path | None) -> Any:
-    """S/N against exposure for each star, which grows with the root of it; the figure where no path is given."""
-    plt = pyplot()
-    with plt.rc_context(STYLE):
-        figure, axis = plt.subplots(figsize=(COLUMN, 2.9 + 0.17 * len(answer.exposures)))
-        for k, e in enumerate(answer.exposures):
-            colour = COLOURS[k % len(COLOURS)]
-            x = np.geomspace(e.exposure_s / e.frames, 4 * e.exposure_s, 50)
-            axis.plot(x, e.snr * np.sqrt(x / e.exposure_s), color=colour, label=f"{e.star}: {e.exposure_s:g} s")
-            axis.plot([e.exposure_s], [e.snr], "o", color=colour, ms=5)
-        first = answer.exposures[0]
-        axis.axhline(first.wanted, color=NULL, linestyle="--", linewidth=1)
-        axis.set(xscale="log", yscale="log", xlabel="exposure (s)", ylabel=f"S/N per {first.per}")
-        plain_numbers(axis)
-        headline(figure, f"S/N at {first.wavelength_nm:g} nm; dashed: the one wanted; nominal throughput")
-        legend_below(figure, *axis.get_legend_handles_labels())
-        return finished(figure, path)
+@drawn
+def exposures(plt: Any, answer: ExposureResult) -> Any:
+    """S/N against exposure for each star, which grows with the root of it."""
+    figure, axis = plt.subplots(figsize=(COLUMN, 2.9 + 0.17 * len(answer.exposures)))
+    for k, e in enumerate(answer.exposures):
+        colour = COLOURS[k % len(COLOURS)]
+        x = np.geomspace(e.exposure_s / e.frames, 4 * e.exposure_s, 50)
+        axis.plot(x, e.snr * np.sqrt(x / e.exposure_s), color=colour, label=f"{e.star}: {e.exposure_s:g} s")
+        axis.plot([e.exposure_s], [e.snr], "o", color=colour, ms=5)
+    first = answer.exposures[0]
+    axis.axhline(first.wanted, color=NULL, linestyle="--", linewidth=1)
+    axis.set(xscale="log", yscale="log", xlabel="exposure (s)", ylabel=f"S/N per {first.per}")
+    plain_numbers(axis)
+    headline(figure, f"S/N at {first.wavelength_nm:g} nm; dashed: the one wanted; nominal throughput")
+    legend_below(figure, *axis.get_legend_handles_labels())
+    return figure

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.stares.stare import Searched
-from mauvecl.pictures.style import COLOURS, NULL, STYLE, finished, pyplot
+from mauvecl.pictures.style import COLOURS, NULL, drawn, headline
 
 if TYPE_CHECKING:
     from mauvecl.answers.stares.stare import StareAnswer, StarStare
@@ -22,39 +21,39 @@ MOST_POINTS, MOST_ROWS = 4000, 600
 IN_SECONDS_S, IN_MINUTES_S = 600.0, 4 * 3600.0
 
 
-def light_curves(one: StarStare, path: str | Path | None = None) -> Any:
+@drawn
+def light_curves(plt: Any, one: StarStare) -> Any:
     """Light curves in all bands, relative to the quiescent star; dotted: flares put in, triangles: found."""
-    plt = pyplot()
     stare, light = one.staring.stare, one.light
     scale, unit = _time(stare.duration_s)
     level = np.median(light.mean, axis=0)
-    with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(
-            len(light.bands), 1, figsize=(7.2, 1.5 * len(light.bands) + 0.7), sharex=True, squeeze=False
-        )
-        for k, axis in enumerate(axes[:, 0]):
-            colour = "black" if k == 0 else COLOURS[(k - 1) % len(COLOURS)]
-            for part in _runs(stare.numbers):
-                step = -(-part.size // max(1, MOST_POINTS * part.size // stare.n_frames))
-                time, flux, mean = (
-                    _binned(values[part], step) for values in (stare.middle_s, light.flux[:, k], light.mean[:, k])
-                )
-                axis.plot(time / scale, flux / level[k], ".", markersize=2, color=colour, alpha=0.6)
-                axis.plot(time / scale, mean / level[k], color=NULL, linewidth=0.8)
-            for flare in one.flares:
-                axis.axvline(flare.event.peak_s / scale, color=NULL, linewidth=0.5, linestyle=":")
-            if isinstance(one.searched, Searched):
-                peaks = [float(alarm.recovered.peak_s[0]) / scale for alarm in one.searched.alarms]
-                top = [1.0] * len(peaks)
-                axis.plot(peaks, top, "v", color=COLOURS[4], markersize=4, transform=axis.get_xaxis_transform())
-            axis.set_title(light.bands[k])
-            axis.set_ylabel("relative light")
-        axes[-1, 0].set_xlabel(f"time from the start of the stare ({unit})")
-        figure.suptitle(f"{one.title}: one simulated stare; nominal throughput", fontsize=10)
-        return finished(figure, path)
+    figure, axes = plt.subplots(
+        len(light.bands), 1, figsize=(7.2, 1.5 * len(light.bands) + 0.7), sharex=True, squeeze=False
+    )
+    for k, axis in enumerate(axes[:, 0]):
+        colour = "black" if k == 0 else COLOURS[(k - 1) % len(COLOURS)]
+        for part in _runs(stare.numbers):
+            step = -(-part.size // max(1, MOST_POINTS * part.size // stare.n_frames))
+            time, flux, mean = (
+                _binned(values[part], step) for values in (stare.middle_s, light.flux[:, k], light.mean[:, k])
+            )
+            axis.plot(time / scale, flux / level[k], ".", markersize=2, color=colour, alpha=0.6)
+            axis.plot(time / scale, mean / level[k], color=NULL, linewidth=0.8)
+        for flare in one.flares:
+            axis.axvline(flare.event.peak_s / scale, color=NULL, linewidth=0.5, linestyle=":")
+        if isinstance(one.searched, Searched):
+            peaks = [float(alarm.recovered.peak_s[0]) / scale for alarm in one.searched.alarms]
+            top = [1.0] * len(peaks)
+            axis.plot(peaks, top, "v", color=COLOURS[4], markersize=4, transform=axis.get_xaxis_transform())
+        axis.set_title(light.bands[k])
+        axis.set_ylabel("relative light")
+    axes[-1, 0].set_xlabel(f"time from the start of the stare ({unit})")
+    headline(figure, f"{one.title}: one simulated stare; nominal throughput")
+    return figure
 
 
-def beside(answers: Sequence[tuple[str, StareAnswer]], band: int = 0, path: str | Path | None = None) -> Any:
+@drawn
+def beside(plt: Any, answers: Sequence[tuple[str, StareAnswer]], band: int = 0) -> Any:
     """One band's light curves of several answers to studies of the same stars: a row to a star, a column to an answer.
 
     Parameters
@@ -63,32 +62,29 @@ def beside(answers: Sequence[tuple[str, StareAnswer]], band: int = 0, path: str 
         With the title of each.
     band : int
         Number of the band, 0 the whole range.
-    path : str or Path, optional
     """
-    plt = pyplot()
     rows = len(answers[0][1].stares)
-    with plt.rc_context(STYLE):
-        figure, axes = plt.subplots(
-            rows, len(answers), figsize=(3.7 * len(answers), 1.5 * rows + 0.8), squeeze=False, sharex=True, sharey="row"
-        )
-        for column, (title, answer) in zip(axes.T, answers, strict=True):
-            for axis, one in zip(column, answer.stares, strict=True):
-                light, stare = one.light, one.staring.stare
-                scale, unit = _time(stare.duration_s)
-                level = np.median(light.mean[:, band])
-                axis.plot(stare.middle_s / scale, light.flux[:, band] / level, ".", markersize=1.5, color=COLOURS[0])
-                axis.plot(stare.middle_s / scale, light.mean[:, band] / level, color=NULL, linewidth=0.8)
-                axis.set_title(f"{one.title}, {light.bands[band]}")
-            column[0].set_title(f"{title}\n{column[0].get_title(loc='left')}")
-            column[-1].set_xlabel(f"time ({unit})")
-        for axis in axes[:, 0]:
-            axis.set_ylabel("relative light")
-        return finished(figure, path)
+    figure, axes = plt.subplots(
+        rows, len(answers), figsize=(3.7 * len(answers), 1.5 * rows + 0.8), squeeze=False, sharex=True, sharey="row"
+    )
+    for column, (title, answer) in zip(axes.T, answers, strict=True):
+        for axis, one in zip(column, answer.stares, strict=True):
+            light, stare = one.light, one.staring.stare
+            scale, unit = _time(stare.duration_s)
+            level = np.median(light.mean[:, band])
+            axis.plot(stare.middle_s / scale, light.flux[:, band] / level, ".", markersize=1.5, color=COLOURS[0])
+            axis.plot(stare.middle_s / scale, light.mean[:, band] / level, color=NULL, linewidth=0.8)
+            axis.set_title(f"{one.title}, {light.bands[band]}")
+        column[0].set_title(f"{title}\n{column[0].get_title(loc='left')}")
+        column[-1].set_xlabel(f"time ({unit})")
+    for axis in axes[:, 0]:
+        axis.set_ylabel("relative light")
+    return figure
 
 
-def dynamic_spectrum(one: StarStare, path: str | Path | None = None) -> Any:
+@drawn
+def dynamic_spectrum(plt: Any, one: StarStare) -> Any:
     """Light in every resolution element and frame, as standard deviations from the median over the stare."""
-    plt = pyplot()
     stare, light = one.staring.stare, one.light
     scale, unit = _time(stare.duration_s)
     # Whole stare on a regular grid, gaps empty.
@@ -105,19 +101,18 @@ def dynamic_spectrum(one: StarStare, path: str | Path | None = None) -> Any:
         image = summed(centred) / np.sqrt(summed(light.spectrum_sd.astype(np.float64) ** 2))
     image[counts[:, 0] == 0] = np.nan
     reach = max(3.0, float(np.nanpercentile(np.abs(image), 99.5)))
-    with plt.rc_context(STYLE):
-        figure, axis = plt.subplots(figsize=(7.2, 3.6))
-        half = (light.element_nm[1] - light.element_nm[0]) / 2 if light.element_nm.size > 1 else 5.0
-        extent = (0.0, n_rows * step * stare.frame_s / scale, light.element_nm[0] - half, light.element_nm[-1] + half)
-        shown = axis.imshow(
-            image.T, origin="lower", aspect="auto", extent=extent, cmap="RdBu_r", vmin=-reach, vmax=reach,
-            interpolation="nearest",
-        )  # fmt: skip
-        axis.set_facecolor("#dddddd")
-        figure.colorbar(shown, label="standard deviations from the median")
-        axis.set(xlabel=f"time from the start of the stare ({unit})", ylabel="wavelength (nm)")
-        axis.set_title(f"{one.title}: dynamic spectrum, {step * stare.frame_s:g} s to a column")
-        return finished(figure, path)
+    figure, axis = plt.subplots(figsize=(7.2, 3.6))
+    half = (light.element_nm[1] - light.element_nm[0]) / 2 if light.element_nm.size > 1 else 5.0
+    extent = (0.0, n_rows * step * stare.frame_s / scale, light.element_nm[0] - half, light.element_nm[-1] + half)
+    shown = axis.imshow(
+        image.T, origin="lower", aspect="auto", extent=extent, cmap="RdBu_r", vmin=-reach, vmax=reach,
+        interpolation="nearest",
+    )  # fmt: skip
+    axis.set_facecolor("#dddddd")
+    figure.colorbar(shown, label="standard deviations from the median")
+    axis.set(xlabel=f"time from the start of the stare ({unit})", ylabel="wavelength (nm)")
+    axis.set_title(f"{one.title}: dynamic spectrum, {step * stare.frame_s:g} s to a column")
+    return figure
 
 
 def _time(duration_s: float) -> tuple[float, str]:

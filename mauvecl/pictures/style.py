@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import wraps
 from pathlib import Path
-from typing import Any
+from typing import Any, Concatenate, ParamSpec
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.files.whole import write_whole
 from mauvecl.host.plotting import AXES
 
+P = ParamSpec("P")
 #: Okabe and Ito's colours, which colour-blind readers can tell apart (jfly.uni-koeln.de/color).
 COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7", "#000000")
 NULL = "#777777"
@@ -165,6 +167,18 @@ def _renderer(figure: Any) -> Any:
 
     size = figure.bbox
     return RendererAgg(size.width, size.height, figure.dpi)  # type: ignore[no-untyped-call]
+
+
+def drawn(draw: Callable[Concatenate[Any, P], Any]) -> Callable[..., Any]:
+    """A picture of what draws with pyplot and gives the figure: in our style, saved where a path is given."""
+
+    @wraps(draw)
+    def picture(*what: Any, path: str | Path | None = None, **how: Any) -> Any:
+        plt = pyplot()
+        with plt.rc_context(STYLE):
+            return finished(draw(plt, *what, **how), path)
+
+    return picture
 
 
 def finished(figure: Any, path: str | Path | None) -> Any:

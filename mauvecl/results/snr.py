@@ -233,7 +233,7 @@ class SnrResult(ByContent):
 
     def plot(self, path: str | Path | None = None, *, ax: Any = None) -> object:
         """S/N per pixel and element, closed form and realisations; needs matplotlib."""
-        return picture("answers.signal_to_noise", [(self.expectation.name, self)], path, ax=ax)
+        return picture("answers.signal_to_noise", [(self.expectation.name, self)], path=path, ax=ax)
 
     def _line(self) -> str:
         return f"of {self.expectation.name!r}, {self.counts.n} realisations"

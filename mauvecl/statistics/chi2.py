@@ -9,7 +9,7 @@ from scipy.linalg import solve_triangular
 
 from mauvecl.statistics.distributions import QuadraticForm
 from mauvecl.statistics.nuisances import Nuisances
-from mauvecl.statistics.statistic import Float, QuadraticStatistic, Setting, Tilt
+from mauvecl.statistics.statistic import Differences, Float, QuadraticStatistic, Setting, Tilt
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -34,19 +34,10 @@ class Chi2(QuadraticStatistic):
     def _free(setting: Setting) -> int:
         return setting.nuisances.free if setting.nuisances else 0
 
-    def form(
-        self,
-        setting: Setting,
-        delta: Float,
-        true: Float,
-        flare: Expectation | None = None,
-        *,
-        estimated: bool = False,
-        scatter: Float | None = None,
-    ) -> QuadraticForm:
-        true = true * setting.used
-        model = true if estimated else self.variance(setting) * setting.used
-        delta, model, true = (self._grouped(setting, values) for values in (delta, model, true))
+    def form(self, setting: Setting, seen: Differences, flare: Expectation | None = None) -> QuadraticForm:
+        true, scatter = seen.variance * setting.used, seen.scatter
+        model = true if seen.estimated else self.variance(setting) * setting.used
+        delta, model, true = (self._grouped(setting, values) for values in (seen.mean, model, true))
         counts = (model > 0) & (true > 0)
         delta, model, true = delta[counts], model[counts], true[counts]
         if setting.nuisances:

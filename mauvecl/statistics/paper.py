@@ -8,7 +8,7 @@ import numpy as np
 
 from mauvecl.statistics.distributions import QuadraticForm
 from mauvecl.statistics.smoothing import Smoothing
-from mauvecl.statistics.statistic import Float, QuadraticStatistic, Setting, Tilt
+from mauvecl.statistics.statistic import Differences, Float, QuadraticStatistic, Setting, Tilt
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -39,17 +39,8 @@ class Paper(QuadraticStatistic):
     def dof(self, setting: Setting) -> int:
         return int(setting.used.sum())
 
-    def form(
-        self,
-        setting: Setting,
-        delta: Float,
-        true: Float,
-        flare: Expectation | None = None,
-        *,
-        estimated: bool = False,
-        scatter: Float | None = None,
-    ) -> QuadraticForm:
-        return self.smoothing(setting).form(self.scale(setting, flare), delta, true)
+    def form(self, setting: Setting, seen: Differences, flare: Expectation | None = None) -> QuadraticForm:
+        return self.smoothing(setting).form(self.scale(setting, flare), seen.mean, seen.variance)
 
     def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
         return np.asarray((x @ self.smoothing(setting).rows.T) ** 2 @ self.scale(setting, flare))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 
 import numpy as np
@@ -107,6 +107,27 @@ class Odds:
         return self.seen.sf(self.threshold)
 
 
+@dataclass(frozen=True, eq=False)
+class Differences:
+    """Of each pixel from the quiescent star.
+
+    Attributes
+    ----------
+    mean, variance : ndarray, shape (n_pixel,)
+        DN, and the true one, DN^2.
+    estimated : bool
+        Whether a statistic divides by the true variances or by the model's.
+    scatter : ndarray, shape (k, n_pixel), optional
+        Standard deviations of normal amplitudes that they hold, DN; by default those of the finite priors that are
+        marginalised over.
+    """
+
+    mean: Float
+    variance: Float
+    estimated: bool = False
+    scatter: Float | None = None
+
+
 class Statistic(ABC):
     """One detection statistic; it holds no data, so that one object serves every detection.
 
@@ -170,7 +191,7 @@ class Statistic(ABC):
         """
         delta = np.where(setting.used, observed.recorded_light_dn - setting.quiet.recorded_light_dn, 0.0)
         true = observed.variance_dn2 + self.added_variance(setting) * setting.quiet.variance_dn2
-        return self.as_drawn(setting, observed, delta, true, flare, estimated=setting.comparison.estimated)
+        return self.as_drawn(setting, observed, Differences(delta, true, setting.comparison.estimated), flare)
 
     def odds(self, setting: Setting, flare: Expectation, fap: float) -> Odds:
         """Closed forms without and with a flare, and the threshold of a false-alarm probability between them."""
@@ -187,20 +208,17 @@ class Statistic(ABC):
         self,
         setting: Setting,
         observed: Expectation,
-        delta: Float,
-        true: Float,
-        flare: Expectation | None = None,
+        seen: Differences,
+        flare: Expectation | None,
         *,
-        estimated: bool = False,
         priors: bool = True,
     ) -> Form:
-        """`form`, integrated over what is drawn where that is marginalised over; parameters as there.
+        """`form`, integrated over what is drawn where that is marginalised over.
 
         Without `priors` what is marginalised over and not drawn does not scatter.
         """
         if not setting.integrates:
-            none = np.zeros((0, delta.size))
-            return self.form(setting, delta, true, flare, estimated=estimated, scatter=None if priors else none)
+            return self.form(setting, seen if priors else replace(seen, scatter=np.zeros((0, seen.mean.size))), flare)
         assert setting.nuisances
         assert setting.drawn
         nodes, rows = setting.drawn.nodes(observed, weighted=isinstance(self, LinearStatistic))
@@ -211,7 +229,8 @@ class Statistic(ABC):
         parts = []
         for node in nodes:
             shift, more = node.on(observed)
-            parts.append(self.form(setting, delta + shift * setting.used, true + more, flare, scatter=rows))
+            moved = Differences(seen.mean + shift * setting.used, seen.variance + more, scatter=rows)
+            parts.append(self.form(setting, moved, flare))
         return parts[0] if len(parts) == 1 else Mixture(tuple(parts), np.array([node.probability for node in nodes]))
 
     @abstractmethod
@@ -219,30 +238,8 @@ class Statistic(ABC):
         """Degrees of freedom without a flare."""
 
     @abstractmethod
-    def form(
-        self,
-        setting: Setting,
-        delta: Float,
-        true: Float,
-        flare: Expectation | None = None,
-        *,
-        estimated: bool = False,
-        scatter: Float | None = None,
-    ) -> QuadraticForm | Gaussian:
-        """The distribution for differences that are Gaussian.
-
-        Parameters
-        ----------
-        setting : Setting
-        delta, true : ndarray, shape (n_pixel,)
-            Mean, DN, and variance, DN^2, of each pixel's difference.
-        flare : Expectation, optional
-        estimated : bool
-            Whether the statistic divides by the true variances or by the model's.
-        scatter : ndarray, shape (k, n_pixel), optional
-            Standard deviations of normal amplitudes that the differences hold, DN; by default those of the finite
-            priors that are marginalised over.
-        """
+    def form(self, setting: Setting, seen: Differences, flare: Expectation | None = None) -> QuadraticForm | Gaussian:
+        """The distribution for differences that are Gaussian."""
 
     @abstractmethod
     def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
@@ -313,25 +310,16 @@ class LinearStatistic(Statistic):
     def dof(self, setting: Setting) -> int:
         return 1
 
-    def form(
-        self,
-        setting: Setting,
-        delta: Float,
-        true: Float,
-        flare: Expectation | None = None,
-        *,
-        estimated: bool = False,
-        scatter: Float | None = None,
-    ) -> Gaussian:
-        weights = self.weights_per_dn(setting, flare)
-        mean, variance = float(weights @ delta), float(weights**2 @ true)
+    def form(self, setting: Setting, seen: Differences, flare: Expectation | None = None) -> Gaussian:
+        weights, scatter = self.weights_per_dn(setting, flare), seen.scatter
+        mean, variance = float(weights @ seen.mean), float(weights**2 @ seen.variance)
         if scatter is None and setting.nuisances:
             scatter = setting.nuisances.finite(setting.nuisances.spectra)
         if scatter is not None:
             variance += float(np.sum((scatter @ weights) ** 2))
         spread = float(np.sqrt(variance))
         # By estimated variances a linear statistic comes in its own standard deviations.
-        return Gaussian(mean / spread, 1.0) if estimated else Gaussian(mean, spread)
+        return Gaussian(mean / spread, 1.0) if seen.estimated else Gaussian(mean, spread)
 
     def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
         weights = self.weights_per_dn(setting, flare)

@@ -63,8 +63,8 @@ class LimitsText(Part):
         from mauvecl.host.orbit.limits import Limits
 
         given = {name: getattr(self, name) for name in type(self).model_fields}
-        found: dict[str, Any] = {name: None if value == "none" else value for name, value in given.items()}
-        return Limits(**found)
+        values: dict[str, Any] = {name: None if value == "none" else value for name, value in given.items()}
+        return Limits(**values)
 
 
 class OrbitQuestion(Part):
@@ -195,7 +195,7 @@ class PlanTarget(Part):
         InputError
             For a type that no preset stands for.
         """
-        from mauvecl.lightcurve.flares.rates import BOLOMETRIC, PowerLaw, RateTable, davenport2019, preset
+        from mauvecl.lightcurve.flares.rates import BOLOMETRIC, EXPONENTS, PowerLaw, RateTable, davenport2019, preset
 
         if self.mass_msun is not None and self.age_myr is not None:
             return davenport2019(mass_msun=self.mass_msun, age_myr=self.age_myr)
@@ -205,9 +205,11 @@ class PlanTarget(Part):
             return RateTable.read(self.rates_file, self.rates_band)
         kind = self.rates or spectral_type.strip()[:1].upper()
         if kind not in ("G", "K", "M", "sunlike"):
+            alpha = EXPONENTS.get(kind)
+            told = "" if alpha is None else f" beside an exponent of {alpha} (Althukair & Tsiklauri 2023)"
             raise InputError(
-                f"no flare rates are known of stars of the type {shortened(spectral_type)} ({self.name}), expected "
-                "rates, mass_msun and age_myr, alpha with rate_per_day and at_erg, or rates_file"
+                f"flare rates of {self.name}, of the type {shortened(spectral_type)}, are not known{told}, expected "
+                "alpha with rate_per_day and at_erg, rates, mass_msun and age_myr, or rates_file"
             )
         return preset(kind)
 
@@ -271,14 +273,16 @@ def targets_of(study: Study) -> list[Target]:
     from mauvecl.host.orbit.names import Target
 
     o = study.orbit
-    found = [Target.of(text, simbad=o.simbad) for text in o.targets] or [t.target(o.simbad) for t in study.plan.targets]
-    if not found:
+    targets = [Target.of(text, simbad=o.simbad) for text in o.targets] or [
+        t.target(o.simbad) for t in study.plan.targets
+    ]
+    if not targets:
         raise InputError("no targets, expected names or coordinates, such as --look-at 'eps Eri'")
-    names = [one.name for one in found]
+    names = [one.name for one in targets]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise InputError(f"the target {twice!r} is named twice, expected different ones")
-    return found
+    return targets
 
 
 def read_targets(path: Path) -> list[dict[str, Any]]:
@@ -306,7 +310,7 @@ def read_targets(path: Path) -> list[dict[str, Any]]:
         raise InputError(f"{named} has the column {shortened(other)}, expected some of {', '.join(sorted(keys))}")
     if not 1 <= len(table) <= MOST_TARGETS:
         raise InputError(f"{named} holds {len(table)} targets, expected 1 to {MOST_TARGETS}")
-    found = []
+    targets = []
     for number, row in enumerate(table, 1):
         one: dict[str, Any] = {}
         for key, name in columns.items():
@@ -324,8 +328,8 @@ def read_targets(path: Path) -> list[dict[str, Any]]:
         file = one.get("rates_file")
         if isinstance(file, str):
             one["rates_file"] = path.parent / file
-        found.append(one)
-    return found
+        targets.append(one)
+    return targets
 
 
 def find_plan_files(data: dict[str, Any], folder: Path) -> None:

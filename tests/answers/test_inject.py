@@ -77,6 +77,7 @@ class Stop(Exception):  # noqa: N818
     """An interruption."""
 
 
+@pytest.mark.long
 def test_resume_gives_the_same(found, tmp_path):
     """Some peaks kept, the others drawn later by two devices of different form: the same to the last bit."""
 
@@ -97,6 +98,7 @@ def test_resume_gives_the_same(found, tmp_path):
     assert again.stars[0].simulated == found.stars[0].simulated
 
 
+@pytest.mark.long
 def test_sweep_over_magnitude_and_temperature(stares):
     """Fainter stars hide larger flares; every cell on common draws, so that each limit moves."""
     axes = [
@@ -114,6 +116,7 @@ def test_sweep_over_magnitude_and_temperature(stares):
         inject(study(sweep={"axes": [{"quantity": "amplitude", "values": [0.1]}]}), stares)
 
 
+@pytest.mark.long
 def test_search_that_leaves_out_a_cycle_is_told(stares):
     """A thermal cycle that the search does not know: false alarms are not those of normal noise."""
     quick = {"count": 10, "positions": 2, "fitted": 0, "widths": 2, "sizes": 2}

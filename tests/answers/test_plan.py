@@ -5,13 +5,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.table import QTable, Table
 from scipy import stats
 
 from mauvecl import Study, plan
 from mauvecl.answers.campaigns.plan import PlanAnswer
-from mauvecl.answers.campaigns.plan_text import SUMMARY, summary_rows, target_lines
+from mauvecl.answers.campaigns.plan_text import SUMMARY_COLUMNS, summary_rows, target_lines
 from mauvecl.answers.campaigns.planned import Looked
 from mauvecl.answers.campaigns.planned_injections import question_of
+from mauvecl.answers.report import write_study, write_table
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.flares.rates import davenport2019
 from mauvecl.lightcurve.search.completeness import Completeness
@@ -28,6 +30,7 @@ my star,10.5,-3.0,8.0,K5V,10,0.7,300
 Denebola,,,,,,,
 EK Dra,,,,,,1.0,100
 """
+TARGET_NAMES = ("eps Eri", "my star", "Denebola", "EK Dra")
 
 
 @pytest.fixture(scope="module")
@@ -40,13 +43,13 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Study:
 
 
 @pytest.fixture(scope="module")
-def found(study: Study) -> PlanAnswer:
+def answer(study: Study) -> PlanAnswer:
     return plan(study)
 
 
-def test_numbers_follow_from_each_other(found: PlanAnswer) -> None:
+def test_numbers_follow_from_each_other(answer: PlanAnswer) -> None:
     """From the tables alone: hours, rates and shares give the flares, their interval and the false alarms."""
-    table, stars, energies = found.table, found.stars, found.by_energy
+    table, stars, energies = answer.table, answer.stars, answer.by_energy
     for k, name in enumerate(table["target"][:2]):
         mine = energies[energies["target"] == name]
         energy, share, above = (mine[one].value for one in ("energy", "recovered", "rate_above"))
@@ -59,35 +62,79 @@ def test_numbers_follow_from_each_other(found: PlanAnswer) -> None:
         assert table["low"][k] < table["expected"][k] < table["high"][k]
     assert table["false_alarms"].tolist() == pytest.approx((table["hours"].value / 24 / (365.25 / 12)).tolist())
     assert (table["hours"] <= table["seen"]).all()
-    assert found.seen.table["hours"].value == pytest.approx(table["seen"].value)
+    assert answer.seen.table["hours"].value == pytest.approx(table["seen"].value)
 
 
-def test_the_rates_are_those_asked_for(found: PlanAnswer) -> None:
+def test_the_rates_are_those_asked_for(answer: PlanAnswer) -> None:
     law = davenport2019(mass_msun=0.82, age_myr=500).in_band("bolometric", 10_000.0)
-    energies = found.by_energy
+    energies = answer.by_energy
     mine = energies[energies["target"] == "eps Eri"]
     assert mine["rate_above"].value == pytest.approx(law.per_day_above(mine["energy"].value))
 
 
-def test_each_number_of_the_report_names_its_column(found: PlanAnswer) -> None:
-    tables = found.tables
-    for k in range(len(found.planned)):
-        for what, _, where in target_lines(found, k):
-            for part in where.split(";"):
-                name, _, columns = part.strip().partition(":")
-                assert name in tables, what
-                for column in filter(None, (one.strip() for one in columns.split(","))):
-                    assert column in tables[name].colnames, (what, column)
-    for row, planned in zip(summary_rows(found), found.planned, strict=True):
-        assert len(row) == len(SUMMARY)
-        assert row[0] == planned.name
+#: Numbers in a text, but not those in names such as K5V or HD 209458.
+NUMBER = re.compile(r"(?<![\w.^])-?\d+(?:\.\d+)?(?:e[+-]?\d+)?(?![\w])")
 
 
-def test_what_is_missing_is_said(found: PlanAnswer) -> None:
-    told = " ".join(found.messages)
-    assert "no flare rates are known of stars of the type 'A3V' (Denebola)" in told
+def printed(token: str, values: list[float]) -> bool:
+    """Whether one of the values is the number that is printed, to half of its last digit."""
+    mantissa, _, exponent = token.partition("e")
+    unit = 10.0 ** (int(exponent or 0) - len(mantissa.partition(".")[2]))
+    return bool(np.any(np.abs(np.array(values) - float(token)) <= 0.5001 * unit))
+
+
+def held(table: Table, column: str, target: str) -> list[float]:
+    """All numbers of a table's column, in its texts too, of one target where the table has them."""
+    if "target" in table.colnames:
+        table = table[table["target"] == target]
+    values: list[float] = []
+    for name in [column] if column else [one for one in table.colnames if one != "target"]:
+        cells = np.ma.filled(np.ma.asarray(getattr(table[name], "value", table[name])))
+        texts = cells.dtype.kind in "OUS"
+        values += [float(n) for text in cells for n in NUMBER.findall(str(text))] if texts else cells.tolist()
+    return values
+
+
+def test_each_number_of_the_report_is_in_the_table_it_names(answer: PlanAnswer, tmp_path: Path) -> None:
+    """As written beside it, in the column that is named, for the target: pages, summary and messages."""
+    tables = {name: QTable.read(write_table(table, tmp_path / f"{name}.ecsv")) for name, table in answer.tables.items()}
+    count = 0
+    for k, one in enumerate(answer.planned):
+        for what, value, where in target_lines(answer, k):
+            places = [part.strip().partition(":") for part in where.split(";")]
+            values = [
+                number
+                for name, _, columns in places
+                for column in columns.split(",")
+                for number in held(tables[name], column.strip(), one.name)
+            ]
+            for token in NUMBER.findall(value):
+                assert printed(token, values), (one.name, what, token)
+                count += 1
+        row = summary_rows(answer)[k]
+        for text, columns in zip(row[1:], SUMMARY_COLUMNS[1:], strict=True):
+            values = [n for column in columns.split(", ") for n in held(tables["plan"], column, one.name)]
+            for token in NUMBER.findall(text):
+                assert printed(token, values), (one.name, columns, token)
+                count += 1
+    whole = [
+        n
+        for name in ("plan", "stars", "assumptions")
+        for row in [*TARGET_NAMES, ""]
+        for n in held(tables[name], "", row)
+    ]
+    for message in answer.messages:
+        for token in NUMBER.findall(message):
+            assert printed(token, whole), message
+            count += 1
+    assert count > 100
+
+
+def test_what_is_missing_is_said(answer: PlanAnswer) -> None:
+    told = " ".join(answer.messages)
+    assert "Flare rates of Denebola, of the type 'A3V', are not known beside an exponent of 1.3" in told
     assert "EK Dra is never seen" in told
-    table = found.table
+    table = answer.table
     assert np.isnan(table["expected"][2])
     assert np.isfinite(table["E50"][2].value)
     assert table["expected"][3] == 0
@@ -95,20 +142,22 @@ def test_what_is_missing_is_said(found: PlanAnswer) -> None:
     assert np.isinf(table["E50"][3].value)
 
 
-def test_report(found: PlanAnswer, study: Study) -> None:
+@pytest.mark.long
+def test_report(answer: PlanAnswer, study: Study) -> None:
     """A page for each target beside the summary and the assumptions; every assumption."""
-    content = found.documents["plan.pdf"]()
-    assert len(re.findall(rb"/Type /Page\b", content)) >= len(found.planned) + 2
+    content = answer.documents["plan.pdf"]()
+    assert len(re.findall(rb"/Type /Page\b", content)) >= len(answer.planned) + 2
     html = plan(study.with_settings(["plan.report=html"])).documents["plan.html"]().decode()
-    for row in found.assumptions:
+    for row in answer.assumptions:
         assert str(row["assumption"]) in html
-    for planned in found.planned:
+    for planned in answer.planned:
         assert f"<h2>{planned.name}</h2>" in html
-    assert html.count("data:image/png") == len(found.planned)
-    names = set(found.assumptions["assumption"])
+    assert html.count("data:image/png") == len(answer.planned)  # the overview; none of the star that is never seen
+    names = set(answer.assumptions["assumption"])
     assert {"stray light", "duration of flares", "noise of a stare", "throughput", "earth_limb_deg"} <= names
 
 
+@pytest.mark.long
 def test_markup_in_names_is_text(study: Study) -> None:
     target = {
         "name": "<script>$x^2$",
@@ -221,5 +270,5 @@ def test_rates_of_a_file_beside_the_table(tmp_path: Path) -> None:
     changes = {"plan": QUICK | {"targets": read_targets(tmp_path / "targets.csv")}, "orbit": {"days": 2.0}}
     answer = plan(Study().with_changes(changes, None))
     assert answer.stars["rates"][0] == "ffd.csv"
-    answer.write(tmp_path / "out")
-    assert Study.read(tmp_path / "out" / "study.toml").plan.targets[0].rates_file == tmp_path / "ffd.csv"
+    write_study(answer.study, tmp_path)
+    assert Study.read(tmp_path / "study.toml").plan.targets[0].rates_file == tmp_path / "ffd.csv"

@@ -6,7 +6,7 @@ import pytest
 from mauvecl import Study
 from mauvecl.answers.campaigns.plan import plan
 from mauvecl.answers.campaigns.planned import Looked, closed_form
-from mauvecl.answers.campaigns.planned_injections import found_share, question_of
+from mauvecl.answers.campaigns.planned_injections import found_by_energy, question_of
 from mauvecl.answers.stares.inject import inject
 from mauvecl.lightcurve.flares.rates import PowerLaw
 from mauvecl.lightcurve.search.completeness import Completeness, DurationLaw
@@ -18,10 +18,10 @@ def test_shares_by_hand() -> None:
     critical = np.array([[1.0, 2.0, 3.0, 4.0], [10.0, 20.0, 0.0, 30.0]])
     widths = np.array([10.0, 1000.0])
     law = DurationLaw(half_width_s=100.0, at_erg=1.0, exponent=0.0, scatter_dex=0.0)
-    found = found_share(critical, widths, np.array([0.5, 2.5, 15.0, 99.0]), law)
+    found = found_by_energy(critical, widths, np.array([0.5, 2.5, 15.0, 99.0]), law)
     # An alarm without a flare is none of it: three injections are left of the second half-width.
     assert found == pytest.approx([0.0, 0.25, (1 + 1 / 3) / 2, 1.0])
-    short = found_share(critical, widths, np.array([2.5]), DurationLaw(1.0, 1.0, 0.0, 0.0))
+    short = found_by_energy(critical, widths, np.array([2.5]), DurationLaw(1.0, 1.0, 0.0, 0.0))
     assert short == pytest.approx([0.5])
 
 
@@ -50,7 +50,11 @@ def test_campaigns_close_through_the_search() -> None:
     Half of the injections make the completeness, the other half decide on the campaigns' flares. 68 +- 5 % within one
     sigma: by chance one of two such counts misses that in one of 11 tests with other seeds; this one is fixed.
     """
-    study = Study().with_settings(["plan.targets=[{name='GJ 205'}]", "orbit.days=20", "plan.injections=200"])
+    # Five half-widths and one sum of each frame in place of nine and three: as good a search, in less time.
+    study = Study().with_settings(
+        ["plan.targets=[{name='GJ 205'}]", "orbit.days=20", "plan.injections=200", "search.sums=1",
+         "search.half_widths_s=[25, 50, 100, 200, 400]"]
+    )  # fmt: skip
     seen: list[Looked] = []
 
     def kept(one: Study, looked: Looked) -> Completeness:
@@ -63,7 +67,7 @@ def test_campaigns_close_through_the_search() -> None:
     widths = np.array(star.injected.half_widths_s)
     first, second = (star.injected.critical[:, :, k::2].reshape(widths.size, -1) for k in (0, 1))
     energy = 10 ** np.arange(28.0, 38.0, 0.05)
-    table = Completeness(energy, found_share(first, widths, energy, law), "bolometric", "injections")
+    table = Completeness(energy, found_by_energy(first, widths, energy, law), "bolometric", "injections")
     # A bank of several temperatures has a higher threshold than one sum; 200 injections leave some per cent.
     assert table.energy_at(0.5) == pytest.approx(form.energy_at(0.5), rel=0.15)
 

@@ -206,6 +206,7 @@ DRAWS, FAP, SCENES = 20_000, 0.01, 100
 SEEDS = itertools.count(2026)
 
 
+@pytest.mark.long
 def test_false_alarms_as_asked_for_with_unknowns_drawn(engine: Engine) -> None:
     """100 random scenes with the documented unknowns drawn, 2e4 draws each.
 

@@ -55,6 +55,7 @@ def test_detect_answers_the_papers_question(answered: tuple[Path, str]) -> None:
     assert row["G2V", 0.0076, "chi2"] < 0.01 < 0.4 < row["G2V", 0.0076, "matched"]
 
 
+@pytest.mark.long
 def test_the_papers_pair_is_compared(answered: tuple[Path, str]) -> None:
     """Both of the paper's values are reconstructed within 30 %, and the text says why a calibrated answer differs."""
     _, text = answered

@@ -76,3 +76,23 @@ def test_no_empty_columns(capsys: pytest.CaptureFixture[str]) -> None:
     assert "empty" not in told
     rows = [line.split() for line in told.splitlines() if line.strip(" ─")]
     assert rows == [["title"], ["a", "b"], ["1", "x"], ["2"]]
+
+
+@pytest.mark.parametrize("width", [10, 40, 80, 132])
+def test_a_narrow_terminal_cuts_nothing(
+    width: int, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("COLUMNS", str(width))
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    columns = ("star", "flare", "threshold", "", "closed form", "why")
+    cells = [(f"star {n}", f"{n} %", f"{n}12.345", f"[{n}, 77]", f"0.{n}", "a reason of many words") for n in range(3)]
+    show_table("title", columns, cells)
+    told = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+    assert "…" not in told
+    for row in cells:
+        assert all(cell in told for cell in row)
+    # What a row is begins each of its parts, and a value keeps its interval.
+    assert all(line.split()[0] in ("star", "title") for line in told.splitlines() if line.strip(" ─"))
+    assert all("[0, 77]" in line for line in told.splitlines() if "012.345" in line)
+    if width >= 80:
+        assert max(map(len, told.splitlines())) <= width

@@ -205,6 +205,7 @@ def names(folder: Path) -> set[str]:
     return {path.name for path in folder.iterdir()}
 
 
+@pytest.mark.long
 def test_nothing_of_another_run_stays_beside_the_new(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Pictures and tables of the run before are removed, what a user changed or put there is not."""
     out = tmp_path / "out"

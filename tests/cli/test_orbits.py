@@ -24,6 +24,7 @@ def test_visible(tmp_path: Path) -> None:
     assert [row["target"] for row in rows] == ["eps Eri", "AU Mic"]
 
 
+@pytest.mark.long
 def test_plan(tmp_path: Path) -> None:
     (tmp_path / "targets.csv").write_text("name,mass_msun,age_myr\neps Eri,0.82,500\nkappa1 Cet,,\n")
     words = ("--days", "20", "--hours", "50", "--completeness", "closed form", "--report", "html")

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from answers import same_counts
+from marks import long_but
 from scenes import instrument, star
 from scipy import stats
 
@@ -77,6 +78,22 @@ CASES = {
 }
 
 
+#: Cases whose statistics a single realisation to a work-item is tried on: of every recipe, in stacks and frames, with
+#: every process. Raw spectra, by the same draws, are tried in all cases.
+ONE_BY_ONE = (
+    "stack",
+    "one frame",
+    "frames",
+    "apart, electrons, frames",
+    "uneven, pairs of two ways",
+    "cosmic rays",
+    "priors, electrons, frames",
+    "jitter, one frame, rays",
+)
+#: A joint draw, one apart and frame by frame, and one with priors: what `make check` looks at.
+SHORT = ("stack", "apart, electrons, frames", "priors")
+
+
 def case(name: str) -> tuple[list, dict]:
     """Expectations, and how to draw them."""
     options = dict(CASES[name])
@@ -86,10 +103,16 @@ def case(name: str) -> tuple[list, dict]:
     return star(magnitude=magnitude, amplitudes=(0.081, 0.24), exposure=exposure, payload=payload), how
 
 
+@pytest.fixture(scope="module")
+def one_by_one() -> Engine:
+    """With one realisation to a work-item."""
+    return Engine(width=1)
+
+
 @pytest.fixture(scope="module", params=["vectors", pytest.param("scalar", marks=pytest.mark.long)])
-def any_width(request: pytest.FixtureRequest, engine: Engine) -> Engine:
+def any_width(request: pytest.FixtureRequest, engine: Engine, one_by_one: Engine) -> Engine:
     """The engine as processors run it, and one realisation to a work-item, as a GPU does."""
-    return engine if request.param == "vectors" else Engine(width=1)
+    return engine if request.param == "vectors" else one_by_one
 
 
 #: Around the boundary of the counter's first word.
@@ -98,7 +121,7 @@ INDEX = np.arange(START, START + 40, dtype=np.uint64)
 SEED = 2**63 + 12345
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", long_but(CASES, *SHORT))
 def test_raw_spectra_are_the_twins(any_width: Engine, name: str) -> None:
     (quiet, *_), how = case(name)
     raw, clipped = any_width.realise_and_count(quiet, start=START, count=INDEX.size, seed=SEED, **how)
@@ -107,6 +130,7 @@ def test_raw_spectra_are_the_twins(any_width: Engine, name: str) -> None:
     assert (raw.dtype == np.uint16) == (quiet.n_frames == 1)
 
 
+@pytest.mark.long
 def test_raw_sums_beyond_what_float32_holds_are_whole(engine: Engine) -> None:
     """400 frames that lose up to 48 000 DN each."""
     how = {"mode": "frames", "processes": Processes(light_loss=Uniform(0.0, 0.9))}
@@ -138,17 +162,26 @@ def _raw_twin(name: str) -> tuple[np.ndarray, np.ndarray]:
     return reference.realise(scene, INDEX, SEED), reference.clipped(scene, INDEX, SEED).sum(axis=(1, 2))
 
 
-@pytest.mark.parametrize("name", CASES)
-def test_every_statistic_is_the_twins(any_width: Engine, name: str) -> None:
+# Without noise there is no statistic.
+@pytest.mark.parametrize("name", long_but([name for name in CASES if name != "noiseless"], *SHORT))
+def test_every_statistic_is_the_twins(engine: Engine, name: str) -> None:
+    check_statistics(engine, name)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ONE_BY_ONE)
+def test_every_statistic_is_the_twins_one_by_one(name: str, one_by_one: Engine) -> None:
+    check_statistics(one_by_one, name)
+
+
+def check_statistics(engine: Engine, name: str) -> None:
     """Those of the fast kernel alone, and all of them, with their histograms."""
     (quiet, *flares), how = case(name)
-    if name == "noiseless":
-        pytest.skip("without noise there is no statistic")
     kind = {"start": START, "seed": SEED, **how}
-    found = any_width.detect(quiet, flares, realisations=INDEX.size, statistics=tuple(STATISTICS), **kind)
+    found = engine.detect(quiet, flares, realisations=INDEX.size, statistics=tuple(STATISTICS), **kind)
     plan, values = _twin(name, NOISE_FREE)
     fast = ("chi2", "chi2_element", "matched", "uv_excess")
-    alone = any_width.statistic_values(quiet, flares, count=INDEX.size, statistics=fast, **kind)
+    alone = engine.statistic_values(quiet, flares, count=INDEX.size, statistics=fast, **kind)
     same = [row for row in range(len(alone)) if row % 3 != 2 or row >= 9]
     np.testing.assert_array_equal(alone[same], values[: len(alone)][same])
     tally = Tally(plan.grids)
@@ -167,12 +200,15 @@ def test_every_statistic_is_the_twins(any_width: Engine, name: str) -> None:
 
 @pytest.mark.parametrize(
     ("name", "comparison"),
-    [
+    long_but(
+        [
+            ("stack", Comparison(1)),
+            ("stack", Comparison(0, True)),
+            ("stack", Comparison(3)),
+            *((name, Comparison(2, True)) for name in ("at the rail", "apart, electrons, frames", "uneven", "priors")),
+        ],
         ("stack", Comparison(1)),
-        ("stack", Comparison(0, True)),
-        ("stack", Comparison(3)),
-        *((name, Comparison(2, True)) for name in ("at the rail", "apart, electrons, frames", "uneven", "priors")),
-    ],
+    ),
 )
 def test_whatever_is_compared_is_the_twins(any_width: Engine, name: str, comparison: Comparison) -> None:
     """Noisy quiescent exposures, one or several, and variances from the counts."""
@@ -185,7 +221,9 @@ def test_whatever_is_compared_is_the_twins(any_width: Engine, name: str, compari
         np.testing.assert_allclose(values[0], values[2], rtol=1e-5)
 
 
-@pytest.mark.parametrize("name", ["stack", "at the rail", "apart, electrons, frames", "priors", "cosmic rays"])
+@pytest.mark.parametrize(
+    "name", long_but(["stack", "at the rail", "apart, electrons, frames", "priors", "cosmic rays"], "stack")
+)
 def test_signal_to_noise_is_the_twins(any_width: Engine, name: str) -> None:
     (quiet, *_), how = case(name)
     scene = prepare([quiet], **how)
@@ -210,6 +248,7 @@ def test_modes_meet_the_rails(engine: Engine) -> None:
     assert not prepare([faint]).frames
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("payload", ["mauve", "mauve-electrons"])
 def test_moments_of_raw_spectra(engine: Engine, payload: str) -> None:
     """Mean and variance of each pixel follow the model: |z| < 6 in 1643 pixels fails once in 3e5 seeds."""
@@ -236,6 +275,7 @@ def test_frames_and_stacks_agree(engine: Engine) -> None:
     assert abs(total - 1) < 5 * np.sqrt(4 / n / quiet.wavelength_nm.size)
 
 
+@pytest.mark.long
 def test_pixels_and_realisations_are_uncorrelated(engine: Engine) -> None:
     """Neighbours in pixel, realisation and seed: |z| < 5 for sums of 3e7 products."""
     (quiet,) = star()
@@ -291,6 +331,7 @@ THREADS = """
 import hashlib, sys
 sys.path.insert(0, {tests!r})
 from answers import same_counts
+from marks import long_but
 from scenes import star
 from mauvecl.device.forms import scene_launches
 from mauvecl.device.engine import Engine
@@ -302,6 +343,7 @@ print(hashlib.sha256(repr([tuple(row) for row in table]).encode()).hexdigest())
 """
 
 
+@pytest.mark.long
 def test_threads_change_no_bit() -> None:
     """The same table from one thread and from two, to the last digit."""
     code = THREADS.format(tests=os.path.dirname(os.path.dirname(__file__)))

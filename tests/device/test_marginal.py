@@ -93,6 +93,7 @@ DRAWN = {
 }  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", DRAWN)
 def test_closed_forms_integrate_over_what_is_drawn(engine: Engine, case: str) -> None:
     """False alarms and detections at the closed forms' thresholds, within 4.5 standard errors and 1e-5.

@@ -48,6 +48,7 @@ def another_key_schedule(source: str) -> str:
     return source.replace("0x9E3779B9u", "0x9E3779BBu")
 
 
+@pytest.mark.long
 def test_all_is_well_here(engine: Engine) -> None:
     """With LUCK 1e-6 and limits of five standard errors a sound device fails once in 1e5 seeds; this seed is fixed."""
     told: list[selftest.Check] = []
@@ -63,6 +64,7 @@ def few_cases(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
 
 
 #: One case of each way to draw for what real devices lack; of roots, whose errors go the same way, two.
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("weakness", "cases"),
     [
@@ -85,6 +87,7 @@ def test_the_weaker_promise_is_kept_and_marked(
     assert len(marked) == sum(not check.passed for check in strict) > 0
 
 
+@pytest.mark.long
 def test_a_wrong_kernel_keeps_no_promise(monkeypatch: pytest.MonkeyPatch) -> None:
     """Another key schedule is other draws, not rounding."""
     few_cases(monkeypatch, "stack", "apart, tables")

@@ -16,6 +16,7 @@ from mauvecl.host.files.bounded import read_bytes, shortened, unpacked
 PACKERS = pytest.mark.parametrize("pack", [gzip.compress, bz2.compress, lzma.compress])
 
 
+@pytest.mark.long
 @PACKERS
 def test_what_is_packed_comes_back_also_from_several_streams(pack) -> None:
     content = half_noise(3_000_000)
@@ -31,6 +32,7 @@ def test_cut_files_end_in_a_sentence(pack) -> None:
             unpacked(packed[:size], "f")
 
 
+@pytest.mark.long
 @PACKERS
 def test_a_bomb_is_noticed_while_it_is_small(pack, monkeypatch) -> None:
     import tracemalloc

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import re
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
+from astropy.table import Table
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import expect
@@ -133,3 +136,21 @@ def test_the_response_of_v_is_per_photon() -> None:
     assert np.ptp([magnitude(star, 0) for star in stars]) > 0.01
     # And the package itself weights so.
     assert np.ptp([star.magnitude("V") for star in stars]) < 2e-4
+
+
+def test_every_spectrum_and_band_tells_the_file_it_is_from() -> None:
+    """By package, wheel and digests, as the headers' own words have it."""
+    library = Path(catalogue.__file__).parent / "library"
+    table = Table.read(library / "inputs.ecsv", format="ascii.ecsv")
+    assert all(re.fullmatch("[0-9a-f]{64}", digest) for digest in (*table["sha256"], *table.meta["wheels"].values()))
+    files = {row["entry"]: row for row in table}
+    index = Table.read(library / "index.ecsv", format="ascii.ecsv")
+    for row in index:
+        told = files.pop(f"spectrum {row['name']}")
+        assert told["file"].endswith("/" + row["source_file"])
+        assert told["package"] in row["origin"]
+    for file in (library / "bands").glob("*.ecsv"):
+        meta = Table.read(file, format="ascii.ecsv").meta
+        assert f"package {files.pop('band ' + meta['name'])['package']} " in meta["origin"]
+    assert not files
+    assert "not known" in table.meta["unknown"]

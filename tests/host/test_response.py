@@ -96,6 +96,7 @@ def test_line_function_is_the_convolution(mauve: Instrument) -> None:
     assert 2 * np.interp(-density[0] / 2, -density, offset) == pytest.approx(13.3, abs=0.05)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("order", ["paper", "physical"])
 @pytest.mark.parametrize(("top_hat", "fwhm"), KERNELS)
 def test_random_spectra_against_quadrature(mauve: Instrument, top_hat: float, fwhm: float, order: Order) -> None:

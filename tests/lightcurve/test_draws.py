@@ -107,6 +107,7 @@ SCENES: dict[str, Any] = {
 }
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", SCENES)
 def test_sums_by_cumulants_are_distributed_as_by_pixels(stares: Stares, name: str) -> None:
     """1e7 frames each way, each sum and two mixtures of them.

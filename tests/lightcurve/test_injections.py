@@ -20,7 +20,7 @@ from mauvecl.lightcurve.search.recovery import Fit
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.noise.processes import CosmicRays
-from mauvecl.results.requests import Shard
+from mauvecl.results.requests.requests import Shard
 from mauvecl.runs.shards import fingerprint
 
 #: What a bank's weakest found flares are, in sigma of a frame; half of them are found (C; +-5 %).
@@ -37,6 +37,7 @@ def day():
     ).value  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("half_width", TABLE)
 def test_half_are_found(day, half_width):
     """Within 5 % of the table. The median of 1000 amplitudes has an error of 0.7 %: once in 10^6 runs it fails."""
@@ -245,6 +246,7 @@ def test_flares_are_those_that_the_engine_draws(injections, stares):
         assert x.var() > 1.5 * a[1, :, best].var()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(("half_width", "snr"), [(30.0, 30.0), (200.0, 30.0)])
 def test_recovered_flares(half_width, snr):
     """Pulls of all parameters, and coverage. Fails by chance once in 10^4 runs: 4 standard errors of each."""

@@ -185,6 +185,7 @@ def test_frame_signal() -> None:
         frame_signal(*Study().expectations(study.star[1])[:2])
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("alpha", [1.6, 2.1])
 def test_the_yield_closes(alpha: float) -> None:
     """Flares drawn from a power law and put through the completeness give back exponent and rate.

@@ -10,7 +10,7 @@ from searches import DAVENPORT, KNOWN, ONE
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.search.bank import Bank, Level
 from mauvecl.lightcurve.search.completeness import default_bank, search_threshold
-from mauvecl.lightcurve.search.null import counted, sampled
+from mauvecl.lightcurve.search.null import DAY_S, Counted, sampled
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.search.trials import Trials
 from mauvecl.lightcurve.stares.stare import Stare
@@ -55,8 +55,8 @@ def test_beside_counts():
     600 stares of six hours: 4 standard errors fail by chance once in 10^4 runs.
     """
     bank, stare, rng = default_bank(), Stare.of(21_600.0), np.random.default_rng(1)
-    draw = lambda _, n: rng.standard_normal((n, stare.n_frames, 1), dtype=np.float32)  # noqa: E731
-    null = counted(Search(bank, stare), draw, 600)
+    maxima = Search(bank, stare).largest(rng.standard_normal((600, stare.n_frames, 1), dtype=np.float32)).maximum
+    null = Counted(np.sort(maxima), stare.observed_s / DAY_S)
     for u in (3.5, 3.75, 4.0):
         rate, expected = null.rate(u), Trials.of(bank).per_second(u) * 86_400
         spread = 2 * (rate.high - rate.low) / 3.92 * 2

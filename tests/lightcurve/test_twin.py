@@ -7,6 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 import pytest
+from marks import long_but
 from scenes import instrument, star
 
 from mauvecl.device.engine import Engine
@@ -65,7 +66,7 @@ def stares(request: pytest.FixtureRequest, engine: Engine) -> Stares:
     return Stares(engine.opened) if request.param == "vectors" else Stares(width=1)
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", long_but(CASES, "plain", "all that wobbles"))
 @pytest.mark.parametrize("method", ["pixels", "cumulants"])
 def test_stares_are_the_twins(stares: Stares, name: str, method: Any) -> None:
     components, stare, flare, amplitudes, more = case(name)

@@ -82,6 +82,7 @@ def test_the_detector_temperature_moves_the_dark(engine: Engine) -> None:
     assert abs(ratio - 1) < 0.01 + 5 * np.sqrt(2 / cold.size)
 
 
+@pytest.mark.long
 def test_jitter_is_drawn_for_every_frame(engine: Engine) -> None:
     """One frame loses a uniform share; ten lose the mean of ten, stacked or frame by frame: six standard errors."""
     most = Processes(jitter=Uniform(0.0, 0.05))
@@ -173,6 +174,7 @@ def test_what_cannot_be_is_refused(make, sentence: str) -> None:
         make()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("recipe", ["joint", "apart"])
 @pytest.mark.parametrize("name", ["mauve", "mauve-electrons"])
 def test_components_add_up_and_scatter_as_they_should(engine: Engine, name: str, recipe: str) -> None:

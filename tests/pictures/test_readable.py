@@ -10,6 +10,7 @@ from typing import Any
 
 import matplotlib as mpl
 import pytest
+from marks import long_but
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.text import Text
 
@@ -57,7 +58,7 @@ def drawn(answer: Answer) -> Iterator[tuple[str, Any, Any]]:
     """Name, figure and renderer of each picture."""
     with mpl.rc_context():
         for name, (function, *given) in answer.pictures.items():
-            figure = picture(function, *given, None)
+            figure = picture(function, *given, path=None)
             canvas = FigureCanvasAgg(figure)
             canvas.draw()
             yield name, figure, canvas.get_renderer()  # type: ignore[no-untyped-call]
@@ -72,7 +73,11 @@ def shown_ticks(axis: Any) -> list[Text]:
     return [tick.label1 for tick in inside if tick.label1.get_visible() and tick.label1.get_text()]
 
 
-@pytest.mark.parametrize("case", CASES)
+#: What `make check` looks at.
+SHORT = ("detect, one statistic", "limit of exposure", "map", "snr", "exposure")
+
+
+@pytest.mark.parametrize("case", long_but(CASES, *SHORT))
 def test_everything_is_inside_and_apart(case: str, engine: Engine) -> None:
     ask, settings, column = CASES[case]
     answer = ask(Study().with_settings(list(settings)), engine)
@@ -114,7 +119,7 @@ def test_everything_is_inside_and_apart(case: str, engine: Engine) -> None:
 def test_a_flare_that_is_detected_is_seen(engine: Engine) -> None:
     """The 5 % flare, hidden in the noise of a pixel, rises to four sigma of an element beneath."""
     answer = detect(Study().with_settings([*FEW, ONE, "flare.amplitudes=[0.05]", ONLY]), engine)
-    figure = picture(*answer.pictures["spectra"], None)
+    figure = picture(*answer.pictures["spectra"], path=None)
     (line,) = [line for line in figure.axes[1].lines if len(line.get_ydata()) > 2]
     assert 3.0 < max(line.get_ydata()) < 6.0
     # The last element of the spectrum is a part of one, and is left out.

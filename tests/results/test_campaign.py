@@ -94,9 +94,9 @@ def test_overlapping_stacks_may_have_more_each() -> None:
         ({"frames": 17_280, "alarms": 1e5}, "campaign.alarms = 100000 of 1728 tests"),
     ],
 )
-def test_wishes_that_cannot_be(campaign_asked: dict, sentence: str) -> None:
+def test_wishes_that_cannot_be(campaign_asked: dict, sentence: str, engine: Engine) -> None:
     def ask() -> None:
-        detect(Study.build({"campaign": campaign_asked}, "test"), None)  # type: ignore[arg-type]
+        detect(Study.build({"campaign": campaign_asked}, "test"), engine)
 
     with pytest.raises(InputError, match=sentence):
         ask()

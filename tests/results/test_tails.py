@@ -73,6 +73,7 @@ UNKNOWNS = {
 }  # fmt: skip
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("case", UNKNOWNS)
 def test_brute_force_agrees_with_what_is_unknown(engine: Engine, case: str) -> None:
     """Up to three statistics at two probabilities, each case: |z| < 4.5 with both errors, 16 values, 1e-4 by chance."""

@@ -45,6 +45,7 @@ def counted(kind: str, fap: float, probability: float, n: int, seeds: int) -> tu
     return above, shared
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", ["matched", "chi2", "other draws"])
 @pytest.mark.parametrize(
     ("fap", "n", "seeds", "probabilities"),

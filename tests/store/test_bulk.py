@@ -64,6 +64,7 @@ def test_sums_of_frames_have_32_bits_and_components_are_kept(tmp_path: Path, eng
     np.testing.assert_allclose(group["quiescent-noise"][:], np.sqrt(quiet.variance_dn2), rtol=1e-12)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("processes", [{}, {"jitter": {"uniform": (0.0, 0.05)}}])
 def test_frames_kept_apart_add_up_to_the_exposure(tmp_path: Path, engine: Engine, processes: dict[str, Any]) -> None:
     how = {"observation": {"exposure_s": 50.0, "mode": "frames"}, "processes": processes}
@@ -216,6 +217,7 @@ def painted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
     return tree(path)
 
 
+@pytest.mark.long
 def test_fifty_kills_at_random(tmp_path: Path, painted: dict[str, bytes]) -> None:
     """Killed at any moment and resumed: the same files, to the bit."""
     path, kills, stores = tmp_path / "frames.zarr", 0, 0
@@ -236,6 +238,7 @@ def test_fifty_kills_at_random(tmp_path: Path, painted: dict[str, bytes]) -> Non
     assert bulk.verify(path) == []
 
 
+@pytest.mark.long
 def test_a_kill_at_every_step_of_writing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Before each fsync, each rename and each line of digests, one by one."""
     described, seen, step = Store(tmp_path, study(200)).description(), store.scenes(study(200)), 0

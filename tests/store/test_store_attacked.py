@@ -133,6 +133,7 @@ def test_a_store_that_is_being_written_is_not_removed(made: Path, how: str, monk
     assert tree(made) == before
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("place", ["mine.txt", "star-1/mine.txt", "star-1/quiescent/c/mine", "star-1/quiescent/c/99/0"])
 @pytest.mark.parametrize("kind", ["file", "link"])
 def test_other_peoples_files_are_not_removed(made: Path, place: str, kind: str) -> None:
@@ -161,6 +162,7 @@ def test_a_restart_draws_another_study(made: Path, tmp_path: Path) -> None:
     assert not made.exists()
 
 
+@pytest.mark.long
 def test_a_kill_while_a_store_is_removed(made: Path, tmp_path: Path) -> None:
     """At any file: what is left is a store, and a second restart ends as the first would have."""
     other = study(run={"seed": 3})

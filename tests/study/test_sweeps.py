@@ -142,6 +142,7 @@ def test_coverage_is_exact(engine: Engine) -> None:
     assert direct.mean() == pytest.approx(ONE_SIGMA, abs=5e-3)
 
 
+@pytest.mark.long
 def test_the_formula_holds_for_the_payload_and_fails_at_the_rail(engine: Engine) -> None:
     """No false alarm or S/N is off for the nominal payload; a bias near zero clips, and everything is."""
     asked = study([MAGNITUDES, EXPOSURES])
@@ -177,6 +178,7 @@ def test_pixels_beyond_five_sigma(name: str, temperature: float, sigmas: float) 
         assert (found > stats.norm.sf(sigmas)) == (side > 0)
 
 
+@pytest.mark.long
 def test_every_column_is_described_and_every_answer_knows_its_study(engine: Engine) -> None:
     """Tables of every kind of answer: a description for each column, and the study that is read back from each."""
     asked = study([{"quantity": "sky", "values": [21.0, 22.0]}])

@@ -62,6 +62,7 @@ def test_nothing_unknown_changes_nothing(engine: Engine) -> None:
     assert abs(one.value.value - two.value.value) < 0.03
 
 
+@pytest.mark.long
 def test_a_limit_over_the_unknown_has_the_power_on_average(engine: Engine) -> None:
     """The closed form's mean is the power; harder instruments have brighter limits; one unknown explains most."""
     asked = study({"draws": 24})

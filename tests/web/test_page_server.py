@@ -14,8 +14,6 @@ import re
 import resource
 import shlex
 import socket
-import subprocess
-import sys
 import tempfile
 import threading
 import zipfile
@@ -25,6 +23,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from commands import run
 
 pytest.importorskip("bokeh")
 
@@ -310,6 +309,7 @@ WIDE = (
 ALIASES = "".join(f"#   a{i}: &a{i} [{', '.join(8 * [f'*a{i - 1}'])}]\n" for i in range(1, 9))
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "bomb",
     [
@@ -664,10 +664,8 @@ def test_addresses_are_checked_before_anything_is_served() -> None:
 
 
 @pytest.mark.parametrize("address", ["", "no such host", "0.0.0.0"])
-def test_serve_refuses_an_address_in_a_sentence(address: str) -> None:
-    command = [sys.executable, "-m", "mauvecl", "serve", "--address", address]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120)
-    assert done.returncode == 2
+def test_serve_refuses_an_address_in_a_sentence(address: str, tmp_path: Path) -> None:
+    done = run("serve", "--address", address, folder=tmp_path, code=2)
     assert re.fullmatch(r"mauvecl: --address '[^\n]*\n", done.stderr)
 
 

@@ -70,11 +70,11 @@ class PlanAnswer(Answer):
         table["E50"] = [one.energy_at(0.5) for one in rows] * u.erg
         table["E90"] = [one.energy_at(0.9) for one in rows] * u.erg
         nothing = Yield(float("nan"), -1, -1, float("nan"))
-        found = [one.found or nothing for one in rows]
-        table["expected"] = [one.expected for one in found]
-        table["low"] = np.ma.MaskedArray([one.low for one in found], [one.low < 0 for one in found])
-        table["high"] = np.ma.MaskedArray([one.high for one in found], [one.high < 0 for one in found])
-        table["at_least_one"] = [one.at_least_one for one in found]
+        recovered = [one.recovered or nothing for one in rows]
+        table["expected"] = [one.expected for one in recovered]
+        table["low"] = np.ma.MaskedArray([one.low for one in recovered], [one.low < 0 for one in recovered])
+        table["high"] = np.ma.MaskedArray([one.high for one in recovered], [one.high < 0 for one in recovered])
+        table["at_least_one"] = [one.at_least_one for one in recovered]
         table["false_alarms"] = self.false_alarms
         table["best_months"] = [" ".join(one.best_months) for one in rows]
         for name, text in DESCRIPTIONS.items():
@@ -98,6 +98,7 @@ class PlanAnswer(Answer):
         table["target"] = [one.target.name for one in rows]
         table["ra"] = [one.target.ra_deg for one in rows] * u.deg
         table["dec"] = [one.target.dec_deg for one in rows] * u.deg
+        table["position"] = [one.target.source for one in rows]
         table["spectral_type"] = [one.target.spectral_type or "" for one in rows]
         table["spectrum"] = [one.star.library or "" for one in rows]
         table["V"] = [one.star.magnitude or 0.0 for one in rows] * u.mag
@@ -193,6 +194,7 @@ class PlanAnswer(Answer):
             ),
         ]
         rows += [(f"flare rates of {one.name}", one.rates.source, _measured(one)) for one in self.planned if one.rates]
+        rows += [("where the satellite will be", "", text) for text in orbit.messages(self.seen.moments)]
         rows += [(f"completeness of {one.name}", "", one.completeness.how) for one in self.planned if one.completeness]
         return Table(rows=rows, names=("assumption", "value", "source"))
 
@@ -238,24 +240,24 @@ class PlanAnswer(Answer):
     @property
     def messages(self) -> list[str]:
         """What saturates, which targets have no answer and why, what is extrapolated, what is said of visibility."""
-        found = [text for text in told(self.inputs) if text.startswith("SATURATED")]
+        lines = [text for text in told(self.inputs) if text.startswith("SATURATED")]
         typical = [one.name for one in self.planned if one.rates is not None and "typical" in one.rates.source]
         if typical:
-            found.append(
-                f"Flare rates of {', '.join(typical)} are those typical of their types at 1 Gyr: mass_msun and "
+            lines.append(
+                f"Flare rates of {', '.join(typical)} are those typical of their types at 1000 Myr: mass_msun and "
                 "age_myr, or rates of their own, say more."
             )
         for one in self.planned:
             if one.no_rates:
-                found.append(f"{one.no_rates}; its expected flares are not given.")
+                lines.append(f"{one.no_rates[0].upper()}{one.no_rates[1:]}; its expected flares are not given.")
             if one.rates is not None and one.completeness is not None and one.extrapolated:
                 low, high = one.rates.measured_erg
-                found.append(
+                lines.append(
                     f"E50 of {one.name}, {one.energy_at(0.5):.2g} erg, lies outside the {low:.2g} to {high:.2g} erg "
                     "for which its flare rates are published: they are extrapolated."
                 )
-        found += self.seen.messages
-        return list(dict.fromkeys(found))
+        lines += self.seen.messages
+        return list(dict.fromkeys(lines))
 
     @property
     def pictures(self) -> dict[str, tuple[Any, ...]]:
@@ -277,6 +279,7 @@ DESCRIPTIONS = {
     "best_months": "those with most hours",
 }
 STAR_COLUMNS = {
+    "position": "who says so",
     "spectrum": "embedded spectrum that stands for the star",
     "sky": "zodiacal light behind it, median over the days on which it is seen",
     "signal_per_frame": "S/N of one frame with a flare of amplitude 1",
@@ -324,8 +327,8 @@ def plan(
     --------
     >>> from mauvecl import Study, plan
     >>> study = Study().with_settings(["plan.targets=[{name = 'eps Eri'}]", "orbit.days=31", "plan.hours=100"])
-    >>> found = plan(study.with_settings(["plan.completeness='closed form'"]))
-    >>> found.table["hours"].value.tolist()
+    >>> answer = plan(study.with_settings(["plan.completeness='closed form'"]))
+    >>> answer.table["hours"].value.tolist()
     [100.0]
     """
     if not study.plan.targets:
@@ -337,7 +340,7 @@ def plan(
     names, hours = seen.visibility.by_month()
     completeness = completeness or _completeness(study)
     met = Met.along(seen.visibility.track) if study.plan.along_orbit else None
-    found: list[Planned] = []
+    planned: list[Planned] = []
     for k, (text, star, target) in enumerate(zip(study.plan.targets, stars, seen.targets, strict=True)):
         if progress is not None:
             progress(k, len(stars))
@@ -346,16 +349,16 @@ def plan(
         observed = exposed if study.plan.hours is None else min(exposed, study.plan.hours)
         order = np.argsort(-hours[:, k], kind="stable")[: study.plan.best_months]
         best = tuple(names[i] for i in sorted(order) if hours[i, k] > 0)
-        share = None
+        its = None
         if looked.window_s > 0:
-            share = completeness(study, looked) if looked.signal_per_frame > 0 else NOTHING
+            its = completeness(study, looked) if looked.signal_per_frame > 0 else NOTHING
         rates, why = rates_of(study, text, looked)
-        result = None
+        recovered = None
         if rates is not None:
             days = observed * 3600 / DAY_S
-            result = Yield.about(0.0, 0.0) if share is None else Yield.of(rates, share, days)
-        found.append(Planned(looked, exposed, observed, share, rates, result, best, why))
-    return PlanAnswer(study, seen, tuple(found))
+            recovered = Yield.about(0.0, 0.0) if its is None else Yield.of(rates, its, days)
+        planned.append(Planned(looked, exposed, observed, its, rates, recovered, best, why))
+    return PlanAnswer(study, seen, tuple(planned))
 
 
 def _completeness(study: Study) -> CompletenessOf:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from html import escape
 from typing import TYPE_CHECKING
 
-from mauvecl.answers.campaigns.plan_text import SUMMARY, SUMMARY_TABLE, heading, summary_rows, target_lines
+from mauvecl.answers.campaigns.plan_text import LEGEND, SUMMARY, heading, summary_rows, target_lines
 from mauvecl.host.plotting import picture
 from mauvecl.host.version import VERSION
 
@@ -15,44 +15,50 @@ if TYPE_CHECKING:
     from mauvecl.answers.campaigns.plan import PlanAnswer
 
 STYLE = (
-    "body{font-family:sans-serif;max-width:60em;margin:2em auto;font-size:14px}"
-    "table{border-collapse:collapse;margin:1em 0}"
+    "body{font-family:sans-serif;max-width:60em;margin:2em auto;font-size:14px;line-height:1.35}"
+    "table{border-collapse:collapse;margin:1em 0}img{max-width:100%;break-inside:avoid}"
     "td,th{padding:.2em .7em;text-align:left;border-bottom:1px solid #ccc;vertical-align:top}.from{color:#666}"
-    "section{break-before:page}img{max-width:100%}"
+    ".numbers td:nth-child(n+2):not(:last-child),.numbers th:nth-child(n+2):not(:last-child){text-align:right}"
+    "section{break-before:page}h2{break-after:avoid}@media print{body{font-size:11px}}"
 )
 
 
-def report_html(found: PlanAnswer) -> bytes:
+def report_html(answer: PlanAnswer) -> bytes:
     """The report: summary, a section for each target with its pictures where matplotlib is there, assumptions."""
     parts = [
-        f"<!doctype html><html lang=en><meta charset=utf-8><title>Mauve: {escape(heading(found))}</title>",
+        f"<!doctype html><html lang=en><meta charset=utf-8><title>Mauve: {escape(heading(answer))}</title>",
         f"<style>{STYLE}</style><h1>Mauve: yields of a campaign</h1>",
-        f"<p>{escape(heading(found))}; mauvecl {VERSION}.</p>",
-        _table(SUMMARY, summary_rows(found)),
-        f"<p class=from>Numbers are those of {SUMMARY_TABLE}.</p>",
-        *(f"<p>{escape(message)}</p>" for message in found.messages),
+        f"<p>{escape(heading(answer))}; mauvecl {VERSION}.</p>",
+        _table(SUMMARY, summary_rows(answer), "numbers"),
+        f"<p class=from>{escape(LEGEND)}</p>",
+        _image("plan_report.overview_png", answer, text="flares expected and energies of all targets"),
+        *(f"<p>{escape(message)}</p>" for message in answer.messages),
     ]
-    for k, one in enumerate(found.planned):
-        parts.append(f"<section><h2>{escape(one.name)}</h2>{_table(('', '', 'table: column'), target_lines(found, k))}")
-        image = _image(found, k)
-        if image:
-            parts.append(f"<img alt='hours and energies of {escape(one.name, quote=True)}' src='{image}'>")
+    for k, one in enumerate(answer.planned):
+        lines = _table(("", "", "table: column"), target_lines(answer, k))
+        parts.append(f"<section><h2>{escape(one.name)}</h2>{lines}")
+        if one.seen_h > 0:
+            parts.append(_image("plan_report.target_png", answer, k, text=f"hours and energies of {one.name}"))
         parts.append("</section>")
-    table = found.assumptions
+    table = answer.assumptions
     rows = [tuple(str(cell) for cell in row) for row in table]
-    parts.append(f"<section><h2>What is assumed</h2>{_table(table.colnames, rows)}</section></html>")
+    parts.append(
+        f"<section><h2>What is assumed</h2><p class=from>Rows of assumptions.ecsv.</p>{_table(table.colnames, rows)}"
+        "</section></html>"
+    )
     return "\n".join(parts).encode()
 
 
-def _table(names: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
+def _table(names: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
     head = "".join(f"<th>{escape(name)}</th>" for name in names)
     body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-    return f"<table><tr>{head}</tr>{body}</table>"
+    return f"<table class='{kind}'><tr>{head}</tr>{body}</table>"
 
 
-def _image(found: PlanAnswer, k: int) -> str:
+def _image(name: str, *what: object, text: str) -> str:
     from importlib.util import find_spec
 
     if find_spec("matplotlib") is None:
         return ""
-    return "data:image/png;base64," + base64.b64encode(picture("plan_report.target_png", found, k)).decode()
+    content = base64.b64encode(picture(name, *what)).decode()
+    return f"<img alt='{escape(text, quote=True)}' src='data:image/png;base64,{content}'>"

@@ -82,7 +82,7 @@ class Planned:
         None where it is never seen.
     rates : Rates, optional
         Of bolometric energies; None where none are known.
-    found : Yield, optional
+    recovered : Yield, optional
         With both of them.
     best_months : tuple of str
     no_rates : str
@@ -94,7 +94,7 @@ class Planned:
     hours: float
     completeness: Completeness | None
     rates: Rates | None
-    found: Yield | None
+    recovered: Yield | None
     best_months: tuple[str, ...]
     no_rates: str = ""
 
@@ -103,9 +103,9 @@ class Planned:
         """The target's."""
         return self.looked.target.name
 
-    def energy_at(self, share: float) -> float:
-        """Bolometric energy from which on such a share of flares is recovered, erg; infinite where it never is."""
-        return float("inf") if self.completeness is None else self.completeness.energy_at(share)
+    def energy_at(self, probability: float) -> float:
+        """Bolometric energy from which on a flare is recovered with a probability, erg; infinite where it never is."""
+        return float("inf") if self.completeness is None else self.completeness.energy_at(probability)
 
     @property
     def extrapolated(self) -> bool:
@@ -131,12 +131,12 @@ def closed_form(study: Study, looked: Looked) -> Completeness:
 def rates_of(study: Study, text: PlanTarget, looked: Looked) -> tuple[Rates | None, str]:
     """A target's flares by bolometric energy, or why none are known."""
     try:
-        found = text.distribution(looked.target.spectral_type or "")
+        rates = text.distribution(looked.target.spectral_type or "")
     except InputError as error:
         if any(getattr(text, name) is not None for name in ("mass_msun", "alpha", "rates_file", "rates")):
             raise
         return None, str(error)
-    return found.in_band(BOLOMETRIC, study.flare.temperature_k), ""
+    return rates.in_band(BOLOMETRIC, study.flare.temperature_k), ""
 
 
 def star_of(study: Study, text: PlanTarget) -> Star:

@@ -48,8 +48,8 @@ def injected(study: Study, looked: Looked) -> Completeness:
     )
     energy = 10 ** np.arange(24.0, 40.0, 1 / PER_DECADE)
     widths = np.array(star.injected.half_widths_s)
-    share = found_share(star.injected.critical.reshape(widths.size, -1), widths, energy, study.plan.law())
-    return Completeness(energy, share, BOLOMETRIC, how)
+    critical = star.injected.critical.reshape(widths.size, -1)
+    return Completeness(energy, found_by_energy(critical, widths, energy, study.plan.law()), BOLOMETRIC, how)
 
 
 def question_of(study: Study, looked: Looked) -> Study:
@@ -75,8 +75,8 @@ def question_of(study: Study, looked: Looked) -> Study:
     )
 
 
-def found_share(critical_erg: Float, half_widths_s: Float, energy_erg: Float, law: DurationLaw) -> Float:
-    """Share found by energy, over the half-widths that flares of an energy have, (n_energy,).
+def found_by_energy(critical_erg: Float, half_widths_s: Float, energy_erg: Float, law: DurationLaw) -> Float:
+    """Completeness by energy, over the half-widths that flares of an energy have, (n_energy,).
 
     Parameters
     ----------
@@ -87,8 +87,8 @@ def found_share(critical_erg: Float, half_widths_s: Float, energy_erg: Float, la
     energy_erg : ndarray, shape (n_energy,)
     law : DurationLaw
     """
-    share = np.empty((half_widths_s.size, energy_erg.size))
-    for row, one in zip(share, critical_erg, strict=True):
+    of_width = np.empty((half_widths_s.size, energy_erg.size))
+    for row, one in zip(of_width, critical_erg, strict=True):
         counted = np.sort(one[one > 0])
         row[:] = np.searchsorted(counted, energy_erg, side="right") / max(counted.size, 1)
     nodes, weights = np.polynomial.hermite_e.hermegauss(15)
@@ -96,5 +96,5 @@ def found_share(critical_erg: Float, half_widths_s: Float, energy_erg: Float, la
     place = np.interp(half, np.log(half_widths_s), np.arange(half_widths_s.size))
     i = np.minimum(place.astype(int), half_widths_s.size - 2)
     part, column = place - i, np.arange(energy_erg.size)[:, None]
-    p = (1 - part) * share[i, column] + part * share[i + 1, column]
+    p = (1 - part) * of_width[i, column] + part * of_width[i + 1, column]
     return np.asarray(np.clip(p @ (weights / weights.sum()), 0.0, 1.0))

@@ -192,10 +192,10 @@ class VisibleAnswer(Answer):
     @property
     def tables(self) -> dict[str, Table]:
         """Targets, months, days, windows, assumptions."""
-        found = {"visible": self.table, "months": self.months, "days": self.by_day}
+        tables: dict[str, Table] = {"visible": self.table, "months": self.months, "days": self.by_day}
         if self._writes_windows:
-            found["windows"] = self.window_table
-        return found | {"assumptions": self.assumptions}
+            tables["windows"] = self.window_table
+        return tables | {"assumptions": self.assumptions}
 
     @property
     def _writes_windows(self) -> bool:
@@ -208,12 +208,12 @@ class VisibleAnswer(Answer):
 
     def entries(self) -> list[Entry]:
         """Appointments of the calendar."""
-        moments, found = self.moments, []
+        moments, entries = self.moments, list[Entry]()
         single = self.study.orbit.orbit().resolved(moments) == "tle" and self._writes_windows
         for k, one in enumerate(self.targets):
             if single:
                 windows = self.windows[k]
-                found += [
+                entries += [
                     Entry(moments.iso(float(a)), moments.iso(float(b)), one.name, f"{(b - a) / 60:.0f} min of exposure")
                     for a, b in zip(windows.start_s, windows.stop_s, strict=True)
                 ]
@@ -222,8 +222,8 @@ class VisibleAnswer(Answer):
             edges = np.flatnonzero(np.diff(np.concatenate([[False], hours >= SEEN_H, [False]])))
             for first, last in zip(edges[::2], edges[1::2], strict=True):
                 mean = f"{hours[first:last].mean():.1f} h of exposure a day"
-                found.append(Entry(self.days[first], self.days[last - 1], one.name, mean))
-        return found
+                entries.append(Entry(self.days[first], self.days[last - 1], one.name, mean))
+        return entries
 
     @property
     def inputs(self) -> list[Expectation]:
@@ -233,20 +233,21 @@ class VisibleAnswer(Answer):
     @property
     def messages(self) -> list[str]:
         """What the orbit is, what is assumed, what is not modelled, and which targets are never seen."""
-        never = [one.name for one, share in zip(self.targets, self.visibility.share, strict=True) if share == 0]
-        found = [f"{name} is never seen: {self._reason(name)}." for name in never]
-        found += self.study.orbit.orbit().messages(self.moments)
-        found.append(
+        never = [one.name for one, part in zip(self.targets, self.visibility.share, strict=True) if part == 0]
+        lines = [f"{name} is never seen: {self.reason(name)}." for name in never]
+        lines += self.study.orbit.orbit().messages(self.moments)
+        lines.append(
             "Mauve's own limits are not public: those used are assumptions, named with their sources in the table of "
             "assumptions. Stray light is not modelled."
         )
         if not self._writes_windows:
-            found.append(
+            lines.append(
                 f"There are more than {MOST_WINDOWS} windows: their table is not written, and the calendar has days."
             )
-        return found
+        return lines
 
-    def _reason(self, name: str) -> str:
+    def reason(self, name: str) -> str:
+        """Why a target is never seen."""
         k = [one.name for one in self.targets].index(name)
         alone = [limit for limit, kept in self.visibility.kept_by.items() if kept[k] == 0]
         return f"the limit of {alone[0]} alone leaves nothing" if alone else "its limits together leave nothing"
@@ -292,8 +293,8 @@ def visible(study: Study) -> VisibleAnswer:
     --------
     >>> from mauvecl import Study, visible
     >>> study = Study().with_settings(["orbit.targets=['eps Eri']", "orbit.start=2027-01-01", "orbit.days=31"])
-    >>> found = visible(study)
-    >>> found.months["month"].tolist()
+    >>> seen = visible(study)
+    >>> seen.months["month"].tolist()
     ['2027-01']
     """
     targets = tuple(targets_of(study))

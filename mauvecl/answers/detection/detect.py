@@ -303,8 +303,9 @@ def _wanted(asked: CampaignQuestion, tests: int, stack: int, seed: int) -> list[
     if asked.alarms is not None:
         if not asked.alarms < tests:
             raise InputError(f"campaign.alarms = {asked.alarms:g} of {tests} tests, expected fewer than tests")
+        alarms = "false alarm" if asked.alarms == 1 else "false alarms"
         lines.append(
-            f"For {asked.alarms:g} false alarms expected in the campaign each of its {tests} tests may have "
+            f"For {asked.alarms:g} {alarms} expected in the campaign each of its {tests} tests may have "
             f"{asked.alarms / tests:.4g}, whatever their dependence: `--fap {asked.alarms / tests:.4g}`."
         )
     return lines

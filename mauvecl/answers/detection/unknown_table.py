@@ -95,7 +95,7 @@ class UnknownTable:
 
     def plot(self, path: str | Path | None = None, *, ax: Any = None) -> object:
         """Detection probability against amplitude, and the smallest amplitude of each star; needs matplotlib."""
-        return picture("unknowns.unknowns", self, path, ax=ax)
+        return picture("unknowns.unknowns", self, path=path, ax=ax)
 
 
 def unknown_table(study: Study, unknowns: Mapping[str, NuisanceChoice] = SHOWN) -> UnknownTable:

@@ -72,7 +72,7 @@ class SimulateAnswer(Answer):
     def plot(self, path: str | Path | None = None, *, number: int = 0, ax: Any = None) -> Any:
         """One of the observations and what it is made of; needs matplotlib."""
         title, _, table = self.observations[number]
-        return picture("answers.observation", title, table, path, ax=ax)
+        return picture("answers.observation", title, table, path=path, ax=ax)
 
 
 @public

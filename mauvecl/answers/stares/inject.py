@@ -16,7 +16,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.tables import tabled
 from mauvecl.lightcurve.search.injected import Injected
 from mauvecl.lightcurve.search.injections import Injections
-from mauvecl.lightcurve.search.null import DAY_S, Counted, in_a_row_rate, sampled
+from mauvecl.lightcurve.search.null import DAY_S, Counted, in_a_row_rate
 from mauvecl.lightcurve.search.recoveries import Fitted, Refit
 from mauvecl.lightcurve.stares.requests import Arrays
 from mauvecl.runs.pool import Pool, together
@@ -42,8 +42,6 @@ POWERS = (0.5, 0.9)
 SIZE_UNITS = {"amplitude": "", "duration": "s", "energy": "erg", "band_energy": "erg"}
 #: Standard errors of the number of alarms beyond which the two differ.
 DIFFERS = 4.0
-#: Star-days of a stare that importance sampling looks at, at most.
-SAMPLED_DAYS = 2.0
 #: Maps in one picture.
 MOST_DRAWN = 6
 
@@ -268,8 +266,7 @@ def _star(
     if choice.nulls:
         maxima = _reduced(engine, survey.null(choice.nulls, seed, rays))["maximum"]
         drawn = Counted(np.sort(maxima), survey.stare.observed_s / DAY_S)
-    short = survey.of_days(SAMPLED_DAYS)
-    tail = sampled(short.search, seed=seed)
+    tail = survey.tail(seed)
     threshold = (
         tail.threshold(choice.rate) if choice.null == "sampled" or drawn is None else drawn.threshold(choice.rate)
     )
@@ -293,7 +290,7 @@ def _star(
     critical = np.stack([part["critical"].T for part in parts], axis=1)
     # Where a few stares in ten have an alarm, drawn ones say most of whether the two agree.
     checked, likely, error = tail.likely
-    simulated, expected = _checked(drawn, checked, likely, error, survey.stare.observed_s / short.stare.observed_s)
+    simulated, expected = _checked(drawn, checked, likely, error, survey.stare.observed_s / DAY_S / tail.days)
     return StarCompleteness(
         label(star, known.quiet),
         at,

@@ -15,7 +15,6 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.tables import tabled
 from mauvecl.lightcurve.flares.events import Event, coefficients, temperatures_of
 from mauvecl.lightcurve.search.alarms import Alarm, alarms
-from mauvecl.lightcurve.search.null import sampled
 from mauvecl.lightcurve.stares.observed import Draw, Light, Staring, seen
 from mauvecl.study.labels import described, label, stacked, told
 from mauvecl.study.stares import check_sweep
@@ -34,8 +33,6 @@ if TYPE_CHECKING:
 MOST_ROWS = 100_000
 #: Frames whose spectra are kept, at most: 115 days, 1.2 GB.
 MOST_SHOWN = 2_000_000
-#: Star-days of a stare that the threshold's importance sampling looks at, at most.
-SAMPLED_DAYS = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -316,8 +313,7 @@ def _searched(study: Study, star: Star, staring: Staring, events: list[Event], d
     try:
         known = surveyed(study, star)
         survey = replace(known.survey, components=staring.components(known.templates.weights))
-        tail = sampled(survey.of_days(SAMPLED_DAYS).search, seed=study.run.seed)
-        threshold = tail.threshold(study.search.rate).value
+        threshold = survey.tail(study.run.seed).threshold(study.search.rate).value
     except InputError as error:
         return f"{label(star, staring.quiet)} is not searched: {error}."
     found = alarms(survey, known.templates, draw(survey.components), threshold)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.cli.flags import DRAWS, FLARE, SIZE, STARE, SWEEP, DeviceFlag
@@ -48,7 +49,7 @@ def _show(answer: StareAnswer) -> None:
     swept = tuple(axis.quantity for axis in answer.study.sweep.axes)
     show_table(
         "One stare each",
-        ("star", *swept, "frames", "in frames (s)", "intervals", "light (DN/s)", "noise of a frame", "saturated"),
+        ("star", *swept, "frames", "recorded (s)", "intervals", "light (DN/s)", "noise of a frame", "saturated"),
         [
             (one.label, *map(short, one.at.values()), str(row["frames"]), f"{row['observed'].value:g}",
              str(row["intervals"]), f"{row['flux'].value:.4g}", f"{100 * row['frame_noise']:.3g} %",
@@ -59,7 +60,7 @@ def _show(answer: StareAnswer) -> None:
     events = answer.events
     show_table(
         "Flares in them; S/N of one who knows all but whether the flare is there",
-        ("star", *swept, "peak at (s)", "half width (s)", "peak", "ED (s)", "bolometric (erg)", "S/N"),
+        ("star", *swept, "peak at (s)", "half-width (s)", "peak", "ED (s)", "bolometric (erg)", "S/N"),
         [
             (row["star"], *(short(getattr(row[name], "value", row[name])) for name in swept),
              f"{row['peak_time'].value:.6g}", f"{row['half_width'].value:g}", f"{100 * row['peak']:.3g} %",
@@ -71,12 +72,12 @@ def _show(answer: StareAnswer) -> None:
         if isinstance(one.searched, Searched):
             show_table(
                 f"Found at {one.title} above {one.searched.threshold:.2f}, {_rate(answer)}",
-                ("peak at (s)", "amplitude", "half width (s)", "temperature (K)", "bolometric (erg)", "value", "flare"),
+                ("peak at (s)", "amplitude", "half-width (s)", "temperature (K)", "bolometric (erg)", "value", "flare"),
                 [
                     (f"{a.recovered.peak_s[0]:.6g}",
-                     f"{100 * a.recovered.amplitude[0]:.3g} ± {100 * a.recovered.amplitude_error[0]:.1g} %",
-                     f"{a.recovered.half_width_s[0]:.3g} ± {a.recovered.half_width_error_s[0]:.1g}",
-                     f"{a.recovered.temperature_k[0]:.4g} ± {a.recovered.temperature_error_k[0]:.1g}",
+                     f"{_with_error(100 * a.recovered.amplitude[0], 100 * a.recovered.amplitude_error[0])} %",
+                     _with_error(a.recovered.half_width_s[0], a.recovered.half_width_error_s[0]),
+                     _with_error(a.recovered.temperature_k[0], a.recovered.temperature_error_k[0]),
                      _energy(energy), f"{a.rho:.2f}", str(event) if event else "none")
                     for a, energy, event in zip(
                         one.searched.alarms, one.searched.bolometric_erg, one.searched.events, strict=True
@@ -88,7 +89,16 @@ def _show(answer: StareAnswer) -> None:
 def _rate(answer: StareAnswer) -> str:
     """How many false alarms there are at the threshold, in words."""
     asked = answer.study.search
-    return f"{asked.false_alarms:g} false alarms per star-{asked.per}"
+    alarms = "false alarm" if asked.false_alarms == 1 else "false alarms"
+    return f"{asked.false_alarms:g} {alarms} per star-{asked.per}"
+
+
+def _with_error(value: float, error: float) -> str:
+    """To the error's two leading digits: 9979 ± 120, not 1e+02."""
+    if not (math.isfinite(error) and error > 0):
+        return f"{value:.3g}"
+    digits = max(1 - math.floor(math.log10(error)), 0)
+    return f"{value:.{digits}f} ± {error:.{digits}f}"
 
 
 def _energy(erg: float) -> str:

@@ -195,9 +195,9 @@ def share_within(low_nm: float, high_nm: float, temperature_k: float) -> float:
 
 def _response(band: str) -> tuple[Float, Float]:
     """Wavelengths and response of a band, its highest one."""
-    found = find_band(band)
-    wavelength = np.linspace(found.wavelength_nm[0], found.wavelength_nm[-1], POINTS)
-    return wavelength, np.interp(wavelength, found.wavelength_nm, found.throughput / found.throughput.max())
+    bandpass = find_band(band)
+    wavelength = np.linspace(bandpass.wavelength_nm[0], bandpass.wavelength_nm[-1], POINTS)
+    return wavelength, np.interp(wavelength, bandpass.wavelength_nm, bandpass.throughput / bandpass.throughput.max())
 
 
 def _integral(wavelength_nm: Float, flux_flam: Float) -> float:

@@ -253,20 +253,20 @@ def coefficients(events: Sequence[Event], start_s: Float, frame_s: float, temper
     InputError
         If a flare has a temperature outside of them.
     """
-    found = np.zeros((start_s.size, temperatures_k.size))
+    factors = np.zeros((start_s.size, temperatures_k.size))
     for event in events:
         if isinstance(event.temperature, Cooling) and not event.temperature.steady:
-            _add_cooling(found, event, event.temperature, start_s, frame_s, temperatures_k)
+            _add_cooling(factors, event, event.temperature, start_s, frame_s, temperatures_k)
             continue
         edges = np.column_stack([start_s, start_s + frame_s])
         mean = event.amplitude * event.form.mean_over(edges, event.peak_s, event.half_width_s)
         for column, share in _mixed(np.array([event.hottest_k]), temperatures_k):
-            found[:, column] += float(share[0]) * mean
-    return found
+            factors[:, column] += float(share[0]) * mean
+    return factors
 
 
 def _add_cooling(
-    found: Float, event: Event, cooling: Cooling, start_s: Float, frame_s: float, temperatures_k: Float
+    factors: Float, event: Event, cooling: Cooling, start_s: Float, frame_s: float, temperatures_k: Float
 ) -> None:
     for part in range(PARTS):
         start = start_s + part * frame_s / PARTS
@@ -274,7 +274,7 @@ def _add_cooling(
         mean = event.amplitude / PARTS * event.form.mean_over(edges, event.peak_s, event.half_width_s)
         temperature = cooling.at(start + frame_s / PARTS / 2 - event.peak_s)
         for column, share in _mixed(temperature, temperatures_k):
-            found[:, column] += share * mean
+            factors[:, column] += share * mean
 
 
 def _mixed(temperature: Float, nodes: Float) -> list[tuple[int, Float]]:

@@ -212,13 +212,13 @@ class RateTable(Rates):
                 raise InputError(f"table of rates {shortened(path.name)}: {name} holds no plain numbers, expected them")
             columns.append(np.asarray(values, np.float64))
         energy, rate = columns
-        found = cls(energy_erg=energy, per_day=rate, band=band, source=path.name)
-        return replace(found, measured_erg=(float(energy[0]), float(energy[-1])))
+        rates = cls(energy_erg=energy, per_day=rate, band=band, source=path.name)
+        return replace(rates, measured_erg=(float(energy[0]), float(energy[-1])))
 
     def per_day_above(self, energy_erg: ArrayLike) -> Float:
         energy = np.asarray(energy_erg, np.float64)
-        found = 10.0 ** np.interp(np.log10(energy), np.log10(self.energy_erg), np.log10(self.per_day))
-        return np.asarray(np.where(energy > self.energy_erg[-1], 0.0, found))
+        rate = 10.0 ** np.interp(np.log10(energy), np.log10(self.energy_erg), np.log10(self.per_day))
+        return np.asarray(np.where(energy > self.energy_erg[-1], 0.0, rate))
 
     def times_energy(self, factor: float) -> Self:
         low, high = self.measured_erg
@@ -316,6 +316,11 @@ def fiducial2018(quiescent_si_iv_erg_s: float) -> PowerLaw:
 TYPICAL = {"G": (0.95, 1000.0), "K": (0.75, 1000.0), "M": (0.4, 1000.0)}
 
 
+#: Exponents for types of which no rate of a single star is to be had: Althukair & Tsiklauri 2023, "Main Sequence Star
+#: Super-flare Frequency based on Entire Kepler Data", abstract.
+EXPONENTS = {"A": "1.3", "F": "2.0 to 2.1"}
+
+
 def preset(name: str) -> PowerLaw:
     """By name: "G", "K" and "M" are Davenport's relation for a typical mass at 1 Gyr, "sunlike" an old, slow G dwarf.
 
@@ -331,5 +336,5 @@ def preset(name: str) -> PowerLaw:
     if name not in TYPICAL:
         raise InputError(f"preset of flare rates {shortened(name)}, expected {', '.join(TYPICAL)} or sunlike")
     mass, age = TYPICAL[name]
-    found = davenport2019(mass_msun=mass, age_myr=age)
-    return replace(found, source=f"{found.source} (typical of type {name}: assumption)")
+    rates = davenport2019(mass_msun=mass, age_myr=age)
+    return replace(rates, source=f"{rates.source} (typical of type {name}: assumption)")

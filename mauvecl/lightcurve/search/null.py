@@ -21,6 +21,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.statistics.intervals import CONFIDENCE, Interval, central_counts, clopper_pearson
 
 if TYPE_CHECKING:
+    from mauvecl.lightcurve.search.conditions import Conditions
     from mauvecl.lightcurve.search.search import Search
 
 Float = NDArray[np.float64]
@@ -34,6 +35,8 @@ LADDER = tuple(float(u) for u in np.arange(3.0, 8.01, STEP))
 DRAWS = 200
 #: Largest probability of an alarm in a stare that importance sampling is used for.
 MOST_LIKELY = 0.7
+#: Values at which rates are known between those of the ladder.
+FINE = 20_000
 #: Second half of the generator's key: draws of this null are no others.
 NULL_KEY = 0x6E756C6C
 #: Alarms that a counted threshold rests on at least.
@@ -151,6 +154,25 @@ class Sampled:
         # All thresholds share their draws, so that errors move together: none is gained by their number.
         inverse = np.linalg.pinv(columns)
         return inverse @ (logs / relative), inverse @ inverse.T
+
+    def under(self, conditions: Conditions) -> Sampled:
+        """The same where the noise is not what the search takes it for."""
+        if conditions.known:
+            return self
+        coefficients, _ = self._fit()
+        # The rate at any u, finely enough to be straight in between.
+        ends = self.thresholds[0] / conditions.scales.max(), self.thresholds[-1] / conditions.scales.min()
+        fine = np.linspace(*ends, FINE)
+        parabola = np.polynomial.polynomial.polyval(fine - self.thresholds[self._trusted].mean(), coefficients)
+        rates = np.exp(scipy.special.log_ndtr(-fine) + parabola)
+        probability, error = np.zeros((2, self.thresholds.size))
+        for k, threshold in enumerate(self.thresholds):
+            rate = np.interp(threshold / conditions.scales, fine, rates).mean(axis=1)
+            each = -np.expm1(-self.days * rate)
+            probability[k] = conditions.weights @ each
+            spread = np.sqrt(np.sum((conditions.weights * (each - probability[k])) ** 2))
+            error[k] = np.hypot(spread, probability[k] * self.error[k] / self.probability[k])
+        return Sampled(self.thresholds, probability, error, self.days)
 
     def log_rate(self, threshold: float) -> tuple[float, float]:
         """The logarithm of false alarms per star-day, and its standard error."""

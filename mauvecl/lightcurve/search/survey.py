@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.search.null import DAY_S
+from mauvecl.lightcurve.search.conditions import Conditions
+from mauvecl.lightcurve.search.null import DAY_S, Sampled, sampled
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.stares.requests import StaresRequest
 from mauvecl.lightcurve.stares.sums import method_for
@@ -27,6 +28,8 @@ Float = NDArray[np.float64]
 
 #: Share of a curve below which it is the others' sum.
 LEAST_CURVE = 1e-6
+#: Star-days of a stare that importance sampling looks at, at most.
+SAMPLED_DAYS = 2.0
 #: S/N over a window from which on what is neglected would raise false alarms.
 SEEN = 0.3
 
@@ -125,6 +128,10 @@ class Survey:
         return StaresRequest(
             self.components, self.stare, count, seed, method=method, cosmic_rays=cosmic_rays, reduction=largest
         )
+
+    def tail(self, seed: int) -> Sampled:
+        """The null by importance sampling, under what is unknown of the stare."""
+        return sampled(self.of_days(SAMPLED_DAYS).search, seed=seed).under(Conditions.of(self, seed))
 
     def of_days(self, days: float) -> Survey:
         """The same with the first star-days of the stare alone, where it is longer."""

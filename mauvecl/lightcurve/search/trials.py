@@ -97,7 +97,7 @@ class Trials:
             for p, one in enumerate(filters, len(filters)):
                 per_frame.append(1 / template.stride)
                 in_time.append(_around(one, [onsets[p - 1], onsets[p + 1]]))
-                near = [max((one.nearest(other) for other in row), key=lambda found: found[0])[1] for row in beside]
+                near = [max((one.nearest(other) for other in row), key=lambda pair: pair[0])[1] for row in beside]
                 in_width.append(_around(one, near))
         sums = [Filter(direction, 0) for direction in bank.directions]
         in_temperature = [_around(one, sums[max(k - 1, 0) : k] + sums[k + 1 : k + 2]) for k, one in enumerate(sums)]
@@ -125,8 +125,8 @@ def _filter(template: Template, shape: Float, powers: tuple[int, ...]) -> Filter
 
 
 def _around(one: Filter, near: list[Filter]) -> tuple[float, ...]:
-    found = [one @ other for other in near]
-    return (*found, near[0] @ near[1]) if len(near) == 2 else tuple(found)
+    alike = [one @ other for other in near]
+    return (*alike, near[0] @ near[1]) if len(near) == 2 else tuple(alike)
 
 
 def _least(z: Float, correlations: tuple[float, ...]) -> Float:

@@ -61,8 +61,8 @@ class Yield:
         nodes = stats.norm.ppf((np.arange(NODES) + 0.5) / NODES) if scatter_dex > 0 else np.zeros(1)
         means = expected * 10.0 ** (scatter_dex * nodes)
 
-        def quantile(share: float) -> int:
-            return smallest(lambda n: float(np.mean(stats.poisson.cdf(n, means))) >= share, float(means.max()))
+        def quantile(probability: float) -> int:
+            return smallest(lambda n: float(np.mean(stats.poisson.cdf(n, means))) >= probability, float(means.max()))
 
         return cls(expected, quantile(0.025), quantile(0.975), float(np.abs(np.expm1(-means)).mean()))
 
@@ -77,15 +77,15 @@ def smallest(reached: Callable[[int], bool], most: float) -> int:
 
 
 def recovered_per_day(rates: Rates, completeness: Completeness) -> float:
-    """Flares a day that are recovered: the rate in each small step of energy times the share there."""
+    """Flares a day that are recovered: the rate in each small step of energy times the completeness there."""
     if rates.band != completeness.band:
         raise InputError(f"rates in {rates.band!r} and completeness in {completeness.band!r}, expected one band")
     low, high = completeness.decades
     edges = 10 ** np.linspace(low, high, max(2, round((high - low) * PER_DECADE)))
     above = rates.per_day_above(edges)
-    share = completeness.at(np.sqrt(edges[1:] * edges[:-1]))
+    chance = completeness.at(np.sqrt(edges[1:] * edges[:-1]))
     # Beyond the table the last value holds.
-    return float(np.sum((above[:-1] - above[1:]) * share) + above[-1] * completeness.probability[-1])
+    return float(np.sum((above[:-1] - above[1:]) * chance) + above[-1] * completeness.probability[-1])
 
 
 def _checked(days: float) -> float:
@@ -148,37 +148,37 @@ def fit_power_law(
     InputError
         For fewer than 3 flares, energies that cannot be, or no time.
     """
-    found = np.log10(np.asarray(energy_erg, np.float64))
-    if found.size < 3 or not np.isfinite(found).all():
-        raise InputError(f"{found.size} recovered flares, expected at least 3 with energies above 0")
+    logs = np.log10(np.asarray(energy_erg, np.float64))
+    if logs.size < 3 or not np.isfinite(logs).all():
+        raise InputError(f"{logs.size} recovered flares, expected at least 3 with energies above 0")
     if _checked(days) == 0:
         raise InputError("days = 0, expected a time that was observed")
-    pivot = float(np.median(found))
+    pivot = float(np.median(logs))
     x = np.linspace(*completeness.decades, GRID)
     step = float(x[1] - x[0])
-    share = completeness.at(10**x)
-    recovered = found - bias_dex
+    chance = completeness.at(10**x)
+    recovered = logs - bias_dex
     # Where nothing is recovered nothing is to be known of the density, which may be huge there.
-    used = share > 0
-    x, share = x[used], share[used]
+    used = chance > 0
+    x, chance = x[used], chance[used]
     blur = None
     if error_dex > 0:
         blur = stats.norm.pdf(recovered[:, None], x, error_dex) * step
 
     def seen(alpha: float) -> Float:
         """Recovered flares a day and dex of true energy, for a rate of one above the pivot."""
-        return np.asarray((alpha - 1) * np.log(10) * 10 ** ((1 - alpha) * (x - pivot)) * share)
+        return np.asarray((alpha - 1) * np.log(10) * 10 ** ((1 - alpha) * (x - pivot)) * chance)
 
     def cost(alpha: float, log10_rate: float | None = None) -> float:
         """Minus the logarithm of the likelihood; at the best rate for the exponent unless one is given."""
         flares = seen(alpha)
         at = np.interp(recovered, x, flares) if blur is None else blur @ flares
         mean = days * step * flares.sum()
-        rate = found.size / mean if log10_rate is None else 10**log10_rate
-        return float(mean * rate - np.sum(np.log(np.maximum(at, 1e-300))) - found.size * np.log(rate * days))
+        rate = logs.size / mean if log10_rate is None else 10**log10_rate
+        return float(mean * rate - np.sum(np.log(np.maximum(at, 1e-300))) - logs.size * np.log(rate * days))
 
     alpha = float(optimize.minimize_scalar(cost, bounds=EXPONENTS, method="bounded", options={"xatol": 1e-7}).x)
-    log10_rate = float(np.log10(found.size / (days * step * seen(alpha).sum())))
+    log10_rate = float(np.log10(logs.size / (days * step * seen(alpha).sum())))
     covariance = np.linalg.inv(_curvature(lambda one: cost(one[0], one[1]), np.array([alpha, log10_rate])))
     return Fitted(
         alpha=alpha,
@@ -186,19 +186,19 @@ def fit_power_law(
         log10_rate=log10_rate,
         log10_rate_sd=float(np.sqrt(covariance[1, 1])),
         pivot_erg=10**pivot,
-        flares=int(found.size),
+        flares=int(logs.size),
     )
 
 
 def _curvature(cost: Callable[[Float], float], at: Float) -> Float:
     """Second derivatives by central differences, (2, 2)."""
     h = 1e-3
-    found = np.empty((2, 2))
+    second = np.empty((2, 2))
     steps = h * np.eye(2)
     for i in range(2):
         for j in range(2):
-            found[i, j] = (
+            second[i, j] = (
                 cost(at + steps[i] + steps[j]) - cost(at + steps[i] - steps[j])
                 - cost(at - steps[i] + steps[j]) + cost(at - steps[i] - steps[j])
             ) / (4 * h * h)  # fmt: skip
-    return found
+    return second

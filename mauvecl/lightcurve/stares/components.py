@@ -137,10 +137,10 @@ class Components:
         constant, each = self.pixel_cumulants(order)
         rows = np.vstack([constant, each])
         letters = "ijklm"[:order]
-        found = np.einsum(
+        sums = np.einsum(
             ",".join(f"{a}p" for a in letters) + f",cp->c{letters}", *[self.weights] * order, rows, optimize=True
         )
-        return found[0], found[1:]
+        return sums[0], sums[1:]
 
     @cached_property
     def _sums(self) -> dict[int, tuple[Float, Float]]:
@@ -160,16 +160,16 @@ class Components:
         ndarray, shape (n_frame, 3 + n_flare)
             Coefficients of star, sky, dark and flares.
         """
-        found = np.zeros((stare.n_frames, len(STEADY) + self.n_flares))
-        found[:, 0], found[:, 1] = stare.light * stare.star, stare.light * stare.sky
-        found[:, 2] = stare.dark_factor(self.quiet)
+        factors = np.zeros((stare.n_frames, len(STEADY) + self.n_flares))
+        factors[:, 0], factors[:, 1] = stare.light * stare.star, stare.light * stare.sky
+        factors[:, 2] = stare.dark_factor(self.quiet)
         if flare is not None:
             if np.shape(flare) != (stare.n_frames, self.n_flares):
                 raise InputError(
                     f"flare coefficients have the shape {np.shape(flare)}, expected {(stare.n_frames, self.n_flares)}"
                 )
-            found[:, 3:] = stare.light[:, None] * flare
-        return found
+            factors[:, 3:] = stare.light[:, None] * flare
+        return factors
 
     def means(self, coefficients: Float) -> Float:
         """Mean statistics of frames: (..., 3 + n_flare) to (..., n_statistic)."""

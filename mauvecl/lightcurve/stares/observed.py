@@ -70,13 +70,13 @@ class Staring:
         """`SATURATED` where the mean of a used pixel reaches saturation in a frame, 0 elsewhere, shape (n_frame,)."""
         rise = self._bare.mean_dn[:, self.used]
         room = self.quiet.ceiling_dn - self.quiet.bias_dn[self.used]
-        found = np.zeros(self.stare.n_frames, np.int32)
+        quality = np.zeros(self.stare.n_frames, np.int32)
         # Most stars are far from it: each component's brightest pixel together is more than any pixel has.
         near = np.flatnonzero(self.coefficients @ rise.max(axis=1) >= room.min())
         for begin in range(0, near.size, BLOCK):
             rows = near[begin : begin + BLOCK]
-            found[rows] = SATURATED * (self.coefficients[rows] @ rise >= room).any(axis=1)
-        return found
+            quality[rows] = SATURATED * (self.coefficients[rows] @ rise >= room).any(axis=1)
+        return quality
 
     def snr(self, flare: Float) -> float:
         """S/N of a flare for one who knows all but whether it is there: frames and pixels weighted by its own shape.

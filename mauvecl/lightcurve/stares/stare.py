@@ -299,11 +299,11 @@ def _unknowns(
     middle = (start[0] + start[-1] + frame_s) / 2
     hours = (start + frame_s / 2 - middle) / HOUR_S
     sine, cosine = (Sinusoid(1.0, orbit_s, phase).mean_over(start, frame_s) for phase in (0.0, np.pi / 2))
-    found = [StareUnknown(f"{of} offset", of, sd, np.ones(start.size)) for of, sd in offsets.items()]
-    found += [StareUnknown(f"{of} drift", of, sd, hours) for of, sd in drifts.items()]
+    unknowns = [StareUnknown(f"{of} offset", of, sd, np.ones(start.size)) for of, sd in offsets.items()]
+    unknowns += [StareUnknown(f"{of} drift", of, sd, hours) for of, sd in drifts.items()]
     for of, sd in cycles.items():
-        found += [StareUnknown(f"{of} sine", of, sd, sine), StareUnknown(f"{of} cosine", of, sd, cosine)]
-    return tuple(found)
+        unknowns += [StareUnknown(f"{of} sine", of, sd, sine), StareUnknown(f"{of} cosine", of, sd, cosine)]
+    return tuple(unknowns)
 
 
 def _kept(values: Float) -> Float:

@@ -144,13 +144,13 @@ def _over_sd(components: Components) -> list[Float]:
     x, w = components.quiet, components.weights
     photons, dark = components.mean_dn[:2].sum(axis=0), components.mean_dn[2]
     sd = np.sqrt(np.sum(w**2 * (x.unsaturated_variance_dn2), axis=1))
-    found = []
+    cumulants = []
     for order in range(3, 8):
         cumulant = x.dark_step_dn ** (order - 1) * dark
         if x.photon_noise == "poisson":
             cumulant = cumulant + x.gain_dn_per_electron ** (order - 1) * photons
-        found.append(np.sum(w**order * cumulant, axis=1) / sd**order)
-    return found
+        cumulants.append(np.sum(w**order * cumulant, axis=1) / sd**order)
+    return cumulants
 
 
 def _fourths_are_needed(components: Components) -> bool:

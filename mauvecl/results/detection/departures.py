@@ -16,7 +16,7 @@ from mauvecl.noise.cumulants import Cumulants
 from mauvecl.results.requests.fap import countable
 from mauvecl.statistics.distributions import Form
 from mauvecl.statistics.intervals import Interval
-from mauvecl.statistics.statistic import LinearStatistic, QuadraticStatistic
+from mauvecl.statistics.statistic import Differences, LinearStatistic, QuadraticStatistic
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -224,8 +224,8 @@ def _moved(detection: Detection, statistic: str, template: int, shift: Float, va
     """False-alarm probability at a threshold if the exposure's counts had another mean and variance, per pixel."""
     one, used = detection.statistic(statistic), detection.scene.used
     added = one.added_variance(detection.setting)
-    delta, true = np.where(used, (1.0 - (added > 0)) * shift, 0.0), (1.0 + added) * variance
-    return one.as_drawn(detection.setting, detection.quiet, delta, true, detection.shape(statistic, template)).sf(cut)
+    moved = Differences(np.where(used, (1.0 - (added > 0)) * shift, 0.0), (1.0 + added) * variance)
+    return one.as_drawn(detection.setting, detection.quiet, moved, detection.shape(statistic, template)).sf(cut)
 
 
 def _digital(x: Expectation) -> tuple[tuple[Float, Float], tuple[Float, Float]]:

@@ -215,7 +215,7 @@ class Detection(ByContent, Hypotheses):
     def plot(self, path: str | Path | None = None, *, fap: float = 1e-3, ax: Any = None) -> object:
         """Null and flare distributions by every statistic, with thresholds; needs matplotlib."""
         flares = [f"flare {k + 1}" for k in range(len(self.flares))]
-        return picture("answers.detection", [(self.quiet.name, self, flares)], fap, path, ax=ax)
+        return picture("answers.detection", [(self.quiet.name, self, flares)], fap, path=path, ax=ax)
 
     def table(self, fap: float = 1e-3) -> QTable:
         """One row per flare and statistic: expected and simulated values, threshold and probability.

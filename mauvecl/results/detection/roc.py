@@ -76,7 +76,7 @@ class Roc:
 
     def plot(self, path: str | Path | None = None, *, name: str = "", ax: Any = None) -> object:
         """Detection probability against false-alarm probability; needs matplotlib."""
-        return picture("answers.roc", [(name, self)], path, ax=ax)
+        return picture("answers.roc", [(name, self)], path=path, ax=ax)
 
     def table(self, rows: int = 200) -> QTable:
         """Some rows of the curve, both probabilities with their Clopper-Pearson intervals; the area in the meta data.

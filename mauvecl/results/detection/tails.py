@@ -20,6 +20,7 @@ from mauvecl.noise import layout
 from mauvecl.noise.drawn import at_score
 from mauvecl.statistics.distributions import Form, Mixture, QuadraticForm
 from mauvecl.statistics.intervals import CONFIDENCE, Interval
+from mauvecl.statistics.statistic import Differences
 
 if TYPE_CHECKING:
     from mauvecl.noise.scene import Scene
@@ -161,12 +162,9 @@ class _Tilt:
         """Such that alarms of this probability are common."""
         one, setting, flare = detection.statistic(statistic), detection.setting, detection.shape(statistic, template)
         tilt = one.tilt(setting, flare)
-        nothing = np.zeros(setting.used.size)
+        nothing = Differences(np.zeros(setting.used.size), one.variance(setting), setting.comparison.estimated)
         # What is marginalised over and not drawn does not scatter.
-        estimated = setting.comparison.estimated
-        null = one.as_drawn(
-            setting, detection.quiet, nothing, one.variance(setting), flare, estimated=estimated, priors=False
-        )
+        null = one.as_drawn(setting, detection.quiet, nothing, flare, priors=False)
         goal = null.isf(fap)
         parts, chance, scores = null.parts if isinstance(null, Mixture) else (null,), np.ones(1), {}
         if isinstance(null, Mixture):
