@@ -199,5 +199,5 @@ def test_a_size_that_a_star_has_not_is_told_before_any_is_searched(monkeypatch, 
     near = SMALL["star"][0]
     asked = study(star=[near, {**near, "distance_pc": None}], injections={"of": "energy"})
     monkeypatch.setattr("mauvecl.answers.stares.inject.surveyed", lambda *_: pytest.fail("searched"))
-    with pytest.raises(InputError, match="injections.of = 'energy' at G2V of unknown size"):
+    with pytest.raises(InputError, match=r"injections\.of = 'energy' at G2V of unknown size"):
         inject(asked, stares)
