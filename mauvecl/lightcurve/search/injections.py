@@ -358,9 +358,9 @@ def _multiple(values: Single, step: float) -> Single:
 def _combined(rows: Float, values: Float) -> Single:
     """Sums over the first axis of values (n_sum, n_draw, n_filter), one after the other, (n_row, n_draw, n_filter)."""
     small = values.astype(np.float32)
-    found = np.empty((len(rows), *values.shape[1:]), np.float32)
-    for row, out in zip(rows.astype(np.float32), found, strict=True):
+    combined = np.empty((len(rows), *values.shape[1:]), np.float32)
+    for row, out in zip(rows.astype(np.float32), combined, strict=True):
         np.multiply(row[0], small[0], out=out)
         for weight, value in zip(row[1:], small[1:], strict=True):
             out += weight * value
-    return found
+    return combined
