@@ -40,6 +40,16 @@ def study_of(
     return changed.with_settings(given["set"]) if given["set"] else changed
 
 
+def holds_study(file: Path) -> bool:
+    """Whether a file is no mere table: CSV is one, and ECSV that no answer wrote."""
+    suffix = file.suffix.lower()
+    if suffix != ".ecsv" or not file.is_file():
+        return suffix != ".csv"
+    from mauvecl.host.files.ecsv import read_ecsv
+
+    return "study" in read_ecsv(file, "table", "a table of targets, or of an answer").meta
+
+
 def sky_of(given: dict[str, Any]) -> dict[str, Any]:
     from mauvecl.host.errors import InputError
 
