@@ -41,7 +41,7 @@ from mauvecl.statistics.registry import STATISTICS
 from mauvecl.study.study import Study
 from mauvecl.web import closed as closed_forms
 from mauvecl.web import doors, server, visitor
-from mauvecl.web.asked import SIMULATED
+from mauvecl.web.asked import SIMULATED, planned
 from mauvecl.web.closed import Closed, percent
 from mauvecl.web.downloads import as_command, as_python
 from mauvecl.web.fields import FIELDS, PRESETS, UPLOADED_UNKNOWN, star_names, star_words
@@ -113,6 +113,15 @@ def test_a_target_to_see_is_a_name_or_coordinates(text: str) -> None:
     for wrong in ("no such star", "400 95", "12,5 3"):
         state.enter({"see": wrong})
         assert "expected a name such as eps Eri" in state.faults["see"], wrong
+
+
+def test_a_plan_needs_a_target_that_is_known() -> None:
+    state = State()
+    state.enter({"see": "12 34", "hours": "50"})
+    study = state.question().study()
+    assert study.plan.hours == 50.0
+    with pytest.raises(InputError, match="neither type nor magnitude nor distance of '12 34' are known, expected"):
+        planned(study)
 
 
 def test_target_and_time_are_asked_for_where_the_sky_is_theirs() -> None:

@@ -90,8 +90,8 @@ def _map(kept: _Kept) -> tuple[Float, Float, Float]:
     """Magnitudes, logarithms of amplitudes in per cent, and probabilities.
 
     Interpolated is what makes them, in standard deviations without a flare: the flare's part of the statistic and its
-    spread, both as logarithms, the threshold, the skewness. A gamma distribution of these moments (Pearson's type III) is
-    within 0.05 of the closed forms where they are steepest.
+    spread, both as logarithms, the threshold, the skewness. A gamma distribution of these moments (Pearson's type III)
+    is within 0.05 of the closed forms where they are steepest.
     """
     (columns, rows), (low, high) = STEPS, np.log10(PERCENTS)
     x, y = np.linspace(*MAGNITUDES, columns), np.linspace(low, high, rows)
