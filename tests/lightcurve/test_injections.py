@@ -219,6 +219,7 @@ def test_sums_hold_what_the_values_say(injections, stares):
     assert np.abs(rows[:, :, 0] - value).max() < 2e-3
 
 
+@pytest.mark.long
 def test_flares_are_those_that_the_engine_draws(injections, stares):
     """Values of templates against frames with the flare in every pixel, on the same stares: means and variances.
 
@@ -244,6 +245,22 @@ def test_flares_are_those_that_the_engine_draws(injections, stares):
         assert abs(x.mean() - y.mean()) < 4 * np.sqrt((x.var() + y.var()) / 400)
         assert abs(np.log(x.var() / y.var())) < 4 * np.sqrt(2 * 2 / 400)
         assert x.var() > 1.5 * a[1, :, best].var()
+
+
+def test_sums_over_frames_are_exact(injections, stares):
+    """In float64 nothing is rounded, so that no processor's order of adding them up shows in what is found."""
+    injecting, drawn = drawn_at(injections, stares, 30)
+    for place in injecting.places:
+        filters = place.filters.T.astype(np.float64)
+        values = drawn.noise[:, :, place.frames].astype(np.float64)
+        forth, back = values @ filters, values[:, :, ::-1] @ filters[::-1]
+        assert len(filters) > 50
+        np.testing.assert_array_equal(forth, back)
+        rounded = (
+            values.astype(np.float32) @ place.filters.T,
+            values.astype(np.float32)[:, :, ::-1] @ place.filters.T[::-1],
+        )
+        assert (rounded[0] != rounded[1]).any()
 
 
 @pytest.mark.long
