@@ -247,6 +247,22 @@ def test_flares_are_those_that_the_engine_draws(injections, stares):
         assert x.var() > 1.5 * a[1, :, best].var()
 
 
+def test_sums_over_frames_are_exact(injections, stares):
+    """In float64 nothing is rounded, so that no processor's order of adding them up shows in what is found."""
+    injecting, drawn = drawn_at(injections, stares, 30)
+    for place in injecting.places:
+        filters = place.filters.T.astype(np.float64)
+        values = drawn.noise[:, :, place.frames].astype(np.float64)
+        forth, back = values @ filters, values[:, :, ::-1] @ filters[::-1]
+        assert len(filters) > 50
+        np.testing.assert_array_equal(forth, back)
+        rounded = (
+            values.astype(np.float32) @ place.filters.T,
+            values.astype(np.float32)[:, :, ::-1] @ place.filters.T[::-1],
+        )
+        assert (rounded[0] != rounded[1]).any()
+
+
 @pytest.mark.long
 @pytest.mark.parametrize(("half_width", "snr"), [(30.0, 30.0), (200.0, 30.0)])
 def test_recovered_flares(half_width, snr):

@@ -32,9 +32,11 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 Single = NDArray[np.float32]
 
-#: Stares that are looked at at once, each in the row that its number gives it: in another row a product of matrices may
-#: round otherwise.
+#: Stares that are looked at at once.
 BLOCK = 64
+#: Frames, and the mean of a flare, are multiples of these where filters weigh them, and filters of `places.STEP`: few
+#: enough bits for sums that are exact in float64, and so the same on every machine.
+NOISE_STEP, MEAN_STEP = 2.0**-11, 2.0**-20
 #: Second half of the key of the generator that places peaks.
 INJECT_KEY = 0x696E6A65
 #: Stares of one peak are numbered from the next multiple of this on: no others have these draws.
@@ -220,47 +222,42 @@ class Injecting:
         Infinite if no template fits into what is observed; zero where there is an alarm without it.
         """
         critical = np.full((len(values), len(self.places)), np.inf, np.float32)
-        for begin in range(-(first % BLOCK), len(values), BLOCK):
-            part = slice(max(begin, 0), begin + BLOCK)
-            drawn = self.drawn(values[part], glow[part], part.start - begin, BLOCK)
+        for begin in range(0, len(values), BLOCK):
+            part = slice(begin, begin + BLOCK)
+            drawn = self.drawn(values[part], glow[part])
             for column, place in zip(critical[part].T, self.places, strict=True):
                 if len(place.filters):
-                    column[:] = self._critical(place, self.values(place, drawn))[drawn.rows]
-        found: dict[str, NDArray[Any]] = {"critical": critical}
+                    column[:] = self._critical(place, self.values(place, drawn))
+        kept: dict[str, NDArray[Any]] = {"critical": critical}
         if self.refit is not None:
             # One stare at a time: a fit knows nothing of what is fitted beside it.
             these = range(min(len(values), max(0, self.start + self.refit.count - first)))
             each = [self._fitted(self.drawn(values[k : k + 1], glow[k : k + 1]), self.refit) for k in these]
             none = np.zeros((0, *self.refit.amplitudes.shape), np.float32)
-            found |= {name: np.array([one[name] for one in each]) if each else none for name in KEPT}
-        return found
+            kept |= {name: np.array([one[name] for one in each]) if each else none for name in KEPT}
+        return kept
 
-    def drawn(self, values: Single, glow: Single, row: int = 0, block: int = 0) -> Drawn:
-        """A few stares, from a row of a block on that is filled up with zeros."""
-        n, n_frame, n_sum = values.shape
-        rows, block = slice(row, row + n), max(block, row + n)
-        noise, own = np.zeros((2, n_sum, block, n_frame), np.float32)
-        np.subtract(np.moveaxis(values, 2, 0), self.known.T[:, None], out=noise[:, rows])
-        own[:, rows] = np.moveaxis(glow[:, :, :n_sum], 2, 0)
-        if not glow[:, :, n_sum].any():
-            return Drawn(rows, noise, own, None)
-        light = np.zeros((block, n_frame), np.float32)
-        light[rows] = glow[:, :, n_sum]
-        return Drawn(rows, noise, own, light)
+    def drawn(self, values: Single, glow: Single) -> Drawn:
+        """A few stares."""
+        n_sum = values.shape[2]
+        noise = np.moveaxis(values, 2, 0) - self.known.T[:, None]
+        own, light = np.ascontiguousarray(np.moveaxis(glow[:, :, :n_sum], 2, 0)), glow[:, :, n_sum]
+        return Drawn(_multiple(noise, NOISE_STEP), own, light if light.any() else None)
 
     def values(self, place: Place, drawn: Drawn) -> tuple[Single, Single, Single]:
         """a, b and c of the module's formula, shapes (n_temperature, n_draw or 1, n_filter)."""
-        filters, here = place.filters.T, place.frames
-        noise = _combined(self.directions, drawn.noise[:, :, here] @ filters)
-        along = (self.directions @ self.response).astype(np.float32)
-        mean = place.mean if drawn.light is None else place.mean * (1 + drawn.light[:, here])
-        rise = along[:, None, None] * (np.atleast_2d(mean) @ filters)[None]
+        filters, here = place.filters.T.astype(np.float64), place.frames
+        mean = np.atleast_2d(place.mean if drawn.light is None else place.mean * (1 + drawn.light[:, here]))
         start, width = self.start_s[here], place.half_width_s
         shining = (start > place.peak_s - width - self.frame_s) & (start < place.peak_s + GLOW * width)
         ends = np.flatnonzero(shining)[[0, -1]] if shining.any() else np.array([0, -1])
         lit = slice(int(ends[0]), int(ends[1]) + 1)
         own = drawn.own[:, :, here][:, :, lit] * np.sqrt(np.maximum(place.mean[lit], 0))
-        return noise, rise, _combined(self.directions @ self.photons, own @ filters[lit])
+        return (
+            _combined(self.directions, drawn.noise[:, :, here].astype(np.float64) @ filters),
+            _combined((self.directions @ self.response)[:, None], (_multiple(mean, MEAN_STEP) @ filters)[None]),
+            _combined(self.directions @ self.photons, _multiple(own, NOISE_STEP) @ filters[lit]),
+        )
 
     def best(self, place: Place, drawn: Drawn, amplitudes: Float) -> tuple[Float, NDArray[np.int64], NDArray[np.int64]]:
         """The largest value among the templates that count, and which: arrays (n_amplitude, n_draw).
@@ -339,8 +336,6 @@ class Drawn:
 
     Attributes
     ----------
-    rows : slice
-        Those that are stares; others are zero.
     noise : ndarray of float32, shape (n_sum, n_draw, n_frame)
         The sums without a flare, less what is known of them.
     own : ndarray of float32, shape (n_sum, n_draw, n_frame)
@@ -349,13 +344,23 @@ class Drawn:
         Relative change of all light, where there is any.
     """
 
-    rows: slice
     noise: Single
     own: Single
     light: Single | None
 
 
-def _combined(rows: Float, values: Single) -> Single:
-    """Sums over the first axis of values (n_sum, n_draw, n_filter), shape (n_row, n_draw, n_filter)."""
-    flat = values.reshape(values.shape[0], -1)
-    return np.asarray((rows.astype(np.float32) @ flat).reshape(len(rows), *values.shape[1:]))
+def _multiple(values: Single, step: float) -> Single:
+    """The nearest multiples of a power of two."""
+    values = values * np.float32(1 / step)
+    return np.asarray(np.rint(values, out=values) * np.float32(step))
+
+
+def _combined(rows: Float, values: Float) -> Single:
+    """Sums over the first axis of values (n_sum, n_draw, n_filter), one after the other, (n_row, n_draw, n_filter)."""
+    small = values.astype(np.float32)
+    found = np.empty((len(rows), *values.shape[1:]), np.float32)
+    for row, out in zip(rows.astype(np.float32), found, strict=True):
+        np.multiply(row[0], small[0], out=out)
+        for weight, value in zip(row[1:], small[1:], strict=True):
+            out += weight * value
+    return found

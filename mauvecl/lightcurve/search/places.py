@@ -19,6 +19,8 @@ Single = NDArray[np.float32]
 
 #: A template counts as finding a flare if it finds this share of the S/N that the best one does.
 OVERLAP = 0.3
+#: Filters are multiples of this.
+STEP = 2.0**-18
 #: Half-widths by which templates may differ from a flare's, and templates before and after its peak that are tried.
 WIDEST, BEFORE, AFTER = 10.0, 3.0, 5.0
 
@@ -99,7 +101,8 @@ def place_of(survey: Survey, width_s: float, peak_s: float, response: Float) -> 
     values = np.array([v for *_, v in chosen]).reshape(len(chosen), len(bank.directions))
     counts = values >= OVERLAP * values.max() if len(chosen) else values > 0
     kept = np.flatnonzero(counts.any(axis=1))
-    filters = np.array([search.in_time(*chosen[k][:2]) for k in kept], np.float32).reshape(len(kept), start.size)
+    filters = np.array([search.in_time(*chosen[k][:2]) for k in kept]).reshape(len(kept), start.size)
+    filters = (np.rint(filters / STEP) * STEP).astype(np.float32)
     used = np.flatnonzero(filters.any(axis=0))
     ends = slice(int(used[0]), int(used[-1]) + 1) if used.size else slice(0, 0)
     return Place(

@@ -173,9 +173,9 @@ class Search:
         shape = row.template.shapes[row.phase][at]
         for (power, series), amplitude in zip(self._terms, row.project[:, onset], strict=True):
             shape = shape - amplitude * row.template.time[at] ** power * self._series[series][self._at[inside]]
-        found = np.zeros(self.stare.n_frames)
-        found[inside] = shape * self._weight[self._at[inside]] / row.per_amplitude[onset]
-        return found
+        template = np.zeros(self.stare.n_frames)
+        template[inside] = shape * self._weight[self._at[inside]] / row.per_amplitude[onset]
+        return template
 
     @property
     def variance(self) -> Float:
@@ -218,13 +218,13 @@ class Search:
             for row in self.grid:
                 if row.template is not template:
                     continue
-                found = self._correlated(spectra[0], template.shapes[row.phase], template)
+                correlated = self._correlated(spectra[0], template.shapes[row.phase], template)
                 for projected, term in zip(row.project.astype(np.float32), known, strict=True):
-                    found -= projected * term
+                    correlated -= projected * term
                 tried = row.per_amplitude > 0
                 scale = np.divide(1.0, row.per_amplitude, out=np.zeros_like(row.per_amplitude), where=tried)
-                found *= scale.astype(np.float32)
-                rho = np.einsum("tk,skn->stn", directions, found, optimize=True)
+                correlated *= scale.astype(np.float32)
+                rho = np.einsum("tk,skn->stn", directions, correlated, optimize=True)
                 if not tried.all():
                     rho[:, :, ~tried] = -np.inf
                 yield row, rho
@@ -262,8 +262,8 @@ class Search:
         held = np.zeros(self._size, real)
         held[: kernel.size] = kernel
         other = np.conj(scipy.fft.rfft(np.roll(held, template.first)))
-        found: NDArray[Any] = scipy.fft.irfft(spectrum * other, self._size)
-        return found[..., self._start(template) : self.n_grid : template.stride]
+        values: NDArray[Any] = scipy.fft.irfft(spectrum * other, self._size)
+        return values[..., self._start(template) : self.n_grid : template.stride]
 
     def _start(self, template: Template) -> int:
         return -self._first % template.stride
@@ -294,9 +294,9 @@ class Search:
             left = power
             if n:
                 shared = np.stack([over(0, a, shape * time**p) for p, a in self._terms], axis=1)
-                found = np.linalg.solve(scaled, (shared / size)[:, :, None])[:, :, 0] / size
-                project = found.T
-                left = power - 2 * np.sum(found * shared, 1) + np.einsum("ni,nij,nj->n", found, gram, found)
+                solved = np.linalg.solve(scaled, (shared / size)[:, :, None])[:, :, 0] / size
+                project = solved.T
+                left = power - 2 * np.sum(solved * shared, 1) + np.einsum("ni,nij,nj->n", solved, gram, solved)
             tried = left >= LEAST_SHARE * self._without_gaps(template, phase)
             yield Row(template, phase, peaks, np.sqrt(np.where(tried, left, 0.0)), project)
 

@@ -33,6 +33,10 @@ FIRST, HALVINGS, CHANGE = 9, 5, 0.25
 FARTHEST = 6.0
 
 
+#: What a map does not depend on; an upload goes by its content.
+FREE = {"magnitude", "amplitude_percent", "realisations", "seed", "see", "hours", "uploaded"}
+
+
 def odds(closed: Closed, magnitude: float, rises: Float) -> list[Odds]:
     """`Closed.at` a magnitude."""
     return closed.at(10 ** (-0.4 * (magnitude - closed.question.magnitude)), rises)
@@ -40,12 +44,9 @@ def odds(closed: Closed, magnitude: float, rises: Float) -> list[Odds]:
 
 def _key(closed: Closed) -> tuple[Any, ...]:
     """Everything that a map depends on but for its own two axes."""
-    q = closed.question
-    star = q.star if q.uploaded is None else q.uploaded.digest
-    return (
-        star, q.band, q.exposure_s, q.temperature_c, q.instrument, q.sky, q.sky_brightness, q.target, q.time,
-        q.flare_temperature_k, q.statistic, q.fap, q.unknown, q.own_unknown,
-    )  # fmt: skip
+    asked = vars(closed.question).items()
+    uploaded = closed.question.uploaded
+    return (*(value for name, value in asked if name not in FREE), None if uploaded is None else uploaded.digest)
 
 
 class _Kept:
