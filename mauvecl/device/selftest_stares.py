@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mauvecl.device.engine import Engine
 from mauvecl.device.program import SAME_BITS
@@ -13,6 +15,7 @@ from mauvecl.device.selftest import COUNT, SEED, START, Check, toy
 from mauvecl.device.stares import Stares
 from mauvecl.lightcurve.stares import twin
 from mauvecl.lightcurve.stares.components import Components
+from mauvecl.lightcurve.stares.requests import Arrays, StaresRequest
 from mauvecl.lightcurve.stares.scene import Flares, StareScene
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.noise.processes import CosmicRays
@@ -48,3 +51,20 @@ def stares(engine: Engine) -> Iterator[Check]:
             else:
                 passed, text = apart < 0.2, f"weaker promise: {apart:.2g} sigma apart"
             yield Check(f"same bits as the NumPy twin: {name}, by {method}", passed, text)
+        asked = StaresRequest(components, stare, COUNT, SEED, start=START, reduction=Glow(), glow=True)
+        ours = Stares(engine.opened).reduced(asked)["glow"]
+        theirs = twin.glow(StareScene.of(components, stare), index, frames, SEED)
+        apart = float(np.abs(ours - theirs).max())
+        passed = bool((ours == theirs).all()) if engine.device.promise == SAME_BITS else apart < 0.2
+        yield Check(f"same bits as the NumPy twin: {name}, what flares need", passed, f"{apart:.2g} apart")
+
+
+@dataclass(frozen=True)
+class Glow:
+    """What flares need beside frames, as it is."""
+
+    adds: ClassVar[bool] = False
+
+    def __call__(self, values: NDArray[np.float32], first: int, glow: NDArray[np.float32]) -> Arrays:
+        """As ``glow``."""
+        return {"glow": glow.copy()}

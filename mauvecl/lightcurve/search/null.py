@@ -247,7 +247,7 @@ def sampled(search: Search, *, seed: int, draws: int = DRAWS) -> Sampled:
         raise InputError("no template of the bank fits into the stare, expected a longer one")
     ladder = np.array(LADDER)
     n_direction, spread = len(search.bank.directions), np.sqrt(search.variance)[:, None]
-    shares = np.zeros((draws, ladder.size))
+    one_in = np.zeros((draws, ladder.size))
     for draw in range(draws):
         which = int(rng.choice(len(rows), p=sizes / sizes.sum()))
         onset, direction = int(rng.choice(tried[which])), int(rng.integers(n_direction))
@@ -266,9 +266,9 @@ def sampled(search: Search, *, seed: int, draws: int = DRAWS) -> Sampled:
             base, rise = base[near], rise[near]
             exceeding += [np.count_nonzero(base + (v - value) * rise > u) for v, u in zip(wanted, ladder, strict=True)]
         # Its own template exceeds for certain, whatever rounding says.
-        shares[draw] = 1.0 / np.maximum(exceeding, 1)
+        one_in[draw] = 1.0 / np.maximum(exceeding, 1)
     scale = sizes.sum() * n_direction * scipy.special.ndtr(-ladder)
     return Sampled(
-        ladder, scale * shares.mean(axis=0), scale * shares.std(axis=0, ddof=1) / np.sqrt(draws),
+        ladder, scale * one_in.mean(axis=0), scale * one_in.std(axis=0, ddof=1) / np.sqrt(draws),
         search.stare.observed_s / DAY_S,
     )  # fmt: skip
