@@ -13,7 +13,7 @@ from mauvecl.device.opened import Device
 from mauvecl.device.program import DeviceError, DeviceRecord, devices
 from mauvecl.device.stares import Stares
 from mauvecl.device.tiles import Progress, Tile, Tiles
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.stares.requests import StaresRequest
 from mauvecl.noise.comparison import NOISE_FREE, Comparison

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
 from mauvecl.device.stares import Stares
 from mauvecl.device.tiles import Progress
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import count as whole
 from mauvecl.lightcurve.stares.requests import StaresRequest, StareSums

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.campaigns.calendars import Entry, calendar_bytes
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.host.orbit.bodies import Bodies
 from mauvecl.host.orbit.moments import DAY_S, Moments
 from mauvecl.host.orbit.names import Target

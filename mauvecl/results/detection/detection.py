@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.arguments import public
 from mauvecl.host.content import ByContent
-from mauvecl.host.doors import public
 from mauvecl.host.plotting import picture
 from mauvecl.host.quantities import count
 from mauvecl.host.tables import tabled, telling
