@@ -20,8 +20,9 @@ unexport PYTHONDONTWRITEBYTECODE
 demo: .venv/plot.stamp
 	$(BIN)/mauvecl detect --output demo
 
-# A file's tests stay in one process, which makes its fixtures and builds its kernels once.
-PYTEST := $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder
+# A file's tests stay in one process, which makes its fixtures and builds its kernels once. There are as many processes
+# as cores and more: threads of OpenBLAS would only wait for each other.
+PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder
 
 test: .venv/test.stamp
 	$(PYTEST) -n 3

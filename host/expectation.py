@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from .arguments import public
 from .content import ByContent
-from .doors import public
 from .errors import InputError
 from .instrument.instrument import Instrument
 from .measured_noise import below_zero

@@ -1,4 +1,4 @@
-"""Units at the door: numbers, arrays and counts, from Quantities of any fitting unit or plain in the documented one.
+"""Units of arguments: numbers, arrays and counts, from Quantities of any fitting unit or plain in the documented one.
 
 What checks a plain number loads no numpy: a wrong one is told at once.
 """

@@ -269,7 +269,7 @@ MUTATIONS = {
         "tests/results/test_detection.py::test_the_null_is_its_closed_form",
     ),
     "closed forms that follow a temperature by their means alone": Mutation(
-        (("mauvecl/statistics/statistic.py", "true + more, flare", "true, flare"),),
+        (("mauvecl/statistics/statistic.py", "seen.variance + more, scatter", "seen.variance, scatter"),),
         "tests/device/test_marginal.py::test_closed_forms_integrate_over_what_is_drawn[half a degree]",
     ),
     "moved scores that count like others": Mutation(

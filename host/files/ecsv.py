@@ -155,7 +155,7 @@ def check_header(lines: list[str], what: str) -> None:
         return sizes[id(node)]
 
     with parsing(what, "an ECSV table"):
-        root = yaml.compose("\n".join(header[1:]), Loader=yaml.SafeLoader)
+        root = yaml.compose("\n".join(header[1:]), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
         unfolded = 0 if root is None else values(root)
     if unfolded >= MOST_VALUES:
         raise InputError(f"{what} has a header that unfolds to more than {MOST_VALUES} values, expected fewer")

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
-from ..doors import public
+from ..arguments import public
 from ..errors import InputError
 from ..quantities import count, is_quantity, number, numbers, unit_of
 from ..records import Record, sentence

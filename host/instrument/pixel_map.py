@@ -10,8 +10,8 @@ import astropy.units as u
 import numpy as np
 from numpy.typing import NDArray
 
+from ..arguments import public
 from ..content import ByContent
-from ..doors import public
 from ..errors import InputError
 from ..files.ecsv import read_numbers
 from ..quantities import count

@@ -11,7 +11,7 @@ import astropy.units as u
 import numpy as np
 from numpy.typing import NDArray
 
-from ..doors import public
+from ..arguments import public
 from ..errors import InputError
 from ..quantities import number
 from .helioecliptic import HelioEcliptic, helioecliptic

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..arguments import public
 from ..content import ByContent
-from ..doors import public
 from ..errors import InputError
 from ..plotting import picture
 from ..quantities import number

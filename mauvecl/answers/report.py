@@ -39,6 +39,8 @@ def make_folder(path: Path) -> Path:
     InputError
         If it cannot be made or written to.
     """
+    if path.exists() and not path.is_dir():
+        raise InputError(f"output folder {str(path)!r} is a file, expected the name of a folder")
     try:
         path.mkdir(parents=True, exist_ok=True)
         probe = path / ".mauvecl-probe"

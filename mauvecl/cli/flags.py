@@ -88,8 +88,8 @@ def group(*flags: Flag) -> dict[str, Flag]:
 
 #: What every verb takes; those without a key are put together by `question.stars_of` and `question.sky_of`.
 OBSERVATION = group(
-    flag(list[str], "--star -s", "Library name or spectrum file; may be repeated."),
-    flag(list[float], "--magnitude -m", "Magnitude, one for all stars or one each."),
+    flag(list[str], "--star -s", "Library name or spectrum file; may be repeated, as in G2V,M3V."),
+    flag(list[float], "--magnitude -m", "Magnitude, one for all stars or one each, as in 7,8."),
     flag(str, "--band", "Band of the magnitude [V]."),
     flag(str, "--magnitude-system", "What it means: catalogue, vega (Vega is 0 in every band), or ab [catalogue]."),
     flag(float, "--ebv", "Dust before the star, E(B-V), mag (needs mauvecl[extinction])."),

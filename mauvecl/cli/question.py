@@ -40,6 +40,16 @@ def study_of(
     return changed.with_settings(given["set"]) if given["set"] else changed
 
 
+def holds_study(file: Path) -> bool:
+    """Whether a file is no mere table: CSV is one, and ECSV that no answer wrote."""
+    suffix = file.suffix.lower()
+    if suffix != ".ecsv" or not file.is_file():
+        return suffix != ".csv"
+    from mauvecl.host.files.ecsv import read_ecsv
+
+    return "study" in read_ecsv(file, "table", "a table of targets, or of an answer").meta
+
+
 def sky_of(given: dict[str, Any]) -> dict[str, Any]:
     from mauvecl.host.errors import InputError
 
@@ -93,12 +103,14 @@ def stars_of(study: Study, given: dict[str, Any]) -> list[dict[str, Any]] | None
         return None
     if names:
         # A name that is a file's is a file; anything else is looked up in the library.
-        stars: list[dict[str, Any]] = [{"file": name} if _is_file(name) else {"library": name} for name in names]
+        each = [one for name in names for one in ([name] if _is_there(name) else map(str.strip, name.split(",")))]
+        stars: list[dict[str, Any]] = [{"file": name} if _is_file(name) else {"library": name} for name in each]
     else:
         stars = [entry.model_dump(exclude_none=True) for entry in study.star]
     if magnitudes:
         if len(magnitudes) not in (1, len(stars)):
-            raise InputError(f"{len(magnitudes)} magnitudes for {len(stars)} stars, expected one for all or one each")
+            of = "one star" if len(stars) == 1 else f"{len(stars)} stars"
+            raise InputError(f"{len(magnitudes)} magnitudes for {of}, expected one for all or one each")
         for entry, value in zip(stars, magnitudes * (len(stars) if len(magnitudes) == 1 else 1), strict=True):
             entry["magnitude"] = value
     if of_files and not any("file" in entry for entry in stars):
@@ -107,15 +119,20 @@ def stars_of(study: Study, given: dict[str, Any]) -> list[dict[str, Any]] | None
     return [entry | same | (of_files if "file" in entry else {}) for entry in stars]
 
 
-def _is_file(name: str) -> bool:
+def _is_there(name: str) -> bool:
+    """Whether a file has that name, which may hold commas."""
     from mauvecl.host.spectra.formats import without_columns
 
     try:
-        file, _ = without_columns(name)
-        if file.exists():
-            return True
+        return bool(name) and without_columns(name)[0].exists()
     except (OSError, ValueError):
         # What no file name can be is refused as one.
         return True
+
+
+def _is_file(name: str) -> bool:
+    if _is_there(name):
+        return True
     # "K2.5V" looks like a file's name and is not one.
-    return bool(file.suffix) and not file.suffix[1:].isupper()
+    suffix = Path(name).suffix
+    return bool(suffix) and not suffix[1:].isupper()

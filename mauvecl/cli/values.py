@@ -70,12 +70,18 @@ def as_text(kind: Any) -> tuple[Any, str, Callable[[str, str], Any] | None]:
     option.min = option.max = None
     option.metavar = ("NUMBER" if each is float else "INTEGER") + (",..." if many else "")
     flag = next((one for one in option.param_decls or () if one.startswith("--")), "")
-    read = partial(_within, read=number if each is float else count, low=low, high=high)
+    read = partial(within, read=number if each is float else count, low=low, high=high)
     texts: Any = list[str] if many else str
     return Annotated[texts | None, option], flag, partial(several, read=read) if many else read
 
 
-def _within(text: str, flag: str, *, read: Callable[[str, str], Any], low: float | None, high: float | None) -> Any:
+def within(text: str, flag: str, *, read: Callable[[str, str], Any], low: float | None, high: float | None) -> Any:
+    """A number between two ends, either of which may be missing.
+
+    Raises
+    ------
+    InputError
+    """
     value = read(text, flag)
     if (low is not None and not value >= low) or (high is not None and not value <= high):
         reach = f"at least {low:g}" if high is None else f"{low:g} to {high:g}"

@@ -19,7 +19,7 @@ from mauvecl.cli.flags import (
     StudyFile,
     output_flag,
 )
-from mauvecl.cli.question import study_of
+from mauvecl.cli.question import holds_study, study_of
 from mauvecl.cli.values import as_text
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ def takes_study(
                 if values.get(key) is not None and not isinstance(values[key], int | float):
                     values[key] = read(values[key], shown)
             given = {key: values.pop(key, None) for key in flags}
-            if "targets" in flags and study_file is not None and study_file.suffix.lower() == ".csv":
+            if "targets" in flags and study_file is not None and not holds_study(study_file):
                 given["targets"], study_file = study_file, None
             if fewer and study_file is None and given["realisations"] is None:
                 given["realisations"] = FEWER

@@ -13,7 +13,7 @@ from mauvecl.device.opened import Device
 from mauvecl.device.program import DeviceError, DeviceRecord, devices
 from mauvecl.device.stares import Stares
 from mauvecl.device.tiles import Progress, Tile, Tiles
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.stares.requests import StaresRequest
 from mauvecl.noise.comparison import NOISE_FREE, Comparison
@@ -74,10 +74,10 @@ class Engine:
     >>> raw = engine.realise(quiet, count=3, seed=1)
     >>> bool((engine.realise(quiet, start=2, count=1, seed=1) == raw[2:]).all())
     True
-    >>> found = engine.detect(quiet, [flare], realisations=100_000, seed=1)
-    >>> found.statistics
+    >>> detection = engine.detect(quiet, [flare], realisations=100_000, seed=1)
+    >>> detection.statistics
     ('chi2', 'chi2_element', 'matched')
-    >>> found.detection_probability(fap=1e-3, statistic="matched")[0].value
+    >>> detection.detection_probability(fap=1e-3, statistic="matched")[0].value
     1.0
     """
 

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mauvecl.device.opened import Device
 from mauvecl.device.stare_launches import StareLaunches
 from mauvecl.device.tiles import Progress, Tile, Tiles
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.stares.components import Components
 from mauvecl.lightcurve.stares.requests import Arrays, Kept, Method, StaresRequest, joined

@@ -11,7 +11,7 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import count, number
 from mauvecl.noise import layout

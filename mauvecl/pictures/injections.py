@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.pictures.style import COLOURS, MOST_COLUMNS, STYLE, finished, headline, pyplot
+from mauvecl.pictures.style import COLOURS, MOST_COLUMNS, STYLE, finished, headline, legend_below, pyplot
 
 if TYPE_CHECKING:
     from mauvecl.answers.stares.inject import InjectAnswer
@@ -102,12 +102,12 @@ def curves(answer: InjectAnswer, path: str | Path | None) -> Any:
                 axis.fill_between(
                     f.sizes, f.completeness_low[k], f.completeness_high[k], color=colour, alpha=0.25, linewidth=0
                 )
-                axis.plot(f.sizes, f.completeness[k], color=colour, label=f"{f.half_widths_s[k]:.3g} s")
+                axis.plot(f.sizes, f.completeness[k], color=colour, label=f"half-width {f.half_widths_s[k]:.0f} s")
             for power in (0.5, 0.9):
                 axis.axhline(power, color="black", linewidth=0.6, linestyle="--")
             axis.set(
                 xscale="log", xlabel=SIZES[star.sizes.of], ylabel="completeness", ylim=(-0.02, 1.02), title=star.title
             )
-        axes[0].legend(title="half-width")
+        legend_below(figure, *axes[0].get_legend_handles_labels())
         _titled(figure, answer)
         return finished(figure, path)

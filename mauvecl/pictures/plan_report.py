@@ -20,9 +20,9 @@ if TYPE_CHECKING:
 #: A4, and its margin, inches.
 PAGE, MARGIN = (8.27, 11.69), 0.6
 #: Width of a letter over its size, about, by which lines are broken; distance of lines over their size.
-LETTER, LINE = 0.5, 1.4
+LETTER, LINE = 0.53, 1.4
 #: Where columns of the summary begin, and of the assumptions, as parts of the width between the margins.
-SUMMARY_AT = (0.0, 0.17, 0.25, 0.36, 0.45, 0.54, 0.63, 0.71, 0.78, 0.87)
+SUMMARY_AT = (0.0, 0.16, 0.235, 0.34, 0.425, 0.51, 0.605, 0.685, 0.755, 0.86)
 ASSUMED_AT = (0.0, 0.24, 0.5)
 
 
@@ -58,7 +58,12 @@ def _overview(axes: Any, answer: PlanAnswer) -> None:
             right.plot(ends[:1], [k], "o", color=COLOURS[4], ms=4)
     left.set(xscale="log", xlabel="flares recovered", xlim=(0.05, None))
     left.set_title("expected (dot); 95 % of campaigns")
-    right.set(xscale="log", xlabel="bolometric energy (erg)")
+    # Whole decades: a part of one has labels that run into each other.
+    ends = [
+        energy for one in answer.planned for energy in (one.energy_at(0.5), one.energy_at(0.9)) if np.isfinite(energy)
+    ]
+    decades = 10.0 ** np.array([np.floor(np.log10(min(ends))), np.ceil(np.log10(max(ends)))]) if ends else None
+    right.set(xscale="log", xlabel="bolometric energy (erg)", xlim=decades)
     right.set_title("E50 (dot) to E90")
     left.set_yticks(range(n), [f"{one.name} ({one.hours:.0f} h)" for one in answer.planned], fontsize=8)
     left.set_ylim(n - 0.5, -0.5)
@@ -170,16 +175,18 @@ def _assumptions(plt: Any, answer: PlanAnswer) -> list[Any]:
 
 def _target(plt: Any, answer: PlanAnswer, k: int) -> Any:
     figure = plt.figure(figsize=PAGE)
-    words, pictures = figure.subfigures(2, 1, height_ratios=[1, 1.35])
-    words.text(0.07, 0.95, answer.planned[k].name, fontsize=14, va="top", parse_math=False)
-    words.text(0.93, 0.95, heading(answer), fontsize=8, va="top", ha="right", color=NULL)
-    y = 0.86
+    # Words above, the pictures below them between the margins.
+    margin = MARGIN / PAGE[0]
+    pictures = figure.subfigures(2, 3, height_ratios=[0.43, 0.57], width_ratios=[margin, 1 - 2 * margin, margin])[1, 1]
+    figure.text(margin, 0.96, answer.planned[k].name, fontsize=14, va="top", parse_math=False)
+    figure.text(1 - margin, 0.96, heading(answer), fontsize=8, va="top", ha="right", color=NULL)
+    y = 0.925
     for name, value, where in target_lines(answer, k):
         told = textwrap.wrap(value, 48) or [""]
-        words.text(0.07, y, name, fontsize=8, va="top")
-        words.text(0.33, y, "\n".join(told), fontsize=8, va="top", parse_math=False)
-        words.text(0.93, y, where, fontsize=6.5, va="top", ha="right", color=NULL)
-        y -= 0.044 * len(told)
+        figure.text(margin, y, name, fontsize=8, va="top")
+        figure.text(0.33, y, "\n".join(told), fontsize=8, va="top", parse_math=False)
+        figure.text(1 - margin, y, where, fontsize=6.5, va="top", ha="right", color=NULL)
+        y -= 0.018 * len(told)
     if answer.planned[k].seen_h > 0:
         _panels(pictures, answer, k)
     return figure

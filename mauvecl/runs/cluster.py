@@ -8,17 +8,15 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from concurrent.futures import Future
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from numpy.typing import NDArray
-
 from mauvecl.device.program import DeviceError, DeviceRecord
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import is_file, json_data, read_text
@@ -26,6 +24,7 @@ from mauvecl.host.version import VERSION
 from mauvecl.results.requests.requests import Countable, Shard
 from mauvecl.results.sums import Arrays
 from mauvecl.runs.pool import Stopped
+from mauvecl.runs.shards import Task
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -116,20 +115,14 @@ class DaskWorkers:
         """The devices of the workers that were there at the beginning."""
         return self._devices
 
-    def submit(
-        self,
-        request: Countable,
-        key: str,
-        shard: Shard,
-        tick: Callable[[int], None],
-        out: NDArray[Any] | None = None,
-    ) -> Future[Arrays]:
-        """Have a shard counted by whichever worker is free; raw spectra travel, and `out` stays as it is."""
+    def submit(self, task: Task) -> Future[Arrays]:
+        """Have a shard counted by whichever worker is free; raw spectra travel, and the task's `out` stays as it is."""
         awaited: Future[Arrays] = Future()
-        self._send(awaited, request, key, shard, 1)
+        self._send(awaited, task, 1)
         return awaited
 
-    def _send(self, awaited: Future[Arrays], request: Countable, key: str, shard: Shard, tried: int) -> None:
+    def _send(self, awaited: Future[Arrays], task: Task, tried: int) -> None:
+        key = task.key
         with self._lock:
             if self._closing:
                 awaited.set_exception(Stopped())
@@ -137,27 +130,19 @@ class DaskWorkers:
             try:
                 if key not in self._given:
                     # A task rather than scattered data: the scheduler can make it again where a worker took it along.
-                    self._given[key] = self._client.submit(_keep, request, key=f"mauvecl-request-{key}")
+                    self._given[key] = self._client.submit(_keep, task.request, key=f"mauvecl-request-{key}")
                     if len(self._given) > REQUESTS:
                         del self._given[next(iter(self._given))]
-                name = f"mauvecl-{key}-{shard.name}-{tried}"
-                sent = self._client.submit(_count, self._given[key], shard, self._device, key=name, pure=False)
+                name = f"mauvecl-{task.name}-{tried}"
+                sent = self._client.submit(_count, self._given[key], task.shard, self._device, key=name, pure=False)
             except (OSError, RuntimeError) as error:
                 # Dask raises either where its client has lost the scheduler.
                 awaited.set_exception(self._gone().with_traceback(error.__traceback__))
                 return
             self._sent[sent] = awaited
-        sent.add_done_callback(partial(self._came, awaited, request, key, shard, tried))
+        sent.add_done_callback(partial(self._came, awaited, task, tried))
 
-    def _came(
-        self,
-        awaited: Future[Arrays],
-        request: Countable,
-        key: str,
-        shard: Shard,
-        tried: int,
-        sent: DaskFuture[Any],
-    ) -> None:
+    def _came(self, awaited: Future[Arrays], task: Task, tried: int, sent: DaskFuture[Any]) -> None:
         with self._lock:
             if self._sent.pop(sent, None) is None:
                 # Nobody waits for it any longer.
@@ -170,10 +155,7 @@ class DaskWorkers:
             known = isinstance(error, InputError | DeviceError)
             if known or tried == TRIES:
                 told = error if known else f"{error or 'the scheduler is gone'}"
-                awaited.set_exception(
-                    DeviceError(f"cluster {self._where} failed at realisations {shard.start} to "
-                                f"{shard.start + shard.count - 1}: {told}")
-                )  # fmt: skip
+                awaited.set_exception(DeviceError(f"cluster {self._where} failed at {task.shard}: {told}"))
             elif sent.status in ("cancelled", "lost") and self._client.status != "running":
                 awaited.set_exception(self._gone())
             else:
@@ -181,8 +163,8 @@ class DaskWorkers:
                     self.retries += 1
                     if error is None:
                         # The request itself was lost with its worker.
-                        self._given.pop(key, None)
-                self._send(awaited, request, key, shard, tried + 1)
+                        self._given.pop(task.key, None)
+                self._send(awaited, task, tried + 1)
         except BaseException as error:
             if not awaited.done():
                 awaited.set_exception(error)

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
 from mauvecl.device.stares import Stares
 from mauvecl.device.tiles import Progress
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import count as whole
 from mauvecl.lightcurve.stares.requests import StaresRequest, StareSums
-from mauvecl.results.requests.requests import Countable, DetectRequest, RealiseRequest, Shard, SnrRequest
+from mauvecl.results.requests.requests import DetectRequest, RealiseRequest, Shard, SnrRequest
 from mauvecl.results.sums import Arrays, DetectionSums, SnrSums
-from mauvecl.runs.shards import fingerprint, shards
+from mauvecl.runs.shards import Task, fingerprint, shards
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -66,18 +66,8 @@ class Workers(Protocol):
     def describe(self) -> list[DeviceRecord]:
         """The devices, for run records."""
 
-    def submit(
-        self,
-        request: Countable,
-        key: str,
-        shard: Shard,
-        tick: Callable[[int], None],
-        out: NDArray[Any] | None = None,
-    ) -> Future[Arrays]:
-        """Have a shard counted; `tick` may be called with realisations done of it.
-
-        Raw spectra go into `out` where a worker of this process draws them.
-        """
+    def submit(self, task: Task) -> Future[Arrays]:
+        """Have a shard counted."""
 
     def stop(self) -> None:
         """End what is under way as soon as may be."""
@@ -131,31 +121,18 @@ class LocalWorkers:
         """The devices."""
         return [engine.device for engine in self._engines]
 
-    def submit(
-        self,
-        request: Countable,
-        key: str,
-        shard: Shard,
-        tick: Callable[[int], None],
-        out: NDArray[Any] | None = None,
-    ) -> Future[Arrays]:
+    def submit(self, task: Task) -> Future[Arrays]:
         """Count a shard, as soon as a device is free."""
-        return self._threads.submit(self._count, request, shard, tick, out)
+        return self._threads.submit(self._count, task)
 
-    def _count(
-        self,
-        request: Countable,
-        shard: Shard,
-        tick: Callable[[int], None],
-        out: NDArray[Any] | None,
-    ) -> Arrays:
+    def _count(self, task: Task) -> Arrays:
         with self._lock:
             place = self._free.pop(0)
-        self._ticks[place] = tick
+        self._ticks[place] = task.tick
         try:
             for tried in range(1, TRIES + 1):
                 try:
-                    return self._engines[place].count(request, shard, out=out)
+                    return self._engines[place].count(task.request, task.shard, out=task.out)
                 except Exception as error:
                     engine = self._engines[place]
                     launch = isinstance(error, engine.opened.cl.Error)
@@ -163,8 +140,8 @@ class LocalWorkers:
                         raise
                     if tried == TRIES:
                         raise DeviceError(
-                            f"{engine.device_name} failed {TRIES} times at realisations {shard.start} to "
-                            f"{shard.start + shard.count - 1} ({error}), expected a device that works"
+                            f"{engine.device_name} failed {TRIES} times at {task.shard} ({error}), expected a device "
+                            "that works"
                         ) from error
                     with self._lock:
                         self.retries += 1
@@ -296,9 +273,8 @@ class Pool:
     ) -> NDArray[Any]:
         """As `Engine.realise`, with the same keywords, by one worker; several calls at a time keep all of them busy."""
         request = RealiseRequest.of(expectation, count, **how)
-        shard = Shard(0, request.start, request.realisations)
-        future = self.workers.submit(request, uuid.uuid4().hex, shard, lambda done: None, out)
-        rows: NDArray[Any] = future.result()["rows"]
+        task = Task(request, uuid.uuid4().hex, Shard(0, request.start, request.realisations), out=out)
+        rows: NDArray[Any] = self.workers.submit(task).result()["rows"]
         if out is None or rows is out:
             return rows
         out[:] = rows
@@ -311,33 +287,31 @@ class Pool:
             self._total += sum(shard.count for shard in todo)
             self._of += len(todo)
         self._told()
-        waiting: dict[Future[Arrays], Shard] = {}
+        waiting: dict[Future[Arrays], Task] = {}
         for shard in todo:
-            name = f"{key}-{shard.name}"
-            known = None if self.checkpoint is None else self.checkpoint.get(name)
+            task = Task(request, key, shard, partial(self._tick, f"{key}-{shard.name}"))
+            known = None if self.checkpoint is None else self.checkpoint.get(task.name)
             if known is not None:
                 sums.add(shard.part, known)
-                self._finished(name, shard, resumed=True)
+                self._finished(task, resumed=True)
                 continue
             if self._stopping:
                 raise Stopped
             while len(waiting) >= self.workers.count * AHEAD:
-                self._collect(sums, key, waiting)
-            tick = partial(self._tick, name)
-            waiting[self.workers.submit(request, key, shard, tick)] = shard
+                self._collect(sums, waiting)
+            waiting[self.workers.submit(task)] = task
         while waiting:
-            self._collect(sums, key, waiting)
+            self._collect(sums, waiting)
 
-    def _collect(self, sums: Sums, key: str, waiting: dict[Future[Arrays], Shard]) -> None:
+    def _collect(self, sums: Sums, waiting: dict[Future[Arrays], Task]) -> None:
         finished, _ = wait(waiting, return_when=FIRST_COMPLETED)
         for future in finished:
-            shard = waiting.pop(future)
+            task = waiting.pop(future)
             counted = future.result()
-            sums.add(shard.part, counted)
-            name = f"{key}-{shard.name}"
+            sums.add(task.shard.part, counted)
             if self.checkpoint is not None:
-                self.checkpoint.put(name, counted)
-            self._finished(name, shard)
+                self.checkpoint.put(task.name, counted)
+            self._finished(task)
 
     def _tick(self, name: str, done: int) -> None:
         with self._lock:
@@ -347,12 +321,12 @@ class Pool:
             threading.Thread(target=aside, name="mauvecl-aside", daemon=True).start()
         self._told()
 
-    def _finished(self, name: str, shard: Shard, *, resumed: bool = False) -> None:
+    def _finished(self, task: Task, *, resumed: bool = False) -> None:
         with self._lock:
-            self._partly.pop(name, None)
-            self._done += shard.count
+            self._partly.pop(task.name, None)
+            self._done += task.shard.count
             self._shards += 1
-            self._resumed += shard.count if resumed else 0
+            self._resumed += task.shard.count if resumed else 0
         self._told()
 
     def _told(self) -> None:

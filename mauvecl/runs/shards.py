@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import itertools
-from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from mauvecl.results.requests.requests import Asked, Divisible, Shard
+from mauvecl.results.requests.requests import Asked, Countable, Divisible, Shard
 
 #: What a shard holds, and how: raised with every change, so that none of an older form is ever added.
 FORM = 2
@@ -28,6 +29,34 @@ def shards(request: Divisible) -> list[Shard]:
     first, end = request.start, request.start + request.realisations
     cuts = [first, *range(first - first % size + size, end, size), end]
     return [Shard(part, a, b - a) for part in range(request.parts) for a, b in itertools.pairwise(cuts)]
+
+
+@dataclass(frozen=True, eq=False)
+class Task:
+    """A shard to be counted.
+
+    Attributes
+    ----------
+    request : Countable
+    key : str
+        The request's fingerprint.
+    shard : Shard
+    tick : callable
+        Told how many realisations are done of it, where a worker can.
+    out : ndarray, optional
+        Where raw spectra go that a worker of this process draws.
+    """
+
+    request: Countable
+    key: str
+    shard: Shard
+    tick: Callable[[int], None] = lambda done: None
+    out: NDArray[Any] | None = None
+
+    @property
+    def name(self) -> str:
+        """What it is kept under."""
+        return f"{self.key}-{self.shard.name}"
 
 
 #: What describes an input and does not change a draw.

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.arguments import public
 from mauvecl.host.content import ByContent
-from mauvecl.host.doors import public
 from mauvecl.host.errors import InputError
 from mauvecl.statistics.names import NUISANCES
 

@@ -46,14 +46,19 @@ class Smoothing:
         What each of them adds to the squares at every pixel.
     sigma : float
         Pixels.
-    rows : ndarray, shape (n_centre, n_pixel)
-        Weights of the pixels; zero for those that do not count.
+    weights : csr_array, shape (n_centre, n_pixel)
+        Of the pixels; zero for those that do not count.
     """
 
     centres: NDArray[np.int64]
     between: Float
     sigma: float
-    rows: Float
+    weights: csr_array
+
+    @cached_property
+    def rows(self) -> Float:
+        """The weights with all their zeros."""
+        return np.asarray(self.weights.toarray())
 
     @classmethod
     def of(cls, x: Expectation, used: NDArray[np.bool_], flares: Sequence[Expectation] = ()) -> Smoothing:
@@ -71,10 +76,10 @@ class Smoothing:
         step = max(int(sigma / STEPS_PER_SIGMA), 1)
         rows = _rows(n, sigma)
         centres, between = _places(n, step)
-        smoothing = cls(centres, between, sigma, rows[centres].toarray() * used)
+        smoothing = cls(centres, between, sigma, rows[centres].multiply(used).tocsr())
         if step == 1 or all(smoothing._follows(flare, used) for flare in flares or (x,)):
             return smoothing
-        return cls(np.arange(n), np.eye(n), sigma, rows.toarray() * used)
+        return cls(np.arange(n), np.eye(n), sigma, rows.multiply(used).tocsr())
 
     def _follows(self, flare: Expectation, used: NDArray[np.bool_]) -> bool:
         """Whether the sum over every pixel comes out on average, by weights of which none is negative."""
@@ -100,7 +105,7 @@ class Smoothing:
             weight = weight[weight > LEAST * weight[-1]]
             return QuadraticForm(weight, np.zeros(weight.size))
         weight, vectors = self._decomposed(scale, variance)
-        return QuadraticForm(weight, (np.sqrt(scale) * (self._sparse @ delta)) @ vectors / np.sqrt(weight))
+        return QuadraticForm(weight, (np.sqrt(scale) * (self.weights @ delta)) @ vectors / np.sqrt(weight))
 
     def modes(self, scale: Float, variance: Float) -> tuple[Float, Float]:
         """What the sum is made of: independent normals' variances, and the weights of the pixels in each.
@@ -121,15 +126,8 @@ class Smoothing:
 
     def _covariance(self, scale: Float, variance: Float) -> Float:
         """Of the smoothed values times the roots of their factors, shape (n_centre, n_centre)."""
-        half = self._sparse * np.sqrt(scale)[:, None]
+        half = self.weights * np.sqrt(scale)[:, None]
         return np.asarray(((half * variance) @ half.T).toarray())
-
-    @cached_property
-    def _sparse(self) -> csr_array:
-        """`rows`: most of them are zeros."""
-        from scipy.sparse import csr_array
-
-        return csr_array(self.rows)
 
     def bands(self, n_padded: int, chunk: int) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
         """The weights chunk by chunk of pixels, for centres under way, and how many are finished with each chunk.

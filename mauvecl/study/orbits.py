@@ -6,12 +6,13 @@ import datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import Field, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import shown
 from mauvecl.host.files.text_table import read_text_table
+from mauvecl.host.records import sentence
 from mauvecl.study.sections import Part
 
 if TYPE_CHECKING:
@@ -321,6 +322,12 @@ def read_targets(path: Path) -> list[dict[str, Any]]:
             raise InputError(
                 f"{named}: row {number} has only one of ra and dec, or coordinates too, expected both or none"
             )
+        odd = next((key for key in ("ra", "dec") if key in one and not _is_number(one[key])), None)
+        if odd is not None:
+            raise InputError(
+                f"{named}: row {number} has {odd} = {shortened(str(one[odd]))}, expected degrees; sexagesimal ones go "
+                "into a column coordinates"
+            )
         if "ra" in one:
             one["coordinates"] = f"{one.pop('ra')} {one.pop('dec')}"
         if "name" in one:
@@ -328,8 +335,20 @@ def read_targets(path: Path) -> list[dict[str, Any]]:
         file = one.get("rates_file")
         if isinstance(file, str):
             one["rates_file"] = path.parent / file
+        try:
+            PlanTarget.model_validate(one)
+        except ValidationError as error:
+            raise InputError(f"{named}: row {number}: {sentence(PlanTarget, error)}") from error
         targets.append(one)
     return targets
+
+
+def _is_number(cell: Any) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def find_plan_files(data: dict[str, Any], folder: Path) -> None:

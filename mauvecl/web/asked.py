@@ -14,6 +14,9 @@ from mauvecl.answers.detection.maps import MapResult, detection_map
 from mauvecl.answers.limits.limits import limiting_magnitude
 from mauvecl.answers.signal.snr import SnrAnswer, snr
 from mauvecl.answers.stares.inject import InjectAnswer, inject
+from mauvecl.host.errors import InputError
+from mauvecl.host.files.bounded import shortened
+from mauvecl.host.orbit.names import Target
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -57,6 +60,12 @@ def completeness(study: Study, pool: Pool) -> InjectAnswer:
 
 def planned(study: Study) -> PlanAnswer:
     """What a campaign on the target would find, without injections."""
+    for name in study.orbit.targets:
+        if Target.of(name).spectral_type is None:
+            raise InputError(
+                f"neither type nor magnitude nor distance of {shortened(name)} are known, expected a target of the "
+                "list, such as eps Eri or AU Mic"
+            )
     data = study.model_dump()
     data["plan"] |= {"targets": [{"name": name} for name in study.orbit.targets], "completeness": "closed form"}
     data["orbit"]["targets"] = ()

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mauvecl.web.closed import Closed, between, percent
+from mauvecl.web.closed import Closed, between, percent, short
 from mauvecl.web.tabs.tab import Answers
 
 #: Part of the sentence that tells what the throughput is; it stands on the page once.
@@ -36,8 +36,8 @@ def card(closed: Closed, answers: Answers) -> dict[str, Any]:
     facts += [
         ("Threshold", f"{cut:.4g}"),
         ("Expected with flare", f"{closed.odds.seen.mean:.4g}"),
-        ("Best S/N per pixel", f"{x.snr().max():.3g}"),
-        ("Best S/N per element", f"{x.snr_per_element().max():.3g}"),
+        ("Best S/N per pixel", short(x.snr().max())),
+        ("Best S/N per element", short(x.snr_per_element().max())),
     ]
     words = (
         f"chance to detect {closed.words}, by the statistic {q.statistic} at a false-alarm probability of {q.fap:g} "

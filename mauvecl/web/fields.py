@@ -14,6 +14,7 @@ from mauvecl.host.files.bounded import shortened
 from mauvecl.host.stars.band_names import ALIASES
 from mauvecl.host.stars.catalogue import embedded, library_table
 from mauvecl.statistics.registry import STATISTICS
+from mauvecl.web.asked import SIMULATED
 
 UPLOADED, UPLOADED_UNKNOWN = "uploaded star", "uploaded spectrum"
 #: Realisations that a visitor may ask for, and with a tail by importance sampling.
@@ -21,8 +22,6 @@ REALISATIONS, SAMPLED = (10_000, 100_000, 1_000_000, 4_000_000), (100_000, 1_000
 #: What is taken for unknown on the page.
 UNKNOWN = ("nothing", "the usual")
 SKIES = ("brightness", "target and time", "none")
-#: What may be simulated on the page.
-SIMULATIONS = ("detection", "limit", "map", "completeness", "visible", "plan")
 #: Characters of a field that are looked at.
 MOST_CHARACTERS = 200
 
@@ -68,8 +67,8 @@ class Choice:
 def several(text: str) -> tuple[str, ...]:
     """Names of simulations, each once."""
     names = [name for name in text.split(",") if name]
-    if len(names) > len(SIMULATIONS) or not set(names) <= set(SIMULATIONS):
-        raise InputError(f"{shortened(text)} is no simulation, expected some of {', '.join(SIMULATIONS)}")
+    if len(names) > len(SIMULATED) or not set(names) <= SIMULATED.keys():
+        raise InputError(f"{shortened(text)} is no simulation, expected some of {', '.join(SIMULATED)}")
     return tuple(dict.fromkeys(names))
 
 

@@ -193,3 +193,11 @@ def test_sizes_may_be_energies():
     assert (asked.injections.low, asked.injections.high) == (1e33, 1e35)
     with pytest.raises(InputError, match=r"injections\.high = 1e\+50"):
         Study().with_settings(["injections.high=1e50"])
+
+
+def test_a_size_that_a_star_has_not_is_told_before_any_is_searched(monkeypatch, stares):
+    near = SMALL["star"][0]
+    asked = study(star=[near, {**near, "distance_pc": None}], injections={"of": "energy"})
+    monkeypatch.setattr("mauvecl.answers.stares.inject.surveyed", lambda *_: pytest.fail("searched"))
+    with pytest.raises(InputError, match=r"injections\.of = 'energy' at G2V of unknown size"):
+        inject(asked, stares)

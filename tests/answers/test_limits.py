@@ -126,6 +126,7 @@ def test_one_stars_failure_does_not_lose_the_others(engine: Engine) -> None:
     assert found.messages[0].startswith(told)
 
 
+@pytest.mark.long
 def test_a_limit_of_more_than_a_day(engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
     """Of some 1e5 frames, which are halved and not walked through."""
     asks, simulated = [], LimitSearch.simulated

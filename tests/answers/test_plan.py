@@ -251,6 +251,9 @@ def test_types() -> None:
         ("name,ra,dec\nnew,10,5\n", "no spectral_type and no magnitude and no distance_pc"),
         ("name,mass_msun,age_myr\neps Eri,9,500\n", "mass_msun = 9"),
         ("name\n", "0 targets"),
+        ("name,ra,dec\nnew,10,5\nother,ten,5\n", "row 2 has ra = 'ten', expected degrees"),
+        ("name,V\neps Eri,3.7\nAU Mic,bright\n", "row 2: magnitude = 'bright', expected a valid number"),
+        ("name,distance_pc\neps Eri,-3\n", "row 1: distance_pc = -3, expected greater than 0"),
     ],
 )
 def test_tables_that_cannot_be(tmp_path: Path, text: str, words: str) -> None:

@@ -136,6 +136,7 @@ def test_lightkurve_reads_it(found, tmp_path):
     assert curve.time[0].iso == "2026-01-01 00:00:02.500"
 
 
+@pytest.mark.long
 def test_the_search_finds_what_was_put_in_and_nothing_else(stares):
     """False alarms: one in a star-month; three flares of S/N 8, 32 and 96, and one of 3 that may be missed."""
     study = Study().with_settings(
@@ -241,6 +242,7 @@ shape_file = "own.txt"
 """
 
 
+@pytest.mark.long
 def test_a_study_file_with_curves_shapes_and_events(tmp_path, stares):
     (tmp_path / "slow.txt").write_text("# s, relative\n0 0.0\n300 0.03\n")
     (tmp_path / "own.txt").write_text("-10 0\n0 4\n30 0\n")

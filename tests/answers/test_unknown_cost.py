@@ -260,3 +260,4 @@ def test_the_table_and_its_picture(tmp_path: Path) -> None:
         snr = row["marginalised"] * found.smallest("G2V V = 7.4 (Vega = 0)", name) / row["amplitude"]
         assert power(np.array([snr]), 1e-3)[0] == pytest.approx(0.9)
     assert found.plot(tmp_path / "unknowns.png") == tmp_path / "unknowns.png"
+    assert [path.name for path in found.write(tmp_path)] == ["unknowns.ecsv", "study.toml"]

@@ -67,6 +67,7 @@ def test_the_papers_pair_is_compared(answered: tuple[Path, str]) -> None:
     assert "no calibrated chi-squared" in text
 
 
+@pytest.mark.long
 def test_files_and_record(answered: tuple[Path, str]) -> None:
     folder, text = answered
     out = folder / "mauvecl-detect"
@@ -95,6 +96,7 @@ def test_everything_side_by_side(tmp_path: Path) -> None:
     assert (asked.reference, asked.variances, asked.statistics) == ("stack:3", "estimated", tuple(STATISTICS))
 
 
+@pytest.mark.long
 def test_the_study_gives_the_same_bits_again(answered: tuple[Path, str], tmp_path: Path) -> None:
     folder, _ = answered
     first = folder / "mauvecl-detect"
@@ -103,6 +105,7 @@ def test_the_study_gives_the_same_bits_again(answered: tuple[Path, str], tmp_pat
     assert (tmp_path / "again" / "study.toml").read_text() == (first / "study.toml").read_text()
 
 
+@pytest.mark.long
 def test_a_table_is_read_back_into_its_study(answered: tuple[Path, str], tmp_path: Path) -> None:
     folder, _ = answered
     table = folder / "mauvecl-detect" / "detection.ecsv"

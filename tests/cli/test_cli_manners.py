@@ -102,7 +102,6 @@ def test_bash_completes_verbs_and_flags(tmp_path: Path) -> None:
         assert wanted in done.stdout.split(), done
 
 
-@pytest.mark.long
 def test_pipes_get_no_colour_and_errors_their_own_way(tmp_path: Path) -> None:
     plain = started("library", folder=tmp_path, TERM="xterm-256color")
     assert "\x1b" not in plain.stdout + plain.stderr
@@ -164,7 +163,7 @@ MISTAKES = [
 #: Runs command lines one after the other in one process, and tells after each what it has loaded.
 TRIED = """
 import atexit, gc, json, sys
-atexit.register(lambda: print("frozen", gc.get_freeze_count() > 10_000))
+atexit.register(lambda: print("frozen", gc.get_freeze_count() > 10_000, gc.get_stats()[0]["collections"] < 100))
 from mauvecl.cli.app import main
 for words in json.loads(sys.argv[1]):
     sys.argv = ["mauvecl", *words]
@@ -183,6 +182,6 @@ def test_nothing_large_is_loaded_for_a_mistake(tmp_path: Path) -> None:
         [sys.executable, "-c", code, json.dumps(asked)], capture_output=True, text=True, cwd=tmp_path, check=True
     )
     told = [json.loads(line) for line in done.stdout.splitlines() if line.startswith("[")]
-    # Nor is all of it looked through for circles at the end.
-    assert done.stdout.splitlines()[-1] == "frozen True"
+    # Nor is all of it looked through for circles at the end, or often before.
+    assert done.stdout.splitlines()[-1] == "frozen True True"
     assert list(zip(asked, told, strict=True)) == [(words, [0 if words == ["--version"] else 2, []]) for words in asked]

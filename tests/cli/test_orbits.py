@@ -4,9 +4,11 @@ import json
 from pathlib import Path
 
 import pytest
+from astropy.table import Table
 from commands import run
 
 from mauvecl import Study
+from mauvecl.cli.question import holds_study
 
 
 def test_visible(tmp_path: Path) -> None:
@@ -36,6 +38,17 @@ def test_plan(tmp_path: Path) -> None:
     rows = json.loads(again.stdout)["rows"]
     assert [row["hours"] for row in rows] == [50.0, 50.0]
     assert rows[0]["expected"] > 0
+
+
+def test_a_table_of_targets_is_told_from_an_answers(tmp_path: Path) -> None:
+    """As `mauvecl plan targets.ecsv` takes it: only what an answer wrote holds a study."""
+    for name, meta in (("targets", {}), ("plan", {"study": "[plan]"})):
+        Table({"name": ["eps Eri"]}, meta=meta).write(tmp_path / f"{name}.ecsv")
+    assert not holds_study(tmp_path / "targets.ecsv")
+    assert holds_study(tmp_path / "plan.ecsv")
+    assert not holds_study(Path("targets.csv"))
+    assert holds_study(Path("study.toml"))
+    run("visible", "targets.ecsv", "--days", "1", "--no-pictures", folder=tmp_path)
 
 
 @pytest.mark.parametrize(

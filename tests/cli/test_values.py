@@ -65,8 +65,12 @@ def test_one_style_for_every_number(tmp_path: Path) -> None:
         (["limit", "--known", "light_loss,luck"], "unknowns.known names 'luck', expected some of "),
         (["snr", "--star", "G2V", "-m", "7", "--at", "30"], "wavelength = 30 nm, expected 200.1 to 699.8 nm"),
         (["detect", "--statistic", "chi2,chi3"], "statistic 'chi3' is unknown, expected one of "),
-        (["detect", "--star", "G2V", "-m", "7,8"], "2 magnitudes for 1 stars, expected one for all or one each"),
+        (["detect", "--star", "G2V", "-m", "7,8"], "2 magnitudes for one star, expected one for all or one each"),
         (["detect", "-n", "1e3", "--fap", "1e-3"], "fap = 0.001 leaves 1 of 1000 realisations beyond"),
+        (["detect", "--star", "G2V,M3V,", "-m", "7"], "library spectrum '' is unknown"),
+        (["detect", "--star", "G2V,M33V", "-m", "7,8"], "library spectrum 'M33V' is unknown"),
+        (["serve", "--port", "99999"], "--port '99999', expected 1 to 65535"),
+        (["detect", "--output", __file__, "-n", "1e5"], "is a file, expected the name of a folder"),
         (["detect", "--instrument", "."], "instrument '.' is a folder, expected a name or a TOML file"),
         (
             [

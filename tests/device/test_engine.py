@@ -90,8 +90,8 @@ ONE_BY_ONE = (
     "priors, electrons, frames",
     "jitter, one frame, rays",
 )
-#: A joint draw, one apart and frame by frame, and one with priors: what `make check` looks at.
-SHORT = ("stack", "apart, electrons, frames", "priors")
+#: A joint draw, and one apart and frame by frame: what `make check` looks at.
+SHORT = ("stack", "apart, electrons, frames")
 
 
 def case(name: str) -> tuple[list, dict]:
@@ -288,6 +288,7 @@ def test_pixels_and_realisations_are_uncorrelated(engine: Engine) -> None:
         assert abs(products.sum()) < 5 * np.sqrt(products.size)
 
 
+@pytest.mark.long
 def test_frames_are_uncorrelated(engine: Engine) -> None:
     """Single frames 0, 1 and 2**32 - 1 of the same realisations: |z| < 5 for sums of 3e7 products."""
     (x,) = star(exposure=5.0)

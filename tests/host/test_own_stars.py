@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import http.server
 import io
+import re
 import threading
 import time
 from collections.abc import Iterator
@@ -304,3 +305,11 @@ def test_the_verbs(tmp_path: Path, archive: str) -> None:
     assert simulated.exit_code == 0, simulated.output
     assert run(app, ["library", "remove", "one", "two", "HD 146233"]).exit_code == 0
     assert "Your own" not in run(app, ["library"]).output
+
+
+def test_documentation_and_help_name_the_collections_that_there_are() -> None:
+    page = (Path(__file__).parents[2] / "docs/my-star.md").read_text(encoding="utf-8")
+    named = {*re.findall(r'fetch "(\w+):', page), *re.findall(r"\b(\w+):\.\.\.", page)}
+    assert named == {one.name for one in own_stars.COLLECTIONS}
+    told = CliRunner().invoke(app, ["library", "fetch", "--help"]).output
+    assert all(name in told for name in named)

@@ -67,9 +67,9 @@ def test_distribution(probes: Probes) -> None:
 
 @pytest.mark.long
 def test_every_word_is_finite(probes_fast: Probes) -> None:
-    """All 2**32 radius words, with angles at the ends of the sine's range and at the turn by pi."""
+    """All 2**32 radius words, with angles at two ends of the sine's range; `test_accuracy` has all ends of both."""
     items, per_item = 2**14, 2**18
-    for angle in (0, 2**30, 2**31 - 1, 2**31, 2**32 - 1):
+    for angle in (0, 2**31 - 1):
         ends = np.empty((items, 2, probes_fast.width), np.float32)
         bad = np.empty((items, probes_fast.width), np.uint32)
         probes_fast.run("probe_every_word", items, bad, np.uint32(per_item), np.uint32(angle), out_first=ends)

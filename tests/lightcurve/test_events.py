@@ -64,7 +64,7 @@ def test_a_flare_that_does_not_cool_is_one_of_a_temperature():
 @pytest.mark.parametrize(
     ("make", "told"),
     [
-        (lambda: Event(np.nan, 60.0, 0.1), "a flare peaks at nan s"),
+        (lambda: Event(np.nan, 60.0, 0.1), "peak_s = nan, expected seconds"),
         (lambda: Event(0.0, 0.0, 0.1), "the half width of a flare = 0 s"),
         (lambda: Event(0.0, 60.0, -0.1), "the amplitude of a flare = -0.1"),
         (lambda: Event(0.0, 60.0, 0.1, 10.0), "flare temperature = 10 K"),

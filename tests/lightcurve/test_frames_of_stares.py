@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from scenes import instrument, star
 from scipy.integrate import quad
 
 from mauvecl.host.errors import InputError
@@ -69,10 +70,8 @@ def test_known_conditions_and_unknowns():
 
 
 def test_the_dark_follows_the_instruments_law():
-    from types import SimpleNamespace
-
+    (quiet,) = star(payload=instrument(part=True))
     stare = Stare.of(50.0, thermal=Table(np.array([0.0, 50.0]), np.array([1.0, 1.0])))
-    quiet = SimpleNamespace(conditions={"dark_slope_per_c": 0.0684, "temperature_c": 21.0})
     np.testing.assert_allclose(stare.dark_factor(quiet), np.exp(0.0684))
 
 

@@ -219,6 +219,7 @@ def test_sums_hold_what_the_values_say(injections, stares):
     assert np.abs(rows[:, :, 0] - value).max() < 2e-3
 
 
+@pytest.mark.long
 def test_flares_are_those_that_the_engine_draws(injections, stares):
     """Values of templates against frames with the flare in every pixel, on the same stares: means and variances.
 

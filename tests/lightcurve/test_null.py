@@ -76,6 +76,7 @@ def short():
 
 
 class TestSampled:
+    @pytest.mark.long
     def test_agrees_with_counting(self, short):
         """Where both can say. Fails by chance once in 10^3 runs: 4 standard errors at six thresholds."""
         search, tail = short

@@ -86,6 +86,7 @@ def test_stares_are_the_twins(stares: Stares, name: str, method: Any) -> None:
     assert SumTable.of(components).fourths == ("fourth" in name)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["pixels", "cumulants"])
 def test_a_split_changes_no_bit(engine: Engine, method: Any) -> None:
     """Whatever the tile, the neighbours or the call: a stare follows from seed and number, a frame from its time."""

@@ -147,6 +147,7 @@ def test_a_detection_uses_it_and_says_so(engine: Engine) -> None:
     assert sampled.threshold(1e-9) == engine.detect(quiet, flares, tails="sampled", **kind).threshold(1e-9)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [

@@ -33,6 +33,7 @@ from mauvecl.host.expectation import Expectation
 from mauvecl.results.requests.requests import RealiseRequest, Shard
 from mauvecl.runs.cluster import DaskWorkers
 from mauvecl.runs.pool import Pool, Stopped, together
+from mauvecl.runs.shards import Task
 from mauvecl.store import bulk
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("small_shards")]
@@ -130,7 +131,7 @@ def test_a_mistake_on_a_worker_is_a_sentence(workers: DaskWorkers) -> None:
     (bright,) = star(magnitude=-0.7, payload=instrument(part=True))
     impossible = RealiseRequest.of(bright, 10, seed=1, mode="stacked")
     with pytest.raises(DeviceError, match=r"failed at realisations 0 to 9: mode = 'stacked' cannot clip"):
-        workers.submit(impossible, "key", Shard(0, 0, 10), lambda done: None).result()
+        workers.submit(Task(impossible, "key", Shard(0, 0, 10))).result()
     assert workers.retries == before
 
 

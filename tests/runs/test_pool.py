@@ -53,16 +53,14 @@ class Shuffled(LocalWorkers):
     def count(self) -> int:
         return 4
 
-    def submit(
-        self, request: Any, key: str, shard: Shard, tick: Callable[[int], None], out: Any = None
-    ) -> Future[Arrays]:
-        sent = pickle.loads(pickle.dumps(request))
+    def submit(self, task: shards.Task) -> Future[Arrays]:
+        sent = pickle.loads(pickle.dumps(task.request))
         wait = self._random.uniform(0.0, 0.05)
 
         def work() -> Arrays:
             time.sleep(wait)
             with self._alone:
-                found = self.first.count(sent, shard)
+                found = self.first.count(sent, task.shard)
             time.sleep(wait)
             return dict(pickle.loads(pickle.dumps(found)))
 
@@ -87,6 +85,7 @@ def test_any_order_gives_the_engines_answer(engine: Engine, scene: list[Expectat
     )
 
 
+@pytest.mark.long
 def test_many_flares_noisy_references_and_processes(engine: Engine) -> None:
     """Several launches to a request, and everything that a request can carry."""
     quiet, *flares = star(amplitudes=tuple(np.linspace(0.01, 0.3, 17)), payload=instrument(part=True))

@@ -47,6 +47,7 @@ class Above:
         return {"frames": np.count_nonzero(values > self.level, axis=(-3, -2))}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("method", ["pixels", "cumulants"])
 @pytest.mark.parametrize("reduction", [None, Largest(), Above(500.0)])
 def test_shards_join_to_the_same_bits(engine: Engine, method: Any, reduction: Any) -> None:

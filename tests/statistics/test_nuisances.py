@@ -148,6 +148,7 @@ def test_what_cannot_be_is_refused_in_a_sentence() -> None:
             STATISTICS[name].check(s)
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("amplitude", [0.24, 3.0])
 def test_the_closed_form_in_the_span_of_few_vectors_is_that_of_all(amplitude: float) -> None:
     """Every fourth pixel, against the eigenvalues of the whole covariance."""

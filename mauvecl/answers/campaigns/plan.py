@@ -21,9 +21,10 @@ from mauvecl.answers.campaigns.planned import (
     star_of,
 )
 from mauvecl.answers.campaigns.visible import VisibleAnswer, visible
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.orbit.conditions import PARTICLES_SOURCE, THERMAL_SOURCE
+from mauvecl.host.tables import tabled
 from mauvecl.lightcurve.search.null import DAY_S
 from mauvecl.lightcurve.search.yields import Yield, recovered_per_day
 from mauvecl.study.labels import described, stacked, told
@@ -59,69 +60,70 @@ class PlanAnswer(Answer):
     @property
     def table(self) -> QTable:
         """One row per target."""
-        import astropy.units as u
-        from astropy.table import QTable
-
-        rows = self.planned
-        table = QTable()
-        table["target"] = [one.name for one in rows]
-        table["seen"] = [one.seen_h for one in rows] * u.h
-        table["hours"] = [one.hours for one in rows] * u.h
-        table["E50"] = [one.energy_at(0.5) for one in rows] * u.erg
-        table["E90"] = [one.energy_at(0.9) for one in rows] * u.erg
-        nothing = Yield(float("nan"), -1, -1, float("nan"))
+        rows, nothing = self.planned, Yield(float("nan"), -1, -1, float("nan"))
         recovered = [one.recovered or nothing for one in rows]
-        table["expected"] = [one.expected for one in recovered]
-        table["low"] = np.ma.MaskedArray([one.low for one in recovered], [one.low < 0 for one in recovered])
-        table["high"] = np.ma.MaskedArray([one.high for one in recovered], [one.high < 0 for one in recovered])
-        table["at_least_one"] = [one.at_least_one for one in recovered]
-        table["false_alarms"] = self.false_alarms
-        table["best_months"] = [" ".join(one.best_months) for one in rows]
-        for name, text in DESCRIPTIONS.items():
-            table[name].info.description = text
-        table.meta |= {
-            "start": self.seen.moments.iso(0.0),
-            "days": self.seen.moments.days,
-            "false_alarms_per_day": self.study.search.rate,
-            "study": self.study.text(),
-        }
-        return described(table)
+        low, high = (
+            np.ma.MaskedArray(values, [value < 0 for value in values])
+            for values in ([one.low for one in recovered], [one.high for one in recovered])
+        )
+        return described(
+            tabled(
+                [
+                    ("target", [one.name for one in rows]),
+                    ("seen", [one.seen_h for one in rows], "time in which the target is seen", "h"),
+                    ("hours", [one.hours for one in rows], "of it observed", "h"),
+                    ("E50", [one.energy_at(0.5) for one in rows], f"{ENERGY} half of the flares are recovered", "erg"),
+                    ("E90", [one.energy_at(0.9) for one in rows], f"{ENERGY} 90 % of the flares are recovered", "erg"),
+                    ("expected", [one.expected for one in recovered], "flares recovered, by the rates as they are"),
+                    ("low", low, "95 % of campaigns recover at least so many: scatter of the rates and Poisson's"),
+                    ("high", high, "95 % of campaigns recover at most so many"),
+                    ("at_least_one", [one.at_least_one for one in recovered], "probability of recovering any"),
+                    ("false_alarms", self.false_alarms, "expected of noise"),
+                    ("best_months", [" ".join(one.best_months) for one in rows], "those with most hours"),
+                ],
+                start=self.seen.moments.iso(0.0),
+                days=self.seen.moments.days,
+                false_alarms_per_day=self.study.search.rate,
+                study=self.study.text(),
+            )
+        )
 
     @property
     def stars(self) -> QTable:
         """What is put in: one row per target."""
-        import astropy.units as u
-        from astropy.table import QTable
-
-        rows = [one.looked for one in self.planned]
-        table = QTable()
-        table["target"] = [one.target.name for one in rows]
-        table["ra"] = [one.target.ra_deg for one in rows] * u.deg
-        table["dec"] = [one.target.dec_deg for one in rows] * u.deg
-        table["position"] = [one.target.source for one in rows]
-        table["spectral_type"] = [one.target.spectral_type or "" for one in rows]
-        table["spectrum"] = [one.star.library or "" for one in rows]
-        table["V"] = [one.star.magnitude or 0.0 for one in rows] * u.mag
-        table["distance"] = [one.star.distance_pc or 0.0 for one in rows] * u.pc
-        table["sky"] = [float("nan") if one.sky is None else one.sky for one in rows] * u.mag / u.arcsec**2
-        table["signal_per_frame"] = [one.signal_per_frame for one in rows]
-        table["energy_per_second"] = [one.scale.erg_per_s for one in rows] * u.erg / u.s
-        table["temperature"] = [one.quiet.conditions["temperature_c"] for one in rows] * u.deg_C
-        table["hits"] = [one.hits_per_cm2_s for one in rows] / u.cm**2 / u.s
-        table["window"] = [one.window_s / 60 for one in rows] * u.min
-        table["saturated"] = [int(one.quiet.saturated.sum()) for one in rows]
-        table["rates"] = [one.no_rates if one.rates is None else one.rates.source for one in self.planned]
-        table["recovered_per_day"] = [
-            float("nan")
-            if one.rates is None or one.completeness is None
-            else recovered_per_day(one.rates, one.completeness)
+        rows, nan = [one.looked for one in self.planned], float("nan")
+        a_day = [
+            nan if one.rates is None or one.completeness is None else recovered_per_day(one.rates, one.completeness)
             for one in self.planned
         ]
-        table["scatter"] = [float("nan") if one.rates is None else one.rates.scatter_dex for one in self.planned]
-        for name, text in STAR_COLUMNS.items():
-            table[name].info.description = text
-        table.meta["study"] = self.study.text()
-        return table
+        sources = [one.no_rates if one.rates is None else one.rates.source for one in self.planned]
+        scatter = [nan if one.rates is None else one.rates.scatter_dex for one in self.planned]
+        columns = (
+            ("target", [one.target.name for one in rows]),
+            ("ra", [one.target.ra_deg for one in rows], "", "deg"),
+            ("dec", [one.target.dec_deg for one in rows], "", "deg"),
+            ("position", [one.target.source for one in rows], "who says so"),
+            ("spectral_type", [one.target.spectral_type or "" for one in rows]),
+            ("spectrum", [one.star.library or "" for one in rows], "embedded spectrum that stands for the star"),
+            ("V", [one.star.magnitude or 0.0 for one in rows], "", "mag"),
+            ("distance", [one.star.distance_pc or 0.0 for one in rows], "", "pc"),
+            ("sky", [nan if one.sky is None else one.sky for one in rows],
+             "zodiacal light behind it, median over the days on which it is seen", "mag / arcsec2"),
+            ("signal_per_frame", [one.signal_per_frame for one in rows],
+             "S/N of one frame with a flare of amplitude 1"),
+            ("energy_per_second", [one.scale.erg_per_s for one in rows],
+             "bolometric energy of a second of equivalent duration", "erg / s"),
+            ("temperature", [one.quiet.conditions["temperature_c"] for one in rows],
+             "of the detector, mean while it is seen", "deg_C"),
+            ("hits", [one.hits_per_cm2_s for one in rows],
+             "of cosmic rays and trapped protons, mean while it is seen", "1 / (s cm2)"),
+            ("window", [one.window_s / 60 for one in rows], "median stretch in which it is seen", "min"),
+            ("saturated", [int(one.quiet.saturated.sum()) for one in rows], "pixels left out since they saturate"),
+            ("rates", sources),
+            ("recovered_per_day", a_day, "flares recovered in a day of exposure"),
+            ("scatter", scatter, "standard deviation of the rate's logarithm, dex"),
+        )  # fmt: skip
+        return tabled(columns, study=self.study.text())
 
     @property
     def by_energy(self) -> QTable:
@@ -136,13 +138,13 @@ class PlanAnswer(Answer):
             energy, p = one.completeness.energy_erg, one.completeness.probability
             first = max(int(np.argmax(p > 0)) - 1, 0)
             part = slice(first, min(first + 161, energy.size))
-            table = QTable({"energy": energy[part] * u.erg, "recovered": p[part]})
             rate = np.full(energy[part].size, np.nan) if one.rates is None else one.rates.per_day_above(energy[part])
-            table["rate_above"] = rate / u.day
-            table["energy"].info.description = "bolometric"
-            table["recovered"].info.description = "share of flares of this energy that is recovered"
-            table["rate_above"].info.description = "flares of this energy or more, a day"
-            parts.append(({"target": one.name}, table))
+            columns = (
+                ("energy", energy[part], "bolometric", "erg"),
+                ("recovered", p[part], "share of flares of this energy that is recovered"),
+                ("rate_above", rate, "flares of this energy or more, a day", "1 / day"),
+            )
+            parts.append(({"target": one.name}, tabled(columns)))
         if not parts:
             return QTable({"target": np.array([], "U1"), "energy": np.array([]) * u.erg})
         return stacked(parts, study=self.study.text())
@@ -265,32 +267,8 @@ class PlanAnswer(Answer):
         return {"plan": ("plan_report.overview", self), "visible": ("visibility.calendar", self.seen)}
 
 
-#: Columns of the table of targets.
-DESCRIPTIONS = {
-    "seen": "time in which the target is seen",
-    "hours": "of it observed",
-    "E50": "bolometric energy from which on half of the flares are recovered",
-    "E90": "bolometric energy from which on 90 % of the flares are recovered",
-    "expected": "flares recovered, by the rates as they are",
-    "low": "95 % of campaigns recover at least so many: scatter of the rates and Poisson's",
-    "high": "95 % of campaigns recover at most so many",
-    "at_least_one": "probability of recovering any",
-    "false_alarms": "expected of noise",
-    "best_months": "those with most hours",
-}
-STAR_COLUMNS = {
-    "position": "who says so",
-    "spectrum": "embedded spectrum that stands for the star",
-    "sky": "zodiacal light behind it, median over the days on which it is seen",
-    "signal_per_frame": "S/N of one frame with a flare of amplitude 1",
-    "energy_per_second": "bolometric energy of a second of equivalent duration",
-    "temperature": "of the detector, mean while it is seen",
-    "hits": "of cosmic rays and trapped protons, mean while it is seen",
-    "window": "median stretch in which it is seen",
-    "saturated": "pixels left out since they saturate",
-    "recovered_per_day": "flares recovered in a day of exposure",
-    "scatter": "standard deviation of the rate's logarithm, dex",
-}
+#: Of E50 and E90.
+ENERGY = "bolometric energy from which on"
 
 
 def _measured(one: Planned) -> str:

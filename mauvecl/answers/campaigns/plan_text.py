@@ -101,4 +101,5 @@ def target_lines(answer: PlanAnswer, k: int) -> list[tuple[str, str, str]]:
 def heading(answer: PlanAnswer) -> str:
     """What the plan is, in a line."""
     moments = answer.seen.moments
-    return f"{len(answer.planned)} targets, {moments.days:g} days from {moments.iso(0.0)[:10]} (UTC)"
+    targets = "1 target" if len(answer.planned) == 1 else f"{len(answer.planned)} targets"
+    return f"{targets}, {moments.days:g} days from {moments.iso(0.0)[:10]} (UTC)"

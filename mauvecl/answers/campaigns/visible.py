@@ -12,12 +12,13 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.campaigns.calendars import Entry, calendar_bytes
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.host.orbit.bodies import Bodies
 from mauvecl.host.orbit.moments import DAY_S, Moments
 from mauvecl.host.orbit.names import Target
 from mauvecl.host.orbit.season import elongation_deg, zodiacal_light
 from mauvecl.host.orbit.visibility import Visibility, Windows
+from mauvecl.host.tables import tabled
 from mauvecl.study.labels import described, stacked
 from mauvecl.study.orbits import targets_of
 from mauvecl.study.study import Study
@@ -85,41 +86,44 @@ class VisibleAnswer(Answer):
     @property
     def table(self) -> QTable:
         """One row per target."""
-        import astropy.units as u
-        from astropy.table import QTable
-
         seen, (names, hours) = self.visibility, self.visibility.by_month()
-        table = QTable()
-        table["target"] = [one.name for one in self.targets]
-        table["ra"] = [one.ra_deg for one in self.targets] * u.deg
-        table["dec"] = [one.dec_deg for one in self.targets] * u.deg
-        table["hours"] = seen.hours * u.h
-        table["share"] = seen.share
-        for name, kept in seen.kept_by.items():
-            table[f"leaves_{name}"] = kept
-            table[f"leaves_{name}"].info.description = f"share of the time that the limit of {name} alone leaves"
+        every = range(len(self.targets))
         lengths = [one.length_s / 60 for one in self.windows]
-        table["windows"] = [one.size for one in lengths]
-        table["median_window"] = [float(np.median(one)) if one.size else 0.0 for one in lengths] * u.min
-        table["longest_gap"] = [self._longest_gap_d(k) for k in range(len(self.targets))] * u.day
-        table["per_orbit"] = [float(np.mean(seen.by_orbit(k))) for k in range(len(self.targets))] * u.min
-        table["in_shadow"] = [
-            float(one.in_shadow_s.sum() / one.length_s.sum()) if one.length_s.size else 0.0 for one in self.windows
-        ]
-        table["best_month"] = [
-            names[int(np.argmax(hours[:, k]))] if hours[:, k].any() else "" for k in range(len(self.targets))
-        ]
-        away = [self.elongation_deg(k) for k in range(len(self.targets))]
-        table["least_elongation"] = [float(one.min()) for one in away] * u.deg
-        table["most_elongation"] = [float(one.max()) for one in away] * u.deg
+        dark = [float(w.in_shadow_s.sum() / w.length_s.sum()) if w.length_s.size else 0.0 for w in self.windows]
+        best = [names[int(np.argmax(hours[:, k]))] if hours[:, k].any() else "" for k in every]
+        away = [self.elongation_deg(k) for k in every]
         light = [one[np.isfinite(one)] for one in self.zodiacal]
-        unit = u.mag / u.arcsec**2
-        table["brightest_sky"] = [float(one.min()) if one.size else np.nan for one in light] * unit
-        table["faintest_sky"] = [float(one.max()) if one.size else np.nan for one in light] * unit
-        for name, text in DESCRIPTIONS.items():
-            table[name].info.description = text
-        table.meta |= {"start": self.moments.iso(0.0), "days": self.moments.days, "study": self.study.text()}
-        return described(table)
+        brightest, faintest = ([float(end(one)) if one.size else np.nan for one in light] for end in (np.min, np.max))
+        per_orbit = [float(np.mean(seen.by_orbit(k))) for k in every]
+        sky = "mag / arcsec2"
+        columns: list[tuple[object, ...]] = [
+            ("target", [one.name for one in self.targets]),
+            ("ra", [one.ra_deg for one in self.targets], "", "deg"),
+            ("dec", [one.dec_deg for one in self.targets], "", "deg"),
+            ("hours", seen.hours, "exposure in the whole time, with the duty cycle", "h"),
+            ("share", seen.share, "of the time in which the target is seen"),
+            *(
+                (f"leaves_{name}", kept, f"share of the time that the limit of {name} alone leaves")
+                for name, kept in seen.kept_by.items()
+            ),
+            ("windows", [one.size for one in lengths], "stretches in which it is seen"),
+            (
+                "median_window",
+                [float(np.median(one)) if one.size else 0.0 for one in lengths],
+                "length of a stretch",
+                "min",
+            ),
+            ("longest_gap", [self._longest_gap_d(k) for k in every], "longest time without one", "day"),
+            ("per_orbit", per_orbit, "exposure in a mean orbit", "min"),
+            ("in_shadow", dark, "share of the windows in the Earth's shadow"),
+            ("best_month", best, "that with most exposure"),
+            ("least_elongation", [float(one.min()) for one in away], "least angle from the Sun", "deg"),
+            ("most_elongation", [float(one.max()) for one in away], "largest angle from the Sun", "deg"),
+            ("brightest_sky", brightest, "zodiacal light at its brightest, V, where the table has it", sky),
+            ("faintest_sky", faintest, "zodiacal light at its faintest, V", sky),
+        ]
+        about = {"start": self.moments.iso(0.0), "days": self.moments.days}
+        return described(tabled(columns, **about, study=self.study.text()))
 
     def _longest_gap_d(self, k: int) -> float:
         """Days without a window."""
@@ -133,52 +137,51 @@ class VisibleAnswer(Answer):
     @property
     def months(self) -> QTable:
         """One row per month, one column of hours per target."""
-        import astropy.units as u
-        from astropy.table import QTable
-
         names, hours = self.visibility.by_month()
-        table = QTable({"month": names})
-        for k, one in enumerate(self.targets):
-            table[one.name] = hours[:, k] * u.h
-        table.meta["study"] = self.study.text()
-        return table
+        each = ((one.name, hours[:, k], "", "h") for k, one in enumerate(self.targets))
+        return tabled([("month", names), *each], study=self.study.text())
 
     @property
     def by_day(self) -> QTable:
         """One row per target and day."""
-        import astropy.units as u
-        from astropy.table import QTable
-
-        parts = []
-        for k, one in enumerate(self.targets):
-            table = QTable({"day": self.days})
-            table["hours"] = self.visibility.by_day(k) * u.h
-            table["elongation"] = self.elongation_deg(k) * u.deg
-            table["zodiacal_light"] = self.zodiacal[k] * u.mag / u.arcsec**2
-            table["elongation"].info.description = "angle from the Sun at noon"
-            table["zodiacal_light"].info.description = "V at noon; none where the table has none, near the Sun"
-            parts.append(({"target": one.name}, table))
+        told = "V at noon; none where the table has none, near the Sun"
+        parts = (
+            (
+                {"target": one.name},
+                tabled(
+                    [
+                        ("day", self.days),
+                        ("hours", self.visibility.by_day(k), "", "h"),
+                        ("elongation", self.elongation_deg(k), "angle from the Sun at noon", "deg"),
+                        ("zodiacal_light", self.zodiacal[k], told, "mag / arcsec2"),
+                    ]
+                ),
+            )
+            for k, one in enumerate(self.targets)
+        )
         return stacked(parts, study=self.study.text())
 
     @property
     def window_table(self) -> QTable:
         """One row per window."""
-        import astropy.units as u
-        from astropy.table import QTable
-
         moments, z = self.moments, self.visibility.track.of_date_km[:, 2]
         nodes = moments.seconds[1:][(z[:-1] < 0) & (z[1:] >= 0)]
-        parts = []
-        for one, windows in zip(self.targets, self.windows, strict=True):
-            table = QTable()
-            table["start"] = [moments.iso(float(t)) for t in windows.start_s] or np.array([], "U19")
-            table["stop"] = [moments.iso(float(t)) for t in windows.stop_s] or np.array([], "U19")
-            table["length"] = windows.length_s / 60 * u.min
-            table["in_shadow"] = windows.in_shadow_s / 60 * u.min
-            table["orbit"] = np.searchsorted(nodes, windows.start_s)
-            table["in_shadow"].info.description = "of it, in the Earth's shadow"
-            table["orbit"].info.description = "ascending nodes since the start of the plan"
-            parts.append(({"target": one.name}, table))
+        nothing, orbits = np.array([], "U19"), "ascending nodes since the start of the plan"
+        parts = (
+            (
+                {"target": one.name},
+                tabled(
+                    [
+                        ("start", [moments.iso(float(t)) for t in windows.start_s] or nothing),
+                        ("stop", [moments.iso(float(t)) for t in windows.stop_s] or nothing),
+                        ("length", windows.length_s / 60, "", "min"),
+                        ("in_shadow", windows.in_shadow_s / 60, "of it, in the Earth's shadow", "min"),
+                        ("orbit", np.searchsorted(nodes, windows.start_s), orbits),
+                    ]
+                ),
+            )
+            for one, windows in zip(self.targets, self.windows, strict=True)
+        )
         return stacked(parts, study=self.study.text(), step_s=moments.step_s)
 
     @property
@@ -259,20 +262,6 @@ class VisibleAnswer(Answer):
 
 
 #: Columns of the table of targets.
-DESCRIPTIONS = {
-    "hours": "exposure in the whole time, with the duty cycle",
-    "share": "of the time in which the target is seen",
-    "windows": "stretches in which it is seen",
-    "median_window": "length of a stretch",
-    "longest_gap": "longest time without one",
-    "per_orbit": "exposure in a mean orbit",
-    "in_shadow": "share of the windows in the Earth's shadow",
-    "best_month": "that with most exposure",
-    "least_elongation": "least angle from the Sun",
-    "most_elongation": "largest angle from the Sun",
-    "brightest_sky": "zodiacal light at its brightest, V, where the table has it",
-    "faintest_sky": "zodiacal light at its faintest, V",
-}
 
 
 @public

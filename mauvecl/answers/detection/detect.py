@@ -11,7 +11,7 @@ import numpy as np
 
 from mauvecl.answers.answer import Answer, InCell
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.results.detection.campaign import campaign, per_test
 from mauvecl.results.detection.departures import departure_table

@@ -17,7 +17,7 @@ from scipy import special
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.detect import DetectAnswer, detect
 from mauvecl.answers.signal.snr import SnrAnswer, snr
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.host.tables import telling
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.results.snr import steps_of

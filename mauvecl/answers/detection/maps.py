@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.host.tables import tabled
 from mauvecl.results.requests.fap import check_fap
 from mauvecl.statistics.intervals import Interval

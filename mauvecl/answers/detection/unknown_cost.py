@@ -111,8 +111,8 @@ def spoken(choice: NuisanceChoice) -> str:
     """Unknowns in a sentence: the dark level (+-0.5 deg C) and the light level (free)."""
     sd: dict[str, float | str] = {u.nuisance: u.sd for u in USUAL} if choice.usual else {}
     sd |= {name: value for name in NUISANCES if (value := getattr(choice, name)) is not None}
-    found = [f"{CALLED[name]} ({_size(value, '%' if name != 'dark' else 'deg C')})" for name, value in sd.items()]
-    return joined(found + [f"{name!r} ({_size(one.sd, '')})" for name, one in choice.own.items()])
+    sizes = [f"{CALLED[name]} ({_size(value, '%' if name != 'dark' else 'deg C')})" for name, value in sd.items()]
+    return joined(sizes + [f"{name!r} ({_size(one.sd, '')})" for name, one in choice.own.items()])
 
 
 def _size(sd: float | str, unit: str) -> str:

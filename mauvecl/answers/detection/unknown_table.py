@@ -4,22 +4,22 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import Cost, spoken, unknown_cost
-from mauvecl.host.plotting import picture
 from mauvecl.host.tables import telling
-from mauvecl.study.labels import described, label
+from mauvecl.study.labels import described, label, told
 from mauvecl.study.nuisances import NuisanceChoice
 
 if TYPE_CHECKING:
-    from astropy.table import QTable
+    from astropy.table import QTable, Table
 
+    from mauvecl.host.expectation import Expectation
     from mauvecl.study.study import Study
 
 #: What is looked at where nothing else is named: METHODS' table, and more.
@@ -44,7 +44,7 @@ DESCRIPTIONS = {
 
 
 @dataclass(frozen=True, eq=False)
-class UnknownTable:
+class UnknownTable(Answer):
     """What `unknown_table` answers.
 
     Attributes
@@ -52,10 +52,13 @@ class UnknownTable:
     study : Study
     costs : dict of dict of Cost
         By (star, amplitude), then by unknown.
+    quiets : tuple of Expectation
+        The stars without a flare.
     """
 
     study: Study
     costs: dict[tuple[str, float], dict[str, Cost]]
+    quiets: tuple[Expectation, ...] = ()
 
     def smallest(self, star: str, unknown: str | None) -> float:
         """The flare amplitude detected with the study's power at its false-alarm probability, marginalised.
@@ -90,12 +93,23 @@ class UnknownTable:
         table.meta |= {"fap": self.study.run.fap, "power": self.study.limit.power, "study": self.study.toml()}
         return described(telling(table, DESCRIPTIONS))
 
-    def _repr_html_(self) -> str:
-        return str(self.table._repr_html_())
+    @property
+    def tables(self) -> dict[str, Table]:
+        """The one table."""
+        return {"unknowns": self.table}
 
-    def plot(self, path: str | Path | None = None, *, ax: Any = None) -> object:
-        """Detection probability against amplitude, and the smallest amplitude of each star; needs matplotlib."""
-        return picture("unknowns.unknowns", self, path=path, ax=ax)
+    @property
+    def messages(self) -> list[str]:
+        return told(list(self.quiets))
+
+    @property
+    def inputs(self) -> list[Expectation]:
+        return list(self.quiets)
+
+    @property
+    def pictures(self) -> dict[str, tuple[Any, ...]]:
+        """Detection probability against amplitude, and the smallest amplitude of each star."""
+        return {"unknowns": ("unknowns.unknowns", self)}
 
 
 def unknown_table(study: Study, unknowns: Mapping[str, NuisanceChoice] = SHOWN) -> UnknownTable:
@@ -108,15 +122,17 @@ def unknown_table(study: Study, unknowns: Mapping[str, NuisanceChoice] = SHOWN) 
         By what they are called.
     """
     costs: dict[tuple[str, float], dict[str, Cost]] = {}
+    quiets = []
     for star in study.star:
         quiet, *flares = study.expectations(star)
+        quiets.append(quiet)
         name = label(star, quiet)
         for amplitude, flare in zip(study.flare.amplitudes, flares, strict=True):
             costs[name, amplitude] = {
                 unknown: unknown_cost(name, quiet, flare, study.model_copy(update={"nuisances": choice}))
                 for unknown, choice in unknowns.items()
             }
-    return UnknownTable(study, costs)
+    return UnknownTable(study, costs, tuple(quiets))
 
 
 def power(snr: NDArray[np.float64], fap: float) -> NDArray[np.float64]:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.limits.search import LimitSearch
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.host.tables import tabled
 from mauvecl.noise.processes import Uniform
 from mauvecl.study.labels import described

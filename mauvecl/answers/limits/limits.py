@@ -12,7 +12,7 @@ import numpy as np
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import Cost, cost_lines, marginal_lines, unknown_cost
 from mauvecl.answers.limits.search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.tables import tabled
 from mauvecl.results.requests.fap import check_fap
@@ -231,7 +231,8 @@ def solve(
     shown = question.study.star[0]
     named = star.model_copy(update={"magnitude": None}) if question.of == "magnitude" else shown
     rise = value.value if question.of == "amplitude" else question.study.flare.amplitudes[0]
-    where = f"{label(named, quiet)} at {question.of} {value.value:.4g}, flare of {100 * rise:.3g} %"
+    there = f"exposure {value.value:.0f} s" if question.of == "exposure" else f"{question.of} {value.value:.4g}"
+    where = f"{label(named, quiet)} at {there}, flare of {100 * rise:.4g} %"
     return Limit(
         star=label(named, quiet),
         amplitude=float("nan") if amplitude is None else amplitude,

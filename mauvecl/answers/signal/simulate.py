@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.answer import Answer
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.host.plotting import picture
 from mauvecl.host.quantities import count
 from mauvecl.noise.components import components

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.answer import Answer, InCell
 from mauvecl.answers.signal.exposures import place_of
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.runs.pool import Pool, together
 from mauvecl.study.labels import label, stacked, told
 from mauvecl.study.study import Study

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer, InCell
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.tables import tabled
 from mauvecl.lightcurve.search.injected import Injected
@@ -235,6 +235,9 @@ def inject(
 
         engine = Default()
     cells = [(values, one, star) for values, one in study.cells() for star in one.star]
+    for _, one, star in cells:
+        # A size that no star has is told before the first of them is searched.
+        Sizes.chosen(one, star, star.source())
     q = study.injections
     each = q.count * q.sizes * q.widths
     answer = InjectAnswer(study, [])

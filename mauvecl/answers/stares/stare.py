@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.answers.answer import Answer, InCell
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.tables import tabled
 from mauvecl.lightcurve.flares.events import Event, coefficients, temperatures_of
@@ -213,8 +213,8 @@ class StareAnswer(Answer):
             for n, one in enumerate(self.stares, 1)
             if one.staring.stare.n_frames <= MOST_ROWS
         }
-        found = {"found": self.found} if self.study.stare.search else {}
-        return {"stare": self.table, "events": self.events} | found | curves
+        searched = {"found": self.found} if self.study.stare.search else {}
+        return {"stare": self.table, "events": self.events} | searched | curves
 
     @property
     def documents(self) -> dict[str, Callable[[], bytes]]:
@@ -277,14 +277,14 @@ def stare(study: Study, stares: Stares) -> StareAnswer:
         raise InputError(f"a stare of {frames} frames, each with a spectrum, expected at most {MOST_SHOWN}")
     # Everything is looked at before anything is drawn: bad input shows at once.
     prepared = [(star, at, cell, *staring_of(cell, star)) for at, cell in study.cells() for star in cell.star]
-    stared = [_drawn(study, stares, *one) for one in prepared]
+    drawn = [_drawn(study, stares, *one) for one in prepared]
     messages = told([staring.quiet for _, _, _, staring, _ in prepared]) + orbit_lines(study)
-    messages += [one.searched for one in stared if isinstance(one.searched, str)]
-    for one in stared:
+    messages += [one.searched for one in drawn if isinstance(one.searched, str)]
+    for one in drawn:
         cut = int(np.count_nonzero(one.staring.quality))
         if cut:
             messages.insert(0, f"SATURATED: {cut} frames of the stare at {one.title}; their quality is 1.")
-    return StareAnswer(study, stared, messages)
+    return StareAnswer(study, drawn, messages)
 
 
 def _drawn(
@@ -316,9 +316,9 @@ def _searched(study: Study, star: Star, staring: Staring, events: list[Event], d
         threshold = survey.tail(study.run.seed).threshold(study.search.rate).value
     except InputError as error:
         return f"{label(star, staring.quiet)} is not searched: {error}."
-    seen_alarms = alarms(survey, known.templates, draw(survey.components), threshold)
+    raised = alarms(survey, known.templates, draw(survey.components), threshold)
     energies, nearest = [], []
-    for alarm in seen_alarms:
+    for alarm in raised:
         fit = alarm.recovered
         kelvin = float(np.nan_to_num(fit.temperature_k[0], nan=study.flare.temperature_k))
         event = Event(
@@ -330,15 +330,15 @@ def _searched(study: Study, star: Star, staring: Staring, events: list[Event], d
         near = int(np.argmin(away)) if away else -1
         close = near >= 0 and away[near] <= events[near].half_width_s + 2 * staring.stare.frame_s
         nearest.append(near + 1 if close else 0)
-    return Searched(threshold, seen_alarms, tuple(energies), tuple(nearest))
+    return Searched(threshold, raised, tuple(energies), tuple(nearest))
 
 
 def _flares(study: Study, star: Star, staring: Staring, events: list[Event]) -> tuple[Flaring, ...]:
     source, kelvin, frames = star.source(), temperatures_of(events), staring.stare
-    flaring = []
+    flares = []
     for event in events:
         energies = [energy_of(study, star, source, event, kind) for kind in ("band", "bolometric")]
         band, bolometric = (float("nan") if energy is None else energy for energy in energies)
         own = coefficients([event], frames.start_s, frames.frame_s, kelvin)
-        flaring.append(Flaring(event, band, bolometric, staring.snr(own)))
-    return tuple(flaring)
+        flares.append(Flaring(event, band, bolometric, staring.snr(own)))
+    return tuple(flares)

@@ -39,7 +39,7 @@ def realise(study: Study, session: Session) -> None:
     One file holds fewer than 4 GiB. An array per star and flare, a row per realisation, with calibration, units and
     the study. What was written stays: --resume draws what is missing.
 
-    Examples: mauvecl realise study.toml -n 1000000 --output frames.zarr
+    Examples: mauvecl realise study.toml -n 10000 --output frames.zarr
 
     mauvecl realise --star G2V --magnitude 7.4 --amplitude 0.24 --exposure 5 -n 1000 --output frames.fits
     """

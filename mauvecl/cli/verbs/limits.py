@@ -51,7 +51,8 @@ def _show_limits(answer: LimitResult) -> None:
     asked, run = study.limit, study.run
     swept = [axis.quantity for axis in study.sweep.axes if axis.quantity != "amplitude"]
     cells = []
-    digits = ".3f" if asked.of == "magnitude" else ".4g"
+    digits = {"magnitude": ".3f", "amplitude": ".4g", "exposure": ".0f"}[asked.of]
+    sought = "exposure (s)" if asked.of == "exposure" else asked.of
     for one in answer.limits:
         p, value = one.check.probability, one.value
         flare = "" if asked.of == "amplitude" else f"{100 * one.amplitude:g} %"
@@ -64,7 +65,7 @@ def _show_limits(answer: LimitResult) -> None:
     show_table(
         f"Limit of {asked.of} at a detection probability of {asked.power:g}, false-alarm probability {run.fap:g} per "
         f"test, {run.realisations:,} realisations; [95 % interval]",
-        ("star", *swept, "flare", "statistic", asked.of, "", "closed form", "simulated again there", "", ""),
+        ("star", *swept, "flare", "statistic", sought, "", "closed form", "simulated again there", "", ""),
         cells,
     )
     if study.unknowns.draws:

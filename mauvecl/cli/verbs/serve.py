@@ -7,12 +7,14 @@ from typing import Annotated
 
 import typer
 
+from mauvecl.cli.values import count, within
+
 
 def serve(
     address: Annotated[
         str, typer.Option(metavar="TEXT", help="Who may come: 127.0.0.1 is this machine alone.")
     ] = "127.0.0.1",
-    port: Annotated[int, typer.Option(min=1, max=65535, help="Port.")] = 5006,
+    port: Annotated[str, typer.Option(metavar="INTEGER", help="Port.")] = "5006",
     allow_origin: Annotated[
         list[str] | None,
         typer.Option(
@@ -31,12 +33,13 @@ def serve(
     from mauvecl.host.errors import InputError
     from mauvecl.host.files.bounded import shortened
 
+    number = within(port, "--port", read=count, low=1, high=65535)
     if find_spec("bokeh") is None or find_spec("tornado") is None:
         raise InputError("Bokeh is missing, expected it for the page: pip install 'mauvecl[web]'")
     from mauvecl.web.server import serve
 
     try:
-        serve(address, port, show=show, allowed=allow_origin or ())
+        serve(address, number, show=show, allowed=allow_origin or ())
     except OSError as error:
         raise InputError(
             f"port {port} of {shortened(address)} cannot be used ({error.strerror}), expected another: --port"

@@ -9,7 +9,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.ranges import FLARE_TEMPERATURES_K
 from mauvecl.lightcurve.flares.energies import EnergyScale, amplitude_of, amplitude_of_peak, equivalent_duration

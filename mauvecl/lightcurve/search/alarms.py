@@ -56,12 +56,12 @@ def alarms(survey: Survey, templates: Templates, sums: NDArray[Any], threshold: 
     search, bank, start = survey.search, survey.bank, survey.stare.start_s
     fit = Fit(bank, templates)
     edges = np.column_stack([start, start + survey.stare.frame_s])
-    every: list[Alarm] = []
-    while len(every) < MOST_ALARMS:
+    raised: list[Alarm] = []
+    while len(raised) < MOST_ALARMS:
         best = search.largest(left.astype(np.float32))
         rho, peak, width = (float(v[0]) for v in (best.maximum, best.peak_s, best.half_width_s))
         # What the fits of the others may have left here.
-        near = [a.rho for a in every if abs(float(a.recovered.peak_s[0]) - peak) < _reach(a, width)]
+        near = [a.rho for a in raised if abs(float(a.recovered.peak_s[0]) - peak) < _reach(a, width)]
         if rho < threshold + LEFT_BEHIND * sum(near):
             break
         kelvin = templates.temperatures_k[templates.chosen[int(best.temperature[0])]]
@@ -69,11 +69,11 @@ def alarms(survey: Survey, templates: Templates, sums: NDArray[Any], threshold: 
             left, start, peak_s=[peak], half_width_s=[width], temperature_k=[kelvin],
             variance=search.variance, curves=survey.curves,
         )  # fmt: skip
-        every.append(Alarm(rho, one))
+        raised.append(Alarm(rho, one))
         light = one.amplitude[0] * bank.shape.mean_over(edges, one.peak_s[0], one.half_width_s[0])
         at = kelvin if np.isnan(one.temperature_k[0]) else float(one.temperature_k[0])
         left = left - light[:, None] * _response(templates, at)
-    return every
+    return raised
 
 
 def _reach(alarm: Alarm, width_s: float) -> float:

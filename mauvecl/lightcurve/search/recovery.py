@@ -168,15 +168,15 @@ class Fit:
             there = peak + move[:, 1] * np.exp(log_width), log_width + move[:, 2]
             kelvin = np.clip(log_kelvin + move[:, 3], coolest, hottest)
             tried = looked(*there)
-            best, gained = fitted(tried, kelvin)
-            better = going & (gained > gain)
-            small = np.abs(gained - gain) < ENOUGH
+            best, reached = fitted(tried, kelvin)
+            better = going & (reached > gain)
+            small = np.abs(reached - gain) < ENOUGH
             peak, log_width = (np.where(better, a, b) for a, b in zip(there, (peak, log_width), strict=True))
             log_kelvin, amplitude = np.where(better, kelvin, log_kelvin), np.where(better, best, amplitude)
             products = tuple(  # type: ignore[assignment]
                 np.where(better[:, None, None], a, b) for a, b in zip(tried, products, strict=True)
             )
-            gain = np.where(better, gained, gain)
+            gain = np.where(better, reached, gain)
             damping = np.where(better, damping / EASIER, damping * HARDER)
             going &= ~(small & better) & (damping < 1e6)
             if not going.any():

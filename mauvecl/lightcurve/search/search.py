@@ -173,9 +173,9 @@ class Search:
         shape = row.template.shapes[row.phase][at]
         for (power, series), amplitude in zip(self._terms, row.project[:, onset], strict=True):
             shape = shape - amplitude * row.template.time[at] ** power * self._series[series][self._at[inside]]
-        filter_in_time = np.zeros(self.stare.n_frames)
-        filter_in_time[inside] = shape * self._weight[self._at[inside]] / row.per_amplitude[onset]
-        return filter_in_time
+        template = np.zeros(self.stare.n_frames)
+        template[inside] = shape * self._weight[self._at[inside]] / row.per_amplitude[onset]
+        return template
 
     @property
     def variance(self) -> Float:
@@ -218,13 +218,13 @@ class Search:
             for row in self.grid:
                 if row.template is not template:
                     continue
-                values = self._correlated(spectra[0], template.shapes[row.phase], template)
+                correlated = self._correlated(spectra[0], template.shapes[row.phase], template)
                 for projected, term in zip(row.project.astype(np.float32), known, strict=True):
-                    values -= projected * term
+                    correlated -= projected * term
                 tried = row.per_amplitude > 0
                 scale = np.divide(1.0, row.per_amplitude, out=np.zeros_like(row.per_amplitude), where=tried)
-                values *= scale.astype(np.float32)
-                rho = np.einsum("tk,skn->stn", directions, values, optimize=True)
+                correlated *= scale.astype(np.float32)
+                rho = np.einsum("tk,skn->stn", directions, correlated, optimize=True)
                 if not tried.all():
                     rho[:, :, ~tried] = -np.inf
                 yield row, rho
@@ -242,12 +242,15 @@ class Search:
     def _levelled(self, sums: NDArray[Any]) -> NDArray[Any]:
         """The sums less their level over the whole stare, which every window marginalises over: for precision alone."""
         y = np.moveaxis(sums, 2, 1)
-        if not self._terms:
-            return y
+        return np.asarray(y - (y @ self._level_span) @ self._level_span.T) if self._terms else y
+
+    @cached_property
+    def _level_span(self) -> Float:
+        """Orthonormal columns that span every level of the stare, (n_frame, n)."""
         time = (self._at - self._at.mean()) / max(self.n_grid, 1)
         columns = np.array([time**power * self._series[series][self._at] for power, series in self._terms])
-        level, *_ = np.linalg.lstsq(columns.T, y.reshape(-1, y.shape[2]).T.astype(np.float64), rcond=None)
-        return np.asarray(y - (columns.T @ level).T.reshape(y.shape))
+        span, size, _ = np.linalg.svd(columns.T, full_matrices=False)
+        return np.asarray(span[:, size > 1e-12 * size[0]])
 
     def _level(self, template: Template, spectra: list[NDArray[Any]]) -> list[Single]:
         """The data's correlation with each term of the level, shape (n_stare, n_sum, n_onset)."""
@@ -259,8 +262,8 @@ class Search:
         held = np.zeros(self._size, real)
         held[: kernel.size] = kernel
         other = np.conj(scipy.fft.rfft(np.roll(held, template.first)))
-        correlated: NDArray[Any] = scipy.fft.irfft(spectrum * other, self._size)
-        return correlated[..., self._start(template) : self.n_grid : template.stride]
+        values: NDArray[Any] = scipy.fft.irfft(spectrum * other, self._size)
+        return values[..., self._start(template) : self.n_grid : template.stride]
 
     def _start(self, template: Template) -> int:
         return -self._first % template.stride
@@ -291,9 +294,9 @@ class Search:
             left = power
             if n:
                 shared = np.stack([over(0, a, shape * time**p) for p, a in self._terms], axis=1)
-                projected = np.linalg.solve(scaled, (shared / size)[:, :, None])[:, :, 0] / size
-                project = projected.T
-                left = power - 2 * np.sum(projected * shared, 1) + np.einsum("ni,nij,nj->n", projected, gram, projected)
+                solved = np.linalg.solve(scaled, (shared / size)[:, :, None])[:, :, 0] / size
+                project = solved.T
+                left = power - 2 * np.sum(solved * shared, 1) + np.einsum("ni,nij,nj->n", solved, gram, solved)
             tried = left >= LEAST_SHARE * self._without_gaps(template, phase)
             yield Row(template, phase, peaks, np.sqrt(np.where(tried, left, 0.0)), project)
 

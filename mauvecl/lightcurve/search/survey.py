@@ -63,8 +63,8 @@ class Survey:
     @cached_property
     def directions(self) -> dict[Changing, Float]:
         """What a small change of the star's level, of light, sky or temperature does, each (n_frame, n_sum)."""
-        moves: dict[Any, Float] = self.components.directions(self.coefficients)
-        return moves
+        directions: dict[Any, Float] = self.components.directions(self.coefficients)
+        return directions
 
     def covariance(self, *, jittered: tuple[Changing, ...] = ("light", "sky", "temperature")) -> Float:
         """Of each frame's sums without a flare, some of the stare's jitters included, (n_frame, n_sum, n_sum)."""
@@ -103,14 +103,14 @@ class Survey:
                     every.append(curve)
         # What is left of each beside a straight line and those before it.
         basis = np.linalg.qr(np.vander(self.stare.start_s / max(self.stare.duration_s, 1.0), 2))[0]
-        kept: list[Float] = []
+        curves: list[Float] = []
         for curve in every:
             left = curve - basis @ (basis.T @ curve)
             size = float(np.linalg.norm(left))
             if size > LEAST_CURVE * float(np.linalg.norm(curve)):
-                kept.append(left)
+                curves.append(left)
                 basis = np.column_stack([basis, left / size])
-        return np.array(kept).reshape(len(kept), self.stare.n_frames)
+        return np.array(curves).reshape(len(curves), self.stare.n_frames)
 
     @cached_property
     def search(self) -> Search:

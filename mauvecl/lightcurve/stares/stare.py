@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.stares.curves import Curve, Sinusoid
 from mauvecl.lightcurve.usual import CHANGING, ORBIT_S, Changing

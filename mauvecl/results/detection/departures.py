@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.host.tables import tabled
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.results.requests.fap import countable

@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.host.arguments import public
 from mauvecl.host.content import ByContent
-from mauvecl.host.doors import public
 from mauvecl.host.plotting import picture
 from mauvecl.host.quantities import count
 from mauvecl.host.tables import tabled, telling
@@ -63,7 +63,9 @@ class Detection(ByContent, Hypotheses):
 
     def _line(self) -> str:
         flares, names = len(self.flares), ", ".join(self.statistics)
-        return f"of {self.quiet.name!r}, {flares} flares by {names}, {self.realisations} realisations"
+        return (
+            f"of {self.quiet.name!r}, {flares} flare{'s'[: flares != 1]} by {names}, {self.realisations} realisations"
+        )
 
     def collect(self, plan: ChannelPlan, tally: Tally, samples: Sequence[TailSamples | None]) -> None:
         """Take over the distributions and tails of one batch."""

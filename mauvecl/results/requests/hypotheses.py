@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.doors import public
+from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise.drawn import Drawn
@@ -127,7 +127,8 @@ class Hypotheses:
     def closed_form(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Form:
         """A statistic's distribution for Gaussian noise; parameters as for `Detection.distribution`."""
         self._check(statistic, flare, template)
-        key = statistic, flare, template
+        # Only the null of what looks for a shape depends on whose shape that is.
+        key = statistic, flare, template if flare is None and self.statistic(statistic).shaped else 0
         if key not in self._forms:
             self._forms[key] = self._closed_form(statistic, flare, template)
         return self._forms[key]

@@ -35,8 +35,11 @@ class Shard:
 
     @property
     def name(self) -> str:
-        """For files and messages."""
+        """For files."""
         return f"{self.part}-{self.start}-{self.count}"
+
+    def __str__(self) -> str:
+        return f"realisations {self.start} to {self.start + self.count - 1}"
 
 
 def expectation_of(what: str, given: Any) -> Expectation:

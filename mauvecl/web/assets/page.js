@@ -166,8 +166,8 @@ class Page {
 
   async draw(told) {
     this.card.rows(told.tab, told.rows)
-    await this.pictures.put(told.pictures)
     this.pinned()
+    await this.pictures.put(told.pictures)
     if (this.answer === null) return
     this.card.fresh(told.tab)
     clearTimeout(this.soon)
@@ -177,7 +177,8 @@ class Page {
   // Pinned scenarios in the pictures of this tab; what they show is asked for once.
   pinned() {
     const name = this.seen.tab, tab = words.tabs[name]
-    const pins = this.compare.drawn
+    // A pinned upload is drawn as long as it is the one that is here.
+    const pins = this.compare.drawn.map(pin => pin && pin.files === this.filesOf(pin.entered) ? pin : undefined)
     for (const box of document.querySelectorAll(".beside")) {
       box.hidden = !pins.some(Boolean)
       box.replaceChildren(box.firstElementChild, ...this.compare.key())
@@ -276,7 +277,14 @@ class Page {
 
   scenario() {
     const {shown, interval, facts, words: said} = this.answer
-    return {link: this.link, entered: {...this.fields.entered}, shown, interval, facts, words: said}
+    const entered = {...this.fields.entered}
+    return {link: this.link, entered, files: this.filesOf(entered), shown, interval, facts, words: said}
+  }
+
+  // Which files stand in fields.
+  filesOf(entered) {
+    const uploads = Object.entries(words.uploads).filter(([field, text]) => entered[field] === text)
+    return uploads.map(([field]) => this.files[field]?.at ?? "gone").join()
   }
 
   // Files to the server and from it
@@ -306,7 +314,7 @@ class Page {
         if (field in this.lacks) this.lack(field, told.lacks)
         return
       }
-      this.files[field] = {name, content}
+      this.files[field] = {at: Date.now(), ...this.files[field], name, content}
       if (!(field in this.lacks)) return
       delete this.lacks[field]
       if (this.fields.entered[field] === told.entered) {
@@ -384,6 +392,7 @@ class Page {
     byId("lost").hidden = true
     for (const part of document.body.children) if (part.id !== "lost") part.inert = false
     this.asking = false
+    this.beside.clear()
     // What the server knew of this page is gone with the connection; the browser has it all.
     const kept = Object.entries(this.files).filter(([field]) => this.fields.entered[field] === words.uploads[field])
     this.wanted = this.seen.simulated.split(",").filter(Boolean)

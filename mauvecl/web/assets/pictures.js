@@ -108,8 +108,9 @@ class Picture {
 
   // Scenarios beside the question, by their slots: columns of each, or nothing.
   pin(pinned) {
+    const same = pinned.every((columns, slot) => columns === (this.pinned[slot] ?? null))
     this.pinned = pinned
-    if (this.models && this.drawn) this.fill()
+    if (!same && this.models && this.drawn) this.fill()
   }
 
   // What is asked for shows; so do the marks that all pictures share.
@@ -201,7 +202,7 @@ export class Pictures {
     for (const {name, pins, alike} of tab.pictures) {
       if (!pins) continue
       const fits = one => one && alike.every(field => one.entered[field] === entered[field])
-      this.all[name].pin(pinned.map(one => fits(one) ? one.columns[name] : null))
+      this.all[name].pin(pinned.map(one => (fits(one) ? one.columns[name] : null) ?? null))
     }
   }
 

@@ -76,11 +76,11 @@ class Expected(Picture):
         energy, recovered, above = _columns(answers)
         # Each step of the rate is recovered as at its middle.
         parts = (above[:-1] - above[1:]) * (recovered[:-1] + recovered[1:]) / 2
-        found = np.append(np.cumsum(parts[::-1])[::-1], 0.0) + above[-1] * recovered[-1]
+        flares = np.append(np.cumsum(parts[::-1])[::-1], 0.0) + above[-1] * recovered[-1]
         text = f"{row['target']} is observed for {short(row['hours'].value)} h; "
         known = np.isfinite(row["expected"])
         text += f"{row['expected']:.3g} flares are expected to be recovered." if known else "no rates are known."
-        columns = {"all": {"x": energy, "y": above}, "found": {"x": energy, "y": np.where(found > 0, found, np.nan)}}
+        columns = {"all": {"x": energy, "y": above}, "found": {"x": energy, "y": np.where(flares > 0, flares, np.nan)}}
         return Drawn(text, columns)
 
 
