@@ -516,6 +516,7 @@ def test_of_questions_in_a_row_the_last_is_answered(served: Any) -> None:
     assert served(work) < 50, "others have become pointless"
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("kind", SIMULATED)
 def test_cancel_ends_whatever_is_computed(served: Any, kind: str) -> None:
     """Each is ended once it has begun, and the next one is computed."""
