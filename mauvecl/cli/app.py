@@ -70,7 +70,7 @@ def main() -> None:
     # Modules and tables are a million objects, hardly one of them in a circle: looked for less often, and not at the
     # end, when everything goes with the process. Both took a tenth of a command's time.
     gc.set_threshold(10_000)
-    # Threads of linear algebra wait for each other in a loop where kernels have the cores.
+    # Threads of linear algebra wait for each other in a loop where kernels, or visitors of the page, have the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     atexit.register(gc.freeze)
     sys.exit(guarded(app))

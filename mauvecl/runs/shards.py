@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.results.requests.requests import Asked, Countable, Divisible, Shard
+from mauvecl.results.requests.requests import Countable, Divisible, Shard
 
 #: What a shard holds, and how: raised with every change, so that none of an older form is ever added.
 FORM = 2
@@ -63,7 +63,7 @@ class Task:
 _TOLD = ("provenance", "messages")
 
 
-def fingerprint(request: Asked) -> str:
+def fingerprint(request: Countable) -> str:
     """Sha256 of everything in a request that its answer depends on, to the last bit.
 
     Realisations are left out: the same shards are counted of more of them.

@@ -83,8 +83,6 @@ def warm() -> None:
     import tempfile
     from pathlib import Path
 
-    from threadpoolctl import threadpool_limits
-
     from mauvecl.web.closed import Closed
     from mauvecl.web.served import prepare
     from mauvecl.web.state import State
@@ -98,8 +96,6 @@ def warm() -> None:
         shown(tab, closed, {})
     Job(lambda pool: pool.realise(closed.quiet, count=1, seed=0)).future.result()
     prepare()
-    # Threads of linear algebra that wait for each other, beside other visitors, cost tens of times as much.
-    threadpool_limits(1, user_api="blas")
     # What is there now stays; looking through it again would cost each visitor.
     gc.collect()
     gc.freeze()

@@ -28,7 +28,6 @@ from commands import run
 pytest.importorskip("bokeh")
 
 from bokeh.models.sources import ColumnDataSource
-from threadpoolctl import threadpool_limits
 from tornado.httpclient import AsyncHTTPClient, HTTPClientError, HTTPRequest
 from tornado.websocket import websocket_connect
 from typer.testing import CliRunner
@@ -278,13 +277,7 @@ def test_the_curve_and_the_map_are_the_closed_form(statistic: str, tmp_path: Pat
     """Between the points that are computed, too: the curve to 1 %, the map to 0.05 mag and its rows."""
     state = State()
     state.enter({"statistic": statistic, "amplitude_percent": "5"})
-    # As the server has it; two threads that wait for each other on a busy machine take a hundred times as long.
-    with threadpool_limits(1, user_api="blas"):
-        closed = Closed.of(state.question(), tmp_path)
-        _curve_and_map(closed)
-
-
-def _curve_and_map(closed: Closed) -> None:
+    closed = Closed.of(state.question(), tmp_path)
     x, y = limit._curve(limit._Kept(closed))
     steep = np.nonzero((y > 0.02) & (y < 0.98))[0][::6]
     exact = [limit.odds(closed, magnitude, np.ones(1))[0].probability for magnitude in x[steep]]

@@ -14,7 +14,7 @@ from mauvecl.lightcurve.stares.components import Components
 from mauvecl.lightcurve.stares.scene import Flares
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.noise.processes import CosmicRays
-from mauvecl.results.requests.requests import Asked
+from mauvecl.results.requests.requests import Countable
 
 Arrays = dict[str, NDArray[Any]]
 Method = Literal["pixels", "cumulants"]
@@ -47,7 +47,7 @@ class Reduction(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class StaresRequest(Asked):
+class StaresRequest(Countable):
     """What `Stares.frames` takes, and what is kept of it; flares and amplitudes as there, for all stares asked for.
 
     Attributes

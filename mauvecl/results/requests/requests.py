@@ -73,7 +73,7 @@ def checked(realisations: Any, seed: Any, start: Any) -> dict[str, int]:
     }
 
 
-class Asked:
+class Countable:
     """What travels to a worker: the question without anything made of it."""
 
     least: ClassVar[int] = 2**12
@@ -88,7 +88,7 @@ class Asked:
         return {each.name: getattr(self, each.name) for each in fields(self)}  # type: ignore[arg-type]
 
 
-class _Drawn(Asked):
+class _Drawn(Countable):
     """Realisations of expectations: whatever was given for a number is whole, and an expectation is one."""
 
     def __post_init__(self) -> None:
@@ -188,10 +188,6 @@ class RealiseRequest(_Drawn):
     seed: int
     start: int = 0
     drawing: Drawing = AUTOMATIC
-
-
-#: What a worker can be asked.
-Countable = Asked
 
 
 class Divisible(Protocol):
