@@ -10,8 +10,8 @@ from searches import DAVENPORT, KNOWN, ONE, survey
 from mauvecl.device.stares import Stares
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.search.bank import Bank, Level
-from mauvecl.lightcurve.search.conditions import Conditions
 from mauvecl.lightcurve.search.null import Counted, in_a_row, in_a_row_rate, sampled
+from mauvecl.lightcurve.search.scatter import Scatter
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.stares.curves import Sinusoid
 from mauvecl.lightcurve.stares.stare import Stare
@@ -153,7 +153,7 @@ def test_false_alarms_in_random_stares(stares):
         stare, level, free = random_stare(rng)
         one, _ = survey(stare, level, (25.0, 120.0), more=free)
         days = stare.observed_s / 86_400
-        tail = sampled(one.search, seed=number, draws=25).under(Conditions.of(one, number))
+        tail = sampled(one.search, seed=number, draws=25).under(Scatter.of(one, number))
         cut = tail.threshold(-np.log1p(-asked) / days).value
         sums = stares.frames(one.components, stare, count=draws, seed=100 + number, method="cumulants")
         alarms += int(np.sum(one.search.largest(one.net(sums)).maximum > cut))
@@ -185,7 +185,7 @@ def test_false_alarms_where_noise_is_unknown(stares):
     )  # fmt: skip
     one, _ = survey(stare, Level(window_s=1200.0), (25.0, 80.0), magnitude=9.5, part=True)
     known = sampled(one.search, seed=3, draws=60)
-    tail, n = known.under(Conditions.of(one, 3)), 500
+    tail, n = known.under(Scatter.of(one, 3)), 500
     maxima = stares.reduced(one.null(n, 8))["maximum"]
     for u in (4.0, 4.5, 5.0):
         k = int(np.flatnonzero(tail.thresholds == u)[0])
@@ -194,4 +194,4 @@ def test_false_alarms_where_noise_is_unknown(stares):
         assert abs(p - tail.probability[k]) < 4 * spread
         assert np.exp(tail.log_rate(u)[0]) == pytest.approx(-np.log1p(-tail.probability[k]) / tail.days, rel=0.1)
     assert known.probability[k] < p / 10
-    assert known.under(Conditions.of(survey(Stare.of(7000.0), KNOWN, (25.0,), part=True)[0], 3)) is known
+    assert known.under(Scatter.of(survey(Stare.of(7000.0), KNOWN, (25.0,), part=True)[0], 3)) is known

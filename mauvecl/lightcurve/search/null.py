@@ -21,7 +21,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.statistics.intervals import CONFIDENCE, Interval, central_counts, clopper_pearson
 
 if TYPE_CHECKING:
-    from mauvecl.lightcurve.search.conditions import Conditions
+    from mauvecl.lightcurve.search.scatter import Scatter
     from mauvecl.lightcurve.search.search import Search
 
 Float = NDArray[np.float64]
@@ -155,22 +155,22 @@ class Sampled:
         inverse = np.linalg.pinv(columns)
         return inverse @ (logs / relative), inverse @ inverse.T
 
-    def under(self, conditions: Conditions) -> Sampled:
+    def under(self, scatter: Scatter) -> Sampled:
         """The same where the noise is not what the search takes it for."""
-        if conditions.known:
+        if scatter.known:
             return self
         coefficients, _ = self._fit()
         # The rate at any u, finely enough to be straight in between.
-        ends = self.thresholds[0] / conditions.scales.max(), self.thresholds[-1] / conditions.scales.min()
+        ends = self.thresholds[0] / scatter.scales.max(), self.thresholds[-1] / scatter.scales.min()
         fine = np.linspace(*ends, FINE)
         parabola = np.polynomial.polynomial.polyval(fine - self.thresholds[self._trusted].mean(), coefficients)
         rates = np.exp(scipy.special.log_ndtr(-fine) + parabola)
         probability, error = np.zeros((2, self.thresholds.size))
         for k, threshold in enumerate(self.thresholds):
-            rate = np.interp(threshold / conditions.scales, fine, rates).mean(axis=1)
+            rate = np.interp(threshold / scatter.scales, fine, rates).mean(axis=1)
             each = -np.expm1(-self.days * rate)
-            probability[k] = conditions.weights @ each
-            spread = np.sqrt(np.sum((conditions.weights * (each - probability[k])) ** 2))
+            probability[k] = scatter.weights @ each
+            spread = np.sqrt(np.sum((scatter.weights * (each - probability[k])) ** 2))
             error[k] = np.hypot(spread, probability[k] * self.error[k] / self.probability[k])
         return Sampled(self.thresholds, probability, error, self.days)
 

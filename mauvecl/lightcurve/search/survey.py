@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.search.conditions import Conditions
 from mauvecl.lightcurve.search.null import DAY_S, Sampled, sampled
+from mauvecl.lightcurve.search.scatter import Scatter
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.stares.requests import StaresRequest
 from mauvecl.lightcurve.stares.sums import method_for
@@ -131,7 +131,7 @@ class Survey:
 
     def tail(self, seed: int) -> Sampled:
         """The null by importance sampling, under what is unknown of the stare."""
-        return sampled(self.of_days(SAMPLED_DAYS).search, seed=seed).under(Conditions.of(self, seed))
+        return sampled(self.of_days(SAMPLED_DAYS).search, seed=seed).under(Scatter.of(self, seed))
 
     def of_days(self, days: float) -> Survey:
         """The same with the first star-days of the stare alone, where it is longer."""

@@ -29,7 +29,7 @@ LEAST = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Conditions:
+class Scatter:
     """Scatter of templates' values under conditions that are drawn.
 
     Attributes
@@ -44,7 +44,7 @@ class Conditions:
     weights: Float
 
     @classmethod
-    def of(cls, survey: Survey, seed: int) -> Conditions:
+    def of(cls, survey: Survey, seed: int) -> Scatter:
         """What a stare's unknowns do to the frames."""
         stare, components, rows = survey.stare, survey.components, survey.bank.directions
         at = np.unique(np.linspace(0, stare.n_frames - 1, POINTS).astype(int))
