@@ -18,6 +18,7 @@ from .arguments import public
 from .content import ByContent
 from .errors import InputError
 from .instrument.instrument import Instrument
+from .instrument.line import Line
 from .measured_noise import below_zero
 from .plotting import picture
 from .quantities import number
@@ -25,6 +26,8 @@ from .ranges import EXPOSURES, check_exposure
 from .response import Order, electrons_per_second
 from .sky import DEFAULT_SKY
 from .sky.zodiacal import Sky
+from .spectra.ends import check_covers, continued
+from .spectra.range import SPAN_NM
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -438,11 +441,8 @@ def expect(
         )
     low, high = instrument.output_min_nm, instrument.output_max_nm
     first, last = source.measured_nm or (float(source.wavelength_nm[0]), float(source.wavelength_nm[-1]))
-    if first > low or last < high:
-        raise InputError(
-            f"the spectrum of {source.name} spans {first:g}-{last:g} nm, "
-            f"expected at least the output range {low:g}-{high:g} nm of {instrument.name}"
-        )
+    check_covers(source.name, (first, last), (low, high), f"{instrument.name}'s output range ")
+    source = _reaching(source, instrument)
     if source.unscaled:
         raise InputError(
             f"the spectrum of {source.name} is not as bright as the star is seen: {source.unscaled}, expected a "
@@ -518,6 +518,16 @@ def expect(
     if source.scale:
         messages.append(source.scale)
     return replace(plain, messages=tuple(messages))
+
+
+def _reaching(source: Source, instrument: Instrument) -> Source:
+    """Return a source whose dark ends are continued as far as the instrument's line function reaches."""
+    nm = source.wavelength_nm
+    if nm[0] <= SPAN_NM[0] and nm[-1] >= SPAN_NM[1]:
+        return source
+    range_nm = (instrument.output_min_nm, instrument.output_max_nm)
+    nm, flux, messages = continued(source.name, nm, source.flux_flam, range_nm, Line.of(instrument))
+    return replace(source, wavelength_nm=nm, flux_flam=flux, told=(*source.told, *messages)) if messages else source
 
 
 def _source(given: Any) -> Source:

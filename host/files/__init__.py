@@ -1,1 +1,1 @@
-"""Files from outside and of our own: read within limits, written whole or not at all."""
+"""Read files of users within limits, and write files whole or not at all."""

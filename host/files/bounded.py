@@ -1,4 +1,4 @@
-"""Files from outside, read within limits: regular files only, and never more bytes than expected, packed or not."""
+"""Read files of users within limits: regular files only, and no more bytes than allowed, packed or unpacked."""
 
 from __future__ import annotations
 
@@ -13,21 +13,18 @@ from typing import Any
 
 from ..errors import InputError
 
-#: Largest file that is read, and largest content that one may unpack to, MiB; the environment can set others.
+#: Largest file that is read, and largest content that it may unpack to, MiB; the environment can set others.
 LIMITS = {"MAUVECL_LARGEST_FILE_MIB": 256, "MAUVECL_LARGEST_CONTENT_MIB": 512}
 #: Bytes unpacked at a time.
 PIECE = 1 << 20
-#: Memory that unpacking xz may take beside its output; its highest preset needs 65 MiB.
+#: Memory for unpacking xz, in addition to its output; the highest preset needs 65 MiB.
 XZ_MEMORY = 128 << 20
 
 
 def limit_bytes(variable: str) -> int:
-    """A limit in bytes, from the environment or `LIMITS`.
+    """Return a limit in bytes, from the environment or `LIMITS`.
 
-    Raises
-    ------
-    InputError
-        If the environment holds no whole number of MiB from 1 to 2**20.
+    Raises InputError if the environment holds no whole number of MiB from 1 to 2**20.
     """
     text = os.environ.get(variable, str(LIMITS[variable]))
     if not (text.isascii() and text.isdigit() and len(text) <= 7 and 1 <= int(text) <= 2**20):
@@ -36,7 +33,7 @@ def limit_bytes(variable: str) -> int:
 
 
 def read_bytes(path: Path, what: str) -> bytes:
-    """The content of a regular file of bounded size, as it is.
+    """Return the content of a regular file of bounded size, without unpacking it.
 
     Parameters
     ----------
@@ -44,14 +41,11 @@ def read_bytes(path: Path, what: str) -> bytes:
     what : str
         What the file should be, for messages: "spectrum file", "study".
 
-    Raises
-    ------
-    InputError
-        If there is no such file, it is no regular file, is too large, or cannot be read.
+    Raises InputError if there is no such file, it is no regular file, is too large, or cannot be read.
     """
     shown = shortened(str(path))
     try:
-        # Opened without waiting: a pipe that nobody writes to would never open.
+        # Without waiting: a pipe that nobody writes to would never open.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError as error:
         raise InputError(f"{what} {shown} does not exist, expected a file") from error
@@ -68,7 +62,7 @@ def read_bytes(path: Path, what: str) -> bytes:
     with open(descriptor, "rb") as file:
         most = limit_bytes("MAUVECL_LARGEST_FILE_MIB")
         try:
-            # Read beyond the size told: it may grow meanwhile.
+            # The file may have grown since its size was read.
             content = file.read(most + 1) if status.st_size <= most else None
         except OSError as error:
             raise InputError(f"{what} {shown} cannot be read ({error.strerror}), expected a readable file") from error
@@ -80,7 +74,7 @@ def read_bytes(path: Path, what: str) -> bytes:
 
 
 def unpacked(content: bytes, what: str) -> bytes:
-    """Content that gzip, bzip2 or xz packed, unpacked; any other as it is.
+    """Unpack content that gzip, bzip2 or xz packed; return any other unchanged.
 
     Parameters
     ----------
@@ -88,10 +82,7 @@ def unpacked(content: bytes, what: str) -> bytes:
     what : str
         What holds it, with its name, for messages.
 
-    Raises
-    ------
-    InputError
-        If it unpacks to more than the limit, is damaged, or is packed more than once.
+    Raises InputError if it unpacks to more than the limit or is damaged.
     """
     if content[:2] == b"\x1f\x8b":
         return _unpack(content, lambda: zlib.decompressobj(wbits=31), "gzip", what)
@@ -103,7 +94,7 @@ def unpacked(content: bytes, what: str) -> bytes:
 
 
 def _unpack(content: bytes, start: Callable[[], Any], form: str, what: str) -> bytes:
-    """Piece by piece, so that a bomb is noticed while it is small; several streams may follow one another."""
+    """Unpack piece by piece, so that a bomb is noticed early; several streams may follow one another."""
     most = limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")
     pieces: list[bytes] = []
     size = 0
@@ -113,7 +104,7 @@ def _unpack(content: bytes, start: Callable[[], Any], form: str, what: str) -> b
             waiting = content
             while not stream.eof:
                 piece = stream.decompress(waiting, PIECE)
-                # zlib hands back what it did not take; the others keep it.
+                # zlib returns the input that it did not use; the others keep it.
                 waiting = getattr(stream, "unconsumed_tail", b"")
                 size += len(piece)
                 if size > most:
@@ -131,5 +122,5 @@ def _unpack(content: bytes, start: Callable[[], Any], form: str, what: str) -> b
 
 
 def shortened(text: str, most: int = 80) -> str:
-    """Text from outside for a message: quoted, on one line, of bounded length."""
+    """Return foreign text for a message: quoted, on one line, of bounded length."""
     return repr(text if len(text) <= most else f"{text[: most - 23]}...{text[-20:]}")

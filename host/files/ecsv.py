@@ -1,4 +1,4 @@
-"""ECSV tables from outside: the header and the cells are looked at before astropy and YAML meet them."""
+"""Read ECSV tables of users; header and cells are checked before astropy and YAML parse them."""
 
 from __future__ import annotations
 
@@ -16,19 +16,16 @@ if TYPE_CHECKING:
     from astropy.table import Table
     from numpy.typing import NDArray
 
-#: Values that a header may hold once its aliases are written out: a few KiB of them can stand for 1e9.
+#: Most values of a header with its aliases written out: a few KiB of aliases can stand for 1e9 values.
 MOST_VALUES = 100_000
-#: Bytes of a header: YAML in plain Python reads a megabyte in half a minute.
+#: Most characters of a header: YAML in plain Python parses a megabyte in half a minute.
 MOST_HEADER = 256 * 2**10
 
 
 def read_ecsv(path: str | Path, what: str, expected: str = "an ECSV table") -> Table:
-    """An ECSV table, or one sentence that begins with what the file is.
+    """Return the table of an ECSV file.
 
-    Raises
-    ------
-    InputError
-        If the file is missing, is not such a table, or is one that would unpack to more than it shows.
+    Raises InputError if the file is missing, is not such a table, or would expand to more than its size suggests.
     """
     path = Path(path)
     named = f"{what} {shortened(str(path))}"
@@ -36,7 +33,7 @@ def read_ecsv(path: str | Path, what: str, expected: str = "an ECSV table") -> T
 
 
 def parse_ecsv(text: str, what: str, expected: str = "an ECSV table") -> Table:
-    """The table in a text.
+    """Return the table in a text.
 
     Parameters
     ----------
@@ -44,38 +41,27 @@ def parse_ecsv(text: str, what: str, expected: str = "an ECSV table") -> Table:
     what : str
         What holds it, with its name, for messages.
     expected : str
-
-    Raises
-    ------
-    InputError
-        As `read_ecsv`.
+        What was expected instead, for messages.
     """
-    # Heavy to import, and needed only where a table is read.
+    # Slow to import, and needed only here.
     from astropy.table import Table
 
     lines = text.splitlines()
     check_header(lines, what)
     check_cells([line for line in lines if not line.startswith("#")], what)
     with parsing(what, expected), warnings.catch_warnings():
-        # What astropy reads all the same.
+        # astropy warns of much that it reads.
         warnings.simplefilter("ignore")
-        # Lines, since a text of one line would be taken for a file's name.
+        # As lines: astropy takes a text of one line for the name of a file.
         return Table.read([*lines, ""], format="ascii.ecsv")
 
 
 @dataclass(frozen=True, eq=False)
 class Numbers:
-    """A table of numbers and nothing else.
+    """A table of numbers."""
 
-    Attributes
-    ----------
-    columns : dict of str to ndarray of float64, shape (n,)
-    units : dict of str to str
-        Of the columns; empty for one without.
-    meta : dict
-    """
-
-    columns: dict[str, NDArray[np.float64]]
+    columns: dict[str, NDArray[np.float64]]  # shape (n,) each
+    #: Units of the columns; empty for a column without one.
     units: dict[str, str]
     meta: dict[str, Any]
 
@@ -84,14 +70,14 @@ class Numbers:
 
 
 def read_numbers(path: str | Path, what: str) -> Numbers:
-    """An ECSV table whose columns are numbers, each there; errors as `read_ecsv`, and for any other column."""
+    """Return an ECSV table of numbers; raise InputError if values are missing or not numeric, or as `read_ecsv`."""
     path = Path(path)
     named = f"{what} {shortened(str(path))}"
     return parse_numbers(as_text(unpacked(read_bytes(path, what), named), named), named)
 
 
 def parse_numbers(text: str, what: str) -> Numbers:
-    """The numbers in a text, as `read_numbers`."""
+    """Return the table of numbers in a text, as `read_numbers`."""
     import numpy as np
 
     lines = text.splitlines()
@@ -108,7 +94,7 @@ def parse_numbers(text: str, what: str) -> Numbers:
 
 
 def _plain_numbers(lines: list[str]) -> Numbers | None:
-    """Numbers with spaces between them, without the time that astropy's tables take to load; None for anything else."""
+    """Parse numbers separated by single blanks without importing astropy's tables; return None for anything else."""
     import numpy as np
     import yaml  # comes with astropy
 
@@ -127,13 +113,7 @@ def _plain_numbers(lines: list[str]) -> Numbers | None:
 
 
 def check_header(lines: list[str], what: str) -> None:
-    """Refuse a header that is long, or whose aliases stand for more values than a header has.
-
-    Raises
-    ------
-    InputError
-        If it is longer than `MOST_HEADER`, or unfolds to more than `MOST_VALUES`.
-    """
+    """Raise InputError if a header is longer than `MOST_HEADER` or its aliases expand to more than `MOST_VALUES`."""
     import yaml  # comes with astropy
 
     header = [line[2:] for line in lines if line.startswith("# ")]
@@ -145,9 +125,9 @@ def check_header(lines: list[str], what: str) -> None:
     sizes: dict[int, int] = {}
 
     def values(node: Any) -> int:
-        # Nodes that an alias repeats are one object, counted once and multiplied.
+        # An alias repeats one object, which is counted once and multiplied.
         if id(node) not in sizes:
-            # A node inside itself has no end.
+            # A node within itself would never end.
             sizes[id(node)] = MOST_VALUES
             inner = node.value if isinstance(node.value, list) else []
             flat = [one for pair in inner for one in (pair if isinstance(pair, tuple) else (pair,))]
@@ -162,13 +142,10 @@ def check_header(lines: list[str], what: str) -> None:
 
 
 def check_cells(lines: list[str], what: str) -> None:
-    """Refuse rows that would take far more room as a table than as text: each cell is as wide as the widest.
+    """Raise InputError for rows that take far more memory as a table than as text.
 
-    Raises
-    ------
-    InputError
-        If the widest line times the number of lines is beyond the limit of unpacked content, or a cell goes on over
-        several lines.
+    Every cell of a column is as wide as the widest, so one long line among many is refused, and so are cells that
+    continue over several lines.
     """
     most = limit_bytes("MAUVECL_LARGEST_CONTENT_MIB")
     widest = max(map(len, lines), default=0)

@@ -1,4 +1,4 @@
-"""What files and flags hold, once read: text, TOML, and numbers that can be; parsers whose failures are sentences."""
+"""Parse what files and flags hold: text, TOML, JSON, and numbers of a possible size; failures are InputError."""
 
 from __future__ import annotations
 
@@ -14,36 +14,33 @@ from typing import Any
 from ..errors import InputError
 from .bounded import read_bytes, shortened
 
-#: Sizes that a number from outside may have, beside 0: products of several stay within double precision.
+#: Sizes that a number of a user may have, apart from 0: products of several stay within double precision.
 SMALLEST, LARGEST = 1e-30, 1e30
-#: The same for energies in erg, of which flares have up to 1e38: keys that end in this.
+#: The same for energies in erg, up to 1e38 for flares: keys that end in this.
 ERG, LARGEST_ERG = "_erg", 1e45
-#: Keys that hold energies too, whose names do not say so.
+#: Other keys that hold energies.
 ENERGIES = ("injections.low", "injections.high")
-#: Whole numbers of 64 bits, with or without a sign.
+#: Range of integers of 64 bits, signed or unsigned.
 WHOLE = (-(2**63), 2**64 - 1)
-#: Characters of a text, and levels of nesting, that a study or an instrument may have.
+#: Longest text and deepest nesting of a study or an instrument.
 LONGEST, DEEPEST = 4096, 32
-#: Dots of what may be a TOML key.
+#: Most dots of a TOML key.
 MOST_PARTS = 512
 
 
 @contextlib.contextmanager
 def parsing(what: str, expected: str) -> Iterator[None]:
-    """Turn whatever a parser of foreign content raises into one sentence.
+    """Turn whatever a parser of foreign content raises into InputError with one sentence.
 
-    Parsers of TOML, YAML, FITS and tables raise dozens of kinds on damaged content: of their own, of Python
-    (RecursionError, OverflowError), of NumPy (MemoryError for sizes that a header claims).
+    Parsers of TOML, YAML, FITS and tables raise dozens of kinds on damaged content: their own, those of Python
+    (RecursionError, OverflowError) and of NumPy (MemoryError for sizes that a header claims).
 
     Parameters
     ----------
     what : str
         What is read, with its name.
     expected : str
-
-    Raises
-    ------
-    InputError
+        What was expected instead.
     """
     try:
         yield
@@ -59,24 +56,12 @@ def parsing(what: str, expected: str) -> Iterator[None]:
 
 
 def read_text(path: Path, what: str) -> str:
-    """The text of a regular file of bounded size, in UTF-8, with or without a byte-order mark.
-
-    Raises
-    ------
-    InputError
-        As `bounded.read_bytes`, or if it is not text.
-    """
+    """Return the text of a regular file of bounded size, in UTF-8, with or without a byte-order mark."""
     return as_text(read_bytes(path, what), f"{what} {shortened(str(path))}")
 
 
 def as_text(content: bytes, what: str) -> str:
-    """Bytes as text in UTF-8.
-
-    Raises
-    ------
-    InputError
-        If they are not; `what` begins the sentence.
-    """
+    """Return bytes as text in UTF-8; raise InputError that begins with `what` if they are not."""
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -84,7 +69,7 @@ def as_text(content: bytes, what: str) -> str:
 
 
 def is_file(path: Path) -> bool:
-    """Whether there is something other than a folder at a path that may be none at all."""
+    """Return whether there is something other than a folder at a path; False for impossible paths."""
     try:
         return path.exists() and not path.is_dir()
     except (OSError, ValueError):
@@ -92,16 +77,10 @@ def is_file(path: Path) -> bool:
 
 
 def toml(text: str, what: str) -> dict[str, Any]:
-    """A TOML document whose values can be.
-
-    Raises
-    ------
-    InputError
-        If it is none, or as `possible`.
-    """
+    """Return a TOML document; raise InputError if it is not valid, or as `possible`."""
     parts = max(part.count(".") for part in re.split(r"[=,{}\[\]\n#]", text))
     if parts > MOST_PARTS:
-        # Python's reader takes memory with the square of it.
+        # Python's parser takes memory with the square of it.
         raise InputError(f"{what} has a key of {parts} parts, expected at most {MOST_PARTS}")
     with parsing(what, "TOML"):
         try:
@@ -113,25 +92,16 @@ def toml(text: str, what: str) -> dict[str, Any]:
 
 
 def json_data(text: str, what: str) -> Any:
-    """A JSON document.
-
-    Raises
-    ------
-    InputError
-        If it is none, or nested too deeply for Python.
-    """
+    """Return a JSON document; raise InputError if it is not valid or nested too deeply."""
     with parsing(what, "JSON"):
         return json.loads(text)
 
 
 def possible(data: Any, what: str) -> None:
-    """See that nested data hold nothing that no study or instrument could mean.
+    """Check nested data for values that no study or instrument can mean.
 
-    Raises
-    ------
-    InputError
-        For a number beyond `SMALLEST` to `LARGEST` (energies in erg: `LARGEST_ERG`), a whole one beyond 64 bits, text
-        that is too long or holds characters that no file could, or nesting that is too deep; naming its key.
+    Raises InputError that names the key, for a number beyond `SMALLEST` to `LARGEST` (energies in erg: `LARGEST_ERG`),
+    an integer beyond 64 bits, text that is too long or holds impossible characters, or nesting that is too deep.
     """
     waiting: list[tuple[str, Any, int]] = [("", data, 0)]
     while waiting:
@@ -153,14 +123,14 @@ def possible(data: Any, what: str) -> None:
 
 
 def _fault(value: Any, largest: float = LARGEST) -> str | None:
-    """Why a single value cannot be, or None."""
+    """Return why a single value is impossible, or None."""
     if isinstance(value, bool):
         return None
     if isinstance(value, int):
         if not WHOLE[0] <= value <= WHOLE[1]:
             return f"is a whole number of {value.bit_length()} bits, expected at most 64"
     elif isinstance(value, float):
-        # NaN and infinity are for those who know what the value means.
+        # Whoever knows the value's meaning judges NaN and infinity.
         if math.isfinite(value) and value and not SMALLEST <= abs(value) <= largest:
             return f"= {value!r}, expected 0 or a size from {SMALLEST:g} to {largest:g}"
     elif isinstance(value, str | Path):
@@ -173,16 +143,16 @@ def _fault(value: Any, largest: float = LARGEST) -> str | None:
 
 
 def shown(value: Any, most: int = 80) -> str:
-    """Any value for a message, however large or deep."""
+    """Return any value for a message, however large or deep."""
     try:
         return _plain(repr(value), most)
     except (ValueError, RecursionError):
-        # Python writes no integers beyond some thousand digits.
+        # Python does not print integers of more than some thousand digits.
         return f"a value of the type {type(value).__name__}"
 
 
 def _plain(text: str, most: int) -> str:
-    """Text on one line, of bounded length, in printable characters."""
+    """Return text on one line, of bounded length, in printable characters."""
     if len(text) > most:
         text = f"{text[: most - 23]}...{text[-20:]}"
     return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)

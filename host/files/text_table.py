@@ -1,4 +1,4 @@
-"""Small tables of one's own: CSV, ECSV, or columns with blanks between them."""
+"""Read small tables of users: CSV, ECSV, or columns separated by blanks."""
 
 from __future__ import annotations
 
@@ -14,24 +14,19 @@ from .parsed import as_text, parsing
 if TYPE_CHECKING:
     from astropy.table import Table
 
-#: Characters of a table that is text: astropy tries a score of forms on it.
+#: Most characters of a table: astropy tries some twenty formats on it.
 MOST_TEXT = 4 * 2**20
 
 
 def read_text_table(path: str | Path, what: str) -> Table:
-    """A table in a file of text.
+    """Return the table in a text file.
 
     Parameters
     ----------
     path : str or Path
-        ECSV by its first line, CSV by its ending, else columns with blanks between them; packed or not.
+        ECSV by its first line, CSV by its ending, else columns separated by blanks; packed or not.
     what : str
         What it should be, for messages.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, or is too large.
     """
     path = Path(path)
     named = f"{what} {shortened(str(path))}"
@@ -39,8 +34,8 @@ def read_text_table(path: str | Path, what: str) -> Table:
 
 
 def text_table(text: str, named: str, commas: bool, expected: str = "CSV or ECSV") -> Table:
-    """The table in a text; errors as `read_text_table`."""
-    # Heavy to import, and needed only where a table is read.
+    """Return the table in a text."""
+    # Slow to import, and needed only here.
     from astropy.table import Table
 
     if len(text) > MOST_TEXT:

@@ -1,4 +1,4 @@
-"""Files that are whole or not there."""
+"""Write files whole or not at all."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from pathlib import Path
 
 from ..errors import InputError
 
-#: Files beside their place carry this in front of their name until they are whole.
+#: Prefix of files that are being written.
 UNFINISHED = ".unfinished-"
 
 
 def write_whole(path: Path, *parts: bytes | memoryview, shared: bool = False) -> None:
-    """Write a file beside its place, bring it to the disk, and rename it.
+    """Write a file under a temporary name in its folder, flush it to the disk, and rename it.
 
     Parameters
     ----------
@@ -22,12 +22,9 @@ def write_whole(path: Path, *parts: bytes | memoryview, shared: bool = False) ->
     parts : bytes or memoryview
         Its content.
     shared : bool
-        Whether another process may write it at the same time: then the last one wins.
+        Whether another process may write it at the same time; the last one wins.
 
-    Raises
-    ------
-    InputError
-        If it cannot be written; what was at its place is still there.
+    Raises InputError if it cannot be written; a file that was there before is kept.
     """
     tail = f".{os.getpid()}-{secrets.token_hex(4)}" if shared else ""
     beside = path.with_name(f"{UNFINISHED}{path.name}{tail}")

@@ -1,16 +1,18 @@
-"""A curve of an instrument: a value against wavelength, straight between its knots."""
+"""Curves of an instrument: a value against wavelength, linear between its knots."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import astropy.units as u
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import InputError
-from ..files.ecsv import Numbers, read_numbers
+from ..files.ecsv import read_numbers
+from ..files.units import unit_of
 
 
 @dataclass(frozen=True)
@@ -47,19 +49,15 @@ class Curve:
 
     @classmethod
     def flat(cls, value: float, source: str = "A: assumed, no source given") -> Curve:
-        """The same value at every wavelength."""
+        """Return a curve with the same value at every wavelength."""
         return cls((0.0,), (value,), source)
 
     @classmethod
     def read(cls, path: str | Path) -> Curve:
-        """Read an ECSV table of two columns with units: wavelength, and the value (A/W or dimensionless).
+        """Read an ECSV table of two columns with units: wavelength, and the value (A/W, per cent or dimensionless).
 
-        The table's metadata give the values' origin: `tag` (P, D, C or A) and `source`.
-
-        Raises
-        ------
-        InputError
-            If the file is missing or is not such a table.
+        The table's metadata give the values' origin: `tag` (P, D, C or A) and `source`. Raises InputError if the file
+        is missing or is not such a table.
         """
         table = read_numbers(path, "curve file")
         if "wavelength" not in table.columns or len(table.columns) != 2:
@@ -69,8 +67,11 @@ class Curve:
         name = next(column for column in table.columns if column != "wavelength")
         meta = table.meta
         try:
-            wavelength = _plain(table, "wavelength", [u.nm])
-            value = _plain(table, name, [u.A / u.W, u.dimensionless_unscaled])
+            length = unit_of(table.units["wavelength"]) if table.units["wavelength"] else None
+            wavelength = _converted(table["wavelength"], "wavelength", length, [u.nm])
+            # Here A is ampere.
+            unit = u.Unit(table.units[name].replace("percent", "%"), parse_strict="silent")
+            value = _converted(table[name], name, unit, [u.A / u.W, u.dimensionless_unscaled])
             return cls(
                 tuple(wavelength.tolist()),
                 tuple(value.tolist()),
@@ -80,18 +81,17 @@ class Curve:
             raise InputError(f"curve file {path}: {error}") from None
 
     def at(self, wavelength_nm: ArrayLike) -> NDArray[np.float64]:
-        """Value at wavelengths in nm, the shape of `wavelength_nm`; the end values hold beyond the knots."""
+        """Return the values at wavelengths in nm, shape of `wavelength_nm`; the end values hold beyond the knots."""
         return np.asarray(np.interp(np.asarray(wavelength_nm, np.float64), self.wavelength_nm, self.value))
 
     def covers(self, low_nm: float, high_nm: float) -> bool:
-        """Whether the knots reach from one wavelength to the other; a flat curve always does."""
+        """Return whether the knots reach from one wavelength to the other; a flat curve always does."""
         return len(self.value) == 1 or (self.wavelength_nm[0] <= low_nm and self.wavelength_nm[-1] >= high_nm)
 
 
-def _plain(table: Numbers, name: str, units: list[u.UnitBase]) -> NDArray[np.float64]:
-    """A column's numbers in the first of `units` that it converts to."""
-    unit = u.Unit(table.units[name], parse_strict="silent")
+def _converted(values: NDArray[np.float64], name: str, unit: u.UnitBase | None, units: list[u.UnitBase]) -> Any:
+    """Return a column's numbers in the first of `units` that its unit converts to."""
     for wanted in units:
-        if unit.is_equivalent(wanted):
-            return np.asarray((table[name] * unit).to_value(wanted))
-    raise InputError(f"column {name!r} has the unit {str(unit) or 'none'!r}, expected {units[0]}")
+        if unit is not None and unit.is_equivalent(wanted):
+            return (values * unit).to_value(wanted)
+    raise InputError(f"column {name!r} has the unit {str(unit or '') or 'none'!r}, expected {units[0]}")

@@ -1,1 +1,1 @@
-"""Spectra as users and archives have them: read by what they hold, checked, continued, binned."""
+"""Read spectra of users and archives, check them, and continue their ends."""

@@ -1,4 +1,4 @@
-"""The ends of a spectrum: what it must span, what may be continued, and by what."""
+"""Check a spectrum's points and range, and continue its ends at their level or by another star's spectrum."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..errors import InputError
-from .columns import NEEDED_NM, looks_like
+from .range import MIN_MEASURED, NEEDED_NM, SPAN_NM, is_gap, likely_unit, measured_part
 from .scatter import point_noise
 from .values import BRIGHTEST, FAINTEST, check_values
 
@@ -18,25 +18,16 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: What the line function reaches from `NEEDED_NM`, nm (the paper, section "Preparing the input spectrum").
-SPAN_NM = (180.0, 750.0)
-#: Light that the outermost pixel may be given by a continuation, in parts of the brightest's: a choice of ours.
-MOST_CONTINUED = 0.01
+#: Largest part of the brightest pixel's light that a continuation may give the outermost pixel: a choice of ours.
+MAX_CONTINUED = 0.01
 #: Width over which a level is taken, at an end or at a join, nm; and of the brightest, a resolution element.
 END_NM, JOIN_NM, ELEMENT_NM = 5.0, 10.0, 10.5
-#: A level to scale by must be so many times its error.
-JOIN_ERRORS = 5.0
-#: A gap between points is told beyond this width, nm, and this multiple of the usual spacing.
-GAP_NM, GAP_TIMES = 10.5, 10.0
+#: Least ratio of a level to its error, so that another spectrum can be scaled to it.
+MIN_JOIN_SNR = 5.0
 
 
 def check_points(name: str, wavelength: Float, flux: Float) -> None:
-    """Refuse what is no spectrum: two equal columns, wavelengths finite and rising.
-
-    Raises
-    ------
-    InputError
-    """
+    """Raise InputError unless wavelengths and fluxes are equally long, and wavelengths finite and increasing."""
     if wavelength.ndim != 1 or wavelength.shape != flux.shape or wavelength.size < 2:
         raise InputError(
             f"spectrum {name} has {wavelength.shape} wavelengths and {flux.shape} fluxes, expected two equal columns"
@@ -47,7 +38,6 @@ def check_points(name: str, wavelength: Float, flux: Float) -> None:
             f"spectrum {name}: wavelength {wavelength[bad[0]]:g} at point {bad[0] + 1}, expected a finite number "
             "above 0"
         )
-    # Steps below the rounding of a change of units are none.
     back = np.flatnonzero(np.diff(wavelength) <= 0)
     if back.size:
         i = int(back[0])
@@ -58,23 +48,40 @@ def check_points(name: str, wavelength: Float, flux: Float) -> None:
     check_values(name, wavelength, flux)
 
 
-def check_span(name: str, wavelength: Float, extra: str = "") -> None:
-    """Refuse a spectrum that does not hold all that is needed.
-
-    Raises
-    ------
-    InputError
-    """
+def check_measured(name: str, wavelength: Float) -> None:
+    """Raise InputError if a spectrum holds less than a third of 200-700 nm, whatever continues it."""
+    part = measured_part(wavelength)
+    if part >= MIN_MEASURED - 1e-9:
+        return
     low, high = float(wavelength[0]), float(wavelength[-1])
-    if low > NEEDED_NM[0] or high < NEEDED_NM[1]:
+    unit = likely_unit(low, high, "nm")
+    meant = f"; as numbers these look like {unit}: --wavelength-unit {unit}" if unit else ""
+    raise InputError(
+        f"spectrum {name} covers {low:g}-{high:g} nm, {part:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm, expected at "
+        f"least a third, which --extend can continue{meant}"
+    )
+
+
+def check_covers(
+    name: str, span_nm: tuple[float, float], needed_nm: tuple[float, float] = NEEDED_NM, of: str = ""
+) -> None:
+    """Raise InputError if a spectrum's range does not cover that of the pixels."""
+    if span_nm[0] > needed_nm[0] or span_nm[1] < needed_nm[1]:
         raise InputError(
-            f"spectrum {name} spans {low:g}-{high:g} nm{extra}, expected at least {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} "
-            f"nm{looks_like(low, high)}: --extend continues it by a library spectrum"
+            f"spectrum {name} spans {span_nm[0]:g}-{span_nm[1]:g} nm, expected at least {of}{needed_nm[0]:g}-"
+            f"{needed_nm[1]:g} nm: --extend continues it by a library spectrum"
         )
 
 
+def coverage(wavelength: Float) -> str:
+    """Return the message that reports which wavelengths a spectrum holds before anything continues it."""
+    part = measured_part(wavelength)
+    share = "" if part > 1 - 1e-9 else f", {part:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm"
+    return f"its own points cover {wavelength[0]:g}-{wavelength[-1]:g} nm{share}"
+
+
 def without_undefined_ends(name: str, wavelength: Float, flux: Float) -> tuple[Float, Float, tuple[str, ...]]:
-    """Leave out the ends from their innermost undefined point on, outside what is needed, and say so."""
+    """Cut the ends outside 200-700 nm from their innermost undefined point on, and return a note of it."""
     bad = ~np.isfinite(flux)
     if not bad.any():
         return wavelength, flux, ()
@@ -89,12 +96,7 @@ def without_undefined_ends(name: str, wavelength: Float, flux: Float) -> tuple[F
 
 
 def check_flux(name: str, wavelength: Float, flux: Float) -> None:
-    """Refuse fluxes that are no numbers, hold no light, or signs for missing ones.
-
-    Raises
-    ------
-    InputError
-    """
+    """Raise InputError for fluxes that are not finite, hold no light, or marks of missing ones."""
     bad = np.flatnonzero(~np.isfinite(flux))
     if bad.size:
         i = int(bad[0])
@@ -120,14 +122,14 @@ def check_flux(name: str, wavelength: Float, flux: Float) -> None:
 
 
 def remarks(wavelength: Float, flux: Float) -> tuple[str, ...]:
-    """What an answer must say of a spectrum's points in the span: negative ones, zeros in a row, gaps."""
+    """Return messages about a spectrum's points in 180-750 nm: negative fluxes, zeros in a row, gaps."""
     inside = (wavelength >= SPAN_NM[0]) & (wavelength <= SPAN_NM[1])
     nm, values = wavelength[inside], flux[inside]
-    told = []
+    messages = []
     negative = int(np.count_nonzero(values < 0.0))
     if negative:
         i = int(np.argmin(values))
-        told.append(
+        messages.append(
             f"{negative} of its {nm.size} points in {SPAN_NM[0]:g}-{SPAN_NM[1]:g} nm have a negative flux, the lowest "
             f"{values[i]:.3g} at {nm[i]:.1f} nm: measured noise, kept; --bin-nm bins it"
         )
@@ -138,72 +140,97 @@ def remarks(wavelength: Float, flux: Float) -> tuple[str, ...]:
     ]
     if runs:
         where = ", ".join(f"{nm[a]:.1f}-{nm[b - 1]:.1f}" for a, b in runs[:3])
-        told.append(f"its flux is exactly zero at {where} nm: no data, or no light")
+        messages.append(f"its flux is exactly zero at {where} nm: no data, or no light")
     steps = np.diff(nm)
     if steps.size:
-        wide = np.flatnonzero((steps > GAP_NM) & (steps > GAP_TIMES * np.median(steps)))
+        wide = np.flatnonzero(is_gap(steps))
         if wide.size:
             i = int(wide[np.argmax(steps[wide])])
-            told.append(f"it has no point between {nm[i]:.1f} and {nm[i + 1]:.1f} nm, where a straight line is taken")
-    return tuple(told)
+            messages.append(
+                f"it has no point between {nm[i]:.1f} and {nm[i + 1]:.1f} nm, where a straight line is taken"
+            )
+    return tuple(messages)
 
 
 @cache
-def _line() -> Line:
+def _nominal_line() -> Line:
     from ..instrument.instrument import Instrument
     from ..instrument.line import Line
 
     return Line.of(Instrument.load("mauve"))
 
 
-def continued(name: str, wavelength: Float, flux: Float) -> tuple[Float, Float, tuple[str, ...]]:
-    """A spectrum that ends within the line function's reach, continued at the level of its end, which is told.
+def continued(
+    name: str,
+    wavelength: Float,
+    flux: Float,
+    needed_nm: tuple[float, float] = NEEDED_NM,
+    line: Line | None = None,
+    *,
+    dark_only: bool = False,
+) -> tuple[Float, Float, tuple[str, ...]]:
+    """Continue the ends of a spectrum that lie within the line function's reach, at their level.
 
-    Raises
-    ------
-    InputError
-        If the light so made up would matter, and another spectrum must say how it goes on.
+    Parameters
+    ----------
+    name : str
+    wavelength, flux : ndarray, shape (n,)
+    needed_nm : tuple of float
+        Range of the pixels; the reach beyond it is that of `SPAN_NM` beyond `NEEDED_NM`.
+    line : Line, optional
+        The line function; that of the nominal instrument by default.
+    dark_only : bool
+        Leave an end as it is that is too bright to be continued, or within the range of the pixels.
+
+    Returns
+    -------
+    wavelength, flux : ndarray
+    messages : tuple of str
+
+    Raises InputError if a continuation would be more than `MAX_CONTINUED` of the brightest pixel's light.
     """
-    if wavelength[0] <= SPAN_NM[0] and wavelength[-1] >= SPAN_NM[1]:
+    span = (needed_nm[0] - NEEDED_NM[0] + SPAN_NM[0], needed_nm[1] - NEEDED_NM[1] + SPAN_NM[1])
+    if wavelength[0] <= span[0] and wavelength[-1] >= span[1]:
         return wavelength, flux, ()
-    check_span(name, wavelength)
-    told = []
-    brightest = _brightest(wavelength, flux)
-    for blue in (True, False):
-        end, goal = (wavelength[0], SPAN_NM[0]) if blue else (wavelength[-1], SPAN_NM[1])
-        if (end <= goal) if blue else (end >= goal):
+    messages = []
+    brightest = _brightest(wavelength, flux, needed_nm)
+    for is_blue in (True, False):
+        end, goal = (wavelength[0], span[0]) if is_blue else (wavelength[-1], span[1])
+        if (end <= goal) if is_blue else (end >= goal):
             continue
         near = np.abs(wavelength - end) <= END_NM
         level = max(float(flux[near].mean()), 0.0)
         # Light of the outermost pixel that comes from beyond the end.
-        beyond = end - NEEDED_NM[0] if blue else NEEDED_NM[1] - end
-        share = float(_line().below(np.array([beyond]))[0]) * level / brightest
-        word = "starts" if blue else "ends"
-        if share > MOST_CONTINUED:
+        beyond = end - needed_nm[0] if is_blue else needed_nm[1] - end
+        share = float((line or _nominal_line()).below(np.array([beyond]))[0]) * level / brightest
+        if dark_only and (beyond > 0 or share > MAX_CONTINUED):
+            continue
+        word = "starts" if is_blue else "ends"
+        if share > MAX_CONTINUED:
             raise InputError(
                 f"spectrum {name} {word} at {end:g} nm, where it is bright: {share:.1%} of the brightest pixel's light "
                 f"would be made up, expected a spectrum to {goal:g} nm: --extend continues it by a library spectrum"
             )
-        told.append(
+        messages.append(
             f"it {word} at {end:g} nm and is continued to {goal:g} nm at its end's level, {level:.3g}: at most "
             f"{100 * share:.2g} % of the brightest pixel's light"
         )
         wavelength, flux = (
             (np.append(goal, wavelength), np.append(level, flux))
-            if blue
+            if is_blue
             else (np.append(wavelength, goal), np.append(flux, level))
         )
-    return wavelength, flux, tuple(told)
+    return wavelength, flux, tuple(messages)
 
 
-def _brightest(wavelength: Float, flux: Float) -> float:
-    """Highest mean over a resolution element in what is needed."""
-    edges = np.arange(NEEDED_NM[0], NEEDED_NM[1] + 0.1, ELEMENT_NM)
+def _brightest(wavelength: Float, flux: Float, needed_nm: tuple[float, float]) -> float:
+    """Return the highest mean over a resolution element in a range."""
+    edges = np.arange(needed_nm[0], needed_nm[1] + 0.1, ELEMENT_NM)
     return max(float(means(wavelength, flux, edges).max()), np.finfo(float).tiny)
 
 
 def means(wavelength: Float, flux: Float, edges: Float) -> Float:
-    """Mean fluxes between edges, of a flux that is straight between its points; shape (n_edge - 1,)."""
+    """Return the mean fluxes between edges, of a flux that is straight between its points; shape (n_edge - 1,)."""
     grid = np.union1d(wavelength, edges)
     values = np.interp(grid, wavelength, flux)
     area = np.concatenate([[0.0], np.cumsum(np.diff(grid) * (values[1:] + values[:-1]) / 2)])
@@ -214,7 +241,7 @@ def means(wavelength: Float, flux: Float, edges: Float) -> Float:
 def extended(
     name: str, wavelength: Float, flux: Float, extension: str, beyond: Float, shape: Float
 ) -> tuple[Float, Float, tuple[str, ...]]:
-    """A spectrum with another's ends where that one reaches farther, scaled to it at the join, which is told.
+    """Continue a spectrum by another where that one reaches farther, scaled at the join, and return messages.
 
     Parameters
     ----------
@@ -225,17 +252,15 @@ def extended(
     beyond, shape : ndarray, shape (m,)
         Its wavelengths, nm, and fluxes.
 
-    Raises
-    ------
-    InputError
-        If there is no light at a join to scale by.
+    Raises InputError if less than a third of 200-700 nm is measured, or there is no light at a join to scale by.
     """
-    told = []
-    # Zeros in a row at an end are no data, which another spectrum is asked for.
+    messages = []
+    # Zeros in a row at an end are no data.
     light = np.flatnonzero(flux != 0.0)
     if light.size > 1 and light[-1] - light[0] + 1 < flux.size:
         wavelength, flux = (array[light[0] : light[-1] + 1] for array in (wavelength, flux))
-        told.append(f"its ends of zeros are cut: {wavelength[0]:g}-{wavelength[-1]:g} nm are left")
+        messages.append(f"its ends of zeros are cut: {wavelength[0]:g}-{wavelength[-1]:g} nm are left")
+    check_measured(name, wavelength)
     for blue in (True, False):
         end = float(wavelength[0] if blue else wavelength[-1])
         more = beyond < end if blue else beyond > end
@@ -243,7 +268,7 @@ def extended(
             continue
         join, own, other = _join(name, wavelength, flux, extension, beyond, shape, blue)
         added = shape[more] * (own / other)
-        told.append(
+        messages.append(
             f"{'below' if blue else 'above'} {end:g} nm it is continued by {extension}, scaled by {own / other:.4g} to "
             f"agree at {join[0]:g}-{join[1]:g} nm"
         )
@@ -252,13 +277,13 @@ def extended(
             if blue
             else (np.append(wavelength, beyond[more]), np.append(flux, added))
         )
-    return wavelength, flux, tuple(told) or (f"its extension {extension} reaches no farther and is not used",)
+    return wavelength, flux, tuple(messages) or (f"its extension {extension} reaches no farther and is not used",)
 
 
 def _join(
     name: str, wavelength: Float, flux: Float, extension: str, beyond: Float, shape: Float, blue: bool
 ) -> tuple[Float, float, float]:
-    """The range in which two spectra are compared, as wide as the first one's noise asks, and their means there."""
+    """Return the range in which two spectra are compared, as wide as the first one's noise needs, and their means."""
     low, high = max(wavelength[0], beyond[0]), min(wavelength[-1], beyond[-1])
     if not low < high:
         raise InputError(
@@ -271,7 +296,7 @@ def _join(
         own, other = (float(means(x, y, join)[0]) for x, y in ((wavelength, flux), (beyond, shape)))
         near = (wavelength >= join[0]) & (wavelength <= join[1])
         error = float(np.sqrt(np.sum(noise[near] ** 2))) / max(int(near.sum()), 1)
-        if own > JOIN_ERRORS * error and other > 0.0 and np.isfinite(own / other):
+        if own > MIN_JOIN_SNR * error and other > 0.0 and np.isfinite(own / other):
             return join, own, other
     raise InputError(
         f"spectrum {name} and its extension {extension} have mean fluxes of {own:g} and {other:g} at "

@@ -1,77 +1,61 @@
-"""Spectra in FITS: tables of any extension, and one-dimensional images with a linear or logarithmic scale."""
+"""Read the tables of FITS files: binary and ASCII tables, and images of spectra."""
 
 from __future__ import annotations
 
 import io
 import math
-import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
-
 from ..errors import InputError
-from ..files.bounded import shortened
-from .columns import Columns, numbers
-from .tables import columns_of, first_fitting
+from ..files.parsed import parsing
+from .file_table import Column, FileTable
+from .fits_images import axis_of, is_spectrum_image, paired_images, rows_of
+from .roles import role_of
 
-#: Units of the archives' tables without a word about them: CALSPEC's.
-USUAL = ("Angstrom", "erg / (s cm2 Angstrom)")
-#: Bytes of a block (FITS standard 4.0, section 3.1); cards of a header and extensions of a file that are read.
-BLOCK, MOST_CARDS, MOST_EXTENSIONS = 2880, 100_000, 1000
-#: Keywords whose words may speak of air, vacuum, the star's surface or its dust.
-_WORDS = ("AIRORVAC", "VACUUM", "WAVEMED", "WAVETYPE", "VACWAVE", "COMMENT", "HISTORY", "DESCRIP")
-#: Images that are no fluxes, by their extension's name.
-_NO_FLUX = re.compile(r"err|sig|var|ivar|qual|mask|dq|snr|cont|sky|back|wave|lambda", re.IGNORECASE)
+#: Units that the archives' tables imply: CALSPEC's.
+IMPLIED_UNITS = ("Angstrom", "erg / (s cm2 Angstrom)")
+#: Bytes of a block (FITS standard 4.0, section 3.1); most cards of a header and extensions of a file that are read.
+BLOCK, MAX_CARDS, MAX_EXTENSIONS = 2880, 100_000, 1000
+#: Keywords whose text may speak of air, vacuum, the star's surface or its dust.
+_REMARKS = ("AIRORVAC", "VACUUM", "WAVEMED", "WAVETYPE", "VACWAVE", "COMMENT", "HISTORY", "DESCRIP")
+WHOLE = "a whole FITS file"
 
 
-def read_fits(content: bytes, name: str, origin: str, asked: Sequence[str]) -> Columns:
-    """Two columns of a FITS table, or an image with a scale of wavelengths.
+def fits_tables(content: bytes, name: str, origin: str, asked: Sequence[str]) -> list[FileTable]:
+    """Return the tables of a FITS file, images of spectra among them.
 
-    Raises
-    ------
-    InputError
-        If it is no such file, is cut short, or holds no spectrum or several.
+    Raises InputError if it is no such file, is cut short, differs from its checksums, or holds neither.
     """
     from astropy.io import fits
 
     check_sizes(content)
-    try:
-        # Old archive files carry headers that astropy warns of and reads all the same.
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            hdus = fits.open(io.BytesIO(content), memmap=False, lazy_load_hdus=False, disable_image_compression=True)
-            with hdus:
-                return _read(hdus, name, origin, asked)
-    except InputError:
-        raise
-    except Exception as error:  # truncated and foreign files fail in many ways
-        reason = str(error) or type(error).__name__
-        raise InputError(f"cannot be read as FITS ({shortened(reason)}), expected a whole FITS file") from error
+    with parsing("it", WHOLE), warnings.catch_warnings():
+        # astropy warns of the headers of old archive files, and reads them.
+        warnings.simplefilter("ignore")
+        hdus = fits.open(io.BytesIO(content), memmap=False, lazy_load_hdus=False, disable_image_compression=True)
+        _check_sums(hdus)
+        return _Reader(hdus, name, origin, asked).tables()
 
 
 def check_sizes(content: bytes) -> None:
-    """Refuse headers whose sizes are impossible or beyond the file, before anyone believes them.
+    """Raise InputError for headers whose sizes are impossible or larger than the file.
 
-    A negative size sends astropy's reader back and around for ever.
-
-    Raises
-    ------
-    InputError
+    astropy's reader would loop for ever on a negative size.
     """
     place = 0
-    for number in range(MOST_EXTENSIONS + 1):
+    for number in range(MAX_EXTENSIONS + 1):
         if content[place : place + 8] not in (b"SIMPLE  ", b"XTENSION"):
             return
-        if number == MOST_EXTENSIONS:
+        if number == MAX_EXTENSIONS:
             break
         cards: dict[bytes, bytes] = {}
         at = place
         while content[at : at + 8] != b"END     ":
             card = content[at : at + 80]
-            if len(card) < 80 or at - place > 80 * MOST_CARDS:
-                raise InputError(f"has a header {number} without an end, expected a whole FITS file")
+            if len(card) < 80 or at - place > 80 * MAX_CARDS:
+                raise InputError(f"has a header {number} without an end, expected {WHOLE}")
             cards.setdefault(card[:8].strip(), card[10:].split(b"/")[0].strip())
             at += 80
         start = place + -(-(at + 80 - place) // BLOCK) * BLOCK
@@ -81,12 +65,12 @@ def check_sizes(content: bytes) -> None:
                 int(cards.get(k, d)) for k, d in ((b"BITPIX", b""), (b"PCOUNT", b"0"), (b"GCOUNT", b"1"))
             )
         except (KeyError, ValueError) as error:
-            raise InputError(f"has a header {number} whose sizes are no numbers, expected a whole FITS file") from error
+            raise InputError(f"has a header {number} whose sizes are no numbers, expected {WHOLE}") from error
         if axes[:1] == [0] and len(axes) > 1:
             # Random groups.
             axes = axes[1:]
         if min([extra, groups, *axes]) < 0 or abs(bits) > 64:
-            raise InputError(f"has a header {number} with impossible sizes, expected a whole FITS file")
+            raise InputError(f"has a header {number} with impossible sizes, expected {WHOLE}")
         size = abs(bits) // 8 * groups * (extra + math.prod(axes) if axes else 0)
         if start + size > len(content):
             raise InputError(
@@ -94,177 +78,171 @@ def check_sizes(content: bytes) -> None:
                 f"{max(0, len(content) - start)} are there, expected a whole file"
             )
         place = start + -(-size // BLOCK) * BLOCK
-    raise InputError(f"has more than {MOST_EXTENSIONS} extensions, expected fewer")
+    raise InputError(f"has more than {MAX_EXTENSIONS} extensions, expected fewer")
 
 
-def _read(hdus: Any, name: str, origin: str, asked: Sequence[str]) -> Columns:
-    from astropy.io import fits
+def _check_sums(hdus: Any) -> None:
+    """Raise InputError where DATASUM or CHECKSUM (FITS standard 4.0, section 4.4.2.7) do not fit what is there."""
+    for number, hdu in enumerate(hdus):
+        for key, verify in (("DATASUM", hdu.verify_datasum), ("CHECKSUM", hdu.verify_checksum)):
+            if hdu.header.get(key) not in (None, "") and verify() == 0:
+                part = "data" if key == "DATASUM" else "header or data"
+                raise InputError(
+                    f"differs from its {key} in extension {number}: its {part} are damaged or were edited, expected "
+                    "the file as it was written; after an intended change, remove the keyword"
+                )
 
-    primary = hdus[0].header
-    tables, images = [], []
-    for place, hdu in enumerate(hdus):
-        label = _text(hdu.header, "EXTNAME") or str(place)
-        # An extension may be asked for by its name or its number.
-        label = str(place) if str(place) in asked else label
-        if isinstance(hdu, fits.BinTableHDU | fits.TableHDU):
-            tables.append((label, lambda rest, hdu=hdu: _table(hdu, primary, name, origin, rest)))
-        elif getattr(hdu, "is_image", False) and hdu.header.get("NAXIS", 0) and not _NO_FLUX.search(label):
-            images.append((label, lambda rest, hdu=hdu: _image(hdu, primary, name, origin, rest)))
-    if not tables and not images:
-        raise InputError("has no table and no image, expected a FITS table with WAVELENGTH and FLUX")
-    if not tables:
-        return _first(images, asked)
+
+class _Reader:
+    """The extensions of one open file."""
+
+    def __init__(self, hdus: Any, name: str, origin: str, asked: Sequence[str]) -> None:
+        self.hdus, self.name, self.origin, self.asked = hdus, name, origin, asked
+        self.primary = hdus[0].header
+
+    def tables(self) -> list[FileTable]:
+        from astropy.io import fits
+
+        pairs = paired_images(self.hdus)
+        if pairs:
+            rows = self._row_names()
+            return [self._of_pair(*pair, rows) for pair in pairs]
+        tables = [
+            self._of_table(number, hdu)
+            for number, hdu in enumerate(self.hdus)
+            if isinstance(hdu, fits.BinTableHDU | fits.TableHDU)
+        ]
+        kinds = [{role_of(c.name, c.unit, c.ucd).kind for c in table.columns} for table in tables]
+        if any("flux" in kind and kind & {"wavelength", "lower edge"} for kind in kinds):
+            return tables
+        images, errors = self._images()
+        if errors and not tables and not images:
+            raise errors[0]
+        if not tables and not images:
+            raise InputError("has no table and no image, expected a FITS table with WAVELENGTH and FLUX")
+        return [*tables, *images]
+
+    def _label(self, number: int, hdu: Any) -> str:
+        """Return what a user calls an extension: its number where that is asked for, else its name."""
+        return str(number) if str(number) in self.asked else text_at(hdu.header, "EXTNAME") or str(number)
+
+    def _table(self, header: Any, columns: Sequence[Column], label: str, **more: Any) -> FileTable:
+        is_relative = text_at(self.primary, "TELESCOP").upper().startswith("LAMOST")
+        return FileTable(
+            columns,
+            next((t for key in ("TARGNAME", "TARGETID", "OBJECT") for one in (self.primary, header)
+                  if (t := text_at(one, key)[:80])), self.name),
+            self.origin,
+            label,
+            IMPLIED_UNITS,
+            remarks=self._remarks(header) + more.pop("remarks", ""),
+            notes=(*self._notes(header), *more.pop("notes", ())),
+            # LAMOST DR5, "Data production description", section 1: fluxes are calibrated relatively.
+            unscaled="LAMOST calibrates fluxes relative to each other" if is_relative else "",
+            **more,
+        )  # fmt: skip
+
+    def _remarks(self, header: Any) -> str:
+        headers = [self.primary] if self.primary is header else [self.primary, header]
+        words = [text_at(one, key) for one in headers for key in _REMARKS]
+        for one in headers:
+            # AIRORVAC = 'air', VACUUM = T
+            if text_at(one, "AIRORVAC").lower() == "air" or text_at(one, "VACUUM") == "False":
+                words.append("in air")
+            if text_at(one, "VACUUM") == "True":
+                words.append("vacuum")
+        return "\n".join(words)[:100_000]
+
+    def _notes(self, header: Any) -> tuple[str, ...]:
+        notes = []
+        for key in ("DATAQUAL", "OFFSETPX"):
+            if value := text_at(self.primary, key) or text_at(header, key):
+                notes.append(f"{key} = {value[:60]}")
+        if "lowlib" in self.origin.lower():
+            notes.append("dereddened and at zero velocity: counts need it reddened again")
+        return tuple(notes)
+
+    def _of_table(self, number: int, hdu: Any) -> FileTable:
+        header = hdu.header
+        if text_at(header, "ZIMAGE") == "True":
+            raise InputError("holds a compressed image, expected a table with WAVELENGTH and FLUX")
+        # The unit of the whole file is that of the flux where its column states none (SDSS).
+        whole = text_at(self.primary, "BUNIT") or text_at(header, "BUNIT") or None
+        columns = []
+        for k, column in enumerate(hdu.columns):
+            unit = (column.unit or "").strip() or None
+            if unit is None and role_of(str(column.name)).kind == "flux" and role_of(str(column.name)).unit is None:
+                unit = whole
+            missing = header.get(f"TNULL{k + 1}")
+            columns.append(
+                Column(
+                    str(column.name),
+                    _reader(hdu, k),
+                    unit,
+                    missing if isinstance(missing, int | float) and not isinstance(missing, bool) else None,
+                    text_at(header, f"TUCD{k + 1}"),
+                )
+            )
+        ucds = " ".join(column.ucd for column in columns if column.ucd)
+        return self._table(header, columns, self._label(number, hdu), remarks=f"\n{ucds}")
+
+    def _images(self) -> tuple[list[FileTable], list[InputError]]:
+        """Return the images that have an axis of wavelengths, and why others have none."""
+        images, errors = [], []
+        for number, hdu in enumerate(self.hdus):
+            if is_spectrum_image(hdu, text_at(hdu.header, "EXTNAME")):
+                try:
+                    images.append(self._of_image(number, hdu))
+                except InputError as error:
+                    errors.append(error)
+        flux = [one for one in images if one.label.strip().lower() in ("flux", "sci", "spectrum")]
+        return (flux if flux and not self.asked else images), errors
+
+    def _of_image(self, number: int, hdu: Any) -> FileTable:
+        header = hdu.header
+        flux, names, note = rows_of(hdu, text_at(self.primary, "TELESCOP"))
+        axis, unit, kind, notes = axis_of(header, self.primary, flux.shape[-1])
+        columns = [
+            Column("wavelength", lambda: axis, unit),
+            Column("flux", lambda: flux, text_at(header, "BUNIT") or text_at(self.primary, "BUNIT") or None),
+        ]
+        remarks = "\nair wavelength" if kind == "AWAV" else "\nvacuum" if kind == "WAVE" else ""
+        return self._table(
+            header, columns, self._label(number, hdu), remarks=remarks, notes=(*notes, *note), row_names=names
+        )
+
+    def _of_pair(self, arm: str, axis: Any, flux: Any, rows: Sequence[str]) -> FileTable:
+        """Return the table of an image of fluxes whose wavelengths are another image (DESI, PFS, APOGEE)."""
+        name = text_at(axis.header, "EXTNAME").removeprefix(f"{arm}_")
+        columns = [
+            Column(name, _reader(axis), text_at(axis.header, "BUNIT") or None),
+            Column("flux", _reader(flux), text_at(flux.header, "BUNIT") or None),
+        ]
+        group = "arms" if arm else None
+        return self._table(flux.header, columns, arm or "flux", row_names=rows, group=group)
+
+    def _row_names(self) -> tuple[str, ...]:
+        """Return the targets of the rows of images, from a fibre map (DESI data model, coadd: FIBERMAP)."""
+        for hdu in self.hdus:
+            if text_at(hdu.header, "EXTNAME").upper() == "FIBERMAP" and "TARGETID" in getattr(hdu.columns, "names", ()):
+                return tuple(str(one) for one in hdu.data.field("TARGETID"))
+        return ()
+
+
+def text_at(header: Any, key: str) -> str:
+    """Return a keyword's value as text, empty where there is none or it cannot be parsed."""
     try:
-        return first_fitting(tables, asked)
-    except InputError:
-        if not images:
-            raise
-        try:
-            return _first(images, asked)
-        except InputError:
-            pass
-        raise
-
-
-def _first(images: list[tuple[str, Any]], asked: Sequence[str]) -> Columns:
-    """Of several images the one named flux, or what all but one are not."""
-    flux = [one for one in images if one[0].strip().lower() in ("flux", "sci", "spectrum")]
-    return first_fitting(flux if flux and not asked else images, asked)
-
-
-def _text(header: Any, key: str) -> str:
-    """A keyword's value as text, empty where there is none or it cannot be read."""
-    try:
-        value = header.get(key, "")
-        return str(value).strip()
+        return str(header.get(key, "")).strip()
     except Exception:  # unparsable cards
         return ""
 
 
-def _named(primary: Any, header: Any, name: str) -> str:
-    for key in ("TARGNAME", "TARGETID", "OBJECT"):
-        for one in (primary, header):
-            if title := _text(one, key)[:80]:
-                return title
-    return name
+def _reader(hdu: Any, column: int | None = None) -> Callable[[], Any]:
+    """Return a reader of an extension's data or column, whose failures on damaged content are InputError."""
 
+    def values() -> Any:
+        with parsing("it", WHOLE), warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            return hdu.data if column is None else hdu.data.field(column)
 
-def _words(primary: Any, header: Any) -> str:
-    words = [_text(one, key) for one in ([primary] if primary is header else [primary, header]) for key in _WORDS]
-    for one in (primary, header):
-        # AIRORVAC = 'air', VACUUM = T
-        if _text(one, "AIRORVAC").lower() == "air" or _text(one, "VACUUM") == "False":
-            words.append("in air")
-        if _text(one, "VACUUM") == "True":
-            words.append("vacuum")
-    return "\n".join(words)[:100_000]
-
-
-def _notes(primary: Any, header: Any, origin: str) -> tuple[str, ...]:
-    notes = []
-    for key in ("DATAQUAL", "OFFSETPX"):
-        if value := _text(primary, key) or _text(header, key):
-            notes.append(f"{key} = {value[:60]}")
-    if "lowlib" in origin.lower():
-        notes.append("dereddened and at zero velocity: counts need it reddened again")
-    return tuple(notes)
-
-
-def _table(hdu: Any, primary: Any, name: str, origin: str, asked: Sequence[str]) -> Columns:
-    header = hdu.header
-    if _text(header, "ZIMAGE") == "True":
-        raise InputError("holds a compressed image, expected a table with WAVELENGTH and FLUX")
-    names = [str(one) for one in hdu.columns.names]
-    given = [(one.unit or "").strip() or None for one in hdu.columns]
-    # The whole file's unit stands for the flux where its column has none (SDSS).
-    whole = _text(primary, "BUNIT") or _text(header, "BUNIT") or None
-    ucds = " ".join(_text(header, f"TUCD{k + 1}") for k in range(len(names)) if _text(header, f"TUCD{k + 1}"))
-
-    def none(place: int) -> Any:
-        value = header.get(f"TNULL{place + 1}")
-        return value if isinstance(value, int | float) and not isinstance(value, bool) else None
-
-    columns = columns_of(
-        names,
-        given,
-        lambda k: hdu.data.field(names[k]),
-        _named(primary, header, name),
-        origin,
-        asked,
-        usual=USUAL,
-        words=_words(primary, header) + "\n" + ucds,
-        notes=_notes(primary, header, origin),
-        none=none,
-    )
-    if columns.flux_unit is None and whole is not None:
-        return Columns(**{**columns.__dict__, "flux_unit": whole})
-    return columns
-
-
-def _image(hdu: Any, primary: Any, name: str, origin: str, asked: Sequence[str]) -> Columns:
-    if asked:
-        raise InputError(f"no column named {shortened(asked[0])} in an image, expected none")
-    header = hdu.header
-    shape = [int(header.get(f"NAXIS{k + 1}", 0)) for k in range(int(header["NAXIS"]))]
-    if sum(n > 1 for n in shape) != 1 or shape[0] < 2:
-        raise InputError(
-            f"holds an image of {' x '.join(map(str, shape))} pixels, expected a spectrum of one dimension, or a table"
-        )
-    flux = np.ravel(hdu.data)
-    axis, unit, kind, notes = _axis(header, primary, flux.size)
-    flux_unit = _text(header, "BUNIT") or _text(primary, "BUNIT") or None
-    words = _words(primary, header) + ("\nair wavelength" if kind == "AWAV" else "\nvacuum" if kind == "WAVE" else "")
-    return Columns(
-        numbers(axis, "its axis"), numbers(flux, "its image"), _named(primary, header, name), origin, unit, flux_unit,
-        USUAL, words=words, notes=(*_notes(primary, header, origin), *notes),
-    )  # fmt: skip
-
-
-def _axis(header: Any, primary: Any, n: int) -> tuple[Any, str | None, str, tuple[str, ...]]:
-    """Values of an image's first axis, its unit and what it is."""
-
-    def number(*keys: str) -> float | None:
-        for key in keys:
-            for one in (header, primary):
-                value = one.get(key)
-                if isinstance(value, int | float) and not isinstance(value, bool):
-                    return float(value)
-        return None
-
-    start, step = number("CRVAL1"), number("CD1_1", "CDELT1")
-    if start is None or step is None or step == 0:
-        raise InputError("has an image without CRVAL1 and CDELT1 or CD1_1, expected the wavelengths of its pixels")
-    if number("CDELT1") is not None and number("CD1_1") is None and (scale := number("PC1_1")) is not None:
-        step *= scale
-    # By the FITS standard a missing CRPIX1 is 0; the archives' spectra without it begin at their first pixel.
-    reference = number("CRPIX1")
-    pixel = np.arange(1, n + 1) - (1.0 if reference is None else reference)
-    kind = (_text(header, "CTYPE1") or _text(primary, "CTYPE1")).upper()
-    unit = _text(header, "CUNIT1") or _text(primary, "CUNIT1") or None
-    value = start + step * pixel
-    flag = number("DC-FLAG")
-    name, _, algorithm = kind.partition("-")
-    if algorithm.strip("-") not in ("", "LOG", "LAMBDA", "LINEAR") or (
-        name not in ("", "WAVE", "AWAV", "FREQ", "ENER", "LINEAR", "LAMBDA", "WAVELENGTH", "LOGLAM", "LOG", "LOG10")
-        and not name.startswith(("WAVELEN", "LAM", "ANGSTROM", "ALOG"))
-    ):
-        raise InputError(f"has an axis of the type {shortened(kind)}, expected linear or logarithmic wavelengths")
-    if unit is not None and re.match(r"\s*log|\s*dex", unit, re.IGNORECASE):
-        flag, unit = 1, re.sub(r"^\s*(log|dex)\w*[\s(\[]*|[)\]\s]+$", "", unit, flags=re.IGNORECASE) or None
-    logarithm = flag == 1 or "LOG" in kind
-    if not logarithm:
-        if unit is None and start < 10.0 and abs(step) < 0.01:
-            raise InputError(
-                f"has an axis from {start:g} in steps of {step:g} without a unit or type, expected CTYPE1 and CUNIT1"
-            )
-        return value, unit, name, ()
-    if algorithm == "LOG" and name in ("WAVE", "AWAV", "FREQ", "ENER") and flag != 1 and start > 20.0:
-        # Greisen et al. 2006 (A&A 446, 747), equation 5: the value at the reference pixel times an exponential.
-        with np.errstate(over="ignore"):
-            return start * np.exp(step * pixel / start), unit, name, (f"logarithmic axis {kind}",)
-    if not 1.0 < start < 6.0:
-        raise InputError(
-            f"has a logarithmic axis from {start:g}, expected logarithms to base ten or the form {name}-LOG"
-        )
-    with np.errstate(over="ignore"):
-        return 10.0**value, unit, name, ("wavelengths from logarithms to base ten",)
+    return values

@@ -1,8 +1,9 @@
-"""Read a spectrum from the files that users bring: what they are is seen from their content, not from their names."""
+"""Read a spectrum from the files that users bring; content decides what a file is, not its name."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -12,11 +13,12 @@ from ..files.bounded import read_bytes, shortened, unpacked
 if TYPE_CHECKING:
     import astropy.units as u
 
-    from .columns import Columns, ReadSpectrum
+    from .conversion import ReadSpectrum
+    from .file_table import FileTable
 
 
 def without_columns(path: str | Path) -> tuple[Path, tuple[str, ...]]:
-    """A file, and the columns named behind it in brackets, as in ``grid.fits[g45]``.
+    """Divide ``grid.fits[g45]`` into the file and the words in brackets, which name what is meant in it.
 
     A file whose own name ends so is that file.
     """
@@ -35,62 +37,56 @@ def read_spectrum(
     Parameters
     ----------
     path : Path
-        May end in columns, ``grid.fits[g45]``, where several fit; or in an extension or a row likewise. Text without a
-        stated unit is in nm and erg s-1 cm-2 A-1 (the paper's rule), FITS in Angstrom and erg s-1 cm-2 A-1, which
-        `ReadSpectrum.told` says; ECSV and VOTable must name their units.
+        May end in words that say what is meant where several fit: a column, ``grid.fits[g45]``, two columns, an
+        extension, the identifier of a row, ``row 3``. Text without a stated unit is in nm and erg s-1 cm-2 A-1 (the
+        paper's rule), FITS in Angstrom and erg s-1 cm-2 A-1, which `ReadSpectrum.messages` report; ECSV and VOTable
+        must name their units.
     wavelength_unit, flux_unit : str or Unit, optional
-        Stand above what the file states; a wavelength's may end in " air" or " vacuum".
-
-    Raises
-    ------
-    InputError
-        If there is no such file, or it holds no spectrum, or several.
+        Override what the file states; a wavelength's may end in " air" or " vacuum".
     """
     import numpy as np
 
-    from .columns import spectrum_of
+    from .conversion import converted
+    from .selection import spectrum_in
 
     try:
         place, asked = without_columns(path)
     except (OSError, ValueError):
-        # Names that are none: `read_bytes` says what is wrong.
+        # `read_bytes` says what is wrong with the name.
         place, asked = Path(path), ()
     content = read_bytes(place, "spectrum file")
     shown = place.name if len(place.name) <= 80 else shortened(place.name)
     try:
-        columns = _columns(
-            unpacked(content, "it"), _stem(place.name), f"file {shown}", asked, wavelength_unit, flux_unit
-        )
-        # Numbers beyond floats end in a sentence where points are checked.
+        tables = _tables(unpacked(content, "it"), _stem(place.name), f"file {shown}", asked, wavelength_unit, flux_unit)
+        # Overflows become infinities, which are refused where points are checked.
         with np.errstate(all="ignore"):
-            return spectrum_of(columns, wavelength_unit, flux_unit)
+            return converted(spectrum_in(tables, asked), wavelength_unit, flux_unit)
     except InputError as error:
         raise InputError(f"{shown}: {error}") from error
 
 
 def _stem(name: str) -> str:
-    return (
-        re.sub(r"(\.(gz|bz2|xz))?$", "", re.sub(r"\.(gz|bz2|xz)$", "", name, flags=re.I)).rsplit(".", 1)[0][:80] or name
-    )
+    """Return a file's name without the endings of its packing and its format."""
+    return re.sub(r"\.(gz|bz2|xz)$", "", name, flags=re.I).rsplit(".", 1)[0][:80] or name
 
 
-def _columns(
-    content: bytes, name: str, origin: str, asked: tuple[str, ...], wavelength_unit: object, flux_unit: object
-) -> Columns:
-    from .fits_files import read_fits
-    from .tables import read_ecsv, read_votable
-    from .text import read_text, text_of
+def _tables(
+    content: bytes, name: str, origin: str, asked: Sequence[str], wavelength_unit: object, flux_unit: object
+) -> list[FileTable]:
+    from .fits_files import fits_tables
+    from .table_files import ecsv_tables, votable_tables
+    from .text import text_of, text_tables
 
     if content[:9] == b"SIMPLE  =":
-        return read_fits(content, name, origin, asked)
+        return fits_tables(content, name, origin, asked)
     start = content[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")
     if re.match(rb"<(\?xml|votable|vot:)", start, re.IGNORECASE) and b"VOTABLE" in content[:4096].upper():
-        return read_votable(content, name, origin, asked)
+        return votable_tables(content, name, origin)
     if start[:1] == b"<":
         raise InputError(
             f"is a page or XML that begins with {shortened(start[:20].decode('ascii', 'replace'))}, expected a spectrum"
         )
     text = text_of(content)
     if re.match(r"#\s*%ECSV", text):
-        return read_ecsv(text, name, origin, asked)
-    return read_text(text, name, f"text {origin}", asked, wavelength_unit is None, flux_unit is None)
+        return ecsv_tables(text, name, origin)
+    return text_tables(text, name, f"text {origin}", asked, wavelength_unit is None, flux_unit is None)

@@ -1,4 +1,4 @@
-"""The noise of a measured spectrum, from its own scatter."""
+"""Estimate the noise of a measured spectrum from its own scatter."""
 
 from __future__ import annotations
 
@@ -7,15 +7,15 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 
-#: Points whose scatter tells the noise of one.
+#: Number of points whose scatter gives the noise of the one in the middle.
 WINDOW = 51
 
 
 def point_noise(flux_flam: Float) -> Float:
-    """Standard deviation of each point, from the scatter of those around it, shape (n,).
+    """Return the standard deviation of each point from the scatter around it, shape (n,).
 
     The median of |2 F_i - F_(i-2) - F_(i+2)| is 1.4826^-1 sqrt(6) of a point's error (Stoehr et al. 2008, ASP
-    Conf. Ser. 394, 505); leaving out the neighbours spares what is correlated.
+    Conf. Ser. 394, 505); adjacent points, whose errors are correlated, are left out.
     """
     from scipy.ndimage import median_filter
 

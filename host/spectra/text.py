@@ -1,10 +1,10 @@
-"""Spectra as text: two columns among others, with or without names and units."""
+"""Read the tables of text files: columns of numbers, with or without a header of names and units."""
 
 from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
@@ -12,27 +12,25 @@ import numpy as np
 
 from ..errors import InputError
 from ..files.bounded import shortened
-from .columns import Columns, chosen, listed, numbers, plain, row_of, step_among
-from .units import stated_units
+from .choice import AXES, listed
+from .file_table import Column, FileTable
+from .header_units import stated_units
+from .roles import Role
+from .text_header import Header, Split, names_of
 
-#: Units of a text file without a word about them: the paper's rule.
-USUAL = ("nm", "erg / (s cm2 Angstrom)")
+#: Units of a text file that states none: the paper's rule.
+IMPLIED_UNITS = ("nm", "erg / (s cm2 Angstrom)")
 #: Gaia DR3's sampled mean spectra: 343 fluxes at 336 + 2 i nm (documentation of gaiadr3.xp_sampled_mean_spectrum).
-GAIA_START_NM, GAIA_STEP_NM, GAIA_POINTS = 336.0, 2.0, 343
-GAIA_FLUX = "W m-2 nm-1"
+GAIA_NM, GAIA_FLUX = 336.0 + 2.0 * np.arange(343), "W m-2 nm-1"
 _REMARK = re.compile(r"^\s*(#|%|!|;|//|\\|\|)")
+_NUMBER = re.compile(r"[+-]?(?:\d[\d_]*[.,]?\d*|[.,]\d+)(?:[eEdD][+-]?\d+)?(?![\w.])")
 _DECIMAL_COMMA = re.compile(r"[+-]?\d+,\d+(?:[eEdD][+-]?\d+)?")
 _MISSING = {"", "--", "-", "null", "none", "indef", "n/a", "na", "...", "masked"}
+_NOT_FINITE = {"nan", "inf", "-inf"}
 
 
 def text_of(content: bytes) -> str:
-    """Text from bytes.
-
-    Raises
-    ------
-    InputError
-        If they are none.
-    """
+    """Return bytes as text in UTF-8 or, with a byte-order mark, UTF-16."""
     # Editors on Windows start a file with a byte-order mark.
     code = "utf-16" if content[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
     try:
@@ -49,91 +47,127 @@ def text_of(content: bytes) -> str:
     return text
 
 
-def read_text(text: str, name: str, origin: str, asked: Sequence[str], wavelength: bool, flux: bool) -> Columns:
-    """Two columns of a text file.
+def text_tables(
+    text: str, name: str, origin: str, asked: Sequence[str], wavelength: bool, flux: bool
+) -> list[FileTable]:
+    """Return the table of a text file.
 
     Parameters
     ----------
     text, name, origin : str
     asked : sequence of str
-        Names or numbers of columns that the user gave.
+        Words that the user gave; for columns without names these are their numbers.
     wavelength, flux : bool
         Whether the units of wavelength and flux are to be found in the header.
-
-    Raises
-    ------
-    InputError
-        If there are no two such columns; it names the line.
     """
     header, lines = _divided(text.splitlines())
     if not lines:
         raise InputError("holds no numbers, expected two columns: wavelength and flux")
-    split, told = _splitter([line for _, line in lines])
-    first = split(lines[0][1])
-    names, units = _named(header, len(first), split)
-    if any(cell.strip()[:1] in ("(", "[") for cell in first):
-        return _from_arrays(names, [split(line) for _, line in lines], name, origin, asked, header)
-    wave, value = _places(names, len(first), asked, told)
-    values = np.array([_row(split(line), wave, value, number, line) for number, line in lines])
-    words = "\n".join(header)
-    stated: list[str | None] = [None, None]
-    for source in (_own_units(names, units, wave, value), words):
-        more = stated_units(source, wavelength=wavelength and not stated[0], flux=flux and not stated[1])
-        stated = [old or new for old, new in zip(stated, more, strict=True)]
-    return Columns(
-        numbers(values[:, 0], "wavelength"),
-        numbers(values[:, 1], "flux"),
-        name,
-        origin,
-        stated[0],
-        stated[1],
-        USUAL,
-        names[wave] if names else "1",
-        names[value] if names else "2",
-        words,
-        told=tuple(told),
+    split, messages = _splitter([line for _, line in lines])
+    rows = [(number, line, split(line)) for number, line in lines]
+    n = len(rows[0][2])
+    names, units = names_of(header, n, split)
+    remarks = "\n".join(line for line, _ in header)
+    if any(cell.strip()[:1] in ("(", "[") for cell in rows[0][2]):
+        return [_table_of_arrays(names, units, rows, name, origin, header)]
+    if names:
+        columns = [_column(rows, k, names[k], units[k] if units else None) for k in range(n)]
+    else:
+        columns = _unnamed(rows, n, asked, messages)
+    columns = _with_units_of(remarks, columns, wavelength, flux, is_named=bool(names))
+    return [FileTable(columns, name, origin, implied_units=IMPLIED_UNITS, remarks=remarks, messages=tuple(messages))]
+
+
+Row = tuple[int, str, list[str]]
+
+
+def _column(rows: Sequence[Row], place: int, name: str, unit: str | None = None, role: Role | None = None) -> Column:
+    return Column(name, partial(_values, rows, place), unit, role=role)
+
+
+def _unnamed(rows: Sequence[Row], n: int, asked: Sequence[str], messages: list[str]) -> list[Column]:
+    """Return columns by their numbers: the first two, or those that the user names."""
+    places = [int(one) - 1 for one in asked if one.isascii() and one.isdigit() and 1 <= int(one[:6]) <= n]
+    if len(places) != len(asked) or len(places) > 2:
+        raise InputError(f"columns {listed(asked)} of {n} without names, expected their numbers, 1 to {n}")
+    if not asked and n > 2:
+        messages.append(f"the first two of its {n} columns are taken, which have no names")
+    wave, value = (0, 1) if not places else (0, places[0]) if len(places) == 1 else (places[0], places[1])
+    roles = {wave: Role("wavelength", 1), value: Role("flux", 1)}
+    return [_column(rows, k, str(k + 1), role=roles.get(k, Role("unknown"))) for k in range(max(n, 2))]
+
+
+def _with_units_of(
+    remarks: str, columns: Sequence[Column], wavelength: bool, flux: bool, is_named: bool
+) -> list[Column]:
+    """Return columns with the units that remarks state, where their own names and units state none."""
+    roles = [column.known_role for column in columns]
+    # A column of an unknown name may be the flux where none is recognised.
+    fluxes = ("flux", "model") if any(role.kind in ("flux", "model") for role in roles) else ("unknown",)
+    has_axis = any(role.kind in AXES and role.unit for role in roles)
+    has_flux = any(role.kind in fluxes and role.unit for role in roles)
+    axis_unit, flux_unit = stated_units(
+        remarks, wavelength=wavelength and not has_axis, flux=flux and not has_flux, is_named=is_named
     )
+    found = []
+    for column, role in zip(columns, roles, strict=True):
+        unit = axis_unit if role.kind in AXES else flux_unit if role.kind in fluxes else None
+        found.append(column if unit is None or role.unit else column.with_unit(unit))
+    return found
 
 
-def _divided(lines: list[str]) -> tuple[list[str], list[tuple[int, str]]]:
-    """The header, with all remarks, and the numbered lines of data."""
-    header: list[str] = []
+def _divided(lines: Sequence[str]) -> tuple[Header, list[tuple[int, str]]]:
+    """Divide a text into its header, with all remarks, and its numbered lines of data."""
+    numbered = [(number, line) for number, line in enumerate(lines, 1) if line.strip()]
+    remarks = {number for number, line in numbered if _REMARK.match(line)}
+    start = _first_of_data([(number, line) for number, line in numbered if number not in remarks])
+    header: Header = []
     data: list[tuple[int, str]] = []
-    for number, line in enumerate(lines, 1):
-        if not line.strip():
+    for number, line in numbered:
+        if number in remarks and not (line.lstrip()[0] == "|" and data):
+            header.append((line.strip().lstrip("#%!;/\\| "), True))
             continue
-        if _REMARK.match(line) and not (line.lstrip()[0] == "|" and data):
-            header.append(line.strip().lstrip("#%!;/\\| "))
-            continue
-        kept = line.split("#", 1)[0].strip()
-        if not data and not _starts_with_number(kept):
-            header.append(kept)
-            continue
-        data.append((number, kept))
+        kept = line.split("#", 1)[0].rstrip()
+        if number < start:
+            header.append((kept, False))
+        else:
+            data.append((number, kept.strip()))
     return header, data
+
+
+def _first_of_data(lines: Sequence[tuple[int, str]]) -> float:
+    """Return the number of the line where the data begin: the first that starts with two numbers, else with one."""
+    starting = [(number, line) for number, line in lines if _starts_with_number(line)]
+    for number, line in starting:
+        cells = re.split(r"[\s;|]+", line.strip())
+        cells = line.split(",") if len(cells) == 1 else cells
+        # A line of a preamble, as "2 columns" or "912 s", has no second one.
+        if sum(bool(_NUMBER.match(cell)) or cell.lower() in _MISSING | _NOT_FINITE for cell in cells) > 1:
+            return number
+    return starting[0][0] if starting else float("inf")
 
 
 def _starts_with_number(line: str) -> bool:
     cell = re.split(r"[\s;|]+|,\s|,(?=[^\d])", line.strip().strip("|").strip())[0].strip("\"'(")
-    return bool(re.match(r"[+-]?(\d|\.\d)", cell)) or cell.lower() in ("nan", "inf", "-inf")
+    return bool(_NUMBER.match(cell)) or cell.lower() in _NOT_FINITE
 
 
-def _splitter(lines: list[str]) -> tuple[Any, list[str]]:
-    """How lines are divided into cells; decimal commas become points, which is told."""
+def _splitter(lines: list[str]) -> tuple[Split, list[str]]:
+    """Return how lines are divided into cells, and messages; decimal commas become points."""
     sample = lines[:50] + lines[-5:]
-    told: list[str] = []
+    messages: list[str] = []
     commas = any("," in line for line in sample)
     points = any("." in line for line in sample)
     for mark in (";", "\t", "|"):
         if all(mark in line for line in sample):
             decimal = commas and not points
             if decimal:
-                told.append("its decimal commas are read as points")
-            return partial(_cells, mark=mark, decimal=decimal), told
+                messages.append("its decimal commas are read as points")
+            return partial(_cells, mark=mark, decimal=decimal), messages
     if any('"' in line for line in sample):
-        return (lambda line: next(csv.reader([line], skipinitialspace=True))), told
+        return (lambda line: next(csv.reader([line], skipinitialspace=True))), messages
     if not commas:
-        return str.split, told
+        return str.split, messages
     blanks = [line.split() for line in sample]
     if all(len(cells) > 1 for cells in blanks) and not any(c.endswith(",") for cells in blanks for c in cells[:-1]):
         if points or not all(_DECIMAL_COMMA.fullmatch(c) or "," not in c for cells in blanks for c in cells):
@@ -141,14 +175,14 @@ def _splitter(lines: list[str]) -> tuple[Any, list[str]]:
                 f"line {shortened(sample[0], 60)} mixes commas, points and blanks, expected decimal points and one "
                 "kind of mark between columns"
             )
-        told.append("its decimal commas are read as points")
-        return partial(_cells, mark=None, decimal=True), told
+        messages.append("its decimal commas are read as points")
+        return partial(_cells, mark=None, decimal=True), messages
     cells = [line.split(",") for line in sample]
     if not points and all(len(row) > 1 and re.fullmatch(r"\s*\d+\s*", row[1]) for row in cells) and len(cells) > 1:
         raise InputError(f"line {shortened(sample[0], 60)} may hold decimal commas or columns, expected decimal points")
     return (
         lambda line: line.replace(",", " , ").split(" , ") if ",," in line else re.split(r"\s*,\s*|\s+", line)
-    ), told
+    ), messages
 
 
 def _cells(line: str, mark: str | None, decimal: bool) -> list[str]:
@@ -156,46 +190,18 @@ def _cells(line: str, mark: str | None, decimal: bool) -> list[str]:
     return [cell.strip().replace(",", ".") if decimal else cell.strip() for cell in cells]
 
 
-def _named(header: list[str], n: int, split: Any) -> tuple[list[str], list[str]]:
-    """Names of the columns, and the units that stand under them, where the header has them."""
-    rows = []
-    for line in header:
-        for how in (split, str.split, lambda text: text.split(",")):
-            cells = [cell.strip().strip("\"'") for cell in how(line)]
-            if len(cells) == n and all(cells):
-                rows.append(cells)
-                break
-    for k, cells in enumerate(rows):
-        try:
-            chosen(cells, ())
-        except InputError as error:
-            if "may be" not in str(error):
-                continue
-        return cells, rows[k + 1] if k + 1 < len(rows) else []
-    return [], []
+def _values(rows: Sequence[Row], place: int) -> Any:
+    """Return the numbers of a column."""
+    return np.array([_value(row, place) for row in rows])
 
 
-def _places(names: list[str], n: int, asked: Sequence[str], told: list[str]) -> tuple[int, int]:
-    if n < 2:
-        return 0, 1
-    if names:
-        return chosen(names, asked)
-    if asked:
-        places = [int(one) - 1 for one in asked if one.isascii() and one.isdigit() and 1 <= int(one[:6]) <= n]
-        if len(places) != len(asked) or len(places) > 2:
-            raise InputError(f"columns {listed(asked)} of {n} without names, expected their numbers, 1 to {n}")
-        return (places[0], places[1]) if len(places) == 2 else (0, places[0])
-    if n > 2:
-        told.append(f"the first two of its {n} columns are taken, which have no names")
-    return 0, 1
-
-
-def _row(cells: list[str], wave: int, value: int, number: int, line: str) -> tuple[float, float]:
-    if len(cells) <= max(wave, value):
+def _value(row: Row, place: int) -> float:
+    number, line, cells = row
+    if len(cells) <= place:
         what = "one column" if len(cells) == 1 else f"{len(cells)} columns"
         raise InputError(f"line {number}: {shortened(line, 60)} has {what}, expected wavelength and flux")
     try:
-        return _number(cells[wave]), _number(cells[value])
+        return _number(cells[place])
     except ValueError as error:
         raise InputError(
             f"line {number}: {shortened(line, 60)} is not numeric, expected wavelength and flux"
@@ -215,69 +221,45 @@ def _number(cell: str) -> float:
         return float(re.sub(r"(?<=[\d.])[dD](?=[+-]?\d)", "e", cell))
 
 
-def _own_units(names: list[str], units: list[str], wave: int, value: int) -> str:
-    """The chosen columns' names, and units under them, as if they were all of the header."""
-    if not names:
-        return ""
-    below = (units[wave], units[value]) if units else ("", "")
-    return f"wavelength {names[wave]} ({below[0]})\nflux {names[value]} ({below[1]})"
-
-
-def _from_arrays(
-    names: list[str], rows: list[list[str]], name: str, origin: str, asked: Sequence[str], header: list[str]
-) -> Columns:
-    """A row whose cells hold arrays: Gaia's sampled spectra, and such."""
+def _table_of_arrays(
+    names: Sequence[str], units: Sequence[str], rows: Sequence[Row], name: str, origin: str, header: Header
+) -> FileTable:
+    """Return a table whose cells hold arrays, a spectrum to a row, as Gaia's."""
+    n = len(rows[0][2])
     if not names:
         # Gaia's has no column of wavelengths.
-        names = next((cells for line in header if len(cells := line.split(",")) == len(rows[0])), [])
+        names = next((cells for line, _ in header if len(cells := line.split(",")) == n), [])
     if not names:
         raise InputError("holds arrays in its cells and no names of columns, expected names in its first line")
-    rows, asked = row_asked(rows, asked)
-    by_name = dict(zip([plain(one) for one in names], rows[0], strict=False))
-    flux = _array(by_name.get("flux", ""))
-    if "source_id" in by_name and "wavelength" not in by_name and flux.size == GAIA_POINTS:
-        wavelength = GAIA_START_NM + GAIA_STEP_NM * np.arange(GAIA_POINTS, dtype=np.float64)
-        return Columns(
-            wavelength,
-            flux,
-            f"Gaia DR3 {by_name['source_id'].strip()[:30]}",
+    columns = [Column(names[k].strip(), _array_reader(rows, k), units[k] if units else None) for k in range(n)]
+    known = {column.name.lower(): column for column in columns}
+    if "source_id" in known and "wavelength" not in known and "flux" in known:
+        if np.shape(known["flux"].values())[-1:] == GAIA_NM.shape:
+            columns = [known["source_id"], Column("wavelength", lambda: GAIA_NM, "nm"),
+                       Column("flux", known["flux"].values, GAIA_FLUX)]  # fmt: skip
+        return FileTable(
+            columns,
+            name,
             f"{origin}, Gaia DR3 sampled XP spectrum",
-            "nm",
-            GAIA_FLUX,
+            row_title="Gaia DR3 {}",
             notes=("wavelengths 336 + 2 i nm, W m-2 nm-1: Gaia DR3's documentation",),
         )
-    wave, value = chosen(names, asked)
-    step = step_among(names)
-    columns = row_of(
-        _array(rows[0][wave]), _array(rows[0][value]), None if step is None else _array(rows[0][step]), "its row"
-    )
-    units = stated_units(_own_units(names, [], wave, value))
-    return Columns(columns[0], columns[1], name, origin, *units, USUAL, names[wave], names[value], "\n".join(header))
+    return FileTable(columns, name, origin, implied_units=IMPLIED_UNITS, remarks="\n".join(line for line, _ in header))
 
 
-def row_asked(rows: Sequence[Any], asked: Sequence[str]) -> tuple[list[Any], list[str]]:
-    """The one row that is meant, and what else is asked for; a row is named by any of its short cells.
+def _array_reader(rows: Sequence[Row], place: int) -> Callable[[], Any]:
+    def read() -> Any:
+        cells = [cells[place].strip() if place < len(cells) else "" for _, _, cells in rows]
+        if not any(cell[:1] in ("(", "[") for cell in cells):
+            return np.array(cells)
+        arrays = [_array(cell) for cell in cells]
+        if len({array.size for array in arrays}) == 1:
+            return np.array(arrays)
+        values = np.empty(len(arrays), object)
+        values[:] = arrays
+        return values
 
-    Raises
-    ------
-    InputError
-        If several rows remain.
-    """
-    left = list(asked)
-    fitting = list(rows)
-    for one in asked:
-        fits = [row for row in rows if any(str(cell).strip() == one for cell in row if np.size(cell) == 1)]
-        if fits:
-            fitting = fits
-            left.remove(one)
-            break
-    if len(fitting) != 1:
-        labels = [next((str(c).strip()[:30] for c in row if np.size(c) == 1 and str(c).strip()), "") for row in fitting]
-        raise InputError(
-            f"{len(fitting)} spectra stand in it, one a row ({listed(labels)}), expected one: name it as in "
-            f"FILE[{labels[0]}]"
-        )
-    return fitting, left
+    return read
 
 
 def _array(cell: str) -> Any:

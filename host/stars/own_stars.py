@@ -151,6 +151,7 @@ def add(
     """
     from astropy.table import Table
 
+    from ..spectra.ends import check_covers
     from . import catalogue
     from .source import Source
 
@@ -158,6 +159,7 @@ def add(
     path, _ = without_columns(path)
     content = read_bytes(path, "spectrum file")
     source: Source = Source.read(given, wavelength_unit=wavelength_unit, flux_unit=flux_unit, extend=extend)
+    check_covers(source.name, source.measured_nm or (source.wavelength_nm[0], source.wavelength_nm[-1]))
     name = (name or source.name).strip()
     if not re.fullmatch(r"[\w][\w .+\-*'()]{0,63}", name):
         raise InputError(f"star name {name!r}, expected up to 64 letters, digits, spaces and . + - * ' ( )")

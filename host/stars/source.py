@@ -19,17 +19,18 @@ from ..plotting import picture
 from ..quantities import number
 from ..ranges import check_magnitude
 from ..spectra.ends import (
-    SPAN_NM,
     check_flux,
+    check_measured,
     check_points,
-    check_span,
     continued,
+    coverage,
     extended,
     means,
     remarks,
     without_undefined_ends,
 )
 from ..spectra.formats import read_spectrum
+from ..spectra.range import SPAN_NM
 from . import bands, catalogue, own_stars
 from .flare import Geometry, with_flare
 
@@ -49,7 +50,8 @@ class Source(ByContent):
     Attributes
     ----------
     wavelength_nm : ndarray, shape (n,)
-        Vacuum wavelengths, strictly increasing, spanning at least 200-700 nm.
+        Vacuum wavelengths, strictly increasing, covering at least a third of 200-700 nm; `expect` asks for all that
+        the instrument's pixels see.
     flux_flam : ndarray, shape (n,)
         erg s-1 cm-2 A-1, finite; linear between the points. Negative ones are measured noise.
     name, origin : str
@@ -103,7 +105,7 @@ class Source(ByContent):
             array.setflags(write=False)
             object.__setattr__(self, field, array)
         check_points(self.name, self.wavelength_nm, self.flux_flam)
-        check_span(self.name, self.wavelength_nm)
+        check_measured(self.name, self.wavelength_nm)
         check_flux(self.name, self.wavelength_nm, self.flux_flam)
 
     @cached_property
@@ -153,27 +155,29 @@ class Source(ByContent):
         flux_unit: str | u.UnitBase | None = None,
         extend: str | Source | None = None,
     ) -> Self:
-        """A user's own spectrum: text, ECSV, VOTable or FITS; `told` says what was assumed or changed.
+        """Read a spectrum from a file of text, ECSV, VOTable or FITS.
 
-        Undefined ends beyond 200-700 nm are left out. Ends within 180-750 nm are continued at their level where they
-        are dark.
+        `told` holds what was assumed or changed. Undefined ends beyond 200-700 nm are left out. Ends within 180-750 nm
+        are continued at their level where they are dark.
 
         Parameters
         ----------
         path : str or Path
             May end in a column, ``grid.fits[g45]``; see `formats.read_spectrum`.
         wavelength_unit, flux_unit : str or Unit, optional
-            Stand above what the file states; a wavelength's may end in " air" or " vacuum".
+            Override what the file states; a wavelength's may end in " air" or " vacuum".
         extend : str or Source, optional
-            A library spectrum that goes on where the file ends, scaled to it at the join.
+            A library spectrum that continues the file's where it ends, scaled to it at the join.
 
         Raises
         ------
         InputError
-            If the file is missing, unreadable or holds no usable spectrum.
+            If the file is missing, unreadable or holds no usable spectrum, or less than a third of 200-700 nm.
         """
         read = read_spectrum(Path(path), wavelength_unit=wavelength_unit, flux_unit=flux_unit)
-        star = cls._made(read.wavelength_nm, read.flux_flam, read.name, read.origin, read.notes, read.told, extend)
+        star = cls._made(
+            read.wavelength_nm, read.flux_flam, read.name, read.origin, read.notes, read.messages, extend, is_file=True
+        )
         unscaled = read.unscaled or star._too_bright()
         return replace(star, unscaled=unscaled) if unscaled else star
 
@@ -187,29 +191,29 @@ class Source(ByContent):
         notes: tuple[str, ...] = (),
         told: tuple[str, ...] = (),
         extend: str | Source | None = None,
+        is_file: bool = False,
     ) -> Self:
-        """A spectrum from outside: its span checked before its ends are cut, extended or continued."""
+        """Make a source of a user's spectrum: check its points and range, cut undefined ends, and continue others."""
         check_points(name, wavelength, flux)
-        if extend is None:
-            check_span(name, wavelength)
+        check_measured(name, wavelength)
         wavelength, flux, cut = without_undefined_ends(name, wavelength, flux)
-        if extend is None:
-            check_span(name, wavelength, " once its undefined ends are cut" if cut else "")
-        told = (*told, *remarks(wavelength, flux))
+        if is_file or extend is not None:
+            told += (coverage(wavelength),)
+        told += remarks(wavelength, flux)
         if extend is not None:
             other = cls.from_library(extend) if isinstance(extend, str) else extend
             wavelength, flux, added = extended(name, wavelength, flux, other.name, other.wavelength_nm, other.flux_flam)
             told += added
         check_flux(name, wavelength, flux)
         measured = (float(wavelength[0]), float(wavelength[-1]))
-        wavelength, flux, added = continued(name, wavelength, flux)
+        wavelength, flux, added = continued(name, wavelength, flux, dark_only=True)
         return cls(
             wavelength, flux, name, origin, (*notes, *cut), told=(*told, *added),
             measured_nm=measured if added else None,
         )  # fmt: skip
 
     def _too_bright(self) -> str:
-        """Why the flux cannot be that of a star at the telescope, or nothing."""
+        """Return why the flux cannot be that of a star at the telescope, or nothing."""
         try:
             v = self.magnitude("V")
         except InputError:

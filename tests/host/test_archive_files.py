@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from astropy.io import fits
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import expect
 from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.stars.source import Source
 
 HERE = Path(__file__).parents[1] / "data" / "spectra"
@@ -45,24 +47,39 @@ RIGHT: list[tuple[str, dict[str, Any], Any, float | None]] = [
     ("ckp00_5750.fits[g45]", {}, lambda name: by_hand(name.split("[")[0], flux="g45"), None),
     ("vb8_stiswfcnic_004.fits", {"extend": "M3V"}, by_hand, 16.80),
     ("wasp-96_estimate_sed.txt", ANGSTROM | {"extend": "G8V"}, lambda name: text_by_hand(name, 1), None),
+    ("ADLeo_912s.dat", {"extend": "M3V"}, lambda name: text_by_hand(name, 2), None),
 ]
-#: File, options, and the sentence.
+#: File, options, and the sentence of reading it.
 REFUSED = [
-    ("vb8_stiswfcnic_004.fits", {}, r"VB8 spans 290\.033-2497\.72 nm, expected at least 200-700 nm: --extend"),
-    ("lwp11854.mxlo", {}, r"lwp11854 spans 175-345\.144 nm, expected at least 200-700 nm: --extend"),
-    ("10lac_stis_001.txt", {}, r"1669-399000 nm, assumed to be in nm .*--wavelength-unit .*look like Angstrom"),
-    ("h_stis_ngsl_hd095735_v2.txtA", {}, r"1675.01-10191.7 nm, assumed to be in nm .*look like Angstrom"),
-    ("wasp-96_estimate_sed.txt", {}, r"spans 1980.05-6067.15 nm, expected at least 200-700 nm \(these look like Angst"),
-    ("wasp-96_estimate_sed.txt", ANGSTROM, r"spans 198.005-606.715 nm, expected at least 200-700 nm: --extend"),
+    ("lwp11854.mxlo", {}, r"lwp11854 covers 175-345\.144 nm, 29% of 200-700 nm, expected at least a third"),
+    (
+        "lwp11854.mxlo",
+        {"extend": "B2IV"},
+        r"lwp11854 covers 175-345\.144 nm, 29% of 200-700 nm, expected at least a third",
+    ),
+    (
+        "10lac_stis_001.txt",
+        {},
+        r"1669 to 399000 without a stated unit look like Angstrom, .*: --wavelength-unit Angstrom$",
+    ),
+    ("h_stis_ngsl_hd095735_v2.txtA", {}, r"1675.01 to 10191.7 .* look like Angstrom, .*: --wavelength-unit Angstrom$"),
+    ("wasp-96_estimate_sed.txt", {}, r"1980.05 to 6067.15 .* look like Angstrom, .*: --wavelength-unit Angstrom$"),
+    ("wasp-96_estimate_sed.txt", {"extend": "G8V"}, r"look like Angstrom, .*: --wavelength-unit Angstrom$"),
     ("ckp00_5750.fits", {}, r"11 columns may be the flux: g00, g05, .*g50, expected one: name it as in FILE\[g50\]"),
-    ("ckp00_5750.fits[g55]", {}, r"no column is named 'g55', expected one of WAVELENGTH, g00"),
+    ("ckp00_5750.fits[g55]", {}, r"no column or row is named 'g55', expected one of WAVELENGTH, g00"),
     ("XP_SAMPLED_RAW_dr3int6.csv", {}, r"2 spectra stand in it, one a row \(6, 4\), expected one: .* FILE\[6\]"),
-    ("XP_SAMPLED_RAW_dr3int6.csv[6]", {}, r"Gaia DR3 6 spans 336-1020 nm, expected at least 200-700 nm"),
+]
+#: Files that are read and hold less than the nominal instrument's range.
+SHORT = [
+    ("vb8_stiswfcnic_004.fits", {}, r"VB8 spans 290\.033-2497\.72 nm, expected at least .*200-700 nm: --extend"),
+    ("ADLeo_912s.dat", {}, r"spans 100.36-444.015 nm, expected at least .*200-700 nm: --extend"),
+    ("wasp-96_estimate_sed.txt", ANGSTROM, r"spans 198.005-606.715 nm, expected at least .*200-700 nm: --extend"),
+    ("XP_SAMPLED_RAW_dr3int6.csv[6]", {}, r"Gaia DR3 6 spans 336-1020 nm, expected at least .*200-700 nm"),
 ]
 
 
 def test_every_file_is_tried() -> None:
-    tried = {entry[0].split("[")[0] for entry in (*RIGHT, *REFUSED)}
+    tried = {entry[0].split("[")[0] for entry in (*RIGHT, *REFUSED, *SHORT)}
     assert tried == {path.name for path in HERE.iterdir() if path.suffix != ".md"}
 
 
@@ -92,9 +109,28 @@ def test_refused_in_a_sentence(name: str, options: dict[str, Any], sentence: str
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize(("name", "options", "sentence"), SHORT, ids=[entry[0] for entry in SHORT])
+def test_short_spectra_need_an_extension(name: str, options: dict[str, Any], sentence: str) -> None:
+    star = Source.read(HERE / name, **options)
+    assert any(text.startswith("its own points cover") for text in star.told)
+    with pytest.raises(InputError, match=sentence):
+        expect(replace(star, unscaled=""), Instrument.load("mauve"), exposure=5.0)
+
+
+def test_short_spectra_suffice_for_a_narrower_range() -> None:
+    """VB 8 from 290 nm, for an instrument from 350 nm: the same light as extended by another star."""
+    red = Instrument.load("mauve").with_(output_min_nm=350.0)
+    short, extended = (Source.read(HERE / "vb8_stiswfcnic_004.fits", extend=one) for one in (None, "M3V"))
+    one, other = (expect(star, red, exposure=5.0) for star in (short, extended))
+    np.testing.assert_array_equal(one.source_electrons, other.source_electrons)
+    assert any("its own points cover 290.033-2497.72 nm, 82% of 200-700 nm" in text for text in one.messages)
+
+
 def test_what_is_told_of_them() -> None:
     told = {name: Source.read(HERE / name, **options).told for name, options, *_ in RIGHT}
-    assert told["18sco_stis_004.fits"] == told["sun_reference_stis_002.fits"] == ()
+    assert told["18sco_stis_004.fits"] == ("its own points cover 171.042-31891.2 nm",)
+    assert told["sun_reference_stis_002.fits"] == ("its own points cover 119.5-2695.74 nm",)
+    assert "its own points cover 290.033-2497.72 nm, 82% of 200-700 nm" in told["vb8_stiswfcnic_004.fits"]
     assert any("ASSUMED: flux in erg" in text for text in told["10lac_stis_001.txt"])
     assert any("merged; 11 of them differ" in text for text in told["10lac_stis_001.txt"])
     assert any("130 of its 2242 points" in text for text in told["h_stis_ngsl_hd095735_v2.txtA"])
@@ -104,17 +140,13 @@ def test_what_is_told_of_them() -> None:
 
 def test_start_and_step_in_one_row() -> None:
     """IUE's file: 640 fluxes from 1750 A in steps of 2.662668 A, zero from 3350 A on."""
-    star = Source.read(HERE / "lwp11854.mxlo", extend="B2IV")
+    read = read_spectrum(HERE / "lwp11854.mxlo")
     with fits.open(HERE / "lwp11854.mxlo") as hdus:
         row = hdus[1].data[0]
         angstrom = float(row["WAVELENGTH"]) + float(row["DELTAW"]) * np.arange(640)
         flux = np.array(row["FLUX"], float)
-    inside = (angstrom > 2000) & (angstrom < 3300)
-    place = np.searchsorted(star.wavelength_nm, angstrom[inside] / 10 * (1 - 1e-12))
-    np.testing.assert_allclose(star.wavelength_nm[place], angstrom[inside] / 10, rtol=1e-12)
-    np.testing.assert_allclose(star.flux_flam[place], flux[inside], rtol=1e-12)
-    # Its zeros are no data, and not what the library's star is scaled to.
-    assert star.flux_flam[star.wavelength_nm > 335].min() > 0
+    np.testing.assert_allclose(read.wavelength_nm, angstrom / 10, rtol=1e-12)
+    np.testing.assert_allclose(read.flux_flam, flux, rtol=1e-12)
 
 
 def test_gaias_arrays_in_a_cell() -> None:

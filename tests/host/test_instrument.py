@@ -199,3 +199,46 @@ def test_curves_hold_their_ends() -> None:
     assert curve.covers(200, 300)
     assert not curve.covers(199, 300)
     assert Curve.flat(0.5).covers(1, 1e6)
+
+
+def curve_file(tmp_path: Path, length: str, value: str, wavelengths: str = "2000 5000 8000") -> Path:
+    rows = "\n".join(f"{one} 0.5" for one in wavelengths.split())
+    path = tmp_path / "curve.ecsv"
+    path.write_text(
+        "# %ECSV 1.0\n# ---\n# datatype:\n"
+        f"# - {{name: wavelength, unit: '{length}', datatype: float64}}\n"
+        f"# - {{name: value, unit: '{value}', datatype: float64}}\n# schema: astropy-2.0\nwavelength value\n{rows}\n"
+    )
+    return path
+
+
+@pytest.mark.parametrize(
+    ("length", "value", "wavelengths", "expected"),
+    [
+        ("ANGSTROMS", "A / W", "2000 5000 8000", 0.5),
+        ("A", "A/W", "2000 5000 8000", 0.5),
+        ("microns", "%", "0.2 0.5 0.8", 0.005),
+        ("Nanometers", "percent", "200 500 800", 0.005),
+    ],
+)
+def test_units_of_curves_in_any_spelling(
+    tmp_path: Path, length: str, value: str, wavelengths: str, expected: float
+) -> None:
+    """Where A is Angstrom of a wavelength and ampere of a sensitivity."""
+    curve = Curve.read(curve_file(tmp_path, length, value, wavelengths))
+    np.testing.assert_allclose(curve.wavelength_nm, [200.0, 500.0, 800.0])
+    np.testing.assert_allclose(curve.value, expected)
+
+
+@pytest.mark.parametrize(
+    ("length", "value", "sentence"),
+    [
+        ("nm", "FLAM", "column 'value' has the unit 'FLAM', expected A / W"),
+        ("nm", "erg / (s cm2 Angstrom)", "column 'value' has the unit 'erg / .*', expected A / W"),
+        ("furlong", "A / W", "unit 'furlong' is unknown"),
+        ("s", "A / W", "column 'wavelength' has the unit 's', expected nm"),
+    ],
+)
+def test_a_spectrum_is_no_curve(tmp_path: Path, length: str, value: str, sentence: str) -> None:
+    with pytest.raises(InputError, match=sentence):
+        Curve.read(curve_file(tmp_path, length, value))

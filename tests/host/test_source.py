@@ -254,7 +254,7 @@ def test_a_real_calspec_file_goes_through(sun: Source) -> None:
     assert star.name == "18SCO"
     # V = 5.50 (SIMBAD); 5.456 with Vega at zero.
     assert star.magnitude() == pytest.approx(5.50, abs=0.02)
-    assert star.told == ()
+    assert star.told == ("its own points cover 171.042-31891.2 nm",)
     mauve = Instrument.load("mauve")
     real, class_mean = (expect(s, mauve, exposure=50) for s in (star.at_magnitude(7.4), sun))
     visible = real.wavelength_nm > 320
@@ -325,12 +325,12 @@ GOOD = grid() * 1e-15
         ("", "holds no numbers"),
         ("200 1\n300\n400 1", "line 2: '300' has one column"),
         ("# head\n200 1\n300 abc", "line 3: '300 abc' is not numeric"),
-        (rows(grid()[31:], GOOD[31:]), "spans 201-1099 nm, expected at least 200-700 nm"),
-        (rows(grid()[25:], GOOD[25:]), r"starts at 195 nm, where it is bright: \d.\d% of the brightest"),
-        (rows(grid()[:500], GOOD[:500]), "spans 170-669 nm"),
-        (rows(grid()[:535], GOOD[:535]), r"ends at 704 nm, where it is bright: \d+.\d% of the brightest"),
-        (rows(grid() * 10, GOOD), "these look like Angstrom"),
-        (rows(grid() / 1000, GOOD), "these look like micrometres"),
+        (
+            rows(grid()[365:], GOOD[365:]),
+            "would hold 33% of 200-700 nm in nm, expected at least a third, or their unit",
+        ),
+        (rows(grid() * 10, GOOD), "look like Angstrom, expected their unit: --wavelength-unit Angstrom$"),
+        (rows(grid() / 1000, GOOD), "look like um, expected their unit: --wavelength-unit um$"),
         (rows(np.where(grid() == 300, 298.0, grid()), GOOD), "wavelength 298 nm at point 131 follows 299 nm"),
         (rows(grid(), np.where(grid() == 300, np.nan, GOOD)), "flux nan at point 131"),
         (rows(grid(), np.where(grid() == 300, -1e-11, GOOD)), "flux -1e-11 at 300 nm lies farther below zero"),
@@ -341,6 +341,29 @@ def test_bad_text_is_one_sentence(tmp_path: Path, text: str, sentence: str) -> N
     with pytest.raises(InputError, match=sentence) as caught:
         Source.read(write(tmp_path / "star.dat", text))
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("kept", "sentence"),
+    [
+        (
+            slice(31, None),
+            "spans 201-1099 nm, expected at least mauve's output range 200-700 nm: --extend continues it",
+        ),
+        (slice(25, None), r"starts at 195 nm, where it is bright: \d.\d% of the brightest"),
+        (slice(500), "spans 170-669 nm"),
+        (slice(535), r"ends at 704 nm, where it is bright: \d+.\d% of the brightest"),
+    ],
+)
+def test_short_spectra_are_refused_for_the_nominal_range(kept: slice, sentence: str) -> None:
+    """And used by an instrument whose pixels see what is there."""
+    star = Source.from_arrays(grid()[kept], GOOD[kept])
+    mauve = Instrument.load("mauve")
+    with pytest.raises(InputError, match=sentence):
+        expect(star, mauve, exposure=5.0)
+    narrow = mauve.with_(output_min_nm=250.0, output_max_nm=600.0)
+    whole = expect(Source.from_arrays(grid(), GOOD), narrow, exposure=5.0)
+    np.testing.assert_array_equal(expect(star, narrow, exposure=5.0).source_electrons, whole.source_electrons)
 
 
 def test_bad_files_are_one_sentence(tmp_path: Path) -> None:
@@ -356,7 +379,7 @@ def test_bad_files_are_one_sentence(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="image without CRVAL1"):
         Source.read(tmp_path / "image.fits")
     Table({"wavelength": grid(), "counts": GOOD}).write(tmp_path / "c.ecsv", format="ascii.ecsv")
-    with pytest.raises(InputError, match="no unit, expected one such as nm"):
+    with pytest.raises(InputError, match=r"no column is recognised as a star's flux, only counts \(counts\)"):
         Source.read(tmp_path / "c.ecsv")
     (tmp_path / "d.ecsv").write_text("not a table")
     with pytest.raises(InputError, match="holds no numbers, expected two columns"):
@@ -383,7 +406,7 @@ def test_other_numbers_of_the_span() -> None:
     one, other = (expect(star.at_magnitude(5.0), mauve, exposure=5.0) for star in (whole, short))
     np.testing.assert_allclose(one.source_electrons, other.source_electrons, rtol=2e-4)
     with pytest.raises(InputError, match=r"starts at 190 nm, where it is bright: .*--extend continues it"):
-        Source.from_arrays(grid()[20:], hot[20:])
+        expect(Source.from_arrays(grid()[20:], hot[20:]), mauve, exposure=5.0)
     # What was continued is not taken for measured light in a band.
     dark = np.where(grid() < 300, 1e-17, GOOD)
     cut = Source.from_arrays(grid()[25:], dark[25:], name="cut")
@@ -397,8 +420,8 @@ def test_extended_by_another_star(sun: Source) -> None:
     kept = (sun.wavelength_nm > 250) & (sun.wavelength_nm < 650)
     mauve = Instrument.load("mauve")
     short = (sun.wavelength_nm[kept], 1e-3 * sun.flux_flam[kept])
-    with pytest.raises(InputError, match="expected at least 200-700 nm: --extend"):
-        Source.from_arrays(*short)
+    with pytest.raises(InputError, match=r"expected at least mauve's output range 200-700 nm: --extend"):
+        expect(Source.from_arrays(*short), mauve, exposure=5.0)
     for extension in ("G2V", Source.from_library("G2V")):
         star = Source.from_arrays(*short, name="short", extend=extension)
         assert sum("it is continued by G2V, scaled by" in text for text in star.told) == 2
@@ -409,7 +432,7 @@ def test_extended_by_another_star(sun: Source) -> None:
         )
     with pytest.raises(InputError, match="expected light in both to scale by"):
         Source.from_arrays(short[0], np.where(short[0] > 600, short[1], 0.0) - 1e-30, extend="G2V")
-    with pytest.raises(InputError, match="expected them to overlap"):
+    with pytest.raises(InputError, match="covers 3000-3002 nm, 0% of 200-700 nm, expected at least a third"):
         Source.from_arrays([3000.0, 3001.0, 3002.0], [1.0, 1.0, 1.0], extend="G2V")
     whole = Source.from_arrays(sun.wavelength_nm, sun.flux_flam, extend="G2V")
     assert "reaches no farther and is not used" in whole.told[-1]

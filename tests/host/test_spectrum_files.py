@@ -222,10 +222,11 @@ def test_assumed_units_are_told(tmp_path: Path) -> None:
     assert [text.split(",")[0] for text in alike(tmp_path / "a.txt").told] == [
         "ASSUMED: wavelength in nm",
         "ASSUMED: flux in erg / (Angstrom s cm2)",
+        "its own points cover 170-998 nm",
     ]
     (tmp_path / "b.txt").write_text(lines(10 * NM, PER_NM))
     star = alike(tmp_path / "b.txt", wavelength_unit="Angstrom", flux_unit="W m-2 nm-1")
-    assert star.told == ()
+    assert star.told == ("its own points cover 170-998 nm",)
     alike(tmp_path / "b.txt", wavelength_unit=u.AA, flux_unit=u.W / u.m**2 / u.nm)
     (tmp_path / "c.fits").write_bytes(table(units=(None, None)))
     alike(tmp_path / "c.fits", told="ASSUMED: wavelength in Angstrom")
@@ -235,10 +236,10 @@ def test_angstrom_that_spans_the_range_as_numbers_is_not_nm(tmp_path: Path) -> N
     """An SED from X-rays to the infrared, in Angstrom, without a word: never read as nm in silence."""
     angstrom = np.geomspace(5.0, 55_000.0, 3000)
     for low, high, sentence in (
-        (0.0, 1e9, "assumed to be in nm for want of a stated unit, are beyond 50-10000 nm"),
+        (0.0, 1e9, "cover 200-700 nm in Angstrom as well as in nm"),
         (60.0, 9000.0, "cover 200-700 nm in Angstrom as well as in nm"),
-        (60.0, 9e9, "beyond 50-10000 nm"),
-        (1150.0, 9000.0, r"expected at least 200-700 nm \(these look like Angstrom\)"),
+        (60.0, 9e9, "--wavelength-unit nm or --wavelength-unit Angstrom"),
+        (1150.0, 9000.0, "look like Angstrom, expected their unit: --wavelength-unit Angstrom$"),
     ):
         kept = angstrom[(angstrom > low) & (angstrom < high)]
         (tmp_path / "sed.txt").write_text(lines(kept, 1e-13 + 0 * kept))
@@ -248,11 +249,59 @@ def test_angstrom_that_spans_the_range_as_numbers_is_not_nm(tmp_path: Path) -> N
         np.testing.assert_allclose(right.wavelength_nm, kept / 10, rtol=1e-9)
 
 
+@pytest.mark.parametrize("extend", [None, "M3V"])
+@pytest.mark.parametrize(
+    ("low", "high"),
+    [
+        (1000, 4440),
+        (1004, 4440),
+        (1150, 3200),
+        (1669, 399_000),
+        (1199, 3348),
+        (2000, 7000),
+        (3000, 10_000),
+        (1700, 5000),
+    ],
+)
+def test_angstrom_without_a_unit_gets_one_advice(tmp_path: Path, low: float, high: float, extend: str | None) -> None:
+    """The range of the AD Leo great flare and others: taken as nm, nearly all light would be another star's."""
+    angstrom = np.geomspace(low, high, 1500)
+    (tmp_path / "flare.dat").write_text(lines(angstrom, 1e-13 + 1e-17 * angstrom))
+    with pytest.raises(
+        InputError, match=r"look like Angstrom, expected their unit: --wavelength-unit Angstrom$"
+    ) as caught:
+        Source.read(tmp_path / "flare.dat", extend=extend)
+    assert "--extend" not in str(caught.value)
+
+
+@pytest.mark.parametrize(("low", "high"), [(100, 250), (540, 2000), (800, 2500), (90, 190), (115, 360)])
+def test_an_extension_needs_a_third_of_the_range(tmp_path: Path, low: float, high: float) -> None:
+    nm = np.linspace(low, high, 800)
+    (tmp_path / "short.txt").write_text(lines(nm, 1e-13 + 1e-15 * nm, head="# nm FLAM\n"))
+    for extend in ("G2V", None):
+        with pytest.raises(InputError, match=r"covers .* nm, \d+% of 200-700 nm, expected at least a third"):
+            Source.read(tmp_path / "short.txt", extend=extend)
+
+
+@pytest.mark.parametrize(("low", "high", "part"), [(290, 2500, 82), (100, 444, 49), (195, 370, 34), (360, 980, 68)])
+def test_the_measured_range_is_always_reported(tmp_path: Path, low: float, high: float, part: int) -> None:
+    nm = np.linspace(low, high, 2000)
+    (tmp_path / "short.txt").write_text(lines(nm, 1e-13 + 1e-15 * nm, head="# nm FLAM\n"))
+    star = Source.read(tmp_path / "short.txt", extend="G2V")
+    assert star.told[0] == f"its own points cover {low:g}-{high:g} nm, {part}% of 200-700 nm"
+
+
+def test_a_gap_is_not_measured(tmp_path: Path) -> None:
+    nm = np.append(np.arange(170.0, 260.0), np.arange(650.0, 900.0))
+    (tmp_path / "gap.txt").write_text(lines(nm, 1e-13 + 1e-15 * nm, head="# nm FLAM\n"))
+    with pytest.raises(InputError, match="covers 170-899 nm, 22% of 200-700 nm"):
+        Source.read(tmp_path / "gap.txt")
+
+
 BAD_TEXT = {
     "magnitudes": (lines(NM, 12 + FLUX), "look like magnitudes, expected a flux density"),
-    "AB magnitudes": (lines(NM, FLUX, head="# wavelength (nm), AB magnitude\n"), "speaks of 'AB magnitude'"),
-    "magnitude unit": (lines(NM, FLUX, head="wave,flux\nnm,ABmag\n", mark=","), "speaks of 'ABmag'"),
-    "counts": (lines(NM, FLUX, head="# wavelength nm, counts\n"), "speaks of 'counts'"),
+    "magnitudes in words": (lines(NM, FLUX, head="# wavelength and magnitude\n"), "speaks of 'magnitude'"),
+    "counts": (lines(NM, FLUX, head="# wavelength in nm and counts\n"), "speaks of 'counts'"),
     "two units": (lines(NM, FLUX, head="# nm or Angstrom\n# FLAM\n"), "names the units nm, Angstrom, expected one"),
     "two fluxes": (
         lines(NM, FLUX, FLUX, head="wave flux_1 flux_2\n"), r"2 columns may be the flux: flux_1, flux_2.*FILE\[flux_2",
@@ -293,9 +342,9 @@ BAD_FITS = {
     "unequal": (table(columns=(short_rows(10 * NM[:-1]), short_rows(FLUX)),
                       formats=(f"{NM.size - 1}D", f"{NM.size}D")), "414 wavelengths for 415 fluxes"),
     "words": (table(columns=(10 * NM, ["x"] * NM.size), formats=("D", "3A")), "holds no plain numbers"),
-    "counts": (table(units=("ANGSTROMS", "Counts/s")), r"unit 'Counts/s' is no flux density \(magnitude, count"),
-    "AB": (table(units=("ANGSTROMS", "ABmag")), r"is no flux density \(magnitude"),
-    "per steradian": (table(units=("nm", "W m-2 nm-1 sr-1")), "is no flux density"),
+    "counts": (table(units=("ANGSTROMS", "Counts/s")), r"unit 'Counts/s' is no flux density \(magnitude or count"),
+    "magnitudes": (table(units=("ANGSTROMS", "mag")), r"is no flux density \(magnitude"),
+    "per steradian": (table(units=("nm", "W m-2 nm-1 sr-1")), "is per solid angle, expected the flux of the whole"),
     "seconds": (table(units=("s", "FLAM")), "expected a length or a frequency"),
     "no axis": (image(FLUX), "image without CRVAL1"),
     "giant": (WHOLE.replace(b"NAXIS2  =                  415", b"NAXIS2  =" + b"4150000000".rjust(21)), "is cut short"),

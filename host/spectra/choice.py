@@ -1,0 +1,112 @@
+"""Choose the columns of wavelength and flux by what they hold; where several fit equally, ask the user."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from ..errors import InputError
+from ..files.bounded import shortened
+from .roles import Role
+
+#: Most names that a message lists.
+MAX_LISTED = 12
+AXES = ("wavelength", "lower edge", "upper edge")
+
+
+def plain(name: str) -> str:
+    """Return a column's name as names are compared: case, quotes and repeated blanks do not count."""
+    return " ".join(name.strip().strip("\"'").lower().split())
+
+
+def listed(names: Sequence[str]) -> str:
+    """Return names for a message; the rest of a long list as a number."""
+    shown = [name.strip()[:40] for name in names]
+    return ", ".join(shown[:MAX_LISTED]) + (f" and {len(shown) - MAX_LISTED} more" if len(shown) > MAX_LISTED else "")
+
+
+@dataclass(frozen=True)
+class Choice:
+    """The columns of a spectrum, by their places: one wavelength or the two edges of each bin, and the flux."""
+
+    wavelength: tuple[int, ...]
+    flux: int
+
+
+def choose(names: Sequence[str], roles: Sequence[Role], asked: Sequence[str] = ()) -> Choice:
+    """Choose the columns of wavelength and flux.
+
+    Parameters
+    ----------
+    names : sequence of str
+    roles : sequence of Role
+        What each of them holds.
+    asked : sequence of str
+        Columns that the user named: a flux, a wavelength, or both.
+    """
+    wanted = [_named(name, names) for name in asked]
+    if len(wanted) > 2:
+        raise InputError(f"columns {listed(asked)} are asked for, expected one flux, and one wavelength at most")
+    axes = [i for i in wanted if roles[i].kind in AXES]
+    if len(wanted) == 2 and not axes:
+        axes = wanted[:1]
+    wavelength = (axes[0],) if axes else _wavelength(names, roles)
+    rest = [i for i in wanted if i not in wavelength]
+    if len(rest) > 1:
+        raise InputError(f"columns {listed(asked)} are asked for, expected one flux, and one wavelength at most")
+    return Choice(wavelength, rest[0] if rest else _flux(names, roles, wavelength))
+
+
+def _named(name: str, names: Sequence[str]) -> int:
+    places = [i for i, one in enumerate(names) if one.strip() == name]
+    places = places or [i for i, one in enumerate(names) if plain(one) == plain(name)]
+    if len(places) != 1:
+        raise InputError(
+            f"{'several columns are' if places else 'no column is'} named {shortened(name)}, expected one of "
+            f"{listed(names)}"
+        )
+    return places[0]
+
+
+def _wavelength(names: Sequence[str], roles: Sequence[Role]) -> tuple[int, ...]:
+    if best := _best([(role.score, i) for i, role in enumerate(roles) if role.kind == "wavelength"]):
+        return (_only("wavelength", names, best),)
+    low, high = ([i for i, role in enumerate(roles) if role.kind == f"{side} edge"] for side in ("lower", "upper"))
+    if low or high:
+        return _only("lower edge of the bins", names, low), _only("upper edge of the bins", names, high)
+    raise InputError(
+        f"no column is recognised as the wavelength among {listed(names)}, expected one named wavelength: name two "
+        "columns as in FILE[wavelength,flux]"
+    )
+
+
+def _flux(names: Sequence[str], roles: Sequence[Role], wavelength: tuple[int, ...]) -> int:
+    rest = [i for i in range(len(names)) if i not in wavelength]
+    for kind in ("flux", "model"):
+        if best := _best([(roles[i].score, i) for i in rest if roles[i].kind == kind]):
+            return _only("flux", names, best)
+    unknown = [i for i in rest if roles[i].kind == "unknown"]
+    if len(rest) == len(unknown) == 1:
+        return unknown[0]
+    held = [f"{names[i].strip()[:40]} ({roles[i].kind})" for i in rest]
+    raise InputError(
+        f"no column is recognised as a star's flux, only {listed(held) or 'the wavelength'}, expected one named flux: "
+        f"name the column as in FILE[{names[(unknown or rest or [0])[0]].strip()[:40]}]"
+    )
+
+
+def _best(scored: list[tuple[int, int]]) -> list[int]:
+    most = max((score for score, _ in scored), default=0)
+    return [i for score, i in scored if score == most]
+
+
+def _only(what: str, names: Sequence[str], places: Sequence[int]) -> int:
+    if len(places) == 1:
+        return places[0]
+    if not places:
+        raise InputError(f"no column is the {what} among {listed(names)}, expected both edges or the wavelength itself")
+    several = [names[i].strip() for i in places]
+    raise InputError(
+        f"{len(several)} columns may be the {what}: {listed(several)}, expected one: name it as in "
+        f"FILE[{several[-1][:40]}]"
+    )

@@ -1,0 +1,117 @@
+"""Read spectra in FITS images: their rows, and the wavelengths of their pixels."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..files.bounded import shortened
+
+#: Images that hold no fluxes, by the name of their extension.
+_NO_FLUX = re.compile(r"err|sig|var|ivar|qual|mask|dq|snr|cont|sky|back|wave|lambda|lam$", re.IGNORECASE)
+_AXIS_NAME = re.compile(r"(?:(.+)_)?(?:WAVELENGTH|WAVE|WAVELEN|LAMBDA|LOGLAM)", re.IGNORECASE)
+_FLUX_NAMES = ("FLUX", "SCI", "SPECTRUM", "SPEC")
+#: Most rows of one spectrum and its errors and masks, as SDSS (spSpec) and LAMOST store them.
+MAX_PLANES = 6
+
+
+def is_spectrum_image(hdu: Any, label: str) -> bool:
+    """Return whether an extension is an image that may hold fluxes."""
+    return bool(getattr(hdu, "is_image", False) and hdu.header.get("NAXIS", 0) and not _NO_FLUX.search(label))
+
+
+def paired_images(hdus: Any) -> list[tuple[str, Any, Any]]:
+    """Return images of wavelengths with those of their fluxes, and what is before their names.
+
+    DESI's B_WAVELENGTH and B_FLUX (https://desidatamodel.readthedocs.io, coadd-SURVEY-PROGRAM-PIXNUM.fits).
+    """
+    named = {str(hdu.header.get("EXTNAME", "")).strip().upper(): hdu for hdu in hdus if getattr(hdu, "is_image", False)}
+    pairs = []
+    for name, hdu in named.items():
+        if (match := _AXIS_NAME.fullmatch(name)) is None:
+            continue
+        arm = match[1] or ""
+        fluxes = [named[one] for kind in _FLUX_NAMES if (one := f"{arm}_{kind}".lstrip("_")) in named]
+        if len(fluxes) == 1:
+            pairs.append((arm, hdu, fluxes[0]))
+    return pairs
+
+
+def rows_of(hdu: Any, telescope: str) -> tuple[Any, tuple[str, ...], tuple[str, ...]]:
+    """Return the fluxes of an image, names of its rows where it has several, and a note.
+
+    Raises InputError for an image of more dimensions than rows and wavelengths.
+    """
+    header = hdu.header
+    shape = [int(header.get(f"NAXIS{k + 1}", 0)) for k in range(int(header["NAXIS"]))]
+    if sum(n > 1 for n in shape) > 2 or shape[0] < 2:
+        raise InputError(
+            f"holds an image of {' x '.join(map(str, shape))} pixels, expected a spectrum of one dimension, rows of "
+            "spectra, or a table"
+        )
+    flux = np.asanyarray(hdu.data).reshape(-1, shape[0])
+    if len(flux) == 1:
+        return flux[0], (), ()
+    if len(flux) <= MAX_PLANES and re.match(r"LAMOST|SDSS", telescope, re.IGNORECASE) and "COEFF0" in header:
+        # https://dr5.lamost.org/v3/doc/data-production-description and https://classic.sdss.org/dr7/dm/flatFiles/spSpec.html:
+        # the first row is the flux; the others are its inverse variance or error, wavelengths and masks.
+        return flux[0], (), (f"the first of {len(flux)} rows is its flux",)
+    return flux, tuple(str(header.get(f"BANDID{k + 1}", "")).strip() for k in range(len(flux))), ()
+
+
+def axis_of(header: Any, primary: Any, n: int) -> tuple[Any, str | None, str, tuple[str, ...]]:
+    """Return the values of an image's first axis, their unit, their kind (WAVE, AWAV, ...) and notes."""
+
+    def number(*keys: str) -> float | None:
+        for key in keys:
+            for one in (header, primary):
+                value = one.get(key)
+                if isinstance(value, int | float) and not isinstance(value, bool):
+                    return float(value)
+        return None
+
+    def text(key: str) -> str:
+        return str(header.get(key, "") or primary.get(key, "")).strip()
+
+    first, slope = number("COEFF0"), number("COEFF1")
+    if first is not None and slope is not None and 1.0 < first < 6.0:
+        return 10.0 ** (first + slope * np.arange(n)), "Angstrom", "", ("wavelengths from COEFF0 and COEFF1",)
+    start, step = number("CRVAL1"), number("CD1_1", "CDELT1")
+    if start is None or step is None or step == 0:
+        raise InputError("has an image without CRVAL1 and CDELT1 or CD1_1, expected the wavelengths of its pixels")
+    if number("CDELT1") is not None and number("CD1_1") is None and (scale := number("PC1_1")) is not None:
+        step *= scale
+    # By the FITS standard a missing CRPIX1 is 0; the archives' spectra without it begin at their first pixel.
+    reference = number("CRPIX1")
+    pixel = np.arange(1, n + 1) - (1.0 if reference is None else reference)
+    kind = text("CTYPE1").upper()
+    unit = text("CUNIT1") or None
+    value = start + step * pixel
+    name, _, algorithm = kind.partition("-")
+    if algorithm.strip("-") not in ("", "LOG", "LAMBDA", "LINEAR") or (
+        name not in ("", "WAVE", "AWAV", "FREQ", "ENER", "LINEAR", "LAMBDA", "WAVELENGTH", "LOGLAM", "LOG", "LOG10")
+        and not name.startswith(("WAVELEN", "LAM", "ANGSTROM", "ALOG"))
+    ):
+        raise InputError(f"has an axis of the type {shortened(kind)}, expected linear or logarithmic wavelengths")
+    flag = number("DC-FLAG")
+    if unit is not None and re.match(r"\s*log|\s*dex", unit, re.IGNORECASE):
+        flag, unit = 1, re.sub(r"^\s*(log|dex)\w*[\s(\[]*|[)\]\s]+$", "", unit, flags=re.IGNORECASE) or None
+    if flag != 1 and "LOG" not in kind:
+        if unit is None and start < 10.0 and abs(step) < 0.01:
+            raise InputError(
+                f"has an axis from {start:g} in steps of {step:g} without a unit or type, expected CTYPE1 and CUNIT1"
+            )
+        return value, unit, name, ()
+    if algorithm == "LOG" and name in ("WAVE", "AWAV", "FREQ", "ENER") and flag != 1 and start > 20.0:
+        # Greisen et al. 2006 (A&A 446, 747), equation 5: the value at the reference pixel times an exponential.
+        with np.errstate(over="ignore"):
+            return start * np.exp(step * pixel / start), unit, name, (f"logarithmic axis {kind}",)
+    if not 1.0 < start < 6.0:
+        raise InputError(
+            f"has a logarithmic axis from {start:g}, expected logarithms to base ten or the form {name}-LOG"
+        )
+    with np.errstate(over="ignore"):
+        return 10.0**value, unit, name, ("wavelengths from logarithms to base ten",)

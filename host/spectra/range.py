@@ -1,0 +1,83 @@
+"""The wavelengths that a star's spectrum must hold, and which unit numbers without one are likely in."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+
+Float = NDArray[np.float64]
+
+#: What the nominal instrument reads, nm (the paper's abstract).
+NEEDED_NM = (200.0, 700.0)
+#: The same with the reach of the line function (the paper, section "Preparing the input spectrum").
+SPAN_NM = (180.0, 750.0)
+#: Part of `NEEDED_NM` that a spectrum must hold; with less, nearly all of the light would be another star's.
+MIN_MEASURED = 1 / 3
+#: Wavelengths, nm, beyond which an assumed unit is less likely than another.
+PLAUSIBLE_NM = (50.0, 10_000.0)
+#: A gap between points is no measurement beyond this width, nm, and this multiple of the usual spacing.
+GAP_NM, GAP_TIMES = 10.5, 10.0
+#: Units in which wavelengths come without one, in nm.
+_USUAL_UNITS = {"nm": 1.0, "Angstrom": 0.1, "um": 1000.0}
+
+
+def measured_part(nm: Float) -> float:
+    """Return the part of `NEEDED_NM` that wavelengths cover, gaps left out."""
+    if nm.size < 2:
+        return 0.0
+    inside = np.clip(nm, *NEEDED_NM)
+    steps = np.diff(nm)
+    return float(np.diff(inside)[~is_gap(steps)].sum() / (NEEDED_NM[1] - NEEDED_NM[0]))
+
+
+def is_gap(steps: Float) -> NDArray[np.bool_]:
+    """Return which of the steps between wavelengths, nm, are gaps."""
+    wide: NDArray[np.bool_] = (steps > GAP_NM) & (steps > GAP_TIMES * np.median(steps))
+    return wide
+
+
+def _part(low: float, high: float) -> float:
+    shared = min(high, NEEDED_NM[1]) - max(low, NEEDED_NM[0])
+    return max(0.0, shared / (NEEDED_NM[1] - NEEDED_NM[0]))
+
+
+def likely_unit(low: float, high: float, unit: str) -> str | None:
+    """Return the one unit other than `unit` in which numbers hold what a spectrum must, or None."""
+    parts = {other: _part(low * factor, high * factor) for other, factor in _USUAL_UNITS.items() if other != unit}
+    fitting = [other for other, part in parts.items() if part >= MIN_MEASURED and low > 0.0]
+    # Short ultraviolet spectra: in Angstrom they hold something, in nm they would begin in the infrared.
+    if not fitting and parts.get("Angstrom", 0.0) > 0.0 and low > 900.0:
+        fitting = ["Angstrom"]
+    return fitting[0] if len(fitting) == 1 else None
+
+
+def check_assumed_unit(values: Float, unit: str) -> None:
+    """Raise InputError if wavelengths of an assumed unit are as likely in another."""
+    finite = values[np.isfinite(values)]
+    factor = _USUAL_UNITS.get(unit)
+    if not finite.size or factor is None:
+        return
+    low, high = float(finite.min()), float(finite.max())
+    numbers = f"wavelengths from {low:g} to {high:g} without a stated unit"
+    own = _part(low * factor, high * factor)
+    other = likely_unit(low, high, unit)
+    if own < MIN_MEASURED and other is not None:
+        raise InputError(f"{numbers} look like {other}, expected their unit: --wavelength-unit {other}")
+    elsewhere = 0.0 if other is None else _part(low * _USUAL_UNITS[other], high * _USUAL_UNITS[other])
+    if other is not None and elsewhere >= max(own, 1.0 - 1e-9):
+        raise InputError(
+            f"{numbers} cover {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm in {other} as well as in {unit}, expected their "
+            f"unit: --wavelength-unit {unit} or --wavelength-unit {other}"
+        )
+    if own < MIN_MEASURED:
+        raise InputError(
+            f"{numbers} would hold {own:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm in {unit}, expected at least a "
+            "third, or their unit: --wavelength-unit names it"
+        )
+    if low * factor < PLAUSIBLE_NM[0] or high * factor > PLAUSIBLE_NM[1]:
+        raise InputError(
+            f"{numbers} would go beyond {PLAUSIBLE_NM[0]:g}-{PLAUSIBLE_NM[1]:g} nm in {unit}, expected their unit: "
+            "--wavelength-unit names it"
+        )

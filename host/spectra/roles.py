@@ -1,0 +1,262 @@
+"""Recognise what a column holds from its name, unit and UCD.
+
+Names are divided into words (``FluxErr``, ``STATERROR``, ``wave_lo``), and words have meanings. A word such as "error"
+or "sky" excludes a column from being the flux, whatever else is in its name. The others get a score for how well name
+and unit fit, by which `choice` chooses.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+from ..errors import InputError
+from ..files.units import SCALE, FluxKind, balanced, flux_kind, is_spectral, is_stated, unit_of
+
+Kind = Literal[
+    "wavelength", "lower edge", "upper edge", "flux", "model", "error", "quality", "continuum", "counts", "background",
+    "width", "magnitude", "throughput", "luminosity", "unknown",
+]  # fmt: skip
+
+_MEANINGS = {
+    "wave": "wavelength wavelengths wave waves wavel lambda lambdas lam wl wlen wav wvl wln awav λ w",
+    "other axis": "frequency freq nu ν energy wavenumber wavenum wn",
+    "flux": "flux fluxes flx flam fnu fλ fν sflux irradiance photlam photnu jy",
+    "weak flux": "intensity radiance brightness f value y sed spec spectrum spectra",
+    "total": "lamflam nufnu wfw vfv",
+    "logarithm": "log ln dex",
+    "error": "err errs error errors e sig sigma unc uncert uncertainty uncertainties std stdev stddev sd rms var"
+    " variance ivar invvar inverse weight weights noise stat sys syst snr sn eflux dflux ferr efl",
+    "quality": "qual quality dq flag flags mask andmask ormask good bad valid pixmask",
+    "continuum": "cont continuum",
+    "counts": "count counts cts ct adu dn electron electrons",
+    "weak counts": "net gross gcounts rate photons",
+    "background": "sky bkg bkgd bg background back airglow",
+    "removed": "sub subtracted corrected removed",
+    "width": "width widths fwhm dw dlam dlambda dwave delta d step disp wdisp dispersion res wres resolution resolving"
+    " bandwidth binsize",
+    "throughput": "throughput transmission transmittance trans efficiency eff qe response sensitivity sens reflectivity"
+    " reflectance bandpass passband",
+    "luminosity": "luminosity lum llambda lnu llam",
+    "magnitude": "mag mags magnitude magnitudes abmag stmag ab st",
+    "model": "model models mod template templates fit synthetic synth bestfit bestmodel",
+    "low": "lo low lower min minimum left start begin",
+    "high": "hi high higher upper max maximum right end stop",
+    "bin": "bin edge edges",
+    "vacuum": "vac vacuum",
+    "air": "air",
+    "neutral": "density densities spectral total data cal calibrated of the in",
+    "label": "obs observed source dered dereddened corr rest norm normalized normalised bolo smooth smoothed raw star",
+}  # fmt: skip
+_WORDS = {word: meaning for meaning, words in _MEANINGS.items() for word in words.split()}
+# Words of a name that may be written together: FLUXERR, loglam, wavehi.
+_GLUED = sorted((w for w in _WORDS if len(w) > 2 or w in ("lo", "hi", "wl", "bg", "dq")), key=len, reverse=True)
+_LAMBDA, _NU = "(?:lambda|lam|λ)", "(?:nu|ν)"
+# Names of several words that mean one thing.
+_PHRASES = tuple(
+    (re.compile(rf"(?<![a-zλν])(?:{pattern})(?![a-zλν])"), word)
+    for pattern, word in (
+        (rf"{_LAMBDA}[\s_*.]*f(?:lux)?[\s_]*{_LAMBDA}|w[\s_*.]*f[\s_]*w", "lamflam"),
+        (rf"{_NU}[\s_*.]*f(?:lux)?[\s_]*{_NU}|v[\s_*.]*f[\s_]*v", "nufnu"),
+        (rf"f(?:lux)?[\s_]*(?:{_LAMBDA}|wl|wave)", "flam"),
+        (rf"f(?:lux)?[\s_]*{_NU}", "fnu"),
+        (rf"l[\s_]*(?:{_LAMBDA}|{_NU})", "luminosity"),
+        (r"log_?10|lg", "log"),
+        (r"s[_/]n", "snr"),
+    )
+)
+# A word of these meanings decides, whatever else is in a name.
+_DECIDING: tuple[Kind, ...] = (
+    "error", "quality", "continuum", "background", "counts", "throughput", "luminosity",
+)  # fmt: skip
+_BRACKETS = re.compile(r"[\[(]((?:[^\[\]()]|\([^()]*\))*)[\])]\s*$")
+_LOGARITHM_OF = re.compile(r"(log_?10|log|lg|ln)\s*[(\[](.*?)[)\]]\s*([(\[].*)?", re.IGNORECASE)
+# Words of the IVOA's unified content descriptors (UCD1+ 1.5), by their first word.
+_UCD: dict[str, Kind] = {"em.wl": "wavelength", "em.freq": "wavelength", "em.energy": "wavelength",
+                         "phot.flux.density": "flux", "stat.error": "error", "meta.code": "quality",
+                         "spect.continuum": "continuum", "instr.bandwidth": "width"}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Role:
+    """What a column holds, as far as its name, unit and UCD tell."""
+
+    kind: Kind
+    #: How well the name fits the kind; comparable among columns of one kind.
+    score: int = 0
+    #: The base of the logarithm that the column holds, or nothing: "10" or "e".
+    logarithm: str = ""
+    #: Whether the name says that the flux is multiplied by its wavelength or frequency.
+    total: bool = False
+    #: The stated unit, or the one in the name, as in ``flux_W_m2_nm`` or ``wave [nm]``.
+    unit: str | None = None
+
+
+@lru_cache(maxsize=1024)
+def role_of(name: str, unit: str | None = None, ucd: str = "") -> Role:
+    """Recognise a column."""
+    base, unit_in_name = divided(name)
+    words = words_of(base)
+    kind, score = _kind_of(words)
+    if kind == "magnitude" and (system := set(words) & {"ab", "abmag", "st", "stmag"}):
+        # AB and ST magnitudes have zero points that are fluxes; others have not.
+        kind, score, unit_in_name = "flux", 0, "ABmag" if system & {"ab", "abmag"} else "STmag"
+    stated = unit if is_stated(unit) else None
+    if stated is None or (unit_in_name is not None and re.search("mag", stated, re.IGNORECASE)):
+        stated = unit_in_name
+    is_known, spectral, flux = _kinds_of_unit(stated)
+    if kind == "magnitude" and flux == "density":
+        kind = "flux"
+    if kind == "unknown" and ucd:
+        kind, score = next(((k, 3) for first, k in _UCD.items() if ucd.lower().startswith(first)), (kind, score))
+    if kind == "unknown" and not words:
+        # A name that is only a unit, as in a line "nm, flam".
+        kind, score = ("wavelength", 3) if spectral else ("flux", 3) if flux != "other" else (kind, 0)
+    if kind == "unknown" and is_stated(unit) and flux == "density":
+        kind, score = "flux", 1
+    # A unit of another kind speaks against a name; an unknown one is refused where it is converted.
+    if is_known and kind in ("flux", "model"):
+        score += 1 if flux in ("density", "total") else -6
+    if is_known and kind == "wavelength":
+        score += 1 if spectral else -6
+    logarithm = next(("e" if word == "ln" else "10" for word in words if _WORDS.get(word) == "logarithm"), "")
+    if logarithm:
+        score -= 1
+    total = any(_WORDS.get(word) == "total" for word in words)
+    return Role(kind, score, logarithm, total, stated)
+
+
+def _kind_of(words: Sequence[str]) -> tuple[Kind, int]:
+    """Return the kind that a name's words tell, and how well they fit."""
+    has = {_WORDS.get(word, "label") for word in words if _WORDS.get(word) != "logarithm"}
+    if len(words) == 1 and len(words[0]) == 1:
+        # An "e" may be an energy, a "d" a distance.
+        has -= {"error", "width"}
+    if {"background", "removed"} <= has:
+        has -= {"background", "removed"}
+    is_axis, is_flux = bool(has & {"wave", "other axis"}), bool(has & {"flux", "total"})
+    for kind in _DECIDING:
+        if kind in has:
+            return kind, 0
+    if "weak counts" in has and not is_flux:
+        return "counts", 0
+    if "width" in has:
+        return "width", 0
+    if is_flux or ("weak flux" in has and not is_axis):
+        # Limits of a flux are those of its confidence interval.
+        return ("error", 0) if has & {"low", "high"} else ("flux", _flux_score(words, has))
+    if has & {"low", "high"} and (is_axis or "bin" in has):
+        return ("lower edge" if "low" in has else "upper edge"), 1
+    if is_axis:
+        return "wavelength", _axis_score(words, has)
+    if "magnitude" in has and words != ("st",):
+        return "magnitude", 0
+    return ("model", 1) if "model" in has else ("unknown", 0)
+
+
+def _flux_score(words: Sequence[str], has: set[str]) -> int:
+    if has - {"flux", "total", "weak flux", "vacuum", "air", "neutral"}:
+        score = 3
+    else:
+        score = 5 if words in (("flux",), ("fluxes",)) else 4
+    return score if has & {"flux", "total"} else score - 2
+
+
+def _axis_score(words: Sequence[str], has: set[str]) -> int:
+    # A "w" may be a weight.
+    if words == ("w",):
+        return 0
+    score = 4 if "wave" in has else 2
+    if has - {"wave", "other axis", "vacuum", "air", "neutral"}:
+        score -= 2
+    return score - 1 if "air" in has else score
+
+
+@lru_cache(maxsize=1024)
+def _kinds_of_unit(unit: str | None) -> tuple[bool, bool, FluxKind]:
+    """Return whether a unit is known, whether it is one of wavelength, and its kind of flux."""
+    try:
+        parsed = None if unit is None else unit_of(unit)
+    except InputError:
+        parsed = None
+    if parsed is None or str(parsed) == "dex":
+        return False, False, "other"
+    return True, is_spectral(parsed), flux_kind(parsed)
+
+
+def divided(name: str) -> tuple[str, str | None]:
+    """Divide a column's name into what it calls and the unit that it holds, if any."""
+    name = " ".join(name.strip().strip("\"'").split())
+    if _is_unit(name, alone=True):
+        return "", name
+    if match := _LOGARITHM_OF.fullmatch(name):
+        # log10(wave/AA), log(F) [erg/s/cm2/A]
+        name = f"{match[1]} {match[2]} {match[3] or ''}".strip()
+    base, unit = name, None
+    if (match := _BRACKETS.search(name)) and match.start() > 0:
+        inner = match[1].strip()
+        if _is_unit(inner) or re.search(r"\d|\^|/", inner):
+            base, unit = name[: match.start()], inner
+    elif (match := re.search(r"\s?/\s*(\S+)$|\sin\s+(\S+)$", name)) and _is_unit(match[1] or match[2]):
+        base, unit = name[: match.start()], match[1] or match[2]
+    elif (match := SCALE.search(name)) and match.start() > 0:
+        # A factor without a unit, as in "flux/10^-15", is no unit that anybody knows.
+        base, unit = re.sub(r"\s*[/*]\s*$|\s+x\s*$", "", name[: match.start()]), name[match.start() :]
+    else:
+        parts = name.split("_")
+        for k in range(1, len(parts)):
+            tail = parts[k:]
+            spelt = "/".join(tail) if len(tail) > 1 and not re.search(r"[/\-−]", "".join(tail)) else " ".join(tail)
+            if _fits(parts[:k], spelt):
+                base, unit = "_".join(parts[:k]), spelt
+                break
+    return base, unit if unit is None else balanced(unit)
+
+
+def _fits(base: Sequence[str], unit: str) -> bool:
+    """Return whether a name may end in a unit: one of wavelength after a wavelength, of flux after a flux."""
+    _, spectral, flux = _kinds_of_unit(unit)
+    if not spectral and flux == "other":
+        return False
+    kind, _ = _kind_of(words_of("_".join(base)))
+    is_axis = kind in ("wavelength", "lower edge", "upper edge", "width")
+    return spectral and len(unit) < 12 if is_axis else flux != "other" and unit.lower() not in ("ab", "st")
+
+
+def _is_unit(text: str, alone: bool = False) -> bool:
+    """Return whether a text is a unit of wavelength or flux; alone, one that is not more likely a word."""
+    if alone and text not in ("A", "Å") and (len(text) < 2 or text.lower() in ("ab", "st", "erg")):
+        return False
+    _, spectral, flux = _kinds_of_unit(text)
+    return spectral or flux != "other"
+
+
+@lru_cache(maxsize=1024)
+def words_of(name: str) -> tuple[str, ...]:
+    """Divide a name into lower-case words: at marks, at capitals, at digits, and between words that are known."""
+    name = re.sub(r"(?<=[a-zµλν])(?=[A-Z])", " ", name.strip())
+    lower = name.lower()
+    for pattern, word in _PHRASES:
+        lower = pattern.sub(word, lower)
+    words: list[str] = []
+    for chunk in re.findall(r"[^\W\d_]+|\d+", lower):
+        words += _unglued(chunk) or [chunk]
+    return tuple(words)
+
+
+def _unglued(chunk: str) -> list[str] | None:
+    """Divide letters into known words, or return None."""
+    if chunk in _WORDS or chunk.isdigit():
+        return [chunk]
+    for word in _GLUED:
+        if chunk.startswith(word):
+            rest = chunk[len(word) :]
+            if rest in _WORDS or (rest and len(rest) > 1 and _unglued(rest)):
+                return [word, *(_unglued(rest) or [])]
+    # wmin, efluxes
+    if chunk[:1] == "w" and _WORDS.get(chunk[1:]) in ("low", "high"):
+        return ["w", chunk[1:]]
+    return None

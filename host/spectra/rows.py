@@ -1,0 +1,149 @@
+"""Take spectra out of tables whose cells hold arrays: a row to a spectrum, or to a part of one."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..errors import InputError
+from ..files.bounded import shortened
+from .choice import Choice, listed, plain
+from .file_table import FileTable
+
+#: Columns that divide one spectrum over several rows: detector segments and echelle orders.
+SEGMENTS = ("segment", "sporder", "order", "stripe")
+#: Names of columns that say how arrays are meant: their step, their length, which points count.
+STEPS = ("deltaw", "delta_w", "delta_wavelength", "step", "dlam", "dlambda")
+LENGTHS = ("npoints", "n_points", "nelem", "npts")
+#: 0 for points to be left out (COS Data Handbook 5.1, section 2.4.3).
+WEIGHTS = ("dq_wgt",)
+
+
+def holds_arrays(cells: Any) -> bool:
+    """Return whether each cell of a column holds an array."""
+    return np.ndim(cells) > 1 or (np.asarray(cells).dtype == object and len(cells) > 0 and np.ndim(cells[0]) > 0)
+
+
+def no_such(word: str, names: Sequence[str]) -> InputError:
+    """Return the error for a word that names nothing."""
+    return InputError(f"no column or row is named {shortened(word)}, expected one of {listed(names)}")
+
+
+@dataclass(frozen=True)
+class Rows:
+    """The rows of one spectrum."""
+
+    #: Arrays of wavelength, or of both edges, and of flux, for each row.
+    arrays: list[list[Any]]
+    #: What the only row is called; empty for several.
+    identifier: str = ""
+    messages: tuple[str, ...] = ()
+
+
+def selected_rows(table: FileTable, choice: Choice, cells: list[Any], asked: Sequence[str]) -> Rows:
+    """Return the row that is meant, or all rows where they are segments of one spectrum.
+
+    Parameters
+    ----------
+    table : FileTable
+    choice : Choice
+        Its columns of wavelength and flux.
+    cells : list
+        Their cells; wavelengths of shape (n,) serve all rows of fluxes of shape (n_row, n).
+    asked : sequence of str
+        Words of the user that may name a row.
+    """
+    n = len(cells[-1])
+    if np.ndim(cells[-1]) == 2:
+        shape = np.shape(cells[-1])
+        cells = [np.broadcast_to(cell, shape) if np.shape(cell) == shape[1:] else cell for cell in cells]
+    if len({len(cell) for cell in cells}) > 1:
+        raise InputError(f"{len(cells[0])} rows of wavelengths for {n} of fluxes, expected as many")
+    names = [plain(column.name) for column in table.columns]
+    is_only = n == 1 and not asked and not table.row_title
+    identifiers = [[""]] if is_only else _identifiers(table, {*choice.wavelength, choice.flux}, n)
+    identifier = ""
+    messages: tuple[str, ...] = ()
+    if n > 1 and not asked and set(names) & set(SEGMENTS):
+        rows = list(range(n))
+        labels = [identifiers[row][0] if identifiers[row] else str(row + 1) for row in rows]
+        messages = (f"its {n} segments ({listed(labels)}) are joined",)
+    else:
+        rows = [_row_asked(identifiers, asked, names)]
+        identifier = (identifiers[rows[0]] or [""])[0]
+    steps, lengths, weights = (_values_of(table, names, wanted) for wanted in (STEPS, LENGTHS, WEIGHTS))
+    found = []
+    for row in rows:
+        arrays = _arrays([cell[row] for cell in cells], None if steps is None else steps[row])
+        kept = np.ones(arrays[-1].size, bool)
+        if lengths is not None and 1 < (count := int(np.ravel(lengths[row])[0])) < kept.size:
+            kept[count:] = False
+        if weights is not None and np.shape(weights[row]) == kept.shape:
+            kept &= np.asarray(weights[row]) != 0
+        if kept.any():
+            found.append([array[kept] for array in arrays])
+    if not found:
+        raise InputError("its rows hold no valid point, expected some")
+    return Rows(found, identifier, messages)
+
+
+def _values_of(table: FileTable, names: Sequence[str], wanted: Sequence[str]) -> Any:
+    """Return the values of the column with one of several names, or None."""
+    return next((c.values() for c, name in zip(table.columns, names, strict=True) if name in wanted), None)
+
+
+def _arrays(cells: list[Any], step: Any) -> list[Any]:
+    """Return a row's cells as arrays of equal length; a start and a step are written out."""
+    *axes, flux = (np.ma.asanyarray(cell).squeeze() for cell in cells)
+    if flux.ndim != 1:
+        raise InputError(f"its row: the flux has the shape {flux.shape}, expected one spectrum")
+    if axes[0].size == 1 < flux.size:
+        if step is None:
+            raise InputError(f"its row: one wavelength for {flux.size} fluxes, expected as many, or a step")
+        axes = [float(axes[0]) + float(np.ravel(step)[0]) * np.arange(flux.size)]
+    if any(axis.shape != flux.shape for axis in axes):
+        raise InputError(f"its row: {axes[0].size} wavelengths for {flux.size} fluxes, expected as many")
+    return [*axes, flux]
+
+
+def _identifiers(table: FileTable, without: set[int], n: int) -> list[list[str]]:
+    """Return what each row may be called: its short texts and whole numbers, the most telling first."""
+    columns = [list(table.row_names)] if len(table.row_names) == n else []
+    for place, column in enumerate(table.columns):
+        if place in without:
+            continue
+        values = column.values()
+        if np.shape(values) == (n,) and np.asarray(values).dtype.kind in "SUiuO" and np.ndim(values[0]) == 0:
+            texts = (one.decode(errors="replace") if isinstance(one, bytes) else str(one) for one in values)
+            columns.append([text.strip() for text in texts])
+    columns.sort(key=lambda texts: len(set(texts)) < n)
+    return [[texts[row] for texts in columns] for row in range(n)]
+
+
+def _row_asked(identifiers: Sequence[Sequence[str]], asked: Sequence[str], names: Sequence[str]) -> int:
+    """Return the one row that is meant: the only one, the one with an asked identifier, or ``row 3``."""
+    fitting = list(range(len(identifiers)))
+    for word in asked:
+        if match := re.fullmatch(r"row\s+(\d{1,9})", word.strip(), re.IGNORECASE):
+            number = int(match[1])
+            if not 1 <= number <= len(identifiers):
+                raise InputError(f"no row {number} among {len(identifiers)}, expected 1 to {len(identifiers)}")
+            fits = [number - 1]
+        else:
+            fits = [row for row in fitting if word.strip() in identifiers[row]]
+        if not fits:
+            raise no_such(word, names)
+        fitting = [row for row in fitting if row in fits]
+    if len(fitting) == 1:
+        return fitting[0]
+    labels = [identifiers[row][0] if identifiers[row] and identifiers[row][0] else f"row {row + 1}" for row in fitting]
+    if len(set(labels)) < len(labels):
+        labels = [f"row {row + 1}" for row in fitting]
+    raise InputError(
+        f"{len(fitting)} spectra stand in it, one a row ({listed(labels)}), expected one: name it as in "
+        f"FILE[{(labels or ['row 1'])[0][:30]}]"
+    )

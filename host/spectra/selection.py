@@ -1,0 +1,118 @@
+"""Take the one spectrum that is meant out of the tables of a file.
+
+A table is chosen among several, columns in the table, and a row where cells hold whole spectra. A user chooses with
+``FILE[word, ...]``: a table's label, a column's name or a row's identifier.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..errors import InputError
+from .choice import choose, listed, plain
+from .file_table import FileTable, numbers
+from .roles import Role
+from .rows import holds_arrays, no_such, selected_rows
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class RawSpectrum:
+    """A spectrum in the units of its file."""
+
+    #: Wavelengths and fluxes of each segment, shape (n,) each.
+    segments: list[tuple[Float, Float]]
+    table: FileTable
+    wavelength_name: str
+    flux_name: str
+    wavelength_role: Role
+    flux_role: Role
+    messages: tuple[str, ...] = ()
+
+
+def spectrum_in(tables: Sequence[FileTable], asked: Sequence[str]) -> RawSpectrum:
+    """Return the spectrum that a file holds, or the one of several that is asked for."""
+    if not tables:
+        raise InputError("has no table, expected one with a wavelength and a flux")
+    labels = [table.label.strip().lower() for table in tables]
+    words = {word.lower() for word in asked}
+    named = [i for i, label in enumerate(labels) if label and label in words]
+    rest = [word for word in asked if word.lower() not in {labels[i] for i in named}]
+    found: list[RawSpectrum] = []
+    errors: list[InputError] = []
+    for table in [tables[i] for i in named] or tables:
+        try:
+            found.append(_spectrum_of(table, rest))
+        except InputError as error:
+            errors.append(error)
+    if errors and any(one.table.group for one in found):
+        # A part that is missing would go unnoticed.
+        raise errors[0]
+    if not found:
+        # The sentence that offers a choice helps most.
+        raise next((error for error in errors if "FILE[" in str(error)), errors[0])
+    if len(found) > 1 and not named:
+        # SDSS: the sum of all exposures, next to each of them.
+        found = [one for one in found if one.table.label.strip().lower() == "coadd"] or found
+    if len(found) > 1 and found[0].table.group is not None and len({one.table.group for one in found}) == 1:
+        parts = listed([one.table.label for one in found])
+        segments = [segment for one in found for segment in one.segments]
+        return replace(found[0], segments=segments, messages=(*found[0].messages, f"its parts {parts} are joined"))
+    if len(found) > 1:
+        held = [one.table.label for one in found]
+        raise InputError(
+            f"{len(held)} tables hold a spectrum: {listed(held)}, expected one: name it as in FILE[{held[0].strip()}]"
+        )
+    return found[0]
+
+
+def _spectrum_of(table: FileTable, asked: Sequence[str]) -> RawSpectrum:
+    names = [column.name for column in table.columns]
+    roles = [column.known_role for column in table.columns]
+    known = {plain(name) for name in names}
+    # What names no column may name a row.
+    rest = [word for word in asked if plain(word) not in known]
+    try:
+        choice = choose(names, roles, [word for word in asked if plain(word) in known])
+    except InputError as error:
+        raise (no_such(rest[0], names) if rest else error) from error
+    messages = []
+    if len(choice.wavelength) == 2:
+        edges = " and ".join(names[i] for i in choice.wavelength)
+        if len({roles[i].unit for i in choice.wavelength}) > 1:
+            raise InputError(f"the edges of its bins, {edges}, state different units, expected one unit")
+        messages.append(f"its wavelengths are the middles of bins, from {edges}")
+    chosen = [table.columns[i] for i in (*choice.wavelength, choice.flux)]
+    cells = [column.values() for column in chosen]
+    if holds_arrays(cells[-1]):
+        selected = selected_rows(table, choice, cells, rest)
+        rows = selected.arrays
+        messages += selected.messages
+        if table.row_title and selected.identifier:
+            table = replace(table, name=table.row_title.format(selected.identifier[:30]))
+    elif rest:
+        raise no_such(rest[0], names)
+    else:
+        rows = [cells]
+    segments = []
+    for row in rows:
+        *axes, flux = (
+            numbers(cell, column.name.strip(), column.missing) for cell, column in zip(row, chosen, strict=True)
+        )
+        segments.append((sum(axes[1:], axes[0]) / len(axes), flux))
+        for array, column in zip((axes[0], flux), (chosen[0], chosen[-1]), strict=True):
+            if array.ndim != 1:
+                raise InputError(f"column {column.name.strip()} has the shape {array.shape}, expected one spectrum")
+        if axes[0].size != flux.size:
+            raise InputError(f"{axes[0].size} wavelengths for {flux.size} fluxes, expected as many")
+    if sum(flux.size for _, flux in segments) < 2:
+        raise InputError("holds less than two points, expected a spectrum")
+    axis, flux_role = roles[choice.wavelength[0]], roles[choice.flux]
+    return RawSpectrum(
+        segments, table, chosen[0].name, chosen[-1].name, axis, flux_role, (*table.messages, *messages),
+    )  # fmt: skip

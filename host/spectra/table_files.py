@@ -1,0 +1,82 @@
+"""Read the tables of ECSV and VOTable files."""
+
+from __future__ import annotations
+
+import io
+import operator
+import warnings
+from functools import partial
+from typing import Any
+
+from ..errors import InputError
+from ..files.bounded import shortened
+from ..files.ecsv import parse_ecsv
+from .file_table import Column, FileTable
+
+#: Most messages of a star kept earlier that its table may carry, and their length.
+MAX_NOTES, MAX_NOTE_LENGTH = 20, 400
+
+
+def ecsv_tables(text: str, name: str, origin: str) -> list[FileTable]:
+    """Return the table of an ECSV file."""
+    table = parse_ecsv(text, "it")
+    meta = table.meta if isinstance(table.meta, dict) else {}
+    own = meta.get("name")
+    return [
+        FileTable(
+            [
+                # As text: astropy keeps units that it does not know as objects without a dimension.
+                Column(
+                    one, partial(_ecsv_values, table, one), None if table[one].unit is None else str(table[one].unit)
+                )
+                for one in table.colnames
+            ],
+            own.strip()[:80] if isinstance(own, str) and own.strip() else name,
+            origin,
+            remarks="\n".join(_texts(meta.get("comments"))),
+            messages=_texts(meta.get("told")),
+        )
+    ]
+
+
+def _ecsv_values(table: Any, name: str) -> Any:
+    return table[name].data
+
+
+def _texts(given: Any) -> tuple[str, ...]:
+    """Return the short texts of a list; nothing for anything else."""
+    if not isinstance(given, list):
+        return ()
+    return tuple(one for one in given[:MAX_NOTES] if isinstance(one, str) and len(one) <= MAX_NOTE_LENGTH)
+
+
+def votable_tables(content: bytes, name: str, origin: str) -> list[FileTable]:
+    """Return the tables of a VOTable file."""
+    from astropy.io import votable
+
+    if b"<!ENTITY" in content or b"<!DOCTYPE" in content:
+        raise InputError("defines entities, expected a VOTable without them")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            tables = list(votable.parse(io.BytesIO(content), verify="ignore").iter_tables())
+    except Exception as error:  # the parser raises many kinds
+        raise InputError(f"cannot be read as a VOTable ({shortened(str(error))}), expected a whole one") from error
+    return [
+        FileTable(
+            [
+                Column(
+                    field.name or field.ID,
+                    partial(operator.getitem, table.array, field.ID),
+                    None if field.unit is None else field.unit.to_string(),
+                    ucd=field.ucd or "",
+                )
+                for field in table.fields
+            ],
+            name,
+            origin,
+            label=str(table.name or table.ID or i + 1),
+            remarks="\n".join(f"{field.ucd or ''} {field.description or ''}" for field in table.fields)[:5000],
+        )
+        for i, table in enumerate(tables)
+    ]
