@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -257,6 +259,17 @@ def test_a_study_file_with_curves_shapes_and_events(tmp_path, stares):
     assert second.event.equivalent_duration_s == pytest.approx(2.0)
     assert second.event.peak == pytest.approx(0.1)
     assert stare_of(study).unknowns[0].name == "light drift"
+
+
+def test_the_two_flares_of_the_documentation(stares):
+    page = Path(__file__).parents[2] / "docs" / "flares-in-time.md"
+    (text,) = (
+        block for block in re.findall(r"```toml\n(.*?)```", page.read_text("utf-8"), re.DOTALL) if "peak = " in block
+    )
+    study = Study.build(tomllib.loads(text), "flares-in-time.md").with_settings(["stare.search=false"])
+    first, second = stare(study, stares).stares[0].flares
+    assert first.event.peak == pytest.approx(0.8)
+    assert second.bolometric_erg == pytest.approx(1e31, rel=1e-9)
 
 
 def test_unknowns_of_a_stare_are_drawn_where_asked_for():

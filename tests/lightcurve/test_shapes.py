@@ -115,6 +115,27 @@ def test_frames_sum_to_the_whole_and_gaps_take_nothing_else(shape):
     np.testing.assert_array_equal(several[0], means)
 
 
+@pytest.mark.parametrize("shape", ALL, ids=NAMES)
+def test_no_frame_of_any_flare_loses_light(shape):
+    # Whole stares about 400 random flares: scipy's erfc underflows to 0 before a product with an exponential does.
+    rng = np.random.Generator(np.random.Philox(26))
+    for _ in range(400):
+        peak, half = rng.uniform(-2000.0, 8000.0), 10 ** rng.uniform(-2.0, 6.0)
+        with np.errstate(all="raise", under="ignore"):
+            means = shape.mean_over(np.arange(1201) * 5.0, peak, half)
+        assert (means >= 0).all(), (peak, half, means.min())
+
+
+def test_tovar_mendozas_rise_keeps_its_digits():
+    # Against quadrature of the shape itself, down to where doubles end.
+    shape = SHAPES["tovarmendoza2022"]
+    for tau in (-0.2513, -0.4, -1.0, -2.0, -4.0, -6.0):
+        # In units of the shape's own value at the end, so that quadrature sees something.
+        scale = float(shape.at(tau))
+        exact = scale * quad(lambda t: float(shape.at(t)) / scale, tau - 1.0, tau, epsrel=1e-12, limit=400)[0]  # noqa: B023
+        assert float(shape.before(tau)) == pytest.approx(exact, rel=1e-8)
+
+
 def test_a_late_frame_keeps_its_digits():
     # The difference of two integrals from the beginning would have none left here.
     shape = SHAPES["davenport2014"]

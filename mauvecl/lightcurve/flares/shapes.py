@@ -86,20 +86,20 @@ class Shape(ABC):
         first, last = np.asarray(first, np.float64), np.asarray(last, np.float64)
         # Of two large integrals the difference has no digits: each side of the peak by what is left on that side.
         late = first > 0
-        return np.asarray(
+        values = np.where(
+            late,
+            self.after(np.where(late, first, 0.0)) - self.after(np.maximum(last, 0.0)),
             np.where(
-                late,
-                self.after(np.where(late, first, 0.0)) - self.after(np.maximum(last, 0.0)),
-                np.where(
-                    last <= 0,
-                    self.before(np.minimum(last, 0.0)) - self.before(np.minimum(first, 0.0)),
-                    self.before(0.0)
-                    - self.before(np.minimum(first, 0.0))
-                    + self.after(0.0)
-                    - self.after(np.maximum(last, 0.0)),
-                ),
-            )
+                last <= 0,
+                self.before(np.minimum(last, 0.0)) - self.before(np.minimum(first, 0.0)),
+                self.before(0.0)
+                - self.before(np.minimum(first, 0.0))
+                + self.after(0.0)
+                - self.after(np.maximum(last, 0.0)),
+            ),
         )
+        # No shape is below zero: what is left of the difference of two equal integrals is their rounding.
+        return np.maximum(values, 0.0)
 
     def mean_over(self, edges_s: ArrayLike, peak_s: ArrayLike, t_half_s: ArrayLike) -> Float:
         """Its mean over each frame, exact.
@@ -204,8 +204,23 @@ class TovarMendoza2022(Shape):
 
     def before(self, tau: ArrayLike) -> Float:
         t = np.asarray(tau, np.float64)
-        until = self._gaussian((self.B - t) / self.C)
-        return np.asarray(sum(share / rate * (until - self._part(t, rate)) for share, rate in self.DECAY))
+        z = (self.B - t) / self.C
+        # Far before the peak, erfc underflows before its product does: the scaled erfcx decreases, so that the
+        # difference is at least zero.
+        far = np.maximum(z, 0.0)
+        scale = np.sqrt(np.pi) / 2 * self.HEIGHT * self.C * np.exp(-(far**2))
+        return np.asarray(
+            sum(
+                share
+                / rate
+                * np.where(
+                    z > 0,
+                    scale * (scipy.special.erfcx(far) - scipy.special.erfcx(far + self.C * rate / 2)),
+                    self._gaussian(z) - self._part(t, rate),
+                )
+                for share, rate in self.DECAY
+            )
+        )
 
     def after(self, tau: ArrayLike) -> Float:
         t = np.asarray(tau, np.float64)
