@@ -182,6 +182,7 @@ CASES: dict[str, Case] = {
     ),
     "CosmicRays.pixels": Case(lambda v: mauvecl.CosmicRays(pixels=v), "count", 1, 5000, (0, 1.5)),
     "CosmicRays.charge.seconds": Case(lambda v: mauvecl.CosmicRays().charge(v), "s", 1, 500, (-1,)),
+    "CosmicRays.most_electrons.seconds": Case(lambda v: mauvecl.CosmicRays().most_electrons(v), "s", 1, 500, (-1,)),
     "Detection.histogram.bins": Case(lambda v: found().histogram("chi2", bins=v)[1], "count", 2, 300, (0, 2.5)),
     "Engine.detect.realisations": Case(
         lambda v: engine().detect(*pair(), realisations=v, seed=1), "count", *DRAW, (0, 1.5)

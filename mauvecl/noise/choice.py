@@ -86,7 +86,7 @@ def choose(scenarios: Sequence[Expectation], drawing: Drawing, factors: Factors)
 def near_rail(x: Expectation, factors: Factors, rays: CosmicRays | None) -> NDArray[np.bool_]:
     """Pixels whose single frame comes within `RAIL_SIGMA` of zero or of saturation, shape (n_pixel,).
 
-    With priors wherever they carry it, and with a cosmic ray's hit.
+    With priors wherever they carry it, and with as many hits of cosmic rays as a frame may collect.
     """
     variance, light = x.unsaturated_variance_dn2 / x.n_frames, x.light_dn / x.n_frames
     mean = x.mean_raw_dn
@@ -96,9 +96,9 @@ def near_rail(x: Expectation, factors: Factors, rays: CosmicRays | None) -> NDAr
         there = mean + (more_light - 1.0) * light + (more_dark - 1.0) * x.dark_dn
         more = (more_light - 1.0) * x.gain_dn_per_electron * light + (more_dark - 1.0) * x.dark_variance_dn2
         ends.append((there, RAIL_SIGMA * np.sqrt(variance + np.maximum(more, 0.0))))
-    hit = 0.0 if rays is None else x.gain_dn_per_electron * rays.electrons[1]
+    hits = 0.0 if rays is None else x.gain_dn_per_electron * rays.most_electrons(x.frame_s)
     low: NDArray[np.bool_] = ends[0][0] - ends[0][1] < 0.0
-    high: NDArray[np.bool_] = ends[1][0] + ends[1][1] + hit > x.highest_dn
+    high: NDArray[np.bool_] = ends[1][0] + ends[1][1] + hits > x.highest_dn
     return low | high
 
 

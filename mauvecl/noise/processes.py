@@ -23,6 +23,9 @@ __all__ = ["NONE", "CosmicRays", "Factors", "Normal", "Prior", "Processes", "Uni
 
 Float = NDArray[np.float64]
 
+#: More hits than have this probability in a pixel and draw are left out.
+NEGLIGIBLE = 2.0**-40
+
 
 @public
 @dataclass(frozen=True)
@@ -74,27 +77,36 @@ class CosmicRays:
         Returns
         -------
         ndarray, shape (n,)
-            Of 0, 1, 2, ... electrons; what is left out has less than 2**-40.
+            Of 0, 1, 2, ... electrons; what is left out has less than `NEGLIGIBLE`.
         """
-        from scipy import special
-
         seconds = number("time", seconds, "s", low=0.0)
         low, high = (int(e) for e in self.electrons)
-        hits = self.rate_per_cm2_s * self.area_cm2 / self.pixels * seconds
-        most = 1
-        while special.pdtrc(most, hits) > 2.0**-40:
-            most += 1
-        size = 1 << (most * high + 1).bit_length()
+        hits, most = self._hits(seconds), self.most_electrons(seconds)
+        size = 1 << (most + 1).bit_length()
         if size > 2**24:
             raise InputError(
-                f"cosmic rays free up to {most * high} electrons in a pixel and draw, expected at most {2**23}: "
-                "lower the rate, the charge or the exposure"
+                f"cosmic rays free up to {most} electrons in a pixel and draw, expected at most {2**23}: lower the "
+                "rate, the charge or the exposure"
             )
         one = np.zeros(size)
         one[low : high + 1] = 1.0 if self.weights is None else self.weights
         # The generating function of a sum of a Poisson number of hits; distances beyond `size` would fold back.
         spectrum = np.exp(hits * (np.fft.rfft(one / one.sum()) - 1.0))
-        return np.maximum(np.fft.irfft(spectrum, size)[: most * high + 1], 0.0)
+        return np.maximum(np.fft.irfft(spectrum, size)[: most + 1], 0.0)
+
+    def most_electrons(self, seconds: float) -> int:
+        """Return the largest charge that one pixel collects in a time, but for a probability of `NEGLIGIBLE`."""
+        from scipy import special
+
+        hits = self._hits(number("time", seconds, "s", low=0.0))
+        most = max(1, int(hits))
+        while special.pdtrc(most, hits) > NEGLIGIBLE:
+            most += 1
+        return most * int(self.electrons[1])
+
+    def _hits(self, seconds: float) -> float:
+        """Return the mean number of hits in one pixel."""
+        return self.rate_per_cm2_s * self.area_cm2 / self.pixels * seconds
 
 
 @public
