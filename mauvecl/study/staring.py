@@ -8,7 +8,7 @@ import numpy as np
 
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.flares.energies import EnergyScale, amplitude_of, amplitude_of_peak
-from mauvecl.lightcurve.flares.events import Cooling, Event, coefficients, temperatures_of
+from mauvecl.lightcurve.flares.events import Cooling, Event, check_seen, coefficients, temperatures_of
 from mauvecl.lightcurve.stares.observed import Staring
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.lightcurve.usual import CHANGING, Changing
@@ -103,6 +103,7 @@ def staring_of(study: Study, star: Star) -> tuple[Staring, list[Event]]:
     """
     source, stare = star.source(), stare_of(study)
     events = events_of(study, star, source)
+    check_seen(events, stare.start_s, stare.frame_s)
     kelvin = temperatures_of(events)
     frames = study.model_copy(
         update={"observation": study.observation.model_copy(update={"exposure_s": stare.frame_s})}
@@ -116,6 +117,17 @@ def staring_of(study: Study, star: Star) -> tuple[Staring, list[Event]]:
     electrons = [(x.source_electrons - quiet.source_electrons) / unit for x in flaring]
     spectra = np.reshape(electrons, (kelvin.size, quiet.wavelength_nm.size))
     return Staring(quiet, stare, spectra, coefficients(events, stare.start_s, stare.frame_s, kelvin)), events
+
+
+def unused_lines(study: Study, staring: Staring, events: Sequence[Event]) -> list[str]:
+    """Return what a study asks for that its stare does not show: an exposure, and flares that peak outside."""
+    exposure_s, frame_s = study.observation.exposure_s, staring.stare.frame_s
+    lines = check_seen(events, staring.stare.start_s, frame_s)
+    if exposure_s != frame_s:
+        lines.insert(
+            0, f"A stare is made of frames of {frame_s:g} s: observation.exposure_s = {exposure_s:g} s is not used."
+        )
+    return lines
 
 
 def orbit_lines(study: Study) -> list[str]:

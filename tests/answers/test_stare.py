@@ -217,6 +217,15 @@ def test_a_saturated_flare_is_told(stares):
     assert cut.stares[0].staring.quality.sum() == cut.table["saturated_frames"][0]
 
 
+def test_what_a_stare_does_not_use_is_said(stares):
+    told = stare(SHORT.with_settings(["observation.exposure_s=20", "events=[{peak_s=310}, {peak_s=200}]"]), stares)
+    assert "A stare is made of frames of 5 s: observation.exposure_s = 20 s is not used." in told.messages
+    (line,) = (message for message in told.messages if "outside of the frames" in message)
+    assert line.startswith("Flare 1 peaks at 310 s")
+    plain = stare(SHORT.with_settings(["observation.exposure_s=5"]), stares)
+    assert not any("not used" in message or "outside" in message for message in plain.messages)
+
+
 STUDY = """
 [[star]]
 library = "G2V"
@@ -298,6 +307,10 @@ def test_unknowns_of_a_stare_are_drawn_where_asked_for():
             "an event has amplitude and peak, expected one of them",
         ),
         (["--energy", "1e33", "--amplitude", "0.1"], "--energy is given beside --amplitude or --flares"),
+        (
+            ["--set", "events=[{peak_s=1e9, half_width_s=100}]"],
+            "flare 1, which peaks at 1e+09 s, sheds no light into the frames of the stare, expected some between 0 and",
+        ),
         (["--duration", "2e7"], "a stare of 4000000 frames, each with a spectrum, expected at most 2000000"),
         (["--duration", "1e12"], "has 2e+11 frames, expected at most 134217728"),
         (["--sweep", "exposure=5,50"], "a sweep over exposure changes no flare of this stare"),

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.stars.flare import blackbody
-from mauvecl.lightcurve.flares.events import Cooling, Event, coefficients, temperatures_of
+from mauvecl.lightcurve.flares.events import Cooling, Event, check_seen, coefficients, temperatures_of
 from mauvecl.lightcurve.flares.shapes import SHAPES
 
 START = np.arange(400) * 5.0
@@ -78,3 +80,31 @@ def test_a_flare_that_does_not_cool_is_one_of_a_temperature():
 def test_what_is_no_event(make, told):
     with pytest.raises(InputError, match=told):
         make()
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_flares_outside_of_the_frames_are_refused_or_named(shape):
+    rng = np.random.Generator(np.random.Philox(81))
+    start = np.concatenate([np.arange(100, 400), np.arange(700, 1000)]) * 5.0
+    count = {"refused": 0, "named": 0, "inside": 0}
+    for _ in range(300):
+        # Of an amplitude of zero, too: it is where it is.
+        event = Event(rng.uniform(-3000, 9000), 10 ** rng.uniform(-1, 3), rng.choice([0.0, 0.5]), shape=shape)
+        mean = coefficients([replace(event, amplitude=1.0)], start, 5.0, np.array([10_000.0]))
+        whole = event.half_width_s * event.form.equivalent_duration
+        if mean.max() < 1e-9 * event.form.peak and 5.0 * mean.sum() < 1e-9 * whole:
+            with pytest.raises(InputError, match=f"peaks at {event.peak_s:g} s".replace(".", r"\.")):
+                check_seen([event], start, 5.0)
+            count["refused"] += 1
+            continue
+        sentences = check_seen([event], start, 5.0)
+        best = start[np.argmax(mean)]
+        if sentences:
+            # The largest light is then at an edge of the frames.
+            assert mean[[0, 299, 300, 599]].max() >= (1 - 1e-9) * mean.max()
+            count["named"] += 1
+        else:
+            # What peaks in a frame is largest there or next to it, but for a boxcar, whose top is flat.
+            assert abs(best + 2.5 - event.peak_s) <= 7.5 + event.half_width_s * (shape == "fiducial")
+            count["inside"] += 1
+    assert min(count.values()) > 20, count

@@ -18,7 +18,7 @@ from mauvecl.lightcurve.search.alarms import Alarm, alarms
 from mauvecl.lightcurve.stares.observed import Draw, Light, Staring, seen
 from mauvecl.study.labels import described, label, stacked, told
 from mauvecl.study.stares import check_sweep
-from mauvecl.study.staring import energy_of, orbit_lines, stare_of, staring_of
+from mauvecl.study.staring import energy_of, orbit_lines, stare_of, staring_of, unused_lines
 from mauvecl.study.study import Study
 from mauvecl.study.surveys import surveyed
 
@@ -279,6 +279,9 @@ def stare(study: Study, stares: Stares) -> StareAnswer:
     prepared = [(star, at, cell, *staring_of(cell, star)) for at, cell in study.cells() for star in cell.star]
     drawn = [_drawn(study, stares, *one) for one in prepared]
     messages = told([staring.quiet for _, _, _, staring, _ in prepared]) + orbit_lines(study)
+    messages += dict.fromkeys(
+        line for *_, cell, staring, events in prepared for line in unused_lines(cell, staring, events)
+    )
     messages += [one.searched for one in drawn if isinstance(one.searched, str)]
     for one in drawn:
         cut = int(np.count_nonzero(one.staring.quality))

@@ -27,6 +27,8 @@ PARTS = 8
 LARGEST_AMPLITUDE = 1e6
 #: Temperatures that differ by less are one.
 SAME_K = 0.5
+#: Share of a flare's peak and of its fluence below which frames hold none of its light.
+LEAST_LIGHT = 1e-9
 
 
 @public
@@ -198,6 +200,34 @@ class Event:
         kelvin = cooling.at((edges[1:] + edges[:-1]) / 2)
         # Energies of a second are smooth in the temperature: straight in logarithms between the nodes.
         return float(self.amplitude * light @ np.exp(np.interp(np.log(kelvin), np.log(nodes), per_s)))
+
+
+def check_seen(events: Sequence[Event], start_s: Float, frame_s: float) -> list[str]:
+    """Return a sentence for each flare that peaks outside of the frames but sheds light into them.
+
+    Raises
+    ------
+    InputError
+        If none of a flare's light falls into the frames.
+    """
+    frames = np.column_stack([start_s, start_s + frame_s])
+    sentences = []
+    for number, event in enumerate(events, 1):
+        mean = event.form.mean_over(frames, event.peak_s, event.half_width_s)
+        share = float(mean.sum()) * frame_s / event.half_width_s / event.form.equivalent_duration
+        if max(share, float(mean.max()) / event.form.peak) < LEAST_LIGHT:
+            raise InputError(
+                f"flare {number}, which peaks at {event.peak_s:g} s, sheds no light into the frames of the stare, "
+                f"expected some between {start_s[0]:g} and {start_s[-1] + frame_s:g} s and not in a gap",
+            )
+        peak_s = event.peak_s + event.half_width_s * event.form.peak_at
+        last = int(np.searchsorted(start_s, peak_s, side="right")) - 1
+        if last < 0 or peak_s >= start_s[last] + frame_s:
+            sentences.append(
+                f"Flare {number} peaks at {event.peak_s:g} s, outside of the frames of the stare, which hold "
+                f"{100 * share:.3g} % of its light."
+            )
+    return sentences
 
 
 def temperatures_of(events: Sequence[Event], most: int = MOST_TEMPERATURES) -> Float:
