@@ -46,15 +46,15 @@ def main() -> None:
                      cpu_s() - started[1] - sum(r[2] for r in rows)))  # fmt: skip
 
     from mauvecl.host.orbit.earth import direction
-    from mauvecl.host.orbit.moments import Moments
     from mauvecl.host.orbit.orbit import Orbit
     from mauvecl.host.orbit.season import zodiacal_light
+    from mauvecl.host.orbit.time_grid import TimeGrid
     from mauvecl.host.orbit.visibility import Visibility
 
     done("imports")
     rng = np.random.default_rng(1)
     target = direction(rng.uniform(0, 360, given.targets), np.degrees(np.arcsin(rng.uniform(-0.7, 0.5, given.targets))))
-    track = Orbit.load().track(Moments("2027-01-01", given.days, given.step))
+    track = Orbit.load().track(TimeGrid("2027-01-01", given.days, given.step))
     assert track.position_km.size
     done("orbit")
     assert track.bodies.sun.size
@@ -64,7 +64,7 @@ def main() -> None:
     windows = sum(visible.windows(k).start_s.size for k in range(given.targets))
     visible.by_month()
     done("windows, hours by month")
-    noons = Orbit.load().track(Moments("2027-01-01", given.days, 86_400.0)).bodies
+    noons = Orbit.load().track(TimeGrid("2027-01-01", given.days, 86_400.0)).bodies
     for one in target:
         zodiacal_light(noons, one)
     done("zodiacal light of each day")

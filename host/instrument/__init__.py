@@ -1,1 +1,1 @@
-"""Instruments: their files, curves and pixel maps."""
+"""Instruments with their files, curves and pixel maps."""

@@ -1,4 +1,4 @@
-"""Curves of an instrument: a value against wavelength, linear between its knots."""
+"""Piecewise linear curves of an instrument against wavelength."""
 
 from __future__ import annotations
 
@@ -17,21 +17,11 @@ from ..files.units import unit_of
 
 @dataclass(frozen=True)
 class Curve:
-    """Value against wavelength.
+    """A quantity against wavelength, linear between knots."""
 
-    Attributes
-    ----------
-    wavelength_nm : tuple of float
-        Knots, strictly increasing; one knot stands for a flat curve without ends.
-    value : tuple of float
-        Value at each knot, >= 0: a fraction, or A/W for a quantum efficiency.
-    source : str
-        "tag: source" of the values.
-    """
-
-    wavelength_nm: tuple[float, ...]
-    value: tuple[float, ...]
-    source: str = "A: assumed, no source given"
+    wavelength_nm: tuple[float, ...]  # knots, strictly increasing; a single knot makes the curve flat
+    value: tuple[float, ...]  # at each knot, >= 0: a fraction, or A/W for a quantum efficiency
+    source: str = "A: assumed, no source given"  # "tag: source" of the values
 
     def __post_init__(self) -> None:
         wavelength = np.asarray(self.wavelength_nm, dtype=np.float64)
@@ -69,7 +59,7 @@ class Curve:
         try:
             length = unit_of(table.units["wavelength"]) if table.units["wavelength"] else None
             wavelength = _converted(table["wavelength"], "wavelength", length, [u.nm])
-            # Here A is ampere.
+            # Here A is ampere, not Angstrom.
             unit = u.Unit(table.units[name].replace("percent", "%"), parse_strict="silent")
             value = _converted(table[name], name, unit, [u.A / u.W, u.dimensionless_unscaled])
             return cls(

@@ -1,4 +1,4 @@
-"""The instrument: optics, spectrograph and detector as one validated, frozen record."""
+"""Validated, frozen record of an instrument's optics, spectrograph and detector."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from ..errors import InputError
 from ..quantities import count, is_quantity, number, numbers, unit_of
 from ..records import Record, sentence
 from .curve import Curve
-from .pixel_map import MOST_PIXELS, PixelMap
+from .pixel_map import MAX_PIXELS, PixelMap
 
 if TYPE_CHECKING:
     import astropy.units as u
@@ -30,14 +30,14 @@ Float = NDArray[np.float64]
 
 
 def _as_curve(value: Any) -> Any:
-    """A curve from what a file or a user gives: a curve, a path, or one number for all wavelengths."""
+    """Convert a path, or one number for all wavelengths, to a curve."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         return Curve.flat(float(value))
     return Curve.read(value) if isinstance(value, str | Path) else value
 
 
 def _as_map(value: Any) -> Any:
-    """A pixel map from a map or a path."""
+    """Convert a path to a pixel map."""
     return PixelMap.read(value) if isinstance(value, str | Path) else value
 
 
@@ -57,46 +57,46 @@ Count = Annotated[int, Field(ge=0, le=20)]
 
 @public
 class Instrument(Record):
-    """An instrument, frozen; units are in the names.
+    """A frozen description of an instrument, with units in the names.
 
-    `Instrument.load` reads one, `with_` gives a changed copy. The values of the nominal payload, with the source
-    and tag of each, are in `instruments/mauve.toml`; none is a flight calibration.
+    `Instrument.load` reads an instrument, and `with_` returns a changed copy. The values of the nominal payload, each
+    with source and tag, are in `instruments/mauve.toml`; none is a flight calibration.
 
     Attributes
     ----------
     name : str
     notice : str
-        What every report must say about the numbers.
+        Remark on the values that every report repeats.
     sources : dict of str
-        "tag: source" of each value, by its name; tags P paper, D datasheet, C computed, A assumption, U the user.
+        "tag: source" of each value by name, with the tags P paper, D datasheet, C computed, A assumption, U user.
     collecting_area_cm2, field_of_view_radius_arcsec, pointing_loss : float
     grating_efficiency, fibre_efficiency, telescope_mirror_reflectivity, spectrometer_mirror_reflectivity : Curve
     collection_lens_efficiency, window_efficiency : Curve
     coupling_loss, light_loss : float
     telescope_mirrors, spectrometer_mirrors, couplings : int
-        How often light meets each.
+        Number of each in the optical path.
     pixels : int
     pixel_zero_nm, dispersion_nm_per_pixel : float
         Centre of pixel 0 and linear dispersion.
     output_min_nm, output_max_nm : float
-        Pixels with centres in this closed range are read.
+        Closed range of the centres of the pixels that are read.
     top_hat_width_nm, gaussian_fwhm_nm : float
-        Line function: a top hat of this full width convolved with a Gaussian; either may be 0 (none), not both.
+        Line spread function: a top hat of this full width convolved with a Gaussian; either may be 0 (none), not both.
     resolution_element_nm : float
     quantum_efficiency_a_per_w : Curve
     conversion_uv_per_electron, adc_range_v, saturation_v : float
     adc_bits : int
     temperature_c : float
-        Of the detector, -40 to 60.
+        Temperature of the detector, -40 to 60.
     dark_scale_dn_per_s, dark_slope_per_c : float
         Dark current is dark_scale_dn_per_s * exp(dark_slope_per_c * temperature_c).
     dark_unit : {"DN", "electrons"}
-        The unit in which dark counts are Poisson.
+        Unit in which the dark counts follow a Poisson distribution.
     photon_noise : {"gaussian", "poisson"}
-        How photons scatter about their mean.
+        Distribution of the photons about their mean.
     read_noise_dn, bias_dn, frame_s : float
     pixel_map : PixelMap, optional
-        What differs from pixel to pixel.
+        Deviations of single pixels from these values.
 
     Examples
     --------
@@ -130,7 +130,7 @@ class Instrument(Record):
     couplings: Count
     light_loss: Loss
 
-    pixels: int = Field(ge=1, le=MOST_PIXELS)
+    pixels: int = Field(ge=1, le=MAX_PIXELS)
     pixel_zero_nm: float
     dispersion_nm_per_pixel: Positive
     output_min_nm: Positive
@@ -156,41 +156,31 @@ class Instrument(Record):
 
     @classmethod
     def load(cls, name: str | Path) -> Instrument:
-        """Read an instrument: one that ships ("mauve", "mauve-electrons") or a TOML file of the user's.
+        """Read an embedded instrument ("mauve", "mauve-electrons") or a TOML file.
 
-        Curves are paths relative to the file; `extends = "mauve"` takes every value that the file does not give.
-
-        Raises
-        ------
-        InputError
-            If there is no such instrument or file, or it holds a value that is unknown, missing or out of range.
+        Paths of curves are relative to the file. With `extends = "mauve"` the file gives only the values that differ.
         """
-        # The reader imports this module.
+        # Imported here because the reader imports this module.
         from .instrument_file import read_instrument
 
         return read_instrument(name)
 
     @classmethod
     def build(cls, values: dict[str, Any], where: str) -> Instrument:
-        """Validate values by name; `where` (a file, say) begins the sentence of the error."""
+        """Validate values by name; error messages begin with `where`, such as a file name."""
         try:
             return cls.model_validate(values)
         except ValidationError as error:
             raise InputError(f"{where}: {sentence(cls, error)}") from None
 
     def with_(self, **changes: Any) -> Instrument:
-        """A copy with some values changed, each marked as the user's in `sources`.
+        """Return a copy with changed values, each marked as the user's in `sources`.
 
         Parameters
         ----------
         **changes
-            Values by name: Quantities of any fitting unit, or plain in the unit of the name; a curve may be a `Curve`,
-            a path or one number.
-
-        Raises
-        ------
-        InputError
-            If a name is unknown or a value out of range.
+            Values by name: Quantities, or plain numbers in the unit of the name. A curve may be a `Curve`, a path or
+            one number.
         """
         marks = {name: "U: set by the user" for name in changes if name not in LABELS}
         changes = {name: _in_its_unit(name, value) for name, value in changes.items()}
@@ -225,7 +215,7 @@ class Instrument(Record):
         if self.top_hat_width_nm == self.gaussian_fwhm_nm == 0:
             raise InputError("top_hat_width_nm and gaussian_fwhm_nm are both 0, expected at least one above 0")
         for name in ("top_hat_width_nm", "gaussian_fwhm_nm"):
-            # Much narrower than a pixel it changes nothing, and costs time and digits.
+            # A width far below a pixel has no effect, but costs time and digits.
             if 0 < getattr(self, name) < 0.1:
                 raise InputError(f"{name} = {getattr(self, name):g}, expected 0 (none) or at least 0.1")
         if (most := float(self.quantum_efficiency(self.wavelength_nm).max())) > 1:
@@ -256,35 +246,35 @@ class Instrument(Record):
 
     @cached_property
     def read_pixels(self) -> slice:
-        """Which pixels of the array have their centres in the output range."""
+        """Range of the array's pixels whose centres lie in the output range."""
         inside = np.flatnonzero((self._centres_nm >= self.output_min_nm) & (self._centres_nm <= self.output_max_nm))
         return slice(int(inside[0]), int(inside[-1]) + 1) if inside.size else slice(0, 0)
 
     def per_pixel(self, name: str, nominal: float) -> Float:
-        """A column of the pixel map over the pixels that are read, or `nominal` in each; shape (n_pixel,)."""
+        """Return a column of the pixel map over the pixels that are read, or `nominal` in each; shape (n_pixel,)."""
         if self.pixel_map is None:
             return np.full(self.wavelength_nm.size, nominal)
         return self.pixel_map.over(name, self.read_pixels, nominal)
 
     @property
     def knots_nm(self) -> tuple[float, ...]:
-        """Wavelengths, nm, where the slope of any curve may jump."""
+        """Wavelengths at which the slope of a curve may jump, nm."""
         curves = [getattr(self, name) for name in CURVES]
         return tuple(sorted({knot for curve in curves if len(curve.value) > 1 for knot in curve.wavelength_nm}))
 
     @property
     def _dn_v(self) -> float:
-        """Volts of one DN."""
+        """Voltage of one DN, V."""
         return float(self.adc_range_v / 2**self.adc_bits)
 
     @property
     def gain_dn_per_electron(self) -> float:
-        """Gain, DN per electron: charge conversion over the volts of one DN (METHODS: CE / (2.2 V / 65536))."""
+        """Gain, DN per electron: charge conversion divided by the voltage of one DN."""
         return self.conversion_uv_per_electron * 1e-6 / self._dn_v
 
     @property
     def adc_max_dn(self) -> int:
-        """Largest value of the ADC, DN."""
+        """Largest output of the ADC, DN."""
         return int(2**self.adc_bits - 1)
 
     @property
@@ -304,21 +294,21 @@ class Instrument(Record):
 
     @cached_property
     def curves_nm(self) -> tuple[float, float]:
-        """From where to where, nm, every curve has values; flat ones have them everywhere."""
+        """Range in which every curve has values, nm; flat curves have no ends."""
         curves = [curve for name in CURVES if len((curve := getattr(self, name)).value) > 1]
         first = max((curve.wavelength_nm[0] for curve in curves), default=self.output_min_nm)
         last = min((curve.wavelength_nm[-1] for curve in curves), default=self.output_max_nm)
         return first, last
 
     def _within(self, wavelength: ArrayLike | u.Quantity) -> Float:
-        """Wavelengths in nm, refused outside the curves."""
+        """Return wavelengths in nm; raises InputError outside the curves."""
         low, high = self.curves_nm
         return numbers("wavelength", wavelength, "nm", low=low, high=high)
 
     def efficiency(self, wavelength_nm: ArrayLike | u.Quantity) -> Float:
-        """Fraction of the light that the optics bring to the detector, quantum efficiency NOT included.
+        """Return the fraction of the light that reaches the detector, without the quantum efficiency.
 
-        The paper's equation of the efficiency, times (1 - pointing_loss).
+        This is the paper's efficiency times (1 - pointing_loss).
 
         Parameters
         ----------
@@ -348,15 +338,16 @@ class Instrument(Record):
         )
 
     def quantum_efficiency(self, wavelength_nm: ArrayLike | u.Quantity) -> Float:
-        """Electrons per photon that reaches the detector: A/W times the photon's energy over the electron's charge.
+        """Return the electrons per photon that reaches the detector.
 
-        Parameters and errors as for `efficiency`.
+        This is the sensitivity in A/W times the photon's energy divided by the electron's charge. Parameters and errors
+        as for `efficiency`.
         """
         nm = self._within(wavelength_nm)
         return np.asarray(self.quantum_efficiency_a_per_w.at(nm) * (HC_J_NM / nm) / ELECTRON_C)
 
     def throughput(self, wavelength_nm: ArrayLike | u.Quantity) -> Float:
-        """End-to-end fraction, electrons per photon: `efficiency` with the quantum efficiency in it.
+        """Return the end-to-end throughput, electrons per photon, including the quantum efficiency.
 
         Parameters and errors as for `efficiency`.
 
@@ -371,21 +362,21 @@ class Instrument(Record):
         return self.efficiency(wavelength_nm) * self.quantum_efficiency(wavelength_nm)
 
     def effective_area_cm2(self, wavelength_nm: ArrayLike | u.Quantity) -> Float:
-        """Collecting area times throughput, cm^2 (electrons per photon per cm^2).
+        """Return the effective area, cm^2: collecting area times throughput.
 
         Parameters and errors as for `efficiency`.
         """
         return self.collecting_area_cm2 * self.throughput(wavelength_nm)
 
     def electrons_per_joule_cm2(self, wavelength_nm: ArrayLike | u.Quantity, *, held: bool = False) -> Float:
-        """Electrons per energy at the telescope's entrance, e- / (J cm^-2): area * efficiency * QE[A/W] / e.
+        """Return the electrons per fluence at the telescope, e- / (J cm^-2): area * efficiency * QE[A/W] / e.
 
         Parameters and errors as for `efficiency`, and
 
         Parameters
         ----------
         held : bool
-            Beyond the ends of a curve its end value holds (an assumption), instead of a refusal.
+            Whether to extend a curve beyond its ends by its end value (an assumption) instead of raising InputError.
         """
         nm = numbers("wavelength", wavelength_nm, "nm", low=0.0) if held else self._within(wavelength_nm)
         per_joule = self._optics(nm) * self.quantum_efficiency_a_per_w.at(nm) / ELECTRON_C
@@ -393,7 +384,7 @@ class Instrument(Record):
 
     @property
     def table(self) -> QTable:
-        """One row per pixel that is read: wavelength, throughput and effective area, with their units."""
+        """Wavelength, throughput and effective area of each pixel that is read, with units."""
         import astropy.units as u
         from astropy.table import QTable
 
@@ -404,7 +395,7 @@ class Instrument(Record):
 
     @cached_property
     def digest(self) -> str:
-        """SHA-256 of every value, without names and sources: equal digests measure alike."""
+        """SHA-256 of all values that affect a measurement, so without names and sources."""
         values = {
             name: (value.wavelength_nm, value.value) if isinstance(value, Curve) else value
             for name, value in self._values().items()
@@ -426,7 +417,7 @@ class Instrument(Record):
 
 
 def _in_its_unit(name: str, value: Any) -> Any:
-    """A number or Quantity as a plain number in the unit of its name; anything else as it is."""
+    """Convert a number or Quantity to a plain number in the unit of the name; return other values unchanged."""
     field = Instrument.model_fields.get(name)
     kind = None if field is None else field.annotation
     quantity = is_quantity(value)
@@ -437,8 +428,8 @@ def _in_its_unit(name: str, value: Any) -> Any:
     return value
 
 
-#: What only labels an instrument, and measures nothing.
+#: Fields that do not affect a measurement.
 LABELS = ("name", "notice", "sources")
-#: The curves, and those of them that are fractions.
+#: Names of the curves, and of those that are fractions.
 CURVES = tuple(name for name, field in Instrument.model_fields.items() if field.annotation is Curve)
 OPTICS = tuple(name for name in CURVES if name != "quantum_efficiency_a_per_w")

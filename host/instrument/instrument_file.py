@@ -1,4 +1,4 @@
-"""Reading an instrument from TOML: values with their sources, curves beside the file, one file extending another."""
+"""Reader of instruments in TOML, with sources of values, paths of curves and inheritance between files."""
 
 from __future__ import annotations
 
@@ -11,24 +11,24 @@ from ..files.bounded import shortened
 from ..files.parsed import read_text, toml
 from .curve import Curve
 from .instrument import CURVES, LABELS, Instrument
+from .paths import instrument_path, shipped_names
 from .pixel_map import PixelMap
-from .places import find_instrument, shipped
 
-#: Where a value comes from: the paper, a datasheet, a computation, an assumption, or the user.
+#: Tags of sources: paper, datasheet, computation, assumption, user.
 TAGS = ("P", "D", "C", "A", "U")
-#: Files of a chain in which each extends the next.
-MOST_EXTENDED = 16
+#: Largest number of files in a chain in which each extends the next.
+MAX_EXTENDED = 16
 
 
 def read_instrument(name: str | Path) -> Instrument:
     """Read an instrument by name or path; see `Instrument.load`."""
-    # What ships does not change while it is used; a user's own file may.
-    return _shipped(name) if name in shipped() else _built(find_instrument(name, Path()))
+    # Embedded files do not change during a run; a user's file may.
+    return _shipped(name) if name in shipped_names() else _built(instrument_path(name, Path()))
 
 
 @cache
 def _shipped(name: str) -> Instrument:
-    return _built(find_instrument(name, Path()))
+    return _built(instrument_path(name, Path()))
 
 
 def _built(path: Path) -> Instrument:
@@ -37,16 +37,16 @@ def _built(path: Path) -> Instrument:
 
 
 def _read(path: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], dict[str, str]]:
-    """Values and sources of a file, over those of the file that it extends."""
+    """Return the values and sources of a file, merged over those of the file that it extends."""
     if path.resolve() in seen:
         raise InputError(f"{path.name} extends itself, expected a chain of files that ends")
-    if len(seen) == MOST_EXTENDED:
-        raise InputError(f"{path.name} ends a chain of {MOST_EXTENDED} files that extend another, expected fewer")
+    if len(seen) == MAX_EXTENDED:
+        raise InputError(f"{path.name} ends a chain of {MAX_EXTENDED} files that extend another, expected fewer")
     content = toml(read_text(path, "instrument file"), f"instrument file {shortened(str(path))}")
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}
     if "extends" in content:
-        values, sources = _read(find_instrument(content.pop("extends"), path.parent), (*seen, path.resolve()))
+        values, sources = _read(instrument_path(content.pop("extends"), path.parent), (*seen, path.resolve()))
     for name, entry in content.items():
         if name == "sources":
             raise InputError(
@@ -60,7 +60,7 @@ def _read(path: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], dict[str,
 
 
 def _entry(name: str, entry: Any, path: Path) -> tuple[Any, str]:
-    """One value and its source: a plain value, a table of value, tag and source, or the path of a curve."""
+    """Return the value and source of an entry: a plain value, a table of value, tag and source, or a path."""
     source = f"A: assumed, no source in {path.name}"
     if isinstance(entry, dict):
         unknown = [key for key in entry if key not in ("value", "tag", "source")]

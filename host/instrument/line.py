@@ -1,4 +1,4 @@
-"""The line function: how a spectrograph spreads light of one wavelength over its pixels, in closed form."""
+"""Line spread function of a spectrograph, in closed form."""
 
 from __future__ import annotations
 
@@ -14,32 +14,24 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Gaussian tails end here, in sigma: what lies beyond is below 1e-15.
+#: Cut-off of the Gaussian's tails, in sigma; less than 1e-15 lies beyond.
 REACH_SIGMA = 8.0
-#: The widest panel in which a pixel's share of a line is smooth enough for a polynomial, in sigma of the Gaussian.
+#: Largest width of a panel in which a polynomial describes a pixel's fraction of a line, in sigma of the Gaussian.
 PANEL_SIGMA = 0.5
 
 
 @dataclass(frozen=True)
 class Line:
-    """The line function and the pixels that it falls on, all in nm.
+    """Line spread function, a top hat convolved with a Gaussian, and the pixels that sample it; all in nm."""
 
-    Attributes
-    ----------
-    centres : tuple of float
-        Pixel centres.
-    pixel, top_hat, sigma : float
-        Widths of a pixel and of the top hat, and the Gaussian's sigma.
-    """
-
-    centres: tuple[float, ...]
-    pixel: float
-    top_hat: float
-    sigma: float
+    centres: tuple[float, ...]  # of the pixels
+    pixel: float  # width of a pixel
+    top_hat: float  # full width of the top hat
+    sigma: float  # of the Gaussian
 
     @classmethod
     def of(cls, instrument: Instrument) -> Line:
-        """The line function of an instrument."""
+        """Return the line spread function of an instrument."""
         return cls(
             tuple(instrument.wavelength_nm.tolist()),
             instrument.dispersion_nm_per_pixel,
@@ -49,17 +41,17 @@ class Line:
 
     @property
     def reach(self) -> float:
-        """Farthest distance from a pixel's centre that sends light into it."""
+        """Largest distance of a line from a pixel's centre at which light reaches the pixel."""
         return (self.top_hat + self.pixel) / 2 + REACH_SIGMA * self.sigma
 
     @property
     def mean_density(self) -> float:
-        """The line function's mean over its own light, the integral of its square, nm^-1, with the pixel's width."""
+        """Integral of the square of the line spread function averaged over a pixel, nm^-1."""
         offset = np.linspace(-self.reach, self.reach, 4001)
         return float(np.trapezoid((self.landing(offset) / self.pixel) ** 2, offset))
 
     def density(self, offset_nm: ArrayLike) -> Float:
-        """The line function, nm^-1, unit integral: a difference of two error functions."""
+        """Return the line spread function, nm^-1, normalised to unit integral."""
         x = np.asarray(offset_nm, np.float64)
         if self.top_hat == 0:
             return np.asarray(np.exp(-0.5 * (x / self.sigma) ** 2) / (self.sigma * np.sqrt(2 * np.pi)))
@@ -70,37 +62,40 @@ class Line:
         return np.asarray((erf((x + half) / scale) - erf((x - half) / scale)) / (2 * self.top_hat))
 
     def landing(self, offset_nm: Float) -> Float:
-        """Fraction of a line's light that a pixel takes, by the distance of its centre from the line."""
-        # Even in the offset; on the left side of the line no digits cancel.
+        """Return the fraction of a line's light that falls on a pixel whose centre is `offset_nm` from the line."""
+        # The function is even; on the left of the line no digits cancel.
         x = -np.abs(offset_nm)
         half = self.pixel / 2
         return np.asarray(self.below(x + half) - self.below(x - half))
 
     def below(self, x: Float) -> Float:
-        """Fraction of a line's light that lands below x."""
+        """Return the fraction of a line's light that falls below x."""
         if self.top_hat == 0:
             return np.asarray(ndtr(x / self.sigma))
         half = self.top_hat / 2
         return (self._ramp(x + half) - self._ramp(x - half)) / self.top_hat
 
     def _ramp(self, x: Float) -> Float:
-        """Integral of the Gaussian's distribution function from far below to x."""
+        """Integrate the Gaussian's distribution function from minus infinity to x."""
         if self.sigma == 0:
             return np.maximum(x, 0.0)
         z = x / self.sigma
         return np.asarray(self.sigma * (z * ndtr(z) + np.exp(-0.5 * z * z) / np.sqrt(2 * np.pi)))
 
     def panel_edges(self, knots: Float) -> Float:
-        """Edges of panels in which every pixel's `landing` is smooth, cut at `knots` too; shape (n_panel + 1,)."""
+        """Return the edges of panels in which every pixel's `landing` is smooth, shape (n_panel + 1,).
+
+        Panels also end at `knots`.
+        """
         low, high = self.centres[0] - self.reach, self.centres[-1] + self.reach
         parts = [np.array([low, high]), knots[(knots > low) & (knots < high)]]
         if self.sigma > 0:
             parts.append(np.linspace(low, high, int(np.ceil((high - low) / (PANEL_SIGMA * self.sigma))) + 1))
         else:
-            # Without a Gaussian it is a trapezoid: straight between these corners.
+            # Without a Gaussian `landing` is a trapezoid, linear between these corners.
             ends = np.append(np.asarray(self.centres) - self.pixel / 2, self.centres[-1] + self.pixel / 2)
             parts += [ends - self.top_hat / 2, ends + self.top_hat / 2]
         edges = np.unique(np.concatenate(parts))
-        # Knots that rounding has split apart would make empty panels.
+        # Knots that differ only by rounding would make empty panels.
         kept: Float = edges[np.append(True, np.diff(edges) > 1e-9)]
         return kept

@@ -1,4 +1,4 @@
-"""What differs from pixel to pixel of a detector: dark, response, gain, bias and read noise, hot pixels included."""
+"""Pixel maps of a detector: dark, response, gain, bias and read noise, including hot pixels."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from ..quantities import count
 
 Float = NDArray[np.float64]
 
-#: Pixels of an array, at most.
-MOST_PIXELS = 65_536
-#: Columns of a map's file, and their units: factors on the instrument's value, or values in place of it.
+#: Largest number of pixels of an array.
+MAX_PIXELS = 65_536
+#: Columns of a map and their units. Dimensionless ones are factors on the instrument's value, others replace it.
 COLUMNS = {
     "response": u.dimensionless_unscaled,
     "dark": u.dimensionless_unscaled,
@@ -33,16 +33,17 @@ COLUMNS = {
 @public
 @dataclass(frozen=True, eq=False)
 class PixelMap(ByContent):
-    """One value per pixel of the whole array; None leaves the instrument's value.
+    """Properties of each pixel of the whole array; None keeps the instrument's value.
 
     Attributes
     ----------
     response, dark, gain : ndarray, shape (n_pixel,), optional
-        Factors on the electrons per photon, the dark current and the DN per electron. A hot pixel is one with a large
-        factor on its dark.
+        Factors on the electrons per photon, the dark current and the DN per electron. A hot pixel has a large factor
+        on its dark current.
     bias_dn, read_noise_dn : ndarray, shape (n_pixel,), optional
-        DN, and DN rms per frame, in place of the instrument's.
+        DN and DN rms per frame, which replace the instrument's values.
     source : str
+        "tag: source" of the values.
     """
 
     response: Float | None = None
@@ -77,7 +78,7 @@ class PixelMap(ByContent):
 
     @property
     def size(self) -> int:
-        """Pixels."""
+        """Number of pixels."""
         return next(int(v.size) for name in COLUMNS if (v := getattr(self, name)) is not None)
 
     @property
@@ -90,18 +91,12 @@ class PixelMap(ByContent):
         return hashed.hexdigest()
 
     def __repr__(self) -> str:
-        # The instrument's digest is made of representations.
+        # The instrument's digest is computed from representations.
         return f"PixelMap({self.digest})"
 
     @classmethod
     def read(cls, path: str | Path) -> PixelMap:
-        """Read an ECSV table: one row per pixel of the array, in order, some of the columns of `COLUMNS`.
-
-        Raises
-        ------
-        InputError
-            If the file is missing, is not such a table, or holds a value that cannot be.
-        """
+        """Read an ECSV table with one row per pixel of the array, in order, and any of the columns of `COLUMNS`."""
         table = read_numbers(path, "pixel map")
         unknown = [name for name in table.columns if name not in COLUMNS and name != "pixel"]
         if unknown or list(table.columns) in ([], ["pixel"]):
@@ -135,18 +130,17 @@ class PixelMap(ByContent):
         hot_share: float = 0.001,
         hot_dark: float = 10.0,
     ) -> PixelMap:
-        """A map with assumed scatter, for pipelines that must meet one; no flight detector looks exactly so.
+        """Draw a map with assumed scatter, to test pipelines; it describes no real detector.
 
         Parameters
         ----------
-        pixels : int
-        seed : int
+        pixels, seed : int
         response_rms, dark_rms : float
             Relative scatter, log-normal.
         hot_share, hot_dark : float
-            Share of hot pixels, and the factor on their dark.
+            Fraction of hot pixels, and the factor on their dark current.
         """
-        pixels, seed = count("pixels", pixels, low=1, high=MOST_PIXELS), count("seed", seed)
+        pixels, seed = count("pixels", pixels, low=1, high=MAX_PIXELS), count("seed", seed)
         generator = np.random.default_rng(seed)
         response = np.exp(generator.normal(0.0, response_rms, pixels) - response_rms**2 / 2)
         dark = np.exp(generator.normal(0.0, dark_rms, pixels) - dark_rms**2 / 2)
@@ -154,7 +148,7 @@ class PixelMap(ByContent):
         return cls(response=response, dark=dark, source=f"A: made up, seed {seed}")
 
     def write(self, path: str | Path) -> None:
-        """Write the table that `read` reads."""
+        """Write an ECSV table for `read`."""
         from astropy.table import Table
 
         tag, source = self.source.split(": ", 1)
@@ -169,7 +163,7 @@ class PixelMap(ByContent):
         return f"of {self.size} pixels, {self.source}"
 
     def over(self, name: str, chosen: slice, nominal: float) -> Float:
-        """One column over a range of pixels: the instrument's value times the factor, or what stands in its place."""
+        """Return a column over a range of pixels: factors times `nominal`, or the values that replace it."""
         values = getattr(self, name)
         size = len(range(*chosen.indices(self.size)))
         if values is None:

@@ -1,1 +1,1 @@
-"""The orbit: where the satellite is, what it can see and when, and what it meets on the way; nothing is downloaded."""
+"""The satellite's orbit: position, visibility of targets, temperature and radiation. Nothing is downloaded."""

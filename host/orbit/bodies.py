@@ -1,4 +1,4 @@
-"""Sun and Moon over a plan, by astropy's built-in ephemeris: no download."""
+"""Positions of Sun and Moon during a plan, from astropy's built-in ephemeris."""
 
 from __future__ import annotations
 
@@ -9,46 +9,36 @@ from numpy.typing import NDArray
 
 from ..sky.helioecliptic import offline
 from .earth import Vectors, unit
-from .moments import Moments, as_time
+from .time_grid import TimeGrid, as_time
 
-#: Days between the places that are computed; a cubic goes between them (to 0.1 arcsec for the Sun, 1 arcsec for the
-#: Moon, tested).
+#: Days between computed positions. Cubic splines interpolate to 0.1 arcsec for the Sun and 1 arcsec for the Moon
+#: (tested).
 SUN_STEP_D, MOON_STEP_D = 0.5, 1 / 12
 
 
 @dataclass(frozen=True, eq=False)
 class Bodies:
-    """Sun and Moon as seen from the Earth's centre, in the frame of star catalogues.
+    """Geocentric positions of Sun and Moon in the frame of star catalogues (J2000)."""
 
-    Attributes
-    ----------
-    sun : ndarray, shape (n, 3)
-        Unit vectors. From the satellite the Sun is at most 10 arcsec elsewhere.
-    sun_km : ndarray, shape (n,)
-        Distance.
-    moon_km : ndarray, shape (n, 3)
-        From the satellite the Moon is up to a degree elsewhere: the satellite's place is to be taken off.
-    ecliptic_pole : ndarray, shape (3,)
-        North pole of the ecliptic at the middle of the plan.
-    """
-
+    # Unit vectors, shape (n, 3); the parallax at the satellite is below 10 arcsec.
     sun: Vectors
-    sun_km: NDArray[np.float64]
+    sun_km: NDArray[np.float64]  # distance, shape (n,)
+    # Shape (n, 3). The parallax reaches a degree: subtract the satellite's position to get its view.
     moon_km: Vectors
-    ecliptic_pole: NDArray[np.float64]
+    ecliptic_pole: NDArray[np.float64]  # north pole at the middle of the plan, shape (3,)
 
     @classmethod
-    def at(cls, moments: Moments) -> Bodies:
-        """At the times of a plan."""
+    def at(cls, times: TimeGrid) -> Bodies:
+        """Compute the positions at the times of a plan."""
         from scipy.interpolate import CubicSpline
 
-        midnight, days = moments.first[0], moments.julian[1]
+        midnight, days = times.first[0], times.julian[1]
         with offline():
             from astropy.coordinates import GeocentricTrueEcliptic, SkyCoord, get_body, get_sun
 
             def between(step_d: float, body: str) -> Vectors:
                 low = days[0] - step_d
-                # One step more at either end: a cubic is poorest there.
+                # One more node at either end, where a cubic spline is least accurate.
                 nodes = low + step_d * np.arange(int(np.ceil((days[-1] - low) / step_d)) + 3)
                 times = as_time(midnight, nodes)
                 body_there = get_sun(times) if body == "sun" else get_body(body, times)

@@ -1,4 +1,4 @@
-"""What the detector meets along the orbit: its temperature through sunlight and shadow, and hits of particles."""
+"""Detector temperature and particle hits along the orbit."""
 
 from __future__ import annotations
 
@@ -14,15 +14,15 @@ from .radiation import proton_map
 
 @dataclass(frozen=True)
 class Thermal:
-    """A detector that nears one temperature in sunlight and another in shadow: an assumption, to be replaced.
+    """First-order thermal model of the detector: dT/dt = (T_end - T) / tau.
 
-    First-order: dT/dt = (T_end - T) / tau. With the defaults it swings by some 3 deg C in every orbit, inside the 13 to
-    21 deg C that the payload's documents name.
+    The model is an assumption. With the defaults the temperature varies by 3 deg C in every orbit, within the 13 to
+    21 deg C of the payload's documents.
 
     Attributes
     ----------
     sunlit_c, shadow_c : float
-        Where it would end, deg C.
+        Equilibrium temperatures in sunlight and in shadow, deg C.
     time_constant_s : float
     """
 
@@ -40,16 +40,16 @@ class Thermal:
     def temperature_c(
         self, sunlight: NDArray[np.float64], step_s: float, start_c: float | None = None
     ) -> NDArray[np.float64]:
-        """Temperature at the ends of steps, (n,).
+        """Return the temperature at the end of each step, deg C, shape (n,).
 
         Parameters
         ----------
         sunlight : ndarray, shape (n,)
-            Share of the Sun's disk that is seen in each step, 0 to 1.
+            Visible fraction of the Sun's disk in each step, 0 to 1.
         step_s : float
-            Within a step the sunlight is taken as constant, which makes the steps exact.
+            Length of a step. Sunlight is constant within a step, for which the solution is exact.
         start_c : float, optional
-            Temperature before the first step; in balance with the mean of the sunlight unless given.
+            Temperature before the first step. The default is the equilibrium for the mean sunlight.
         """
         from scipy.signal import lfilter
 
@@ -62,15 +62,15 @@ class Thermal:
 
 @dataclass(frozen=True)
 class Particles:
-    """Hits on the detector: cosmic rays everywhere, and trapped protons that get through the walls (assumption).
+    """Particles that hit the detector: cosmic rays, and trapped protons that penetrate the shielding (assumption).
 
     Attributes
     ----------
     cosmic_per_cm2_s : float
-        Cosmic rays outside the South Atlantic Anomaly.
+        Rate of cosmic rays outside the South Atlantic Anomaly.
     share : float
-        Of the trapped protons above 30 MeV, counted from all directions, that reach the detector: a quarter of an
-        omnidirectional flux crosses one face of a thin plate, twice that both.
+        Fraction of the omnidirectional flux of trapped protons above 30 MeV that reaches the detector: a quarter of it
+        crosses either face of a thin plate.
     """
 
     cosmic_per_cm2_s: float = 1.0
@@ -83,11 +83,11 @@ class Particles:
             raise InputError(f"share = {self.share}, expected 0 to 1")
 
     def rate_per_cm2_s(self, track: Track) -> NDArray[np.float64]:
-        """Hits along a track, cm^-2 s^-1, (n,)."""
-        return np.asarray(self.cosmic_per_cm2_s + self.share * proton_map().at(*track.below_deg, above_mev=30))
+        """Return the rate of hits along a track, cm^-2 s^-1, shape (n,)."""
+        return np.asarray(self.cosmic_per_cm2_s + self.share * proton_map().at(*track.subsatellite_deg, above_mev=30))
 
 
-#: Where the defaults are from.
+#: Sources of the default values.
 THERMAL_SOURCE = "assumption: first-order heating and cooling between 13 and 21 deg C, the ends that are documented"
 PARTICLES_SOURCE = (
     "assumption: 1 cm^-2 s^-1 of cosmic rays, and half of AP8's omnidirectional protons above 30 MeV, which some 4 mm "

@@ -1,4 +1,4 @@
-"""What must hold for a target to be seen: one small function each, of places and directions alone."""
+"""Geometric constraints on the visibility of targets, one function each."""
 
 from __future__ import annotations
 
@@ -14,24 +14,14 @@ Flags = NDArray[np.bool_]
 
 
 def limb_angle_rad(position_km: Vectors) -> NDArray[np.float64]:
-    """Angular radius of the Earth, a sphere of its equatorial radius, as the satellite sees it, (n,)."""
+    """Return the angular radius of the Earth, a sphere of its equatorial radius, at the satellite, shape (n,)."""
     return np.asarray(np.arcsin(LIMB_KM / np.linalg.norm(position_km, axis=-1)))
 
 
 def clear_of_earth(position_km: Vectors, target: Vectors, margin_deg: float) -> Flags:
-    """Whether targets stand at least so far above the Earth's limb.
+    """Return whether targets are at least `margin_deg` above the Earth's limb, shape (n, k).
 
-    Parameters
-    ----------
-    position_km : ndarray, shape (n, 3)
-        From the Earth's centre.
-    target : ndarray, shape (k, 3)
-        Unit vectors, as in all that follow.
-    margin_deg : float
-
-    Returns
-    -------
-    ndarray of bool, shape (n, k)
+    `position_km` is geocentric, shape (n, 3); `target` holds unit vectors, shape (k, 3), here and below.
     """
     least = limb_angle_rad(position_km) + np.radians(margin_deg)
     towards_earth = (-unit(position_km)).astype(np.float32) @ target.T.astype(np.float32)
@@ -39,32 +29,38 @@ def clear_of_earth(position_km: Vectors, target: Vectors, margin_deg: float) -> 
 
 
 def clear_of_sun(sun: Vectors, target: Vectors, least_deg: float) -> Flags:
-    """Whether targets stand at least so far from the Sun's centre, (n, k); `sun` are unit vectors, (n, 3)."""
+    """Return whether targets are at least `least_deg` from the Sun's centre, shape (n, k).
+
+    `sun` holds unit vectors, shape (n, 3).
+    """
     return np.asarray(sun.astype(np.float32) @ target.T.astype(np.float32) <= np.float32(np.cos(np.radians(least_deg))))
 
 
 def clear_of_moon(moon_km: Vectors, position_km: Vectors, target: Vectors, least_deg: float) -> Flags:
-    """Whether targets stand at least so far from the Moon's centre as the satellite sees it, (n, k)."""
+    """Return whether targets are at least `least_deg` from the Moon's centre at the satellite, shape (n, k)."""
     return clear_of_sun(unit(moon_km - position_km), target, least_deg)
 
 
 def in_declinations(target: Vectors, low_deg: float, high_deg: float) -> Flags:
-    """Whether targets lie between two declinations, (k,)."""
+    """Return whether targets lie between two declinations, shape (k,)."""
     declination = np.degrees(np.arcsin(np.clip(target[:, 2], -1, 1)))
     return np.asarray((declination >= low_deg) & (declination <= high_deg))
 
 
 def in_cone(axis: Vectors, target: Vectors, half_angle_deg: float) -> Flags:
-    """Whether targets lie within an angle of an axis, such as the orbit's normal, (n, 3); (n, k)."""
+    """Return whether targets lie within an angle of an axis such as the orbit's normal, shape (n, k).
+
+    `axis` holds unit vectors, shape (n, 3).
+    """
     return np.asarray(
         axis.astype(np.float32) @ target.T.astype(np.float32) >= np.float32(np.cos(np.radians(half_angle_deg)))
     )
 
 
 def sunlight(position_km: Vectors, sun: Vectors, sun_km: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Share of the Sun's disk that the Earth does not hide, 0 to 1, (n,).
+    """Return the fraction of the Sun's disk that the Earth does not hide, 0 to 1, shape (n,).
 
-    Between the two contacts of the penumbra it is taken as a line; that takes some eight seconds.
+    The fraction is linear in angle between the two contacts of the penumbra, which are eight seconds apart.
     """
     distance = np.linalg.norm(position_km, axis=1)
     separation = np.arccos(np.clip(-np.einsum("ni,ni->n", position_km, sun) / distance, -1, 1))
@@ -73,16 +69,16 @@ def sunlight(position_km: Vectors, sun: Vectors, sun_km: NDArray[np.float64]) ->
 
 
 def in_polygon(longitude_deg: NDArray[np.float64], latitude_deg: NDArray[np.float64], corners: Vectors) -> Flags:
-    """Whether places lie inside a polygon of straight lines on the plate of longitude and latitude, (n,).
+    """Return whether positions lie inside a polygon in the plane of longitude and latitude, shape (n,).
 
     Parameters
     ----------
     longitude_deg, latitude_deg : ndarray, shape (n,)
-        Longitudes of any turn.
+        Longitudes may exceed 180 deg on either side.
     corners : ndarray, shape (m, 2)
-        Longitude and latitude of its corners, deg, one after the other; it may reach over 180.
+        Longitude and latitude of the corners in order, deg. The polygon may cross longitude 180.
     """
-    # Longitudes are counted from the polygon's first corner.
+    # Longitudes are relative to the first corner.
     x = (longitude_deg - corners[0, 0] + 180) % 360 - 180
     around = np.concatenate([[0.0], np.cumsum((np.diff(corners[:, 0]) + 180) % 360 - 180)])
     inside = np.zeros(np.shape(x), bool)

@@ -1,4 +1,4 @@
-"""Orbital elements as two lines, from the package or a file of one's own."""
+"""Two-line element sets, embedded or from a file."""
 
 from __future__ import annotations
 
@@ -15,24 +15,16 @@ from ..errors import InputError
 from ..files.bounded import shortened
 from ..files.parsed import read_text
 from .earth import GRAVITY, J2, RADIUS_KM
-from .moments import DAY_S, utc_text
+from .time_grid import DAY_S, utc_text
 
 
 @dataclass(frozen=True)
 class Elements:
-    """A two-line element set.
+    """A two-line element set."""
 
-    Attributes
-    ----------
-    first, second : str
-        Its lines.
-    source : str
-        Where they are from.
-    """
-
-    first: str
-    second: str
-    source: str
+    first: str  # line 1
+    second: str  # line 2
+    source: str  # origin of the set, for reports
 
     def __post_init__(self) -> None:
         for number, line in enumerate((self.first, self.second), 1):
@@ -49,19 +41,16 @@ class Elements:
 
     @classmethod
     def read(cls, path: str | Path) -> Elements:
-        """The first set in a file of two-line elements; titles and lines that begin with # are passed over.
+        """Read the first set of a file; titles and comments are ignored.
 
-        Raises
-        ------
-        InputError
-            If there is none in it, or a line's checksum is wrong.
+        Raises InputError if the file holds no set or a line's checksum is wrong.
         """
         path = Path(path)
         return cls._of(read_text(path, "orbit file"), f"file {path.name}", shortened(str(path)))
 
     @classmethod
     def embedded(cls) -> Elements:
-        """The public elements of Mauve that come with the package."""
+        """Return the public elements of Mauve that the package contains."""
         text = resources.files(__package__).joinpath("mauve.tle").read_text(encoding="utf-8")
         return cls._of(text, "public catalogue, object 66756, embedded", "the embedded elements")
 
@@ -75,24 +64,24 @@ class Elements:
 
     @cached_property
     def satellite(self) -> Any:
-        """The set as `sgp4` takes it."""
+        """Satellite record of `sgp4`."""
         from sgp4.api import WGS72, Satrec
 
         return Satrec.twoline2rv(self.first, self.second, WGS72)
 
     @property
     def name(self) -> str:
-        """NORAD's number."""
+        """NORAD catalogue number."""
         return self.first[2:7].strip()
 
     @property
     def epoch_jd(self) -> float:
-        """Julian date, UTC."""
+        """Epoch as a Julian date, UTC."""
         return float(self.satellite.jdsatepoch + self.satellite.jdsatepochF)
 
     @property
     def epoch(self) -> str:
-        """ISO 8601, UTC, to the second."""
+        """Epoch in ISO 8601, UTC, to the second."""
         return utc_text(self.epoch_jd)
 
     @property
@@ -107,33 +96,34 @@ class Elements:
 
     @property
     def axis_km(self) -> float:
-        """Semi-major axis by Kepler's third law from the mean motion."""
+        """Semi-major axis, from the mean motion by Kepler's third law."""
         return float((GRAVITY / (2 * np.pi / self.period_s) ** 2) ** (1 / 3))
 
     @property
     def inclination_deg(self) -> float:
-        """Against the equator."""
+        """Inclination to the equator."""
         return float(np.degrees(self.satellite.inclo))
 
     @property
     def node_drift_deg_per_day(self) -> float:
-        """How fast J2 turns the node eastward; the mean Sun moves 0.98565 deg a day."""
+        """Eastward drift of the node due to J2; the mean Sun moves by 0.98565 deg per day."""
         return float(np.degrees(-1.5 * self._oblate * np.cos(self.satellite.inclo)) * DAY_S)
 
     @property
     def latitude_rate_deg_per_day(self) -> float:
-        """How fast the mean argument of latitude grows: mean motion and the perigee's drift."""
+        """Rate of the mean argument of latitude: mean motion plus the drift of the perigee."""
         perigee = 0.75 * self._oblate * (5 * np.cos(self.satellite.inclo) ** 2 - 1)
         return 360.0 * self.revolutions_per_day + float(np.degrees(perigee)) * DAY_S
 
     @property
     def _oblate(self) -> float:
+        """Common factor of the secular J2 rates, rad/s, with p the semi-latus rectum."""
         p = self.axis_km * (1 - self.satellite.ecco**2)
         return float(2 * np.pi / self.period_s * J2 * (RADIUS_KM / p) ** 2)
 
 
 def _check(line: str, number: int) -> None:
-    """A line's form and checksum: the sum of its digits, with 1 for a minus, modulo 10."""
+    """Raise InputError unless a line has the right form and checksum (digits plus 1 per minus sign, modulo 10)."""
     if len(line) < 69 or not line.isascii() or not line.startswith(f"{number} "):
         raise InputError(f"orbital elements {shortened(line)}, expected line {number} with 69 characters")
     checksum = sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10

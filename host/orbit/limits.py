@@ -1,4 +1,4 @@
-"""What must hold for a target to be observed, as values; `visibility` looks when it does, and takes longer to load."""
+"""Observing limits as plain values; `visibility`, which applies them, takes longer to import."""
 
 from __future__ import annotations
 
@@ -13,26 +13,26 @@ EclipseRule = Literal["any", "only", "never"]
 
 @dataclass(frozen=True)
 class Limits:
-    """What must hold for a target to be observed. None of Mauve's own limits is public: all are assumptions.
+    """Limits on when a target can be observed. Mauve's own limits are not public: all defaults are assumptions.
 
     Attributes
     ----------
     earth_limb_deg, sun_deg, moon_deg : float or None
-        Least angles from the Earth's limb, the Sun and the Moon; None is no limit.
+        Smallest angles from the Earth's limb, the Sun and the Moon; None means no limit.
     declination_deg : (low, high) or None
-        Field of regard.
+        Field of regard in declination.
     normal_cone_deg : float or None
-        Field of regard as a cone about the orbit's normal, on either side.
+        Field of regard as a double cone about the orbit's normal.
     eclipse : {"any", "only", "never"}
         Whether to observe in the Earth's shadow.
     proton_flux : float or None
-        Largest flux of trapped protons above 10 MeV, cm^-2 s^-1: the South Atlantic Anomaly.
+        Largest flux of trapped protons above 10 MeV, cm^-2 s^-1, which excludes the South Atlantic Anomaly.
     anomaly : tuple of (longitude, latitude), deg
-        A polygon of one's own in place of the map.
+        Polygon that replaces the proton map.
     shortest_s : float
-        Shorter windows are left out.
+        Length below which windows are dropped.
     duty_cycle : float
-        Share of a window in which the star is exposed.
+        Fraction of a window in which the star is exposed.
     """
 
     earth_limb_deg: float | None = 25.0
@@ -70,7 +70,7 @@ class Limits:
 
     @property
     def assumptions(self) -> list[tuple[str, str, str]]:
-        """Each limit in force: its name, its value, where the default is from."""
+        """Name, value and source of each limit in force."""
         return [
             (field.name, _text(getattr(self, field.name)), SOURCES[field.name])
             for field in fields(self)
@@ -79,7 +79,7 @@ class Limits:
 
 
 _UVEX = "assumption, borrowed from UVEX (m4opt's definition of that mission); Mauve's own is not public"
-#: Where the defaults are from.
+#: Sources of the default values.
 SOURCES = {
     "earth_limb_deg": _UVEX,
     "sun_deg": _UVEX,

@@ -1,4 +1,4 @@
-"""Where the satellite is: by SGP4 near the epoch of its elements, by a mean Sun-synchronous orbit far from it."""
+"""Position of the satellite: SGP4 near the epoch of its elements, a mean Sun-synchronous orbit far from it."""
 
 from __future__ import annotations
 
@@ -12,34 +12,35 @@ from numpy.typing import NDArray
 
 from ..errors import InputError
 from .bodies import Bodies
-from .earth import GRAVITY, Vectors, below, to_j2000, unit
+from .earth import GRAVITY, Vectors, subsatellite_point, to_j2000, unit
 from .elements import Elements
-from .moments import Moments
+from .time_grid import TimeGrid
 
 Kind = Literal["auto", "tle", "mean"]
-#: Days from the epoch within which SGP4 is taken at its word: after a fortnight the answer tells how far it may be off.
+#: Days from the epoch beyond which reports state the possible error of SGP4.
 TRUSTED_D = 14.0
-#: Days from the epoch from which "auto" takes the mean orbit: by then drag may have moved the satellite by a tenth of
+#: Days from the epoch beyond which "auto" uses the mean orbit: by then drag may have moved the satellite by a tenth of
 #: an orbit (assumption; see `along_track_km`).
 MEAN_FROM_D = 60.0
 #: Along-track error of public elements near their epoch, km (about one in low orbit: Kelso 2007, AAS 07-127), and its
-#: growth, km a day (1 to 3: documentation of the package sgp4).
+#: growth, km per day (1 to 3: documentation of the package sgp4).
 AT_EPOCH_KM, PER_DAY_KM = 1.0, 2.0
-#: By how much the drag of the days to come may differ from that of the elements (assumption: the density of the upper
-#: atmosphere follows the Sun, and halves or doubles within weeks).
+#: Relative uncertainty of the drag after the epoch (assumption: the density of the upper atmosphere follows solar
+#: activity and halves or doubles within weeks).
 DRAG_SHARE = 0.5
 
 
 @dataclass(frozen=True)
 class Orbit:
-    """Where the satellite is.
+    """The satellite's orbit and its propagation.
 
     Attributes
     ----------
     elements : Elements
     kind : {"auto", "tle", "mean"}
-        SGP4 from the elements; a mean circular Sun-synchronous orbit through them, which keeps the local time of its
-        node for years; or the first to `MEAN_FROM_D` days from the epoch and the second beyond.
+        ``tle`` propagates the elements with SGP4. ``mean`` is a circular Sun-synchronous orbit through the elements,
+        whose node keeps its local time for years. ``auto`` uses SGP4 up to `MEAN_FROM_D` days from the epoch, and the
+        mean orbit beyond.
     """
 
     elements: Elements = field(default_factory=Elements.embedded)
@@ -51,49 +52,38 @@ class Orbit:
 
     @classmethod
     def load(cls, file: str | Path | None = None, kind: Kind = "auto") -> Orbit:
-        """By a file of two-line elements, or the embedded ones.
-
-        Raises
-        ------
-        InputError
-            As `Elements.read`.
-        """
+        """Read an orbit from a file of two-line elements; the default is the embedded set."""
         return cls(Elements.embedded() if file is None else Elements.read(file), kind)
 
-    def resolved(self, moments: Moments) -> Literal["tle", "mean"]:
-        """Which of the two is used for a plan."""
+    def resolved(self, times: TimeGrid) -> Literal["tle", "mean"]:
+        """Return the kind of propagation that a plan uses."""
         if self.kind == "auto":
-            return "mean" if self.farthest_d(moments) > MEAN_FROM_D else "tle"
+            return "mean" if self.farthest_d(times) > MEAN_FROM_D else "tle"
         return self.kind
 
-    def farthest_d(self, moments: Moments) -> float:
-        """Days from the elements' epoch to the end of a plan that is farther from it."""
-        _, days = moments.julian
-        ends = moments.first[0] + days[[0, -1]]
+    def farthest_d(self, times: TimeGrid) -> float:
+        """Return the largest distance of a plan's times from the elements' epoch, days."""
+        _, days = times.julian
+        ends = times.first[0] + days[[0, -1]]
         return float(np.abs(ends - self.elements.epoch_jd).max())
 
     def along_track_km(self, days: float) -> float:
-        """How far along its track the satellite may be from where SGP4 has it, km.
+        """Return the possible along-track error of SGP4 `days` from the epoch, km.
 
-        The error of public elements and its growth, and drag that differs from what the elements foresee by
-        `DRAG_SHARE`, which grows with the square of the time. An assumption, not a covariance.
-
-        Parameters
-        ----------
-        days : float
-            From the epoch.
+        The estimate adds the error of public elements, its linear growth, and the quadratic effect of a drag that
+        differs by `DRAG_SHARE` from the elements'. It is an assumption, not a covariance.
         """
         days = abs(days)
-        # The elements' first number is half of the mean motion's rate, revolutions a day squared.
+        # The elements give half of the mean motion's derivative, in revolutions per day^2.
         half_rate = abs(float(self.elements.satellite.ndot)) * 1440.0**2 / (2 * np.pi)
         drag = DRAG_SHARE * half_rate * days**2 * 2 * np.pi * self.elements.axis_km
         return float(AT_EPOCH_KM + PER_DAY_KM * days + drag)
 
-    def messages(self, moments: Moments) -> list[str]:
-        """What the reader of a plan must be told of the orbit."""
-        elements, days = self.elements, self.farthest_d(moments)
+    def messages(self, times: TimeGrid) -> list[str]:
+        """Return the remarks on the orbit's accuracy that a plan must report."""
+        elements, days = self.elements, self.farthest_d(times)
         source = f"{elements.source}, epoch {elements.epoch[:10]}"
-        if self.resolved(moments) == "mean":
+        if self.resolved(times) == "mean":
             return [
                 f"The orbit is a mean Sun-synchronous one through the elements ({source}): shares of time and seasons "
                 f"hold, but where the satellite stands in its orbit {days:.0f} days from the epoch is not known: times "
@@ -108,31 +98,25 @@ class Orbit:
             ]
         return []
 
-    def track(self, moments: Moments) -> Track:
-        """The satellite's places at the times of a plan.
-
-        Raises
-        ------
-        InputError
-            If SGP4 cannot follow the elements that far.
-        """
-        midnight, days = moments.julian
-        if self.resolved(moments) == "mean":
+    def track(self, times: TimeGrid) -> Track:
+        """Propagate the orbit to the times of a plan; raises InputError if SGP4 fails at one of them."""
+        midnight, days = times.julian
+        if self.resolved(times) == "mean":
             position, velocity = self._mean(midnight, days)
         else:
             error, position, velocity = self.elements.satellite.sgp4_array(midnight, days)
             if np.any(error):
                 raise InputError(
                     f"orbital elements of epoch {self.elements.epoch} cannot be followed to "
-                    f"{moments.iso(float(moments.seconds[np.argmax(error != 0)]))} (SGP4 error "
+                    f"{times.iso(float(times.seconds[np.argmax(error != 0)]))} (SGP4 error "
                     f"{int(error[np.argmax(error != 0)])}), expected newer ones or the mean orbit"
                 )
-        return Track(moments, np.asarray(position), np.asarray(velocity))
+        return Track(times, np.asarray(position), np.asarray(velocity))
 
     def _mean(
         self, midnight: NDArray[np.float64], days: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """A circular orbit whose node keeps its local mean time."""
+        """Return positions and velocities in a circular orbit whose node keeps its local mean time."""
         e, since = self.elements, (midnight - self.elements.epoch_jd) + days
         node = e.satellite.nodeo + 2 * np.pi / 365.2421897 * since
         along = e.satellite.argpo + e.satellite.mo + np.radians(e.latitude_rate_deg_per_day) * since
@@ -142,16 +126,9 @@ class Orbit:
 def circular(
     axis_km: float, inclination_rad: float, node_rad: NDArray[np.float64] | float, along_rad: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Positions (km) and velocities (km/s) in a circular orbit, (n, 3) each.
+    """Return positions (km) and velocities (km/s) in a circular orbit, shape (n, 3) each.
 
-    Parameters
-    ----------
-    axis_km : float
-    inclination_rad : float
-    node_rad : float or ndarray, shape (n,)
-        Right ascension of the ascending node.
-    along_rad : ndarray, shape (n,)
-        Argument of latitude.
+    `node_rad` is the right ascension of the ascending node, `along_rad` the argument of latitude, shape (n,).
     """
     node = np.broadcast_to(node_rad, along_rad.shape)
     ascending = np.stack([np.cos(node), np.sin(node), np.zeros_like(node)], axis=1)
@@ -164,62 +141,54 @@ def circular(
 
 @dataclass(frozen=True, eq=False)
 class Track:
-    """Where the satellite is at the times of a plan.
+    """The satellite's positions at the times of a plan."""
 
-    Attributes
-    ----------
-    moments : Moments
-    of_date_km : ndarray, shape (n, 3)
-        In SGP4's frame: true equator and mean equinox of date.
-    velocity_km_s : ndarray, shape (n, 3)
-        In the same frame.
-    """
-
-    moments: Moments
+    times: TimeGrid
+    # Position and velocity in SGP4's frame (true equator, mean equinox of date), shape (n, 3).
     of_date_km: NDArray[np.float64]
     velocity_km_s: NDArray[np.float64]
 
     @cached_property
     def _to_j2000(self) -> NDArray[np.float64]:
-        return to_j2000(self.moments.first[0], self.moments.julian[1])
+        return to_j2000(self.times.first[0], self.times.julian[1])
 
     @cached_property
     def position_km(self) -> Vectors:
-        """In the frame of star catalogues, (n, 3)."""
+        """Position in the frame of star catalogues (J2000), shape (n, 3)."""
         return np.asarray(np.einsum("nij,nj->ni", self._to_j2000, self.of_date_km))
 
     @cached_property
     def normal(self) -> Vectors:
-        """Unit vectors along the orbit's angular momentum, in the frame of star catalogues, (n, 3)."""
+        """Unit vectors along the orbit's angular momentum in the frame of star catalogues, shape (n, 3)."""
         return unit(np.einsum("nij,nj->ni", self._to_j2000, np.cross(self.of_date_km, self.velocity_km_s)))
 
     @cached_property
-    def below_deg(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Geodetic longitude (-180 to 180) and latitude of the place below, (n,) each."""
-        return below(self.of_date_km, *self.moments.julian)
+    def subsatellite_deg(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Geodetic longitude (-180 to 180) and latitude of the sub-satellite point, shape (n,) each."""
+        return subsatellite_point(self.of_date_km, *self.times.julian)
 
     @cached_property
     def bodies(self) -> Bodies:
-        """Sun and Moon."""
-        return Bodies.at(self.moments)
+        """Positions of Sun and Moon."""
+        return Bodies.at(self.times)
 
     @property
     def beta_deg(self) -> NDArray[np.float64]:
-        """Angle of the Sun from the orbit's plane, positive on the side of the angular momentum, (n,)."""
+        """Angle of the Sun from the orbital plane, positive towards the angular momentum, shape (n,)."""
         return np.asarray(np.degrees(np.arcsin(np.einsum("ni,ni->n", self.normal, self.bodies.sun))))
 
     @property
     def local_time_h(self) -> NDArray[np.float64]:
-        """Local mean solar time of the descending node, hours, (n,)."""
+        """Local mean solar time of the descending node, hours, shape (n,)."""
         momentum = np.cross(self.of_date_km, self.velocity_km_s)
         ascending = np.arctan2(momentum[:, 0], -momentum[:, 1])
-        midnight, days = self.moments.julian
-        # Mean longitude of the Sun, from the mean equinox of date (Meeus, Astronomical Algorithms, chapter 25).
+        midnight, days = self.times.julian
+        # Mean longitude of the Sun from the mean equinox of date (Meeus, Astronomical Algorithms, chapter 25).
         sun = np.radians(280.46646 + 0.98564736 * (midnight - 2_451_545.0 + days))
         return np.asarray((np.degrees(ascending + np.pi - sun) / 15.0 + 12.0) % 24.0)
 
     @property
     def period_s(self) -> float:
-        """Of a circular orbit at the mean distance."""
+        """Period of a circular orbit at the mean distance, s."""
         axis = float(np.linalg.norm(self.of_date_km, axis=1).mean())
         return float(2 * np.pi * np.sqrt(axis**3 / GRAVITY))

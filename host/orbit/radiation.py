@@ -1,4 +1,4 @@
-"""Protons that the Earth's field has trapped, along the orbit: a map computed once, with the package's script."""
+"""Flux of trapped protons along the orbit, from an embedded map."""
 
 from __future__ import annotations
 
@@ -18,31 +18,17 @@ Energy = Literal[10, 30]
 
 @dataclass(frozen=True, eq=False)
 class FluxMap:
-    """Flux of trapped protons by the place below, cm^-2 s^-1, from all directions.
+    """Omnidirectional flux of trapped protons by sub-satellite point, cm^-2 s^-1."""
 
-    Attributes
-    ----------
-    step_deg : float
-        Between the cells' middles.
-    flux : dict of int to ndarray, shape (n_latitude, n_longitude)
-        By the energy above which protons are counted, MeV; latitude from -90, longitude from -180.
-    source : str
-    """
-
-    step_deg: float
+    step_deg: float  # spacing of the grid
+    # By lower energy limit, MeV; each of shape (n_latitude, n_longitude), from latitude -90 and longitude -180.
     flux: dict[int, NDArray[np.float64]]
     source: str
 
     def at(
         self, longitude_deg: NDArray[np.float64], latitude_deg: NDArray[np.float64], above_mev: Energy = 10
     ) -> NDArray[np.float64]:
-        """Flux at places, bilinearly between cells, (n,).
-
-        Raises
-        ------
-        InputError
-            For an energy that the map does not have.
-        """
+        """Interpolate the flux above an energy bilinearly, shape (n,)."""
         if above_mev not in self.flux:
             raise InputError(f"protons above {above_mev} MeV, expected {' or '.join(map(str, self.flux))}")
         grid = self.flux[above_mev]
@@ -57,7 +43,7 @@ class FluxMap:
 
 @lru_cache(maxsize=1)
 def proton_map() -> FluxMap:
-    """AP8 at solar maximum, 510 km up: see `tools/build_flux_map.py`."""
+    """Return the map of AP8 at solar maximum, at an altitude of 510 km (see `tools/build_flux_map.py`)."""
     text = resources.files(__package__).joinpath("protons.ecsv").read_text(encoding="utf-8")
     table = parse_ecsv(text, "the embedded map of protons")
     step = float(table.meta["step_deg"])

@@ -1,4 +1,4 @@
-"""When targets can be seen: windows, and how long by day and month."""
+"""Visibility of targets: windows, and exposure time per orbit, day and month."""
 
 from __future__ import annotations
 
@@ -9,76 +9,48 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from . import constraints as must
+from . import constraints
 from .constraints import Flags
 from .earth import Vectors
 from .limits import Limits
 from .orbit import Track
 from .radiation import proton_map
 
-#: One limit: which targets some steps leave, (steps or 1, k or 1).
+#: A limit as a function of a slice of steps that returns which targets are allowed, shape (steps or 1, k or 1).
 Rule = Callable[[slice], Flags]
-#: Steps looked at together, so that what is held for a hundred targets stays in some tens of MB.
+#: Steps evaluated at once, which keeps the arrays of a hundred targets within tens of MB.
 CHUNK = 1 << 16
 
 
 @dataclass(frozen=True, eq=False)
 class Windows:
-    """Stretches of time in which one target is seen.
+    """Intervals in which one target is visible; arrays of shape (n_window,)."""
 
-    Attributes
-    ----------
-    start_s, stop_s : ndarray, shape (n_window,)
-        Since the start of the plan.
-    in_shadow_s : ndarray, shape (n_window,)
-        Of each, in the Earth's shadow.
-    """
-
-    start_s: NDArray[np.float64]
+    start_s: NDArray[np.float64]  # since the start of the plan, as stop_s
     stop_s: NDArray[np.float64]
-    in_shadow_s: NDArray[np.float64]
+    in_shadow_s: NDArray[np.float64]  # part of the window in the Earth's shadow
 
     @property
     def length_s(self) -> NDArray[np.float64]:
-        """(n_window,)."""
+        """Length of each window."""
         return self.stop_s - self.start_s
 
 
 @dataclass(frozen=True, eq=False)
 class Visibility:
-    """When targets are seen over a plan.
-
-    Attributes
-    ----------
-    track : Track
-    target : ndarray, shape (k, 3)
-        Unit vectors.
-    limits : Limits
-    seen : ndarray of bool, shape (n, k)
-        By step and target, before windows that are too short are left out.
-    kept_by : dict of str to ndarray, shape (k,)
-        Share of the time that each limit alone leaves to each target.
-    """
+    """Visibility of targets at the times of a plan."""
 
     track: Track
-    target: Vectors
+    target: Vectors  # unit vectors, shape (k, 3)
     limits: Limits
-    seen: Flags
-    kept_by: dict[str, NDArray[np.float64]]
+    seen: Flags  # shape (n, k), without windows that are too short
+    kept_by: dict[str, NDArray[np.float64]]  # fraction of time that each limit alone allows, shape (k,)
 
     @classmethod
     def of(cls, track: Track, target: Vectors, limits: Limits | None = None) -> Visibility:
-        """Look from each place of a track.
-
-        Parameters
-        ----------
-        track : Track
-        target : ndarray, shape (k, 3)
-            Unit vectors in the frame of star catalogues.
-        limits : Limits, optional
-        """
+        """Compute the visibility of targets, unit vectors in the frame of star catalogues of shape (k, 3)."""
         limits = limits or Limits()
-        n, k = track.moments.n, len(target)
+        n, k = track.times.n, len(target)
         seen, kept = np.ones((n, k), bool), {}
         for name, rule in _rules(track, target, limits).items():
             count = np.zeros(k)
@@ -89,43 +61,43 @@ class Visibility:
                 count += np.broadcast_to(flags, (part.stop - part.start, k)).sum(axis=0)
             kept[name] = count / n
         if limits.shortest_s > 0:
-            _drop_short(seen, track.moments.step_s, limits.shortest_s)
+            _drop_short(seen, track.times.step_s, limits.shortest_s)
         return cls(track, target, limits, seen, kept)
 
     @cached_property
     def shadow(self) -> Flags:
-        """Whether the satellite is in the Earth's shadow, (n,)."""
+        """True where the satellite is in the Earth's shadow, shape (n,)."""
         return in_shadow(self.track)
 
     @property
     def share(self) -> NDArray[np.float64]:
-        """Of the time, (k,), before the duty cycle."""
+        """Fraction of the time in which each target is visible, without the duty cycle, shape (k,)."""
         return np.asarray(self.seen.mean(axis=0))
 
     @property
     def hours(self) -> NDArray[np.float64]:
-        """Of exposure, with the duty cycle, (k,)."""
-        return np.asarray(self.share * self.track.moments.n * self.track.moments.step_s / 3600 * self.limits.duty_cycle)
+        """Exposure time of each target with the duty cycle, shape (k,)."""
+        return np.asarray(self.share * self.track.times.n * self.track.times.step_s / 3600 * self.limits.duty_cycle)
 
     def windows(self, k: int) -> Windows:
-        """Of one target, one after the other; limits are met at steps, so ends are good to a step."""
+        """Return the windows of one target in order, with ends accurate to one step."""
         edges = np.flatnonzero(np.diff(np.concatenate([[False], self.seen[:, k], [False]])))
         first, last = edges[::2], edges[1::2]
         dark = np.concatenate([[0], np.cumsum(self.shadow)])
-        step = np.float64(self.track.moments.step_s)
+        step = np.float64(self.track.times.step_s)
         return Windows(first * step, last * step, (dark[last] - dark[first]) * step)
 
     def by_day(self, k: int) -> NDArray[np.float64]:
-        """Hours of exposure of each UTC day, from the day of the start, (n_day,)."""
-        _, days = self.track.moments.julian
+        """Return the hours of exposure on each UTC day from the day of the start, shape (n_day,)."""
+        _, days = self.track.times.julian
         number = np.floor(days).astype(int)
         return np.asarray(np.bincount(number, self.seen[:, k]) * self._step_h)
 
     def by_month(self) -> tuple[list[str], NDArray[np.float64]]:
-        """Calendar months (UTC), such as "2027-01", and hours of exposure in them, (n_month, k)."""
-        moments = self.track.moments
-        _, days = moments.julian
-        day = np.datetime64(moments.iso(0.0)[:10], "D") + np.arange(int(np.floor(days[-1])) + 1)
+        """Return the calendar months (UTC), such as "2027-01", and the hours of exposure, shape (n_month, k)."""
+        times = self.track.times
+        _, days = times.julian
+        day = np.datetime64(times.iso(0.0)[:10], "D") + np.arange(int(np.floor(days[-1])) + 1)
         month = day.astype("datetime64[M]")
         names, place = np.unique(month, return_inverse=True)
         starts = np.searchsorted(np.floor(days).astype(int), np.arange(day.size))
@@ -135,51 +107,55 @@ class Visibility:
         return [str(name) for name in names], hours
 
     def by_orbit(self, k: int) -> NDArray[np.float64]:
-        """Minutes of exposure in each orbit, from one ascending node to the next, (n_orbit,); the ends may be parts."""
+        """Return the minutes of exposure between ascending nodes, shape (n_orbit,).
+
+        The first and last orbit may be incomplete.
+        """
         z = self.track.of_date_km[:, 2]
         number = np.concatenate([[0], np.cumsum((z[:-1] < 0) & (z[1:] >= 0))])
         return np.asarray(np.bincount(number, self.seen[:, k]) * self._step_h * 60)
 
     @property
     def _step_h(self) -> float:
-        return self.track.moments.step_s / 3600 * self.limits.duty_cycle
+        return self.track.times.step_s / 3600 * self.limits.duty_cycle
 
 
 def in_shadow(track: Track) -> Flags:
-    """Whether half of the Sun's disk or more is hidden, (n,)."""
-    return np.asarray(must.sunlight(track.position_km, track.bodies.sun, track.bodies.sun_km) < 0.5)
+    """Return whether more than half of the Sun's disk is hidden, shape (n,)."""
+    return np.asarray(constraints.sunlight(track.position_km, track.bodies.sun, track.bodies.sun_km) < 0.5)
 
 
 def _rules(track: Track, target: Vectors, limits: Limits) -> dict[str, Rule]:
-    """The limits in force, each as a function of a slice of steps."""
+    """Return the limits in force by name."""
     at, bodies, rules = track.position_km, track.bodies, dict[str, Rule]()
     if (earth := limits.earth_limb_deg) is not None:
-        rules["earth_limb"] = lambda part: must.clear_of_earth(at[part], target, earth)
+        rules["earth_limb"] = lambda part: constraints.clear_of_earth(at[part], target, earth)
     if (sun := limits.sun_deg) is not None:
-        rules["sun"] = lambda part: must.clear_of_sun(bodies.sun[part], target, sun)
+        rules["sun"] = lambda part: constraints.clear_of_sun(bodies.sun[part], target, sun)
     if (moon := limits.moon_deg) is not None:
-        rules["moon"] = lambda part: must.clear_of_moon(bodies.moon_km[part], at[part], target, moon)
+        rules["moon"] = lambda part: constraints.clear_of_moon(bodies.moon_km[part], at[part], target, moon)
     if (regard := limits.declination_deg) is not None:
-        inside = must.in_declinations(target, *regard)
+        inside = constraints.in_declinations(target, *regard)
         rules["declination"] = lambda part: inside[None, :]
     if (cone := limits.normal_cone_deg) is not None:
         rules["normal_cone"] = lambda part: (
-            must.in_cone(track.normal[part], target, cone) | must.in_cone(-track.normal[part], target, cone)
+            constraints.in_cone(track.normal[part], target, cone)
+            | constraints.in_cone(-track.normal[part], target, cone)
         )
     if limits.eclipse != "any":
         allowed = in_shadow(track) == (limits.eclipse == "only")
         rules["eclipse"] = lambda part: allowed[part, None]
     if limits.anomaly or limits.proton_flux is not None:
         if limits.anomaly:
-            outside = ~must.in_polygon(*track.below_deg, np.array(limits.anomaly))
+            outside = ~constraints.in_polygon(*track.subsatellite_deg, np.array(limits.anomaly))
         else:
-            outside = proton_map().at(*track.below_deg) <= (limits.proton_flux or 0.0)
+            outside = proton_map().at(*track.subsatellite_deg) <= (limits.proton_flux or 0.0)
         rules["anomaly"] = lambda part: outside[part, None]
     return rules
 
 
 def _drop_short(seen: Flags, step_s: float, shortest_s: float) -> None:
-    """Take out of each column the stretches that are too short."""
+    """Clear intervals shorter than `shortest_s` in each column, in place."""
     for column in seen.T:
         edges = np.flatnonzero(np.diff(np.concatenate([[False], column, [False]])))
         for first, last in zip(edges[::2], edges[1::2], strict=True):

@@ -1,4 +1,4 @@
-"""The sky: zodiacal light, by place and date."""
+"""Zodiacal light by position and date."""
 
-#: V mag arcsec-2 where nothing is said of the sky: the ecliptic opposite the Sun, in the paper's table.
+#: Default surface brightness, V mag arcsec-2: the ecliptic opposite the Sun in the paper's table.
 DEFAULT_SKY = 22.1

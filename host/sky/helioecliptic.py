@@ -1,4 +1,4 @@
-"""Where a target stands against the Sun: helio-ecliptic coordinates, without a download."""
+"""Helio-ecliptic coordinates of a target, without downloads."""
 
 from __future__ import annotations
 
@@ -17,59 +17,42 @@ if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord
     from astropy.time import Time
 
-#: Calendar years in which UTC and the ephemeris are good to far better than a cell of the zodiacal table.
+#: Calendar years in which errors of UTC and ephemeris are far smaller than a cell of the zodiacal table.
 YEARS = (1990, 2100)
 
-#: Two plain numbers, such as "290.0 -11.2": degrees.
+#: Two plain numbers such as "290.0 -11.2", in degrees.
 _DEGREES = re.compile(r"\s*([+-]?\d+(?:\.\d*)?)\s*[,\s]\s*[+-]?\d+(?:\.\d*)?\s*")
 
 
 @dataclass(frozen=True)
 class HelioEcliptic:
-    """Position against the Sun, degrees.
+    """Ecliptic position relative to the Sun."""
 
-    Attributes
-    ----------
-    longitude_deg : float
-        Ecliptic longitude of the target minus that of the Sun, folded to 0-180.
-    latitude_deg : float
-        Absolute ecliptic latitude, 0-90.
-    separation_deg : float
-        Angle between target and Sun.
-    """
-
-    longitude_deg: float
-    latitude_deg: float
-    separation_deg: float
+    longitude_deg: float  # absolute difference of the target's and the Sun's ecliptic longitudes, 0-180
+    latitude_deg: float  # absolute ecliptic latitude, 0-90
+    separation_deg: float  # angle between target and Sun
 
 
 def helioecliptic(target: SkyCoord | str, time: Time | str) -> HelioEcliptic:
-    """Helio-ecliptic coordinates of a target at a time.
-
-    The true geocentric ecliptic of date, by astropy with its built-in ephemeris and leap seconds.
+    """Return the helio-ecliptic coordinates of a target, in the true geocentric ecliptic of date.
 
     Parameters
     ----------
     target : SkyCoord or str
-        One position; a string is ICRS, two numbers in degrees ("290.0 -11.2") or sexagesimal hours and degrees.
+        Single position; a string is ICRS, in degrees ("290.0 -11.2") or sexagesimal hours and degrees.
     time : Time or str
-        One time; a string is ISO 8601, UTC.
-
-    Raises
-    ------
-    InputError
-        If either cannot be understood, is not finite, is more than one, or lies outside 1990-2100.
+        Single time within 1990-2100; a string is ISO 8601, UTC.
     """
     with offline():
         from astropy.coordinates import GeocentricTrueEcliptic, get_sun
 
-        moment = moment_of(time)
-        position = position_of(target)
+        moment = parse_time(time)
+        position = parse_position(target)
         frame = GeocentricTrueEcliptic(equinox=moment, obstime=moment)
         sun = get_sun(moment).transform_to(frame)
         try:
             star = position.transform_to(frame)
-        except Exception:  # frames without a way to the ecliptic (AltAz without a place) raise many kinds
+        except Exception:  # frames that cannot be transformed (AltAz without a location) raise many kinds
             raise InputError(
                 f"target in the frame {position.frame.name!r} cannot be turned to the ecliptic, expected ICRS"
             ) from None
@@ -84,28 +67,22 @@ def helioecliptic(target: SkyCoord | str, time: Time | str) -> HelioEcliptic:
 
 @contextmanager
 def offline() -> Iterator[None]:
-    """Astropy without the network and, for far years, without warnings; everything as before afterwards."""
+    """Keep astropy from using the network and from warning of distant years."""
     from astropy.utils import iers
 
     with iers.conf.set_temp("auto_download", False):
-        # These imports look for leap seconds, so they come after the line above.
+        # This import reads leap seconds, which may download them, so it comes after the line above.
         from astropy.coordinates import solar_system_ephemeris
 
-        # The ephemeris's own context manager is module-wide too, and restores what was set.
+        # The ephemeris has a context manager of its own.
         with solar_system_ephemeris.set("builtin"), warnings.catch_warnings():
             warnings.filterwarnings("ignore", message=".*dubious year.*")
             warnings.filterwarnings("ignore", message=".*leap-second file is expired.*")
             yield
 
 
-def moment_of(time: Time | str) -> Time:
-    """One time between 1990 and 2100; text is ISO 8601, UTC. To be called inside `offline`.
-
-    Raises
-    ------
-    InputError
-        If it cannot be understood, is not finite, is more than one, or lies outside these years.
-    """
+def parse_time(time: Time | str) -> Time:
+    """Return a single finite time between 1990 and 2100; text is ISO 8601, UTC. Call inside `offline`."""
     from astropy.time import Time
 
     expected = "expected a UTC time such as '2026-03-01T12:00:00'"
@@ -128,14 +105,8 @@ def moment_of(time: Time | str) -> Time:
     return moment
 
 
-def position_of(target: SkyCoord | str) -> SkyCoord:
-    """One position; text is ICRS, two numbers in degrees or sexagesimal hours and degrees.
-
-    Raises
-    ------
-    InputError
-        If it cannot be understood, is not finite, or is more than one.
-    """
+def parse_position(target: SkyCoord | str) -> SkyCoord:
+    """Return a single finite position; text is ICRS, in degrees or sexagesimal hours and degrees."""
     import astropy.units as u
     from astropy.coordinates import SkyCoord
     from astropy.coordinates.baseframe import BaseCoordinateFrame
@@ -160,7 +131,10 @@ def position_of(target: SkyCoord | str) -> SkyCoord:
 
 
 def _in_degrees(target: str) -> bool:
-    """Whether a string is two plain numbers, degrees; astropy would wrap a right ascension of 700."""
+    """Return whether a string holds two numbers in degrees.
+
+    Raises InputError for a right ascension outside 0-360, which astropy would wrap.
+    """
     degrees = _DEGREES.fullmatch(target)
     if degrees and not 0 <= float(degrees[1]) <= 360:
         raise InputError(f"target = {target!r} has a right ascension of {degrees[1]}, expected 0 to 360 degrees")
@@ -168,5 +142,5 @@ def _in_degrees(target: str) -> bool:
 
 
 def _line(value: object) -> str:
-    """An object as one line of a message."""
+    """Return the representation of an object on one line."""
     return " ".join(repr(value).split())

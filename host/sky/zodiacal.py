@@ -1,4 +1,4 @@
-"""The sky behind a target: zodiacal light, which the fibre collects over its whole field of view."""
+"""Zodiacal light, which the fibre collects over its whole field of view."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ if TYPE_CHECKING:
     from ..stars.source import Source
 
 Lookup = Literal["bilinear", "nearest"]
-#: Faintest and brightest sky that a user may set, V mag arcsec^-2: any sky from orbit lies well within.
+#: Accepted surface brightness, V mag arcsec^-2; any sky seen from orbit lies well within.
 RANGE_MAG_ARCSEC2 = (5.0, 35.0)
 
 
 @public
 @dataclass(frozen=True)
 class Sky:
-    """Zodiacal light of one brightness over the field of view.
+    """Zodiacal light of uniform surface brightness.
 
     Attributes
     ----------
     surface_brightness : float or None
-        V mag arcsec^-2 (Vega); None is no sky at all.
+        V mag arcsec^-2 (Vega); None means no sky.
     description : str
-        One line for reports.
+        Origin of the value, for reports.
 
     Examples
     --------
@@ -51,22 +51,17 @@ class Sky:
 
     @classmethod
     def none(cls) -> Sky:
-        """No sky."""
+        """Return a sky without light."""
         return cls(None, "no sky")
 
     @classmethod
     def of_brightness(cls, brightness: u.Quantity | float) -> Sky:
-        """A fixed surface brightness.
+        """Return a sky of fixed surface brightness.
 
         Parameters
         ----------
         brightness : Quantity or float
-            V mag arcsec^-2.
-
-        Raises
-        ------
-        InputError
-            If it is not a finite number of mag arcsec^-2 between 5 and 35.
+            V mag arcsec^-2, 5 to 35.
         """
         low, high = RANGE_MAG_ARCSEC2
         expected = f"a finite number of mag/arcsec2, {low:g} to {high:g}"
@@ -75,25 +70,24 @@ class Sky:
 
     @classmethod
     def at(cls, target: SkyCoord | str, time: Time | str, lookup: Lookup = "bilinear") -> Sky:
-        """Zodiacal light towards a target at a time, from the table of the MauveSim paper (COS Instrument Handbook).
+        """Return the zodiacal light towards a target, from the table of the MauveSim paper (COS Instrument Handbook).
 
-        Between the cells of the table, which stand every 15 deg, magnitudes are interpolated bilinearly, or the nearest
-        cell is read off as in the paper. Solar avoidance is the nearest cell's in both: the table gives no brightness
-        for avoided cells, so where one borders on the point, the others share its weight. The sky there is up to some
-        0.4 mag too faint; at the edge of the avoidance zone that is 0.1 DN/s per pixel.
+        The table has a cell every 15 deg. Magnitudes are interpolated bilinearly, or taken from the nearest cell as in
+        the paper. Cells in the solar avoidance zone have no value: the other corners share their weight, which makes
+        the sky beside the zone up to 0.4 mag too faint (0.1 DN/s per pixel).
 
         Parameters
         ----------
         target : SkyCoord or str
-            One position; a string is ICRS, in degrees ("290.0 -11.2") or sexagesimal ("19h22m00s -11d12m00s").
+            Single position; a string is ICRS, in degrees ("290.0 -11.2") or sexagesimal ("19h22m00s -11d12m00s").
         time : Time or str
-            One time in 1990-2100; a string is ISO 8601, UTC.
+            Single time in 1990-2100; a string is ISO 8601, UTC.
         lookup : {"bilinear", "nearest"}
 
         Raises
         ------
         InputError
-            If target or time cannot be used, or the target is in the solar avoidance zone; says how far the Sun is.
+            If the nearest cell is in the solar avoidance zone.
         """
         if lookup not in ("bilinear", "nearest"):
             raise InputError(f"lookup = {lookup!r}, expected 'bilinear' or 'nearest'")
@@ -107,16 +101,17 @@ class Sky:
         )
 
     def total_magnitude(self, field_of_view_arcsec2: u.Quantity | float) -> float | None:
-        """V of the whole field of view: V_zodi - 2.5 log10(area), or None without a sky."""
+        """Return the V magnitude of the whole field of view, or None without a sky."""
         area = number("field of view", field_of_view_arcsec2, "arcsec2", low=1e-6, high=1e12)
         if self.surface_brightness is None:
             return None
         return float(self.surface_brightness - 2.5 * np.log10(area))
 
     def spectrum(self, field_of_view_arcsec2: u.Quantity | float) -> Source | None:
-        """Light of the whole field of view: the CALSPEC Sun at the total V, or None without a sky.
+        """Return the spectrum of the whole field of view, or None without a sky.
 
-        The paper scales HD 87646, a G2V star; zodiacal light is scattered sunlight with little reddening.
+        Zodiacal light is scattered sunlight with little reddening, so the spectrum is that of the Sun (CALSPEC) at the
+        total magnitude. The paper uses HD 87646, a G2V star.
 
         Parameters
         ----------
@@ -129,7 +124,7 @@ class Sky:
 
 @lru_cache(maxsize=16)
 def _sunlight(magnitude: float) -> Source:
-    # The library is read only when there is a sky.
+    # A sky without light does not need the library.
     from ..stars.source import Source
 
     return Source.from_library("Sun").at_magnitude(magnitude)
@@ -137,26 +132,16 @@ def _sunlight(magnitude: float) -> Source:
 
 @dataclass(frozen=True)
 class ZodiacalTable:
-    """The zodiacal table.
+    """Surface brightness of the zodiacal light on a grid of helio-ecliptic coordinates."""
 
-    Attributes
-    ----------
-    longitude_deg : ndarray, shape (13,)
-        0 to 180 in equal steps.
-    latitude_deg : ndarray, shape (7,)
-        0 to 90 in the same steps.
-    brightness : ndarray, shape (13, 7)
-        V mag arcsec^-2; NaN is solar avoidance.
-    """
-
-    longitude_deg: NDArray[np.float64]
-    latitude_deg: NDArray[np.float64]
-    brightness: NDArray[np.float64]
+    longitude_deg: NDArray[np.float64]  # 0 to 180 in equal steps, shape (13,)
+    latitude_deg: NDArray[np.float64]  # 0 to 90 in the same steps, shape (7,)
+    brightness: NDArray[np.float64]  # V mag arcsec^-2, shape (13, 7); NaN in the solar avoidance zone
 
 
 @lru_cache(maxsize=1)
 def zodiacal_table() -> ZodiacalTable:
-    """The table of the MauveSim paper, from the file beside this module."""
+    """Return the table of the MauveSim paper."""
     from astropy.table import Table
 
     path = resources.files(__package__).joinpath("zodiacal.ecsv")
@@ -168,12 +153,10 @@ def zodiacal_table() -> ZodiacalTable:
 
 
 def zodiacal_brightness(place: HelioEcliptic, lookup: Lookup = "bilinear") -> float:
-    """V mag arcsec^-2 of the zodiacal light at a place; see `Sky.at`.
+    """Return the surface brightness of the zodiacal light, V mag arcsec^-2 (see `Sky.at`).
 
-    Raises
-    ------
-    InputError
-        If the nearest cell (of two as near, the one farther from the Sun) is one of solar avoidance.
+    Raises InputError if the nearest cell (of two equally near, the one farther from the Sun) is in the solar avoidance
+    zone.
     """
     table = zodiacal_table()
     step = table.longitude_deg[1] - table.longitude_deg[0]

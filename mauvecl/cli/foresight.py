@@ -39,7 +39,7 @@ def question_values(study: Study, *, detects: bool) -> None:
     InputError
         For the first of them.
     """
-    from mauvecl.host.instrument.places import find_instrument
+    from mauvecl.host.instrument.paths import instrument_path
     from mauvecl.host.ranges import check_amplitude, check_exposure, check_magnitude, check_temperature
     from mauvecl.host.stars.band_names import known_band
     from mauvecl.results.requests.fap import check_fap
@@ -53,7 +53,7 @@ def question_values(study: Study, *, detects: bool) -> None:
         if star.magnitude is not None:
             check_magnitude(star.magnitude)
         known_band(star.band)
-    find_instrument(study.observation.instrument, Path())
+    instrument_path(study.observation.instrument, Path())
     check_exposure(study.observation.exposure_s)
     if not detects:
         return

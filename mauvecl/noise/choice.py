@@ -23,7 +23,7 @@ RAIL_SIGMA = 8.0
 #: Counts further from their base than this are not rounded to whole DN by the device.
 REACH_DN = 2.0**22
 #: Groups of four pixels have 24 bits in the counter.
-MOST_PIXELS = 65_536
+MAX_PIXELS = 65_536
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +58,8 @@ def choose(scenarios: Sequence[Expectation], drawing: Drawing, factors: Factors)
     """
     quiet, processes = scenarios[0], drawing.processes
     modulations = processes.modulations
-    if quiet.wavelength_nm.size > MOST_PIXELS:
-        raise InputError(f"{quiet.wavelength_nm.size} pixels, expected at most {MOST_PIXELS}")
+    if quiet.wavelength_nm.size > MAX_PIXELS:
+        raise InputError(f"{quiet.wavelength_nm.size} pixels, expected at most {MAX_PIXELS}")
     for other in scenarios[1:]:
         _check_same_detector(quiet, other)
     corners = _corners(factors)

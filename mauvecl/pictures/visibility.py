@@ -23,7 +23,7 @@ def calendar(answer: VisibleAnswer, path: str | Path | None) -> Any:
     draw = _calendars if len(answer.targets) <= MOST_CALENDARS else _rows
     with plt.rc_context(STYLE):
         figure = draw(plt, answer)
-        kind = "mean orbit" if answer.study.orbit.orbit().resolved(answer.moments) == "mean" else "SGP4"
+        kind = "mean orbit" if answer.study.orbit.orbit().resolved(answer.times) == "mean" else "SGP4"
         headline(figure, f"Hours of exposure a day ({kind}); limits are assumptions, no stray light")
         return finished(figure, path)
 
@@ -51,7 +51,7 @@ def _calendars(plt: Any, answer: VisibleAnswer) -> Any:
         axis.set_xticks([1, 8, 15, 22, 29])
         axis.invert_yaxis()
         total = answer.visibility.hours[k]
-        axis.set_title(f"{one.name}: {total:.0f} h in {answer.moments.days:g} d")
+        axis.set_title(f"{one.name}: {total:.0f} h in {answer.times.days:g} d")
     for axis in axes.flat[n:]:
         axis.set_visible(False)
     for axis in axes[-1]:

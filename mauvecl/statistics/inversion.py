@@ -28,7 +28,7 @@ NOTHING = 40.0
 #: Points computed at once, and where the last of them lies at most.
 BLOCK, FARTHEST = 32, 80.0
 #: Newton's steps at most, and the last one's size in the logarithm of a quantile.
-MOST_STEPS, CLOSE = 200, 1e-10
+MAX_STEPS, CLOSE = 200, 1e-10
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ class Squares:
         start = (special.gammainccinv if upper else special.gammaincinv)(shape, probability) * variance / mean
         at = float(np.log(max(start, 1e-300)))
         low, high = -700.0, 700.0
-        for _ in range(MOST_STEPS):
+        for _ in range(MAX_STEPS):
             mass, ratio = self.tail(float(np.exp(at)), upper=upper)
             off = mass - goal
             if (off > 0) == upper:
@@ -103,7 +103,7 @@ class Squares:
                 return float(np.exp(at + step))
             after = at + float(np.clip(step, -3.0, 3.0))
             at = after if low < after < high else (max(low, at - 3.0) + min(high, at + 3.0)) / 2
-        raise ArithmeticError(f"no quantile at {probability!r} after {MOST_STEPS} steps")
+        raise ArithmeticError(f"no quantile at {probability!r} after {MAX_STEPS} steps")
 
     def _integral(
         self, value: float, upper: bool, path: tuple[float, float, float], top: float

@@ -17,9 +17,9 @@ from mauvecl.study.sections import Part
 
 if TYPE_CHECKING:
     from mauvecl.host.orbit.limits import Limits
-    from mauvecl.host.orbit.moments import Moments
-    from mauvecl.host.orbit.names import Target
     from mauvecl.host.orbit.orbit import Orbit
+    from mauvecl.host.orbit.targets import Target
+    from mauvecl.host.orbit.time_grid import TimeGrid
     from mauvecl.lightcurve.flares.rates import Rates
     from mauvecl.lightcurve.search.completeness import DurationLaw
     from mauvecl.study.study import Study
@@ -110,11 +110,11 @@ class OrbitQuestion(Part):
 
         return Orbit.load(self.tle, self.kind)
 
-    def moments(self) -> Moments:
+    def times(self) -> TimeGrid:
         """The times that are looked at."""
-        from mauvecl.host.orbit.moments import Moments
+        from mauvecl.host.orbit.time_grid import TimeGrid
 
-        return Moments(self.start, self.days, self.step_s)
+        return TimeGrid(self.start, self.days, self.step_s)
 
 
 class PlanTarget(Part):
@@ -177,7 +177,7 @@ class PlanTarget(Part):
         """Its place and what is known of it."""
         from dataclasses import replace
 
-        from mauvecl.host.orbit.names import Target
+        from mauvecl.host.orbit.targets import Target
 
         if self.coordinates is None:
             return Target.of(self.name, name=self.name, simbad=simbad)
@@ -271,7 +271,7 @@ def targets_of(study: Study) -> list[Target]:
     InputError
         If there are none, or one is unknown.
     """
-    from mauvecl.host.orbit.names import Target
+    from mauvecl.host.orbit.targets import Target
 
     o = study.orbit
     targets = [Target.of(text, simbad=o.simbad) for text in o.targets] or [

@@ -132,16 +132,16 @@ def unused_lines(study: Study, staring: Staring, events: Sequence[Event]) -> lis
 
 def orbit_lines(study: Study) -> list[str]:
     """What must be told of the orbit that a study's stare is along, if it is."""
-    from mauvecl.host.orbit.moments import DAY_S, Moments
+    from mauvecl.host.orbit.time_grid import DAY_S, TimeGrid
 
     if not study.stare.along_orbit:
         return []
     o = study.orbit
-    moments = Moments(o.start, study.stare.duration_s / DAY_S, study.load_instrument().frame_s)
+    times = TimeGrid(o.start, study.stare.duration_s / DAY_S, study.load_instrument().frame_s)
     assumed = (
         "Limits, temperatures and windows of a stare along the orbit are assumptions; stray light is not modelled."
     )
-    return [*o.orbit().messages(moments), assumed]
+    return [*o.orbit().messages(times), assumed]
 
 
 def energy_scale(

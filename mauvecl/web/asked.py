@@ -16,7 +16,7 @@ from mauvecl.answers.signal.snr import SnrAnswer, snr
 from mauvecl.answers.stares.inject import InjectAnswer, inject
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
-from mauvecl.host.orbit.names import Target
+from mauvecl.host.orbit.targets import Target
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:

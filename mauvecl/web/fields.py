@@ -113,7 +113,7 @@ def star_name(text: str) -> str:
 
 def seen_target(text: str) -> str:
     """What to look at: nothing, a name of the embedded list, or coordinates."""
-    from mauvecl.host.orbit.names import Target
+    from mauvecl.host.orbit.targets import Target
 
     try:
         if text.strip():

@@ -80,9 +80,9 @@ class State:
 
     def _placed(self) -> None:
         """Whether target and time can be read, where the sky is theirs."""
-        from mauvecl.host.sky.helioecliptic import moment_of, offline, position_of
+        from mauvecl.host.sky.helioecliptic import offline, parse_position, parse_time
 
-        read: tuple[tuple[str, Callable[[str], Any]], ...] = (("target", position_of), ("time", moment_of))
+        read: tuple[tuple[str, Callable[[str], Any]], ...] = (("target", parse_position), ("time", parse_time))
         for name, understood in read:
             if not self.faults.get(name, name).startswith(name):
                 continue

@@ -115,7 +115,7 @@ def test_pictures(found: VisibleAnswer, study: Study) -> None:
 
 def test_dates_as_toml_has_them() -> None:
     starts = ("orbit.start=2027-01-01", "orbit.start=2027-01-01T06:00:00", "orbit.start=2027-01-01T06:00:00+02:00")
-    found = [Study().with_settings([one]).orbit.moments().iso(0.0) for one in starts]
+    found = [Study().with_settings([one]).orbit.times().iso(0.0) for one in starts]
     assert found == ["2027-01-01T00:00:00", "2027-01-01T06:00:00", "2027-01-01T04:00:00"]
 
 

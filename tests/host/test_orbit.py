@@ -10,8 +10,8 @@ import sgp4
 from mauvecl.host.errors import InputError
 from mauvecl.host.orbit.earth import direction
 from mauvecl.host.orbit.elements import Elements
-from mauvecl.host.orbit.moments import Moments, utc_text
 from mauvecl.host.orbit.orbit import MEAN_FROM_D, Orbit, Track
+from mauvecl.host.orbit.time_grid import TimeGrid, utc_text
 from mauvecl.host.sky.helioecliptic import offline
 
 VECTORS = Path(sgp4.__file__).parent
@@ -25,7 +25,7 @@ def orbit() -> Orbit:
 @pytest.fixture(scope="module")
 def day(orbit: Orbit) -> Track:
     """A day at the elements' epoch."""
-    return orbit.track(Moments("2026-09-14T12:00", 1.0, 60.0))
+    return orbit.track(TimeGrid("2026-09-14T12:00", 1.0, 60.0))
 
 
 def verification() -> list[tuple[str, str, list[list[float]]]]:
@@ -64,7 +64,7 @@ def test_a_track_goes_through_the_verification_vectors() -> None:
     minutes = np.array([row[0] for row in rows])
     step = float(minutes[1] - minutes[0]) * 60
     start = utc_text(elements.epoch_jd + (minutes[0] * 60 - step / 2) / 86_400, 6)
-    track = Orbit(elements, "tle").track(Moments(start, len(rows) * step / 86_400, step))
+    track = Orbit(elements, "tle").track(TimeGrid(start, len(rows) * step / 86_400, step))
     assert np.abs(track.of_date_km - np.array(rows)[:, 1:]).max() < 0.02
 
 
@@ -74,14 +74,14 @@ def test_frames_are_astropys(day: Track) -> None:
         from astropy.coordinates import GCRS, ITRS, TEME, CartesianRepresentation, get_body
         from astropy.time import Time
 
-        times = Time(*day.moments.julian, format="jd", scale="utc")
+        times = Time(*day.times.julian, format="jd", scale="utc")
         here = TEME(CartesianRepresentation(day.of_date_km.T * u.km), obstime=times)
         there = here.transform_to(GCRS(obstime=times)).cartesian.xyz.to_value("km").T
         place = here.transform_to(ITRS(obstime=times)).earth_location.geodetic
         moon = get_body("moon", times).cartesian.xyz.to_value("km").T
         sun = get_body("sun", times).cartesian.xyz.to_value("km").T
     assert np.abs(there - day.position_km).max() < 0.005
-    longitude, latitude = day.below_deg
+    longitude, latitude = day.subsatellite_deg
     assert np.abs((place.lon.deg - longitude + 180) % 360 - 180).max() < 0.005  # UT1 - UTC
     assert np.abs(place.lat.deg - latitude).max() < 0.001
     assert np.abs(moon - day.bodies.moon_km).max() < 2.0  # 1 arcsec
@@ -99,27 +99,27 @@ def test_check_values(orbit: Orbit, day: Track) -> None:
     assert elements.epoch == "2026-09-14T15:42:13"
     assert day.local_time_h.mean() * 60 == pytest.approx(10 * 60 + 26, abs=0.5)
     # Ten whole orbits; a step of 20 s is 0.04 % of them.
-    whole = orbit.track(Moments("2026-09-14T12:00", 10 * elements.period_s / 86_400, 20.0))
+    whole = orbit.track(TimeGrid("2026-09-14T12:00", 10 * elements.period_s / 86_400, 20.0))
     assert in_shadow(whole).mean() == pytest.approx(0.368, abs=0.002)
-    year = orbit.track(Moments("2026-09-14", 365.0, 7200.0))
+    year = orbit.track(TimeGrid("2026-09-14", 365.0, 7200.0))
     assert 16.5 < year.beta_deg.min() < 18.5
     assert 27.5 < year.beta_deg.max() < 28.5
-    month = orbit.track(Moments("2026-09-14", 30.0, 60.0))
-    flux = proton_map().at(*month.below_deg)
+    month = orbit.track(TimeGrid("2026-09-14", 30.0, 60.0))
+    flux = proton_map().at(*month.subsatellite_deg)
     shares = [100 * float((flux > limit).mean()) for limit in (1, 10, 100)]
     assert shares == pytest.approx([6.3, 5.0, 3.2], abs=0.15)
-    longitude, latitude = (np.asarray(values)[flux > 10] for values in month.below_deg)
+    longitude, latitude = (np.asarray(values)[flux > 10] for values in month.subsatellite_deg)
     ends = [longitude.min(), longitude.max(), latitude.min(), latitude.max()]
     assert ends == pytest.approx([-71, 31, -55, -10], abs=2.0)  # cells are 2 deg wide
 
 
 def test_mean_orbit(orbit: Orbit) -> None:
     """It begins where SGP4 has the satellite, keeps its local time, and says what it is."""
-    near = Moments("2026-09-14T15:00", 0.1, 30.0)
+    near = TimeGrid("2026-09-14T15:00", 0.1, 30.0)
     mean, exact = (Orbit(orbit.elements, kind).track(near) for kind in ("mean", "tle"))
     apart = np.linalg.norm(mean.of_date_km - exact.of_date_km, axis=1)
     assert apart.max() < 30  # short-period terms of J2 and the eccentricity
-    later = Moments("2027-06-01", 30.0, 60.0)
+    later = TimeGrid("2027-06-01", 30.0, 60.0)
     assert orbit.resolved(later) == "mean"
     assert np.abs(orbit.track(later).local_time_h - mean.local_time_h.mean()).max() < 0.01
     assert "mean Sun-synchronous" in orbit.messages(later)[0]
@@ -129,7 +129,7 @@ def test_mean_orbit(orbit: Orbit) -> None:
 
 def test_the_mean_orbit_follows_sgp4_for_a_fortnight(orbit: Orbit) -> None:
     """Its node, and its place along the orbit but for drag, which SGP4 has and it has not."""
-    fortnight = Moments("2026-09-28T00:00", 0.1, 30.0)
+    fortnight = TimeGrid("2026-09-28T00:00", 0.1, 30.0)
     mean, exact = (Orbit(orbit.elements, kind).track(fortnight) for kind in ("mean", "tle"))
     assert np.degrees(np.arccos((mean.normal * exact.normal).sum(axis=1))).max() < 0.1
     apart = np.linalg.norm(mean.of_date_km - exact.of_date_km, axis=1).max()
@@ -137,12 +137,12 @@ def test_the_mean_orbit_follows_sgp4_for_a_fortnight(orbit: Orbit) -> None:
 
 
 def test_what_is_told_of_the_epoch(orbit: Orbit) -> None:
-    assert orbit.messages(Moments("2026-09-20", 5.0)) == []
-    told = orbit.messages(Moments("2026-10-10", 5.0))
+    assert orbit.messages(TimeGrid("2026-09-20", 5.0)) == []
+    told = orbit.messages(TimeGrid("2026-10-10", 5.0))
     assert len(told) == 1
     assert "along its track" in told[0]
     assert orbit.along_track_km(30) == pytest.approx(1 + 60 + 0.5 * 5.125e-5 * 900 * 2 * np.pi * 6879.04, rel=1e-4)
-    assert orbit.farthest_d(Moments("2026-10-10", 5.0)) < MEAN_FROM_D
+    assert orbit.farthest_d(TimeGrid("2026-10-10", 5.0)) < MEAN_FROM_D
 
 
 @pytest.mark.parametrize(
@@ -168,18 +168,18 @@ def test_own_elements(tmp_path: Path, orbit: Orbit) -> None:
 @pytest.mark.parametrize("kwargs", [{"days": 0.0}, {"days": float("nan")}, {"step_s": 1e-3}, {"start": "yesterday"}])
 def test_impossible_times(kwargs: dict[str, float | str]) -> None:
     with pytest.raises(InputError):
-        Moments(**({"start": "2027-01-01", "days": 365.0} | kwargs))  # type: ignore[arg-type]
+        TimeGrid(**({"start": "2027-01-01", "days": 365.0} | kwargs))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("start", ["2027-01-01", "2027-01-01T11:59:59", "2027-01-01T12:00:01", "2027-01-01T23:59:59.5"])
 def test_days_begin_at_midnight(start: str) -> None:
     """However astropy divides a date into two numbers."""
-    moments = Moments(start, 1.0, 3600.0)
-    midnight, fraction = moments.first
+    times = TimeGrid(start, 1.0, 3600.0)
+    midnight, fraction = times.first
     assert midnight % 1 == 0.5
     assert 0 <= fraction < 1
-    assert moments.iso(0.0, 1) == f"{start}T00:00:00.0" if len(start) == 10 else f"{start}.0"[:21]
-    assert np.floor(moments.julian[1][0]) == 0 or start.endswith("59.5")
+    assert times.iso(0.0, 1) == f"{start}T00:00:00.0" if len(start) == 10 else f"{start}.0"[:21]
+    assert np.floor(times.julian[1][0]) == 0 or start.endswith("59.5")
 
 
 def test_nothing_global_is_left_changed(orbit: Orbit) -> None:
@@ -187,7 +187,7 @@ def test_nothing_global_is_left_changed(orbit: Orbit) -> None:
     from astropy.utils import iers
 
     before = iers.conf.auto_download, solar_system_ephemeris.get()
-    _ = orbit.track(Moments("2027-03-01", 1.0)).beta_deg
+    _ = orbit.track(TimeGrid("2027-03-01", 1.0)).beta_deg
     assert (iers.conf.auto_download, solar_system_ephemeris.get()) == before
 
 

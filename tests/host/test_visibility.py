@@ -11,15 +11,15 @@ from astropy.table import Table
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
-from mauvecl.host.orbit import constraints as must
+from mauvecl.host.orbit import constraints
 from mauvecl.host.orbit.conditions import Particles, Thermal
 from mauvecl.host.orbit.earth import direction, unit
 from mauvecl.host.orbit.limits import Limits
-from mauvecl.host.orbit.moments import Moments
-from mauvecl.host.orbit.names import Target
 from mauvecl.host.orbit.orbit import Orbit, circular
 from mauvecl.host.orbit.radiation import proton_map
 from mauvecl.host.orbit.season import elongation_deg, zodiacal_light
+from mauvecl.host.orbit.targets import Target
+from mauvecl.host.orbit.time_grid import TimeGrid
 from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.host.sky.helioecliptic import helioecliptic, offline
 from mauvecl.host.sky.zodiacal import zodiacal_brightness
@@ -30,7 +30,7 @@ AXIS_KM = 6879.0
 @pytest.fixture(scope="module")
 def month() -> Visibility:
     """Five targets, forty days over the end of a month."""
-    track = Orbit.load().track(Moments("2026-12-20T06:30", 40.0, 60.0))
+    track = Orbit.load().track(TimeGrid("2026-12-20T06:30", 40.0, 60.0))
     names = ("eps Eri", "AU Mic", "V889 Her", "EK Dra", "DX Leo")
     return Visibility.of(track, np.array([Target.of(name).direction for name in names]))
 
@@ -45,7 +45,7 @@ def test_visible_share_of_a_circular_orbit(from_plane_deg: float, shares: tuple[
     normal = unit(np.cross(position[0], position[5000]))
     target = np.cos(np.radians(from_plane_deg)) * unit(position[0]) + np.sin(np.radians(from_plane_deg)) * normal
     for margin, share in zip((0.0, 10.0, 20.0), shares, strict=True):
-        found = must.clear_of_earth(position, target[None], margin).mean()
+        found = constraints.clear_of_earth(position, target[None], margin).mean()
         assert found == pytest.approx(share, abs=0.005 * share)
         rho = np.arcsin(6378.137 / AXIS_KM)
         cosine = np.cos(rho + np.radians(margin)) / np.cos(np.radians(from_plane_deg))
@@ -57,7 +57,7 @@ def test_continuous_viewing(margin: float) -> None:
     """Always visible within 22.0 - x deg of the orbit's pole."""
     position, _ = circular(AXIS_KM, 0.0, 0.0, np.linspace(0, 2 * np.pi, 400, endpoint=False))
     from_pole = np.arange(0.0, 30.0, 0.05)
-    seen = must.clear_of_earth(position, direction(0.0, 90 - from_pole), margin).all(axis=0)
+    seen = constraints.clear_of_earth(position, direction(0.0, 90 - from_pole), margin).all(axis=0)
     assert from_pole[seen].max(initial=-1.0) == pytest.approx(22.0 - margin, abs=0.1)
 
 
@@ -67,7 +67,7 @@ def test_m4opts_definitions() -> None:
     The Earth's limb: altitude + arccos(R_earth / distance); its altitude is over the ellipsoid's horizon, up to 0.2 deg
     from the sphere's. Sun and Moon: `get_body` for the place, and `separation`.
     """
-    track = Orbit.load().track(Moments("2026-09-14T12:00", 0.5, 600.0))
+    track = Orbit.load().track(TimeGrid("2026-09-14T12:00", 0.5, 600.0))
     names = ("eps Eri", "AU Mic", "Vega")
     target = np.array([Target.of(name).direction for name in names])
     with offline():
@@ -76,8 +76,8 @@ def test_m4opts_definitions() -> None:
         from astropy.coordinates import AltAz, EarthLocation, SkyCoord, get_body
         from astropy.time import Time
 
-        times = Time(*track.moments.julian, format="jd", scale="utc")
-        longitude, latitude = track.below_deg
+        times = Time(*track.times.julian, format="jd", scale="utc")
+        longitude, latitude = track.subsatellite_deg
         height = np.linalg.norm(track.of_date_km, axis=1) * u.km
         # The place at its true distance: geodetic height by the ellipsoid.
         place = EarthLocation.from_geodetic(longitude * u.deg, latitude * u.deg, 0 * u.m)
@@ -88,7 +88,9 @@ def test_m4opts_definitions() -> None:
             there = SkyCoord(one.ra_deg, one.dec_deg, unit="deg")
             altitude = there.transform_to(AltAz(obstime=times, location=place)).alt.deg
             theirs = altitude + np.degrees(np.arccos(R_earth.to_value("km") / height.to_value("km")))
-            ours = np.degrees(np.arccos(-unit(track.position_km) @ star) - must.limb_angle_rad(track.position_km))
+            ours = np.degrees(
+                np.arccos(-unit(track.position_km) @ star) - constraints.limb_angle_rad(track.position_km)
+            )
             assert np.abs(theirs - ours).max() < 0.25
             for body, found in (
                 ("sun", track.bodies.sun),
@@ -103,12 +105,12 @@ def test_flags_are_the_angles(month: Visibility) -> None:
     track, target = month.track, month.target
     part = slice(0, 3000)
     at = track.position_km[part]
-    above = np.degrees(np.arccos(-unit(at) @ target.T) - must.limb_angle_rad(at)[:, None])
-    _agree(must.clear_of_earth(at, target, 25.0), above - 25.0)
+    above = np.degrees(np.arccos(-unit(at) @ target.T) - constraints.limb_angle_rad(at)[:, None])
+    _agree(constraints.clear_of_earth(at, target, 25.0), above - 25.0)
     sun = np.degrees(np.arccos(track.bodies.sun[part] @ target.T))
-    _agree(must.clear_of_sun(track.bodies.sun[part], target, 46.0), sun - 46.0)
+    _agree(constraints.clear_of_sun(track.bodies.sun[part], target, 46.0), sun - 46.0)
     moon = np.degrees(np.arccos(unit(track.bodies.moon_km[part] - at) @ target.T))
-    _agree(must.clear_of_moon(track.bodies.moon_km[part], at, target, 25.0), moon - 25.0)
+    _agree(constraints.clear_of_moon(track.bodies.moon_km[part], at, target, 25.0), moon - 25.0)
 
 
 def _agree(flags: NDArray[np.bool_], over_deg: NDArray[np.float64]) -> None:
@@ -130,11 +132,11 @@ def test_windows_add_up(month: Visibility) -> None:
         assert (windows.in_shadow_s <= windows.length_s).all()
         assert (windows.start_s[1:] > windows.stop_s[:-1]).all()
     # Days begin at midnight: the first after 17.5 hours.
-    second = np.floor((month.track.moments.seconds / 3600 - 17.5) / 24) == 0
+    second = np.floor((month.track.times.seconds / 3600 - 17.5) / 24) == 0
     assert month.by_day(0)[1] == pytest.approx(month.seen[second, 0].sum() / 60)
     assert len(month.by_day(0)) == 41
     # The first of January begins after 11 days and 17.5 hours.
-    split = month.track.moments.seconds < (11 * 24 + 17.5) * 3600
+    split = month.track.times.seconds < (11 * 24 + 17.5) * 3600
     assert hours[0] == pytest.approx(month.seen[split].sum(axis=0) / 60)
     # Orbits of 94.6 minutes in forty days.
     assert len(month.by_orbit(0)) in (609, 610)
@@ -180,7 +182,7 @@ def test_shadow_of_a_circular_orbit() -> None:
     position, _ = circular(AXIS_KM, 0.0, 0.0, np.linspace(0, 2 * np.pi, 50_000, endpoint=False))
     for beta in (0.0, 17.0, 28.0, 60.0, 75.0):
         sun = np.broadcast_to(direction(30.0, beta), position.shape)
-        found = (must.sunlight(position, sun, np.full(len(position), 1.496e8)) < 0.5).mean()
+        found = (constraints.sunlight(position, sun, np.full(len(position), 1.496e8)) < 0.5).mean()
         cosine = np.sqrt(1 - (6378.137 / AXIS_KM) ** 2) / np.cos(np.radians(beta))
         assert found == pytest.approx(0.0 if cosine > 1 else np.arccos(cosine) / np.pi, abs=2e-4)
 
@@ -188,8 +190,8 @@ def test_shadow_of_a_circular_orbit() -> None:
 def test_polygon_over_the_date_line() -> None:
     corners = np.array([[170.0, -10.0], [-170.0, -10.0], [-170.0, 10.0], [170.0, 10.0]])
     longitude = np.array([175.0, -175.0, 185.0, 165.0, -165.0, 0.0])
-    assert must.in_polygon(longitude, np.zeros(6), corners).tolist() == [True, True, True, False, False, False]
-    assert not must.in_polygon(np.array([180.0]), np.array([11.0]), corners)[0]
+    assert constraints.in_polygon(longitude, np.zeros(6), corners).tolist() == [True, True, True, False, False, False]
+    assert not constraints.in_polygon(np.array([180.0]), np.array([11.0]), corners)[0]
 
 
 def test_map_between_cells() -> None:
@@ -209,13 +211,13 @@ def test_map_between_cells() -> None:
 
 def test_zodiacal_light_over_the_year() -> None:
     """As `Sky.at` has it, target by target and day by day."""
-    moments = Moments("2027-01-01", 360.0, 86_400 * 30)
-    bodies = Orbit.load().track(moments).bodies
+    times = TimeGrid("2027-01-01", 360.0, 86_400 * 30)
+    bodies = Orbit.load().track(times).bodies
     for name in ("eps Eri", "Vega"):
         star = Target.of(name)
         light, away = zodiacal_light(bodies, star.direction), elongation_deg(bodies.sun, star.direction)
-        for i, seconds in enumerate(moments.seconds):
-            place = helioecliptic(f"{star.ra_deg} {star.dec_deg}", moments.iso(float(seconds)))
+        for i, seconds in enumerate(times.seconds):
+            place = helioecliptic(f"{star.ra_deg} {star.dec_deg}", times.iso(float(seconds)))
             assert away[i] == pytest.approx(place.separation_deg, abs=0.01)
             if np.isfinite(light[i]):
                 assert light[i] == pytest.approx(zodiacal_brightness(place), abs=0.01)
@@ -239,7 +241,7 @@ def test_temperature_follows_its_equation() -> None:
 def test_hits_along_the_orbit(month: Visibility) -> None:
     rate = Particles(1.0, 0.5).rate_per_cm2_s(month.track)
     assert rate.min() == 1.0
-    flux = proton_map().at(*month.track.below_deg, above_mev=30)
+    flux = proton_map().at(*month.track.subsatellite_deg, above_mev=30)
     assert rate.max() == pytest.approx(1 + flux.max() / 2)
 
 
@@ -299,7 +301,7 @@ def test_simbad(monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_no_network_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     """With a network that fails, one that never answers, and without astroquery."""
-    from mauvecl.host.orbit import names
+    from mauvecl.host.orbit import targets
 
     def fails(_: str) -> None:
         raise ConnectionError("no route to host")
@@ -311,7 +313,7 @@ def test_no_network_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch:
         done = threading.Event()
         _simbad(patch, lambda _: done.wait(60))
-        patch.setattr(names, "TIMEOUT_S", 0.1)
+        patch.setattr(targets, "TIMEOUT_S", 0.1)
         with pytest.raises(InputError, match=r"within 0.1 s \(TimeoutError\)"):
             Target.of("HD 1", simbad=True)
         done.set()

@@ -6,9 +6,9 @@ import pytest
 from mauvecl.host.errors import InputError
 from mauvecl.host.orbit.conditions import Thermal
 from mauvecl.host.orbit.limits import Limits
-from mauvecl.host.orbit.moments import Moments
-from mauvecl.host.orbit.names import Target
 from mauvecl.host.orbit.orbit import Orbit
+from mauvecl.host.orbit.targets import Target
+from mauvecl.host.orbit.time_grid import TimeGrid
 from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.lightcurve.stares.along import OrbitStare, stare_along
 from mauvecl.lightcurve.stares.stare import Stare
@@ -27,7 +27,7 @@ def night(orbit: Orbit) -> OrbitStare:
 
 
 def test_frames_are_the_windows(orbit: Orbit, night: OrbitStare) -> None:
-    track = orbit.track(Moments(START, HOURS / 24, 5.0))
+    track = orbit.track(TimeGrid(START, HOURS / 24, 5.0))
     windows = Visibility.of(track, Target.of("eps Eri").direction[None]).windows(0)
     assert night.stare.gtis == pytest.approx(np.column_stack([windows.start_s, windows.stop_s]))
     assert 0 < night.stare.n_frames < HOURS * 720

@@ -61,7 +61,7 @@ class Met:
     def along(cls, track: Track, thermal: Thermal | None = None, particles: Particles | None = None) -> Met:
         """As the orbit gives it; both are assumed unless given."""
         light = sunlight(track.position_km, track.bodies.sun, track.bodies.sun_km)
-        temperature = (thermal or Thermal()).temperature_c(light, track.moments.step_s)
+        temperature = (thermal or Thermal()).temperature_c(light, track.times.step_s)
         return cls(temperature, (particles or Particles()).rate_per_cm2_s(track))
 
     def of(self, visibility: Visibility, k: int, orbit_s: float) -> Conditions | None:
@@ -70,7 +70,7 @@ class Met:
         if not seen.any():
             return None
         mean = float(self.temperature_c[seen].mean())
-        step = visibility.track.moments.step_s
+        step = visibility.track.times.step_s
         # Of windows of one length the first.
         typical = int(np.argmin(np.abs(windows.length_s - np.median(windows.length_s))))
         first = round(float(windows.start_s[typical]) / step)

@@ -81,8 +81,8 @@ class PlanAnswer(Answer):
                     ("false_alarms", self.false_alarms, "expected of noise"),
                     ("best_months", [" ".join(one.best_months) for one in rows], "those with most hours"),
                 ],
-                start=self.seen.moments.iso(0.0),
-                days=self.seen.moments.days,
+                start=self.seen.times.iso(0.0),
+                days=self.seen.times.days,
                 false_alarms_per_day=self.study.search.rate,
                 study=self.study.text(),
             )
@@ -161,7 +161,7 @@ class PlanAnswer(Answer):
             ("stray light", "none", "not modelled"),
             (
                 "orbit",
-                orbit.resolved(self.seen.moments),
+                orbit.resolved(self.seen.times),
                 f"{orbit.elements.source}, epoch {orbit.elements.epoch}; mean is a Sun-synchronous orbit through them",
             ),
             ("throughput", self.study.observation.instrument, "nominal, not a flight calibration"),
@@ -196,7 +196,7 @@ class PlanAnswer(Answer):
             ),
         ]
         rows += [(f"flare rates of {one.name}", one.rates.source, _measured(one)) for one in self.planned if one.rates]
-        rows += [("where the satellite will be", "", text) for text in orbit.messages(self.seen.moments)]
+        rows += [("where the satellite will be", "", text) for text in orbit.messages(self.seen.times)]
         rows += [(f"completeness of {one.name}", "", one.completeness.how) for one in self.planned if one.completeness]
         return Table(rows=rows, names=("assumption", "value", "source"))
 

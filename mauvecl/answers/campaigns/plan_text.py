@@ -100,6 +100,6 @@ def target_lines(answer: PlanAnswer, k: int) -> list[tuple[str, str, str]]:
 
 def heading(answer: PlanAnswer) -> str:
     """What the plan is, in a line."""
-    moments = answer.seen.moments
+    times = answer.seen.times
     targets = "1 target" if len(answer.planned) == 1 else f"{len(answer.planned)} targets"
-    return f"{targets}, {moments.days:g} days from {moments.iso(0.0)[:10]} (UTC)"
+    return f"{targets}, {times.days:g} days from {times.iso(0.0)[:10]} (UTC)"

@@ -10,7 +10,7 @@ import numpy as np
 
 from mauvecl.answers.campaigns.conditions import Conditions, Met, hits_variance_dn2
 from mauvecl.host.errors import InputError
-from mauvecl.host.orbit.names import Target
+from mauvecl.host.orbit.targets import Target
 from mauvecl.lightcurve.flares.energies import EnergyScale
 from mauvecl.lightcurve.flares.rates import BOLOMETRIC, Rates
 from mauvecl.lightcurve.search.completeness import Completeness, frame_signal

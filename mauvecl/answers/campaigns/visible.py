@@ -14,9 +14,9 @@ from mauvecl.answers.answer import Answer
 from mauvecl.answers.campaigns.calendars import Entry, calendar_bytes
 from mauvecl.host.arguments import public
 from mauvecl.host.orbit.bodies import Bodies
-from mauvecl.host.orbit.moments import DAY_S, Moments
-from mauvecl.host.orbit.names import Target
 from mauvecl.host.orbit.season import elongation_deg, zodiacal_light
+from mauvecl.host.orbit.targets import Target
+from mauvecl.host.orbit.time_grid import DAY_S, TimeGrid
 from mauvecl.host.orbit.visibility import Visibility, Windows
 from mauvecl.host.tables import tabled
 from mauvecl.study.labels import described, stacked
@@ -53,21 +53,21 @@ class VisibleAnswer(Answer):
     visibility: Visibility
 
     @property
-    def moments(self) -> Moments:
+    def times(self) -> TimeGrid:
         """The times that are looked at."""
-        return self.visibility.track.moments
+        return self.visibility.track.times
 
     @cached_property
     def days(self) -> list[str]:
         """Its UTC days, such as "2027-01-31"."""
-        first = np.datetime64(self.moments.iso(0.0)[:10], "D")
-        count = int(np.floor(self.moments.julian[1][-1])) + 1
+        first = np.datetime64(self.times.iso(0.0)[:10], "D")
+        count = int(np.floor(self.times.julian[1][-1])) + 1
         return [str(first + n) for n in range(count)]
 
     @cached_property
     def noons(self) -> Bodies:
         """Sun and Moon at the noon of each day, UTC."""
-        return Bodies.at(Moments(self.days[0], len(self.days), DAY_S))
+        return Bodies.at(TimeGrid(self.days[0], len(self.days), DAY_S))
 
     def elongation_deg(self, k: int) -> Float:
         """Angle of a target from the Sun at noon of each day, (n_day,)."""
@@ -122,7 +122,7 @@ class VisibleAnswer(Answer):
             ("brightest_sky", brightest, "zodiacal light at its brightest, V, where the table has it", sky),
             ("faintest_sky", faintest, "zodiacal light at its faintest, V", sky),
         ]
-        about = {"start": self.moments.iso(0.0), "days": self.moments.days}
+        about = {"start": self.times.iso(0.0), "days": self.times.days}
         return described(tabled(columns, **about, study=self.study.text()))
 
     def _longest_gap_d(self, k: int) -> float:
@@ -130,7 +130,7 @@ class VisibleAnswer(Answer):
         one = self.windows[k]
         ends = (
             np.concatenate([[0.0], one.stop_s]),
-            np.concatenate([one.start_s, [self.moments.n * self.moments.step_s]]),
+            np.concatenate([one.start_s, [self.times.n * self.times.step_s]]),
         )
         return float(np.max(ends[1] - ends[0])) / DAY_S
 
@@ -164,16 +164,16 @@ class VisibleAnswer(Answer):
     @property
     def window_table(self) -> QTable:
         """One row per window."""
-        moments, z = self.moments, self.visibility.track.of_date_km[:, 2]
-        nodes = moments.seconds[1:][(z[:-1] < 0) & (z[1:] >= 0)]
+        times, z = self.times, self.visibility.track.of_date_km[:, 2]
+        nodes = times.seconds[1:][(z[:-1] < 0) & (z[1:] >= 0)]
         nothing, orbits = np.array([], "U19"), "ascending nodes since the start of the plan"
         parts = (
             (
                 {"target": one.name},
                 tabled(
                     [
-                        ("start", [moments.iso(float(t)) for t in windows.start_s] or nothing),
-                        ("stop", [moments.iso(float(t)) for t in windows.stop_s] or nothing),
+                        ("start", [times.iso(float(t)) for t in windows.start_s] or nothing),
+                        ("stop", [times.iso(float(t)) for t in windows.stop_s] or nothing),
                         ("length", windows.length_s / 60, "", "min"),
                         ("in_shadow", windows.in_shadow_s / 60, "of it, in the Earth's shadow", "min"),
                         ("orbit", np.searchsorted(nodes, windows.start_s), orbits),
@@ -182,7 +182,7 @@ class VisibleAnswer(Answer):
             )
             for one, windows in zip(self.targets, self.windows, strict=True)
         )
-        return stacked(parts, study=self.study.text(), step_s=moments.step_s)
+        return stacked(parts, study=self.study.text(), step_s=times.step_s)
 
     @property
     def assumptions(self) -> Table:
@@ -211,13 +211,13 @@ class VisibleAnswer(Answer):
 
     def entries(self) -> list[Entry]:
         """Appointments of the calendar."""
-        moments, entries = self.moments, list[Entry]()
-        single = self.study.orbit.orbit().resolved(moments) == "tle" and self._writes_windows
+        times, entries = self.times, list[Entry]()
+        single = self.study.orbit.orbit().resolved(times) == "tle" and self._writes_windows
         for k, one in enumerate(self.targets):
             if single:
                 windows = self.windows[k]
                 entries += [
-                    Entry(moments.iso(float(a)), moments.iso(float(b)), one.name, f"{(b - a) / 60:.0f} min of exposure")
+                    Entry(times.iso(float(a)), times.iso(float(b)), one.name, f"{(b - a) / 60:.0f} min of exposure")
                     for a, b in zip(windows.start_s, windows.stop_s, strict=True)
                 ]
                 continue
@@ -238,7 +238,7 @@ class VisibleAnswer(Answer):
         """What the orbit is, what is assumed, what is not modelled, and which targets are never seen."""
         never = [one.name for one, part in zip(self.targets, self.visibility.share, strict=True) if part == 0]
         lines = [f"{name} is never seen: {self.reason(name)}." for name in never]
-        lines += self.study.orbit.orbit().messages(self.moments)
+        lines += self.study.orbit.orbit().messages(self.times)
         lines.append(
             "Mauve's own limits are not public: those used are assumptions, named with their sources in the table of "
             "assumptions. Stray light is not modelled."
@@ -288,6 +288,6 @@ def visible(study: Study) -> VisibleAnswer:
     """
     targets = tuple(targets_of(study))
     o = study.orbit
-    track = o.orbit().track(o.moments())
+    track = o.orbit().track(o.times())
     directions = np.array([one.direction for one in targets])
     return VisibleAnswer(study, targets, Visibility.of(track, directions, o.limits.limits()))

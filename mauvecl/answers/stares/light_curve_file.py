@@ -62,9 +62,9 @@ def light_curve_file(answer: StareAnswer, number: int = 0) -> bytes:
 
 
 def _mjd(when: str) -> float:
-    from mauvecl.host.sky.helioecliptic import moment_of
+    from mauvecl.host.sky.helioecliptic import parse_time
 
-    return float(moment_of(when).utc.mjd)
+    return float(parse_time(when).utc.mjd)
 
 
 def _table(one: StarStare) -> fits.BinTableHDU:

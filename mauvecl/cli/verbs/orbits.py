@@ -103,7 +103,7 @@ def _show_visible(answer: VisibleAnswer) -> None:
 
     table = answer.table
     show_table(
-        f"Seen in {answer.moments.days:g} days from {answer.moments.iso(0.0)} UTC",
+        f"Seen in {answer.times.days:g} days from {answer.times.iso(0.0)} UTC",
         ("target", "RA", "dec", "hours", "share", "windows", "median", "longest gap", "least elongation", "best month"),
         [
             (str(row["target"]), f"{row['ra'].value:.3f}", f"{row['dec'].value:.3f}", f"{row['hours'].value:.0f}",

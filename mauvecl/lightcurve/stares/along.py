@@ -12,9 +12,9 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.orbit.conditions import Particles, Thermal
 from mauvecl.host.orbit.constraints import sunlight
 from mauvecl.host.orbit.limits import Limits
-from mauvecl.host.orbit.moments import DAY_S, Moments
-from mauvecl.host.orbit.names import Target
 from mauvecl.host.orbit.orbit import Orbit, Track
+from mauvecl.host.orbit.targets import Target
+from mauvecl.host.orbit.time_grid import DAY_S, TimeGrid
 from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.lightcurve.stares.stare import MOST_FRAMES, Stare
 
@@ -100,13 +100,13 @@ def stare_along(
     place = target if isinstance(target, Target) else Target.of(target)
     thermal, particles = thermal or Thermal(), particles or Particles()
     count = int(np.ceil(duration_s / frame_s * (1 - 1e-12)))
-    moments = Moments(start, count * frame_s / DAY_S, frame_s)
-    track = orbit.track(moments)
+    times = TimeGrid(start, count * frame_s / DAY_S, frame_s)
+    track = orbit.track(times)
     visible = Visibility.of(track, place.direction[None], limits)
     seen = visible.seen[:, 0]
     if not seen.any():
         raise InputError(
-            f"target {place.name!r} is never seen in {duration_s / 3600:g} h from {moments.iso(0.0)}, expected another "
+            f"target {place.name!r} is never seen in {duration_s / 3600:g} h from {times.iso(0.0)}, expected another "
             "time or other limits"
         )
     # Everything about the frames but the temperature is the whole stare's with frames left out.
@@ -122,21 +122,21 @@ def stare_along(
         unknowns=tuple(replace(one, curve=one.curve[seen]) for one in whole.unknowns),
     )
     hits = particles.rate_per_cm2_s(track)[seen]
-    return OrbitStare(stare, hits, visible.shadow[seen], moments.iso(0.0), tuple(orbit.messages(moments)))
+    return OrbitStare(stare, hits, visible.shadow[seen], times.iso(0.0), tuple(orbit.messages(times)))
 
 
 def _temperature(orbit: Orbit, track: Track, thermal: Thermal) -> Float:
     """Of the detector at each step, deg C, with its past of some time constants before the first."""
-    moments = track.moments
-    past = Moments(
-        moments.iso(-SETTLING * thermal.time_constant_s, 3),
+    times = track.times
+    past = TimeGrid(
+        times.iso(-SETTLING * thermal.time_constant_s, 3),
         SETTLING * thermal.time_constant_s / DAY_S,
         PAST_STEP_S,
     )
     # The whole of it by one kind of orbit, whichever the plan has.
-    before = Orbit(orbit.elements, orbit.resolved(moments)).track(past)
+    before = Orbit(orbit.elements, orbit.resolved(times)).track(past)
     first = float(thermal.temperature_c(_light(before), PAST_STEP_S)[-1])
-    return thermal.temperature_c(_light(track), moments.step_s, first)
+    return thermal.temperature_c(_light(track), times.step_s, first)
 
 
 def _light(track: Track) -> Float:

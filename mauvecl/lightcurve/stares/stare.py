@@ -17,8 +17,8 @@ from mauvecl.lightcurve.usual import CHANGING, ORBIT_S, Changing
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
-    from mauvecl.host.orbit.names import Target
     from mauvecl.host.orbit.orbit import Orbit
+    from mauvecl.host.orbit.targets import Target
 
 Float = NDArray[np.float64]
 #: Unit of each, for messages and tables.

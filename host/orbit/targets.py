@@ -1,4 +1,4 @@
-"""Where a named star stands: the embedded list, coordinates as they are, or SIMBAD where it is asked for."""
+"""Targets by name or coordinates: the embedded list, and SIMBAD on request."""
 
 from __future__ import annotations
 
@@ -17,57 +17,40 @@ from numpy.typing import NDArray
 from ..errors import InputError
 from ..files.bounded import shortened
 from ..files.ecsv import parse_ecsv
-from ..sky.helioecliptic import offline, position_of
+from ..sky.helioecliptic import offline, parse_position
 from .earth import direction
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
-#: Seconds that SIMBAD is waited for.
+#: Timeout of a SIMBAD query, s.
 TIMEOUT_S = 10.0
 
 
 @dataclass(frozen=True)
 class Target:
-    """A place on the sky, and what is known of the star there.
-
-    Attributes
-    ----------
-    name : str
-    ra_deg, dec_deg : float
-        ICRS.
-    source : str
-        Who says so.
-    distance_pc, magnitude : float or None
-        Magnitude in V.
-    spectral_type : str or None
-    """
+    """A position on the sky and the known properties of the star there."""
 
     name: str
-    ra_deg: float
+    ra_deg: float  # ICRS, as the declination
     dec_deg: float
-    source: str
+    source: str  # origin of the position
     distance_pc: float | None = None
-    magnitude: float | None = None
+    magnitude: float | None = None  # in V
     spectral_type: str | None = None
 
     @classmethod
     def of(cls, text: str, *, name: str | None = None, simbad: bool = False) -> Target:
-        """By a name of the embedded list, or by coordinates.
+        """Resolve a name of the embedded list or coordinates.
 
         Parameters
         ----------
         text : str
             A name, or ICRS coordinates: degrees ("290.0 -11.2") or sexagesimal ("19h22m00s -11d12m00s").
         name : str, optional
-            What it is called; the text by default.
+            Name of the target in reports. The default is the list's name, or `text`.
         simbad : bool
-            Ask SIMBAD for a name that is not embedded (needs `mauvecl[names]` and a network).
-
-        Raises
-        ------
-        InputError
-            If it is neither, or SIMBAD does not answer.
+            Whether to query SIMBAD for a name that is not embedded (needs `mauvecl[names]` and a network).
         """
         row = _names().get(_key(text))
         if row is not None:
@@ -84,12 +67,12 @@ class Target:
                 "'290.0 -11.2', or --simbad to ask SIMBAD"
             )
         with offline():
-            place = position_of(text).icrs
+            place = parse_position(text).icrs
         return cls(name or text.strip(), float(place.ra.deg), float(place.dec.deg), "given")
 
     @property
     def direction(self) -> NDArray[np.float64]:
-        """Unit vector, ICRS, (3,)."""
+        """Unit vector, ICRS, shape (3,)."""
         return direction(self.ra_deg, self.dec_deg)
 
 
@@ -101,7 +84,7 @@ def _list() -> Table:
 
 @cache
 def _names() -> dict[str, Target]:
-    """Every name, without blanks and case, to its star."""
+    """Return the embedded stars by normalised name."""
     stars = {}
     for row in _list():
         star = Target(
@@ -114,16 +97,23 @@ def _names() -> dict[str, Target]:
 
 
 def target_table() -> Table:
-    """The stars known by name: name, ra, dec, distance, V, spectral_type, other_names."""
+    """Return the embedded stars.
+
+    Returns
+    -------
+    Table
+        Columns name, ra, dec (deg, ICRS), distance (pc), V, spectral_type and other_names.
+    """
     return _list().copy()
 
 
-#: Greek letters as catalogues shorten them.
+#: Abbreviations of Greek letters in catalogues.
 _GREEK = {"alpha": "alp", "beta": "bet", "gamma": "gam", "delta": "del", "epsilon": "eps", "zeta": "zet", "iota": "iot",
           "kappa": "kap", "sigma": "sig", "omicron": "omi"}  # fmt: skip
 
 
 def _key(name: str) -> str:
+    """Normalise a name: lower case, no separators, abbreviated Greek letters."""
     key = re.sub(r"[\s_*.']+", "", name).casefold()
     for long, short in _GREEK.items():
         if key.startswith(long):
@@ -131,7 +121,7 @@ def _key(name: str) -> str:
     return key
 
 
-#: What is asked of SIMBAD's tables (tried with astroquery 0.4.11): a star without a V has its place all the same.
+#: ADQL query of SIMBAD (tried with astroquery 0.4.11). The left join keeps stars without a V magnitude.
 SIMBAD_QUERY = (
     'SELECT basic.ra, basic.dec, basic.plx_value, basic.sp_type, allfluxes."V" FROM ident JOIN basic '
     "ON ident.oidref = basic.oid LEFT JOIN allfluxes ON allfluxes.oidref = basic.oid WHERE ident.id = '{}'"
@@ -139,7 +129,7 @@ SIMBAD_QUERY = (
 
 
 def _from_simbad(text: str, name: str | None) -> Target:
-    """Ask SIMBAD, for so many seconds."""
+    """Query SIMBAD, with a timeout."""
     try:
         from astroquery.simbad import Simbad
     except ImportError:
@@ -150,7 +140,7 @@ def _from_simbad(text: str, name: str | None) -> Target:
     query = SIMBAD_QUERY.format(text.strip().replace("'", "''"))
     try:
         table = _within(TIMEOUT_S, lambda: Simbad.query_tap(query))
-    except Exception as error:  # the network fails in many ways
+    except Exception as error:  # astroquery raises many kinds for a network failure
         raise InputError(
             f"target {shortened(text)} is not in the embedded list and SIMBAD did not answer within {TIMEOUT_S:g} s "
             f"({type(error).__name__}), expected a network, or coordinates"
@@ -172,7 +162,7 @@ def _from_simbad(text: str, name: str | None) -> Target:
 
 
 def _within(seconds: float, ask: Callable[[], Any]) -> Any:
-    """What a function returns, if it does so in time: requests of astroquery wait for ever where nothing answers."""
+    """Call a function and raise TimeoutError if it takes too long, since astroquery's requests may never return."""
     answers: list[Any] = []
     failed: list[BaseException] = []
 
@@ -182,7 +172,7 @@ def _within(seconds: float, ask: Callable[[], Any]) -> Any:
         except Exception as error:
             failed.append(error)
 
-    # Not waited for at exit.
+    # A daemon thread does not delay the exit of the program.
     thread = threading.Thread(target=run, daemon=True)
     thread.start()
     thread.join(seconds)

@@ -1,4 +1,4 @@
-"""Where instruments' files are: those that come with the package, and a user's own."""
+"""Paths of instrument files, embedded or a user's."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from ..files.bounded import shortened
 from ..files.parsed import is_file
 
 
-def shipped() -> tuple[str, ...]:
-    """Names of the instruments that come with the package."""
+def shipped_names() -> tuple[str, ...]:
+    """Return the names of the instruments that the package contains."""
     files = resources.files(__package__).joinpath("instruments").iterdir()
     return tuple(sorted(file.name.removesuffix(".toml") for file in files if file.name.endswith(".toml")))
 
 
-def find_instrument(name: str | Path, folder: Path) -> Path:
-    """The file of a shipped instrument or, failing that, a user's own, relative to `folder`."""
+def instrument_path(name: str | Path, folder: Path) -> Path:
+    """Return the path of an embedded instrument or of a user's file, relative to `folder`."""
     if not isinstance(name, str | Path):
         raise InputError(f"instrument {name!r}, expected a name or the path of a TOML file")
-    names = shipped()
+    names = shipped_names()
     if name in names:
         return _local(resources.files(__package__).joinpath("instruments", f"{name}.toml"))
     path = folder / name
@@ -40,5 +40,5 @@ def find_instrument(name: str | Path, folder: Path) -> Path:
 
 
 def _local(resource: Traversable) -> Path:
-    # setuptools installs real files; a zipped package would need extracting.
+    # setuptools installs real files; a zipped package would have to be extracted.
     return Path(str(resource))
