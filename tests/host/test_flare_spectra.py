@@ -1,0 +1,145 @@
+"""Spectra of flares: their light, their totals, and observed ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mauvecl import InputError
+from mauvecl.host.stars.flare import blackbody
+from mauvecl.host.stars.flare_spectra import (
+    BALMER_EDGE_NM,
+    LINES_NM,
+    BalmerFlare,
+    Blackbody,
+    EmissionLine,
+    FlareSpectrum,
+    FlareWithLines,
+    ObservedFlare,
+    TwoBlackbodies,
+)
+
+DATA = Path(__file__).parent.parent / "data"
+QUIET = DATA / "flares" / "adleo_quiescent2.dat"
+FILES = {912: DATA / "spectra" / "ADLeo_912s.dat", 1497: DATA / "flares" / "ADLeo_1497s.dat"}
+
+
+def ad_leo(seconds: int, continue_at_k: float | None = 9500.0) -> ObservedFlare:
+    return ObservedFlare.read(FILES[seconds], QUIET, wavelength_unit="Angstrom", continue_at_k=continue_at_k)
+
+
+SPECTRA = {
+    "blackbody": Blackbody(9000.0),
+    "two": TwoBlackbodies(7000.0, 25_000.0, 0.1),
+    "Balmer": BalmerFlare(9500.0, 2.5),
+    "lines": FlareWithLines(BalmerFlare(9500.0, 1.5), {"Mg II": 0.03, "Ca II": 0.02, "Balmer": 0.1, "250": 0.01}),
+    "observed": ad_leo(912),
+}
+
+
+@pytest.mark.parametrize("spectrum", SPECTRA.values(), ids=SPECTRA)
+def test_the_total_is_the_integral(spectrum: FlareSpectrum) -> None:
+    grid = spectrum.grid(np.geomspace(10.0, 300_000.0, 40_001))
+    total = 10.0 * np.trapezoid(spectrum.flux(grid), grid)
+    assert spectrum.bolometric_flux() == pytest.approx(total, rel=2e-5)
+
+
+@pytest.mark.parametrize("spectrum", SPECTRA.values(), ids=SPECTRA)
+def test_a_coarse_grid_with_the_nodes_of_the_spectrum_keeps_lines_and_edges(spectrum: FlareSpectrum) -> None:
+    coarse, fine = (spectrum.grid(np.linspace(180.0, 750.0, n)) for n in (1141, 57_001))
+    one, other = (np.trapezoid(spectrum.flux(grid), grid) for grid in (coarse, fine))
+    assert one == pytest.approx(other, rel=1e-5)
+
+
+def test_the_balmer_flare_is_that_of_its_formula() -> None:
+    nm, flare = np.array([200.0, 300.0, 364.5, 364.7, 500.0]), BalmerFlare(9500.0, 2.5, 8000.0)
+    edge = blackbody(np.array([364.6]), 9500.0)[0]
+    # h, c and k of CODATA 2018, SI.
+    exponent = 6.62607015e-34 * 2.99792458e8 / (1.380649e-23 * 8000.0) * (1 / nm - 1 / 364.6) * 1e9
+    added = np.where(nm <= 364.6, 1.5 * edge * (364.6 / nm) ** 2 * np.exp(-exponent), 0.0)
+    np.testing.assert_allclose(flare.flux(nm), blackbody(nm, 9500.0) + added, rtol=1e-8)
+    sides = flare.flux(np.array([BALMER_EDGE_NM, BALMER_EDGE_NM + 1e-3]))
+    assert sides[0] / sides[1] == pytest.approx(2.5, rel=1e-4)
+    assert BalmerFlare(9500.0, 1.0).flux(nm) == pytest.approx(blackbody(nm, 9500.0), rel=1e-15)
+
+
+def test_two_blackbodies_of_one_temperature_are_one() -> None:
+    nm = np.linspace(200.0, 700.0, 11)
+    np.testing.assert_allclose(TwoBlackbodies(9e3, 9e3, 0.25).flux(nm), 1.25 * blackbody(nm, 9e3), rtol=1e-14)
+
+
+def test_relative_lines_carry_their_fraction_and_absolute_ones_their_flux() -> None:
+    plain, nm = Blackbody(10_000.0), np.linspace(200.0, 700.0, 50_001)
+    lined = FlareWithLines(plain, {"Mg II": 0.05}, {"H beta": 2e-13})
+    grid = lined.grid(nm)
+    added = np.trapezoid(lined.flux(grid) - plain.flux(grid), grid) / np.trapezoid(plain.flux(nm), nm)
+    assert added == pytest.approx(0.05, rel=1e-6)
+    assert 10 * np.trapezoid(lined.flux_at_telescope(grid), grid) == pytest.approx(2e-13, rel=1e-12)
+    assert lined.fixed_lines
+    assert not FlareWithLines(plain, {"Mg II": 0.05}).fixed_lines
+    centre = np.average(grid, weights=lined.flux_at_telescope(grid) * np.gradient(grid))
+    assert centre == pytest.approx(LINES_NM["H beta"], abs=1e-3)
+
+
+def test_balmer_lines_have_the_wavelengths_of_hydrogen() -> None:
+    """Rydberg constant of hydrogen, 1.09677583e7 m-1 (CODATA)."""
+    for n, name in enumerate(("H alpha", "H beta", "H gamma", "H delta", "H epsilon", "H8"), 3):
+        assert LINES_NM[name] == pytest.approx(1e9 / (1.09677583e7 * (0.25 - 1 / n**2)), abs=0.02)
+    assert EmissionLine.named("h_ALPHA").wavelengths_nm == (LINES_NM["H alpha"],)
+    assert EmissionLine.named("Ca II").wavelengths_nm == (LINES_NM["Ca II K"], LINES_NM["Ca II H"])
+
+
+def test_ad_leos_great_flare() -> None:
+    """The numbers of the published spectra at 912 and 1497 s: colours, the ultraviolet."""
+    for seconds, ratio, ultraviolet in ((912, 1.41, 4.0e-9), (1497, 1.96, 9.2e-10)):
+        flare = ad_leo(seconds)
+        near = [np.mean(flare.flux(np.linspace(a, b, 201))) for a, b in ((359.5, 363.5), (415.0, 419.0))]
+        assert near[0] / near[1] == pytest.approx(ratio, rel=0.05)
+        nm = np.linspace(200.0, 330.0, 13_001)
+        assert 10 * np.trapezoid(flare.flux(nm), nm) == pytest.approx(ultraviolet, rel=0.03)
+        assert flare.measured_nm == pytest.approx((100.36, 444.015))
+        assert any("9500 K continues it" in text for text in flare.messages)
+    nm = np.array([500.0, 600.0, 700.0])
+    shape = flare.flux(nm) / blackbody(nm, 9500.0)
+    np.testing.assert_allclose(shape, shape[0], rtol=2e-4)
+
+
+def test_a_short_flare_is_not_continued_unless_asked() -> None:
+    with pytest.raises(InputError, match="covers 100"):
+        ad_leo(912, continue_at_k=None)
+
+
+def test_a_quiescent_spectrum_is_subtracted(tmp_path: Path) -> None:
+    nm, other = np.linspace(150.0, 800.0, 1301), np.linspace(190.0, 820.0, 2001)
+    for name, at, flux in (("both", nm, 3e-14 * nm), ("star", other, 1e-14 * other)):
+        np.savetxt(tmp_path / f"{name}.txt", np.column_stack([at, flux]))
+    flare = ObservedFlare.read(tmp_path / "both.txt", tmp_path / "star.txt")
+    assert flare.measured_nm == (190.0, 800.0)
+    inside = nm[nm >= 190.0]
+    np.testing.assert_allclose(flare.flux(inside), 2e-14 * inside, rtol=1e-9)
+    assert not any("gaps" in text for text in flare.messages)
+    kept = (nm < 330.0) | (nm > 356.0)
+    gap = ObservedFlare.from_arrays(nm[kept], 1e-14 * nm[kept])
+    assert any("gaps at 329.5-356.5 nm" in text for text in gap.messages)
+    with pytest.raises(InputError, match="total flux"):
+        ObservedFlare.from_arrays(nm, -blackbody(nm, 9e3))
+
+
+@pytest.mark.parametrize(
+    ("make", "text"),
+    [
+        (lambda: Blackbody(10.0), "flare temperature"),
+        (lambda: TwoBlackbodies(9e3, 1e7, 0.1), "second flare temperature"),
+        (lambda: TwoBlackbodies(9e3, 2e4, -1.0), "area of the second"),
+        (lambda: BalmerFlare(9e3, 0.5), "Balmer jump ratio"),
+        (lambda: FlareWithLines(Blackbody(), {"Fe XXI": 0.1}), "'Fe XXI' is unknown"),
+        (lambda: FlareWithLines(Blackbody(), {"Mg II": -0.1}), "flux of the line 'Mg II'"),
+        (lambda: FlareWithLines(Blackbody(), {"Mg II": 0.1}, {"Mg II": 1e-13}), "a fraction and a flux"),
+        (lambda: FlareWithLines(Blackbody(), {"2800": 0.1}), "wavelength of the line"),
+    ],
+)
+def test_what_cannot_be_is_named(make, text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        make()
