@@ -1,1 +1,1 @@
-"""The deterministic chain: a stellar spectrum in, mean electrons per pixel out. No OpenCL here."""
+"""Deterministic chain from a stellar spectrum to mean electrons per pixel, without OpenCL."""

@@ -1,4 +1,4 @@
-"""Objects that are equal where their content is, and are shown in one line."""
+"""Base class of objects that compare by content, arrays included."""
 
 from __future__ import annotations
 
@@ -8,18 +8,18 @@ from typing import Any
 import numpy as np
 
 
-class ByContent:
-    """What compares by its fields, arrays among them; a subclass says in `_line` what it is."""
+class ContentEquality:
+    """Mixin with equality and hash by fields, arrays included, and a one-line repr from `_line`."""
 
     def __init_subclass__(cls, **words: Any) -> None:
         super().__init_subclass__(**words)
-        # A dataclass brings its own unless it finds them.
+        # Set on the subclass, since a dataclass adds its own methods unless the class defines them.
         for name in ("__repr__", "__eq__", "__hash__"):
             if name not in vars(cls):
-                setattr(cls, name, vars(ByContent)[name])
+                setattr(cls, name, vars(ContentEquality)[name])
 
     def __eq__(self, other: object) -> bool:
-        return NotImplemented if type(other) is not type(self) else same(_parts(self), _parts(other))
+        return NotImplemented if type(other) is not type(self) else equal_content(_parts(self), _parts(other))
 
     def __hash__(self) -> int:
         plain = (value for value in _parts(self).values() if isinstance(value, str | int | float))
@@ -32,35 +32,35 @@ class ByContent:
         return ", ".join(str(value) for value in _parts(self).values() if isinstance(value, str | int | float))
 
 
-def same(one: Any, other: Any) -> bool:
-    """Whether two things hold the same: arrays element by element, objects without an equality part by part."""
+def equal_content(one: Any, other: Any) -> bool:
+    """Return whether two objects have equal content, comparing arrays by bytes and plain objects by attributes."""
     if one is other:
         return True
     if isinstance(one, np.ndarray) or isinstance(other, np.ndarray):
         one, other = np.asarray(one), np.asarray(other)
         if one.dtype == object:
-            return same(one.tolist(), other.tolist())
+            return equal_content(one.tolist(), other.tolist())
         return bool(one.shape == other.shape and one.dtype == other.dtype and one.tobytes() == other.tobytes())
     if type(one) is not type(other):
         return bool(one == other)
     if isinstance(one, dict):
-        return one.keys() == other.keys() and all(same(value, other[key]) for key, value in one.items())
+        return one.keys() == other.keys() and all(equal_content(value, other[key]) for key, value in one.items())
     if isinstance(one, list | tuple):
-        return len(one) == len(other) and all(map(same, one, other))
+        return len(one) == len(other) and all(map(equal_content, one, other))
     if hasattr(one, "colnames"):
-        # A table of astropy's: its columns, their units, and what is said of it.
+        # An astropy table: compare columns, units and metadata.
         units = [[str(getattr(table[name], "unit", "")) for name in table.colnames] for table in (one, other)]
         columns = [{name: np.asarray(table[name]) for name in table.colnames} for table in (one, other)]
-        return units[0] == units[1] and same(*columns) and same(dict(one.meta), dict(other.meta))
+        return units[0] == units[1] and equal_content(*columns) and equal_content(dict(one.meta), dict(other.meta))
     if isinstance(one, float):
         return one == other or (one != one and other != other)
     if not any("__eq__" in vars(kind) for kind in type(one).__mro__[:-1]):
-        return same(_parts(one), _parts(other))
+        return equal_content(_parts(one), _parts(other))
     return bool(one == other)
 
 
 def _parts(thing: Any) -> dict[str, Any]:
-    """The fields of a dataclass that count, or all attributes of another object."""
+    """Return the compared fields of a dataclass, or all attributes of another object."""
     if is_dataclass(thing):
         return {each.name: getattr(thing, each.name) for each in fields(thing) if each.compare}
     return dict(vars(thing))

@@ -1,4 +1,4 @@
-"""What the detector expects: per-pixel means and noise of an exposure, before anything is drawn."""
+"""Means and noise of the pixels of an exposure, before anything is drawn."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from scipy import special
 
 from .arguments import public
-from .content import ByContent
+from .content import ContentEquality
 from .errors import InputError
 from .instrument.instrument import Instrument
 from .instrument.line import Line
-from .measured_noise import below_zero
+from .measured_noise import negative_means_message
 from .plotting import picture
 from .quantities import number
 from .ranges import EXPOSURES, check_exposure
@@ -36,20 +36,19 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Pixels whose mean is further below saturation, in standard deviations of a frame, never meet it.
+#: Distance of a mean below saturation, in standard deviations of a frame, beyond which saturation is neglected.
 CUT_SIGMA = 8.0
-#: Frames of an exposure, at most: a day of 5 ms each, a thousandth of the payload's.
-MOST_FRAMES = 2**24
-#: What counts as signal: the star's light alone, to which the sky adds noise; or the zodiacal light too, as in the
-#: MauveSim paper.
+#: Largest number of frames of an exposure: a day of 5 ms each, a thousandth of the payload's.
+MAX_FRAMES = 2**24
+#: Definition of the signal: the star alone ("net"), or the star and the zodiacal light, as in the MauveSim paper.
 Signal = Literal["net", "paper"]
 SIGNALS: tuple[Signal, ...] = get_args(Signal)
 
 
 @public
 @dataclass(frozen=True, eq=False)
-class Expectation(ByContent):
-    """Means and noise per pixel of an exposure of `n_frames` frames; arrays are for ONE frame and read-only.
+class Expectation(ContentEquality):
+    """Means and noise per pixel of an exposure; the arrays are read-only and refer to a single frame.
 
     Attributes
     ----------
@@ -58,16 +57,16 @@ class Expectation(ByContent):
     source_electrons, sky_electrons : ndarray, shape (n_pixel,)
         Mean electrons per frame.
     dark_dn : ndarray, shape (n_pixel,)
-        Mean dark per frame, DN, whatever unit it is drawn in.
+        Mean dark counts per frame, DN, independent of `dark_unit`.
     dark_unit : {"DN", "electrons"}
-        Unit in which the dark is Poisson; its mean in electrons is dark_dn / gain.
+        Unit in which the dark counts follow a Poisson distribution; their mean in electrons is dark_dn / gain.
     bias_dn, read_noise_dn, gain_dn_per_electron : ndarray, shape (n_pixel,)
-        Mean and rms per frame, DN; DN per electron.
+        Bias (DN), read noise (DN rms per frame) and gain.
     photon_noise : {"gaussian", "poisson"}
-        How photons scatter about their mean; the variance is the same.
+        Distribution of the photons about their mean; the variance is the same.
     n_frames : int
     frame_s : float
-        The exposure is n_frames * frame_s.
+        Length of a frame; the exposure is n_frames * frame_s.
     element : ndarray of int32, shape (n_pixel,)
         Index of each pixel's resolution element, ascending from 0: half-open bins from the start of the output range.
     element_wavelength_nm : ndarray, shape (n_element,)
@@ -77,15 +76,16 @@ class Expectation(ByContent):
         Raw level at which the detector saturates, DN.
     name, instrument : str
     provenance : mapping of str
-        Where everything came from: digests, order, sky, history of the source, exposure asked for.
+        Origin of all inputs: digests, order, sky, history of the source, requested exposure.
     conditions : mapping of float
-        The instrument's own values of what priors may vary: ``temperature_c``, ``dark_slope_per_c``, ``light_loss``,
-        ``pointing_loss``.
+        The instrument's values of the quantities that priors may vary: ``temperature_c``, ``dark_slope_per_c``,
+        ``light_loss``, ``pointing_loss``.
     messages : tuple of str
-        What the user must be told, saturation first.
+        Remarks for the user, saturation first.
     signal : {"net", "paper"}
-        What counts as signal: the star alone, the sky being subtracted as bias and dark are, its noise left; or, as in
-        the MauveSim paper, the zodiacal light too. The noise is the same.
+        Definition of the signal. With ``net`` it is the star alone: the sky is subtracted like bias and dark, and only
+        its noise remains. With ``paper`` it includes the zodiacal light, as in the MauveSim paper. The noise is the
+        same.
     """
 
     wavelength_nm: Float
@@ -111,12 +111,9 @@ class Expectation(ByContent):
     signal: Signal = "net"
 
     def to_specutils(self) -> Any:
-        """The mean net signal of the exposure, DN, with its standard deviation, as a specutils Spectrum.
+        """Convert the mean signal of the exposure, DN, and its standard deviation to a specutils Spectrum.
 
-        Raises
-        ------
-        InputError
-            If specutils, the extra ``spectra``, is missing.
+        This needs the extra ``spectra``.
         """
         import astropy.units as u
 
@@ -159,20 +156,20 @@ class Expectation(ByContent):
             values = getattr(self, name)
             if values.shape != n_pixel:
                 raise ValueError(f"{name} has the shape {values.shape}, expected {n_pixel}")
-            bad = ~((values >= 0) & (values <= LARGEST))
+            bad = ~((values >= 0) & (values <= MAX_PER_FRAME))
             if bad.any():
                 pixel = int(np.argmax(bad))
-                raise InputError(f"{name} of pixel {pixel} = {values[pixel]:g}, expected 0 to {LARGEST:g}")
+                raise InputError(f"{name} of pixel {pixel} = {values[pixel]:g}, expected 0 to {MAX_PER_FRAME:g}")
         object.__setattr__(self, "provenance", dict(self.provenance))
 
     @property
     def table(self) -> QTable:
-        """One row per pixel: wavelength, signal, noise (rms) and S/N of the exposure, with their units."""
+        """Wavelength, signal, noise (rms) and S/N of the exposure, one row per pixel, with units."""
         return self._table(self.wavelength_nm, self.signal_dn, self._noise_dn2, self.snr())
 
     @property
     def element_table(self) -> QTable:
-        """The same, one row per resolution element."""
+        """The columns of `table`, one row per resolution element."""
         signal, variance = self.per_element(self.signal_dn), self.per_element(self._noise_dn2)
         return self._table(self.element_wavelength_nm, signal, variance, self.snr_per_element())
 
@@ -187,7 +184,7 @@ class Expectation(ByContent):
         return table
 
     def plot(self, path: str | Path | None = None, *, ax: Any = None) -> Any:
-        """Mean signal with its noise against wavelength, saved under a path or drawn in axes; needs matplotlib."""
+        """Plot the mean signal and its noise against wavelength, to a file or in given axes; needs matplotlib."""
         return picture("inputs.expectation", self, path=path, ax=ax)
 
     @property
@@ -207,63 +204,60 @@ class Expectation(ByContent):
 
     @cached_property
     def sky_dn(self) -> Float:
-        """Mean light of the sky in the exposure, DN, shape (n_pixel,)."""
+        """Mean signal of the sky in the exposure, DN, shape (n_pixel,)."""
         return self.n_frames * self.gain_dn_per_electron * self.sky_electrons
 
     @cached_property
     def recorded_light_dn(self) -> Float:
-        """Mean light of the exposure as recorded, source and sky, DN: `light_dn` less what saturation cuts off."""
+        """Mean recorded light of the exposure, source and sky, DN: `light_dn` minus the loss by saturation."""
         return self.light_dn - self._cut[0]
 
     @cached_property
     def subtracted_dn(self) -> Float:
-        """What an observer subtracts of the exposure beside bias and dark, DN, shape (n_pixel,).
+        """Mean that an observer subtracts in addition to bias and dark, DN, shape (n_pixel,).
 
-        The sky's mean, or nothing where the sky counts as signal.
+        This is the mean of the sky, or zero if the sky counts as signal.
         """
         return self.sky_dn if self.signal == "net" else np.zeros_like(self.sky_dn)
 
     @cached_property
     def signal_dn(self) -> Float:
-        """Mean signal of the exposure as recorded, DN, shape (n_pixel,).
-
-        The star's: `recorded_light_dn` less the sky's mean; with the sky's where `signal` is ``paper``.
-        """
+        """Mean recorded signal of the exposure, DN, shape (n_pixel,): `recorded_light_dn` minus `subtracted_dn`."""
         return self.recorded_light_dn - self.subtracted_dn
 
     @cached_property
     def mean_raw_dn(self) -> Float:
-        """Mean raw level of one frame: light, dark and bias, DN, before saturation and the ADC; shape (n_pixel,)."""
+        """Mean raw level of a frame before saturation and ADC: light, dark and bias, DN, shape (n_pixel,)."""
         return self.light_dn / self.n_frames + self.dark_dn + self.bias_dn
 
     @cached_property
     def recorded_dn(self) -> Float:
-        """Mean of the exposure's raw values, DN, shape (n_pixel,)."""
+        """Mean raw value of the exposure, DN, shape (n_pixel,)."""
         return self.n_frames * self.mean_raw_dn - self._cut[0]
 
     @cached_property
     def dark_step_dn(self) -> Float:
-        """DN of one count of the dark, shape (n_pixel,): one, or the gain where the dark is drawn in electrons."""
+        """DN per dark count, shape (n_pixel,): one, or the gain if the dark counts are electrons."""
         return self.gain_dn_per_electron if self.dark_unit == "electrons" else np.ones_like(self.dark_dn)
 
     @cached_property
     def dark_variance_dn2(self) -> Float:
-        """Variance of one frame's dark, DN^2, shape (n_pixel,): Poisson in DN, or in electrons times the gain."""
+        """Variance of the dark counts of a frame, DN^2, shape (n_pixel,)."""
         return np.asarray(self.dark_dn * self.dark_step_dn)
 
     @cached_property
     def variance_dn2(self) -> Float:
-        """Variance of the exposure as recorded, DN^2, with the rounding of each frame (1/12); shape (n_pixel,).
+        """Variance of the recorded exposure, DN^2, including the rounding of each frame (1/12), shape (n_pixel,).
 
-        What is left of it where frames are cut off at saturation, but never below the rounding's. Rounding is noise of
-        mean 0 and variance 1/12 only where a frame's own noise is about 1 DN and more: for a nearly noiseless detector
-        this assumption, and every closed form that rests on it, fails, and draws differ.
+        Saturation reduces the variance, but not below that of rounding. Rounding acts as noise of mean 0 and variance
+        1/12 only if the noise of a frame is at least about 1 DN. For a nearly noiseless detector this assumption, and
+        every closed form based on it, fails, and draws differ.
         """
         return self._cut[1]
 
     @cached_property
     def unsaturated_variance_dn2(self) -> Float:
-        """The same if nothing saturated, shape (n_pixel,)."""
+        """Variance of the exposure without saturation, DN^2, shape (n_pixel,)."""
         return self._noise_of(self.light_dn) + self.n_frames / 12
 
     @cached_property
@@ -276,7 +270,7 @@ class Expectation(ByContent):
 
     @cached_property
     def _cut(self) -> tuple[Float, Float]:
-        """What saturation takes of the exposure's mean, and the variance it leaves: of a normal cut at its high end."""
+        """Mean lost to saturation and remaining variance, for normally distributed frames that are clipped above."""
         lost, variance = np.zeros_like(self.light_dn), self.unsaturated_variance_dn2.copy()
         sd = np.sqrt(variance / self.n_frames)
         near = self.mean_raw_dn + CUT_SIGMA * sd > self.highest_dn
@@ -284,7 +278,7 @@ class Expectation(ByContent):
             mean, sd = self.mean_raw_dn[near], sd[near]
             a = (self.highest_dn - mean) / sd
             below, density = special.ndtr(a), np.exp(-(a**2) / 2) / np.sqrt(2 * np.pi)
-            # Mean and square of min(z, a) - a; of max(z - a, 0) where little is left below.
+            # First and second moment of min(z, a) - a.
             first = -(a * below + density)
             second = (a**2 + 1) * below + a * density
             lost[near] = self.n_frames * (mean - self.highest_dn - sd * first)
@@ -293,25 +287,24 @@ class Expectation(ByContent):
 
     @cached_property
     def cut_share(self) -> Float:
-        """Probability that saturation cuts off a frame of a pixel, shape (n_pixel,)."""
+        """Probability that saturation clips a frame of a pixel, shape (n_pixel,)."""
         sd = np.sqrt(self.unsaturated_variance_dn2 / self.n_frames)
         return np.asarray(special.ndtr((self.mean_raw_dn - self.highest_dn - 0.5) / sd))
 
     def snr(self) -> Float:
-        """Signal to noise per pixel, shape (n_pixel,).
+        """Return the signal-to-noise ratio per pixel, shape (n_pixel,).
 
-        S / sqrt(sigma_L^2 + sigma_R^2 + sigma_D^2), all in DN, with S the star's net signal and sigma_L the gain times
-        the root of all electrons of light, the sky's among them. Without the ADC's rounding. Where `signal` is
-        ``paper``, S holds the zodiacal light as well.
+        The ratio is S / sqrt(sigma_L^2 + sigma_R^2 + sigma_D^2), all in DN, where S is `signal_dn` and sigma_L is the
+        gain times the root of all electrons of light, including the sky's. The ADC's rounding is not included.
         """
         return _ratio(self.signal_dn, self._noise_dn2)
 
     def snr_per_element(self) -> Float:
-        """Signal to noise per resolution element, shape (n_element,): signals summed, noise in quadrature."""
+        """Return the signal-to-noise ratio per resolution element, shape (n_element,), with noise in quadrature."""
         return _ratio(self.per_element(self.signal_dn), self.per_element(self._noise_dn2))
 
     def per_element(self, values: Float) -> Float:
-        """Sums of pixels over resolution elements: (n_pixel,) to (n_element,)."""
+        """Sum the values of pixels over resolution elements, from shape (n_pixel,) to (n_element,)."""
         if np.shape(values) != self.element.shape:
             raise InputError(
                 f"values of the shape {np.shape(values)}, expected {self.element.shape}: one for each pixel"
@@ -319,18 +312,19 @@ class Expectation(ByContent):
         return np.asarray(np.bincount(self.element, values, minlength=self.element_wavelength_nm.size), np.float64)
 
     def noise_budget(self) -> QTable:
-        """Noise of the exposure by origin, DN rms per pixel.
+        """Return the noise of the exposure by origin, DN rms per pixel.
 
         Returns
         -------
         QTable
-            `wavelength`, `source_photon`, `zodiacal_photon`, `dark`, `read` and `total`, which is the four in
-            quadrature: signal_dn / total is `snr`. The ADC's rounding, 0.29 DN per frame, is left out.
+            Columns `wavelength`, `source_photon`, `zodiacal_photon`, `dark`, `read` and `total`. The total is the
+            quadratic sum of the four, so `snr` is signal_dn / total. The ADC's rounding, 0.29 DN per frame, is not
+            included.
         """
         from astropy.table import QTable
 
         n, gain = self.n_frames, self.gain_dn_per_electron
-        # One, but for what saturation cuts off.
+        # Fraction of the light that saturation leaves.
         kept = np.divide(self.recorded_light_dn, self.light_dn, out=np.ones_like(gain), where=self.light_dn > 0)
         variances = {
             "source_photon": n * gain**2 * self.source_electrons * kept,
@@ -348,30 +342,30 @@ class Expectation(ByContent):
 
     @property
     def ceiling_dn(self) -> float:
-        """Raw level at which a pixel is saturated: the detector's or the ADC's, whichever is lower, DN."""
+        """Raw level at which a pixel saturates, DN: the lower of the detector's and the ADC's."""
         return min(self.saturation_dn, float(self.adc_max_dn))
 
     @property
     def highest_dn(self) -> int:
-        """Largest value that a frame is recorded with: the last whole DN up to `ceiling_dn`."""
+        """Largest recorded value of a frame: the last whole DN up to `ceiling_dn`."""
         return int(np.floor(self.ceiling_dn))
 
     @cached_property
     def saturated(self) -> NDArray[np.bool_]:
-        """Pixels whose mean raw level in one frame reaches `ceiling_dn`, shape (n_pixel,)."""
+        """True for pixels whose mean raw level in a frame reaches `ceiling_dn`, shape (n_pixel,)."""
         return np.asarray(self.mean_raw_dn >= self.ceiling_dn)
 
     @property
     def longest_safe_frame_s(self) -> float:
-        """Longest frame in which no pixel's mean, with dark and bias, reaches saturation, s; infinite in the dark."""
+        """Longest frame in which no pixel's mean raw level reaches saturation, s; infinite without light and dark."""
         rise = (self.mean_raw_dn - self.bias_dn) / self.frame_s
         with np.errstate(divide="ignore"):
             return float(np.min(np.where(rise > 0, (self.ceiling_dn - self.bias_dn) / rise, np.inf)))
 
 
-#: Electrons or DN of one pixel and frame beyond which a mean is no mean of a detector.
-LARGEST = 1e12
-#: The arrays of one value per pixel, all from 0 to `LARGEST`.
+#: Largest electrons or DN per pixel and frame, far beyond any detector.
+MAX_PER_FRAME = 1e12
+#: Arrays with one value per pixel, from 0 to `MAX_PER_FRAME`.
 PER_PIXEL = (
     "source_electrons",
     "sky_electrons",
@@ -383,7 +377,7 @@ PER_PIXEL = (
 
 
 def _ratio(signal: Float, variance: Float) -> Float:
-    # A noiseless detector without light has no signal to noise to speak of: 0.
+    # A noiseless detector without light has a ratio of 0 by definition.
     return np.divide(signal, np.sqrt(variance), out=np.zeros_like(signal), where=variance > 0)
 
 
@@ -397,28 +391,28 @@ def expect(
     order: Order = "paper",
     signal: Signal = "net",
 ) -> Expectation:
-    """What an instrument expects of a source: deterministic, nothing is drawn.
+    """Compute the expectation of an exposure: means and noise per pixel, without drawing anything.
 
     Parameters
     ----------
     source : Source or str
-        Zero beyond its own wavelengths; a name is the library's.
+        A source, which emits no light beyond its wavelengths, or a name of the library.
     instrument : Instrument, str or Path
-        A name or file is what `Instrument.load` takes.
+        An instrument, or a name or file for `Instrument.load`.
     exposure : Quantity or float
-        Time, or seconds; rounded up to whole frames, which `messages` then tells.
+        Exposure time, up to one day; plain numbers are seconds. It is rounded up to whole frames, with a message.
     sky : Sky, Quantity or float, optional
-        A brightness is one in mag arcsec^-2; by default that of zodiacal light of V = 22.1 mag arcsec^-2, as for the
-        command line. `Sky.none()` for none.
+        Plain numbers are mag arcsec^-2. The default is zodiacal light of V = 22.1 mag arcsec^-2, as on the command
+        line; `Sky.none()` means no sky.
     order : {"paper", "physical"}
-        Whether efficiencies act after the line function or before; see `response_matrix`.
+        Whether efficiencies act after or before the line spread function; see `response_matrix`.
     signal : {"net", "paper"}
-        What counts as signal in an S/N: the star alone, or the zodiacal light too, as in the MauveSim paper.
+        Whether the signal in an S/N is the star alone, or includes the zodiacal light as in the MauveSim paper.
 
     Raises
     ------
     InputError
-        If the exposure is not a time above 0 and up to one day, or the source does not cover the output range.
+        If the source does not cover the output range, or its flux has no absolute scale.
 
     Examples
     --------
@@ -432,17 +426,16 @@ def expect(
     """
     source, instrument, sky = _source(source), _instrument(instrument), _sky(sky)
     asked_s = _seconds(exposure)
-    # A hair less, so that 0.1 + 0.2 s is three frames of 0.1 s.
+    # The margin makes 0.1 + 0.2 s three frames of 0.1 s despite rounding.
     n_frames = max(1, int(np.ceil(asked_s / instrument.frame_s * (1 - 1e-12))))
-    if n_frames > MOST_FRAMES:
+    if n_frames > MAX_FRAMES:
         raise InputError(
-            f"exposure = {asked_s:g} s has {n_frames} frames of {instrument.frame_s:g} s, expected at most "
-            f"{MOST_FRAMES}"
+            f"exposure = {asked_s:g} s has {n_frames} frames of {instrument.frame_s:g} s, expected at most {MAX_FRAMES}"
         )
     low, high = instrument.output_min_nm, instrument.output_max_nm
     first, last = source.measured_nm or (float(source.wavelength_nm[0]), float(source.wavelength_nm[-1]))
     check_covers(source.name, (first, last), (low, high), f"{instrument.name}'s output range ")
-    source = _reaching(source, instrument)
+    source = _continued_to_reach(source, instrument)
     if source.unscaled:
         raise InputError(
             f"the spectrum of {source.name} is not as bright as the star is seen: {source.unscaled}, expected a "
@@ -500,7 +493,7 @@ def expect(
     )
     messages = [*_saturation(plain), *(f"{source.name}: {text}." for text in source.told)]
     drawn = np.sqrt(plain.variance_dn2) / (n_frames * plain.gain_dn_per_electron)
-    messages += below_zero(source, instrument, electrons, drawn, order)
+    messages += negative_means_message(source, instrument, electrons, drawn, order)
     if signal == "paper" and plain.sky_electrons.any():
         messages.append("S/N counts the zodiacal light as signal, as the MauveSim paper does.")
     if n_frames * instrument.frame_s > asked_s * (1 + 1e-9):
@@ -520,8 +513,8 @@ def expect(
     return replace(plain, messages=tuple(messages))
 
 
-def _reaching(source: Source, instrument: Instrument) -> Source:
-    """Return a source whose dark ends are continued as far as the instrument's line function reaches."""
+def _continued_to_reach(source: Source, instrument: Instrument) -> Source:
+    """Continue the dark ends of a source as far as the instrument's line spread function reaches."""
     nm = source.wavelength_nm
     if nm[0] <= SPAN_NM[0] and nm[-1] >= SPAN_NM[1]:
         return source
@@ -563,7 +556,7 @@ def _seconds(exposure: Any) -> float:
 
 
 def _elements(instrument: Instrument) -> tuple[NDArray[np.int32], Float]:
-    """Each pixel's resolution element, and the centres of those that hold a pixel."""
+    """Return each pixel's resolution element, and the centres of those that hold a pixel."""
     width = instrument.resolution_element_nm
     bins = np.floor((instrument.wavelength_nm - instrument.output_min_nm) / width)
     # An array that starts above the output range leaves the first bins empty.
@@ -571,25 +564,25 @@ def _elements(instrument: Instrument) -> tuple[NDArray[np.int32], Float]:
     return element.astype(np.int32), instrument.output_min_nm + (held + 0.5) * width
 
 
-#: Share of exposures with a frame cut off from which it is told.
-TOLD = 1e-4
+#: Fraction of exposures with a clipped frame from which a message reports it.
+REPORTED_CLIPPING = 1e-4
 
 
 def _saturation(x: Expectation) -> tuple[str, ...]:
-    """The sentence on saturation, if any."""
+    """Return the message on saturation, if any."""
     cut = x.cut_share
     touched = float(-np.expm1(x.n_frames * np.sum(np.log1p(-np.minimum(cut, 1 - 1e-16)))))
-    if not x.saturated.any() and touched < TOLD:
+    if not x.saturated.any() and touched < REPORTED_CLIPPING:
         return ()
     brightest = int(np.argmax(x.mean_raw_dn))
     safe = x.longest_safe_frame_s
-    # Rounded down: a frame of the length told is safe.
-    told = np.floor(safe * 1000) / 1000
+    # Rounded down, so that the reported length is safe.
+    safe_s = np.floor(safe * 1000) / 1000
     flares = [text for text in x.provenance.get("source history", "").split("; ") if text.startswith("flare")]
     name = f"{x.name} with a {flares[-1].removesuffix(', added')}" if flares else x.name
     advice = (
-        f"the longest safe frame is {told:g} s (brightest pixel at {x.wavelength_nm[brightest]:.1f} nm, dark and bias "
-        "included)"
+        f"the longest safe frame is {safe_s:g} s (brightest pixel at {x.wavelength_nm[brightest]:.1f} nm, dark and "
+        "bias included)"
     )
     often = (
         f"frames are cut off there: {cut.sum():.3g} pixels of a frame on average, at least one in "
@@ -597,7 +590,7 @@ def _saturation(x: Expectation) -> tuple[str, ...]:
     )
     if not x.saturated.any():
         return (f"SATURATED at times: pixels of {name} come near {x.ceiling_dn:.0f} DN, and {often}.",)
-    # Runs of saturated pixels, as first and last wavelength.
+    # First and last wavelength of each run of saturated pixels.
     steps = np.flatnonzero(np.diff(np.concatenate([[0], x.saturated.astype(np.int8), [0]])))
     runs = [f"{x.wavelength_nm[a]:.1f}-{x.wavelength_nm[b - 1]:.1f}" for a, b in steps.reshape(-1, 2)]
     return (

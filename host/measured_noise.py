@@ -1,4 +1,4 @@
-"""Negative fluxes are measured noise: how much of it a pixel's mean takes over, and whether that explains the mean."""
+"""Propagation of a measured spectrum's noise to pixel means, and the check of negative means against it."""
 
 from __future__ import annotations
 
@@ -18,17 +18,18 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: A mean may lie so many of its errors below zero: by chance one of 740 independent ones does.
-ERRORS = 3.0
-#: Means so far below zero, in parts of the largest, are rounding: quadrature leaves -1e-30 where there is no light.
+#: Accepted distance of a mean below zero, in standard errors; noise exceeds it in one of 740 independent pixels.
+MAX_SIGMA_BELOW_ZERO = 3.0
+#: Negative means up to this fraction of the largest mean are rounding errors of the quadrature.
 ROUNDING = 1e-12
 
 
-def error_per_second(source: Source, instrument: Instrument, order: Order) -> Float:
-    """Standard error of each pixel's mean by the noise of the points, electrons per second, shape (n_pixel,).
+def standard_error_per_second(source: Source, instrument: Instrument, order: Order) -> Float:
+    """Return the standard error of each pixel's mean due to the noise of the points, electrons/s, shape (n_pixel,).
 
-    A pixel weighs the points by its response r and their spacing d; its variance, the sum of (r d sigma)^2, is taken
-    as mean(r) times the sum of r d (d sigma^2), the mean weighted by r itself: right where the noise changes slowly.
+    A pixel weights the points by its response r and their spacing d. Its variance, the sum of (r d sigma)^2, is
+    approximated by mean(r) times the sum of r d (d sigma^2), where the mean is weighted by r. The approximation holds
+    where the noise changes slowly.
     """
     nm = source.wavelength_nm
     variance = np.gradient(nm) * point_noise(source.flux_flam) ** 2
@@ -36,35 +37,27 @@ def error_per_second(source: Source, instrument: Instrument, order: Order) -> Fl
     return np.sqrt(mean * electrons_per_second(instrument, nm, variance, order))
 
 
-def below_zero(source: Source, instrument: Instrument, electrons: Float, drawn: Float, order: Order) -> tuple[str, ...]:
-    """The sentence on pixels whose mean lies below zero, within their error; such means are taken as no light.
+def negative_means_message(
+    source: Source, instrument: Instrument, electrons: Float, drawn: Float, order: Order
+) -> tuple[str, ...]:
+    """Return the message on pixels with a negative mean, which counts as no light.
 
-    Parameters
-    ----------
-    source : Source
-    instrument : Instrument
-    electrons, drawn : ndarray, shape (n_pixel,)
-        Mean electrons per frame as they come, and the exposure's own noise on them.
-    order : {"paper", "physical"}
-
-    Raises
-    ------
-    InputError
-        If a mean lies farther below zero than the spectrum's noise and the exposure's explain.
+    `electrons` and `drawn`, shape (n_pixel,), are the mean electrons per frame and their standard deviation in the
+    exposure. Raises InputError if a mean is more negative than the noise of spectrum and exposure explains.
     """
     below = electrons < -ROUNDING * max(float(electrons.max()), 0.0)
     if not below.any() or not (source.flux_flam < 0.0).any():
         return ()
-    own = error_per_second(source, instrument, order) * instrument.frame_s
-    # The exposure's noise hides what lies below it.
+    own = standard_error_per_second(source, instrument, order) * instrument.frame_s
+    # A negative mean below the exposure's noise does not matter.
     error = np.hypot(own, drawn)
-    worst = int(np.argmin(electrons + ERRORS * error))
+    worst = int(np.argmin(electrons + MAX_SIGMA_BELOW_ZERO * error))
     nm = instrument.wavelength_nm
-    if electrons[worst] < -ERRORS * error[worst]:
+    if electrons[worst] < -MAX_SIGMA_BELOW_ZERO * error[worst]:
         raise InputError(
             f"the spectrum of {source.name} makes a mean of {electrons[worst]:.3g} electrons a frame at "
-            f"{nm[worst]:.1f} nm, beyond {ERRORS:g} times its error of {error[worst]:.2g}, expected light: bin the "
-            "spectrum (--bin-nm) or mend it"
+            f"{nm[worst]:.1f} nm, beyond {MAX_SIGMA_BELOW_ZERO:g} times its error of {error[worst]:.2g}, expected "
+            "light: bin the spectrum (--bin-nm) or mend it"
         )
     return (
         f"{source.name}: the means of {int(below.sum())} of {below.size} pixels, from {nm[below][0]:.1f} to "

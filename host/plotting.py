@@ -1,4 +1,4 @@
-"""Pictures by name: what draws itself loads no matplotlib, and imports nothing above it."""
+"""Plots by name, so that classes with a `plot` method import neither matplotlib nor `mauvecl.pictures`."""
 
 from __future__ import annotations
 
@@ -9,26 +9,21 @@ from typing import Any
 from .errors import InputError
 from .quantities import shown
 
-#: Axes of the caller's that a picture is drawn in; None where it has a figure of its own.
+#: The caller's axes to draw in; None if the plot makes its own figure.
 AXES: ContextVar[Any] = ContextVar("axes", default=None)
 
 
 def picture(name: str, *given: Any, ax: Any = None, **named: Any) -> Any:
-    """A figure, or the path it was saved under.
+    """Draw a plot and return the figure, the path of the saved file, or `ax`.
 
     Parameters
     ----------
     name : str
         Module and function in `mauvecl.pictures`, such as ``"answers.detection"``.
     *given, **named
-        What the function takes, such as the `path` that it is saved under.
+        Arguments of the function, such as the `path` of the file.
     ax : matplotlib Axes, optional
-        Drawn into instead, and handed back; a picture of several panels takes their place.
-
-    Raises
-    ------
-    InputError
-        If `ax` is no axes.
+        Axes to draw in; a plot of several panels replaces them.
     """
     if ax is not None and not (hasattr(ax, "plot") and hasattr(ax, "figure")):
         raise InputError(f"ax = {shown(ax)}, expected axes, as plt.subplots makes")

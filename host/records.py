@@ -1,4 +1,4 @@
-"""Records that pydantic validates: whatever is wrong with a value ends in one sentence."""
+"""Pydantic models whose validation errors become an InputError of one sentence."""
 
 from __future__ import annotations
 
@@ -17,18 +17,21 @@ else:
     ModelMetaclass = type(BaseModel)
 
 
-class _Told(ModelMetaclass):
-    """Validation inside another record goes past `__call__`, so that the outer one names the whole place."""
+class _InputErrorMeta(ModelMetaclass):
+    """Metaclass that raises InputError for invalid arguments.
+
+    Validation of a nested record does not pass `__call__`, so the outer record names the full path of the value.
+    """
 
     def __call__(cls, *args: Any, **values: Any) -> Any:  # noqa: N805
         try:
             return super().__call__(*args, **values)
         except ValidationError as error:
-            raise InputError(f"{cls.__name__}: {sentence(cast(type[BaseModel], cls), error)}") from None
+            raise InputError(f"{cls.__name__}: {first_error(cast(type[BaseModel], cls), error)}") from None
 
 
-class Record(BaseModel, metaclass=_Told):
-    """Frozen, and strict about its keys."""
+class Record(BaseModel, metaclass=_InputErrorMeta):
+    """Frozen pydantic model that rejects unknown keys."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
@@ -41,8 +44,8 @@ class Record(BaseModel, metaclass=_Told):
             ) from None
 
 
-def sentence(model: type[BaseModel], error: ValidationError) -> str:
-    """The first fault as: key = value, what was expected."""
+def first_error(model: type[BaseModel], error: ValidationError) -> str:
+    """Return the first validation error as a sentence: key = value, expected ..."""
     first = error.errors()[0]
     path = [str(part) for part in first["loc"]]
     key = ".".join(path) or model.__name__.lower()
@@ -56,7 +59,7 @@ def sentence(model: type[BaseModel], error: ValidationError) -> str:
     if first["type"] == "value_error":
         told = str(first["ctx"]["error"])
         field = _fields(model, path[:-1]).get(path[-1]) if path else None
-        # Records name what is theirs; what reads a single value may not know which.
+        # A record's own error names the key; that of a single value's validator may not.
         own = field is None or _model_in(field.annotation) is not None or path[-1] in told
         return told if own else f"{key}: {told}"
     told = first["msg"].removeprefix("Input should be ")
@@ -76,7 +79,7 @@ def _fields(model: type[BaseModel], path: list[str]) -> Any:
 
 
 def _model_in(annotation: Any) -> type[BaseModel] | None:
-    """The model in a type such as `Star | None` or `tuple[Star, ...]`."""
+    """Return the model in a type such as `Star | None` or `tuple[Star, ...]`, or None."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
     return next((model for part in get_args(annotation) if (model := _model_in(part))), None)

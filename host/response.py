@@ -1,15 +1,15 @@
-"""The instrument as one matrix: flux at the nodes of a spectrum to mean electrons per second and pixel.
+"""Response matrix of an instrument, from the flux at the nodes of a spectrum to electrons per second and pixel.
 
-Flux is piecewise linear between its nodes. With P_p(l) the fraction of light of wavelength l that lands in pixel p
-(the line function integrated over the pixel, in closed form), a pixel's rate is the integral of flux * P_p, times the
-efficiency and area. The integral runs over panels in which every P_p is smooth: in a panel P_p is its polynomial
-through Gauss-Legendre nodes, and the flux enters through its integrals against the Lagrange polynomials of these
-nodes. So the matrix is a product,
+The flux is piecewise linear between its nodes. With P_p(l) the fraction of light of wavelength l that falls on pixel p
+(the line spread function integrated over the pixel, in closed form), a pixel's rate is the integral of flux * P_p times
+efficiency and area. The integral runs over panels in which every P_p is smooth. In a panel, P_p is its interpolating
+polynomial through Gauss-Legendre nodes, and the flux enters through its integrals against the Lagrange polynomials of
+these nodes. The matrix is therefore a product,
 
     response = landing @ gathering        (n_pixel, n_panel_node) @ (n_panel_node, n_wavelength)
 
-whose first factor belongs to the instrument and whose second costs the same for every node, however dense the spectrum:
-nothing is resampled, and no flux lost. Against adaptive quadrature it is right to 1e-13.
+whose first factor depends on the instrument only, and whose second has a constant cost per node of the spectrum.
+Nothing is resampled and no flux is lost; results agree with adaptive quadrature to 1e-13.
 """
 
 from __future__ import annotations
@@ -34,38 +34,33 @@ Float = NDArray[np.float64]
 W_PER_NM_IN_FLAM = 1e-6
 #: Gauss-Legendre nodes per panel.
 PANEL_NODES = 10
-#: Gauss-Legendre nodes per cell of the flux: exact for a linear flux times a panel's Lagrange polynomials.
+#: Gauss-Legendre nodes per cell of the flux; exact for a linear flux times a panel's Lagrange polynomials.
 CELL_NODES = 6
-#: Cells gathered at once, which bounds the memory.
+#: Cells processed at once, which limits the memory.
 CHUNK = 20_000
-#: Spectra with more nodes than this go through without a matrix of their own.
+#: Largest number of nodes for which a response matrix is built and cached.
 MATRIX_NODES = 20_000
 
 
 def response_matrix(instrument: Instrument, wavelength_nm: ArrayLike, order: Order = "paper") -> csr_array:
-    """Mean electrons per second in each pixel for unit flux at each node.
+    """Return the mean electrons per second in each pixel for unit flux at each node.
 
     Parameters
     ----------
     instrument : Instrument
     wavelength_nm : array_like, shape (n_wavelength,)
-        Nodes of the flux, nm, strictly increasing; the flux is straight between them and zero outside.
+        Nodes of the flux, nm, strictly increasing; the flux is linear between them and zero outside.
     order : {"paper", "physical"}
-        Efficiency of the wavelength where light lands, applied after the line function (the paper), or of the light's
-        own wavelength, before it (physics). They differ by up to 4 % (G2V) or 6 % (K2.5V), by 6-11 % at 200 nm, and
-        by 0.1 % in total. Beyond the ends of an efficiency curve its end value holds: an assumption that only the
-        physical order meets, for light from outside the output range.
+        With ``paper``, the efficiency at the wavelength of the pixel is applied after the line spread function. With
+        ``physical``, the efficiency at the wavelength of the light is applied before it. The results differ by up to
+        4 % (G2V) or 6 % (K2.5V), by 6-11 % at 200 nm, and by 0.1 % in total. Beyond its ends an efficiency curve keeps
+        its end value (an assumption), which affects only ``physical``, for light from outside the output range.
 
     Returns
     -------
     csr_array, shape (n_pixel, n_wavelength)
-        Electrons s^-1 per (erg s^-1 cm^-2 A^-1): `response_matrix(...) @ flux_flam` is electrons per second.
-        Cached: the same instrument, nodes and order give the same object, which is not to be changed.
-
-    Raises
-    ------
-    InputError
-        If the nodes are not at least two finite, strictly increasing wavelengths, or the order is unknown.
+        Electrons s^-1 per (erg s^-1 cm^-2 A^-1): `response_matrix(...) @ flux_flam` is electrons per second. The
+        matrix is cached and read-only.
     """
     return _response(instrument, _nodes(wavelength_nm).tobytes(), _known(order))
 
@@ -73,7 +68,7 @@ def response_matrix(instrument: Instrument, wavelength_nm: ArrayLike, order: Ord
 def electrons_per_second(
     instrument: Instrument, wavelength_nm: ArrayLike, flux_flam: ArrayLike, order: Order = "paper"
 ) -> Float:
-    """Mean electrons per second in each pixel, shape (n_pixel,), for a spectrum of any number of nodes.
+    """Return the mean electrons per second in each pixel, shape (n_pixel,), for a spectrum of any number of nodes.
 
     Parameters
     ----------
@@ -81,11 +76,6 @@ def electrons_per_second(
         As in `response_matrix`.
     flux_flam : array_like, shape (n_wavelength,)
         Flux at the nodes, erg s^-1 cm^-2 A^-1.
-
-    Raises
-    ------
-    InputError
-        As `response_matrix`, or if fluxes and nodes differ in number.
     """
     nodes = _nodes(wavelength_nm)
     flux = np.asarray(flux_flam, np.float64)
@@ -111,7 +101,7 @@ def _response(instrument: Instrument, nodes: bytes, order: Order) -> csr_array:
 
 
 def _landing(instrument: Instrument, order: Order) -> csr_array:
-    """First factor of the matrix, with every constant; shape (n_pixel, n_panel_node)."""
+    """Return the first factor of the matrix with all constants, shape (n_pixel, n_panel_node)."""
     landing = _line_landing(Line.of(instrument), _knots(instrument, order))
     if order == "physical":
         return landing
@@ -123,7 +113,7 @@ def _landing(instrument: Instrument, order: Order) -> csr_array:
 
 @lru_cache(maxsize=8)
 def _line_landing(line: Line, knots: tuple[float, ...]) -> csr_array:
-    """Fraction of the light at each panel node that lands in each pixel, shape (n_pixel, n_panel_node)."""
+    """Return the fraction of the light at each panel node that falls on each pixel, shape (n_pixel, n_panel_node)."""
     nodes = _panel_nodes(line.panel_edges(np.array(knots)))
     centres = np.array(line.centres)
     first = np.searchsorted(nodes, centres - line.reach)
@@ -136,10 +126,10 @@ def _line_landing(line: Line, knots: tuple[float, ...]) -> csr_array:
 
 
 def _gathering(instrument: Instrument, wavelength: Float, order: Order) -> Iterator[csr_array]:
-    """Second factor of the matrix, as a sum of parts; each of shape (n_panel_node, n_wavelength).
+    """Yield the terms of the second factor of the matrix, each of shape (n_panel_node, n_wavelength).
 
-    An entry is the integral (nm) over a panel of a Lagrange polynomial of the panel times the hat function of a node;
-    in the physical order the efficiency is under the integral.
+    An entry is the integral (nm) over a panel of one of its Lagrange polynomials times the hat function of a node, and
+    times the efficiency in the physical order.
     """
     panels = Line.of(instrument).panel_edges(np.array(_knots(instrument, order)))
     low, high = max(panels[0], wavelength[0]), min(panels[-1], wavelength[-1])
@@ -156,7 +146,7 @@ def _gathering(instrument: Instrument, wavelength: Float, order: Order) -> Itera
 def _gather(
     instrument: Instrument, wavelength: Float, order: Order, panels: Float, edges: Float, shape: tuple[int, int]
 ) -> csr_array:
-    """`_gathering` of the cells between `edges`, each within one panel and between two nodes."""
+    """Return the term of `_gathering` for the cells between `edges`, each within one panel and between two nodes."""
     abscissa, weight = leggauss(CELL_NODES)
     width = np.diff(edges)
     middle = edges[:-1] + width / 2
@@ -169,18 +159,18 @@ def _gather(
     span = (wavelength[node + 1] - wavelength[node])[:, None]
     right = (at - wavelength[node][:, None]) / span
     in_panel = (2 * at - (panels[panel] + panels[panel + 1])[:, None]) / np.diff(panels)[panel][:, None]
-    # Lagrange polynomials of Gauss-Legendre nodes, through the Legendre polynomials (no division, no cancellation).
+    # Lagrange polynomials from Legendre polynomials, without division or cancellation.
     lagrange = legvander(in_panel, PANEL_NODES - 1) @ _legendre_to_lagrange()
     rows = np.broadcast_to(panel[:, None] * PANEL_NODES + np.arange(PANEL_NODES), (panel.size, PANEL_NODES))
     values = [np.einsum("cq,cqk->ck", mass * share, lagrange) for share in (1 - right, right)]
     columns = [np.broadcast_to((node + side)[:, None], rows.shape) for side in (0, 1)]
     index = (np.tile(rows.ravel(), 2), np.concatenate([c.ravel() for c in columns]))
-    # Entries of one place add up.
+    # Entries with the same index are summed.
     return csr_array((np.concatenate([v.ravel() for v in values]), index), shape=shape)
 
 
 def _read_only(matrix: csr_array) -> csr_array:
-    # What a cache hands out twice must not change in between, nor be tidied by scipy in place.
+    # Cached matrices are shared, so neither callers nor scipy's in-place clean-up may change them.
     matrix.sum_duplicates()
     matrix.data.setflags(write=False)
     return matrix
@@ -188,20 +178,20 @@ def _read_only(matrix: csr_array) -> csr_array:
 
 @lru_cache(maxsize=1)
 def _legendre_to_lagrange() -> Float:
-    """Lagrange polynomials of the panel's nodes from Legendre polynomials, shape (degree, node)."""
+    """Return the matrix from Legendre to Lagrange polynomials of a panel's nodes, shape (degree, node)."""
     x, weight = leggauss(PANEL_NODES)
     degree = np.arange(PANEL_NODES)
     return np.asarray((degree[:, None] + 0.5) * legvander(x, PANEL_NODES - 1).T * weight)
 
 
 def _panel_nodes(edges: Float) -> Float:
-    """Gauss-Legendre nodes of each panel, in order, shape (n_panel * PANEL_NODES,)."""
+    """Return the Gauss-Legendre nodes of all panels in order, shape (n_panel * PANEL_NODES,)."""
     x, _ = leggauss(PANEL_NODES)
     return np.asarray(edges[:-1, None] + np.diff(edges)[:, None] * (1 + x) / 2).ravel()
 
 
 def _knots(instrument: Instrument, order: Order) -> tuple[float, ...]:
-    """Wavelengths where the integrand has a kink of the instrument's own."""
+    """Return the wavelengths at which the instrument's curves make the integrand's slope jump."""
     if order == "paper":
         return ()
     return instrument.knots_nm

@@ -1,4 +1,4 @@
-"""Tables with their columns' units and what they hold, in one place each."""
+"""Tables whose columns carry units and descriptions."""
 
 from __future__ import annotations
 
@@ -10,15 +10,8 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
 
-def tabled(columns: Iterable[tuple[Any, ...]], **meta: object) -> QTable:
-    """A table, column by column.
-
-    Parameters
-    ----------
-    columns : iterable of tuple
-        Name and values; then what they are, in words; then their unit.
-    **meta
-    """
+def make_table(columns: Iterable[tuple[Any, ...]], **meta: object) -> QTable:
+    """Make a table of columns given as (name, values), (name, values, description) or (..., description, unit)."""
     import astropy.units as u
     import numpy as np
     from astropy.table import QTable
@@ -32,8 +25,8 @@ def tabled(columns: Iterable[tuple[Any, ...]], **meta: object) -> QTable:
     return table
 
 
-def telling(table: QTable, texts: Mapping[str, str]) -> QTable:
-    """The table, some of its columns told in words."""
+def set_descriptions(table: QTable, texts: Mapping[str, str]) -> QTable:
+    """Set the descriptions of columns in place and return the table."""
     for name, text in texts.items():
         table[name].info.description = text
     return table

@@ -1,3 +1,3 @@
-"""The version, for every room."""
+"""Version of the package."""
 
 VERSION = "0.1.0"

@@ -31,7 +31,7 @@ def same(ours: Detection, theirs: Detection) -> None:
 
 
 def twice(engine: Engine, request: DetectRequest) -> tuple[Detection, Detection]:
-    """What is asked, and again with as many realisations after those: planned once, which takes longer than drawing."""
+    """Return an answer and the same with further realisations; both share one plan, which takes longer than drawing."""
     return _counted(engine, request, request.start), _counted(engine, request, request.start + request.realisations)
 
 

@@ -16,7 +16,7 @@ from mauvecl.runs import shards
 
 @pytest.fixture(scope="session")
 def engine() -> Engine:
-    """The default engine, shared because a build takes a second."""
+    """Return the default engine, shared because a build takes a second."""
     return Engine()
 
 
@@ -28,7 +28,7 @@ def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Any:
-    """A file system of its own with 2 MB, where tests may mount one."""
+    """Mount a separate file system of 2 MB, if tests may."""
     place = tmp_path / "disk"
     place.mkdir()
     mounted = subprocess.run(
@@ -42,7 +42,7 @@ def small_disk(tmp_path: Path) -> Any:
 
 @pytest.fixture(scope="session")
 def scene() -> list[Expectation]:
-    """A star without and with two flares, on a part of the pixels."""
+    """Return expectations of a star without and with two flares, on a part of the pixels."""
     return star(amplitudes=(0.05, 0.24), payload=instrument(part=True))
 
 

@@ -40,7 +40,7 @@ def counts(
 
 
 def of_polynomial(coefficients: Sequence[float], sd: float, mean: float, low: int, size: int) -> Float:
-    """The same for mean + sd * (c0 + c1 z + c2 z^2 + ...), z normal, rounded."""
+    """Return the probabilities of mean + sd * (c0 + c1 z + c2 z^2 + ...), rounded, for normal z."""
     power = np.polynomial.Polynomial(coefficients)
     slope, edge = power.deriv(), (np.arange(low, low + size + 1) - 0.5 - mean) / sd
     z = edge.copy()
@@ -56,7 +56,7 @@ def draws_to_tell(p: Float, q: Float) -> float:
 
 
 def worst_tail(p: Float, q: Float) -> float:
-    """The largest relative error of q's tails where p's lie between 5 and 6 sigma, on either side."""
+    """Return the largest relative error of q's tails where p's lie between 5 and 6 sigma, on either side."""
     found = 0.0
     for way in (slice(None), slice(None, None, -1)):
         one, other = np.cumsum(p[way]), np.cumsum(q[way])

@@ -19,7 +19,7 @@ N_STARES, FIRST_STARE = 200, 2**32 - 70
 
 
 def instrument(name: str = "mauve", *, part: bool = False, **changes: Any) -> Instrument:
-    """The payload, or 198 of its pixels around the peak of the throughput, which the slow twin can afford."""
+    """Return the payload, or only its 198 pixels around the peak of the throughput for the slow reference."""
     if part:
         changes = {"output_min_nm": 300.0, "output_max_nm": 360.0} | changes
     found = Instrument.load(name)
@@ -34,7 +34,7 @@ def star(
     exposure: float = 50.0,
     payload: Instrument | None = None,
 ) -> list[Expectation]:
-    """The quiescent star, then its flares."""
+    """Return the expectations of the quiescent star and its flares."""
     payload = payload or instrument()
     quiet = Source.from_library(name).at_magnitude(magnitude)
     sources = [quiet, *(quiet.flaring(a) for a in amplitudes)]

@@ -79,7 +79,7 @@ def killed(child: int) -> bool:
 
 
 def full_after(n_bytes: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A disk with room for so many bytes."""
+    """Simulate a disk with limited free space."""
     left, real = n_bytes, os.fsync
 
     def fsync(handle: int) -> None:

@@ -85,7 +85,7 @@ def things() -> dict[str, Any]:
 
 @cache
 def fitting() -> dict[str, Any]:
-    """A value for each parameter that must be given, by its name."""
+    """Return a value for each required parameter, by name."""
     quiet, flare = pair()
     pixels = np.ones(quiet.wavelength_nm.size)
     return {
@@ -142,7 +142,7 @@ def parameters() -> list[tuple[str, str]]:
 
 
 def answer_to(call: Callable[[], Any]) -> str:
-    """What a refusal says; nothing where there is an answer."""
+    """Return the message of an InputError, or an empty string."""
     try:
         call()
     except (InputError, DeviceError) as error:

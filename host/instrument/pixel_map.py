@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..arguments import public
-from ..content import ByContent
+from ..content import ContentEquality
 from ..errors import InputError
 from ..files.ecsv import read_numbers
 from ..quantities import count
@@ -32,7 +32,7 @@ COLUMNS = {
 
 @public
 @dataclass(frozen=True, eq=False)
-class PixelMap(ByContent):
+class PixelMap(ContentEquality):
     """Properties of each pixel of the whole array; None keeps the instrument's value.
 
     Attributes

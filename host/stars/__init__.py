@@ -1,1 +1,1 @@
-"""Stars: spectra, magnitudes, flares, the embedded library and stars of one's own."""
+"""Spectra of stars, magnitudes, flares, the embedded library and the user's own stars."""

@@ -1,10 +1,10 @@
-"""Names of photometric bands, for whoever asks for one; `bands` has what is behind them, and takes longer to load."""
+"""Names of photometric bands; `bands`, which holds the bands themselves, takes longer to import."""
 
 from __future__ import annotations
 
 from ..errors import InputError
 
-#: Band names and what else they answer to.
+#: Aliases by band name.
 ALIASES = {
     "B": ("Johnson B",),
     "V": ("Johnson V",),
@@ -19,13 +19,7 @@ ALIASES = {
 
 
 def known_band(name: str) -> str:
-    """A band's own name, by name or alias.
-
-    Raises
-    ------
-    InputError
-        If there is none of that name.
-    """
+    """Return the name of a band, given its name or alias in any case."""
     wanted = name.strip().casefold()
     for known, others in ALIASES.items():
         if wanted in (known.casefold(), *(other.casefold() for other in others)):

@@ -1,8 +1,8 @@
 """Photometric bands and synthetic photometry with embedded bands and Vega.
 
-As synphot has it, to the last bit (the tests compare them): photons per Angstrom straight between the points of a
-spectrum, and trapezoids over the points of spectrum and band together. Loading synphot and its models took longer
-than all else that a star needs.
+The results equal synphot's to the last bit (tested): photons per Angstrom are linear between the points of a spectrum,
+and integrals are trapezoidal over the union of the points of spectrum and band. Importing synphot would take longer
+than everything else that a star needs.
 """
 
 from __future__ import annotations
@@ -17,63 +17,43 @@ import numpy as np
 from astropy.constants import c, h
 from numpy.typing import NDArray
 
+from ..array_cache import array_cache
 from ..errors import InputError
 from ..files.bounded import shortened
-from ..remembered import remembered
 from .band_names import known_band
 from .catalogue import band_table, find, spectrum_table
 
 Float = NDArray[np.float64]
 
-#: What a magnitude may mean: what catalogues print in the band, Vega at zero in every band, or AB.
+#: Magnitude systems: that of catalogues in the band, Vega at zero in every band, or AB.
 System = Literal["catalogue", "vega", "ab"]
 SYSTEMS: tuple[System, ...] = get_args(System)
-#: A spectrum must cover this share of a band's throughput.
+#: Fraction of a band's throughput that a spectrum must cover.
 COVERAGE = 0.99
-#: Angstrom to a nanometre, and h c in erg Angstrom, with astropy's own rounding.
+#: Angstrom per nanometre, and h c in erg Angstrom, with astropy's rounding.
 ANGSTROM = float(u.nm.to(u.AA))
 HC = float(h.cgs.value * c.to_value(u.AA / u.s))
-#: Wavelengths nearer to each other than this are one, Angstrom (synphot).
-SAME = 1e-12
+#: Distance up to which two wavelengths count as one, Angstrom (synphot).
+SAME_WAVELENGTH_A = 1e-12
 #: AB = 0, erg s-1 cm-2 Hz-1 (Oke & Gunn 1983, doi 10.1086/160817: -48.60).
 AB_ZERO = 10.0 ** (48.6 / -2.5)
 
 
 @dataclass(frozen=True, eq=False)
 class Band:
-    """A photometric band.
-
-    Attributes
-    ----------
-    name : str
-    system : {"Vega", "AB"}
-        What catalogues' magnitudes in it mean.
-    vega : float
-        Vega's magnitude in them; NaN for AB, where it is no zero point.
-    zero_point : str
-        Where that is from.
-    origin : str
-    wavelength_nm, throughput : ndarray, shape (n,)
-        Response per photon, relative.
-    """
+    """A photometric band."""
 
     name: str
-    system: Literal["Vega", "AB"]
-    vega: float
-    zero_point: str
-    origin: str
-    wavelength_nm: Float
-    throughput: Float
+    system: Literal["Vega", "AB"]  # magnitude system of catalogues in this band
+    vega: float  # Vega's magnitude in that system; NaN for AB
+    zero_point: str  # source of the zero point
+    origin: str  # source of the curve
+    wavelength_nm: Float  # shape (n,)
+    throughput: Float  # relative response per photon, shape (n,)
 
 
 def band(name: str) -> Band:
-    """A band by name or alias, in any case.
-
-    Raises
-    ------
-    InputError
-        If there is none of that name.
-    """
+    """Return a band, given its name or alias in any case."""
     return _load(known_band(name))
 
 
@@ -92,13 +72,7 @@ def _load(name: str) -> Band:
 
 
 def scale(name: str, system: System = "catalogue") -> str:
-    """What magnitudes in a band mean, as a sentence.
-
-    Raises
-    ------
-    InputError
-        For an unknown band or system.
-    """
+    """Return a sentence that explains the magnitudes of a system in a band."""
     chosen = band(name)
     _check_system(system)
     if system == "vega":
@@ -114,43 +88,44 @@ def _check_system(system: str) -> None:
         raise InputError(f"magnitude system {shortened(str(system))} is unknown, expected one of {', '.join(SYSTEMS)}")
 
 
-@remembered(256)
+@array_cache(256)
 def magnitude(wavelength_nm: Float, flux_flam: Float, name: str = "V", system: System = "catalogue") -> float:
-    """Synthetic magnitude in a band.
+    """Return the synthetic magnitude in a band.
 
     Parameters
     ----------
     wavelength_nm : ndarray, shape (n,)
     flux_flam : ndarray, shape (n,)
-        erg s-1 cm-2 A-1.
+        Flux density, erg s-1 cm-2 A-1.
     name : str
+        Name or alias of the band.
     system : {"catalogue", "vega", "ab"}
-        What catalogues print in the band (its record holds the zero point, with its source), Vega at zero, or AB.
+        The system of catalogues in the band (the band holds its zero point and source), Vega at zero, or AB.
 
     Raises
     ------
     InputError
-        For an unknown band or system, a band that the spectrum does not cover, or no light in it.
+        If the spectrum does not cover the band or has no light in it.
     """
     _check_system(system)
     chosen = _covered(wavelength_nm, name)
     grid = np.union1d(wavelength_nm, chosen.wavelength_nm) * 10.0
-    star = _integral(grid, *_light(wavelength_nm, flux_flam, chosen), chosen)
+    star = _photon_rate(grid, *_photon_density(wavelength_nm, flux_flam, chosen), chosen)
     if not star > 0.0:
         raise InputError(f"the spectrum has no light in the band {chosen.name}, expected a positive flux")
     if system == "ab" or (system == "catalogue" and chosen.system == "AB"):
-        return _ab(star, grid, chosen)
+        return _ab_magnitude(star, grid, chosen)
     vega = math.log10(photons(*_vega(), chosen.name))
     return 2.5 * (vega - math.log10(star)) + (chosen.vega if system == "catalogue" else 0.0)
 
 
-@remembered(256)
+@array_cache(256)
 def photons(wavelength_nm: Float, flux_flam: Float, name: str) -> float:
-    """Photons s-1 cm-2 in a band, weighted with its throughput; errors as `magnitude`."""
+    """Return the photons s-1 cm-2 in a band, weighted by its throughput; raises as `magnitude`."""
     chosen = _covered(wavelength_nm, name)
-    at, light = _light(wavelength_nm, flux_flam, chosen)
+    at, light = _photon_density(wavelength_nm, flux_flam, chosen)
     grid = np.union1d(at, chosen.wavelength_nm * ANGSTROM)
-    return _integral(grid[np.append(np.diff(grid) > SAME, True)], at, light, chosen)
+    return _photon_rate(grid[np.append(np.diff(grid) > SAME_WAVELENGTH_A, True)], at, light, chosen)
 
 
 @cache
@@ -160,13 +135,7 @@ def _vega() -> tuple[Float, Float]:
 
 
 def _covered(wavelength_nm: Float, name: str) -> Band:
-    """A band that a spectrum covers.
-
-    Raises
-    ------
-    InputError
-        If it does not, or there is no such band.
-    """
+    """Return a band; raises InputError if the spectrum does not cover it."""
     chosen = band(name)
     inside = (chosen.wavelength_nm >= wavelength_nm[0]) & (chosen.wavelength_nm <= wavelength_nm[-1])
     share = np.trapezoid(chosen.throughput * inside, chosen.wavelength_nm) / np.trapezoid(
@@ -181,10 +150,10 @@ def _covered(wavelength_nm: Float, name: str) -> Band:
     return chosen
 
 
-def _light(wavelength_nm: Float, flux_flam: Float, chosen: Band) -> tuple[Float, Float]:
-    """Wavelengths, Angstrom, and photons s-1 cm-2 A-1 there.
+def _photon_density(wavelength_nm: Float, flux_flam: Float, chosen: Band) -> tuple[Float, Float]:
+    """Return wavelengths, Angstrom, and photon flux densities, photons s-1 cm-2 A-1.
 
-    A spectrum that ends within the band goes down to nothing within one more step of the same ratio.
+    A spectrum that ends within the band falls to zero over one more step of the same ratio, as in synphot.
     """
     at = wavelength_nm * ANGSTROM
     light = flux_flam * at / HC
@@ -195,22 +164,22 @@ def _light(wavelength_nm: Float, flux_flam: Float, chosen: Band) -> tuple[Float,
     return np.array([before, *at, after]), np.array([0.0, *light, 0.0])
 
 
-def _integral(grid: Float, at: Float, light: Float, chosen: Band) -> float:
-    """Photons s-1 cm-2 in a band by trapezoids between the wavelengths of a grid, Angstrom."""
-    through = _between(grid, chosen.wavelength_nm * ANGSTROM, chosen.throughput)
-    return float(np.trapezoid(_between(grid, at, light) * through, grid))
+def _photon_rate(grid: Float, at: Float, light: Float, chosen: Band) -> float:
+    """Integrate photons s-1 cm-2 in a band by the trapezoidal rule on a grid in Angstrom."""
+    through = _interpolate(grid, chosen.wavelength_nm * ANGSTROM, chosen.throughput)
+    return float(np.trapezoid(_interpolate(grid, at, light) * through, grid))
 
 
-def _between(grid: Float, at: Float, values: Float) -> Float:
-    """Straight between points, the end values beyond them; weighted as scipy's `interpn` does, which synphot calls."""
+def _interpolate(grid: Float, at: Float, values: Float) -> Float:
+    """Interpolate linearly and extend by the end values, with the rounding of scipy's `interpn` (synphot's choice)."""
     after = np.clip(np.searchsorted(at, grid, side="right"), 1, at.size - 1)
     share = np.clip((grid - at[after - 1]) / (at[after] - at[after - 1]), 0.0, 1.0)
     return np.asarray(values[after - 1] * (1.0 - share) + values[after] * share)
 
 
-def _ab(star: float, grid: Float, chosen: Band) -> float:
-    """The AB magnitude of so many photons: their mean flux to a wavelength, at the band's pivot to a frequency."""
+def _ab_magnitude(star: float, grid: Float, chosen: Band) -> float:
+    """Return the AB magnitude of a photon rate: its mean flux per wavelength, converted at the pivot wavelength."""
     at, through = chosen.wavelength_nm * ANGSTROM, chosen.throughput
     pivot = float(np.sqrt(np.trapezoid(through * at, at) / np.trapezoid(through / at, at)))
-    mean = HC * star / float(np.trapezoid(grid * _between(grid, at, through), grid))
+    mean = HC * star / float(np.trapezoid(grid * _interpolate(grid, at, through), grid))
     return -2.5 * math.log10(mean * pivot**2 / c.to_value(u.AA / u.s) / AB_ZERO)

@@ -1,4 +1,4 @@
-"""The embedded library: which spectra there are, and their tables."""
+"""Index and tables of the embedded library."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _LIBRARY = files("mauvecl.host.stars") / "library"
 
 @cache
 def _index() -> dict[str, dict[str, str]]:
-    # All text, one row a line: read without astropy, so that a misspelt name is told at once.
+    # Read without astropy, which keeps the error for a misspelt name fast.
     text = _LIBRARY.joinpath("index.ecsv").read_text(encoding="utf-8")
     lines = [line for line in text.splitlines() if not line.startswith("#")]
     return {entry["name"].casefold(): entry for entry in csv.DictReader(lines, delimiter=" ")}
@@ -27,7 +27,7 @@ def _index() -> dict[str, dict[str, str]]:
 
 @cache
 def _names() -> dict[str, str]:
-    """Every name and alias, in lower case, to its entry's name."""
+    """Return the key of the index entry for every name and alias, in lower case."""
     names = {}
     for key, entry in _index().items():
         names[key] = key
@@ -38,20 +38,20 @@ def _names() -> dict[str, str]:
 
 
 def library_table() -> Table:
-    """The embedded spectra, and those of one's own behind them.
+    """Return the embedded spectra, followed by the user's own.
 
     Returns
     -------
     astropy.table.Table
-        Columns name, alias, spectral_type, star, origin, citation, licence, treatment, uv_quality, kept (all text; the
-        last is "embedded" or "yours").
+        Columns name, alias, spectral_type, star, origin, citation, licence, treatment, uv_quality and kept. All are
+        text; the last is "embedded" or "yours".
     """
     from astropy.table import Table
 
     from . import own_stars
 
     table = Table.read(_LIBRARY.joinpath("index.ecsv").read_text(encoding="utf-8"), format="ascii.ecsv")
-    # Empty text comes back masked.
+    # The reader masks empty text.
     table = table.filled("")
     table.remove_columns(["file", "source_file"])
     table["kept"] = "embedded"
@@ -59,30 +59,22 @@ def library_table() -> Table:
         row = dict.fromkeys(table.colnames, "") | {"name": star.name, "star": star.name, "origin": star.origin}
         row |= {"treatment": "; ".join(star.notes), "kept": "yours"}
         for name in table.colnames:
-            # Columns of text are as wide as their longest entry.
+            # A column of dtype str is only as wide as its longest entry.
             table[name] = table[name].astype(object)
         table.add_row(row)
     return table
 
 
 def embedded(name: str) -> dict[str, str] | None:
-    """The index entry of an embedded spectrum by name, alias or star, in any case, or None."""
+    """Return the index entry of an embedded spectrum by name, alias or star in any case, or None."""
     key = _names().get(name.strip().casefold())
     return None if key is None else _index()[key]
 
 
 def find(name: str) -> dict[str, str]:
-    """The index entry of an embedded spectrum.
+    """Return the index entry of an embedded spectrum by name, alias or star in any case.
 
-    Parameters
-    ----------
-    name : str
-        Name, alias or star, in any case.
-
-    Raises
-    ------
-    InputError
-        If there is none; the message holds the nearest names, kept stars' among them.
+    Raises InputError for an unknown name; the message suggests the nearest names, including the user's own stars.
     """
     from . import own_stars
 
@@ -98,12 +90,12 @@ def find(name: str) -> dict[str, str]:
 
 @lru_cache(8)
 def spectrum_table(file: str) -> Numbers:
-    """A library spectrum: columns wavelength (nm) and flux (erg s-1 cm-2 A-1)."""
+    """Read a library spectrum with the columns wavelength (nm) and flux (erg s-1 cm-2 A-1)."""
     return _numbers("spectra", file)
 
 
 def band_table(file: str) -> Numbers:
-    """A photometric band: columns wavelength (nm) and throughput (per photon)."""
+    """Read a photometric band with the columns wavelength (nm) and throughput (per photon)."""
     return _numbers("bands", file)
 
 

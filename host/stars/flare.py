@@ -1,4 +1,4 @@
-"""A flare as a blackbody added to a star, or taking the place of part of its photosphere (METHODS section 1)."""
+"""Flares as blackbodies that are added to a star or replace part of its photosphere (METHODS section 1)."""
 
 from __future__ import annotations
 
@@ -9,31 +9,25 @@ import numpy as np
 from astropy.constants import c, h, k_B
 from numpy.typing import NDArray
 
+from ..array_cache import array_cache
 from ..errors import InputError
 from ..ranges import check_amplitude, check_temperature
-from ..remembered import remembered
 from .bands import ANGSTROM, photons
 
 Geometry = Literal["added", "replaces"]
 
 
-@remembered(32)
+@array_cache(32)
 def blackbody(wavelength_nm: NDArray[np.float64], temperature_k: float) -> NDArray[np.float64]:
-    """Surface flux pi B_lambda of a blackbody, erg s-1 cm-2 A-1, shape (n,).
-
-    Parameters
-    ----------
-    wavelength_nm : ndarray, shape (n,)
-    temperature_k : float
-    """
-    # The steps of astropy's BlackBody, to the last bit, without the time that its models take to load.
+    """Return the surface flux pi B_lambda of a blackbody, erg s-1 cm-2 A-1, shape (n,)."""
+    # The steps of astropy's BlackBody to the last bit, without the slow import of its models.
     metre = u.m.to(u.AA)
     frequency = c.value / (wavelength_nm * ANGSTROM / metre)
-    # Far down Wien's side there is nothing.
+    # Overflow in the Wien tail gives zero flux.
     with np.errstate(over="ignore"):
         steps = c.value**2 * np.expm1(h.value * frequency / (k_B.value * temperature_k))
     per_hz = 2.0 * h.value * frequency**3 / steps
-    # From W m-2 Hz-1 to erg s-1 cm-2 Hz-1, to each Angstrom.
+    # From W m-2 Hz-1 to erg s-1 cm-2 Hz-1, and to erg s-1 cm-2 A-1.
     return np.asarray(np.pi * (per_hz / 1e-3 / ((c.value / frequency * metre) ** 2 / c.to_value(u.AA / u.s))))
 
 
@@ -47,7 +41,7 @@ def with_flare(
     geometry: Geometry,
     photosphere_temperature_k: float | None,
 ) -> NDArray[np.float64]:
-    """The flux of a flaring star, shape (n,).
+    """Return the flux of a flaring star, shape (n,).
 
     Parameters
     ----------
@@ -56,20 +50,15 @@ def with_flare(
     amplitude : float
         Relative rise of the photons in the band: 0.24 is 24 %.
     temperature_k : float
-        Of the flare's blackbody.
+        Temperature of the flare's blackbody.
     band : str
-        Where the amplitude is measured.
+        Band in which the amplitude is measured.
     geometry : {"added", "replaces"}
-        ``added``: F + k B, the paper's way. ``replaces``: a patch of the filling factor f = A / (R - 1) takes the
-        place of photosphere, F (1 - f) + f R (N_F / N_B) B; N are photons in the band and R is the ratio of the two
-        surface fluxes there, from blackbodies of the two temperatures.
+        With ``added``, the flux is F + k B, as in the paper. With ``replaces``, a region of filling factor
+        f = A / (R - 1) replaces photosphere: F (1 - f) + f R (N_F / N_B) B, where N are photons in the band and R is
+        the ratio of the surface fluxes of the two blackbodies there.
     photosphere_temperature_k : float, optional
-        Only for ``replaces``.
-
-    Raises
-    ------
-    InputError
-        For an impossible value, or a band that the spectrum does not cover.
+        Temperature of the photosphere, which ``replaces`` requires.
     """
     check_amplitude(amplitude)
     check_temperature("flare temperature", temperature_k)

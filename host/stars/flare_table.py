@@ -1,4 +1,4 @@
-"""Flares that were found elsewhere: tables of AltaiPony, of lightkurve users, or one's own, as a study's amplitudes."""
+"""Reader of flare tables, such as AltaiPony's, whose amplitudes a study can use."""
 
 from __future__ import annotations
 
@@ -16,32 +16,27 @@ from ..files.text_table import text_table
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
-#: Columns that hold the relative rise above the quiescent flux; AltaiPony's first.
+#: Names of the column of the relative rise above the quiescent flux; AltaiPony's first.
 AMPLITUDES = ("ampl_rec", "amplitude", "ampl", "amp", "peak_amplitude", "relative_amplitude")
-#: Where a flare begins and ends, days; AltaiPony's first.
+#: Names of the columns of start and stop, days; AltaiPony's first.
 STARTS, STOPS = ("tstart", "start", "t_start", "time_start"), ("tstop", "stop", "t_stop", "time_stop", "end")
-#: More make a study that nobody reads.
-MOST = 500
-FORMS = "CSV, ECSV or FITS"
+#: Largest number of flares; results for more would be too many to read.
+MAX_FLARES = 500
+FORMATS = "CSV, ECSV or FITS"
 
 
 def read_flares(path: str | Path) -> QTable:
-    """Amplitudes of a table of flares, with the times where it has them.
+    """Read amplitudes, and times if present, from a table of flares.
 
     Parameters
     ----------
     path : str or Path
-        CSV, ECSV or FITS; a column named as in `AMPLITUDES`, in any case.
+        CSV, ECSV or FITS file with a column named as in `AMPLITUDES`, in any case.
 
     Returns
     -------
     QTable
-        ``amplitude``, and ``start`` and ``stop`` in days of the table's own clock.
-
-    Raises
-    ------
-    InputError
-        If the file cannot be read, or holds no such column, none or too many flares, or an impossible amplitude.
+        ``amplitude``, and ``start`` and ``stop`` in days of the table's own time system.
     """
     path = Path(path)
     named = f"flare table {shortened(str(path))}"
@@ -49,19 +44,19 @@ def read_flares(path: str | Path) -> QTable:
     if content.startswith(b"SIMPLE  ="):
         table = _fits_table(content, named)
     else:
-        table = text_table(as_text(content, named), named, path.suffix.lower() == ".csv", FORMS)
+        table = text_table(as_text(content, named), named, path.suffix.lower() == ".csv", FORMATS)
     return flares_of(table, shortened(path.name))
 
 
 def _fits_table(content: bytes, named: str) -> Table:
-    """The first table of a FITS file, which is no larger than the file is."""
+    """Read the first table of a FITS file; raises InputError if it claims to be larger than the file."""
     import io
 
     from astropy.io import fits
     from astropy.table import Table
 
-    with parsing(named, FORMS), warnings.catch_warnings(), fits.open(io.BytesIO(content), memmap=False) as hdus:
-        # Headers that astropy warns of and reads all the same.
+    with parsing(named, FORMATS), warnings.catch_warnings(), fits.open(io.BytesIO(content), memmap=False) as hdus:
+        # Astropy warns of headers that it can read nevertheless.
         warnings.simplefilter("ignore")
         for hdu in hdus:
             claimed = hdu.size
@@ -69,22 +64,18 @@ def _fits_table(content: bytes, named: str) -> Table:
                 raise InputError(f"{named} says that it has {claimed} bytes of data, expected at most the file's")
             if isinstance(hdu, fits.BinTableHDU | fits.TableHDU):
                 return Table.read(hdu)
-        raise InputError(f"{named} has no table, expected {FORMS}")
+        raise InputError(f"{named} has no table, expected {FORMATS}")
 
 
 def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
-    """The same of a table in memory: astropy's, or a DataFrame such as AltaiPony's ``flares``.
+    """Extract amplitudes and times from a table in memory; see `read_flares`.
 
     Parameters
     ----------
     table : Table or DataFrame
+        An astropy table, or a DataFrame such as AltaiPony's ``flares``.
     name : str
-        For messages.
-
-    Raises
-    ------
-    InputError
-        As `read_flares`.
+        Name of the table in error messages.
     """
     from astropy.table import QTable, Table
 
@@ -101,8 +92,8 @@ def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
         raise InputError(
             f"{name} has the columns {shown(', '.join(lower), 300)}, expected one named {', '.join(AMPLITUDES)}"
         )
-    if not 0 < amplitudes.size <= MOST:
-        raise InputError(f"{name} holds {amplitudes.size} flares, expected 1 to {MOST}")
+    if not 0 < amplitudes.size <= MAX_FLARES:
+        raise InputError(f"{name} holds {amplitudes.size} flares, expected 1 to {MAX_FLARES}")
     bad = ~((amplitudes >= SMALLEST) & (amplitudes <= LARGEST))
     if bad.any():
         row = int(np.argmax(bad))
@@ -120,7 +111,7 @@ def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
 
 
 def _numbers(column: Any, named: str, unit: str) -> np.ndarray:
-    """A column's numbers in a unit, which is also assumed where it has none; NaN where it has no value."""
+    """Return a column's numbers in a unit, which is also assumed if the column has none; masked values become NaN."""
     import astropy.units as u
 
     kind = np.asarray(column).dtype.kind if hasattr(column, "dtype") else "O"

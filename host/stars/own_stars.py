@@ -1,7 +1,7 @@
-"""Stars of one's own beside the embedded library: added from files, or fetched from public collections of HST spectra.
+"""The user's own stars, which supplement the embedded library.
 
-Each is an ECSV file in a folder of the user's, with its origin and the digest of its spectrum, which is compared at
-every reading. Nothing is fetched unless asked for.
+Each star is an ECSV file in the user's data folder, with its origin and the digest of its spectrum, which is verified
+at every reading.
 """
 
 from __future__ import annotations
@@ -11,23 +11,15 @@ import hashlib
 import io
 import os
 import re
-import sys
-import tempfile
-import time
-from collections.abc import Callable
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import IO, TYPE_CHECKING
-from urllib.parse import urljoin, urlsplit
+from typing import TYPE_CHECKING
 
 from ..errors import InputError
-from ..files.bounded import limit_bytes, read_bytes, shortened
+from ..files.bounded import read_bytes
 from ..files.ecsv import read_ecsv
-from ..files.parsed import parsing
 from ..files.whole import write_whole
 from ..spectra.formats import without_columns
-from ..version import VERSION
 
 if TYPE_CHECKING:
     import numpy as np
@@ -35,19 +27,10 @@ if TYPE_CHECKING:
 
     from .source import Source
 
-#: Seconds without an answer.
-TIMEOUT_S = 20.0
-#: Schemes of an address; a local file is added, not fetched.
-SCHEMES = ("http", "https", "ftp")
-#: Seconds that a file may take to come: `bounded.LIMITS` at 0.5 MB/s.
-LONGEST_S = 600.0
-#: Bytes of a listing, at most.
-MOST_LISTED = 20 * 2**20
-
 
 @dataclass(frozen=True)
 class OwnStar:
-    """What is known of a kept star without reading its spectrum."""
+    """Metadata of a kept star; fields as in `Source`."""
 
     name: str
     origin: str
@@ -60,7 +43,7 @@ class OwnStar:
 
 
 def folder() -> Path:
-    """Where kept stars are: ``MAUVECL_DATA_DIR``, or the user's data folder."""
+    """Return the folder of kept stars, below ``MAUVECL_DATA_DIR`` or the user's data folder."""
     import platformdirs
 
     given = os.environ.get("MAUVECL_DATA_DIR")
@@ -68,12 +51,12 @@ def folder() -> Path:
 
 
 def kept() -> list[OwnStar]:
-    """All stars kept, by name."""
+    """Return all kept stars, sorted by file name."""
     return [star for path in sorted(folder().glob("*.ecsv")) if (star := _described(path)) is not None]
 
 
 def find(name: str) -> OwnStar | None:
-    """One of them by name, in any case, or None."""
+    """Return a kept star by name in any case, or None."""
     wanted = name.strip().casefold()
     return next((star for star in kept() if star.name.casefold() == wanted), None)
 
@@ -96,13 +79,7 @@ def _read(path: Path) -> Table:
 
 
 def spectrum(star: OwnStar) -> tuple[np.ndarray, np.ndarray]:
-    """Wavelengths, nm, and fluxes, erg s-1 cm-2 A-1.
-
-    Raises
-    ------
-    InputError
-        If the file is not as it was kept.
-    """
+    """Return wavelengths, nm, and fluxes, erg s-1 cm-2 A-1; raises InputError if the file was changed."""
     import numpy as np
 
     table = _read(star.path)
@@ -134,20 +111,20 @@ def add(
     Parameters
     ----------
     path : str or Path
-        As `formats.read_spectrum` takes it.
+        File of any format that `formats.read_spectrum` supports.
     name : str, optional
-        That of the file's header, or the file's own, by default.
+        Name of the star. The default is that of the file's header, or the file name.
     origin : str, optional
-        Where it came from.
+        Origin of the spectrum, for reports. The default is the file name.
     replace : bool
-        Take the place of a kept star of that name.
+        Whether to replace a kept star of the same name.
     wavelength_unit, flux_unit, extend : str, optional
-        As `Source.read` takes them.
+        As for `Source.read`.
 
     Raises
     ------
     InputError
-        If the file holds no usable spectrum, the name is taken or impossible, or the folder cannot be written.
+        If the file holds no usable spectrum, the name is taken or invalid, or the folder cannot be written.
     """
     from astropy.table import Table
 
@@ -199,13 +176,7 @@ def add(
 
 
 def remove(name: str) -> None:
-    """Forget a kept star.
-
-    Raises
-    ------
-    InputError
-        If there is none of that name.
-    """
+    """Delete a kept star; raises InputError for an unknown name."""
     wanted = name.strip().casefold()
     for path in sorted(folder().glob("*.ecsv")):
         if path.stem.casefold() == re.sub(r"[^a-z0-9.+-]", "_", wanted) or _named(path) == wanted:
@@ -221,219 +192,3 @@ def _named(path: Path) -> str | None:
     except InputError:
         return None
     return None if described is None else described.name.casefold()
-
-
-@dataclass(frozen=True)
-class Collection:
-    """A public collection of HST spectra.
-
-    Attributes
-    ----------
-    name, title, citation : str
-    base : str
-        Address of its files; assumed from the archive's pages, not verified here.
-    file_of : callable
-        The address of a star's file below the base, from the star's name and a function that gives a folder's listing.
-    """
-
-    name: str
-    title: str
-    citation: str
-    base: str
-    file_of: Callable[[str, Callable[[str], list[str]]], str]
-
-
-def _plain(name: str) -> str:
-    return re.sub(r"[^a-z0-9+-]", "", name.casefold())
-
-
-def _hd(name: str) -> str:
-    """HD numbers with six digits, as archives write them in file names."""
-    plain = _plain(name)
-    match = re.fullmatch(r"(hd)0*(\d{1,6})", plain)
-    return f"{match[1]}{int(match[2]):06d}" if match else plain
-
-
-def _latest_calspec(name: str, listing: Callable[[str], list[str]]) -> str:
-    """The newest STIS file of a star: CALSPEC counts them."""
-    plain = _plain(name)
-    files = [file for file in listing("") if re.fullmatch(rf"{re.escape(plain)}_stis(wfcnic|wfc|nic)?_\d+\.fits", file)]
-    if not files:
-        raise FileNotFoundError(plain)
-    return max(files, key=lambda file: (int(file.rsplit("_", 1)[1][:-5]), file))
-
-
-COLLECTIONS = (
-    Collection(
-        "calspec",
-        "CALSPEC, HST's flux standards",
-        "Bohlin, Gordon & Tremblay 2014, PASP 126, 711, doi 10.1086/677655",
-        "https://archive.stsci.edu/hlsps/reference-atlases/cdbs/current_calspec/",
-        _latest_calspec,
-    ),
-    Collection(
-        "ngsl",
-        "Next Generation Spectral Library, version 2",
-        "Heap & Lindler 2007, ASP Conf. Ser. 374, 409",
-        "https://archive.stsci.edu/pub/hlsp/stisngsl/v2/",
-        lambda name, listing: f"{_hd(name)}/h_stis_ngsl_{_hd(name)}_v2.fits",
-    ),
-    Collection(
-        "lowlib",
-        "the HST stellar library of 513 stars, dereddened",
-        "Pal et al. 2023, doi 10.17909/kmdt-pw63",
-        "https://archive.stsci.edu/hlsps/lowlib/",
-        lambda name, listing: f"hlsp_lowlib_hst_stis_{_plain(name)}_g230lb-g430l-g750l_v1.0_spect.fits",
-    ),
-)
-
-
-def fetch(
-    name: str,
-    *,
-    base: str | None = None,
-    replace: bool = False,
-    show_progress: bool = True,
-    extend: str | None = None,
-) -> OwnStar:
-    """Fetch a star of a public collection and keep it.
-
-    Parameters
-    ----------
-    name : str
-        Such as ``"HD 37202"``, looked for in one collection after the other, or ``"ngsl:HD 37202"``.
-    base : str, optional
-        Another address of the collection's files: a mirror. The collection is to be named then.
-    replace : bool
-        Take the place of a kept star of that name.
-    show_progress : bool
-    extend : str, optional
-        A library spectrum that goes on where the star's file ends.
-
-    Raises
-    ------
-    InputError
-        If there is no network, no such star, or what came is no usable spectrum.
-    """
-    word, colon, star = (part.strip() for part in name.partition(":"))
-    chosen = [c for c in COLLECTIONS if c.name == word.casefold()] if colon else list(COLLECTIONS)
-    known = ", ".join(c.name for c in COLLECTIONS)
-    if not chosen:
-        raise InputError(f"collection {word!r} is unknown, expected one of {known}")
-    if base is not None and not colon:
-        raise InputError(f"another address is given for {name!r}, expected its collection too, such as ngsl:{name}")
-    star = star if colon else word
-    if not _plain(star):
-        raise InputError(f"star {name!r} has no name to look for, expected one such as ngsl:HD 37202")
-    for collection in chosen:
-        address = base or collection.base
-        try:
-            _check_address(address)
-            url = urljoin(_folder(address), collection.file_of(star, partial(_listing, address)))
-            downloaded = _download(url, show_progress)
-        except FileNotFoundError:
-            continue
-        file = url.rsplit("/", 1)[1]
-        # Messages and notes go by the archive's name of the file.
-        local = downloaded.rename(downloaded.with_name(f"{downloaded.name}-{file}"))
-        try:
-            title = f"{collection.title}; {collection.citation}; {url}"
-            return add(local, star, origin=title, replace=replace, extend=extend)
-        except InputError as error:
-            raise InputError(
-                f"{url} came, and is no usable spectrum ({str(error).replace(local.name, file)}), expected a whole file"
-            ) from error
-        finally:
-            local.unlink(missing_ok=True)
-    where = " or ".join(c.title for c in chosen)
-    raise InputError(
-        f"no star {star!r} in {where}, expected its name there, such as HD 37202; or bring the file: "
-        "mauvecl library add"
-    )
-
-
-def _folder(address: str) -> str:
-    return address if address.endswith("/") else address + "/"
-
-
-def _check_address(address: str) -> None:
-    """Refuse what is no address of the network."""
-    with parsing(f"address {shortened(address)}", "one such as https://host/folder/"):
-        parts = urlsplit(address)
-        known = parts.scheme in SCHEMES and bool(parts.hostname) and parts.port != 0
-    if not (known and address.isprintable() and " " not in address):
-        raise InputError(
-            f"address {shortened(address)} is none of the network, expected one such as https://host/folder/"
-        )
-
-
-def _download(url: str, show_progress: bool, most: int | None = None) -> Path:
-    """A file of the network, within limits of size and time; FileNotFoundError where the server has none."""
-    # TLS takes a while to load, and most runs fetch nothing.
-    import http.client
-    import urllib.error
-
-    most = limit_bytes("MAUVECL_LARGEST_FILE_MIB") if most is None else most
-    descriptor, name = tempfile.mkstemp(prefix="mauvecl-fetch-")
-    try:
-        with open(descriptor, "wb") as file:
-            _receive(url, file, most, show_progress)
-        return Path(name)
-    except BaseException as error:
-        Path(name).unlink(missing_ok=True)
-        if isinstance(error, InputError):
-            raise
-        if isinstance(error, urllib.error.HTTPError):
-            if error.code in (403, 404, 410):
-                # Archives on object stores answer 403 where there is nothing.
-                raise FileNotFoundError(url) from error
-            raise InputError(
-                f"{url} answers {error.code} {error.reason}, expected the file: try again later"
-            ) from error
-        if not isinstance(error, OSError | ValueError | http.client.HTTPException):
-            raise
-        # Names that no host has are ValueErrors of the IDNA codec, wrong answers HTTPExceptions.
-        reason = getattr(error, "reason", error)
-        raise InputError(
-            f"{url} cannot be reached ({reason}), expected a network; without one bring the file: mauvecl library add "
-            f"{url.rsplit('/', 1)[1] or 'FILE'}"
-        ) from error
-
-
-def _receive(url: str, file: IO[bytes], most: int, show_progress: bool) -> None:
-    """Write what a server sends, piece by piece, for it may tell a wrong size or none, and never end."""
-    import urllib.request
-
-    from astropy.utils.console import ProgressBarOrSpinner
-
-    latest, got = time.monotonic() + LONGEST_S, 0
-    request = urllib.request.Request(url, headers={"User-Agent": f"mauvecl/{VERSION}"})
-    with urllib.request.urlopen(request, timeout=TIMEOUT_S) as answer:
-        length = answer.headers.get("Content-Length", "")
-        size = int(length) if length.isascii() and length.isdigit() and len(length) < 20 else None
-        shown = sys.stderr if show_progress else io.StringIO()
-        with ProgressBarOrSpinner(size, f"Fetching {url}", file=shown) as bar:
-            while (size is None or size <= most) and (piece := answer.read1(1 << 16)):
-                file.write(piece)
-                got += len(piece)
-                bar.update(got)
-                if got > most:
-                    size = got
-                if time.monotonic() > latest:
-                    raise InputError(f"{url} takes more than {LONGEST_S:.0f} s to come, expected less: try again later")
-    if size is not None and size > most:
-        raise InputError(
-            f"{url} has more than {most >> 20} MiB, expected less; MAUVECL_LARGEST_FILE_MIB sets the limit of files"
-        )
-    if size is not None and got < size:
-        raise InputError(f"{url} broke off ({got} of {size} bytes came), expected the whole file: try again")
-
-
-def _listing(address: str, below: str) -> list[str]:
-    """Names of the files that a server's page of a folder links to."""
-    page = _download(urljoin(_folder(address), below), False, MOST_LISTED)
-    try:
-        text = page.read_text(encoding="utf-8", errors="replace")
-    finally:
-        page.unlink(missing_ok=True)
-    return [link.rsplit("/", 1)[-1] for link in re.findall(r'href="([^"?#]+)"', text, flags=re.IGNORECASE)]

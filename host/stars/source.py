@@ -1,4 +1,4 @@
-"""A star: its spectrum at a magnitude, with or without a flare or dust."""
+"""Stellar spectra, scaled to a magnitude, flaring or reddened."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arguments import public
-from ..content import ByContent
+from ..content import ContentEquality
 from ..errors import InputError
 from ..plotting import picture
 from ..quantities import number
@@ -38,38 +38,38 @@ if TYPE_CHECKING:
     import astropy.units as u
     from astropy.table import QTable
 
-#: V of the brightest star, Sirius (Bessell 1990: -1.46), with room, and of the Sun with room: -26.76 (Willmer 2018).
+#: V of the brightest star, Sirius (-1.46, Bessell 1990), and of the Sun (-26.76, Willmer 2018), with margins.
 BRIGHTEST_V, SUN_V = -2.0, (-27.3, -26.2)
 
 
 @public
 @dataclass(frozen=True, eq=False)
-class Source(ByContent):
+class Source(ContentEquality):
     """A stellar spectrum at the telescope.
 
     Attributes
     ----------
     wavelength_nm : ndarray, shape (n,)
-        Vacuum wavelengths, strictly increasing, covering at least a third of 200-700 nm; `expect` asks for all that
-        the instrument's pixels see.
+        Vacuum wavelengths, strictly increasing, that cover at least a third of 200-700 nm; `expect` requires the range
+        of the instrument's pixels.
     flux_flam : ndarray, shape (n,)
-        erg s-1 cm-2 A-1, finite; linear between the points. Negative ones are measured noise.
+        Flux density, erg s-1 cm-2 A-1, finite, linear between points. Negative values are measured noise.
     name, origin : str
-        Origin says where the spectrum came from, with its citation.
+        The origin includes the citation.
     notes : tuple of str
-        What a report should say of it.
+        Remarks for reports.
     history : tuple of str
-        What was done to it.
+        Operations applied to the spectrum.
     scale : str
-        What the magnitude means that it was brought to; nothing where it was not.
+        Explanation of the magnitude to which the spectrum was scaled; empty if it was not.
     told : tuple of str
-        What every answer must say of it: what was assumed, continued or merged.
+        Assumptions, continuations and merged orders, which every answer reports.
     measured_nm : tuple of float, optional
-        Its span without what was continued at the level of its ends; all of it by default.
+        Range without the parts that were continued at the level of the ends; the whole range by default.
     unscaled : str
-        Why its flux is not that at the telescope, so that it needs a magnitude; empty where it is.
+        Reason why the flux is not that at the telescope, so that a magnitude is needed; empty otherwise.
     temperature_k : float, optional
-        Of its photosphere, which flares may take the place of; None where it is not known.
+        Temperature of the photosphere, which flares with ``geometry="replaces"`` need; None if unknown.
 
     Raises
     ------
@@ -100,7 +100,7 @@ class Source(ByContent):
 
     def __post_init__(self) -> None:
         for field in ("wavelength_nm", "flux_flam"):
-            # A copy of its own, so that nobody else can write to it.
+            # A private copy, which no caller can modify.
             array = np.array(getattr(self, field), dtype=np.float64)
             array.setflags(write=False)
             object.__setattr__(self, field, array)
@@ -110,17 +110,14 @@ class Source(ByContent):
 
     @cached_property
     def digest(self) -> str:
-        """sha256 of the spectrum, hexadecimal."""
+        """SHA-256 of the spectrum, hexadecimal."""
         return hashlib.sha256(self.wavelength_nm.tobytes() + self.flux_flam.tobytes()).hexdigest()
 
     @classmethod
     def from_library(cls, name: str) -> Self:
-        """An embedded spectrum, or one of one's own, by name in any case; `catalogue.library_table` lists them.
+        """Return an embedded spectrum or one of the user's own stars, by name in any case.
 
-        Raises
-        ------
-        InputError
-            For an unknown name, with the nearest ones.
+        `catalogue.library_table` lists the names. For an unknown name the error suggests the nearest ones.
         """
         mine = own_stars.find(name) if catalogue.embedded(name) is None else None
         if mine is not None:
@@ -157,8 +154,8 @@ class Source(ByContent):
     ) -> Self:
         """Read a spectrum from a file of text, ECSV, VOTable or FITS.
 
-        `told` holds what was assumed or changed. Undefined ends beyond 200-700 nm are left out. Ends within 180-750 nm
-        are continued at their level where they are dark.
+        `told` lists assumptions and changes. Undefined ends beyond 200-700 nm are dropped. Dark ends within 180-750 nm
+        are continued at their level.
 
         Parameters
         ----------
@@ -167,7 +164,7 @@ class Source(ByContent):
         wavelength_unit, flux_unit : str or Unit, optional
             Override what the file states; a wavelength's may end in " air" or " vacuum".
         extend : str or Source, optional
-            A library spectrum that continues the file's where it ends, scaled to it at the join.
+            Library spectrum that continues the file's beyond its end, scaled to match at the join.
 
         Raises
         ------
@@ -193,7 +190,7 @@ class Source(ByContent):
         extend: str | Source | None = None,
         is_file: bool = False,
     ) -> Self:
-        """Make a source of a user's spectrum: check its points and range, cut undefined ends, and continue others."""
+        """Check a user's spectrum, drop undefined ends, continue others, and make it a source."""
         check_points(name, wavelength, flux)
         check_measured(name, wavelength)
         wavelength, flux, cut = without_undefined_ends(name, wavelength, flux)
@@ -213,7 +210,7 @@ class Source(ByContent):
         )  # fmt: skip
 
     def _too_bright(self) -> str:
-        """Return why the flux cannot be that of a star at the telescope, or nothing."""
+        """Return why the flux cannot be that of a star at the telescope, or an empty string."""
         try:
             v = self.magnitude("V")
         except InputError:
@@ -222,17 +219,12 @@ class Source(ByContent):
         return "" if v > BRIGHTEST_V or sunlike else f"its flux makes V = {v:.1f}, brighter than any star in the sky"
 
     def binned(self, width_nm: u.Quantity | float) -> Self:
-        """The spectrum as means over bins, for noisy ones; bins start at its first wavelength.
+        """Return the spectrum averaged over bins from its first wavelength on, which reduces noise.
 
         Parameters
         ----------
         width_nm : Quantity or float
-            In nm, 0.01 to 50.
-
-        Raises
-        ------
-        InputError
-            For an impossible width.
+            Width of the bins, nm, 0.01 to 50.
         """
         width = number("bin", width_nm, "nm", low=0.01, high=50.0)
         first, last = self.wavelength_nm[0], self.wavelength_nm[-1]
@@ -252,14 +244,9 @@ class Source(ByContent):
         origin: str = "arrays",
         extend: str | Source | None = None,
     ) -> Self:
-        """A spectrum from two arrays, shape (n,): Quantities, or plain numbers in nm and erg s-1 cm-2 A-1.
+        """Make a spectrum from two arrays, shape (n,): Quantities, or plain numbers in nm and erg s-1 cm-2 A-1.
 
-        `extend` names a library spectrum, or is one, that goes on where the arrays end.
-
-        Raises
-        ------
-        InputError
-            For wrong units or an unusable spectrum.
+        `extend` is a library spectrum, or its name, that continues the arrays beyond their ends.
         """
         import astropy.units as u
 
@@ -275,13 +262,13 @@ class Source(ByContent):
             raise InputError(f"spectrum {name}: {error}, expected a wavelength and a flux density") from error
         axis, density = np.ma.filled(nm.value, np.nan), np.ma.filled(values.value, np.nan)
         if isinstance(wavelength, u.Quantity) and wavelength.unit.physical_type != "length" and axis[:1] > axis[-1:]:
-            # Rising frequencies are falling wavelengths.
+            # Rising frequencies or energies are falling wavelengths.
             axis, density = axis[::-1], density[::-1]
         return cls._made(np.asarray(axis, float), np.asarray(density, float), name, origin, extend=extend)
 
     @classmethod
     def from_synphot(cls, spectrum: Any, *, name: str = "synphot spectrum") -> Self:
-        """A synphot SourceSpectrum, sampled at its own wavelengths, or at half a nanometre where it has none near."""
+        """Sample a synphot SourceSpectrum at its own wavelengths and every half nanometre between them."""
         import astropy.units as u
         from synphot.units import FLAM
 
@@ -295,7 +282,7 @@ class Source(ByContent):
         grid = np.arange(160.0, 1150.0, 0.5)
         nm = np.unique(own.to_value(u.nm))
         inside = grid[(grid > nm[0]) & (grid < nm[-1])]
-        # A hair beside one of its own a wavelength says nothing new.
+        # A grid point within 1e-3 nm of one of the spectrum's own adds no information.
         at = np.searchsorted(nm, inside)
         alone = np.minimum(inside - nm[at - 1], nm[at] - inside) > 1e-3
         grid = np.union1d(nm, inside[alone])
@@ -304,7 +291,7 @@ class Source(ByContent):
 
     @classmethod
     def from_specutils(cls, spectrum: Any, *, name: str = "specutils spectrum") -> Self:
-        """A one-dimensional specutils Spectrum with units."""
+        """Convert a one-dimensional specutils Spectrum with units."""
         if not (hasattr(spectrum, "spectral_axis") and hasattr(spectrum, "flux")):
             raise InputError(f"the spectrum is of the type {type(spectrum).__name__}, expected a Spectrum of specutils")
         axis, flux = spectrum.spectral_axis, spectrum.flux
@@ -316,18 +303,18 @@ class Source(ByContent):
         return cls.from_arrays(u.Quantity(axis)[order], u.Quantity(flux)[order], name=name, origin="specutils Spectrum")
 
     def to_synphot(self) -> Any:
-        """The spectrum as a synphot SourceSpectrum, linear between its points."""
+        """Convert to a synphot SourceSpectrum, linear between points."""
         import astropy.units as u
         from synphot import Empirical1D, SourceSpectrum
         from synphot.units import FLAM, PHOTLAM, convert_flux
 
         at = self.wavelength_nm * u.nm
         photons = convert_flux(at, self.flux_flam * FLAM, PHOTLAM)
-        # Negative fluxes are measured noise; without this they become zero.
+        # Negative fluxes are measured noise; synphot's default sets them to zero.
         return SourceSpectrum(Empirical1D, points=at, lookup_table=photons, keep_neg=True)
 
     def to_specutils(self) -> Any:
-        """The spectrum as a specutils Spectrum (needs the extra ``spectra``)."""
+        """Convert to a specutils Spectrum (needs the extra ``spectra``)."""
         import astropy.units as u
 
         try:
@@ -343,7 +330,7 @@ class Source(ByContent):
 
     @property
     def table(self) -> QTable:
-        """Wavelength and flux with their units, one row per point."""
+        """Wavelength and flux with units, one row per point."""
         import astropy.units as u
         from astropy.table import QTable
 
@@ -353,7 +340,7 @@ class Source(ByContent):
         return table
 
     def plot(self, path: str | Path | None = None, *, ax: Any = None) -> Any:
-        """Flux against wavelength, saved under a path or drawn in axes; needs matplotlib."""
+        """Plot flux against wavelength, to a file or in given axes; needs matplotlib."""
         return picture("inputs.source", self, path=path, ax=ax)
 
     def _line(self) -> str:
@@ -366,43 +353,39 @@ class Source(ByContent):
         return f"<b>{html.escape(self.name)}</b>, {span}{notes}"
 
     def magnitude(self, band: str = "V", system: bands.System = "catalogue") -> float:
-        """Synthetic magnitude, as catalogues print it unless another system is named.
+        """Return the synthetic magnitude in a band.
 
         Parameters
         ----------
         band : str
         system : {"catalogue", "vega", "ab"}
-            What catalogues mean in the band, Vega at zero in every band, or AB.
+            The system of catalogues in the band, Vega at zero in every band, or AB.
 
         Raises
         ------
         InputError
-            For an unknown band or system, or a band that the spectrum does not cover.
+            If the measured spectrum does not cover the band.
         """
         low, high = self.measured_nm or (0.0, np.inf)
-        # What was made up is nobody's magnitude.
+        # Continued ends are assumptions, so they do not count.
         inside = (self.wavelength_nm >= low) & (self.wavelength_nm <= high)
         return bands.magnitude(self.wavelength_nm[inside], self.flux_flam[inside], band, system)
 
     def at_magnitude(self, magnitude: u.Quantity | float, band: str = "V", system: bands.System = "catalogue") -> Self:
-        """The same star at another magnitude: F 10**(-0.4 (m - m0)) (the paper's equation 1).
+        """Return the star scaled to a magnitude: F 10**(-0.4 (m - m0)) (the paper's equation 1).
 
         Parameters
         ----------
         magnitude : Quantity or float in mag
+            Magnitude in the band, -30 to 40.
         band : str
         system : {"catalogue", "vega", "ab"}
             See `magnitude`.
-
-        Raises
-        ------
-        InputError
-            As `magnitude`, or for a magnitude outside -30 to 40.
         """
         magnitude = number("magnitude", magnitude, "mag")
         check_magnitude(magnitude)
         factor = 10.0 ** (-0.4 * (magnitude - self.magnitude(band, system)))
-        scaled = self._changed(self.flux_flam * factor, f"scaled to {bands.band(band).name} = {magnitude:g}")
+        scaled = self._with_flux(self.flux_flam * factor, f"scaled to {bands.band(band).name} = {magnitude:g}")
         return replace(scaled, scale=bands.scale(band, system), unscaled="")
 
     def flaring(
@@ -414,22 +397,19 @@ class Source(ByContent):
         geometry: Geometry = "added",
         photosphere_temperature: u.Quantity | float | None = None,
     ) -> Self:
-        """The star with a flare; see `flare.with_flare` for the geometries.
+        """Return the star with a flare; see `flare.with_flare` for the geometries.
 
         Parameters
         ----------
         amplitude : Quantity or float
             Relative rise of the photons in the band: 0.24 is 24 %.
         temperature : Quantity or float in K
+            Temperature of the flare's blackbody.
         band : str
+            Band in which the amplitude is measured.
         geometry : {"added", "replaces"}
         photosphere_temperature : Quantity or float in K, optional
-            For ``replaces``, in place of the star's own `temperature_k`.
-
-        Raises
-        ------
-        InputError
-            For an impossible value, or a band that the spectrum does not cover.
+            For ``replaces``; the default is the star's `temperature_k`.
         """
         amplitude, kelvin = number("flare amplitude", amplitude), number("flare temperature", temperature, "K")
         photosphere = self.temperature_k
@@ -447,10 +427,10 @@ class Source(ByContent):
         title = f"flare of {100 * amplitude:g} % in {bands.band(band).name} at {kelvin:g} K, {geometry}"
         if geometry == "replaces":
             title += f" photosphere of {photosphere:g} K"
-        return self._changed(flux, title)
+        return self._with_flux(flux, title)
 
     def reddened(self, ebv: u.Quantity | float, *, rv: float = 3.1, law: str = "G23") -> Self:
-        """The star behind dust (needs the extra ``extinction``).
+        """Return the star reddened by dust (needs the extra ``extinction``).
 
         Parameters
         ----------
@@ -459,12 +439,12 @@ class Source(ByContent):
         rv : float
             A_V / E(B-V).
         law : {"G23", "F19", "CCM89"}
-            A law of dust_extinction.
+            Extinction law of dust_extinction.
 
         Raises
         ------
         InputError
-            For an impossible value, a law that does not cover the spectrum's part in 180-750 nm, or the missing extra.
+            If the law does not cover 180-750 nm, or the extra is missing.
         """
         try:
             from dust_extinction import parameter_averages
@@ -481,7 +461,7 @@ class Source(ByContent):
             model = getattr(parameter_averages, law)(Rv=rv)
         except ValueError as error:
             raise InputError(f"R_V = {rv!r}: {error}, expected what the law {law} allows") from error
-        # Laws end somewhere in the far ultraviolet; light beyond does not reach the detector.
+        # Laws end in the far ultraviolet, whose light does not reach the detector.
         low, high = 1000.0 / np.asarray(model.x_range)[::-1]
         inside = (self.wavelength_nm >= low) & (self.wavelength_nm <= high)
         if low > SPAN_NM[0] or high < SPAN_NM[1]:
@@ -490,5 +470,5 @@ class Source(ByContent):
         history = (*self.history, f"reddened by E(B-V) = {ebv:g}, {law}, R_V = {rv:g}")
         return replace(self, wavelength_nm=self.wavelength_nm[inside], flux_flam=flux, history=history)
 
-    def _changed(self, flux: NDArray[np.float64], what: str) -> Self:
+    def _with_flux(self, flux: NDArray[np.float64], what: str) -> Self:
         return replace(self, flux_flam=flux, history=(*self.history, what))

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from mauvecl.host.content import ByContent
+from mauvecl.host.content import ContentEquality
 from mauvecl.host.plotting import picture
 from mauvecl.study.labels import titled
 
@@ -34,7 +34,7 @@ class InCell:
         return titled(self.label, self.at)
 
 
-class Answer(ByContent, ABC):
+class Answer(ContentEquality, ABC):
     """The answer to one question of a study."""
 
     #: Endings of the files of each table; the first table's alone in some answers.

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.content import ByContent
+from mauvecl.host.content import ContentEquality
 from mauvecl.host.errors import InputError
 from mauvecl.host.plotting import picture
-from mauvecl.host.tables import tabled, telling
+from mauvecl.host.tables import make_table, set_descriptions
 from mauvecl.noise import layout
 from mauvecl.noise.scene import Scene
 from mauvecl.noise.twin import Floats, fma
@@ -173,7 +173,7 @@ def signal_to_noise(dn: NDArray[np.integer], observers: NDArray[np.void], sky: n
 
 
 @dataclass(frozen=True, eq=False)
-class SnrResult(ByContent):
+class SnrResult(ContentEquality):
     """Distributions of the S/N over realisations.
 
     Attributes
@@ -213,7 +213,7 @@ class SnrResult(ByContent):
         frames = self.counts.n * x.n_frames
         table["clipped_low"], table["clipped_high"] = self.counts.clipped.T / frames
         cut = "share of frames cut off at this end: zero or saturation"
-        return telling(table, {"clipped_low": cut, "clipped_high": cut})
+        return set_descriptions(table, {"clipped_low": cut, "clipped_high": cut})
 
     @property
     def element(self) -> QTable:
@@ -268,7 +268,7 @@ class SnrResult(ByContent):
             std[i] = np.sqrt(held @ (middle - mean[i]) ** 2 / self.counts.n)
             ends = np.column_stack([snr(i, filled), snr(i, filled + 1)]).ravel()
             quantiles[i] = np.interp(np.array(PERCENTAGES) / 100, steps_of(held) / self.counts.n, ends)
-        return tabled(
+        return make_table(
             (
                 ("wavelength", wavelength_nm, "", "nm"),
                 ("expected", expected, "closed-form S/N of the mean spectrum"),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.arguments import public
-from mauvecl.host.content import ByContent
+from mauvecl.host.content import ContentEquality
 from mauvecl.host.errors import InputError
 from mauvecl.statistics.statistic import Float, LinearStatistic, Setting
 
@@ -66,7 +66,7 @@ class UvExcess(LinearStatistic):
 
 @public
 @dataclass(frozen=True, eq=False)
-class Linear(ByContent, LinearStatistic):
+class Linear(ContentEquality, LinearStatistic):
     """A statistic of one's own: the sum over pixels of weight times (observed - reference), DN of the exposure.
 
     Attributes

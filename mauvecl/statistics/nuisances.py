@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.arguments import public
-from mauvecl.host.content import ByContent
+from mauvecl.host.content import ContentEquality
 from mauvecl.host.errors import InputError
 from mauvecl.statistics.names import NUISANCES
 
@@ -29,7 +29,7 @@ TILT_NM, MIDDLE_NM = 250.0, 450.0
 
 @public
 @dataclass(frozen=True, eq=False)
-class Nuisances(ByContent):
+class Nuisances(ContentEquality):
     """Unknown amplitudes of known spectra.
 
     Attributes

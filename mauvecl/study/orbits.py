@@ -12,7 +12,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import shown
 from mauvecl.host.files.text_table import read_text_table
-from mauvecl.host.records import sentence
+from mauvecl.host.records import first_error
 from mauvecl.study.sections import Part
 
 if TYPE_CHECKING:
@@ -338,7 +338,7 @@ def read_targets(path: Path) -> list[dict[str, Any]]:
         try:
             PlanTarget.model_validate(one)
         except ValidationError as error:
-            raise InputError(f"{named}: row {number}: {sentence(PlanTarget, error)}") from error
+            raise InputError(f"{named}: row {number}: {first_error(PlanTarget, error)}") from error
         targets.append(one)
     return targets
 

@@ -13,7 +13,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import possible, read_text, toml
 from mauvecl.host.quantities import number
-from mauvecl.host.records import sentence
+from mauvecl.host.records import first_error
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.study.orbits import OrbitQuestion, PlanQuestion, find_plan_files, without_usual_plan
 from mauvecl.study.quantities import QUANTITIES
@@ -122,12 +122,12 @@ class Study(Part):
 
     @classmethod
     def build(cls, data: dict[str, Any], where: str) -> Self:
-        """Validate nested data, with one sentence for the first fault."""
+        """Validate nested data; raises InputError that describes the first fault."""
         possible(data, where)
         try:
             return cls.model_validate(data)
         except ValidationError as error:
-            raise InputError(f"{where}: {sentence(cls, error)}") from error
+            raise InputError(f"{where}: {first_error(cls, error)}") from error
 
     def with_changes(
         self, changes: dict[str, dict[str, Any]], stars: list[dict[str, Any]] | None, where: str = "command line"

@@ -23,7 +23,7 @@ SUN_V = -26.76  # Willmer 2018, ApJS 236, 47
 
 
 def by_hand(name: str, wavelength: str = "WAVELENGTH", flux: str = "FLUX") -> tuple[np.ndarray, np.ndarray]:
-    """A FITS table's columns, Angstrom and erg s-1 cm-2 A-1, by astropy alone."""
+    """Read a FITS table's columns, Angstrom and erg s-1 cm-2 A-1, by astropy alone."""
     with fits.open(HERE / name) as hdus:
         data = hdus[1].data
         return np.array(data[wavelength], float), np.array(data[flux], float)

@@ -24,7 +24,7 @@ def orbit() -> Orbit:
 
 @pytest.fixture(scope="module")
 def day(orbit: Orbit) -> Track:
-    """A day at the elements' epoch."""
+    """Return the track of a day at the elements' epoch."""
     return orbit.track(TimeGrid("2026-09-14T12:00", 1.0, 60.0))
 
 

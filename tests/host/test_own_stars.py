@@ -21,7 +21,7 @@ from mauvecl.cli.app import app
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import expect
 from mauvecl.host.instrument.instrument import Instrument
-from mauvecl.host.stars import own_stars
+from mauvecl.host.stars import hst_collections, own_stars
 from mauvecl.host.stars.catalogue import library_table
 from mauvecl.host.stars.source import Source
 from mauvecl.study.study import Study
@@ -29,7 +29,7 @@ from mauvecl.study.study import Study
 
 @pytest.fixture(autouse=True)
 def own_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """A data folder of the test's own."""
+    """Set a temporary data folder."""
     monkeypatch.setenv("MAUVECL_DATA_DIR", str(tmp_path / "data"))
     return tmp_path / "data" / "stars"
 
@@ -45,7 +45,7 @@ def text_file(path: Path, scale: float = 1.0) -> Path:
 
 
 def archive_file(units: tuple[str, str], **header: Any) -> bytes:
-    """A table as the archives have it."""
+    """Return a FITS table in the archives' format."""
     columns = [
         fits.Column("WAVELENGTH", "D", unit=units[0], array=10 * WAVELENGTH_NM),
         fits.Column("FLUX", "E", unit=units[1], array=FLUX),
@@ -140,7 +140,7 @@ class Archive(http.server.BaseHTTPRequestHandler):
 
 @pytest.fixture
 def archive() -> Iterator[str]:
-    """The archives' files on this machine; the address."""
+    """Serve the archives' files locally and return the address."""
     calspec = WHOLE.read_bytes()
     ngsl = archive_file(("Angstrom", "erg/s/cm2/A"), TARGNAME="HD037202", DATAQUAL="good", OFFSETPX=0.1)
     names = (
@@ -173,7 +173,7 @@ def archive() -> Iterator[str]:
 
 
 def test_a_calspec_star_by_its_newest_file(archive: str) -> None:
-    kept = own_stars.fetch("calspec:18 Sco", base=f"{archive}/calspec/", show_progress=False)
+    kept = hst_collections.fetch("calspec:18 Sco", base=f"{archive}/calspec/", show_progress=False)
     assert kept.name == "18 Sco"
     assert "18sco_stis_006.fits" in kept.origin
     assert "doi 10.1086/677655" in kept.origin
@@ -187,8 +187,8 @@ def test_a_calspec_star_by_its_newest_file(archive: str) -> None:
 def test_a_short_one_is_kept_with_what_extends_it(archive: str, tmp_path: Path) -> None:
     base = f"{archive}/calspec/"
     with pytest.raises(InputError, match=r"VB8 spans 290\.033-2497\.72 nm, expected at least 200-700 nm"):
-        own_stars.fetch("calspec:VB 8", base=base, show_progress=False)
-    kept = own_stars.fetch("calspec:VB 8", base=base, show_progress=False, extend="M3V")
+        hst_collections.fetch("calspec:VB 8", base=base, show_progress=False)
+    kept = hst_collections.fetch("calspec:VB 8", base=base, show_progress=False, extend="M3V")
     assert any("continued by M3V" in text for text in kept.told)
     star = Source.from_library("VB 8")
     direct = Source.read(WHOLE.parent / "vb8_stiswfcnic_004.fits", extend="M3V")
@@ -205,13 +205,13 @@ def test_a_short_one_is_kept_with_what_extends_it(archive: str, tmp_path: Path) 
 
 
 def test_an_ngsl_star(archive: str) -> None:
-    kept = own_stars.fetch("ngsl:HD 37202", base=f"{archive}/ngsl", show_progress=False)
+    kept = hst_collections.fetch("ngsl:HD 37202", base=f"{archive}/ngsl", show_progress=False)
     assert "DATAQUAL = good" in kept.notes
     assert not kept.dereddened
 
 
 def test_a_star_freed_of_its_dust_is_marked_and_reddened_again(archive: str) -> None:
-    kept = own_stars.fetch("lowlib:HD146233", base=f"{archive}/lowlib/", show_progress=False)
+    kept = hst_collections.fetch("lowlib:HD146233", base=f"{archive}/lowlib/", show_progress=False)
     assert kept.dereddened
     star, mauve = Source.from_library("HD146233").at_magnitude(7.0), Instrument.load("mauve")
     plain = expect(star, mauve, exposure=5.0)
@@ -226,11 +226,11 @@ def test_a_star_freed_of_its_dust_is_marked_and_reddened_again(archive: str) -> 
 def test_any_collection_is_searched(archive: str, monkeypatch: pytest.MonkeyPatch) -> None:
     from dataclasses import replace
 
-    here = tuple(replace(c, base=f"{archive}/{c.name}/") for c in own_stars.COLLECTIONS)
-    monkeypatch.setattr(own_stars, "COLLECTIONS", here)
-    assert "Spectral Library" in own_stars.fetch("HD 37202", show_progress=False).origin
+    here = tuple(replace(c, base=f"{archive}/{c.name}/") for c in hst_collections.COLLECTIONS)
+    monkeypatch.setattr(hst_collections, "COLLECTIONS", here)
+    assert "Spectral Library" in hst_collections.fetch("HD 37202", show_progress=False).origin
     with pytest.raises(InputError, match=r"no star 'HD 99999' in CALSPEC.* or Next Generation.* or the HST stellar"):
-        own_stars.fetch("HD 99999", show_progress=False)
+        hst_collections.fetch("HD 99999", show_progress=False)
 
 
 @pytest.mark.parametrize(
@@ -248,13 +248,13 @@ def test_any_collection_is_searched(archive: str, monkeypatch: pytest.MonkeyPatc
 def test_what_goes_wrong_is_a_sentence(
     archive: str, name: str, below: str, sentence: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(own_stars, "TIMEOUT_S", 0.5)
+    monkeypatch.setattr(hst_collections, "TIMEOUT_S", 0.5)
     base = f"{archive}/{below}" if below != "hang" else f"{archive}/x"
     if below == "hang":
-        collection = own_stars.Collection("calspec", "CALSPEC", "", base, lambda star, listing: "hang")
-        monkeypatch.setattr(own_stars, "COLLECTIONS", (collection,))
+        collection = hst_collections.Collection("calspec", "CALSPEC", "", base, lambda star, listing: "hang")
+        monkeypatch.setattr(hst_collections, "COLLECTIONS", (collection,))
     with pytest.raises(InputError, match=sentence):
-        own_stars.fetch(name, base=base, show_progress=False)
+        hst_collections.fetch(name, base=base, show_progress=False)
     assert own_stars.kept() == []
 
 
@@ -270,20 +270,20 @@ def test_what_never_ends_is_not_fetched(
     archive: str, name: str, below: str, sentence: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MAUVECL_LARGEST_FILE_MIB", "1")
-    monkeypatch.setattr(own_stars, "MOST_LISTED", 1 << 20)
-    monkeypatch.setattr(own_stars, "LONGEST_S", 0.3 if below == "slow" else 60.0)
+    monkeypatch.setattr(hst_collections, "MAX_LISTING_BYTES", 1 << 20)
+    monkeypatch.setattr(hst_collections, "MAX_DOWNLOAD_S", 0.3 if below == "slow" else 60.0)
     with pytest.raises(InputError, match=sentence):
-        own_stars.fetch(name, base=f"{archive}/{below}", show_progress=False)
+        hst_collections.fetch(name, base=f"{archive}/{below}", show_progress=False)
     assert own_stars.kept() == []
 
 
 def test_without_a_network() -> None:
     with pytest.raises(InputError, match=r"cannot be reached \(.*refused.*mauvecl library add"):
-        own_stars.fetch("ngsl:HD 37202", base="http://127.0.0.1:9/", show_progress=False)
+        hst_collections.fetch("ngsl:HD 37202", base="http://127.0.0.1:9/", show_progress=False)
     with pytest.raises(InputError, match="collection 'mast' is unknown, expected one of calspec, ngsl, lowlib"):
-        own_stars.fetch("mast:HD 37202")
+        hst_collections.fetch("mast:HD 37202")
     with pytest.raises(InputError, match="expected its collection too, such as ngsl:HD 37202"):
-        own_stars.fetch("HD 37202", base="http://127.0.0.1:9/")
+        hst_collections.fetch("HD 37202", base="http://127.0.0.1:9/")
 
 
 def test_the_verbs(tmp_path: Path, archive: str) -> None:
@@ -310,6 +310,6 @@ def test_the_verbs(tmp_path: Path, archive: str) -> None:
 def test_documentation_and_help_name_the_collections_that_there_are() -> None:
     page = (Path(__file__).parents[2] / "docs/my-star.md").read_text(encoding="utf-8")
     named = {*re.findall(r'fetch "(\w+):', page), *re.findall(r"\b(\w+):\.\.\.", page)}
-    assert named == {one.name for one in own_stars.COLLECTIONS}
+    assert named == {one.name for one in hst_collections.COLLECTIONS}
     told = CliRunner().invoke(app, ["library", "fetch", "--help"]).output
     assert all(name in told for name in named)

@@ -439,7 +439,7 @@ def test_extended_by_another_star(sun: Source) -> None:
 
 
 def noisy(level: float) -> tuple[np.ndarray, np.ndarray]:
-    """A cool star at 0.1 nm, dark below 350 nm, with noise of 1e-14 a point about a level there."""
+    """Make a cool star sampled at 0.1 nm, dark below 350 nm, with noise of 1e-14 per point about a level there."""
     nm = np.arange(170.0, 1100.0, 0.1)
     rng = np.random.default_rng(3)
     return nm, np.where(nm > 350, 1e-12, level) + 1e-14 * rng.standard_normal(nm.size)
@@ -475,7 +475,7 @@ def test_a_pixels_error_is_the_scatter_of_its_means() -> None:
     200 draws tell a standard deviation to 5 %, and the error told, a mean over 20 of them, is right to 3 %: 0.75 to
     1.25 is beyond four deviations and fails by chance less than once in 1e3 for any of ten pixels, of a fixed seed.
     """
-    from mauvecl.host.measured_noise import error_per_second
+    from mauvecl.host.measured_noise import standard_error_per_second
     from mauvecl.host.response import electrons_per_second
 
     mauve = Instrument.load("mauve")
@@ -483,7 +483,9 @@ def test_a_pixels_error_is_the_scatter_of_its_means() -> None:
     rng = np.random.default_rng(5)
     draws = [1e-12 + 1e-13 * rng.standard_normal(nm.size) for _ in range(200)]
     means = np.array([electrons_per_second(mauve, nm, flux) for flux in draws])
-    told = np.mean([error_per_second(Source.from_arrays(nm, flux), mauve, "paper") for flux in draws[:20]], axis=0)
+    told = np.mean(
+        [standard_error_per_second(Source.from_arrays(nm, flux), mauve, "paper") for flux in draws[:20]], axis=0
+    )
     ratio = (told / means.std(axis=0))[100:1600:150]
     assert (np.abs(ratio - 1) < 0.25).all(), ratio
 

@@ -29,7 +29,7 @@ LOGLAM = LOG_START + LOG_STEP * np.arange(N_LOG)
 
 
 def light(angstrom: np.ndarray) -> np.ndarray:
-    """A spectrum that is not straight, erg s-1 cm-2 A-1."""
+    """Return a curved spectrum, erg s-1 cm-2 A-1."""
     return 1e-13 * (1.5 + np.sin(angstrom / 370.0))
 
 
@@ -45,7 +45,7 @@ def written(tmp_path: Path, hdus: list[Any], **options: Any) -> Path:
 
 
 def cos(tmp_path: Path, ranges: list[tuple[str, float, float]]) -> Path:
-    """A COS x1d: a row to a detector segment, the longer wavelengths first, padded and flagged points at the ends."""
+    """Make a COS x1d file: one row per detector segment, longer wavelengths first, padded and flagged ends."""
     n = 1024
     wave = np.array([np.linspace(low, high, n) for _, low, high in ranges])
     weight = np.ones((len(ranges), n))

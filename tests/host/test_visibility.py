@@ -260,7 +260,7 @@ def test_names_in_any_writing() -> None:
 
 
 def _simbad(monkeypatch: pytest.MonkeyPatch, query_tap: Callable[[str], object]) -> None:
-    """A SIMBAD in the place of the network's: astroquery's where it is installed, one of the same form elsewhere."""
+    """Replace SIMBAD's query, in astroquery if it is installed, else in a module of the same form."""
     try:
         from astroquery.simbad import SimbadClass
     except ImportError:

@@ -18,7 +18,7 @@ from mauvecl.noise.scene import prepare
 
 
 def one_pixel(dark: float, photons: float, read: float, *, unit: str = "DN", noise: str = "poisson") -> Expectation:
-    """An expectation of one frame whose pixels are all alike; bias 600, gain 0.6."""
+    """Make an expectation of one frame with equal pixels, bias 600 and gain 0.6."""
     (x,) = star(exposure=5.0)
     full = np.ones_like(x.dark_dn)
     return replace(
@@ -60,7 +60,7 @@ def exact(x: Expectation, low: int, size: int) -> np.ndarray:
 
 
 def by_polynomial(x: Expectation, low: int, size: int) -> np.ndarray:
-    """The same of the polynomial that the kernels evaluate, in double precision."""
+    """Return the probabilities of the polynomial that the kernels evaluate, in double precision."""
     c = Cumulants.of(x, 1)
     c0, c1, c2, c3, c4 = (float(a[0]) for a in polynomial(c))
     if not needs_fourth_power(c):

@@ -55,7 +55,7 @@ class Noise:
         )
 
     def both(self, *, varying: bool) -> tuple[np.ndarray, np.ndarray]:
-        """The exact probabilities of whole DN, and those of the polynomial that the kernels evaluate."""
+        """Return the exact probabilities of whole DN, and those of the polynomial that the kernels evaluate."""
         c = self.cumulants
         sd = float(np.sqrt(c.variance[0]))
         shape = [float(a[0]) / sd for a in polynomial(c)]

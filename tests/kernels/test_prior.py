@@ -50,7 +50,7 @@ PRIORS = [
 
 @cache
 def factors(name: str, prior: Prior) -> Factors:
-    """The table of one prior, made once for all tests."""
+    """Return the table of one prior, made once for all tests."""
     return Processes(**{name: prior}).factors(CONDITIONS)
 
 
@@ -127,7 +127,7 @@ def test_tails(probes: Probes, name: str, prior: Prior) -> None:
 
 
 def invert(name: str, factor: float) -> float:
-    """The prior's value behind a factor."""
+    """Return the prior's value that belongs to a factor."""
     if name == "detector_temperature":
         return 21.0 + np.log(factor) / 0.0684
     if name == "qe_scale":

@@ -24,7 +24,7 @@ from mauvecl.answers.campaigns.visible import VisibleAnswer, visible
 from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.orbit.conditions import PARTICLES_SOURCE, THERMAL_SOURCE
-from mauvecl.host.tables import tabled
+from mauvecl.host.tables import make_table
 from mauvecl.lightcurve.search.null import DAY_S
 from mauvecl.lightcurve.search.yields import Yield, recovered_per_day
 from mauvecl.study.labels import described, stacked, told
@@ -67,7 +67,7 @@ class PlanAnswer(Answer):
             for values in ([one.low for one in recovered], [one.high for one in recovered])
         )
         return described(
-            tabled(
+            make_table(
                 [
                     ("target", [one.name for one in rows]),
                     ("seen", [one.seen_h for one in rows], "time in which the target is seen", "h"),
@@ -123,7 +123,7 @@ class PlanAnswer(Answer):
             ("recovered_per_day", a_day, "flares recovered in a day of exposure"),
             ("scatter", scatter, "standard deviation of the rate's logarithm, dex"),
         )  # fmt: skip
-        return tabled(columns, study=self.study.text())
+        return make_table(columns, study=self.study.text())
 
     @property
     def by_energy(self) -> QTable:
@@ -144,7 +144,7 @@ class PlanAnswer(Answer):
                 ("recovered", p[part], "share of flares of this energy that is recovered"),
                 ("rate_above", rate, "flares of this energy or more, a day", "1 / day"),
             )
-            parts.append(({"target": one.name}, tabled(columns)))
+            parts.append(({"target": one.name}, make_table(columns)))
         if not parts:
             return QTable({"target": np.array([], "U1"), "energy": np.array([]) * u.erg})
         return stacked(parts, study=self.study.text())

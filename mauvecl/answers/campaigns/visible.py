@@ -18,7 +18,7 @@ from mauvecl.host.orbit.season import elongation_deg, zodiacal_light
 from mauvecl.host.orbit.targets import Target
 from mauvecl.host.orbit.time_grid import DAY_S, TimeGrid
 from mauvecl.host.orbit.visibility import Visibility, Windows
-from mauvecl.host.tables import tabled
+from mauvecl.host.tables import make_table
 from mauvecl.study.labels import described, stacked
 from mauvecl.study.orbits import targets_of
 from mauvecl.study.study import Study
@@ -123,7 +123,7 @@ class VisibleAnswer(Answer):
             ("faintest_sky", faintest, "zodiacal light at its faintest, V", sky),
         ]
         about = {"start": self.times.iso(0.0), "days": self.times.days}
-        return described(tabled(columns, **about, study=self.study.text()))
+        return described(make_table(columns, **about, study=self.study.text()))
 
     def _longest_gap_d(self, k: int) -> float:
         """Days without a window."""
@@ -139,7 +139,7 @@ class VisibleAnswer(Answer):
         """One row per month, one column of hours per target."""
         names, hours = self.visibility.by_month()
         each = ((one.name, hours[:, k], "", "h") for k, one in enumerate(self.targets))
-        return tabled([("month", names), *each], study=self.study.text())
+        return make_table([("month", names), *each], study=self.study.text())
 
     @property
     def by_day(self) -> QTable:
@@ -148,7 +148,7 @@ class VisibleAnswer(Answer):
         parts = (
             (
                 {"target": one.name},
-                tabled(
+                make_table(
                     [
                         ("day", self.days),
                         ("hours", self.visibility.by_day(k), "", "h"),
@@ -170,7 +170,7 @@ class VisibleAnswer(Answer):
         parts = (
             (
                 {"target": one.name},
-                tabled(
+                make_table(
                     [
                         ("start", [times.iso(float(t)) for t in windows.start_s] or nothing),
                         ("stop", [times.iso(float(t)) for t in windows.stop_s] or nothing),

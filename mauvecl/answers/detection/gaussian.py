@@ -18,7 +18,7 @@ from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.detect import DetectAnswer, detect
 from mauvecl.answers.signal.snr import SnrAnswer, snr
 from mauvecl.host.arguments import public
-from mauvecl.host.tables import telling
+from mauvecl.host.tables import set_descriptions
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.results.snr import steps_of
 from mauvecl.study.labels import described
@@ -140,7 +140,7 @@ def _promises(result: SnrResult) -> QTable:
     with np.errstate(divide="ignore", invalid="ignore"):
         table["bias"] = table["mean"] / table["expected"] - 1.0
     table["coverage"] = x.per_element(coverage(result)) / x.per_element(np.ones(x.wavelength_nm.size))
-    return telling(table, PROMISED)
+    return set_descriptions(table, PROMISED)
 
 
 @dataclass(eq=False)
@@ -202,7 +202,7 @@ class GaussianReport(Answer):
             if axis.quantity in UNITS:
                 table[axis.quantity] = table[axis.quantity] * u.Unit(UNITS[axis.quantity])
         table.meta |= {"fap": self.study.run.fap, "study": self.study.text()}
-        return described(telling(table, WORST))
+        return described(set_descriptions(table, WORST))
 
 
 def _by_star(table: QTable, stars: int) -> list[QTable]:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
 from mauvecl.host.arguments import public
-from mauvecl.host.tables import tabled
+from mauvecl.host.tables import make_table
 from mauvecl.results.requests.fap import check_fap
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, told
@@ -71,7 +71,7 @@ class MapResult(Answer):
         """One row per cell and statistic."""
         s, j, i = (index.ravel() for index in np.indices(self.probability.shape))
         axes = ((self.study.map.x, self.x, i), (self.study.map.y, self.y, j))
-        table = tabled(
+        table = make_table(
             (
                 *((a.quantity, np.array(values)[at], "", UNITS.get(a.quantity, "")) for a, values, at in axes),
                 ("statistic", np.array(self.statistics)[s]),

@@ -12,7 +12,7 @@ from scipy import special
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import Cost, spoken, unknown_cost
-from mauvecl.host.tables import telling
+from mauvecl.host.tables import set_descriptions
 from mauvecl.study.labels import described, label, told
 from mauvecl.study.nuisances import NuisanceChoice
 
@@ -91,7 +91,7 @@ class UnknownTable(Answer):
         ]
         table = QTable(rows=rows, names=("star", "amplitude", "unknown", "known", "plain", "marginalised", "smallest"))
         table.meta |= {"fap": self.study.run.fap, "power": self.study.limit.power, "study": self.study.toml()}
-        return described(telling(table, DESCRIPTIONS))
+        return described(set_descriptions(table, DESCRIPTIONS))
 
     @property
     def tables(self) -> dict[str, Table]:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.limits.search import LimitSearch
 from mauvecl.host.arguments import public
-from mauvecl.host.tables import tabled
+from mauvecl.host.tables import make_table
 from mauvecl.noise.processes import Uniform
 from mauvecl.study.labels import described
 from mauvecl.study.sections import Star, Unknowns
@@ -99,7 +99,7 @@ def what_matters(study: Study) -> QTable:
             for statistic in study.run.statistics:
                 rows += sorted(_moves(study, star, amplitude, statistic), key=lambda m: -m.span)
     of = study.limit.of
-    table = tabled(
+    table = make_table(
         (
             ("star", [m.star for m in rows]),
             ("amplitude", [m.amplitude for m in rows]),

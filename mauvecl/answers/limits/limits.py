@@ -14,7 +14,7 @@ from mauvecl.answers.detection.unknown_cost import Cost, cost_lines, marginal_li
 from mauvecl.answers.limits.search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle
 from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
-from mauvecl.host.tables import tabled
+from mauvecl.host.tables import make_table
 from mauvecl.results.requests.fap import check_fap
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, stacked, told
@@ -154,7 +154,7 @@ class LimitResult(Answer):
                 ("its_share", [share for _, share in most], "share of the limits' variance that this unknown explains"),
             ]
         run = {"fap": self.study.run.fap, "realisations": self.study.run.realisations}
-        return described(tabled(columns, power=self.study.limit.power, **run, study=self.study.text()))
+        return described(make_table(columns, power=self.study.limit.power, **run, study=self.study.text()))
 
     @property
     def draws(self) -> QTable:

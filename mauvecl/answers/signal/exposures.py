@@ -12,7 +12,7 @@ from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import number
 from mauvecl.host.ranges import DAY_S
-from mauvecl.host.tables import tabled
+from mauvecl.host.tables import make_table
 from mauvecl.study.labels import described, label, told
 from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.sections import Star
@@ -75,7 +75,7 @@ class ExposureResult(Answer):
             ("saturated", "saturated", "whether the pixel, or one of the element, saturates in a single frame"),
         )
         made = ((name, [getattr(r, of) for r in self.exposures], *more) for name, of, *more in columns)
-        return described(tabled(made, study=self.study.text()))
+        return described(make_table(made, study=self.study.text()))
 
     @property
     def tables(self) -> dict[str, Table]:

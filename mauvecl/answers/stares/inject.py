@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from mauvecl.answers.answer import Answer, InCell
 from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
-from mauvecl.host.tables import tabled
+from mauvecl.host.tables import make_table
 from mauvecl.lightcurve.search.injected import Injected
 from mauvecl.lightcurve.search.injections import Injections
 from mauvecl.lightcurve.search.null import DAY_S, Counted, in_a_row_rate
@@ -168,7 +168,7 @@ def _limits(star: StarCompleteness) -> QTable:
             (f"{name}_high", limits[2], "its 95 % interval, upper end", unit),
         ]
     text = "share of flares for which no template fits into what is observed"
-    return described(tabled([*columns, ("never", np.array([injected.never(k) for k in every]), text)]))
+    return described(make_table([*columns, ("never", np.array([injected.never(k) for k in every]), text)]))
 
 
 def _cells(star: StarCompleteness) -> QTable:
@@ -185,7 +185,7 @@ def _cells(star: StarCompleteness) -> QTable:
     ]
     if star.fitted is not None:
         columns += [(name, getattr(star.fitted, name)[d, s], text) for name, text in Fitted.COLUMNS.items()]
-    return described(tabled(columns))
+    return described(make_table(columns))
 
 
 def _search(star: StarCompleteness) -> QTable:
@@ -205,7 +205,7 @@ def _search(star: StarCompleteness) -> QTable:
         ("spectral_loss", float(star.surveyed.templates.loss.max()), "largest share of S/N lost to so few sums"),
         ("star_days", s.stare.observed_s / DAY_S, "star-days of a stare"),
     )
-    return described(tabled((name, [value], text) for name, value, text in rows))
+    return described(make_table((name, [value], text) for name, value, text in rows))
 
 
 @public

@@ -12,7 +12,7 @@ import numpy as np
 from mauvecl.answers.answer import Answer, InCell
 from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
-from mauvecl.host.tables import tabled
+from mauvecl.host.tables import make_table
 from mauvecl.lightcurve.flares.events import Event, coefficients, temperatures_of
 from mauvecl.lightcurve.search.alarms import Alarm, alarms
 from mauvecl.lightcurve.stares.observed import Draw, Light, Staring, seen
@@ -120,7 +120,7 @@ class StareAnswer(Answer):
                 ]
             saturated = int(np.count_nonzero(one.staring.quality))
             told_of = "frames in which the mean of a used pixel reaches saturation"
-            return tabled([*columns, ("saturated_frames", [saturated], told_of)])
+            return make_table([*columns, ("saturated_frames", [saturated], told_of)])
 
         return self._together(row)
 
@@ -143,7 +143,7 @@ class StareAnswer(Answer):
             )
             shapes = np.array([e.form.name for e in events], dtype="U32")
             plain = ((name, np.array(values, np.float64), *more) for name, values, *more in numbers)
-            return tabled([*plain, ("shape", shapes)])
+            return make_table([*plain, ("shape", shapes)])
 
         return self._together(rows)
 
@@ -173,7 +173,7 @@ class StareAnswer(Answer):
                 ("value", np.array([alarm.rho for alarm in searched.alarms], np.float64), best),
                 ("event", np.array(searched.events, np.int64), nearest),
             ]
-            return tabled(columns)
+            return make_table(columns)
 
         return self._together(rows)
 
@@ -187,7 +187,7 @@ class StareAnswer(Answer):
             ("mean", light.mean, "the same without any noise"),
         )
         suffixes = ["", *("_" + name.removesuffix(" nm").replace("-", "_") for name in light.bands[1:])]
-        return tabled(
+        return make_table(
             [
                 ("time", stare.middle_s, "middle of the frame, from the start of the stare", "s"),
                 ("frame", stare.numbers, "number of the frame, gaps included"),

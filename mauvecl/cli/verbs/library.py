@@ -103,7 +103,7 @@ def fetch(
     """
     import sys
 
-    from mauvecl.host.stars.own_stars import fetch
+    from mauvecl.host.stars.hst_collections import fetch
 
     for name in names:
         shown = not quiet and sys.stderr.isatty()

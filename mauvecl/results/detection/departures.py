@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.host.arguments import public
-from mauvecl.host.tables import tabled
+from mauvecl.host.tables import make_table
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.results.requests.fap import countable
 from mauvecl.statistics.distributions import Form
@@ -168,7 +168,7 @@ def departure_table(detection: Detection, amplitudes: Sequence[float], fap: floa
         ("clipping", [d.clipping for d in rows], "predicted change of the ratio by the ADC's ends"),
     )
     differs = np.array([d.differs for d in rows], bool)
-    return tabled(
+    return make_table(
         (
             ("statistic", np.array([d.statistic for d in rows], str)),
             (

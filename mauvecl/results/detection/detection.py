@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.arguments import public
-from mauvecl.host.content import ByContent
+from mauvecl.host.content import ContentEquality
 from mauvecl.host.plotting import picture
 from mauvecl.host.quantities import count
-from mauvecl.host.tables import tabled, telling
+from mauvecl.host.tables import make_table, set_descriptions
 from mauvecl.results.counts.tally import Distribution, TailSamples, Tally
 from mauvecl.results.detection.roc import Roc
 from mauvecl.results.requests.channels import ChannelPlan, Key
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @public
 @dataclass(eq=False)
-class Detection(ByContent, Hypotheses):
+class Detection(ContentEquality, Hypotheses):
     """Null and flare distributions as they were counted; made by `Engine.detect`.
 
     Parameters and attributes are those of `Hypotheses` and these.
@@ -206,7 +206,7 @@ class Detection(ByContent, Hypotheses):
         self._at(key)
         kept = self._samples[key]
         told = "of the statistic, as the device computed it"
-        return tabled([("realisation", kept.realisations), ("value", kept.values, told)])
+        return make_table([("realisation", kept.realisations), ("value", kept.values, told)])
 
     def roc(self, statistic: str = "chi2", flare: int = 0) -> Roc:
         """False-alarm probability against detection probability, and the area under the curve."""
@@ -255,7 +255,7 @@ class Detection(ByContent, Hypotheses):
         table["fap_error"] = [binomial if tail is None else tail.relative_error for tail in tails]
         table.meta |= {"fap": fap, "realisations": self.realisations, "exposure_s": self.quiet.exposure_s}
         table.meta["tails"] = "counted" if countable(fap, self.realisations) else "importance sampling"
-        return telling(table, DESCRIPTIONS)
+        return set_descriptions(table, DESCRIPTIONS)
 
     def _null_key(self, statistic: str, template: int) -> Key:
         return statistic, "null", self._null(statistic, template)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.host.plotting import picture
-from mauvecl.host.tables import tabled
+from mauvecl.host.tables import make_table
 from mauvecl.statistics.intervals import CONFIDENCE, Interval, clopper_pearson
 
 if TYPE_CHECKING:
@@ -95,4 +95,4 @@ class Roc:
             text = f"{what} probability{' per test' * (name == 'fap')}, with a 95 % Clopper-Pearson interval"
             columns += [(name, values, text), (f"{name}_low", low), (f"{name}_high", high)]
         area = dict(zip(("area", "area_low", "area_high"), astuple(self.area), strict=True))
-        return tabled(columns, realisations=n, **area)
+        return make_table(columns, realisations=n, **area)

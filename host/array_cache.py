@@ -1,4 +1,4 @@
-"""Values remembered by what they were computed from: a change of one thing computes no other again."""
+"""Cache decorator for functions of arrays."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ P = ParamSpec("P")
 R = TypeVar("R")
 
 
-class _Given:
-    """Arguments, equal where their bytes are; they are let go once the value is there, only their digest stays."""
+class _Arguments:
+    """Arguments that compare by the digest of their bytes; the values are released after the call."""
 
     __slots__ = ("digest", "values")
 
@@ -32,21 +32,18 @@ class _Given:
         return hash(self.digest)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Given) and self.digest == other.digest
+        return isinstance(other, _Arguments) and self.digest == other.digest
 
 
-def remembered(most: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """A function of arrays and plain values that remembers its last values.
+def array_cache(maxsize: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """Cache the latest results of a function of arrays and plain values.
 
-    Parameters
-    ----------
-    most : int
-        How many. Arrays among them cannot be written to, for they are shared. What raises is not remembered.
+    Arrays among the results are read-only, since callers share them. Exceptions are not cached.
     """
 
     def decorate(function: Callable[P, R]) -> Callable[P, R]:
-        @lru_cache(maxsize=most)
-        def computed(given: _Given) -> R:
+        @lru_cache(maxsize=maxsize)
+        def computed(given: _Arguments) -> R:
             (arguments, named), given.values = given.values, ()
             value = function(*arguments, **named)
             if isinstance(value, np.ndarray):
@@ -55,7 +52,7 @@ def remembered(most: int) -> Callable[[Callable[P, R]], Callable[P, R]]:
 
         @wraps(function)
         def wrapper(*arguments: P.args, **named: P.kwargs) -> R:
-            given = _Given((*arguments, *sorted(named.items())))
+            given = _Arguments((*arguments, *sorted(named.items())))
             given.values = arguments, named
             return computed(given)
 
