@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..arguments import public
-from ..content import ByContent
+from ..content import ContentEquality
 from ..errors import InputError
 from ..quantities import number
 from ..ranges import check_temperature
@@ -357,7 +357,7 @@ def _sum_of_lines(fluxes: Mapping[str, float], wavelength_nm: Float) -> Float:
 
 @public
 @dataclass(frozen=True, eq=False)
-class ObservedFlare(ByContent, FlareSpectrum):
+class ObservedFlare(ContentEquality, FlareSpectrum):
     """The spectrum of an observed or computed flare, without its star.
 
     Attributes
