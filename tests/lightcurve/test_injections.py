@@ -14,9 +14,10 @@ from searches import DAVENPORT, KNOWN, ONE, spectra, survey
 from mauvecl.device.stares import Stares
 from mauvecl.lightcurve.search.bank import Bank, Level
 from mauvecl.lightcurve.search.injections import Injections
-from mauvecl.lightcurve.search.null import in_a_row, in_a_row_rate, sampled
+from mauvecl.lightcurve.search.null import in_a_row, in_a_row_rate
 from mauvecl.lightcurve.search.places import OVERLAP
 from mauvecl.lightcurve.search.recovery import Fit
+from mauvecl.lightcurve.search.sampled import sampled
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.noise.processes import CosmicRays

@@ -10,7 +10,8 @@ from searches import DAVENPORT, KNOWN, ONE
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.search.bank import Bank, Level
 from mauvecl.lightcurve.search.completeness import default_bank, search_threshold
-from mauvecl.lightcurve.search.null import DAY_S, Counted, sampled
+from mauvecl.lightcurve.search.null import DAY_S, Counted
+from mauvecl.lightcurve.search.sampled import sampled
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.search.trials import Trials
 from mauvecl.lightcurve.stares.stare import Stare

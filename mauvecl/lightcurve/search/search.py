@@ -154,10 +154,10 @@ class Search:
         parts = [self._largest(sums[batch]) for batch in self._batches(len(sums))]
         return Found(*(np.concatenate([getattr(p, name) for p in parts]) for name in Found.__annotations__))
 
-    def values(self, sums: NDArray[Any]) -> Iterator[tuple[Row, Single]]:
+    def values(self, sums: NDArray[Any]) -> Iterator[tuple[Row, NDArray[Any]]]:
         """Each row with its values of rho, shape (n_stare, n_temperature, n_onset); minus infinity where none is.
 
-        All stares at once: for few.
+        In the precision of the sums; all stares at once: for few.
         """
         yield from self._values(self._checked(sums))
 
@@ -210,20 +210,21 @@ class Search:
             amplitude[better] = value[better] / row.per_amplitude[onset]
         return Found(best, peak, width, temperature, amplitude)
 
-    def _values(self, sums: NDArray[Any]) -> Iterator[tuple[Row, Single]]:
+    def _values(self, sums: NDArray[Any]) -> Iterator[tuple[Row, NDArray[Any]]]:
         spectra = self._spectra(sums)
-        directions = self.bank.directions.astype(np.float32)
+        real = _precision(sums)
+        directions = self.bank.directions.astype(real)
         for template in self.bank.templates:
             known = self._level(template, spectra)
             for row in self.grid:
                 if row.template is not template:
                     continue
                 correlated = self._correlated(spectra[0], template.shapes[row.phase], template)
-                for projected, term in zip(row.project.astype(np.float32), known, strict=True):
+                for projected, term in zip(row.project.astype(real), known, strict=True):
                     correlated -= projected * term
                 tried = row.per_amplitude > 0
                 scale = np.divide(1.0, row.per_amplitude, out=np.zeros_like(row.per_amplitude), where=tried)
-                correlated *= scale.astype(np.float32)
+                correlated *= scale.astype(real)
                 rho = np.einsum("tk,skn->stn", directions, correlated, optimize=True)
                 if not tried.all():
                     rho[:, :, ~tried] = -np.inf
@@ -231,11 +232,12 @@ class Search:
 
     def _spectra(self, sums: NDArray[Any]) -> list[NDArray[Any]]:
         """Fourier transforms of the weighted sums times each series, zero in gaps, (n_stare, n_sum, n_frequency)."""
-        held = np.zeros((len(sums), sums.shape[2], self.n_grid), np.float32)
+        real = _precision(sums)
+        held = np.zeros((len(sums), sums.shape[2], self.n_grid), real)
         held[:, :, self._at] = self._levelled(sums) * self._weight[self._at]
         used = {series for _, series in self._terms} | {0}
         return [
-            scipy.fft.rfft(held * self._series[k].astype(np.float32), self._size) if k in used else held[:0]
+            scipy.fft.rfft(held * self._series[k].astype(real), self._size) if k in used else held[:0]
             for k in range(len(self._series))
         ]
 
@@ -308,3 +310,8 @@ class Search:
             level, *_ = np.linalg.lstsq(columns.T, shape, rcond=None)
             shape = shape - level @ columns
         return float(shape @ shape) * float(np.median(self._weight[self._at]))
+
+
+def _precision(sums: NDArray[Any]) -> type[np.floating[Any]]:
+    """Return the precision of the sums: double where they have it, single otherwise."""
+    return np.float64 if sums.dtype == np.float64 else np.float32

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.search.null import DAY_S, Sampled, sampled
+from mauvecl.lightcurve.search.null import DAY_S
+from mauvecl.lightcurve.search.sampled import Sampled, sampled
 from mauvecl.lightcurve.search.scatter import Scatter
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.stares.requests import StaresRequest

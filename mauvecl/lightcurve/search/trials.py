@@ -105,12 +105,21 @@ class Trials:
 
     def per_second(self, threshold: float) -> float:
         """False alarms a second of frames above a threshold, in standard deviations."""
+        density, chances, warmer = self._chances(threshold)
+        return float(self.per_frame @ chances @ (density * sum(warmer))) / self.frame_s
+
+    def peaked(self, threshold: float) -> Float:
+        """Return each template's chance to be a local maximum above a threshold, of one, (n_row, n_temperature)."""
+        density, chances, warmer = self._chances(threshold)
+        return np.asarray(np.einsum("z,rz,tz->rt", density / density.sum(), chances, warmer))
+
+    def _chances(self, threshold: float) -> tuple[Float, Float, Float]:
+        """Return the density at nodes z, and the chances there: of each row, and of each temperature, (n, n_node)."""
         x, weights = np.polynomial.laguerre.laggauss(NODES)
         z = np.sqrt(threshold**2 + 2 * x)
         density = weights / z * np.exp(-(threshold**2) / 2) / np.sqrt(2 * np.pi)
         chances = [_least(z, t) * _least(z, w) for t, w in zip(self.in_time, self.in_width, strict=True)]
-        warmer = sum(_least(z, one) for one in self.in_temperature)
-        return float(self.per_frame @ np.array(chances) @ (density * warmer)) / self.frame_s
+        return density, np.array(chances), np.array([_least(z, one) for one in self.in_temperature])
 
     def per_frame_above(self, threshold: float) -> float:
         """Independent tests to a frame that would alarm as often."""
