@@ -19,6 +19,7 @@ from mauvecl.pictures.style import (
     legend_below,
     plain_numbers,
 )
+from mauvecl.results.requests.fap import NoThresholdError
 from mauvecl.statistics.registry import label
 from mauvecl.statistics.statistic import LinearStatistic
 
@@ -76,7 +77,10 @@ def _distributions(axis: Any, outcome: Detection, flares: Sequence[str], statist
     # Where a statistic is scaled by the flare, each has a threshold of its own.
     own = range(len(flares)) if one.shaped and not linear else range(1)
     for k in own:
-        cut = outcome.threshold(fap, statistic, template=k).value
+        try:
+            cut = outcome.threshold(fap, statistic, template=k).value
+        except NoThresholdError:
+            continue
         colour = COLOURS[k % len(COLOURS)] if len(own) > 1 else "black"
         name = f"threshold, fap {fap:g} per test"
         axis.axvline(cut, color=colour, linewidth=0.9, linestyle="--", label=None if len(own) > 1 else name)

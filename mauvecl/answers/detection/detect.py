@@ -208,11 +208,13 @@ def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
     costs = [text for (_, cell, *_), one in zip(prepared, stars, strict=True) for text in _template_costs(cell, one)]
     answer = DetectAnswer(study, stars)
     blinding = [f"{text[:-1]} ({star.title})." for star in stars for text in star.detection.messages]
+    blinding += [f"{t[:-1]} ({star.title})." for star in stars for t in star.detection.without_threshold(run.fap)]
     messages = [*blinding, *told([x for *_, group in prepared for x in group])]
-    if not countable(run.fap, run.realisations):
+    errors = answer.table["fap_error"][np.isfinite(answer.table["fap_error"])]
+    if not countable(run.fap, run.realisations) and errors.size:
         messages.append(
             f"Thresholds at a false-alarm probability of {run.fap:g} come from importance sampling, right to "
-            f"{100 * answer.table['fap_error'].max():.1f} % of it: {run.realisations} realisations leave fewer than "
+            f"{100 * errors.max():.1f} % of it: {run.realisations} realisations leave fewer than "
             "100 beyond them."
         )
     unknown = [

@@ -160,7 +160,13 @@ def detection_map(
         x=x,
         y=y,
         statistics=study.run.statistics,
-        messages=[*_blinded(values["probability"]), *told(seen), *marginal_lines(study), *_cost(study, x, y)],
+        messages=[
+            *_blinded(values),
+            *_without_threshold(study, values),
+            *told(seen),
+            *marginal_lines(study),
+            *_cost(study, x, y),
+        ],
         shares=parts,
         quiet=quiet,
         **values,
@@ -180,15 +186,28 @@ def _shown(value: float | str) -> str:
     return value if isinstance(value, str) else f"{value:.3g}"
 
 
-def _blinded(probability: NDArray[np.float64]) -> list[str]:
-    """The sentence on cells without a number, if any."""
-    cells = int(np.isnan(probability[0]).sum())
+Arrays = dict[str, NDArray[np.float64]]
+
+
+def _blinded(values: Arrays) -> list[str]:
+    """Return the sentence on cells where every pixel saturates, if any."""
+    form = values["closed_form"][0]
+    cells = int(np.isnan(form).sum())
     if not cells:
         return []
-    return [f"SATURATED: every pixel that counts saturates in {cells} of {probability[0].size} cells: no number there."]
+    return [f"SATURATED: every pixel that counts saturates in {cells} of {form.size} cells: no number there."]
 
 
-Arrays = dict[str, NDArray[np.float64]]
+def _without_threshold(study: Study, values: Arrays) -> list[str]:
+    """Return a sentence for each statistic on cells where no threshold has the false-alarm probability, if any."""
+    missing = np.isnan(values["probability"]) & ~np.isnan(values["closed_form"])
+    return [
+        f"NO THRESHOLD: in {int(there.sum())} of {there.size} cells no threshold of {statistic} has a false-alarm "
+        f"probability of {study.run.fap:g}, because one value is more probable, as saturated pixels give it: no number "
+        "there; `mauvecl detect` names the probabilities that thresholds have."
+        for statistic, there in zip(study.run.statistics, missing, strict=True)
+        if there.any()
+    ]
 
 
 def _map(

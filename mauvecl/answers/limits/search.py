@@ -125,6 +125,8 @@ class LimitSearch:
         )
         for message in detection.messages:
             raise InputError(f"at a {self.of} of {value:g}: {message} Expected a limit where some pixel tells")
+        # Raises InputError where no threshold has the false-alarm probability.
+        detection.threshold(self.fap, self.statistic)
         (probability,) = detection.detection_probability(self.fap, self.statistic)
         self.points.append(Point(value, probability, seed))
         return probability

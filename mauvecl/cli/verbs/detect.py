@@ -53,7 +53,7 @@ def _show_detections(answer: DetectAnswer) -> None:
         reduced = "" if math.isnan(row["reduced"]) else f"{row['reduced']:.3f}"
         probability = f"{row['probability']:.4f}", f"[{row['low']:.4f}, {row['high']:.4f}]"
         if row["probability"] != row["probability"]:
-            probability = "saturated", ""
+            probability = "saturated" if row["threshold"] == row["threshold"] else "no threshold", ""
         cells.append(
             (row["star"], *(short(row[name]) for name in swept), amplitude, row["statistic"],
              *(f"{value:.2f}" for value in digits), reduced, f"{row['threshold']:.2f}", *probability,

@@ -238,6 +238,11 @@ class Distribution:
         more = np.flatnonzero(self._below[-1] - self._below[:-1] > n_above)
         return float(self.bins[1][more[-1]]) if more.size else -math.inf
 
+    def around(self, edge: float) -> tuple[int, int]:
+        """Return the counts at or above the lower edge of a bin, and in the filled bin below that edge."""
+        at = int(np.searchsorted(self.bins[1], edge, side="right"))
+        return int(self._below[-1] - self._below[at]), int(self.bins[2][at - 1]) if at else 0
+
     def quantile(self, probability: float | NDArray[np.float64]) -> NDArray[np.float64]:
         """Quantiles, linear within a bin; exact to a bin's width."""
         lower, upper, _ = self.bins

@@ -18,7 +18,7 @@ from mauvecl.host.tables import make_table, set_descriptions
 from mauvecl.results.counts.tally import Distribution, TailSamples, Tally
 from mauvecl.results.detection.roc import Roc
 from mauvecl.results.requests.channels import ChannelPlan, Key
-from mauvecl.results.requests.fap import Tails, check_fap, countable
+from mauvecl.results.requests.fap import NoThresholdError, Tails, check_atom, check_fap, countable
 from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.statistics.detection_interval import detection_interval
 from mauvecl.statistics.intervals import Interval, central_counts, clopper_pearson
@@ -126,6 +126,8 @@ class Detection(ContentEquality, Hypotheses):
         ------
         InputError
             If fewer than 100 realisations lie beyond and tails are counted: the tail is never extrapolated.
+        NoThresholdError
+            If no threshold has this probability, because one value of the statistic is more probable.
         """
         return self._cut(fap, statistic, template)
 
@@ -151,21 +153,27 @@ class Detection(ContentEquality, Hypotheses):
         return self._share_above(null, Interval(threshold, threshold, threshold))
 
     def detection_probability(self, fap: float = 1e-3, statistic: str = "chi2") -> list[Interval]:
-        """For each flare, the fraction of realisations at or above the threshold; NaN for `blinding` ones.
+        """For each flare, the fraction of realisations at or above the threshold; NaN where there is no number.
+
+        That is for `blinding` flares, and where no threshold has the probability (`without_threshold`).
 
         The interval holds the probability above the true threshold with 95 %: see `intervals.detection_interval`.
 
         Raises
         ------
         InputError
-            As `threshold`.
+            As `threshold`, but for `NoThresholdError`.
         """
         probabilities = []
         for flare in range(len(self.flares)):
             if flare in self.blinding:
                 probabilities.append(Interval(np.nan, np.nan, np.nan))
                 continue
-            cut = self._cut(fap, statistic, flare)
+            try:
+                cut = self._cut(fap, statistic, flare)
+            except NoThresholdError:
+                probabilities.append(Interval(np.nan, np.nan, np.nan))
+                continue
             counted = self._at((statistic, "flare_on_null_grid", flare))
             above = [counted.above(value) for value in (cut.value, cut.high, cut.low)]
             shared = 0.0
@@ -174,6 +182,17 @@ class Detection(ContentEquality, Hypotheses):
                 shared = min(self._at(self._null_key(statistic, flare)).std / counted.std, 1.0)
             probabilities.append(detection_interval(above, counted.n, fap, shared))
         return probabilities
+
+    def without_threshold(self, fap: float) -> tuple[str, ...]:
+        """Return a sentence for each statistic of which no threshold has a false-alarm probability."""
+        sentences = []
+        for statistic in self.statistics:
+            for template in range(len(self.flares)) if self.statistic(statistic).shaped else (0,):
+                try:
+                    self._cut(fap, statistic, template)
+                except NoThresholdError as error:
+                    sentences.append(f"NO THRESHOLD: {error}.")
+        return tuple(dict.fromkeys(sentences))
 
     @staticmethod
     def _share_above(distribution: Distribution, cut: Interval) -> Interval:
@@ -222,10 +241,12 @@ class Detection(ContentEquality, Hypotheses):
     def table(self, fap: float = 1e-3) -> QTable:
         """One row per flare and statistic: expected and simulated values, threshold and probability.
 
+        NaN where there is no number; see `detection_probability`.
+
         Raises
         ------
         InputError
-            As `threshold`.
+            As `detection_probability`.
         """
         from astropy.table import QTable
 
@@ -238,7 +259,10 @@ class Detection(ContentEquality, Hypotheses):
         for flare, x in enumerate(self.flares):
             for statistic in self.statistics:
                 d, p = self.distribution(statistic, flare), probability[statistic][flare]
-                cut = self.threshold(fap, statistic, template=flare)
+                try:
+                    cut = self.threshold(fap, statistic, template=flare)
+                except NoThresholdError:
+                    cut = Interval(np.nan, np.nan, np.nan)
                 theory = self.closed_form(statistic, flare)
                 limit = self.closed_form(statistic, template=flare).isf(fap)
                 dof = self.dof(statistic)
@@ -250,12 +274,20 @@ class Detection(ContentEquality, Hypotheses):
                 row = (x.name, statistic, dof, *of_flare, cut.value, cut.low, cut.high, p.value, p.low, p.high)
                 rows.append((*row, limit, power))
         table = QTable(rows=rows, names=columns)
-        tails = [self.tail(fap, s, template=flare) for flare in range(len(self.flares)) for s in self.statistics]
-        binomial = float(np.sqrt((1 - fap) / (fap * self.realisations)))
-        table["fap_error"] = [binomial if tail is None else tail.relative_error for tail in tails]
+        errors = [self._fap_error(fap, s, flare) for flare in range(len(self.flares)) for s in self.statistics]
+        table["fap_error"] = errors
         table.meta |= {"fap": fap, "realisations": self.realisations, "exposure_s": self.quiet.exposure_s}
         table.meta["tails"] = "counted" if countable(fap, self.realisations) else "importance sampling"
         return set_descriptions(table, DESCRIPTIONS)
+
+    def _fap_error(self, fap: float, statistic: str, template: int) -> float:
+        """Return the relative standard error of the false-alarm probability at a threshold, NaN where there is none."""
+        try:
+            self._cut(fap, statistic, template)
+        except NoThresholdError:
+            return float("nan")
+        tail = self.tail(fap, statistic, template=template)
+        return float(np.sqrt((1 - fap) / (fap * self.realisations))) if tail is None else tail.relative_error
 
     def _null_key(self, statistic: str, template: int) -> Key:
         return statistic, "null", self._null(statistic, template)
@@ -271,7 +303,10 @@ class Detection(ContentEquality, Hypotheses):
         null = self._at(self._null_key(statistic, template))
         n_low, n_high = central_counts(null.n, fap)
         wanted = (int(np.floor(fap * null.n * (1 + 1e-12))), n_high, max(n_low - 1, 0))
-        return Interval(*map(null.edge_with_at_most, wanted))
+        cut = Interval(*map(null.edge_with_at_most, wanted))
+        beyond, at = null.around(cut.value)
+        check_atom(f"{statistic} of {self.quiet.name}", fap, beyond / null.n, at / null.n)
+        return cut
 
 
 DESCRIPTIONS = {

@@ -8,6 +8,7 @@ from their priors in one half of the realisations and from where alarms come fro
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +19,7 @@ from scipy import special
 from mauvecl.host.errors import InputError
 from mauvecl.noise import layout
 from mauvecl.noise.drawn import at_score
+from mauvecl.results.requests.fap import check_atom
 from mauvecl.statistics.distributions import Form, Mixture, QuadraticForm
 from mauvecl.statistics.intervals import CONFIDENCE, Interval
 from mauvecl.statistics.statistic import Differences
@@ -78,6 +80,8 @@ def tail(detection: Detection, fap: float, statistic: str, *, template: int = 0,
 
     Raises
     ------
+    NoThresholdError
+        If no threshold has the probability.
     InputError
         If the noise is not drawn jointly and as stacks, cosmic rays act, priors are drawn that the statistics are not
         marginalised over, more than 30 quiescent exposures are averaged, or the error stays too large.
@@ -92,6 +96,8 @@ def tail(detection: Detection, fap: float, statistic: str, *, template: int = 0,
         more = _tilted(detection, statistic, template, how, seed, values.size, goal)
         values, logs = (np.concatenate(pair) for pair in zip((values, logs), more, strict=True))
         cut, low, high, error = _threshold(values, logs, fap)
+        beyond, at = _around(values, logs, cut)
+        check_atom(f"{statistic} of {detection.quiet.name}", fap, beyond, at)
         if error <= WANTED_ERROR:
             return Tail(Interval(cut, low, high), fap, error, values.size)
         if goal >= MOST:
@@ -136,6 +142,15 @@ def _threshold(values: Float, logs: Float, fap: float) -> tuple[float, float, fl
     ends = np.searchsorted(above, (fap * (1.0 + reach), fap * (1.0 - reach)))
     low, high = (float(ordered[min(int(end), values.size - 1)]) for end in ends)
     return float(ordered[at]), low, high, relative
+
+
+def _around(values: Float, logs: Float, cut: float) -> tuple[float, float]:
+    """Return the probability of larger values than a threshold, and what the one at it has for certain."""
+    weight, n = np.exp(logs), values.size
+    same = weight[values == cut]
+    mean = float(same.sum() / n)
+    error = math.sqrt(max(float(same @ same) / n - mean**2, 0.0) / n)
+    return float(weight[values > cut].sum() / n), mean - 4.0 * error
 
 
 @dataclass(frozen=True, eq=False)

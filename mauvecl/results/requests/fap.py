@@ -1,4 +1,4 @@
-"""Which false-alarm probabilities so many realisations can settle."""
+"""Which false-alarm probabilities a number of realisations settles, and which a statistic can have."""
 
 from __future__ import annotations
 
@@ -12,6 +12,43 @@ FEWEST_IN_TAIL = 100
 
 #: Thresholds with fewer than `FEWEST_IN_TAIL` beyond them: refused, or by importance sampling.
 Tails = Literal["counted", "sampled"]
+
+
+class NoThresholdError(InputError):
+    """A false-alarm probability that no threshold of a statistic has."""
+
+
+def check_atom(what: str, fap: float, beyond: float, at: float) -> None:
+    """Refuse a false-alarm probability that lies within the probability of a single value.
+
+    Parameters
+    ----------
+    what : str
+        The statistic and the star.
+    fap : float
+    beyond, at : float
+        Probabilities of larger values, and of the value at which the probability is passed.
+
+    Raises
+    ------
+    NoThresholdError
+        If that value alone is more probable than `fap`: as where saturation gives many exposures the same counts.
+    """
+    if at > fap:
+        fewer = f"at most {rounded(beyond, up=False):g} or " if beyond > 0 else ""
+        more = beyond + at
+        exist = f"{fewer}{rounded(more, up=True):g} and more" if more < 1.0 else (fewer.removesuffix(" or ") or "none")
+        raise NoThresholdError(
+            f"no threshold of {what} has a false-alarm probability of {fap:g}: {100 * at:.3g} % of exposures without a "
+            "flare give one and the same value, as saturated pixels do, and either all of them or none are alarms; "
+            f"expected a false-alarm probability that a threshold has: {exist}"
+        )
+
+
+def rounded(value: float, *, up: bool) -> float:
+    """Return a positive number with four digits, rounded up or down."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 3)
+    return (math.ceil if up else math.floor)(value / unit * (1 + (-1e-12 if up else 1e-12))) * unit
 
 
 def countable(fap: float, realisations: int) -> bool:

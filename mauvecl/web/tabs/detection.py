@@ -105,15 +105,19 @@ class Distributions(Picture):
             for name, flare in (("null bars", None), ("flare bars", 0)):
                 edges, counts = star.detection.histogram(q.statistic, flare, bins=80)
                 sources[name] = {"left": edges[:-1], "right": edges[1:], "top": counts / max(counts.max(), 1)}
-            cut = star.detection.threshold(q.fap, q.statistic).value
             (row,) = (row for row in answers["detection"].table if row["statistic"] == q.statistic)
-            chance = float(row["probability"])
+            cut, chance = float(row["threshold"]), float(row["probability"])
+        share = f"{percent(chance)} of flares lie above the threshold of {cut:.4g}"
         text = (
             f"Without a flare {q.statistic} lies at {closed.null.mean:.4g} ± {closed.null.std:.3g}, with it at "
-            f"{closed.seen.mean:.4g} ± {closed.seen.std:.3g}; {percent(chance)} of flares lie above the threshold of "
-            f"{cut:.4g}."
+            f"{closed.seen.mean:.4g} ± {closed.seen.std:.3g}; "
+            f"{share if cut == cut else 'no threshold has this false-alarm probability'}."
         )
-        return Drawn(text, sources, {"threshold": {"location": cut}, "x axis": {"axis_label": label(q.statistic)}})
+        return Drawn(
+            text,
+            sources,
+            {"threshold": {"location": cut if cut == cut else None}, "x axis": {"axis_label": label(q.statistic)}},
+        )
 
 
 class Trade(Picture):
