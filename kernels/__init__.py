@@ -1,1 +1,1 @@
-"""OpenCL C sources (Mako): what the device runs. They know pixels, not stars."""
+"""OpenCL C sources (Mako templates) for pixels; stars are unknown here."""

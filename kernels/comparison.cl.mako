@@ -1,11 +1,11 @@
-## Every statistic of every scenario where more is compared than the expectation: noisy quiescent exposures, variances
-## estimated from the counts, smoothed spectra. What `statistics.cl.mako` knows too comes out here with the same bits.
+## General statistics of every scenario: noisy reference exposures, variances estimated from counts, smoothed spectra.
+## Statistics that `statistics.cl.mako` computes too have the same bits here.
 <%
     single = pair or slots
     exposures = "job->reference_count" if noisy else "1u"
 %>\
 % if estimated:
-/* What an observer takes a count for: photons as seen, the dark's and the readout's noise as known. */
+/* Variance that an observer estimates from a count: photon noise of the count, known dark and read noise. */
 INLINE floatv variance_of(floatv x, __global const Estimate *e)
 {
     return FMA(most(x + e->net_offset, (floatv)0.0f), (floatv)e->gain, (floatv)e->variance);
@@ -33,7 +33,7 @@ void comparison(SCENE, const uint first_low, const uint first_high,
     floatv element_variance[${scenarios}];
 % endif
 % if slots:
-    /* Smoothed values under way; the one in slot 0 is finished first. */
+    /* Partial sums of smoothed values; slot 0 is completed first. */
     floatv window[${scenarios}][${slots}], smoothed[${smooths}];
     uint centre = 0;
     for (uint r = 0; r < scale_count; r++) smoothed[r] = (floatv)0.0f;
@@ -60,7 +60,7 @@ void comparison(SCENE, const uint first_low, const uint first_high,
         intv counts[${scenarios}][${chunk}];
         expose(SCENE_PASSED, &observation, start, 0u, scenario_count, counts, 0, 0u);
 % if noisy or single:
-        /* The first quiescent exposure, and the sum of all; scenarios with one reference share them. */
+        /* First quiescent exposure and sum of all, which scenarios with the same reference share. */
         floatv first[${chunk}], sum[${chunk}];
         uint seen = ~0u;
 % endif
@@ -140,7 +140,7 @@ void comparison(SCENE, const uint first_low, const uint first_high,
 % endif
                     if (pixel[j].element_end) {
 % if estimated:
-                        /* An element without a pixel that counts adds 0 / 1e-12. */
+                        /* An element without used pixels adds 0 / 1e-12. */
                         chi2_element[k] += element[k] * element[k] / most(element_variance[k], (floatv)1e-12f);
                         element_variance[k] = (floatv)0.0f;
 % else:
@@ -171,7 +171,7 @@ void comparison(SCENE, const uint first_low, const uint first_high,
 % if slots:
             __global const float *band = bands + (size_t)(start / CHUNK) * ${slots}u * CHUNK;
             for (uint s = 0; s < ${slots}u; s += 4u) {
-                /* Four at a time, none of which waits for another. */
+                /* Four independent sums at a time, to hide latency. */
                 floatv a = window[k][s], b = window[k][s + 1u], c = window[k][s + 2u], d = window[k][s + 3u];
                 for (uint i = 0; i < CHUNK; i++) {
 % for j, part in enumerate("abcd"):
@@ -195,7 +195,7 @@ void comparison(SCENE, const uint first_low, const uint first_high,
 % endif
     }
 
-    /* One row per channel: the fixed ones of each scenario, then the linear ones, then the smoothed ones. */
+    /* One row per channel: fixed statistics of each scenario, then linear, then smoothed ones. */
     __global float *out = values + item * ${width}u;
     for (uint k = 0; k < scenario_count; k++) {
         STORE(SUM(chi2[k]) + constants[k], out + ${fixed}u * k * stride);

@@ -1,9 +1,9 @@
-## What one draw of one pixel holds: METHODS section 2. A draw is one frame, or one stack of frames.
+## Draws of pixels (METHODS section 2). A draw is one frame, or one stack of frames.
 #define CHUNK ${chunk}u
 #define MAGIC ${magic}
 #define REFERENCE ${reference}u
 
-/* Everything that a launch reads, in one order; helpers take the kernel's pointers without repeating its promises. */
+/* Input buffers of a launch; helper functions take the pointers without `restrict`. */
 #define POINTERS(r) __global const Job *r job, __global const Pixel *r pixels, __global const Level *r levels, \
     __global const Edge *r edges, __global const Poisson *r darks, __global const Poisson *r photon_counts, \
     __global const Response *r responses, __global const uint *r tables, __global const float *r priors
@@ -11,7 +11,7 @@
 #define SCENE_GIVEN POINTERS()
 #define SCENE_PASSED job, pixels, levels, edges, darks, photon_counts, responses, tables, priors
 
-/* What was drawn for CHUNK neighbouring pixels: normals, and what the recipe asks for beside them. */
+/* Draws for CHUNK neighbouring pixels: normals, and counts that the recipe draws separately. */
 typedef struct {
     floatv z[${chunk}];
 % if not joint:
@@ -26,11 +26,11 @@ typedef struct {
 } Draws;
 
 <% skies = any(factor == "sky" for _, factor in modulations) %>\
-/* Factors on light, dark and sky of one draw, less one. */
+/* Factors on light, dark and sky of one draw, minus one. */
 typedef struct { floatv light, dark${", sky" if skies else ""}; } Factors;
 
-/* Words first, then normals: each is a long chain of dependent operations, and only short bodies without
-   ties between their turns keep the pipelines filled. */
+/* Words and normals are separate loops: each is a long chain of dependent operations, and only short loop bodies
+   with independent iterations keep the pipelines filled. */
 INLINE void draw_words(const Address *at, uint stream, uint group, uintv *w)
 {
 % if chunk % 8 == 0:
@@ -52,7 +52,7 @@ INLINE void normals(const uintv *w, floatv *z)
 % endif
 }
 
-/* `exposure` is 0 for the observed one, REFERENCE for the other; start is a multiple of four. */
+/* `exposure` is 0 for the observed exposure and REFERENCE for a reference; `start` is a multiple of four. */
 INLINE void draw(SCENE_GIVEN, const Address *at, uint exposure, uint start, Draws *out)
 {
     const uint group = job->first_group + start / 4u;
@@ -73,7 +73,7 @@ INLINE void draw(SCENE_GIVEN, const Address *at, uint exposure, uint start, Draw
 % endif
 }
 
-/* Factors of the realisation, less one, the same in all its frames and pixels. */
+/* Factors of a realisation, minus one, common to all its frames and pixels. */
 INLINE Factors factors_of(SCENE_GIVEN, uintv realisation, uint realisation_high)
 {
     Factors f = {(floatv)0.0f, (floatv)0.0f${", (floatv)0.0f" if skies else ""}};
@@ -92,7 +92,7 @@ INLINE Factors factors_of(SCENE_GIVEN, uintv realisation, uint realisation_high)
     return f;
 }
 
-/* The factor of the light that one frame keeps, or all frames of a stack together, less one. */
+/* Pointing factor on the light of one frame, or the mean over a stack of frames, minus one. */
 INLINE floatv kept(SCENE_GIVEN, uintv realisation, uint realisation_high, uint exposure, uint frame)
 {
 % if jitter is not None:
@@ -100,7 +100,7 @@ INLINE floatv kept(SCENE_GIVEN, uintv realisation, uint realisation_high, uint e
     floatv sum = 0.0f;
     const uint first = job->first_frame + frame, end = ${"first + 1u" if frames else "first + job->frame_count"};
     for (uint block = first / 4u; block * 4u < end; block++) {
-        /* Four frames share a block of words; the next one's last bits are a word's finer digits. */
+        /* Four frames share a block of words; the low bits of the next word refine each word. */
         const Address at = address(realisation, realisation_high, block, job->seed_low, job->seed_high);
         const Words w = words_at(&at, exposure + ${streams["jitter"]}u, 0u);
         const uintv word[5] = {w.a, w.b, w.c, w.d, w.a};
@@ -113,14 +113,14 @@ INLINE floatv kept(SCENE_GIVEN, uintv realisation, uint realisation_high, uint e
 % endif
 }
 
-/* The count above the level's base before the ADC; level = levels + at, at = scenario * padded_count + pixel. */
+/* Analogue count above the level's base; level = levels + at, at = scenario * padded_count + pixel. */
 INLINE floatv analogue(SCENE_GIVEN, const Draws *drawn, uint i, __global const Level *level, uint pixel, uint at, const Factors *factors)
 {
     floatv z = drawn->z[i];
 % if modulated:
     __global const Response *r = responses + at;
 % if skies:
-    /* The sky's light follows the factors on all light, too. */
+    /* Factors on all light apply to the sky too. */
     const floatv changed = factors->sky * (floatv)r->sky_share, more = TOGETHER(factors->light, changed);
 % else:
     const floatv more = factors->light;
@@ -156,7 +156,7 @@ INLINE floatv analogue(SCENE_GIVEN, const Draws *drawn, uint i, __global const L
     v = FMA(drawn->dark[i], (floatv)darks[pixel].gain, v);
 % endif
 % if photons:
-    /* The two of a pair use each other's words where the count comes from a normal. */
+    /* Counts from a normal use both words of a pair. */
     floatv both[2];
     poisson_pair(drawn->photon[i & ~1u], drawn->photon[i | 1u], photon_counts + (at & ~1u), photon_counts + (at | 1u), tables, both);
     v = FMA(both[i & 1u], (floatv)photon_counts[at].gain, v);
@@ -167,10 +167,10 @@ INLINE floatv analogue(SCENE_GIVEN, const Draws *drawn, uint i, __global const L
     return v;
 }
 
-/* One where whole number a lies above whole number b, else zero. */
+/* 1 if whole number a exceeds whole number b, else 0. */
 #define PASSED(a, b) least(most((a) - (b), (floatv)0.0f), (floatv)1.0f)
 
-/* The ADC: MAGIC + whole DN above the base, clipped to its range. */
+/* Output of the ADC: MAGIC + whole DN above the base, clipped to its range. */
 INLINE floatv digitise(floatv v, __global const Edge *edge)
 {
     floatv r = v + MAGIC;
@@ -181,10 +181,10 @@ INLINE floatv digitise(floatv v, __global const Edge *edge)
 }
 
 <% sums = "+=" if frames else "=" %>\
-/* What all pixels of one draw share. */
+/* State common to all pixels of a draw. */
 typedef struct { Address at; Factors factors; } Shared;
 
-/* One exposure of a vector of realisations: the observed one, or number so many of the REFERENCE ones. */
+/* Exposure of a vector of realisations: the observed one, or the reference with index `number`. */
 typedef struct {
     uintv realisation;
     uint realisation_high, which, number;
@@ -204,7 +204,7 @@ INLINE Shared shared_of(SCENE_GIVEN, const Exposure *x, uint draw_number)
     return s;
 }
 
-/* The same realisations' exposure of a kind. */
+/* Another exposure of the same realisations. */
 INLINE Exposure another(SCENE_GIVEN, Exposure x, uint which, uint number)
 {
     x.which = which;
@@ -224,8 +224,9 @@ INLINE Exposure observed(SCENE_GIVEN, uintv realisation, uint realisation_high)
     return another(SCENE_PASSED, x, 0u, 0u);
 }
 
-/* Draws an exposure of CHUNK pixels from `start` on: whole DN above the base of scenarios `first` to `end` - 1, summed
-   over its draws. Where `cut` is given, draws cut off below and above are added to it, pixels `apart` from each other. */
+/* Draw an exposure of CHUNK pixels from `start` on: whole DN above the base of scenarios `first` to `end` - 1, summed
+   over its draws. If `cut` is given, count the clipped draws, low and high, in `cut`, with a stride of `apart` per
+   pixel. */
 INLINE void expose(SCENE_GIVEN, const Exposure *x, uint start, uint first, uint end, intv (*counts)[${chunk}], uintv (*cut)[2], uint apart)
 {
 % if frames:

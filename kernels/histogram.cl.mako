@@ -1,17 +1,17 @@
 ## Histograms of each pixel's counts and each resolution element's S/N, over realisations.
-## An observer's S/N of a pixel is a function of its count alone, so that the count's histogram holds it.
-## What lies outside is only marked, in the first and the last bin and in `outside`: the host counts it from raw spectra.
+## The S/N of a pixel is a function of its count alone, so the histogram of counts contains it.
+## Values outside the bins only set the first or last bin and `outside`; the host counts them from raw spectra.
 % if width == 1:
-/* Many work-items to an element: whole-number additions, whose order changes nothing. */
+/* Many work-items per element: integer additions, whose order does not matter. */
 #define COUNT(pointer) atomic_inc(pointer)
 #define ADD(pointer, n) atomic_add((pointer), (n))
 % else:
-/* An element belongs to one work-item. */
+/* One work-item per element. */
 #define COUNT(pointer) (*(pointer))++
 #define ADD(pointer, n) (*(pointer) += (n))
 % endif
 
-/* Whether a bin is the first or the last. */
+/* True for the first and the last bin. */
 #define END(bin) (((bin) == 0) | ((bin) == ${observer_bins - 1}))
 #define WANTED(lane) (row + (lane) >= start_row && row + (lane) < stop_row)
 
@@ -72,9 +72,9 @@ void histogram(SCENE, const uint first_low, const uint first_high, const uint st
 % endif
             }
         }
-        /* The sky is no signal, but its photons are noise. */
+        /* The sky is not signal, but its photons add noise. */
         signal -= (floatv)element.sky;
-        /* Zero where the observer knows of no noise. */
+        /* The ratio is zero if the estimated noise is zero. */
         floatv ratio = variance > 0.0f ? signal / root(variance) : (floatv)0.0f;
         floatv steps = (ratio - element.centre) * element.bins_per_unit;
         steps = least(most(steps, (floatv)${-(observer_bins // 2)}.0f), (floatv)${observer_bins // 2 - 1}.0f);

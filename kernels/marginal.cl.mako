@@ -1,6 +1,6 @@
-## Statistics marginalised over what is unknown: from chi-squared the squares of some weighted sums are taken away.
+## Statistics marginalised over nuisance parameters: chi-squared minus the squares of weighted sums.
 
-/* values[base] -= sum of values[row]^2, row from first to end - 1; each work-item follows one vector of realisations. */
+/* values[base] -= sum of values[row]^2, row from first to end - 1; one vector of realisations per work-item. */
 __kernel ${attributes}
 void marginalise(const uint count, __global const uint *restrict bases, __global const uint *restrict firsts,
                  __global const uint *restrict ends, const uint stride, __global float *restrict values)

@@ -1,4 +1,4 @@
-## Box-Muller with its own polynomials, so that every device gives the same bits.
+## Box-Muller transform with explicit polynomials, so that every device gives the same bits.
 <%def name="pairs(count)">\
 % for i in range(count):
     floatv t${i} = TO_FLOAT(w[${2 * i}]) + 0.5f;
@@ -11,7 +11,7 @@ ${evaluate("q", "f", polynomials["log"], count)}\
     floatv radius${i} = root(FMA(halvings${i}, (floatv)${two_ln2}, f${i} * q${i}));  /* sqrt(-2 ln u) */
 % endfor
 % for i in range(count):
-    /* The top bit turns by pi, the other 31 choose an angle in [-pi/2, pi/2). */
+    /* The top bit adds pi; the other 31 bits give an angle in [-pi/2, pi/2). */
     floatv s${i} = TO_FLOAT(AS_INT(w[${2 * i + 1}] << 1)) * 2.3283064365386963e-10f;
     floatv y${i} = s${i} * s${i};
 % endfor
@@ -33,14 +33,14 @@ ${evaluate("cosine", "y", polynomials["cos"], count)}\
 % endfor
 % endfor
 </%def>\
-/* Two standard normals z[0], z[1] from the words w[0], w[1]. The radius comes from (w[0] + 1/2) / 2^32, so that
-   small words keep all their digits: |z| reaches 6.76 and no word gives an infinity. */
+/* Two standard normals z[0], z[1] from the words w[0], w[1]. The radius follows from (w[0] + 1/2) / 2^32, which keeps
+   all digits of small words: |z| reaches 6.76 and is never infinite. */
 INLINE void normal_pair(const uintv *w, floatv *z)
 {
 ${pairs(1)}\
 }
 
-/* Four pairs, their steps taken in turn, for the same reason as in words_of_two. */
+/* Four interleaved pairs, for the same reason as in words_of_two. */
 INLINE void four_normal_pairs(const uintv *w, floatv *z)
 {
 ${pairs(4)}\

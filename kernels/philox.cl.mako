@@ -1,4 +1,4 @@
-## Philox4x32-10 (Salmon et al. 2011, doi 10.1145/2063384.2063405), addressed, never consumed in sequence.
+## Philox4x32-10 (Salmon et al. 2011, doi 10.1145/2063384.2063405), addressed by counter.
 ## counter = (realisation low, realisation high, frame, stream << 24 | pixel group); key = the 64-bit seed.
 #define PHILOX_M0 0xD2511F53u
 #define PHILOX_M1 0xCD9E8D57u
@@ -7,7 +7,7 @@
 
 typedef struct { uintv a, b, c, d; } Words;
 
-/* Unrolled here, because not every compiler follows a request to. */
+/* Unrolled by the template, because not every compiler obeys an unroll pragma. */
 #define PHILOX_ROUND(r) \
     multiply(PHILOX_M0, c0, &high0, &low0); \
     multiply(PHILOX_M1, c2, &high1, &low1); \
@@ -35,8 +35,8 @@ INLINE Words philox(uintv c0, uintv c1, uintv c2, uintv c3, uint k0, uint k1)
     return rounds_3_to_9(c0, c1, c2, c3, k0, k1);
 }
 
-/* Only the last counter word changes from pixel to pixel. What the first three rounds make of the
-   others is computed once per realisation and frame: 16 of the 20 products are left in the loop. */
+/* Only the last counter word differs between pixels. The contribution of the others to the first three rounds is
+   computed once per realisation and frame, which leaves 16 of the 20 products in the loop. */
 typedef struct { uintv first, e, f; uint s1, s3; uint k0, k1; } Address;
 
 INLINE Address address(uintv realisation, uint realisation_high, uint frame, uint k0, uint k1)
@@ -69,8 +69,8 @@ INLINE Words words_at(const Address *at, uint stream, uint group)
     return rounds_3_to_9(at->e ^ low, at->f, high0 ^ (uintv)at->s3, low0, at->k0, at->k1);
 }
 
-/* Two neighbouring groups at once, their steps taken in turn: each is one long chain of dependent operations, and
-   a processor sees only so far ahead. */
+/* Two interleaved groups: each is one long chain of dependent operations, and a processor looks only a limited number
+   of instructions ahead. */
 INLINE void words_of_two(const Address *at, uint stream, uint group, uintv *w)
 {
     uintv h[2], l[2], h0[2], l0[2], c0[2], c1[2], c2[2], c3[2];

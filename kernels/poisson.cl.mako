@@ -1,6 +1,7 @@
-## Poisson counts, relative to a whole number near their mean: never a rounded normal (METHODS section 4).
-/* By an exact integer alias table: one word, one look-up, no rejection. Entry = alias << (32 - bits) | threshold.
-   The word's top bits choose the column, the rest accept it or take its alias. */
+## Poisson counts relative to a whole number near their mean (METHODS section 4).
+/* Draw from an exact integer alias table: one word, one look-up, no rejection.
+   Entry = alias << (32 - bits) | threshold. The top bits of the word choose a column; the others accept it or take its
+   alias. */
 INLINE uintv alias_draw(uintv word, __global const uint *table, uint bits)
 {
     uint shift = 32u - bits;
@@ -10,8 +11,8 @@ INLINE uintv alias_draw(uintv word, __global const uint *table, uint bits)
     return (word & mask) < (entry & mask) ? column : entry >> (uintv)shift;
 }
 
-/* By the inverse's expansion in the mean (Cornish & Fisher), for means of a thousand and more, where no number
-   of draws that anyone makes can tell it from the exact distribution:
+/* Draw by the Cornish-Fisher expansion of the quantile, for means of at least a thousand, where no feasible number
+   of draws distinguishes it from the exact distribution:
    n = nearest(mean + sqrt(mean) z + (z^2 - 1) / 6 - z (z^2 + 2) / (72 sqrt(mean))). */
 INLINE floatv expansion_draw(floatv z, float offset, float slope, float cubic)
 {
@@ -19,9 +20,9 @@ INLINE floatv expansion_draw(floatv z, float offset, float slope, float cubic)
     return nearest(FMA(z, FMA(z, curve, (floatv)slope), (floatv)offset));
 }
 
-/* Counts of two neighbours from their two words: one each from tables, or both of both from the expansion. The scene
-   lets no pair mix the two ways (scene.py: _both_of_a_pair), for a word used twice would tie its counts together; a
-   padded neighbour alone may differ, and counts for nothing. */
+/* Counts of two neighbours from two words: a table uses one word per count, the expansion uses both words for both.
+   No pair mixes the two methods (scene.py: _both_of_a_pair), because a word used twice would correlate the counts.
+   Only a padded neighbour, which has no effect, may differ. */
 INLINE void poisson_pair(uintv first, uintv second, __global const Poisson *a, __global const Poisson *b,
                          __global const uint *tables, floatv *out)
 {

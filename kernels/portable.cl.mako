@@ -1,5 +1,5 @@
-## One small header for what differs between compilers: vectors of WIDTH realisations, and forms that
-## PoCL's compiler turns into single vector instructions. Both branches give the same bits.
+## Differences between compilers: vectors of WIDTH realisations, and expressions that PoCL's compiler translates to
+## single vector instructions. Both branches give the same bits.
 <%
     lanes = [""] if width == 1 else [f".s{lane:x}" for lane in range(width)]
     w = "" if width == 1 else str(width)
@@ -25,12 +25,12 @@ typedef float${w} floatv;
 % endif
 
 % if vector_forms:
-/* A built-in on a 16-vector is a function call that spills every register here; a loop over lanes is
-   fused into one instruction, and operators never call. */
+/* Here a built-in on a 16-vector is a function call that spills every register. Expressions per lane are fused into one
+   instruction, and operators never call. */
 #define FMA(a, b, c) fused((a), (b), (c))
 % if width == 16:
 #ifdef __AVX512F__
-/* One operation to the compiler instead of sixteen: half its time. */
+/* One operation for the compiler instead of sixteen halves the compile time. */
 INLINE floatv fused(floatv a, floatv b, floatv c) { return __builtin_ia32_vfmaddps512_mask(a, b, c, (unsigned short)0xffff, 4); }
 INLINE floatv root(floatv a) { return __builtin_ia32_sqrtps512(a, 4); }
 #else
@@ -43,7 +43,7 @@ INLINE floatv root(floatv a) { return ${per_lane("__builtin_sqrtf(a@)")}; }
 #define TO_FLOAT(x) __builtin_convertvector((x), floatv)
 #define TO_INT(x) __builtin_convertvector((x), intv)
 
-/* 32 x 32 -> 64 bit products of the even and the odd lanes, put back together with a shuffle. */
+/* 32 x 32 -> 64 bit products of even and odd lanes, interleaved by a shuffle. */
 INLINE void multiply(uint factor, uintv x, uintv *high, uintv *low)
 {
     ulong${half} even = (as_ulong${half}(x) & (ulong${half})0xffffffffUL) * (ulong${half})factor;
@@ -63,7 +63,7 @@ INLINE void multiply(uint factor, uintv x, uintv *high, uintv *low)
 }
 % endif
 
-/* The ternary operator works lane by lane and never becomes a call. */
+/* The ternary operator works per lane and is never a call. */
 #define least(a, b) ((a) < (b) ? (a) : (b))
 #define most(a, b) ((a) > (b) ? (a) : (b))
 
@@ -83,7 +83,7 @@ INLINE uintv look_up(__global const uint *table, uintv index)
 % endif
 }
 
-/* Nearest integer, ties to even, for |x| < 2^22: no call, and the same bits as rint(). */
+/* Nearest integer, ties to even, for |x| < 2^22: the bits of rint() without a call. */
 INLINE floatv nearest(floatv x) { return (x + 12582912.0f) - 12582912.0f; }
 % if width == 1:
 #define LOAD(pointer) (*(pointer))

@@ -1,6 +1,6 @@
 ## Factors from tables of quantiles; see mauvecl/noise/priors.py.
-/* A prior's factor, less one, at the probability that a word stands for. Its top bit chooses an end of the table, the
-   other 31 and 23 finer ones are the probability from there times 2^32, whose float has octave and cell in its bits. */
+/* Factor of a prior, minus one, at the probability that a word represents. The top bit chooses an end of the table. The
+   other 31 bits and 23 finer ones give the probability from that end times 2^32; octave and cell are bits of its float. */
 INLINE floatv quantile(uintv word, uintv finer, __global const float *table)
 {
     intv side = AS_INT(word) >> 31;

@@ -1,5 +1,5 @@
-## Small kernels that push chosen words through the production code, for tests and the self-test.
-/* What all lanes hold; something else where they differ. */
+## Kernels that run the production code on given words, for tests and the self-test.
+/* Common value of all lanes; another value if they differ. */
 INLINE uint agreed(uintv word)
 {
     uint lanes[${width}], differ = 0u;
@@ -11,7 +11,7 @@ INLINE uint agreed(uintv word)
 __kernel ${attributes}
 void probe_philox(const uint count, __global const uint *counters, __global const uint *keys, __global uint *out)
 {
-    /* Each work-item takes one counter and key in all lanes. */
+    /* Each work-item uses the same counter and key in all lanes. */
     const uint item = get_global_id(0);
     __global const uint *c = counters + 4u * item;
     Words full = philox((uintv)c[0], (uintv)c[1], (uintv)c[2], (uintv)c[3], keys[2u * item], keys[2u * item + 1u]);
@@ -59,7 +59,7 @@ void probe_expansion(__global const uint *restrict words, const float offset, co
 __kernel ${attributes}
 void probe_prior(__global const uint *restrict words, __global const float *restrict table, __global float *restrict out)
 {
-    /* words[2][n]: chances and their finer digits -> factors[n], less one; n = WIDTH x global size */
+    /* words[2][n]: probabilities and their finer digits -> factors[n], minus one; n = WIDTH x global size */
     const uint item = get_global_id(0), n = get_global_size(0) * ${width}u;
     STORE(quantile(LOAD(words + item * ${width}u), LOAD(words + n + item * ${width}u), table), out + item * ${width}u);
 }
@@ -75,8 +75,8 @@ __kernel void probe_layout(__global uint *restrict out)
 % endfor
 }
 
-/* Every word that a work-item owns as radius, with one angle: its smallest and largest normals, and how many of
-   them are no finite numbers. */
+/* Use every word of a work-item as radius, with one angle; return the smallest and the largest normal and the number
+   of values that are not finite. */
 __kernel ${attributes}
 void probe_every_word(const uint per_item, const uint angle, __global float *restrict ends, __global uint *restrict bad)
 {

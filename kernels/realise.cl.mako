@@ -16,7 +16,7 @@ void realise(SCENE, const uint first_low, const uint first_high, const uint star
     for (uint start = 0; start < pixel_count; start += CHUNK) {
         intv dn[1][${chunk}];
         expose(SCENE_PASSED, &observation, start, 0u, 1u, dn, met, 0u);
-        /* From pixels of WIDTH realisations to realisations of CHUNK pixels. */
+        /* Transpose from pixels of WIDTH realisations to realisations of CHUNK pixels. */
         const uint end = pixel_count - start < CHUNK ? pixel_count - start : CHUNK;
         ${row_type} block[${chunk}][${width}];
         for (uint i = 0; i < CHUNK; i++) STORE(CONVERT_ROW(dn[0][i] + (intv)(int)job->draw_count * (intv)edges[start + i].base), block[i]);

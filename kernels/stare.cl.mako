@@ -1,5 +1,5 @@
-## Frames of stares. What differs from frame to frame and from stare to stare is the strength of a few spectra;
-## see mauvecl/lightcurve/stares/components.py. Lanes are stares where pixels are drawn, and frames where sums are.
+## Frames of stares. Only the strengths of a few spectra vary between frames and stares; see
+## mauvecl/lightcurve/stares/components.py. Vector lanes are stares if pixels are drawn, and frames if sums are drawn.
 #define STARE_POINTERS(r) __global const Staring *r staring, __global const uint *r numbers, __global const float *r known, \
     __global const float *r curves, __global const uint *r kinds, __global const float *r flares, __global const float *r amplitudes
 #define STARE STARE_POINTERS(restrict)
@@ -12,7 +12,7 @@
 #define OF_FRAME(array) ((floatv)((array)[frame]))
 % endif
 
-/* Coefficients of star, sky and dark, less one, and the factor on all light, less one. */
+/* Coefficients of star, sky and dark, and the factor on all light, each minus one. */
 typedef struct { floatv star, sky, dark, light; } Strengths;
 
 /* exp(x) - 1, for |x| < 80 */
@@ -28,7 +28,7 @@ INLINE floatv exponential_less_one(floatv x)
     return FMA(scale, FMA(r * r, q, r), scale - 1.0f);
 }
 
-/* The amplitudes of what is not known of a stare, in units of their standard deviations. */
+/* Amplitudes of a stare's unknowns, in standard deviations. */
 INLINE void unknowns_of(const Staring staring, uintv realisation, uint realisation_high, uint seed_low, uint seed_high, floatv *z)
 {
     const Address at = address(realisation, realisation_high, 0u, seed_low, seed_high);

@@ -1,4 +1,4 @@
-## What flares put into frames need beside them: normals for their own photons, and the factor on all light as drawn.
+## Draws for flares added to existing frames: normals for the photon noise of the flare, and the factor on all light.
 <%
     words = [("stare_frame", 0)] * jittered + [("stare_glow", group) for group in range(-(-sums // 4))]
     n_words = len(words)
@@ -7,7 +7,7 @@ __kernel ${attributes}
 void stare_glow(__global const Job *restrict job, STARE, const uint first_low, const uint first_high, const uint frames_each,
                 const uint row_count, const uint first_row, __global float *restrict values)
 {
-    /* values[stare][statistic, then light less one][frame] */
+    /* values[stare][statistic, then light minus one][frame] */
     const uint stare = get_global_id(0), stride = staring->padded_frames;
     const uint begin = get_global_id(1) * frames_each, end = least(begin + frames_each, stride);
     const uintv realisation = (uintv)(first_low + stare);

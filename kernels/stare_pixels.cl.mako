@@ -1,4 +1,4 @@
-## Stares pixel by pixel: every frame drawn with all its noise, rounded, and reduced to a few weighted sums.
+## Stares by pixel: every frame is drawn with all its noise, rounded, and reduced to a few weighted sums.
 <% parts = 4 %>\
 __kernel ${attributes}
 void stare_pixels(SCENE, STARE, const uint first_low, const uint first_high, const uint start_row, const uint stop_row,
@@ -24,7 +24,7 @@ void stare_pixels(SCENE, STARE, const uint first_low, const uint first_high, con
 % endif
     const Strengths strengths = strengths_of(STARE_PASSED, frame, jitter, unknown);
 % if spectra:
-    /* Each stare's flares, or those of all; lanes beyond what is wanted take the nearest. */
+    /* Flares per stare, or common to all; lanes outside the wanted range use the nearest row. */
     floatv flare[${scenarios}][${spectra}];
     const uint rows = staring->flare_rows, amplitude_rows = staring->amplitude_rows;
     for (uint i = 0; i < ${width}u; i++) {
@@ -64,7 +64,7 @@ void stare_pixels(SCENE, STARE, const uint first_low, const uint first_high, con
                 fourth = FMA(light, (floatv)m->photon_fourth, fourth);
                 fifth = FMA(light, (floatv)m->photon_fifth, fifth);
 % endif
-                /* As analogue() has it for factors on light and dark. */
+                /* The expansion of analogue() for factors on light and dark. */
                 const floatv sd = root(variance), each = 1.0f / variance, skew = third * each;
                 const floatv curve = fourth * FMA(zz, (floatv)0.041666668f, (floatv)-0.125f)
                                    - third * skew * FMA(zz, (floatv)0.055555556f, (floatv)-0.1388889f);

@@ -1,5 +1,5 @@
-## Stares without their pixels: the weighted sums of each frame from their joint cumulants, which are linear in the
-## strengths of the few spectra. All is done in sums that are independent and of variance one at coefficients of one.
+## Stares without pixels: weighted sums of each frame from their joint cumulants, which are linear in the strengths of a
+## few spectra. The sums are transformed to be independent with unit variance at coefficients of one.
 <%
     from itertools import combinations_with_replacement
     pairs = [(a, b) for a in range(sums) for b in range(a + 1)]
@@ -13,20 +13,20 @@
     def name(*key):
         return "".join(str(i) for i in sorted(key, reverse=True))
     def chain(terms):
-        """Products added up, the first one first."""
+        """Return the sum of products, starting with the first."""
         (a, b), *rest = terms
         text = f"{a} * {b}"
         for a, b in rest:
             text = f"FMA({a}, {b}, {text})"
         return text
     def remaining(a, b):
-        """A covariance less what earlier columns of its factor account for."""
+        """Return a covariance minus the contribution of earlier columns of its factor."""
         text = f"c{a}{b}"
         for i in range(b):
             text = f"FMA(-l{a}{i}, l{b}{i}, {text})"
         return text
     def cumulant(offset, lit=True):
-        """A cumulant at these strengths."""
+        """Return a cumulant at the given strengths."""
         text = f"(floatv)table[{offset}]"
         rows = [("strengths.dark", 3)] + ([(s, r) for s, r in zip(lights, [1, 2, *range(4, 4 + spectra)])] if lit else [])
         for strength, r in rows:
@@ -48,7 +48,7 @@ void stare_sums(__global const Job *restrict job, STARE, const uint first_low, c
     __global const float *whole = table + ${row * (4 + spectra)}u;
     for (uint frame = begin; frame < end; frame += ${width}u) {
         const uintv number = LOAD(numbers + frame);
-        /* Normals of the jitters, and of the sums. */
+        /* Normals for the jitters and the sums. */
         floatv z[${4 * n_words}];
         uintv w[${4 * n_words}];
         Words x;
@@ -63,7 +63,7 @@ void stare_sums(__global const Job *restrict job, STARE, const uint first_low, c
 % endif
         const Strengths strengths = strengths_of(STARE_PASSED, frame, z, unknown);
         const floatv *y = z + ${4 * jittered}u;
-        /* What skewness adds to each is a sum of these. */
+        /* Quadratic terms of the skewness. */
 % for a, b in pairs:
         const floatv q${a}${b} = ${f"FMA(y[{a}], y[{a}], (floatv)-1.0f) * 0.16666667f" if a == b else f"y[{a}] * y[{b}] * 0.33333334f"};
 % endfor
@@ -77,7 +77,7 @@ void stare_sums(__global const Job *restrict job, STARE, const uint first_low, c
                 flare[j] = FMA(strengths.light, flare[j], flare[j]);
             }
 % endif
-            /* Covariances, their Cholesky factor l, and its inverse m. */
+            /* Covariances, their Cholesky factor l and its inverse m. */
 % for a, b in pairs:
             const floatv c${a}${b} = ${cumulant(at[a, b])};
 % endfor
@@ -92,7 +92,7 @@ void stare_sums(__global const Job *restrict job, STARE, const uint first_low, c
             const floatv m${a}${b} = -(${chain([(f"l{a}{i}", f"m{i}{b}") for i in range(b, a)])}) * m${a}${a};
 % endfor
 % endfor
-            /* Third cumulants, turned into those of the independent z one index after the other. */
+            /* Third cumulants, transformed to the independent z one index at a time. */
 % for key in threes:
             const floatv t${name(*key)} = ${cumulant(at[key], lit=counts)};
 % endfor

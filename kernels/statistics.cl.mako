@@ -1,15 +1,15 @@
-## chi2, chi2_element and linear statistics of every scenario against its reference, from one pass over common draws:
-## the fast kernel, for what is asked most. `comparison.cl.mako` knows the rest.
+## Fast kernel for the most frequent statistics: chi2, chi2_element and linear ones of every scenario against its
+## reference, from one pass over common draws. `comparison.cl.mako` computes the others.
 <%
     plain = joint and not (modulations or frames or photons or cosmic)
     powers = (["c4"] if quartic else []) + ["c3", "c2", "c1", "c0"]
 
     def each(text):
-        """Statements, each for all vectors of realisations before the next; @ is a vector's number."""
+        """Repeat each statement for all vectors of realisations; @ is the index of a vector."""
         return " ".join(one.replace("@", str(v)) + ";" for one in text.split(";")[:-1] for v in range(vectors))
 %>\
-## x = observed - reference, whole DN: what is left of the reference's fraction of a DN is a constant of each sum.
-/* Each work-item follows ${vectors} vectors of realisations: what is read of a level serves them all. */
+## x = observed - reference in whole DN; the fractional DN of the reference is a constant of each sum.
+/* Each work-item processes ${vectors} vectors of realisations, which share the reads of levels. */
 __kernel ${attributes}
 void statistics(SCENE, const uint first_low, const uint first_high,
                 __global const float *restrict constants,
@@ -49,7 +49,7 @@ void statistics(SCENE, const uint first_low, const uint first_high,
             floatv inside[${vectors}], outside[${vectors}];
             ${each("sum[@] = chi2[k][@]; inside[@] = element[k][@]; outside[@] = chi2_element[k][@];")}
 % if linear:
-            /* The scenario's first linear statistic is summed on the way; one without any adds nothing to the last. */
+            /* The first linear statistic of a scenario is summed in this pass; without one, a dummy is summed. */
             const uint own = l < pixels_end[k] ? l++ : linear_count;
             __global const float *own_weight = weights + own * padded + start;
             Four own_sum[${vectors}];
@@ -59,12 +59,12 @@ void statistics(SCENE, const uint first_low, const uint first_high,
             ${each("own_sum[@] = linear[own][@];")}
 % endif
             for (uint i = 0; i < CHUNK; i += 4u) {
-                /* Four pixels at once: addresses without an index, and sums that need not wait for each other. */
+                /* Four pixels at once: constant address offsets and independent sums. */
                 __global const Level *four = level + i;
                 floatv y[${vectors}][4], term[${vectors}];
 % for j, part in enumerate("abcd"):
 % if plain:
-                /* As analogue() has it, steps of the vectors in turn. */
+                /* The polynomial of analogue(), with the vectors interleaved. */
                 ${each(f"y[@][{j}] = (floatv)four[{j}].{powers[0]};")}
 % for power in powers[1:]:
                 ${each(f"y[@][{j}] = FMA(drawn[@].z[i + {j}u], y[@][{j}], (floatv)four[{j}].{power});")}
@@ -89,7 +89,7 @@ void statistics(SCENE, const uint first_low, const uint first_high,
 % endif
 % if elements:
                 if (!pixel[i].four_uneven) {
-                    /* Most of the time: one addition to wait for. */
+                    /* The common case: one dependent addition. */
                     ${each("inside[@] += (y[@][0] + y[@][1]) + (y[@][2] + y[@][3]);")}
                 } else {
 % for j in range(4):
@@ -132,7 +132,7 @@ void statistics(SCENE, const uint first_low, const uint first_high,
         }
     }
 
-    /* One row per channel: the fixed ones of each scenario, then the linear ones. */
+    /* One row per channel: fixed statistics of each scenario, then linear ones. */
     for (uint v = 0; v < ${vectors}u; v++) {
         __global float *out = values + (item * ${vectors}u + v) * ${width}u;
         for (uint k = 0; k < scenario_count; k++) {

@@ -1,21 +1,21 @@
-## Histograms and integer sums of whole channels. Everything added is a whole number: no order, tile or device can
-## change a result. What lies outside the fine bins is marked in the first and the last one and counted in `outside`; the
-## host looks at those values themselves.
+## Histograms and integer sums of whole channels. All additions are of integers, so order, tiling and device do not
+## change the result. Values outside the fine bins set the first or last bin and are counted in `outside`; the host then
+## processes these values itself.
 <%
     block = 16
     end = bins // 2 << fine_bits
     inner = end - (1 << fine_bits)
 %>\
 % if width == 1:
-/* Many work-items to a channel. */
+/* Many work-items per channel. */
 #define COUNT(bin) atomic_inc(bins + (bin))
 #define ADD(pointer, n) atomic_add((pointer), (n))
 % else:
-/* A channel belongs to one work-item. */
+/* One work-item per channel. */
 #define COUNT(bin) bins[bin]++
 #define ADD(pointer, n) (*(pointer) += (n))
 % endif
-/* Whole fine steps from the grid's centre; what is far, or no number, is held at the ends. */
+/* Whole fine steps from the grid's centre; distant values and NaN are set to the ends. */
 static inline int step_of(float value, Grid grid)
 {
     float steps = (value - grid.centre) * grid.steps_per_unit;
@@ -29,7 +29,7 @@ static inline int bin_of(int step)
     return (step >> ${fine_bits}) + ${bins // 2};
 }
 
-/* The step where it lies in a bin that is neither the first nor the last, zero elsewhere. */
+/* The step if its bin is neither the first nor the last, else zero. */
 static inline int inner_of(int step)
 {
     return step >= -${inner} && step < ${inner} ? step : 0;
@@ -53,7 +53,7 @@ void tally(const uint from, const uint to, const uint stride, __global const flo
     const uint item = 0u, items = 1u;
     uint i = from;
     for (; i + ${block}u <= to; i += ${block}u) {
-        /* Blocks, because a compiler makes vectors of what has a fixed length. */
+        /* Loops of fixed length, which the compiler vectorises. */
         int step[${block}], inner[${block}];
         for (uint j = 0; j < ${block}u; j++) step[j] = step_of(row[i + j], grid);
         for (uint j = 0; j < ${block}u; j++) inner[j] = inner_of(step[j]);
