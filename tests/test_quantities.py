@@ -248,6 +248,27 @@ CASES: dict[str, Case] = {
     "EnergyScale.of_star.flare_k": Case(
         lambda v: mauvecl.EnergyScale.of_star(star(), 10.0, flare_k=v).erg_per_s, "K", 6000, 20_000
     ),
+    "EnergyScale.of_blackbody.photosphere_k": Case(
+        lambda v: mauvecl.EnergyScale.of_blackbody(1.0, 5700.0, geometry="replaces", photosphere_k=v).erg_per_s,
+        "K",
+        3000,
+        8000,
+    ),
+    "EnergyScale.of_star.photosphere_k": Case(
+        lambda v: mauvecl.EnergyScale.of_star(star(), 10.0, geometry="replaces", photosphere_k=v).erg_per_s,
+        "K",
+        3000,
+        8000,
+    ),
+    "EnergyScale.shibayama2013.radius_rsun": Case(
+        lambda v: mauvecl.EnergyScale.shibayama2013(v, 5700.0).erg_per_s, "solRad", 0.2, 3
+    ),
+    "EnergyScale.shibayama2013.temperature_k": Case(
+        lambda v: mauvecl.EnergyScale.shibayama2013(1.0, v).erg_per_s, "K", 3000, 9000
+    ),
+    "EnergyScale.shibayama2013.flare_k": Case(
+        lambda v: mauvecl.EnergyScale.shibayama2013(1.0, 5700.0, flare_k=v).erg_per_s, "K", 6000, 20_000
+    ),
     "EnergyScale.of_star.distance_pc": Case(lambda v: mauvecl.EnergyScale.of_star(star(), v).erg_per_s, "pc", 1, 100),
     "Sinusoid.period_s": Case(lambda v: mauvecl.Sinusoid(0.1, v).period_s, "s", 100, 9000),
     "Stare.of.duration_s": Case(lambda v: mauvecl.Stare.of(v).start_s[-1], "s", 10, 9000),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import astropy.units as u
@@ -61,14 +62,85 @@ def with_flare(
         Temperature of the photosphere, which ``replaces`` requires.
     """
     check_amplitude(amplitude)
+    light = _photons_in_band(
+        wavelength_nm,
+        flux_flam,
+        temperature_k=temperature_k,
+        band=band,
+        geometry=geometry,
+        photosphere_temperature_k=photosphere_temperature_k,
+    )
+    body = blackbody(wavelength_nm, temperature_k)
+    if light.ratio is None:
+        return flux_flam + amplitude * light.star / light.hot * body
+    filling = amplitude / (light.ratio - 1.0)
+    if filling > 1.0:
+        raise InputError(
+            f"flare amplitude = {amplitude:g} needs {filling:.2f} of the star's disc at {temperature_k:g} K, "
+            f"expected at most {light.ratio - 1.0:.3g}"
+        )
+    return flux_flam * (1.0 - filling) + filling * light.ratio * light.star / light.hot * body
+
+
+@dataclass(frozen=True)
+class AddedLight:
+    """The light that a flare of amplitude 1 adds to a star: `hot` blackbodies of the flare less `lost` of the star."""
+
+    hot: float  # multiple of the flare's surface flux pi B_lambda
+    lost: float  # share of the star's own light
+
+
+def added_light(
+    wavelength_nm: NDArray[np.float64],
+    flux_flam: NDArray[np.float64],
+    *,
+    temperature_k: float,
+    band: str,
+    geometry: Geometry,
+    photosphere_temperature_k: float | None,
+) -> AddedLight:
+    """Return the light of a flare of amplitude 1, with the arguments and errors of `with_flare`.
+
+    `with_flare` adds it times the amplitude, whose largest value it checks.
+    """
+    light = _photons_in_band(
+        wavelength_nm,
+        flux_flam,
+        temperature_k=temperature_k,
+        band=band,
+        geometry=geometry,
+        photosphere_temperature_k=photosphere_temperature_k,
+    )
+    if light.ratio is None:
+        return AddedLight(light.star / light.hot, 0.0)
+    return AddedLight(light.ratio / (light.ratio - 1.0) * light.star / light.hot, 1.0 / (light.ratio - 1.0))
+
+
+@dataclass(frozen=True)
+class _Photons:
+    """Photons in the band in which amplitudes are measured."""
+
+    star: float
+    hot: float  # of the flare's surface
+    ratio: float | None  # flare's surface to photosphere's; None where the flare replaces nothing
+
+
+def _photons_in_band(
+    wavelength_nm: NDArray[np.float64],
+    flux_flam: NDArray[np.float64],
+    *,
+    temperature_k: float,
+    band: str,
+    geometry: Geometry,
+    photosphere_temperature_k: float | None,
+) -> _Photons:
     check_temperature("flare temperature", temperature_k)
     star = photons(wavelength_nm, flux_flam, band)
     if not star > 0.0:
         raise InputError(f"the star has no light in the band {band}, expected some to measure the flare against")
-    body = blackbody(wavelength_nm, temperature_k)
-    hot = photons(wavelength_nm, body, band)
+    hot = photons(wavelength_nm, blackbody(wavelength_nm, temperature_k), band)
     if geometry == "added":
-        return flux_flam + amplitude * star / hot * body
+        return _Photons(star, hot, None)
     if geometry != "replaces":
         raise InputError(f"flare geometry = {geometry!r}, expected 'added' or 'replaces'")
     if photosphere_temperature_k is None:
@@ -80,10 +152,4 @@ def with_flare(
             f"flare temperature = {temperature_k:g} K is no hotter than the photosphere it replaces, "
             f"expected more than {photosphere_temperature_k:g} K"
         )
-    filling = amplitude / (ratio - 1.0)
-    if filling > 1.0:
-        raise InputError(
-            f"flare amplitude = {amplitude:g} needs {filling:.2f} of the star's disc at {temperature_k:g} K, "
-            f"expected at most {ratio - 1.0:.3g}"
-        )
-    return flux_flam * (1.0 - filling) + filling * ratio * star / hot * body
+    return _Photons(star, hot, ratio)

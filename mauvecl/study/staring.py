@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, Literal
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.flares.energies import EnergyScale, amplitude_of, amplitude_of_peak
+from mauvecl.lightcurve.flares.energies import EnergyScale, Kind, amplitude_of, amplitude_of_peak
 from mauvecl.lightcurve.flares.events import Cooling, Event, check_seen, coefficients, temperatures_of
 from mauvecl.lightcurve.stares.observed import Staring
 from mauvecl.lightcurve.stares.stare import Stare
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
     from mauvecl.study.sections import Star
     from mauvecl.study.stares import CurveText
     from mauvecl.study.study import Study
+
+Float = NDArray[np.float64]
 
 #: What `nuisances.usual` draws of a stare, each with the reasons of `noise.usual.USUAL`: a thermal cycle of the orbit,
 #: light lost by pointing in each frame (uniform 0-5 %), the sky's level; and the star's own slow change, an assumption.
@@ -144,27 +148,30 @@ def orbit_lines(study: Study) -> list[str]:
     return [*o.orbit().messages(times), assumed]
 
 
-def energy_scale(
-    study: Study, star: Star, source: Source, kind: Literal["bolometric", "band"], flare_k: float
-) -> EnergyScale | None:
-    """What a second of equivalent duration comes to for a star; None where its size and distance are unknown.
+def energy_scale(study: Study, star: Star, source: Source, kind: Kind, flare_k: float) -> EnergyScale | None:
+    """Return the energy of flares of a temperature per second of equivalent duration.
 
-    By radius and temperature where the study has them, by its distance otherwise.
+    By the star's distance where it is known, by its radius and temperature otherwise; None where neither is.
     """
-    hot = flare_k if kind == "bolometric" else None
-    if star.radius_rsun is not None and star.effective_temperature_k is not None:
-        return EnergyScale.of_blackbody(
-            star.radius_rsun, star.effective_temperature_k, band=study.flare.band, flare_k=hot
-        )
+    flare = study.flare
+    how: dict[str, Any] = {
+        "band": flare.band, "flare_k": flare_k, "kind": kind, "geometry": flare.geometry,
+        "photosphere_k": flare.photosphere_temperature_k,
+    }  # fmt: skip
     if star.distance_pc is not None:
-        return EnergyScale.of_star(source, star.distance_pc, band=study.flare.band, flare_k=hot)
+        return EnergyScale.of_star(source, star.distance_pc, **how)
+    if star.radius_rsun is not None and star.effective_temperature_k is not None:
+        return EnergyScale.of_blackbody(star.radius_rsun, star.effective_temperature_k, **how)
     return None
 
 
 def energy_of(
-    study: Study, star: Star, source: Source, event: Event, kind: Literal["bolometric", "band"]
+    study: Study, star: Star, source: Source, event: Event, kind: Kind, temperatures_k: Float | None = None
 ) -> float | None:
-    """Energy of a flare at a star, erg; None where the star's size and distance are unknown."""
+    """Return the energy of a flare at a star, erg; None where the star's size and distance are unknown.
+
+    `temperatures_k` are those from which the stare's flares are mixed, as `Event.total_energy` takes them.
+    """
     if energy_scale(study, star, source, kind, event.hottest_k) is None:
         return None
 
@@ -173,7 +180,7 @@ def energy_of(
         assert scale is not None
         return scale
 
-    return event.bolometric_energy(scale_of)
+    return event.total_energy(scale_of, temperatures_k)
 
 
 def events_of(study: Study, star: Star, source: Source) -> list[Event]:
@@ -185,7 +192,10 @@ def events_of(study: Study, star: Star, source: Source) -> list[Event]:
         For an energy where neither the star's size nor its distance is known, or a flare that cannot be.
     """
     texts = study.events or _spread(study)
-    return [_event(study, star, source, text) for text in texts]
+    events = [_event(study, text) for text in texts]
+    # What a flare that cools is mixed from depends on the temperatures of all flares.
+    kelvin = temperatures_of(events)
+    return [_of_energy(study, star, source, text, event, kelvin) for text, event in zip(texts, events, strict=True)]
 
 
 def _spread(study: Study) -> Sequence[EventText]:
@@ -196,7 +206,8 @@ def _spread(study: Study) -> Sequence[EventText]:
     return [EventText(peak_s=step * (n + 1), **size) for n, size in enumerate(sizes)]
 
 
-def _event(study: Study, star: Star, source: Source, text: EventText) -> Event:
+def _event(study: Study, text: EventText) -> Event:
+    """Return a flare as it is given; of amplitude 1 where its energy is."""
     shape, flare = text.form(study.stare.shape), study.flare
     half = study.stare.half_width_s if text.half_width_s is None else text.half_width_s
     kelvin = flare.temperature_k if text.temperature_k is None else text.temperature_k
@@ -207,12 +218,19 @@ def _event(study: Study, star: Star, source: Source, text: EventText) -> Event:
     elif text.equivalent_duration_s is not None:
         amplitude = amplitude_of(text.equivalent_duration_s, half, shape)
     elif text.energy_erg is not None:
-        # Any energy is linear in the amplitude.
-        one = energy_of(study, star, source, Event(text.peak_s, half, 1.0, temperature, shape), text.energy)
-        if one is None:
-            raise InputError(
-                f"a flare of {text.energy_erg:g} erg at {source.name} of unknown size, expected the star's distance_pc "
-                "or radius_rsun and effective_temperature_k"
-            )
-        amplitude = text.energy_erg / one
+        amplitude = 1.0
     return Event(text.peak_s, half, amplitude, temperature, shape)
+
+
+def _of_energy(study: Study, star: Star, source: Source, text: EventText, event: Event, temperatures_k: Float) -> Event:
+    """Return the flare with the amplitude for its energy, where that is given."""
+    if text.energy_erg is None:
+        return event
+    # Any energy is linear in the amplitude.
+    one = energy_of(study, star, source, event, text.energy, temperatures_k)
+    if one is None:
+        raise InputError(
+            f"a flare of {text.energy_erg:g} erg at {source.name} of unknown size, expected the star's distance_pc "
+            "or radius_rsun and effective_temperature_k"
+        )
+    return replace(event, amplitude=text.energy_erg / one)

@@ -45,30 +45,39 @@ def test_bolometric_energies_by_astropy_and_by_other_tables_of_the_bands(name, k
         return float(np.trapezoid(response * flux, nm))
 
     for flare, value in ((9000.0, cool), (10_000.0, hot)):
-        scale = EnergyScale.of_blackbody(radius, kelvin, band=name, flare_k=flare)
+        scale = EnergyScale.shibayama2013(radius, kelvin, band=name, flare_k=flare)
         area = through(kelvin) / through(flare) * np.pi * (radius * constants.R_sun) ** 2
         exact = (area * constants.sigma_sb * (flare * u.K) ** 4).to_value(u.erg / u.s)
         assert scale.erg_per_s == pytest.approx(exact, rel=2e-6)
         assert scale.erg_per_s == pytest.approx(value, rel=0.015)
 
 
-@pytest.mark.parametrize("weighted", ["energy", "photons"])
-def test_bolometric_energies_by_an_integral_of_ones_own(weighted):
+def test_energies_by_an_integral_of_ones_own():
     # Planck's law written out, Gauss-Legendre between the band's points; CODATA 2018.
     h, c, k = 6.62607015e-27, 2.99792458e10, 1.380649e-16
     found = band("Kepler")
     nodes, weights = np.polynomial.legendre.leggauss(4)
     a, b = found.wavelength_nm[:-1, None], found.wavelength_nm[1:, None]
-    nm, step = (a + b) / 2 + (b - a) / 2 * nodes, (b - a) / 2 * weights
-    response = np.interp(nm, found.wavelength_nm, found.throughput) * (nm if weighted == "photons" else 1.0)
+    nm, step = (a + b) / 2 + (b - a) / 2 * nodes, (b - a) / 2 * weights * 1e-7
+    response = np.interp(nm, found.wavelength_nm, found.throughput)
 
-    def through(kelvin: float) -> float:
+    def through(kelvin: float, weight: float | np.ndarray) -> float:
         cm = nm * 1e-7
-        return float(np.sum(step * response / cm**5 / np.expm1(h * c / (cm * k * kelvin))))
+        light = 2 * np.pi * h * c**2 / cm**5 / np.expm1(h * c / (cm * k * kelvin))
+        return float(np.sum(step * response * weight * light))
 
-    exact = through(4830) / through(9000) * np.pi * (0.755 * 6.957e10) ** 2 * 5.670374419e-5 * 9000.0**4
-    scale = EnergyScale.of_blackbody(0.755, 4830, flare_k=9000.0, weighted=weighted)
-    assert scale.erg_per_s == pytest.approx(exact, rel=2e-7)
+    area = 4 * np.pi * (0.755 * 6.957e10) ** 2
+    bodies = through(4830, nm) / through(9000, nm)  # as many photons
+    energies_per_s = {
+        "bolometric": area * bodies * 5.670374419e-5 * 9000.0**4,
+        "band": area * bodies * through(9000, 1 / found.throughput.max()),
+    }
+    for kind, exact in energies_per_s.items():
+        scale = EnergyScale.of_blackbody(0.755, 4830, flare_k=9000.0, kind=kind)
+        assert scale.erg_per_s == pytest.approx(exact, rel=2e-7)
+    published = EnergyScale.shibayama2013(0.755, 4830, flare_k=9000.0).erg_per_s
+    weighted = through(4830, 1.0) / through(9000, 1.0)
+    assert published == pytest.approx(energies_per_s["bolometric"] / 4 * weighted / bodies, rel=2e-7)
 
 
 def test_a_star_that_is_its_own_blackbody_gives_the_same():
@@ -78,12 +87,13 @@ def test_a_star_that_is_its_own_blackbody_gives_the_same():
     # Of one solar radius seen from 10 pc.
     shrunk = (energies.SUN_CM / (10 * energies.PARSEC_CM)) ** 2
     star = Source.from_arrays(nm, shrunk * blackbody(nm, 5778.0))
-    seen, made = EnergyScale.of_star(star, 10.0), EnergyScale.of_blackbody(1.0, 5778.0)
-    assert seen.kind == made.kind == "band"
-    assert seen.erg_per_s == pytest.approx(made.erg_per_s, rel=1e-5)
-    # Alike in all directions, against a patch seen face on.
-    seen, made = (EnergyScale.of_star(star, 10.0, flare_k=9e3), EnergyScale.of_blackbody(1.0, 5778.0, flare_k=9e3))
-    assert seen.erg_per_s == pytest.approx(4 * made.erg_per_s, rel=1e-5)
+    for how in ({"kind": "band"}, {"flare_k": 9e3}, {"geometry": "replaces", "photosphere_k": 5778.0}):
+        seen, made = EnergyScale.of_star(star, 10.0, **how), EnergyScale.of_blackbody(1.0, 5778.0, **how)
+        assert seen.kind == made.kind == how.get("kind", "bolometric")
+        assert seen.erg_per_s == pytest.approx(made.erg_per_s, rel=1e-5)
+    luminosity = energies.quiescent_luminosity(star, 10.0)
+    sun = 4 * np.pi * energies.SUN_CM**2 * energies.in_band("Kepler", 5778.0)
+    assert luminosity == pytest.approx(sun, rel=1e-5)
 
 
 @pytest.mark.parametrize("name", list(SHAPES))

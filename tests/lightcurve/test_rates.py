@@ -145,7 +145,7 @@ def test_closed_form_beside_white_noise() -> None:
     with other seeds; this one is fixed.
     """
     shape, window, frame, law = shape_of("davenport2014"), 1500.0, 5.0, DurationLaw(scatter_dex=0.0)
-    scale = EnergyScale.of_blackbody(1.0, 5778.0, flare_k=10_000.0)
+    scale = EnergyScale.shibayama2013(1.0, 5778.0, flare_k=10_000.0)
     signal, alarms = 300.0, 1 / 30
     form = Completeness.of_search(signal, scale, window_s=window, false_alarms_per_day=alarms, law=law)
     threshold = search_threshold(alarms)
@@ -195,7 +195,7 @@ def test_the_yield_closes(alpha: float) -> None:
     the seed is fixed beforehand.
     """
     rng, error, campaigns = np.random.default_rng(19), 0.1, 350
-    scale = EnergyScale.of_blackbody(1.0, 5778.0, flare_k=10_000.0)
+    scale = EnergyScale.shibayama2013(1.0, 5778.0, flare_k=10_000.0)
     form = Completeness.of_search(1000.0, scale, window_s=1800.0, false_alarms_per_day=1 / 30)
     law = PowerLaw.through(alpha, 1e33, 0.2, band="bolometric")
     days = 60 / recovered_per_day(law, form)

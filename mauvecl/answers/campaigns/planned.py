@@ -18,6 +18,7 @@ from mauvecl.lightcurve.search.yields import Yield
 from mauvecl.study.orbits import PlanTarget
 from mauvecl.study.sections import SkyLight, Star
 from mauvecl.study.spectral_types import nearest_spectrum
+from mauvecl.study.staring import energy_scale
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -178,8 +179,8 @@ def looked_of(
     rays = one.processes.cosmic_rays
     hits = None if rays is None else hits_variance_dn2(rays, quiet)
     signal = frame_signal(quiet, flare, SMALL, added_variance_dn2=hits)
-    assert star.distance_pc is not None
-    scale = EnergyScale.of_star(source, star.distance_pc, band=study.flare.band, flare_k=study.flare.temperature_k)
+    scale = energy_scale(study, star, source, "bolometric", study.flare.temperature_k)
+    assert scale is not None
     return Looked(
         target, star, quiet, signal, scale, window, sky, conditions, 0.0 if rays is None else rays.rate_per_cm2_s
     )

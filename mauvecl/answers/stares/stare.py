@@ -13,6 +13,7 @@ from mauvecl.answers.answer import Answer, InCell
 from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.tables import make_table
+from mauvecl.lightcurve.flares.energies import Kind
 from mauvecl.lightcurve.flares.events import Event, coefficients, temperatures_of
 from mauvecl.lightcurve.search.alarms import Alarm, alarms
 from mauvecl.lightcurve.stares.observed import Draw, Light, Staring, seen
@@ -27,8 +28,10 @@ if TYPE_CHECKING:
 
     from mauvecl.device.stares import Stares
     from mauvecl.host.expectation import Expectation
+    from mauvecl.host.stars.source import Source
     from mauvecl.study.sections import Star
 
+KINDS: tuple[Kind, ...] = ("band", "bolometric")
 #: Light curves in text, at most; longer ones are in their FITS files alone.
 MOST_ROWS = 100_000
 #: Frames whose spectra are kept, at most: 115 days, 1.2 GB.
@@ -327,8 +330,7 @@ def _searched(study: Study, star: Star, staring: Staring, events: list[Event], d
         event = Event(
             float(fit.peak_s[0]), float(fit.half_width_s[0]), float(fit.amplitude[0]), kelvin, study.search.shape
         )
-        energy = energy_of(study, star, known.source, event, "bolometric")
-        energies.append(float("nan") if energy is None else energy)
+        energies.append(_found_energy(study, star, known.source, event))
         away = [abs(one.peak_s - event.peak_s) for one in events]
         near = int(np.argmin(away)) if away else -1
         close = near >= 0 and away[near] <= events[near].half_width_s + 2 * staring.stare.frame_s
@@ -336,11 +338,23 @@ def _searched(study: Study, star: Star, staring: Staring, events: list[Event], d
     return Searched(threshold, raised, tuple(energies), tuple(nearest))
 
 
+def _found_energy(study: Study, star: Star, source: Source, event: Event) -> float:
+    """Return the bolometric energy of a flare that was found, erg; NaN where the star's size is unknown.
+
+    NaN also where flares replace photosphere and the fitted temperature is no higher than the photosphere's.
+    """
+    photosphere = study.flare.photosphere_temperature_k or source.temperature_k
+    if study.flare.geometry == "replaces" and photosphere is not None and event.hottest_k <= photosphere:
+        return float("nan")
+    energy = energy_of(study, star, source, event, "bolometric")
+    return float("nan") if energy is None else energy
+
+
 def _flares(study: Study, star: Star, staring: Staring, events: list[Event]) -> tuple[Flaring, ...]:
     source, kelvin, frames = star.source(), temperatures_of(events), staring.stare
     flares = []
     for event in events:
-        energies = [energy_of(study, star, source, event, kind) for kind in ("band", "bolometric")]
+        energies = [energy_of(study, star, source, event, kind, kelvin) for kind in KINDS]
         band, bolometric = (float("nan") if energy is None else energy for energy in energies)
         own = coefficients([event], frames.start_s, frames.frame_s, kelvin)
         flares.append(Flaring(event, band, bolometric, staring.snr(own)))

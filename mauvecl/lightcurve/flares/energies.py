@@ -1,8 +1,17 @@
-"""Energies of flares: from equivalent durations, by what the star shines with in a band.
+"""Energies of flares: how energy, equivalent duration, amplitude and half-width follow from each other.
 
-The equivalent duration ED is the integral of (F / F_quiescent - 1) over time: the time in which the quiescent star
-gives off, in the band, what the flare does. For a shape it is amplitude x half width x the shape's own area, so that
-each of the three follows from the other two; energy is ED times a number of the star, `EnergyScale`.
+Amplitude and equivalent duration count photons, as a detector does; energies weight them with their energy. Both
+describe the same light, the flare's excess over the quiescent star:
+
+- amplitude: relative rise of the photons in a band, int R F_flare lambda dlambda / int R F_quiet lambda dlambda, with R
+  the band's response per photon;
+- equivalent duration: its integral over time, amplitude x half-width x the area of the shape, s;
+- energy in the band: 4 pi d^2 int dt int R F_flare dlambda, with R's highest value 1, erg;
+- bolometric energy: 4 pi d^2 int dt int F_flare dlambda, over all wavelengths, erg.
+
+`EnergyScale` is the one place that converts between photons and energies. It takes all light to leave alike in all
+directions. Published energies differ in two ways: `EnergyScale.shibayama2013` gives those of a flat patch seen face on,
+and `quiescent_luminosity` times the equivalent duration is what many catalogues call the energy in a band.
 """
 
 from __future__ import annotations
@@ -18,7 +27,8 @@ from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.ranges import FLARE_TEMPERATURES_K
 from mauvecl.host.stars.bands import band as find_band
-from mauvecl.host.stars.flare import blackbody
+from mauvecl.host.stars.bands import photons
+from mauvecl.host.stars.flare import Geometry, added_light, blackbody
 from mauvecl.lightcurve.flares.shapes import Shape, shape_of
 
 if TYPE_CHECKING:
@@ -27,8 +37,10 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 #: CODATA 2018: erg s-1 cm-2 K-4; IAU 2015 (resolution B3) nominal solar radius, and parsec, cm.
 STEFAN_BOLTZMANN, SUN_CM, PARSEC_CM = 5.670374419e-5, 6.957e10, 3.0856775814913674e18
-#: As published energies have it, a response times energies (Shibayama et al. 2013); or what a detector counts.
+#: What an integral over a band weights the response with.
 Weighted = Literal["energy", "photons"]
+#: Which light of a flare: that in the band of its amplitude, or all of it.
+Kind = Literal["band", "bolometric"]
 #: Points of the integral over a band; a tenth of its own sampling at most.
 POINTS = 20_001
 
@@ -36,65 +48,23 @@ POINTS = 20_001
 @public
 @dataclass(frozen=True)
 class EnergyScale:
-    """What a second of equivalent duration in a band comes to.
+    """Energy of the light of a flare per second of its equivalent duration.
 
     Attributes
     ----------
     band : str
         In which amplitude and equivalent duration are measured.
     kind : {"band", "bolometric"}
-        Energy in the band alone, or of the flare's whole blackbody.
+        Energy in the band alone, or of all wavelengths.
     erg_per_s : float
     how : str
         What it was made of, for tables.
     """
 
     band: str
-    kind: Literal["band", "bolometric"]
+    kind: Kind
     erg_per_s: float
     how: str
-
-    @classmethod
-    def of_blackbody(
-        cls,
-        radius_rsun: float,
-        temperature_k: float,
-        *,
-        band: str = "Kepler",
-        flare_k: float | None = None,
-        weighted: Weighted = "energy",
-    ) -> Self:
-        """Of a star of a radius and a temperature, taken for a blackbody.
-
-        Parameters
-        ----------
-        radius_rsun, temperature_k : float
-        band : str
-        flare_k : float, optional
-            Temperature of the flare, for its bolometric energy: [int R B(star) / int R B(flare)] pi R^2 sigma T_flare^4
-            (Shibayama et al. 2013, doi 10.1088/0067-0049/209/1/5), the light of a flat patch that is seen face on.
-            Without it the energy in the band: 4 pi R^2 int R pi B(star).
-        weighted : {"energy", "photons"}
-            Published energies weight a response with energies; the amplitudes of this package are of photons.
-
-        Raises
-        ------
-        InputError
-            For a radius or temperature that cannot be, or an unknown band.
-        """
-        _check("radius_rsun", radius_rsun, 1e-4, 1e4)
-        _check("temperature_k", temperature_k, *FLARE_TEMPERATURES_K)
-        radius = radius_rsun * SUN_CM
-        quiet = in_band(band, temperature_k, weighted)
-        star = f"a blackbody of {temperature_k:g} K and {radius_rsun:g} solar radii"
-        if flare_k is None:
-            name = find_band(band).name
-            return cls(name, "band", 4 * np.pi * radius**2 * in_band(band, temperature_k, "energy"), star)
-        _check("flare_k", flare_k, *FLARE_TEMPERATURES_K)
-        area = np.pi * radius**2 * quiet / in_band(band, flare_k, weighted)
-        return cls(
-            find_band(band).name, "bolometric", area * STEFAN_BOLTZMANN * flare_k**4, f"{star}, flare of {flare_k:g} K"
-        )
 
     @classmethod
     def of_star(
@@ -103,40 +73,148 @@ class EnergyScale:
         distance_pc: float,
         *,
         band: str = "Kepler",
-        flare_k: float | None = None,
-        weighted: Weighted = "energy",
+        flare_k: float = 10_000.0,
+        kind: Kind = "bolometric",
+        geometry: Geometry = "added",
+        photosphere_k: float | None = None,
     ) -> Self:
-        """Of a spectrum as it is seen from a distance; all light is taken to leave alike in all directions.
+        """Return the scale of a spectrum that is seen from a distance: 4 pi d^2 times the flux of the flare.
 
         Parameters
         ----------
         source : Source
             At its magnitude.
         distance_pc : float
-        band, flare_k, weighted
-            As `of_blackbody`. A face-on patch of the same flux gives off a quarter of the bolometric energy.
+        band : str
+        flare_k : float
+            Temperature of the flare's blackbody.
+        kind : {"band", "bolometric"}
+        geometry : {"added", "replaces"}
+            As `Source.flaring`. The photosphere that a flare replaces is subtracted; for bolometric energies it is a
+            blackbody.
+        photosphere_k : float, optional
+            For ``replaces``, in place of the star's own `temperature_k`.
 
         Raises
         ------
         InputError
-            For a distance that cannot be, a spectrum of no scale, or a band that it does not cover.
+            For an impossible value, a spectrum without a scale, or a band that it does not cover.
         """
         _check("distance_pc", distance_pc, 1e-7, 1e6)
         if source.unscaled:
             raise InputError(f"the flux of {source.name} is of no scale: {source.unscaled}, expected a magnitude")
         source.magnitude(band)  # refuses a band that the spectrum does not cover
-        sphere = 4 * np.pi * (distance_pc * PARSEC_CM) ** 2
-        told, name = f"{source.name} at {distance_pc:g} pc", find_band(band).name
-        wavelength, response = _response(band)
-        flux = np.interp(wavelength, source.wavelength_nm, source.flux_flam)
-        if flare_k is None:
-            return cls(name, "band", sphere * _integral(wavelength, response * flux), told)
-        _check("flare_k", flare_k, *FLARE_TEMPERATURES_K)
-        weight = response if weighted == "energy" else response * wavelength
-        share = _integral(wavelength, weight * flux) / in_band(band, flare_k, weighted)
-        return cls(
-            name, "bolometric", sphere * share * STEFAN_BOLTZMANN * flare_k**4, f"{told}, flare of {flare_k:g} K"
+        return cls._of_light(
+            source.wavelength_nm,
+            source.flux_flam,
+            sphere_cm2=4 * np.pi * (distance_pc * PARSEC_CM) ** 2,
+            star=f"{source.name} at {distance_pc:g} pc",
+            band=band,
+            flare_k=flare_k,
+            kind=kind,
+            geometry=geometry,
+            photosphere_k=source.temperature_k if photosphere_k is None else photosphere_k,
         )
+
+    @classmethod
+    def of_blackbody(
+        cls,
+        radius_rsun: float,
+        temperature_k: float,
+        *,
+        band: str = "Kepler",
+        flare_k: float = 10_000.0,
+        kind: Kind = "bolometric",
+        geometry: Geometry = "added",
+        photosphere_k: float | None = None,
+    ) -> Self:
+        """Return the scale of a star of a radius and a temperature, taken for a blackbody.
+
+        Parameters
+        ----------
+        radius_rsun, temperature_k : float
+        band, flare_k, kind, geometry
+            As `of_star`.
+        photosphere_k : float, optional
+            For ``replaces``; the star's temperature by default.
+
+        Raises
+        ------
+        InputError
+            For an impossible value or an unknown band.
+        """
+        _check("radius_rsun", radius_rsun, 1e-4, 1e4)
+        _check("temperature_k", temperature_k, *FLARE_TEMPERATURES_K)
+        wavelength, _ = _response(band)
+        return cls._of_light(
+            wavelength,
+            blackbody(wavelength, temperature_k),
+            sphere_cm2=4 * np.pi * (radius_rsun * SUN_CM) ** 2,
+            star=f"a blackbody of {temperature_k:g} K and {radius_rsun:g} solar radii",
+            band=band,
+            flare_k=flare_k,
+            kind=kind,
+            geometry=geometry,
+            photosphere_k=temperature_k if photosphere_k is None else photosphere_k,
+        )
+
+    @classmethod
+    def shibayama2013(
+        cls, radius_rsun: float, temperature_k: float, *, band: str = "Kepler", flare_k: float = 10_000.0
+    ) -> Self:
+        """Return the published scale for bolometric energies, for comparisons with catalogues.
+
+        [int R B(star) / int R B(flare)] pi R_star^2 sigma T_flare^4 (Shibayama et al. 2013,
+        doi 10.1088/0067-0049/209/1/5). It differs from `of_blackbody` twice: a flat patch seen face on gives off a
+        quarter of the energy of light that leaves alike in all directions, and the response weights energies although
+        equivalent durations count photons.
+        """
+        _check("radius_rsun", radius_rsun, 1e-4, 1e4)
+        _check("temperature_k", temperature_k, *FLARE_TEMPERATURES_K)
+        _check("flare_k", flare_k, *FLARE_TEMPERATURES_K)
+        area = np.pi * (radius_rsun * SUN_CM) ** 2 * in_band(band, temperature_k) / in_band(band, flare_k)
+        return cls(
+            find_band(band).name,
+            "bolometric",
+            area * STEFAN_BOLTZMANN * flare_k**4,
+            f"a blackbody of {temperature_k:g} K and {radius_rsun:g} solar radii, a patch of {flare_k:g} K seen face "
+            "on, response weighted with energies (Shibayama et al. 2013)",
+        )
+
+    @classmethod
+    def _of_light(
+        cls,
+        wavelength_nm: Float,
+        flux_flam: Float,
+        *,
+        sphere_cm2: float,
+        star: str,
+        band: str,
+        flare_k: float,
+        kind: Kind,
+        geometry: Geometry,
+        photosphere_k: float | None,
+    ) -> Self:
+        """Return the energy of what a flare of amplitude 1 adds to a flux, through a sphere around the star."""
+        _check("flare_k", flare_k, *FLARE_TEMPERATURES_K)
+        light = added_light(
+            wavelength_nm,
+            flux_flam,
+            temperature_k=flare_k,
+            band=band,
+            geometry=geometry,
+            photosphere_temperature_k=photosphere_k,
+        )
+        if kind == "band":
+            flux = light.hot * in_band(band, flare_k)
+            lost = light.lost and light.lost * _through(wavelength_nm, flux_flam, band)
+        else:
+            flux = light.hot * STEFAN_BOLTZMANN * flare_k**4
+            lost = light.lost and light.lost * _bolometric(wavelength_nm, flux_flam, band, photosphere_k)
+        how = f"{star}, flare of {flare_k:g} K"
+        if geometry == "replaces":
+            how += f" in place of photosphere of {photosphere_k:g} K"
+        return cls(find_band(band).name, kind, sphere_cm2 * (flux - lost), how)
 
     def energy(self, equivalent_duration_s: float) -> float:
         """Energy of an equivalent duration, erg."""
@@ -153,6 +231,18 @@ class EnergyScale:
         if not (np.isfinite(energy_erg) and energy_erg > 0):
             raise InputError(f"energy = {energy_erg:g} erg, expected one above 0")
         return energy_erg / self.erg_per_s
+
+
+def quiescent_luminosity(source: Source, distance_pc: float, band: str = "Kepler") -> float:
+    """Return the luminosity of a star in a band, erg/s: 4 pi d^2 int R F dlambda, with R's highest value 1.
+
+    Many catalogues give equivalent duration times this as the energy of a flare in the band. It is the energy of light
+    with the star's spectrum, not the flare's.
+    """
+    _check("distance_pc", distance_pc, 1e-7, 1e6)
+    source.magnitude(band)
+    sphere = 4 * np.pi * (distance_pc * PARSEC_CM) ** 2
+    return sphere * _through(source.wavelength_nm, source.flux_flam, band)
 
 
 def equivalent_duration(amplitude: float, half_width_s: float, shape: Shape | str) -> float:
@@ -198,6 +288,19 @@ def _response(band: str) -> tuple[Float, Float]:
     bandpass = find_band(band)
     wavelength = np.linspace(bandpass.wavelength_nm[0], bandpass.wavelength_nm[-1], POINTS)
     return wavelength, np.interp(wavelength, bandpass.wavelength_nm, bandpass.throughput / bandpass.throughput.max())
+
+
+def _through(wavelength_nm: Float, flux_flam: Float, band: str) -> float:
+    """Return the flux of a spectrum through a band, erg s-1 cm-2."""
+    wavelength, response = _response(band)
+    return _integral(wavelength, response * np.interp(wavelength, wavelength_nm, flux_flam, left=0.0, right=0.0))
+
+
+def _bolometric(wavelength_nm: Float, flux_flam: Float, band: str, photosphere_k: float | None) -> float:
+    """Return the flux of the blackbody of a temperature that has the photons of a spectrum in a band, erg s-1 cm-2."""
+    assert photosphere_k is not None
+    body = photons(wavelength_nm, blackbody(wavelength_nm, photosphere_k), band)
+    return photons(wavelength_nm, flux_flam, band) / body * STEFAN_BOLTZMANN * photosphere_k**4
 
 
 def _integral(wavelength_nm: Float, flux_flam: Float) -> float:

@@ -19,10 +19,9 @@ Float = NDArray[np.float64]
 
 #: Flare spectra that a stare's frames are made of, at most (`components.MOST_FLARES`); the least for flares that cool.
 MOST_TEMPERATURES, LEAST_STEPS = 8, 3
-#: Temperatures at which the energy of a second is known, where a flare cools.
-SCALE_NODES = 33
-#: Parts of a frame with one temperature each, where a flare cools.
-PARTS = 8
+#: Parts with one temperature each of a frame, of the half-width and of the fold of a flare that cools, at least; and
+#: parts of a frame at most.
+PARTS, MOST_PARTS = 16, 512
 #: Amplitudes beyond this are no flares: of the largest known, an M dwarf's in the ultraviolet, a few thousand.
 LARGEST_AMPLITUDE = 1e6
 #: Temperatures that differ by less are one.
@@ -148,7 +147,7 @@ class Event:
         temperature: float | Cooling = 10_000.0,
         shape: Shape | str = "davenport2014",
     ) -> Self:
-        """Of an energy by the star's `EnergyScale`; for one that cools see `bolometric_energy`."""
+        """Of an energy by the star's `EnergyScale`; for one that cools see `total_energy`."""
         return cls.of_equivalent_duration(
             scale.equivalent_duration(energy_erg),
             peak_s=peak_s,
@@ -181,25 +180,34 @@ class Event:
         """Energy by a star's scale, erg."""
         return scale.energy(self.equivalent_duration_s)
 
-    def bolometric_energy(self, scale_of: Callable[[float], EnergyScale]) -> float:
-        """Bolometric energy, erg, of a flare that may cool.
+    def total_energy(self, scale_of: Callable[[float], EnergyScale], nodes: Float | None = None) -> float:
+        """Return the energy, erg, of a flare that may cool.
+
+        Frames mix the light of a flare that cools from the spectra of a few temperatures. The energy is that of the
+        mixture, so that it is the energy of the light that is drawn.
 
         Parameters
         ----------
         scale_of : callable
-            A star's bolometric scale for flares of a temperature, K.
+            A star's scale for flares of a temperature, K.
+        nodes : ndarray, shape (n_temperature,), optional
+            Temperatures, K, from which the flares of the stare are mixed: `temperatures_of` all of them. Those of this
+            flare alone by default.
         """
         cooling = self.temperature
         if not isinstance(cooling, Cooling) or cooling.steady:
             return self.energy(scale_of(self.hottest_k))
-        nodes = np.geomspace(cooling.end_k, cooling.peak_k, SCALE_NODES)
-        per_s = np.log([scale_of(float(k)).erg_per_s for k in nodes])
+        nodes = temperatures_of([self]) if nodes is None else nodes
         tau = np.concatenate([np.linspace(-10.0, 10.0, 2001), np.geomspace(10.0, 1000.0, 1001)[1:]])
-        edges = self.half_width_s * tau
+        # Steps as fine as the half-width and as the fold; rounded, lest two of them differ by their last bits.
+        fold = np.linspace(0.0, 20.0, 2001) * cooling.fold_s / self.half_width_s
+        edges = self.half_width_s * np.unique(np.concatenate([tau, fold[fold < 1000.0]]).round(6))
         light = self.form.mean_over(edges, 0.0, self.half_width_s) * np.diff(edges)
         kelvin = cooling.at((edges[1:] + edges[:-1]) / 2)
-        # Energies of a second are smooth in the temperature: straight in logarithms between the nodes.
-        return float(self.amplitude * light @ np.exp(np.interp(np.log(kelvin), np.log(nodes), per_s)))
+        per_s = 0.0
+        for column, share in _mixed(kelvin, nodes):
+            per_s += float(light @ share) * scale_of(float(nodes[column])).erg_per_s
+        return float(self.amplitude * per_s)
 
 
 def check_seen(events: Sequence[Event], start_s: Float, frame_s: float) -> list[str]:
@@ -264,7 +272,7 @@ def coefficients(events: Sequence[Event], start_s: Float, frame_s: float, temper
     """What the events add to each frame: mean amplitude of each flare spectrum over it.
 
     A flare of constant temperature is integrated exactly. One that cools is mixed from the spectra of the two
-    neighbouring temperatures, linearly in 1 / T, with one temperature in each of `PARTS` parts of a frame.
+    neighbouring temperatures, linearly in 1 / T, with one temperature in each of several parts of a frame.
 
     Parameters
     ----------
@@ -298,11 +306,13 @@ def coefficients(events: Sequence[Event], start_s: Float, frame_s: float, temper
 def _add_cooling(
     factors: Float, event: Event, cooling: Cooling, start_s: Float, frame_s: float, temperatures_k: Float
 ) -> None:
-    for part in range(PARTS):
-        start = start_s + part * frame_s / PARTS
-        edges = np.column_stack([start, start + frame_s / PARTS])
-        mean = event.amplitude / PARTS * event.form.mean_over(edges, event.peak_s, event.half_width_s)
-        temperature = cooling.at(start + frame_s / PARTS / 2 - event.peak_s)
+    shortest = min(frame_s, event.half_width_s, cooling.fold_s)
+    parts = int(min(np.ceil(PARTS * frame_s / shortest), MOST_PARTS))
+    for part in range(parts):
+        start = start_s + part * frame_s / parts
+        edges = np.column_stack([start, start + frame_s / parts])
+        mean = event.amplitude / parts * event.form.mean_over(edges, event.peak_s, event.half_width_s)
+        temperature = cooling.at(start + frame_s / parts / 2 - event.peak_s)
         for column, share in _mixed(temperature, temperatures_k):
             factors[:, column] += share * mean
 
