@@ -1,9 +1,13 @@
-"""Processors newer than PoCL's compiler.
+"""Names of x86-64 processors that PoCL's compiler can build for.
 
-PoCL asks LLVM for the processor's name. An LLVM older than the processor says "generic", a name that its own compiler
-then refuses for x86-64, so that no kernel builds (PoCL issue 1049, open; met with LLVM 14 and AMD's family 26). No
-setting names another one. Here the device's record in memory is given the instruction set's level instead (x86-64
-psABI, v2 to v4), from what the kernel says the processor can do.
+A PoCL made for many processors, as wheels and distributions ship it, loads the library of built-in functions that suits
+the instructions of the processor, but until version 5 it compiles kernels for the name by which LLVM knows the
+processor. The two need not fit. LLVM 14 calls AMD's Zen 4 "znver3", which has no AVX-512, while PoCL loads the AVX-512
+library because the processor has it: a build then takes minutes and gigabytes and ends in a segmentation fault. LLVM
+calls a processor that it does not know "generic", which its own compiler refuses for x86-64 (PoCL issue 1049).
+
+No setting gives another name. This module writes the highest level of the x86-64 psABI that fits both the processor and
+the library into PoCL's record of the device in memory. From version 5 on PoCL names the processor after the library.
 """
 
 from __future__ import annotations
@@ -12,44 +16,42 @@ import contextlib
 import ctypes
 import itertools
 import os
+import re
 from functools import cache
 from pathlib import Path
 from typing import Any
 
-#: What PoCL calls a processor that LLVM does not know.
-UNKNOWN = "generic"
-#: Levels of the x86-64 psABI, and what each needs beyond the one before, as /proc/cpuinfo spells it.
+#: Names to compile for, lowest first, and the instructions that each needs beyond the one before, as /proc/cpuinfo
+#: spells them. The psABI has no level for processors with AVX but without AVX2, which have a library of their own.
 LEVELS = {
+    "x86-64": (),
     "x86-64-v2": ("cx16", "lahf_lm", "popcnt", "sse4_1", "sse4_2", "ssse3"),
-    "x86-64-v3": ("avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe", "xsave"),
+    "sandybridge": ("avx", "xsave"),
+    "x86-64-v3": ("avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe"),
     "x86-64-v4": ("avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"),
 }
-#: Bytes of a device's record that are looked through: it is some 2500 long.
+#: The name of a processor that LLVM does not know.
+UNKNOWN = "generic"
+#: A PoCL that chooses among libraries says so in its version.
+CHOOSES = "DISTRO"
+#: The end of a device's version: driver, target triple, processor.
+TARGET = re.compile(r"HSTR: \w+-(x86_64-\w+-\w+-\w+)-([\w-]+)$")
+#: Bytes of a device's record that are searched; it is some 2500 long.
 RECORD_BYTES = 2048
 
-#: Names given to devices: PoCL keeps pointers to them.
-_given: dict[str, Any] = {}
+#: Names in memory: PoCL keeps pointers to them.
+_names: dict[str, Any] = {}
 
 
-def unknown(device: Any) -> bool:
-    """Whether PoCL's compiler will refuse an x86-64 processor because it does not know it."""
-    triple = str(device.version).rpartition("pthread-")[2]
-    return triple.startswith("x86_64-") and triple.endswith(f"-{UNKNOWN}")
-
-
-def level(flags: frozenset[str]) -> str:
-    """The highest level of the x86-64 psABI that a processor with these flags has."""
-    best = "x86-64"
-    for name, needed in LEVELS.items():
-        if not flags.issuperset(needed):
-            break
-        best = name
-    return best
+def levels(flags: frozenset[str]) -> tuple[str, ...]:
+    """Return the names that a processor with these flags can run, highest first."""
+    fitting = itertools.takewhile(lambda name: flags.issuperset(LEVELS[name]), LEVELS)
+    return tuple(fitting)[::-1]
 
 
 @cache
 def flags() -> frozenset[str]:
-    """What the first processor of this machine can do; nothing where the kernel does not say."""
+    """Return what the first processor of this machine can do; nothing if the kernel does not say."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").splitlines():
             name, _, words = line.partition(":")
@@ -58,42 +60,52 @@ def flags() -> frozenset[str]:
     return frozenset()
 
 
-def give_name(device: Any) -> str | None:
-    """Give a device that PoCL calls unknown a name that its compiler takes; called again it changes nothing.
+def target(device: Any) -> tuple[str, str] | None:
+    """Return the triple and the processor's name for which PoCL compiles, or None if it can be left alone.
 
     Parameters
     ----------
     device : pyopencl.Device
-
-    Returns
-    -------
-    str or None
-        The name, or None where PoCL knows its own or the record was not understood.
     """
-    if not unknown(device):
+    found = TARGET.search(str(device.version))
+    if found is None or not (CHOOSES in str(device.platform.version) or found[2] == UNKNOWN):
         return None
-    wanted = level(flags())
-    triple = str(device.version).rpartition("pthread-")[2].removesuffix(f"-{UNKNOWN}")
+    return found[1], found[2]
+
+
+def give_name(device: Any, name: str) -> bool:
+    """Let PoCL compile for a processor of this name; return whether its record of the device was understood.
+
+    Parameters
+    ----------
+    device : pyopencl.Device
+    name : str
+        A name that LLVM knows, such as one of `LEVELS`.
+    """
+    found = target(device)
+    if found is None:
+        return False
+    triple, own = found
     record = int(device.int_ptr)
     try:
         memory = os.open("/proc/self/mem", os.O_RDONLY)
     except OSError:
-        return None
+        return False
     try:
-        # In PoCL's record the pointer to the triple stands before that to the processor's name.
+        # Until PoCL 5 the pointer to the triple stands before that to the processor's name.
         pointers = [int.from_bytes(_bytes(memory, record + at, 8), "little") for at in range(0, RECORD_BYTES, 8)]
         for place, (first, second) in enumerate(itertools.pairwise(pointers), 1):
-            if _text(memory, first) == triple and _text(memory, second) in (UNKNOWN, wanted):
-                text = _given.setdefault(wanted, ctypes.create_string_buffer(wanted.encode()))
+            if _text(memory, first) == triple and _text(memory, second) in (own, *_names):
+                text = _names.setdefault(name, ctypes.create_string_buffer(name.encode()))
                 ctypes.c_void_p.from_address(record + 8 * place).value = ctypes.addressof(text)
-                return wanted
+                return True
     finally:
         os.close(memory)
-    return None
+    return False
 
 
 def _bytes(memory: int, address: int, size: int) -> bytes:
-    """Memory of this process, read as a file: an address that is none gives nothing instead of a crash."""
+    """Read memory of this process as a file, so that a wrong address gives nothing instead of a crash."""
     try:
         return os.pread(memory, size, address)
     except (OSError, OverflowError):

@@ -149,8 +149,8 @@ def _devices() -> list[Any]:
             "no OpenCL device found: install PoCL with `pip install 'pyopencl[pocl]'` or a driver for your device"
         )
     for device in handles:
-        if device.platform.name == POCL:
-            processor.give_name(device)
+        if device.platform.name == POCL and processor.flags():
+            processor.give_name(device, processor.levels(processor.flags())[0])
     # PoCL on the CPU first: it is the default.
     return sorted(handles, key=lambda d: (d.platform.name != POCL, "cpu" not in _kind(d)))
 
@@ -295,15 +295,16 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
     """
     cl = load_opencl()
     device = context.devices[0]
-    options = ["-cl-std=CL1.2"]
+    # Without -w PoCL's compiler prints how many warnings it kept to itself.
+    options = ["-cl-std=CL1.2", "-w"]
     if not weaknesses(device):
         options.append("-cl-fp32-correctly-rounded-divide-sqrt")
     kept = kernel_cache()
     # A store shared by several machines holds what each processor can run; names such as "AMD EPYC" do not tell.
     # PoCL tells its programs apart by the place of its own libraries too: what another installation has compiled would
     # be brought back and compiled again at every start.
-    level = processor.level(processor.flags())
-    target = (device.name, device.version, device.driver_version, level, sys.prefix)
+    levels = processor.levels(processor.flags())
+    target = (device.name, device.version, device.driver_version, levels[0], sys.prefix)
     key = hashlib.sha256("\0".join((source, *options, *target)).encode()).hexdigest()[:32]
     restored = kept.restore(key)
     try:
