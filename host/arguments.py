@@ -99,8 +99,13 @@ def _taken(name: str, value: Any, kinds: tuple[_Kind, ...]) -> Any:
     )
     if any(word in expected for word in CLASSES):
         called = CALLED.get(name, name if name[-1:].isdigit() else f"the {name}")
-        raise InputError(f"{called} is of the type {type(value).__name__}, expected {expected}")
-    raise InputError(f"{name} = {shown(value)}, expected {expected}")
+        raise InputError(
+            f"{called} is of the type {type(value).__name__}, expected {expected}",
+            key=name,
+            value=value,
+            expected=expected,
+        )
+    raise InputError(f"{name} = {shown(value)}, expected {expected}", key=name, value=value, expected=expected)
 
 
 @cache

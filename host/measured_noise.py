@@ -57,7 +57,7 @@ def negative_means_message(
         raise InputError(
             f"the spectrum of {source.name} makes a mean of {electrons[worst]:.3g} electrons a frame at "
             f"{nm[worst]:.1f} nm, beyond {MAX_SIGMA_BELOW_ZERO:g} times its error of {error[worst]:.2g}, expected "
-            "light: bin the spectrum (--bin-nm) or mend it"
+            "light: bin the spectrum (`bin_nm`) or mend it"
         )
     return (
         f"{source.name}: the means of {int(below.sum())} of {below.size} pixels, from {nm[below][0]:.1f} to "

@@ -99,7 +99,7 @@ def number(
         one = _plain(what, value, unit, wanted)
         plain = float(one) if not one.ndim else math.nan
     if not (math.isfinite(plain) and low <= plain <= high):
-        raise InputError(f"{what} = {shown(value)}, expected {wanted}")
+        raise _unusable(what, value, wanted)
     return plain
 
 
@@ -114,7 +114,12 @@ def numbers(
     bad = ~(np.isfinite(plain) & (plain >= low) & (plain <= high))
     if bad.any():
         first = plain[np.unravel_index(int(np.argmax(bad)), plain.shape)]
-        raise InputError(f"{what} = {first:g}{f' {unit}' if unit else ''}, expected {wanted}")
+        raise InputError(
+            f"{what} = {first:g}{f' {unit}' if unit else ''}, expected {wanted}",
+            key=_key(what),
+            value=float(first),
+            expected=wanted,
+        )
     return plain
 
 
@@ -133,10 +138,10 @@ def count(what: str, value: Any, *, low: int = 0, high: int = 2**63 - 1) -> int:
     except TypeError:
         plain = number(what, value, expected=wanted)
         if not plain.is_integer():
-            raise InputError(f"{what} = {shown(value)}, expected {wanted}") from None
+            raise _unusable(what, value, wanted) from None
         whole = int(plain)
     if not low <= whole <= high:
-        raise InputError(f"{what} = {whole}, expected {wanted}")
+        raise _unusable(what, whole, wanted)
     return whole
 
 
@@ -150,7 +155,7 @@ def _plain(what: str, value: Any, unit: str, wanted: str) -> NDArray[np.float64]
             raise TypeError("no number")
         return np.asarray(value, np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{what} = {shown(value)}, expected {wanted}") from error
+        raise _unusable(what, value, wanted) from error
 
 
 def _converted(value: Any, unit: str) -> Any:
@@ -178,6 +183,15 @@ def _no_truth(value: Any) -> Any:
 def word_of(unit: str) -> str:
     """What a unit is called in a sentence."""
     return WORDS.get(unit, unit)
+
+
+def _unusable(what: str, value: Any, wanted: str) -> InputError:
+    return InputError(f"{what} = {shown(value)}, expected {wanted}", key=_key(what), value=value, expected=wanted)
+
+
+def _key(what: str) -> str:
+    """Return the parameter that a sentence calls so: "flare temperature" is `flare_temperature`."""
+    return what.replace(" ", "_")
 
 
 def _expected(unit: str, low: float, high: float) -> str:

@@ -27,7 +27,7 @@ class _InputErrorMeta(ModelMetaclass):
         try:
             return super().__call__(*args, **values)
         except ValidationError as error:
-            raise InputError(f"{cls.__name__}: {first_error(cast(type[BaseModel], cls), error)}") from None
+            raise input_error(cls.__name__, cast(type[BaseModel], cls), error) from None
 
 
 class Record(BaseModel, metaclass=_InputErrorMeta):
@@ -44,7 +44,19 @@ class Record(BaseModel, metaclass=_InputErrorMeta):
             ) from None
 
 
-def first_error(model: type[BaseModel], error: ValidationError) -> str:
+def input_error(where: str, model: type[BaseModel], error: ValidationError) -> InputError:
+    """Return the first fault as an InputError whose message begins with the place where it is."""
+    first = error.errors()[0]
+    message = f"{where}: {_sentence(model, error)}"
+    key, value = ".".join(map(str, first["loc"])) or None, first.get("input")
+    inner = first.get("ctx", {}).get("error")
+    if isinstance(inner, InputError):
+        # What read the value knows more of it than where it stands.
+        return InputError(message, key=inner.key or key, value=inner.value, expected=inner.expected)
+    return InputError(message, key=key, value=None if first["type"] == "missing" else value)
+
+
+def _sentence(model: type[BaseModel], error: ValidationError) -> str:
     """Return the first validation error as a sentence: key = value, expected ..."""
     first = error.errors()[0]
     path = [str(part) for part in first["loc"]]

@@ -14,7 +14,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_
 from ..arguments import public
 from ..errors import InputError
 from ..quantities import count, is_quantity, number, numbers, unit_of
-from ..records import Record, first_error
+from ..records import Record, input_error
 from .curve import Curve
 from .pixel_map import MAX_PIXELS, PixelMap
 
@@ -171,7 +171,7 @@ class Instrument(Record):
         try:
             return cls.model_validate(values)
         except ValidationError as error:
-            raise InputError(f"{where}: {first_error(cls, error)}") from None
+            raise input_error(where, cls, error) from None
 
     def with_(self, **changes: Any) -> Instrument:
         """Return a copy with changed values, each marked as the user's in `sources`.

@@ -94,7 +94,7 @@ class Orbit:
             late = off / (2 * np.pi * elements.axis_km) * elements.period_s
             return [
                 f"The plan reaches {days:.0f} days from the epoch of the elements ({source}): along its track the "
-                f"satellite may be off by about {off:.0f} km, {late:.0f} s; newer elements by --tle FILE."
+                f"satellite may be off by about {off:.0f} km, {late:.0f} s; `tle='FILE'` reads newer elements."
             ]
         return []
 

@@ -64,7 +64,7 @@ class Target:
             like = f"a name such as {like}" if like else "a name of the embedded list"
             raise InputError(
                 f"target {shortened(text)} is not in the embedded list, expected {like}, coordinates such as "
-                "'290.0 -11.2', or --simbad to ask SIMBAD"
+                "'290.0 -11.2', or `simbad=True` to ask SIMBAD"
             )
         with offline():
             place = parse_position(text).icrs

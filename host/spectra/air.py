@@ -37,7 +37,7 @@ def vacuum_wavelengths(
     for text in (column, remarks) if medium is None else ():
         air, vacuum = bool(_AIR.search(text)), bool(_VACUUM.search(text))
         if air and vacuum:
-            messages = ("its header speaks of air and of vacuum: ASSUMED vacuum; --wavelength-unit 'nm air' says air",)
+            messages = ("its header speaks of air and of vacuum: ASSUMED vacuum; `wavelength_unit='nm air'` says air",)
         if air or vacuum:
             medium = "vacuum" if vacuum else "air"
             break

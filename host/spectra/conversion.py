@@ -237,14 +237,14 @@ def _check_assumed_flux(flux: Float, raw: RawSpectrum) -> None:
     low, high = float(finite.min()), float(finite.max())
     if low >= LIKELY_MAGNITUDES[0] and high <= LIKELY_MAGNITUDES[1]:
         raise InputError(
-            f"fluxes of {low:g} to {high:g} without a unit look like magnitudes, expected a flux density: --flux-unit "
+            f"fluxes of {low:g} to {high:g} without a unit look like magnitudes, expected a flux density: `flux_unit` "
             "names its unit"
         )
     said = _THROUGHPUT.search(f"{raw.table.remarks}\n{raw.table.origin}".replace("_", " "))
     if said and low >= 0.0 and 1e-3 <= high <= 1.0:
         raise InputError(
             f"values of {low:g} to {high:g} without a unit and the word {said[0]!r} speak of a throughput, expected a "
-            "star's flux: --flux-unit names its unit"
+            "star's flux: `flux_unit` names its unit"
         )
 
 

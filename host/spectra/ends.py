@@ -55,10 +55,10 @@ def check_measured(name: str, wavelength: Float) -> None:
         return
     low, high = float(wavelength[0]), float(wavelength[-1])
     unit = likely_unit(low, high, "nm")
-    meant = f"; as numbers these look like {unit}: --wavelength-unit {unit}" if unit else ""
+    meant = f"; as numbers these look like {unit}: `wavelength_unit={unit!r}`" if unit else ""
     raise InputError(
         f"spectrum {name} covers {low:g}-{high:g} nm, {part:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm, expected at "
-        f"least a third, which --extend can continue{meant}"
+        f"least a third, which `extend` can continue{meant}"
     )
 
 
@@ -69,7 +69,7 @@ def check_covers(
     if span_nm[0] > needed_nm[0] or span_nm[1] < needed_nm[1]:
         raise InputError(
             f"spectrum {name} spans {span_nm[0]:g}-{span_nm[1]:g} nm, expected at least {of}{needed_nm[0]:g}-"
-            f"{needed_nm[1]:g} nm: --extend continues it by a library spectrum"
+            f"{needed_nm[1]:g} nm: `extend` continues it by a library spectrum"
         )
 
 
@@ -131,7 +131,7 @@ def remarks(wavelength: Float, flux: Float) -> tuple[str, ...]:
         i = int(np.argmin(values))
         messages.append(
             f"{negative} of its {nm.size} points in {SPAN_NM[0]:g}-{SPAN_NM[1]:g} nm have a negative flux, the lowest "
-            f"{values[i]:.3g} at {nm[i]:.1f} nm: measured noise, kept; --bin-nm bins it"
+            f"{values[i]:.3g} at {nm[i]:.1f} nm: measured noise, kept; `bin_nm` bins it"
         )
     # Runs of at least three zeros are no measurement of light.
     edges = np.flatnonzero(np.diff(np.concatenate([[0], (values == 0.0).astype(np.int8), [0]])))
@@ -209,7 +209,7 @@ def continued(
         if share > MAX_CONTINUED:
             raise InputError(
                 f"spectrum {name} {word} at {end:g} nm, where it is bright: {share:.1%} of the brightest pixel's light "
-                f"would be made up, expected a spectrum to {goal:g} nm: --extend continues it by a library spectrum"
+                f"would be made up, expected a spectrum to {goal:g} nm: `extend` continues it by a library spectrum"
             )
         messages.append(
             f"it {word} at {end:g} nm and is continued to {goal:g} nm at its end's level, {level:.3g}: at most "

@@ -70,16 +70,16 @@ def stated_units(
     if len(distinct) > 1:
         next_to = re.search(r"flux\w*\W{0,4}(?:in\W+)?(" + _FLUX.pattern + ")", text, re.IGNORECASE)
         if next_to is None:
-            raise InputError(f"its header names the units {', '.join(distinct)}, expected one: --flux-unit says which")
+            raise InputError(f"its header names the units {', '.join(distinct)}, expected one: `flux_unit` says which")
         distinct = [_spelt(next_to[1].strip())]
     if flux and not distinct and not is_named and (match := _NO_FLUX.search(text)):
         raise InputError(
-            f"its header speaks of {(match[1] or match[2])!r}, expected a flux density: --flux-unit names its unit"
+            f"its header speaks of {(match[1] or match[2])!r}, expected a flux density: `flux_unit` names its unit"
         )
     rest = re.sub(_FLUX.pattern, " FLUXUNIT ", text)
     lengths = _lengths(rest) if wavelength else []
     if len(lengths) > 1:
-        raise InputError(f"its header names the units {', '.join(lengths)}, expected one: --wavelength-unit says which")
+        raise InputError(f"its header names the units {', '.join(lengths)}, expected one: `wavelength_unit` says which")
     return (lengths[0] if lengths else None), (distinct[0] if distinct else None)
 
 

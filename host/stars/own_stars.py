@@ -141,10 +141,10 @@ def add(
     if not re.fullmatch(r"[\w][\w .+\-*'()]{0,63}", name):
         raise InputError(f"star name {name!r}, expected up to 64 letters, digits, spaces and . + - * ' ( )")
     if catalogue.embedded(name) is not None:
-        raise InputError(f"star name {name!r} is one of the embedded library's, expected another: give one with --name")
+        raise InputError(f"star name {name!r} is one of the embedded library's, expected another: give one with `name`")
     there = find(name)
     if there is not None and not replace:
-        raise InputError(f"star {name!r} is kept already, expected another name, or --replace")
+        raise InputError(f"star {name!r} is kept already, expected another name, or `replace=True`")
     dereddened = any("dereddened" in note for note in source.notes)
     table = Table({"wavelength": source.wavelength_nm, "flux": source.flux_flam})
     table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"

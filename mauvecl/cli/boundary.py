@@ -79,7 +79,9 @@ def _run(app: typer.Typer) -> int:
     try:
         code = app(standalone_mode=False)
     except InputError as error:
-        return _say(str(error), BAD_INPUT)
+        from mauvecl.cli.naming import name_flag
+
+        return _say(name_flag(error), BAD_INPUT)
     except MemoryError:
         return _say("the memory does not suffice for this question, expected a smaller one or more of it", BAD_INPUT)
     except OSError as error:

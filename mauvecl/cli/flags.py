@@ -224,11 +224,11 @@ STARE = group(
     flag(bool, "--search/--no-search", "Search the stare for flares, as [search] has it [search].", "stare.search"),
     WITH_UNKNOWNS,
 )
-#: How far or large the star is; put together by `question.stars_of`.
+#: How far away or large the star is: keys of a star, which `question.stars_of` puts together.
 SIZE = group(
-    flag(float, "--distance", "Of the star, pc, for energies."),
-    flag(float, "--radius", "Of the star, solar radii, for energies."),
-    flag(float, "--star-temperature", "Effective temperature of the star, K, for energies."),
+    flag(float, "--distance", "Of the star, pc, for energies.", "distance_pc"),
+    flag(float, "--radius", "Of the star, solar radii, for energies.", "radius_rsun"),
+    flag(float, "--star-temperature", "Effective temperature of the star, K, for energies.", "effective_temperature_k"),
 )
 SIGNAL = group(
     flag(float, "--snr", "Wanted signal-to-noise ratio.", "signal.snr"),

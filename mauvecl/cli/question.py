@@ -6,6 +6,8 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mauvecl.cli.flags import SIZE
+
 if TYPE_CHECKING:
     from mauvecl.cli.flags import Flag
     from mauvecl.study.study import Study
@@ -36,8 +38,8 @@ def study_of(
                 changes.setdefault(one.section, {})[one.key] = one.convert(value) if one.convert else value
     if given.get("nuisance"):
         changes.setdefault("nuisances", {}).update(nuisances_of(study, given["nuisance"]))
-    changed = study.with_changes(changes, stars_of(study, given))
-    return changed.with_settings(given["set"]) if given["set"] else changed
+    changed = study.with_changes(changes, stars_of(study, given), "command line")
+    return changed.with_settings(given["set"], "--set") if given["set"] else changed
 
 
 def holds_study(file: Path) -> bool:
@@ -96,8 +98,7 @@ def stars_of(study: Study, given: dict[str, Any]) -> list[dict[str, Any]] | None
         return None
     names, magnitudes = given["star"], given["magnitude"]
     same = {key: given[key] for key in ("band", "magnitude_system", "ebv", "bin_nm") if given[key] is not None}
-    sizes = {"distance_pc": "distance", "radius_rsun": "radius", "effective_temperature_k": "star_temperature"}
-    same |= {key: given[flag] for key, flag in sizes.items() if given.get(flag) is not None}
+    same |= {one.key: given[name] for name, one in SIZE.items() if given.get(name) is not None}
     of_files = {key: given[key] for key in ("wavelength_unit", "flux_unit", "extend") if given[key] is not None}
     if not (names or magnitudes or same or of_files):
         return None

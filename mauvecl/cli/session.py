@@ -164,9 +164,10 @@ class Session:
     def say(self, lines: Sequence[str]) -> None:
         """Tell the reader, unless standard output is for JSON alone."""
         from mauvecl.cli.console import show
+        from mauvecl.cli.naming import with_flags
 
         if lines and not self.as_json:
-            show(lines)
+            show([with_flags(line) for line in lines])
 
     @cached_property
     def draws_pictures(self) -> bool:
@@ -229,7 +230,10 @@ class Session:
         with told_of_interrupts(self._written):
             self._leave_all(answer)
         if self.as_json:
-            self.print_json(answer.as_json())
+            from mauvecl.cli.naming import with_flags
+
+            content = answer.as_json()
+            self.print_json(content | {"messages": [with_flags(line) for line in content["messages"]]})
             return
         show()
         self.say(answer.remarks)

@@ -126,8 +126,8 @@ class Checkpoint:
             return
         if not self._resume:
             raise InputError(
-                f"{str(self.folder)!r} holds an unfinished run, expected --resume to go on with it or --restart to "
-                "forget it"
+                f"{str(self.folder)!r} holds an unfinished run, expected `resume=True` to continue it or "
+                "`restart=True` to forget it"
             )
         try:
             manifest = json_data(read_text(self.folder / MANIFEST, "manifest"), "manifest")
@@ -146,14 +146,14 @@ class Checkpoint:
         if form != FORM:
             raise InputError(
                 f"the unfinished run in {str(self.folder)!r} keeps its counts in form {form}, expected form {FORM} as "
-                "this version writes: --restart to forget it"
+                "this version writes: `restart=True` to forget it"
             )
         ours = {"mauvecl": VERSION, "verb": self.verb, **self._plain_study()}
         differing = differing_keys(ours, theirs)
         if differing:
             raise InputError(
                 f"the unfinished run in {str(self.folder)!r} differs in {', '.join(differing)}, expected the same "
-                "study, or --restart to forget it"
+                "study, or `restart=True` to forget it"
             )
 
     def get(self, name: str) -> Arrays | None:

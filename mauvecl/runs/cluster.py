@@ -68,7 +68,7 @@ class DaskWorkers:
         try:
             import distributed
         except ImportError as error:
-            raise InputError("Dask is missing, expected it for --cluster: pip install 'mauvecl[cluster]'") from error
+            raise InputError("Dask is missing, expected it for Dask workers: pip install 'mauvecl[cluster]'") from error
         self._where, self._device, self.retries = where, device, 0
         self._lock = threading.Lock()
         self._closing = False
@@ -207,7 +207,7 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
         word, _, number = where.partition(":")
         if word == "local":
             if not (number.isdecimal() and len(number) <= 4 and 1 <= int(number) <= 1024):
-                raise InputError(f"--cluster {where!r}, expected local:N with N from 1 to 1024")
+                raise InputError(f"cluster = {where!r}, expected local:N with N from 1 to 1024")
             threads = max((os.cpu_count() or 1) // int(number), 1)
             # Deaths are counted and shards sent out again here, so that they are told.
             how = {"distributed.scheduler.allowed-failures": 0, "distributed.admin.tick.limit": "1h"}
@@ -239,7 +239,7 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
             how = {"scheduler_file": where}
         else:
             raise InputError(
-                f"--cluster {shortened(where)}, expected local:N, an address such as tcp://host:8786, or a "
+                f"cluster = {shortened(where)}, expected local:N, an address such as tcp://host:8786, or a "
                 "scheduler file"
             )
         try:
@@ -273,7 +273,7 @@ def _private(distributed: Any) -> Any:
         return distributed.Security.temporary()
     except ImportError as error:
         raise InputError(
-            "cryptography is missing, expected it for --cluster local:N: pip install 'mauvecl[cluster]'"
+            "cryptography is missing, expected it for workers on local:N: pip install 'mauvecl[cluster]'"
         ) from error
 
 

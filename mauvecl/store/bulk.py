@@ -124,7 +124,7 @@ def realise_file(
     """
     file = Path(file)
     if file.exists() and not restart:
-        raise InputError(f"{str(file)!r} is there already, expected another place, or --restart to write it anew")
+        raise InputError(f"{str(file)!r} is there already, expected another place, or `restart=True` to write it anew")
     store = Store(unfinished(file), study)
     store.make_folder()
     with alone(store.path, "store"):
@@ -149,8 +149,8 @@ def _complete(store: Store, engine: Engine | Pool, resume: bool, restart: bool, 
     todo = [chunk for chunk in store.chunks() if not store.has(chunk)]
     if begun and not resume and todo:
         raise InputError(
-            f"store {str(store.path)!r} holds {store.count() - len(todo)} of {store.count()} chunks, expected --resume "
-            "to draw the others, or another place"
+            f"store {str(store.path)!r} holds {store.count() - len(todo)} of {store.count()} chunks, expected "
+            "`resume=True` to draw the others, or another place"
         )
     _fill(store, todo, engine, progress)
 
@@ -323,7 +323,7 @@ def verify(
         if total - there > MOST_MISSING:
             raise InputError(
                 f"store {str(store.path)!r} holds {there} chunks where its study asks for {total}, expected at most "
-                f"{MOST_MISSING} missing: choose --rows, or `mauvecl realise --resume` draws them"
+                f"{MOST_MISSING} missing: choose `rows`, or `mauvecl realise --resume` draws them"
             )
         faults = list(_faults_of_description(store, repair))
         for number, chunk in enumerate(store.chunks(first, last)):
@@ -348,7 +348,8 @@ def _fault(store: Store, chunk: Chunk, engine: Engine | Pool | None, repair: boo
     if store.digests.get(chunk.key, drawn) != drawn and not redraw:
         raise InputError(
             f"{chunk.key} of {store.path.name} was written with the digest {store.digests[chunk.key]} and is now "
-            f"drawn with {drawn}, expected the same: its study or its list is wrong; --redraw --repair trusts the study"
+            f"drawn with {drawn}, expected the same: its study or its list is wrong; "
+            "`redraw=True` with `repair=True` trusts the study"
         )
     if seen == "good":
         if drawn == store.digests[chunk.key]:

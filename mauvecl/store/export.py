@@ -101,7 +101,7 @@ def export(selection: Selection, path: str | Path, *, replace: bool = False) -> 
     if path.suffix not in ENDINGS:
         raise InputError(f"export {path.name!r}, expected a name ending in {', '.join(ENDINGS)}")
     if path.exists() and not (replace and path.is_file()):
-        expected = "another name, or --replace" if path.is_file() else "a file's name"
+        expected = "another name, or `replace=True`" if path.is_file() else "a file's name"
         raise InputError(f"export {str(path)!r} exists already, expected {expected}")
     if path.suffix != ".fits":
         # In memory first: on a full disk the HDF5 library ends the whole process.

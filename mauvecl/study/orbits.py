@@ -12,7 +12,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import shown
 from mauvecl.host.files.text_table import read_text_table
-from mauvecl.host.records import first_error
+from mauvecl.host.records import input_error
 from mauvecl.study.sections import Part
 
 if TYPE_CHECKING:
@@ -278,7 +278,7 @@ def targets_of(study: Study) -> list[Target]:
         t.target(o.simbad) for t in study.plan.targets
     ]
     if not targets:
-        raise InputError("no targets, expected names or coordinates, such as --look-at 'eps Eri'")
+        raise InputError("no targets, expected names or coordinates, such as `orbit.targets='eps Eri'`")
     names = [one.name for one in targets]
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
@@ -338,7 +338,7 @@ def read_targets(path: Path) -> list[dict[str, Any]]:
         try:
             PlanTarget.model_validate(one)
         except ValidationError as error:
-            raise InputError(f"{named}: row {number}: {first_error(PlanTarget, error)}") from error
+            raise input_error(f"{named}: row {number}", PlanTarget, error) from error
         targets.append(one)
     return targets
 

@@ -13,7 +13,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import possible, read_text, toml
 from mauvecl.host.quantities import number
-from mauvecl.host.records import first_error
+from mauvecl.host.records import input_error
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.study.orbits import OrbitQuestion, PlanQuestion, find_plan_files, without_usual_plan
 from mauvecl.study.quantities import QUANTITIES
@@ -127,10 +127,10 @@ class Study(Part):
         try:
             return cls.model_validate(data)
         except ValidationError as error:
-            raise InputError(f"{where}: {first_error(cls, error)}") from error
+            raise input_error(where, cls, error) from error
 
     def with_changes(
-        self, changes: dict[str, dict[str, Any]], stars: list[dict[str, Any]] | None, where: str = "command line"
+        self, changes: dict[str, dict[str, Any]], stars: list[dict[str, Any]] | None, where: str = "changes"
     ) -> Self:
         """The study with values replaced where they are not None, by sections such as "orbit.limits"; other stars."""
         data = self.model_dump()
@@ -147,7 +147,7 @@ class Study(Part):
             data["star"] = stars
         return self.build(data, where)
 
-    def with_settings(self, settings: Sequence[str]) -> Self:
+    def with_settings(self, settings: Sequence[str], where: str = "settings") -> Self:
         """The study with keys set as text, such as ``run.fap=0.01`` or ``star.0.magnitude=6``.
 
         Raises
@@ -159,9 +159,9 @@ class Study(Part):
         for text in settings:
             path, equals, value = (part.strip() for part in text.partition("="))
             if not (path and equals):
-                raise InputError(f"--set {text!r}, expected key=value, such as run.fap=0.01")
+                raise InputError(f"setting = {text!r}, expected key=value, such as run.fap=0.01")
             put(data, path.split("."), toml_value(value), text)
-        return self.build(data, "--set")
+        return self.build(data, where)
 
     def toml(self) -> str:
         """The study as TOML that `read` reads back."""

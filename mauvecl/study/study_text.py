@@ -100,13 +100,13 @@ def put(data: Any, path: list[str], value: Any, text: str) -> None:
         if isinstance(data, list | tuple):
             if part not in (numbers := [str(i) for i in range(len(data))]):
                 raise InputError(
-                    f"--set {shortened(text)}: no entry {shortened(part)}, expected 0 to {len(numbers) - 1}"
+                    f"setting = {shortened(text)}: no entry {shortened(part)}, expected 0 to {len(numbers) - 1}"
                 )
             data = data[int(part)]
         elif isinstance(data, dict):
             data = data.setdefault(part, {})
     if not isinstance(data, dict):
         raise InputError(
-            f"--set {shortened(text)}: {shortened('.'.join(parents))} holds no keys, expected one that does"
+            f"setting = {shortened(text)}: {shortened('.'.join(parents))} holds no keys, expected one that does"
         )
     data[last] = value

@@ -101,7 +101,7 @@ def warm() -> None:
     gc.freeze()
 
 
-def serve(address: str, port: int, *, show: bool = False, allowed: Sequence[str] = ()) -> None:
+def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence[str] = ()) -> None:
     """Serve the page until interrupted.
 
     Parameters
@@ -111,7 +111,7 @@ def serve(address: str, port: int, *, show: bool = False, allowed: Sequence[str]
     port : int
     show : bool
         Open a browser.
-    allowed : sequence of str
+    allow_origin : sequence of str
         Origins by which the page may be asked for; needed where the address lets in other machines.
 
     Raises
@@ -127,7 +127,7 @@ def serve(address: str, port: int, *, show: bool = False, allowed: Sequence[str]
     async def run() -> None:
         from tornado.ioloop import PeriodicCallback
 
-        make(address, port, allowed)
+        make(address, port, allow_origin)
         warm()
         if not local(address):
             print(

@@ -60,20 +60,24 @@ REFUSED = [
     (
         "10lac_stis_001.txt",
         {},
-        r"1669 to 399000 without a stated unit look like Angstrom, .*: --wavelength-unit Angstrom$",
+        r"1669 to 399000 without a stated unit look like Angstrom, .*: `wavelength_unit='Angstrom'`$",
     ),
-    ("h_stis_ngsl_hd095735_v2.txtA", {}, r"1675.01 to 10191.7 .* look like Angstrom, .*: --wavelength-unit Angstrom$"),
-    ("wasp-96_estimate_sed.txt", {}, r"1980.05 to 6067.15 .* look like Angstrom, .*: --wavelength-unit Angstrom$"),
-    ("wasp-96_estimate_sed.txt", {"extend": "G8V"}, r"look like Angstrom, .*: --wavelength-unit Angstrom$"),
+    (
+        "h_stis_ngsl_hd095735_v2.txtA",
+        {},
+        r"1675.01 to 10191.7 .* look like Angstrom, .*: `wavelength_unit='Angstrom'`$",
+    ),
+    ("wasp-96_estimate_sed.txt", {}, r"1980.05 to 6067.15 .* look like Angstrom, .*: `wavelength_unit='Angstrom'`$"),
+    ("wasp-96_estimate_sed.txt", {"extend": "G8V"}, r"look like Angstrom, .*: `wavelength_unit='Angstrom'`$"),
     ("ckp00_5750.fits", {}, r"11 columns may be the flux: g00, g05, .*g50, expected one: name it as in FILE\[g50\]"),
     ("ckp00_5750.fits[g55]", {}, r"no column or row is named 'g55', expected one of WAVELENGTH, g00"),
     ("XP_SAMPLED_RAW_dr3int6.csv", {}, r"2 spectra stand in it, one a row \(6, 4\), expected one: .* FILE\[6\]"),
 ]
 #: Files that are read and hold less than the nominal instrument's range.
 SHORT = [
-    ("vb8_stiswfcnic_004.fits", {}, r"VB8 spans 290\.033-2497\.72 nm, expected at least .*200-700 nm: --extend"),
-    ("ADLeo_912s.dat", {}, r"spans 100.36-444.015 nm, expected at least .*200-700 nm: --extend"),
-    ("wasp-96_estimate_sed.txt", ANGSTROM, r"spans 198.005-606.715 nm, expected at least .*200-700 nm: --extend"),
+    ("vb8_stiswfcnic_004.fits", {}, r"VB8 spans 290\.033-2497\.72 nm, expected at least .*200-700 nm: `extend`"),
+    ("ADLeo_912s.dat", {}, r"spans 100.36-444.015 nm, expected at least .*200-700 nm: `extend`"),
+    ("wasp-96_estimate_sed.txt", ANGSTROM, r"spans 198.005-606.715 nm, expected at least .*200-700 nm: `extend`"),
     ("XP_SAMPLED_RAW_dr3int6.csv[6]", {}, r"Gaia DR3 6 spans 336-1020 nm, expected at least .*200-700 nm"),
 ]
 

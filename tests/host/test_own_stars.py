@@ -83,7 +83,7 @@ def test_names_that_cannot_be(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="expected up to 64 letters"):
         own_stars.add(file, "../escape")
     own_stars.add(file, "twin")
-    with pytest.raises(InputError, match="'twin' is kept already, expected another name, or --replace"):
+    with pytest.raises(InputError, match="'twin' is kept already, expected another name, or `replace=True`"):
         own_stars.add(file, "twin")
     own_stars.add(text_file(tmp_path / "other.txt", 2.0), "Twin", replace=True)
     assert len(own_stars.kept()) == 1

@@ -329,8 +329,8 @@ GOOD = grid() * 1e-15
             rows(grid()[365:], GOOD[365:]),
             "would hold 33% of 200-700 nm in nm, expected at least a third, or their unit",
         ),
-        (rows(grid() * 10, GOOD), "look like Angstrom, expected their unit: --wavelength-unit Angstrom$"),
-        (rows(grid() / 1000, GOOD), "look like um, expected their unit: --wavelength-unit um$"),
+        (rows(grid() * 10, GOOD), "look like Angstrom, expected their unit: `wavelength_unit='Angstrom'`$"),
+        (rows(grid() / 1000, GOOD), "look like um, expected their unit: `wavelength_unit='um'`$"),
         (rows(np.where(grid() == 300, 298.0, grid()), GOOD), "wavelength 298 nm at point 131 follows 299 nm"),
         (rows(grid(), np.where(grid() == 300, np.nan, GOOD)), "flux nan at point 131"),
         (rows(grid(), np.where(grid() == 300, -1e-11, GOOD)), "flux -1e-11 at 300 nm lies farther below zero"),
@@ -348,7 +348,7 @@ def test_bad_text_is_one_sentence(tmp_path: Path, text: str, sentence: str) -> N
     [
         (
             slice(31, None),
-            "spans 201-1099 nm, expected at least mauve's output range 200-700 nm: --extend continues it",
+            "spans 201-1099 nm, expected at least mauve's output range 200-700 nm: `extend` continues it",
         ),
         (slice(25, None), r"starts at 195 nm, where it is bright: \d.\d% of the brightest"),
         (slice(500), "spans 170-669 nm"),
@@ -405,7 +405,7 @@ def test_other_numbers_of_the_span() -> None:
     mauve = Instrument.load("mauve")
     one, other = (expect(star.at_magnitude(5.0), mauve, exposure=5.0) for star in (whole, short))
     np.testing.assert_allclose(one.source_electrons, other.source_electrons, rtol=2e-4)
-    with pytest.raises(InputError, match=r"starts at 190 nm, where it is bright: .*--extend continues it"):
+    with pytest.raises(InputError, match=r"starts at 190 nm, where it is bright: .*`extend` continues it"):
         expect(Source.from_arrays(grid()[20:], hot[20:]), mauve, exposure=5.0)
     # What was continued is not taken for measured light in a band.
     dark = np.where(grid() < 300, 1e-17, GOOD)
@@ -420,7 +420,7 @@ def test_extended_by_another_star(sun: Source) -> None:
     kept = (sun.wavelength_nm > 250) & (sun.wavelength_nm < 650)
     mauve = Instrument.load("mauve")
     short = (sun.wavelength_nm[kept], 1e-3 * sun.flux_flam[kept])
-    with pytest.raises(InputError, match=r"expected at least mauve's output range 200-700 nm: --extend"):
+    with pytest.raises(InputError, match=r"expected at least mauve's output range 200-700 nm: `extend`"):
         expect(Source.from_arrays(*short), mauve, exposure=5.0)
     for extension in ("G2V", Source.from_library("G2V")):
         star = Source.from_arrays(*short, name="short", extend=extension)

@@ -238,8 +238,8 @@ def test_angstrom_that_spans_the_range_as_numbers_is_not_nm(tmp_path: Path) -> N
     for low, high, sentence in (
         (0.0, 1e9, "cover 200-700 nm in Angstrom as well as in nm"),
         (60.0, 9000.0, "cover 200-700 nm in Angstrom as well as in nm"),
-        (60.0, 9e9, "--wavelength-unit nm or --wavelength-unit Angstrom"),
-        (1150.0, 9000.0, "look like Angstrom, expected their unit: --wavelength-unit Angstrom$"),
+        (60.0, 9e9, "`wavelength_unit='nm'` or `wavelength_unit='Angstrom'`"),
+        (1150.0, 9000.0, "look like Angstrom, expected their unit: `wavelength_unit='Angstrom'`$"),
     ):
         kept = angstrom[(angstrom > low) & (angstrom < high)]
         (tmp_path / "sed.txt").write_text(lines(kept, 1e-13 + 0 * kept))
@@ -268,10 +268,10 @@ def test_angstrom_without_a_unit_gets_one_advice(tmp_path: Path, low: float, hig
     angstrom = np.geomspace(low, high, 1500)
     (tmp_path / "flare.dat").write_text(lines(angstrom, 1e-13 + 1e-17 * angstrom))
     with pytest.raises(
-        InputError, match=r"look like Angstrom, expected their unit: --wavelength-unit Angstrom$"
+        InputError, match=r"look like Angstrom, expected their unit: `wavelength_unit='Angstrom'`$"
     ) as caught:
         Source.read(tmp_path / "flare.dat", extend=extend)
-    assert "--extend" not in str(caught.value)
+    assert "`extend`" not in str(caught.value)
 
 
 @pytest.mark.parametrize(("low", "high"), [(100, 250), (540, 2000), (800, 2500), (90, 190), (115, 360)])

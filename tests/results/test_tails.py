@@ -142,7 +142,7 @@ def test_a_detection_uses_it_and_says_so(engine: Engine) -> None:
     counted = engine.detect(quiet, flares, **kind)
     assert sampled.table(1e-2).meta["tails"] == "counted"
     assert sampled.threshold(1e-2) == counted.threshold(1e-2)
-    with pytest.raises(InputError, match="or for sampled tails"):
+    with pytest.raises(InputError, match="or for `tails='sampled'`"):
         counted.table(fap=1e-9)
     assert sampled.threshold(1e-9) == engine.detect(quiet, flares, tails="sampled", **kind).threshold(1e-9)
 

@@ -261,7 +261,9 @@ def test_an_interrupted_run_goes_on(tmp_path: Path, engine: Engine) -> None:
 def test_what_is_unfinished_is_not_overwritten(tmp_path: Path, engine: Engine) -> None:
     with pytest.raises(KeyboardInterrupt):
         at_work(tmp_path, engine, interrupting(10_000))
-    with pytest.raises(InputError, match="holds an unfinished run, expected --resume to go on with it or --restart"):
+    with pytest.raises(
+        InputError, match="holds an unfinished run, expected `resume=True` to continue it or `restart=True`"
+    ):
         at_work(tmp_path, engine)
     other = small().with_settings(["run.seed=4", "flare.amplitudes=[0.1]"])
     with pytest.raises(InputError, match=r"differs in flare\.amplitudes\.0, flare\.amplitudes\.1, run\.seed, expected"):
@@ -278,7 +280,7 @@ def test_counts_of_another_form_are_refused(tmp_path: Path, engine: Engine) -> N
     manifest = json.loads(path.read_text())
     old = {key: value for key, value in manifest.items() if key not in ("form", "digest")}
     path.write_text(json.dumps(old | {"digest": _digest_of(old)}))
-    with pytest.raises(InputError, match="in form 1, expected form 2 as this version writes: --restart to"):
+    with pytest.raises(InputError, match="in form 1, expected form 2 as this version writes: `restart=True` to"):
         at_work(tmp_path, engine, resume=True)
     quiet, *flares = small().expectations(small().star[0])
     request = DetectRequest(quiet, tuple(flares), N, 5)

@@ -400,7 +400,7 @@ def test_the_verbs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert run(app, ["verify", "f.zarr", "--redraw", "--rows", "0:10"]).exit_code == 0
     assert run(app, ["export", "f.zarr", "f.h5", "--rows", "0:10"]).exit_code == 0
     written = Path("f.h5").read_bytes()
-    with pytest.raises(InputError, match="exists already, expected another name, or --replace"):
+    with pytest.raises(InputError, match="exists already, expected another name, or `replace=True`"):
         app(["export", "f.zarr", "f.h5", "--rows", "0:5"], standalone_mode=False)
     assert Path("f.h5").read_bytes() == written
     assert run(app, ["export", "f.zarr", "f.h5", "--rows", "0:5", "--replace"]).exit_code == 0
@@ -409,7 +409,7 @@ def test_the_verbs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert direct.exit_code == 0, direct.output
     assert sorted(p.name for p in tmp_path.iterdir()) == ["f.fits", "f.h5", "f.zarr", "study.toml"]
     Path("f.zarr/star-1/quiescent/c/0/0").unlink()
-    with pytest.raises(InputError, match=r"holds 3 of 4 chunks, expected --resume"):
+    with pytest.raises(InputError, match=r"holds 3 of 4 chunks, expected `resume=True`"):
         app(["realise", "study.toml", "--output", "f.zarr"], standalone_mode=False)
     app(["realise", "study.toml", "--output", "f.zarr", "--resume"], standalone_mode=False)
     assert run(app, ["verify", "f.zarr"]).exit_code == 0

@@ -217,7 +217,7 @@ def test_one_file_is_not_overwritten(name: str, tmp_path: Path, monkeypatch: pyt
     Path("study.toml").write_text(study(20).toml())
     Path(name).write_text("mine")
     for more in ([], ["--resume"]):
-        with pytest.raises(InputError, match=f"'{name}' is there already, expected another place, or --restart"):
+        with pytest.raises(InputError, match=f"'{name}' is there already, expected another place, or `restart=True`"):
             app(["realise", "study.toml", "--output", name, *more], standalone_mode=False)
     assert Path(name).read_text() == "mine"
     done = CliRunner().invoke(app, ["realise", "study.toml", "--output", name, "--restart"])

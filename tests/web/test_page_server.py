@@ -652,9 +652,9 @@ def test_command_and_program_are_the_question(link: str, tmp_path: Path) -> None
 def test_addresses_are_checked_before_anything_is_served() -> None:
     with pytest.raises(InputError, match="is empty"):
         doors.hosts("", 5006, [])
-    with pytest.raises(InputError, match="expected --allow-origin"):
+    with pytest.raises(InputError, match="expected `allow_origin`"):
         doors.hosts("0.0.0.0", 5006, [])
-    with pytest.raises(InputError, match="expected --allow-origin"):
+    with pytest.raises(InputError, match="expected `allow_origin`"):
         doors.hosts("::", 5006, [])
     with pytest.raises(InputError, match="unknown here"):
         doors.hosts("no such host", 5006, [])

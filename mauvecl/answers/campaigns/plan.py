@@ -310,7 +310,7 @@ def plan(
     [100.0]
     """
     if not study.plan.targets:
-        raise InputError("the plan has no targets, expected some, such as --targets targets.csv")
+        raise InputError("the plan has no targets, expected some, such as `plan.targets='targets.csv'`")
     if study.orbit.targets:
         raise InputError("both orbit.targets and plan.targets are given, expected the plan's")
     stars = [star_of(study, text) for text in study.plan.targets]

@@ -301,14 +301,14 @@ def _wanted(asked: CampaignQuestion, tests: int, stack: int, seed: int) -> list[
         if one.overlapping is not None:
             o = one.overlapping
             text += f", and with the overlap of its stacks {o.value:.3g} [{o.low:.3g}, {o.high:.3g}]"
-        lines.append(f"{text}: `--fap {one.at_least:.4g}`.")
+        lines.append(f"{text}: `fap={one.at_least:.4g}`.")
     if asked.alarms is not None:
         if not asked.alarms < tests:
             raise InputError(f"campaign.alarms = {asked.alarms:g} of {tests} tests, expected fewer than tests")
         alarms = "false alarm" if asked.alarms == 1 else "false alarms"
         lines.append(
             f"For {asked.alarms:g} {alarms} expected in the campaign each of its {tests} tests may have "
-            f"{asked.alarms / tests:.4g}, whatever their dependence: `--fap {asked.alarms / tests:.4g}`."
+            f"{asked.alarms / tests:.4g}, whatever their dependence: `fap={asked.alarms / tests:.4g}`."
         )
     return lines
 

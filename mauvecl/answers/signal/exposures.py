@@ -148,7 +148,7 @@ def exposure_for(
     snr, wavelength_nm, per = study.signal.snr, study.signal.wavelength_nm, study.signal.per
     if snr is None or wavelength_nm is None:
         missing = "S/N" if snr is None else "wavelength"
-        raise InputError(f"no wanted {missing}, expected --snr and --at, or snr and wavelength_nm of a study's signal")
+        raise InputError(f"no wanted {missing}, expected `signal.snr` and `signal.wavelength_nm`")
     answered, failed = [], []
     for star in study.star:
         try:

@@ -39,7 +39,7 @@ def serve(
     from mauvecl.web.server import serve
 
     try:
-        serve(address, number, show=show, allowed=allow_origin or ())
+        serve(address, number, show=show, allow_origin=allow_origin or ())
     except OSError as error:
         raise InputError(
             f"port {port} of {shortened(address)} cannot be used ({error.strerror}), expected another: --port"

@@ -72,5 +72,5 @@ def check_fap(fap: float, realisations: int, tails: Tails = "counted") -> None:
         raise InputError(
             f"fap = {fap:g} leaves {fap * realisations:.3g} of {realisations} realisations beyond the threshold, "
             f"expected at least {FEWEST_IN_TAIL}: ask for {math.ceil(FEWEST_IN_TAIL / fap)} realisations, or for "
-            "sampled tails"
+            "`tails='sampled'`"
         )

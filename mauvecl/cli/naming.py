@@ -1,0 +1,95 @@
+"""Write flags in messages where they name parameters of functions and keys of studies."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shlex
+import sys
+from collections.abc import Iterator, Mapping
+from functools import cache
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from mauvecl.host.errors import InputError
+
+#: A remedy in a message: `extend`, `resume=True`, `wavelength_unit='Angstrom'`, `fap=0.001`.
+_REMEDY = re.compile(r"`(?P<name>[a-z][a-z0-9_.]*)(?:=(?P<value>[^`]+))?`")
+#: Parameters whose flags are called otherwise, and which no key of the study gives.
+_OTHERWISE = {"setting": "--set"}
+
+
+@cache
+def _keys() -> Mapping[str, str]:
+    """Return the parameter behind every key of a study that a flag sets, as in ``run.fap``."""
+    from mauvecl.cli import flags
+    from mauvecl.cli.verbs import injections, orbits
+
+    groups = [group for module in (flags, injections, orbits) for group in vars(module).values()]
+    known = [one for group in groups if isinstance(group, dict) for one in group.values()]
+    return {f"{one.section or 'star'}.{one.key}": one.name for one in known if isinstance(one, flags.Flag) and one.key}
+
+
+def _commands() -> Iterator[Any]:
+    """Yield the command that was called, then all others."""
+    from typer.main import get_command
+
+    from mauvecl.cli.app import app
+
+    called: Any = get_command(app)
+    others = [called]
+    for word in sys.argv[1:]:
+        called = getattr(called, "commands", {}).get(word, called)
+    yield called
+    while others:
+        one = others.pop()
+        yield one
+        others += getattr(one, "commands", {}).values()
+
+
+def _flags(name: str, command: Any) -> list[str]:
+    """Return the flags that set a parameter or a key of the study, the long one first."""
+    wanted = {name} | {parameter for key, parameter in _keys().items() if f".{key}".endswith(f".{name}")}
+    for parameter in command.params:
+        if parameter.name in wanted:
+            return sorted((one for one in parameter.opts if one.startswith("-")), key=len, reverse=True)
+    return []
+
+
+def with_flags(text: str) -> str:
+    """Return a message with flags in place of the remedies that it names in backticks."""
+    return _REMEDY.sub(_as_flag, text) if "`" in text else text
+
+
+def _as_flag(found: re.Match[str]) -> str:
+    name = found["name"]
+    flag = _OTHERWISE.get(name) or next((flags[0] for one in _commands() if (flags := _flags(name, one))), None)
+    if flag is None:
+        return found[0]
+    if found["value"] is None:
+        return flag
+    try:
+        value = ast.literal_eval(found["value"])
+    except (ValueError, SyntaxError):
+        value = found["value"]
+    return flag if value is True else f"{flag} {shlex.quote(str(value))}"
+
+
+def name_flag(error: InputError) -> str:
+    """Return the error's message with a flag in place of its key, where that flag gave the value."""
+    text, key = with_flags(str(error)), error.key
+    if key is None:
+        return text
+    name = re.sub(r"\.\d+(?=\.|$)", "", key)
+    flags = [_OTHERWISE[name]] if name in _OTHERWISE else _flags(name, command := next(_commands()))
+    if not flags:
+        # "flare amplitude" is the amplitude of a flare.
+        flags = _flags(name.removeprefix("flare_"), command)
+    if not any(_gives(word, flags) for word in sys.argv[1:]):
+        return text
+    # The key as it is written, which may have blanks, after the place that holds it.
+    return re.sub(rf"^(?:[^:=]*: )?{re.escape(key).replace('_', '[_ ]')} = ", lambda _: f"{flags[0]} ", text)
+
+
+def _gives(word: str, flags: list[str]) -> bool:
+    return any(word.partition("=")[0] == one if one.startswith("--") else word.startswith(one) for one in flags)

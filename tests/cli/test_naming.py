@@ -1,0 +1,132 @@
+"""Messages name parameters in Python and flags on the command line."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import ended
+
+import mauvecl
+from mauvecl import Engine, Instrument, Sky, Source, Study
+from mauvecl.cli.naming import with_flags
+from mauvecl.host.errors import InputError
+from mauvecl.host.quantities import count, number, numbers
+
+ROOT = Path(mauvecl.__file__).parent
+#: The command line itself, and the command that the page offers.
+OF_FLAGS = ("cli/", "web/downloads.py")
+FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
+#: Whole commands are named as they are typed.
+COMMAND = re.compile(r"`mauvecl [^`]*`")
+
+
+def texts(file: Path) -> list[str]:
+    """Return the text of every literal of a module but its docstrings."""
+    tree = ast.parse(file.read_text(encoding="utf-8"))
+    documented = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    docs = {
+        id(node.body[0].value)
+        for node in ast.walk(tree)
+        if isinstance(node, documented) and node.body and isinstance(node.body[0], ast.Expr)
+    }
+    nodes = [node for node in ast.walk(tree) if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+    return [node.value for node in nodes if id(node) not in docs]
+
+
+def test_no_module_below_the_command_line_names_a_flag() -> None:
+    files = [*ROOT.rglob("*.py"), *(ROOT / "host").rglob("*.py")]
+    below = {file for file in files if not str(file.relative_to(ROOT)).startswith(OF_FLAGS)}
+    assert len(below) > 200
+    named = {
+        (str(file.relative_to(ROOT)), text)
+        for file in below
+        for text in texts(file)
+        if FLAG.search(COMMAND.sub("", text))
+    }
+    assert not named
+
+
+def test_dir_shows_public_names_only() -> None:
+    import mauvecl.cli.app  # its submodules become attributes
+
+    shown = [name for name in dir(mauvecl) if not name.startswith("__")]
+    assert sorted(shown) == sorted(mauvecl.__all__)
+    assert all(getattr(mauvecl, name) is not None for name in shown)
+
+
+STUDY = Study().with_changes({}, [{"library": "G2V", "magnitude": 7.4}])
+
+
+@pytest.mark.parametrize(
+    ("call", "key", "value"),
+    [
+        (lambda: Study().with_settings(["run.fap=3"]), "run.fap", 3),
+        (lambda: Study().with_settings(["star.0.magnitude=x"]), "star.0.magnitude", "x"),
+        (lambda: Study.build({"run": {"seeds": 3}}, "text"), "run.seeds", 3),
+        (lambda: STUDY.at("magnitude", "bright"), "magnitude", "bright"),
+        (lambda: Source.from_library("G2V").at_magnitude(99.0), "magnitude", None),
+        (lambda: Source.from_library("G2V").at_magnitude([7]), "magnitude", [7]),
+        (lambda: Engine().detect(1, [], realisations=10, seed=1), "quiet", 1),
+        (lambda: Sky.of_brightness("dark"), "sky_brightness", "dark"),
+        (lambda: number("flare temperature", 1.0, "K", low=1000.0), "flare_temperature", 1.0),
+        (lambda: numbers("wavelengths", np.array([1.0, -1.0]), "nm", low=0.0), "wavelengths", -1.0),
+        (lambda: count("frames", 0, low=1), "frames", 0),
+        (lambda: Instrument.load("mauve").with_(temperature_c=99.0), "temperature_c", 99.0),
+    ],
+)
+def test_errors_carry_key_value_and_what_is_expected(call, key, value) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(InputError) as caught:
+        call()
+    error = caught.value
+    assert error.key == key
+    if value is not None:
+        assert error.value == value
+    assert (error.expected or "") in str(error)
+    assert FLAG.search(str(error)) is None
+
+
+@pytest.mark.parametrize(
+    ("words", "begins"),
+    [
+        (("detect", "--fap", "2"), "--fap 2.0, expected"),
+        (("detect", "--fap=2"), "--fap 2.0, expected"),
+        (("detect", "-m99"), "--magnitude 99.0, expected"),
+        (("detect", "-a", "-3"), "--amplitude -3.0, expected"),
+        (("detect", "--flare-temperature", "1"), "--flare-temperature 1.0 K, expected"),
+        (("detect", "--geometry", "beside"), "--geometry 'beside', expected"),
+        (("detect", "--set", "x"), "--set 'x', expected"),
+        (("detect", "--cluster", "x"), "--cluster 'x', expected"),
+        (("snr", "--temperature", "99"), "--temperature 99.0, expected"),
+        (("stare", "--star", "G2V", "-m", "7", "--distance", "-5"), "--distance -5.0, expected"),
+        (("visible", "--earth-limb", "x"), "--earth-limb 'x', expected"),
+        (("visible",), "no targets, expected names or coordinates, such as --look-at 'eps Eri'"),
+        (("plan",), "the plan has no targets, expected some, such as --targets targets.csv"),
+        (("exposure", "--star", "G2V"), "no wanted S/N, expected --snr and --at"),
+    ],
+)
+def test_the_command_line_names_flags(words: tuple[str, ...], begins: str, tmp_path: Path) -> None:
+    code, _, told = ended(*words, folder=tmp_path)
+    assert code == 2
+    assert told.startswith(f"mauvecl: {begins}")
+    assert "`" not in told
+
+
+def test_a_value_of_a_study_file_keeps_its_key(tmp_path: Path) -> None:
+    (tmp_path / "s.toml").write_text("[run]\nfap = 2\n")
+    code, _, told = ended("detect", "s.toml", "--seed", "3", folder=tmp_path)
+    assert (code, told) == (2, "mauvecl: s.toml: run.fap = 2, expected less than 1\n")
+
+
+def test_remedies_become_flags() -> None:
+    assert with_flags("`extend` continues it") == "--extend continues it"
+    assert with_flags("expected `resume=True` or `wavelength_unit='nm air'`") == (
+        "expected --resume or --wavelength-unit 'nm air'"
+    )
+    assert with_flags("`fap=0.001`, `statistic='paper'`") == "--fap 0.001, --statistic paper"
+    assert with_flags("see `mauvecl realise --resume` and `nothing_known`") == (
+        "see `mauvecl realise --resume` and `nothing_known`"
+    )
