@@ -195,7 +195,7 @@ class BalmerFlare(FlareSpectrum):
     def flux(self, wavelength_nm: Float) -> Float:
         """Return the surface flux of blackbody and Balmer continuum, erg s-1 cm-2 A-1."""
         extra = balmer_continuum(wavelength_nm, self.electron_temperature_k)
-        return np.asarray(blackbody(wavelength_nm, self.temperature_k) + self._extra * extra)
+        return np.asarray(blackbody(wavelength_nm, self.temperature_k) + self.edge_flux * extra)
 
     @property
     def nodes_nm(self) -> Float:  # type: ignore[override]
@@ -203,7 +203,7 @@ class BalmerFlare(FlareSpectrum):
         return np.array([BALMER_EDGE_NM, BALMER_EDGE_NM + EDGE_WIDTH_NM])
 
     @property
-    def _extra(self) -> float:
+    def edge_flux(self) -> float:
         """Surface flux of the Balmer continuum at the edge, erg s-1 cm-2 A-1."""
         return (self.jump - 1.0) * float(blackbody(np.array([BALMER_EDGE_NM]), self.temperature_k)[0])
 
@@ -211,7 +211,7 @@ class BalmerFlare(FlareSpectrum):
         """Return the surface flux over all wavelengths, erg s-1 cm-2."""
         # The integral of (edge / l)^2 exp(-h c / k T (1 / l - 1 / edge)) over l, in Angstrom.
         width = 10.0 * BALMER_EDGE_NM**2 * self.electron_temperature_k / HC_OVER_K_NM_K
-        return STEFAN_BOLTZMANN * self.temperature_k**4 + self._extra * width
+        return STEFAN_BOLTZMANN * self.temperature_k**4 + self.edge_flux * width
 
     def describe(self) -> str:
         """Return the spectrum in a few words."""

@@ -1,0 +1,1 @@
+"""Measurements of flares: models of their light, forecasts of errors, and fits."""

@@ -1,0 +1,300 @@
+"""Fits of flares to observed frames, with intervals by profile likelihood; and forecasts of their errors."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy
+from numpy.typing import ArrayLike, NDArray
+
+from mauvecl.host.arguments import public
+from mauvecl.host.errors import InputError
+from mauvecl.results.measurements.model import FlareModel, derived_values
+from mauvecl.results.measurements.profile import Profile, covariance, covariance_at, intervals
+from mauvecl.results.measurements.reduction import Reduction
+from mauvecl.statistics.nuisances import Nuisances
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+    from astropy.table import QTable
+
+    from mauvecl.host.expectation import Expectation
+
+Float = NDArray[np.float64]
+
+#: Probabilities of the intervals: one and two standard deviations of a normal variable, about.
+LEVELS = (0.6827, 0.95)
+#: Fits after the first one; the variance is that of the flare fitted before.
+REFITS = 2
+#: Frames share a variance if their flares change its logarithm alike, to this step in each of some ranges of pixels.
+VARIANCE_STEP, VARIANCE_RANGES = 0.03, 12
+#: Frames that are fitted together, which bounds the memory.
+BATCH = 2048
+
+
+@dataclass(frozen=True, eq=False)
+class Measurement:
+    """Fitted flares of n frames; quantities are those of the model, in its order.
+
+    Attributes
+    ----------
+    names, units : tuple of str
+    estimates : ndarray, shape (n, n_derived)
+        Of maximum likelihood.
+    covariance : ndarray, shape (n, n_derived, n_derived)
+        From the Fisher information at the fit.
+    levels : tuple of float
+        Nominal coverage of the intervals.
+    low, high : ndarray, shape (n_level, n, n_derived)
+        Ends of the intervals; infinite where there is none, so that the other end is a one-sided limit.
+    chi2, p_value : ndarray, shape (n,)
+        Goodness of fit, and the probability of a worse one if the model is right.
+    dof : int
+    snr : ndarray, shape (n,)
+        Root of what the flare lowers chi-squared by.
+    log_k : ndarray, shape (n,)
+    amplitudes : ndarray, shape (n, n_linear)
+        Parameters of the model's `counts`.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    estimates: Float
+    covariance: Float
+    levels: tuple[float, ...]
+    low: Float
+    high: Float
+    chi2: Float
+    p_value: Float
+    dof: int
+    snr: Float
+    log_k: Float
+    amplitudes: Float
+
+    @property
+    def errors(self) -> Float:
+        """Standard errors from the Fisher information, shape (n, n_derived)."""
+        return np.asarray(np.sqrt(np.einsum("nqq->nq", self.covariance)))
+
+    @property
+    def one_sided(self) -> NDArray[np.bool_]:
+        """Intervals with one end, shape (n_level, n, n_derived)."""
+        return np.asarray(np.isinf(self.low) != np.isinf(self.high))
+
+    def column(self, name: str) -> int:
+        """Return the place of a quantity.
+
+        Raises
+        ------
+        InputError
+            For an unknown name.
+        """
+        if name not in self.names:
+            raise InputError(f"quantity {name!r} is not measured, expected one of {', '.join(self.names)}")
+        return self.names.index(name)
+
+    def table(self, frame: int = 0) -> QTable:
+        """Return the estimates and intervals of one frame, one row per quantity."""
+        from astropy.table import Table
+
+        table = Table({"quantity": list(self.names), "unit": list(self.units), "estimate": self.estimates[frame]})
+        table["error"] = self.errors[frame]
+        for level, low, high in zip(self.levels, self.low, self.high, strict=True):
+            percent = f"{100 * level:.4g}"
+            table[f"low_{percent}"], table[f"high_{percent}"] = low[frame], high[frame]
+        table.meta |= {"chi2": float(self.chi2[frame]), "dof": self.dof, "p_value": float(self.p_value[frame])}
+        return table
+
+
+@public
+def fit(
+    frames: ArrayLike,
+    expectation: Expectation,
+    model: FlareModel,
+    nuisances: Nuisances | None = None,
+    *,
+    levels: Sequence[float] = LEVELS,
+) -> Measurement:
+    """Fit one flare to each of some exposures.
+
+    The likelihood is Gaussian with the variance of the fitted flare and star. Intervals are those of the profile
+    likelihood, with Wilks' thresholds; for a quantity at the end of the model's temperatures they have one end.
+
+    Parameters
+    ----------
+    frames : array_like, shape (n, n_pixel)
+        Raw DN of the exposures, as `Engine.realise` gives them.
+    expectation : Expectation
+        The exposure of the quiescent star.
+    model : FlareModel
+    nuisances : Nuisances, optional
+        Unknown amplitudes of known spectra, which are marginalised over.
+    levels : sequence of float
+        Nominal coverage of the intervals.
+
+    Raises
+    ------
+    InputError
+        For frames of another shape, or a flare that cannot be told from what is unknown.
+
+    Examples
+    --------
+    >>> from mauvecl import Instrument, Source, expect
+    >>> from mauvecl.results.measurements.model import FlareModel
+    >>> from mauvecl.results.measurements.fit import fit
+    >>> star, mauve = Source.from_library("M3V").at_magnitude(9), Instrument.load("mauve")
+    >>> quiet, flare = (expect(s, mauve, exposure=50.0) for s in (star, star.flaring(0.5, 9000)))
+    >>> model = FlareModel.of(star, mauve, quiet)
+    >>> found = fit(flare.recorded_dn, quiet, model)
+    >>> [round(float(x), 2) for x in found.estimates[0, :2]]
+    [9000.0, 0.5]
+    """
+    raw = np.atleast_2d(np.asarray(frames, np.float64))
+    if raw.ndim != 2 or raw.shape[1] != expectation.wavelength_nm.size:
+        raise InputError(f"frames of the shape {raw.shape}, expected {expectation.wavelength_nm.size} pixels in each")
+    if not np.isfinite(raw).all():
+        raise InputError("frames hold undefined values, expected finite numbers")
+    if not levels or not all(0.0 < level < 1.0 for level in levels):
+        raise InputError(f"levels = {list(levels)}, expected probabilities between 0 and 1")
+    excess = raw - expectation.recorded_dn
+    log_k, linear = _pilot(excess, expectation, model, nuisances)
+    parts: list[tuple[NDArray[np.intp], dict[str, Any]]] = []
+    for step in range(REFITS):
+        parts = []
+        for rows, reduction in _groups(expectation, model, nuisances, log_k, linear):
+            for start in range(0, rows.size, BATCH):
+                some = rows[start : start + BATCH]
+                parts.append((some, _fitted(excess[some], model, reduction, levels if step == REFITS - 1 else ())))
+        for some, one in parts:
+            log_k[some], linear[some] = one["log_k"], one["amplitudes"]
+    order = np.argsort(np.concatenate([rows for rows, _ in parts]))
+    along = {"low": 1, "high": 1}
+    joined = {
+        name: np.take(np.concatenate([one[name] for _, one in parts], along.get(name, 0)), order, along.get(name, 0))
+        for name in parts[0][1]
+    }
+    dof = joined.pop("dof")
+    joined["p_value"] = np.asarray(scipy.stats.chi2.sf(joined["chi2"], dof))
+    units = tuple(one.unit for one in model.derived)
+    return Measurement(model.names, units, levels=tuple(levels), dof=int(dof.min()), **joined)
+
+
+def _pilot(excess: Float, quiet: Expectation, model: FlareModel, nuisances: Nuisances | None) -> tuple[Float, Float]:
+    """Return fits with the variance of the quiescent star."""
+    reduction = Reduction.of(model, quiet, None, nuisances)
+    log_k, linear = np.empty(len(excess)), np.empty((len(excess), len(model.linear)))
+    for start in range(0, len(excess), BATCH):
+        some = slice(start, start + BATCH)
+        best = Profile(reduction, reduction.sums(excess[some])[0]).best()
+        log_k[some], linear[some] = best.log_k, best.linear
+    return log_k, linear
+
+
+def _groups(
+    quiet: Expectation, model: FlareModel, nuisances: Nuisances | None, log_k: Float, linear: Float
+) -> Iterator[tuple[NDArray[np.intp], Reduction]]:
+    """Yield frames whose fitted flares have nearly the same variance, with their reduction."""
+    n_pixel = quiet.wavelength_nm.size
+    edges = np.linspace(0, n_pixel, VARIANCE_RANGES + 1).astype(np.intp)[:-1]
+    relative = quiet.gain_dn_per_electron / quiet.unsaturated_variance_dn2
+    averaged = np.diff(np.append(edges, n_pixel))
+    hot = np.add.reduceat(model.hot * relative, edges, axis=1) / averaged
+    fixed = np.add.reduceat(model.fixed * relative, edges, axis=1) / averaged
+    node = np.rint(np.interp(log_k, model.log_k, np.arange(model.log_k.size))).astype(np.intp)
+    added = linear[:, :1] * hot[node] + linear[:, 1:] @ fixed
+    keys = np.rint(np.log1p(np.maximum(added, -0.9)) / VARIANCE_STEP).astype(np.int64)
+    _, number, counts = np.unique(keys, axis=0, return_inverse=True, return_counts=True)
+    order = np.argsort(number, kind="stable")
+    for rows in np.split(order, np.cumsum(counts)[:-1]):
+        middle = np.mean(log_k[rows])
+        mean = linear[rows, 0].mean() * model.hot_spline(middle) + linear[rows, 1:].mean(axis=0) @ model.fixed
+        yield rows, Reduction.of(model, quiet, mean, nuisances)
+
+
+def _fitted(excess: Float, model: FlareModel, reduction: Reduction, levels: Sequence[float]) -> dict[str, Any]:
+    """Return the attributes of `Measurement` for some frames of one variance."""
+    sums, rest = reduction.sums(excess)
+    profile = Profile(reduction, sums)
+    at_nodes = profile.gain_at_nodes()
+    best = profile.best(at_nodes)
+    found: dict[str, Any] = {"log_k": best.log_k, "amplitudes": best.linear}
+    if not levels:
+        return found
+    left = np.einsum("nk,nk->n", sums, sums) - best.gain
+    ends = [intervals(model, profile, best, at_nodes, float(scipy.stats.chi2.isf(1 - p, 1))) for p in levels]
+    n_fitted = len(model.linear) + 1
+    return found | {
+        "estimates": derived_values(model, best.log_k, best.linear),
+        "covariance": covariance(model, profile, best),
+        "low": np.stack([low for low, _ in ends]),
+        "high": np.stack([high for _, high in ends]),
+        "chi2": rest + left,
+        "dof": np.full(len(sums), reduction.n_used - reduction.n_free - n_fitted),
+        "snr": np.sqrt(best.gain),
+    }
+
+
+@dataclass(frozen=True, eq=False)
+class Forecast:
+    """Errors that a measurement will have, from the Fisher information.
+
+    Attributes
+    ----------
+    names, units : tuple of str
+    values, errors : ndarray, shape (n_derived,)
+    covariance : ndarray, shape (n_derived, n_derived)
+    snr : float
+        Of the flare.
+    """
+
+    names: tuple[str, ...]
+    units: tuple[str, ...]
+    values: Float
+    errors: Float
+    covariance: Float
+    snr: float
+
+    @property
+    def correlation(self) -> Float:
+        """Correlation of the estimates, shape (n_derived, n_derived)."""
+        return np.asarray(self.covariance / np.outer(self.errors, self.errors))
+
+
+@public
+def forecast(
+    expectation: Expectation,
+    model: FlareModel,
+    temperature_k: float,
+    amplitudes: Sequence[float] | Float,
+    nuisances: Nuisances | None = None,
+) -> Forecast:
+    """Return the errors with which a flare will be measured, from the Fisher information of one exposure.
+
+    Parameters
+    ----------
+    expectation : Expectation
+        The exposure of the quiescent star.
+    model : FlareModel
+    temperature_k, amplitudes
+        The flare, as `FlareModel.counts` takes it.
+    nuisances : Nuisances, optional
+        Unknown amplitudes of known spectra.
+
+    Raises
+    ------
+    InputError
+        For a flare that is not of the model, or cannot be told from what is unknown.
+    """
+    counts = model.counts(temperature_k, amplitudes)
+    reduction = Reduction.of(model, expectation, counts, nuisances)
+    log_k, linear = np.array([np.log(temperature_k)]), np.asarray(amplitudes, np.float64)[None]
+    hot, slope = reduction.spline(log_k), reduction.spline(log_k, 1)
+    spread = covariance_at(model, log_k, linear, hot, slope, reduction.fixed)[0]
+    signal = linear[:, :1] * hot + linear[:, 1:] @ reduction.fixed
+    units = tuple(one.unit for one in model.derived)
+    values = derived_values(model, log_k, linear)[0]
+    return Forecast(model.names, units, values, np.sqrt(np.diag(spread)), spread, float(np.linalg.norm(signal)))

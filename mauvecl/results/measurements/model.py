@@ -1,0 +1,303 @@
+"""What a flare adds to a frame, as a function of its temperature and of amplitudes in which it is linear.
+
+A model is a blackbody, whose spectrum depends on one temperature, and components of fixed shape beside it: a Balmer
+continuum, and emission lines. Everything but the temperature is linear, so that a fit searches in one dimension.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from mauvecl.host.arguments import public
+from mauvecl.host.errors import InputError
+from mauvecl.host.ranges import FLARE_TEMPERATURES_K
+from mauvecl.host.response import Order, response_matrix
+from mauvecl.host.stars.bands import photons
+from mauvecl.host.stars.flare import blackbody
+from mauvecl.host.stars.flare_spectra import (
+    BALMER_EDGE_NM,
+    ELECTRON_TEMPERATURE_K,
+    STEFAN_BOLTZMANN,
+    BalmerFlare,
+    EmissionLine,
+    balmer_continuum,
+)
+
+if TYPE_CHECKING:
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.instrument.instrument import Instrument
+    from mauvecl.host.stars.source import Source
+
+Float = NDArray[np.float64]
+
+#: Temperatures that are fitted, K: those that a flare may have, but for cool ones without ultraviolet light.
+TEMPERATURES_K = (3_000.0, FLARE_TEMPERATURES_K[1])
+#: Temperatures at which spectra are computed, evenly spaced in log T; splines run through them.
+NODES = 225
+#: Grid of the spectra, nm: beyond the reach of the line function, in steps far below the resolution.
+GRID_NM = np.linspace(170.0, 760.0, 2361)
+#: Bands in which light is reported unless others are named, nm.
+BANDS_NM = ((200.0, 320.0), (200.0, 700.0))
+#: Nominal solar radius (IAU 2015, resolution B3) and parsec, cm.
+SUN_CM, PARSEC_CM = 6.957e10, 3.0856775814913674e18
+
+
+@dataclass(frozen=True, eq=False)
+class Derived:
+    """A quantity that follows from temperature and amplitudes.
+
+    Attributes
+    ----------
+    name, unit, description : str
+    factors : ndarray, shape (n_node, n_linear), optional
+        The quantity is the sum of these times the amplitudes; None for the temperature and for a ratio.
+    ratio : ndarray, shape (n_node,), optional
+        The quantity is one plus amplitude 1 over amplitude 0 times this.
+    """
+
+    name: str
+    unit: str
+    description: str
+    factors: Float | None = None
+    ratio: Float | None = None
+
+
+@public
+@dataclass(frozen=True, eq=False)
+class FlareModel:
+    """The mean counts that a flare adds to an exposure.
+
+    Attributes
+    ----------
+    log_k : ndarray, shape (n_node,)
+        Natural logarithms of temperatures, ascending and evenly spaced.
+    hot : ndarray, shape (n_node, n_pixel)
+        DN of the exposure for a blackbody of amplitude 1.
+    fixed : ndarray, shape (n_linear - 1, n_pixel)
+        DN of the exposure for the other components: a Balmer continuum of 1 erg s-1 cm-2 A-1 at its edge, and lines of
+        1 erg s-1 cm-2.
+    linear : tuple of str
+        Names of the amplitudes, that of the blackbody first.
+    derived : tuple of Derived
+        What fits report, the temperature first.
+    """
+
+    log_k: Float
+    hot: Float
+    fixed: Float
+    linear: tuple[str, ...]
+    derived: tuple[Derived, ...]
+
+    @classmethod
+    def of(
+        cls,
+        star: Source,
+        instrument: Instrument,
+        quiet: Expectation,
+        *,
+        jump: bool = False,
+        lines: Sequence[str] = (),
+        band: str = "Kepler",
+        electron_temperature_k: float = ELECTRON_TEMPERATURE_K,
+        distance_pc: float | None = None,
+        radius_rsun: float | None = None,
+        bands_nm: Sequence[tuple[float, float]] = BANDS_NM,
+        order: Order = "paper",
+    ) -> Self:
+        """Return the model of a blackbody at a star, with a Balmer continuum and lines if they are asked for.
+
+        Parameters
+        ----------
+        star : Source
+            The quiescent star at its magnitude.
+        instrument : Instrument
+        quiet : Expectation
+            One exposure of the quiescent star.
+        jump : bool
+            Whether a Balmer jump is fitted.
+        lines : sequence of str
+            Lines whose fluxes are fitted; names as in `FlareWithLines`, or vacuum wavelengths in nm.
+        band : str
+            In which the amplitude is the relative rise of the photons.
+        electron_temperature_k : float
+            Of the Balmer continuum.
+        distance_pc, radius_rsun : float, optional
+            Of the star: areas, luminosities and energies need the distance, the filling factor both. Light is taken to
+            leave alike in all directions.
+        bands_nm : sequence of tuple
+            Wavelengths between which the light is reported.
+        order : {"paper", "physical"}
+            As in `expect`.
+
+        Raises
+        ------
+        InputError
+            For a name or value that cannot be, or a spectrum that does not cover the band.
+        """
+        chosen = [EmissionLine.named(name) for name in lines]
+        for name, value in (("distance_pc", distance_pc), ("radius_rsun", radius_rsun)):
+            if value is not None and not 0.0 < value < np.inf:
+                raise InputError(f"{name} = {value:g}, expected a number above 0")
+        for low, high in bands_nm:
+            if not GRID_NM[0] <= low < high <= GRID_NM[-1]:
+                raise InputError(
+                    f"band of {low:g}-{high:g} nm, expected ascending wavelengths within {GRID_NM[0]:g}-{GRID_NM[-1]:g}"
+                )
+        kelvin = np.geomspace(*TEMPERATURES_K, NODES)
+        edge = BalmerFlare().nodes_nm
+        ends = np.ravel(bands_nm)
+        grid = np.unique(np.concatenate([GRID_NM, edge, ends, *(line.nodes_nm for line in chosen)]))
+        bodies = np.array([blackbody(grid, float(k)) for k in kelvin])
+        nm = star.wavelength_nm
+        light = photons(nm, star.flux_flam, band)
+        if not light > 0.0:
+            raise InputError(f"the star has no light in the band {band}, expected some to measure the flare against")
+        # Flux at the telescope over that of the flare's surface, for an amplitude of one.
+        scale = np.array([light / photons(nm, blackbody(nm, float(k)), band) for k in kelvin])
+        extra = ([balmer_continuum(grid, electron_temperature_k)] if jump else []) + [
+            one.profile(grid) for one in chosen
+        ]
+        names = ("amplitude", *(["balmer"] if jump else []), *(f"line {one.name}" for one in chosen))
+        matrix = response_matrix(instrument, grid, order)
+        dn = quiet.exposure_s * instrument.per_pixel("response", 1.0) * quiet.gain_dn_per_electron
+        fluxes = np.vstack([scale[:, None] * bodies, *extra]) if extra else scale[:, None] * bodies
+        counts = np.asarray((matrix @ fluxes.T).T) * dn
+        # Flux of each component between two wavelengths, and over all of them, for an amplitude of one.
+        parts = np.array([_between(grid, fluxes, low, high) for low, high in bands_nm]).reshape(-1, len(fluxes))
+        balmer = BalmerFlare(10_000.0, 2.0, electron_temperature_k)
+        whole = [(balmer.bolometric_flux() - STEFAN_BOLTZMANN * 1e16) / float(balmer.edge_flux)] if jump else []
+        every = np.concatenate([scale * STEFAN_BOLTZMANN * kelvin**4, whole, np.ones(len(chosen))])
+        derived = _derived(
+            kelvin, scale, names, parts, every, list(bands_nm), quiet.exposure_s, distance_pc, radius_rsun
+        )
+        return cls(np.log(kelvin), counts[:NODES], counts[NODES:], names, derived)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of what fits report."""
+        return tuple(one.name for one in self.derived)
+
+    @cached_property
+    def hot_spline(self) -> scipy.interpolate.CubicSpline:
+        """Counts of the blackbody over log temperature."""
+        return scipy.interpolate.CubicSpline(self.log_k, self.hot)
+
+    @cached_property
+    def splines(self) -> tuple[scipy.interpolate.CubicSpline | None, ...]:
+        """What derived quantities are made of, over log temperature."""
+        values = [one.factors if one.ratio is None else one.ratio for one in self.derived]
+        return tuple(None if value is None else scipy.interpolate.CubicSpline(self.log_k, value) for value in values)
+
+    def counts(self, temperature_k: float, amplitudes: Sequence[float] | Float) -> Float:
+        """Return the mean DN that a flare adds to each pixel of the exposure, shape (n_pixel,)."""
+        linear = self._checked(temperature_k, amplitudes)
+        return np.asarray(linear[0] * self.hot_spline(np.log(temperature_k)) + linear[1:] @ self.fixed)
+
+    def values(self, temperature_k: float, amplitudes: Sequence[float] | Float) -> dict[str, float]:
+        """Return the reported quantities of a flare, by name."""
+        linear = self._checked(temperature_k, amplitudes)
+        values = derived_values(self, np.array([np.log(temperature_k)]), linear[None])[0]
+        return dict(zip(self.names, values.tolist(), strict=True))
+
+    def amplitudes(
+        self, temperature_k: float, amplitude: float, *, jump: float = 1.0, lines: Sequence[float] = ()
+    ) -> Float:
+        """Return the model's amplitudes, shape (n_linear,), for a Balmer jump ratio and line fluxes, erg s-1 cm-2."""
+        ratio = next(
+            (spline for spline, one in zip(self.splines, self.derived, strict=True) if one.ratio is not None), None
+        )
+        if ratio is None and jump != 1.0:
+            raise InputError(f"jump = {jump:g} of a model without a Balmer continuum, expected 1")
+        own = [] if ratio is None else [(jump - 1.0) * amplitude / float(ratio(np.log(temperature_k)))]
+        given = np.array([amplitude, *own, *lines], np.float64)
+        return self._checked(temperature_k, given)
+
+    def _checked(self, temperature_k: float, amplitudes: Sequence[float] | Float) -> Float:
+        low, high = np.exp(self.log_k[[0, -1]])
+        if not low * (1 - 1e-9) <= temperature_k <= high * (1 + 1e-9):
+            raise InputError(f"temperature_k = {temperature_k:g}, expected {low:g} to {high:g}")
+        linear = np.asarray(amplitudes, np.float64)
+        if linear.shape != (len(self.linear),) or not np.isfinite(linear).all():
+            raise InputError(
+                f"amplitudes of the shape {linear.shape}, expected finite ones of {', '.join(self.linear)}"
+            )
+        return linear
+
+
+def derived_values(model: FlareModel, log_k: Float, linear: Float) -> Float:
+    """Return the reported quantities, shape (n, n_derived), of temperatures (n,) and amplitudes (n, n_linear)."""
+    columns = []
+    for one, spline in zip(model.derived, model.splines, strict=True):
+        if spline is None:
+            columns.append(np.exp(log_k))
+        elif one.ratio is None:
+            columns.append(np.einsum("nl,nl->n", spline(log_k), linear))
+        else:
+            positive = linear[:, 0] > 0.0
+            over = np.divide(linear[:, 1], linear[:, 0], out=np.full(log_k.size, np.nan), where=positive)
+            columns.append(1.0 + spline(log_k) * over)
+    return np.column_stack(columns)
+
+
+def _between(grid: Float, fluxes: Float, low: float, high: float) -> Float:
+    inside = (grid >= low) & (grid <= high)
+    return np.asarray(10.0 * np.trapezoid(fluxes[:, inside], grid[inside], axis=1))
+
+
+def _derived(
+    kelvin: Float,
+    scale: Float,
+    names: tuple[str, ...],
+    parts: Float,
+    every: Float,
+    bands_nm: list[tuple[float, float]],
+    exposure_s: float,
+    distance_pc: float | None,
+    radius_rsun: float | None,
+) -> tuple[Derived, ...]:
+    """List what a model reports; `parts` and `every` hold fluxes per amplitude, blackbodies' first."""
+    n, m = kelvin.size, len(names)
+
+    def summed(fluxes: Float) -> Float:
+        return np.column_stack([fluxes[:n], np.tile(fluxes[n:], (n, 1))])
+
+    def single(column: int, values: Float | float) -> Float:
+        factors = np.zeros((n, m))
+        factors[:, column] = values
+        return factors
+
+    derived = [Derived("temperature", "K", "temperature of the flare's blackbody")]
+    derived.append(Derived("amplitude", "", "relative rise of the band's photons by the blackbody", single(0, 1.0)))
+    if "balmer" in names:
+        edge = np.array([float(blackbody(np.array([BALMER_EDGE_NM]), float(k))[0]) for k in kelvin])
+        derived.append(
+            Derived("jump", "", "flux just below the Balmer edge over that just above", ratio=1.0 / (scale * edge))
+        )
+    for column, name in enumerate(names):
+        if name.startswith("line "):
+            what = f"flux of the line {name[5:]} at the telescope"
+            derived.append(Derived(name, "erg / (cm2 s)", what, single(column, 1.0)))
+    light = [(f"{low:g}-{high:g} nm", flux) for (low, high), flux in zip(bands_nm, parts, strict=True)]
+    light.append(("bolometric", every))
+    for where, flux in light:
+        derived.append(Derived(f"flux {where}", "erg / (cm2 s)", f"flux at the telescope, {where}", summed(flux)))
+    if distance_pc is not None:
+        far = distance_pc * PARSEC_CM
+        area = single(0, np.pi * far**2 * scale)
+        derived.append(Derived("area", "cm2", "projected area of the blackbody", area))
+        if radius_rsun is not None:
+            share = area / (np.pi * (radius_rsun * SUN_CM) ** 2)
+            derived.append(Derived("filling factor", "", "share of the star's disc that the blackbody covers", share))
+        for where, flux in light:
+            total = summed(flux) * 4 * np.pi * far**2
+            derived.append(Derived(f"luminosity {where}", "erg / s", f"luminosity, {where}", total))
+            energy = total * exposure_s
+            derived.append(Derived(f"energy {where}", "erg", f"energy within the exposure, {where}", energy))
+    return tuple(derived)

@@ -1,0 +1,319 @@
+"""Fits of weighted sums: the best temperature and amplitudes, and intervals by profile likelihood.
+
+At a given temperature everything else is linear, so that chi-squared's minimum over the amplitudes is a closed form and
+a function of one variable is left. The profile likelihood of a quantity that is linear in the amplitudes follows
+from that function: at each temperature the quantity may lie within sqrt(c - delta) standard deviations of its best
+value there, delta being what the temperature alone costs of the allowed c; the interval is the hull over temperatures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.results.measurements.model import derived_values
+
+if TYPE_CHECKING:
+    from scipy.interpolate import CubicSpline
+
+    from mauvecl.results.measurements.model import FlareModel
+    from mauvecl.results.measurements.reduction import Reduction
+
+Float = NDArray[np.float64]
+
+#: Parabolas through three temperatures that refine the best node, and the factor by which they get narrower.
+REFINEMENTS, NARROWER = 3, 8.0
+#: Steps of the search for the end of an interval.
+STEPS = 12
+#: Temperatures within an interval at which derived quantities are computed.
+SAMPLES = 33
+
+
+@dataclass(frozen=True, eq=False)
+class Best:
+    """Best fits of n frames.
+
+    Attributes
+    ----------
+    log_k : ndarray, shape (n,)
+    linear : ndarray, shape (n, n_linear)
+        Amplitudes; that of the blackbody is at least zero.
+    gain : ndarray, shape (n,)
+        Chi-squared of the sums without a flare less that of the fit.
+    """
+
+    log_k: Float
+    linear: Float
+    gain: Float
+
+
+class Profile:
+    """The profile likelihood of some frames' sums over the temperature."""
+
+    def __init__(self, reduction: Reduction, sums: Float) -> None:
+        self.reduction, self.sums = reduction, sums
+        basis, self._triangle = reduction.basis
+        self.along = sums @ basis.T
+        self.rest = sums - self.along @ basis
+        self._basis = basis
+        self.nodes = reduction.log_k
+        self.hot_nodes = reduction.hot - (reduction.hot @ basis.T) @ basis
+        self._lengths = np.linalg.norm(self.hot_nodes, axis=1)
+        self._coefficients = np.ascontiguousarray(np.moveaxis(reduction.spline.c, 0, 1))
+
+    def hot(self, log_k: Float) -> Float:
+        """Return the mean sums of a blackbody of amplitude 1, shape (*log_k.shape, n_sum)."""
+        step = self.nodes[1] - self.nodes[0]
+        interval = np.clip(((log_k - self.nodes[0]) / step).astype(np.int64), 0, self.nodes.size - 2)
+        offset = (log_k - self.nodes[interval])[..., None]
+        c = self._coefficients
+        cubic = c[interval, 0]
+        for power in (1, 2, 3):
+            cubic = cubic * offset + c[interval, power]
+        return np.asarray(cubic)
+
+    def parts(self, log_k: Float) -> tuple[Float, Float, Float]:
+        """Return amplitudes with nothing else held, their variances, and sums, at temperatures (n, ...)."""
+        hot = self.hot(log_k)
+        basis = self._basis
+        free = hot - (hot @ basis.T) @ basis
+        power = np.einsum("...k,...k->...", free, free)
+        rest = self.rest.reshape(self.rest.shape[:1] + (1,) * (log_k.ndim - 1) + self.rest.shape[1:])
+        return np.einsum("...k,...k->...", free, rest) / power, 1.0 / power, hot
+
+    def gain(self, log_k: Float) -> Float:
+        """Return what a flare of temperatures (n, ...) lowers chi-squared by; its blackbody adds light."""
+        amplitude, variance, _ = self.parts(log_k)
+        base = np.einsum("nk,nk->n", self.along, self.along).reshape((-1,) + (1,) * (log_k.ndim - 1))
+        return np.asarray(base + np.maximum(amplitude, 0.0) ** 2 / variance)
+
+    def gain_at_nodes(self) -> Float:
+        """Return `gain` at the model's temperatures, shape (n, n_node)."""
+        product = self.rest @ (self.hot_nodes / self._lengths[:, None]).T
+        return np.asarray(np.maximum(product, 0.0) ** 2 + np.einsum("nk,nk->n", self.along, self.along)[:, None])
+
+    def linear(self, log_k: Float, amplitude: Float, hot: Float) -> Float:
+        """Return all amplitudes, shape (n, ..., n_linear), for that of the blackbody."""
+        if not len(self._basis):
+            return amplitude[..., None]
+        along = self.along.reshape(self.along.shape[:1] + (1,) * (log_k.ndim - 1) + self.along.shape[1:])
+        others = np.linalg.solve(self._triangle, (along - amplitude[..., None] * (hot @ self._basis.T))[..., None])
+        return np.concatenate([amplitude[..., None], others[..., 0]], axis=-1)
+
+    def best(self, at_nodes: Float | None = None) -> Best:
+        """Return the best fit of each frame."""
+        at_nodes = self.gain_at_nodes() if at_nodes is None else at_nodes
+        low, high = self.nodes[0], self.nodes[-1]
+        step = float(self.nodes[1] - self.nodes[0])
+        x = self.nodes[np.argmax(at_nodes, axis=1)]
+        for _ in range(REFINEMENTS):
+            there = np.clip(x[:, None] + step * np.array([-1.0, 0.0, 1.0]), low, high)
+            g = self.gain(there)
+            # The vertex of the parabola through three points; the best of them where that has none.
+            a, b = there[:, 0] - there[:, 1], there[:, 2] - there[:, 1]
+            left, right = g[:, 0] - g[:, 1], g[:, 2] - g[:, 1]
+            under = right * a - left * b
+            over = right * a**2 - left * b**2
+            inside = np.abs(under) > 1e-300
+            vertex = there[:, 1] + np.divide(over, 2 * under, out=np.zeros_like(over), where=inside)
+            three = there[np.arange(x.size), np.argmax(g, axis=1)]
+            good = inside & (vertex >= there[:, 0]) & (vertex <= there[:, 2])
+            vertex = np.where(good, vertex, three)
+            reached = self.gain(vertex)
+            x = np.where(reached >= g.max(axis=1), vertex, three)
+            step /= NARROWER
+        amplitude, _, hot = self.parts(x)
+        amplitude = np.maximum(amplitude, 0.0)
+        return Best(x, self.linear(x, amplitude, hot), self.gain(x))
+
+    def ends(self, best: Best, at_nodes: Float, allowed: float) -> tuple[Float, Float]:
+        """Return the log temperatures at which chi-squared has risen by `allowed`, low and high, each (n,).
+
+        NaN where it has not risen that far at the end of the model's temperatures.
+        """
+        inside = best.gain[:, None] - at_nodes <= allowed
+        number = np.arange(self.nodes.size)
+        lowest = np.where(inside, number, self.nodes.size).min(axis=1)
+        highest = np.where(inside, number, -1).max(axis=1)
+        low, high = (
+            np.full(best.log_k.shape, np.nan),
+            np.full(best.log_k.shape, np.nan),
+        )
+        for out, outermost, side in ((low, lowest, -1), (high, highest, 1)):
+            known = (outermost >= 0) & (outermost < self.nodes.size)
+            start = np.where(known, self.nodes[np.clip(outermost, 0, self.nodes.size - 1)], best.log_k)
+            start = np.minimum(start, best.log_k) if side < 0 else np.maximum(start, best.log_k)
+            beyond = (
+                np.searchsorted(self.nodes, start, side="left") - 1
+                if side < 0
+                else np.searchsorted(self.nodes, start, side="right")
+            )
+            closed = (beyond >= 0) & (beyond < self.nodes.size)
+            stop = self.nodes[np.clip(beyond, 0, self.nodes.size - 1)]
+            crossing = self._crossing(best.gain, allowed, start, np.where(closed, stop, start))
+            out[:] = np.where(closed, crossing, np.nan)
+        return low, high
+
+    def _crossing(self, gain: Float, allowed: float, inner: Float, outer: Float) -> Float:
+        """Return where chi-squared has risen by `allowed` between two temperatures (Illinois method on its root)."""
+        root = np.sqrt(allowed)
+
+        def over(x: Float) -> Float:
+            return np.asarray(np.sqrt(np.maximum(gain - self.gain(x), 0.0)) - root)
+
+        a, b = inner, outer
+        fa, fb = over(a), over(b)
+        x = b
+        for _ in range(STEPS):
+            spread = fb - fa
+            x = np.where(np.abs(spread) > 1e-14, b - fb * (b - a) / np.where(spread == 0.0, 1.0, spread), b)
+            fx = over(x)
+            crossed = fx * fb < 0.0
+            fa = np.where(crossed, fb, 0.5 * fa)
+            a = np.where(crossed, b, a)
+            b, fb = x, fx
+        return x
+
+
+def intervals(model: FlareModel, profile: Profile, best: Best, at_nodes: Float, allowed: float) -> tuple[Float, Float]:
+    """Return the profile-likelihood intervals of a model's quantities, low and high, each (n, n_derived).
+
+    Infinite where the data give no limit within the model's temperatures, and for the temperature itself.
+    """
+    low, high = profile.ends(best, at_nodes, allowed)
+    first = np.where(np.isnan(low), profile.nodes[0], low)
+    last = np.where(np.isnan(high), profile.nodes[-1], high)
+    # Even in the sine's angle: the allowed rest goes to zero at the ends like a root.
+    angle = np.linspace(-np.pi / 2, np.pi / 2, SAMPLES)
+    x = (first + last)[:, None] / 2 + (last - first)[:, None] / 2 * np.sin(angle)
+    amplitude, variance, hot = profile.parts(x)
+    linear = profile.linear(x, amplitude, hot)
+    spent = best.gain[:, None] - np.einsum("nk,nk->n", profile.along, profile.along)[:, None] - amplitude**2 / variance
+    left = allowed - spent
+    columns: list[tuple[Float, Float]] = []
+    for one, spline in zip(model.derived, model.splines, strict=True):
+        if spline is None:
+            columns.append(
+                (np.where(np.isnan(low), -np.inf, np.exp(low)), np.where(np.isnan(high), np.inf, np.exp(high)))
+            )
+        elif one.ratio is None:
+            columns.append(_linear_interval(profile, spline, x, linear, variance, hot, left))
+        else:
+            columns.append(_ratio_interval(profile, spline(x), x, hot, best.gain - allowed))
+    return np.column_stack([c[0] for c in columns]), np.column_stack([c[1] for c in columns])
+
+
+def _linear_interval(
+    profile: Profile, spline: CubicSpline, x: Float, linear: Float, variance: Float, hot: Float, left: Float
+) -> tuple[Float, Float]:
+    factors = spline(x)
+    value = np.einsum("nsl,nsl->ns", factors, linear)
+    basis, triangle = profile.reduction.basis
+    if len(basis):
+        others = np.linalg.solve(triangle.T, factors[..., 1:, None])[..., 0]
+        slope = factors[..., 0] - np.einsum("nsk,nsk->ns", others, hot @ basis.T)
+        spread = slope**2 * variance + np.einsum("nsk,nsk->ns", others, others)
+    else:
+        spread = factors[..., 0] ** 2 * variance
+    reach = np.sqrt(np.maximum(left, 0.0) * spread)
+    outside = left < 0.0
+    outside[:, [0, -1]] = False  # the ends themselves, where rounding decides
+    low = _extreme(np.where(outside, np.inf, value - reach), np.minimum)
+    high = _extreme(np.where(outside, -np.inf, value + reach), np.maximum)
+    return low, high
+
+
+def _extreme(values: Float, which: Callable[..., Float]) -> Float:
+    """Return the smallest or largest of samples (n, n_sample), by a parabola through the outermost three."""
+    sign = 1.0 if which is np.maximum else -1.0
+    signed = sign * values
+    k = np.argmax(signed, axis=1)
+    rows = np.arange(len(values))
+    middle = signed[rows, k]
+    inner = (k > 0) & (k < values.shape[1] - 1)
+    before, after = signed[rows, np.maximum(k - 1, 0)], signed[rows, np.minimum(k + 1, values.shape[1] - 1)]
+    usable = inner & np.isfinite(before) & np.isfinite(after)
+    with np.errstate(invalid="ignore"):
+        bend = np.where(usable, 2 * middle - before - after, 1.0)
+        rise = np.where(usable & (bend > 0), (after - before) ** 2 / (8 * np.where(bend > 0, bend, 1.0)), 0.0)
+    return np.asarray(sign * (middle + rise))
+
+
+def _ratio_interval(profile: Profile, per: Float, x: Float, hot: Float, least_gain: Float) -> tuple[Float, Float]:
+    """Return the interval of 1 + per x (amplitude 1) / (amplitude 0): Fieller's at each temperature, then the hull."""
+    fixed = profile.reduction.fixed
+    others = np.linalg.qr(fixed[1:].T)[0].T if len(fixed) > 1 else np.zeros((0, fixed.shape[1]))
+
+    def less(values: Float) -> Float:
+        return values - (values @ others.T) @ others
+
+    y, t = less(profile.sums), less(hot)
+    f = less(fixed[0]) / per[..., None]
+    explained = np.einsum("nk,nk->n", profile.sums @ others.T, profile.sums @ others.T)
+    least = (least_gain - explained)[:, None]
+    yt, yf = np.einsum("nk,nsk->ns", y, t), np.einsum("nk,nsk->ns", y, f)
+    tt, tf, ff = (np.einsum("nsk,nsk->ns", a, b) for a, b in ((t, t), (t, f), (f, f)))
+    # (yt + r yf)^2 >= least |t + r f|^2, with r the jump less one and a blackbody that adds light.
+    a, b, c = yf**2 - least * ff, yt * yf - least * tf, yt**2 - least * tt
+    inside = b**2 - a * c
+    root = np.sqrt(np.maximum(inside, 0.0))
+    bounded = (a < 0.0) & (inside >= -1e-9 * b**2)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        one, other = (-b + root) / a, (-b - root) / a
+    smaller, larger = np.fmin(one, other), np.fmax(one, other)
+    # Without a bound the light may be all recombination: every jump above the larger root is allowed.
+    open_low = (a >= 0.0) & (inside < 0.0)
+    low = np.where(bounded, smaller, np.where(a >= 0.0, np.where(open_low, -np.inf, larger), np.inf))
+    high = np.where(bounded, larger, np.where(a >= 0.0, np.inf, -np.inf))
+    return 1.0 + _extreme(low, np.minimum), 1.0 + _extreme(high, np.maximum)
+
+
+def covariance(model: FlareModel, profile: Profile, best: Best) -> Float:
+    """Return the covariance of quantities from the Fisher information at the fit, (n, n_derived, n_derived)."""
+    hot = profile.hot(best.log_k)
+    slope = profile.reduction.spline(best.log_k, 1)
+    return covariance_at(model, best.log_k, best.linear, hot, slope, profile.reduction.fixed)
+
+
+def covariance_at(model: FlareModel, log_k: Float, linear: Float, hot: Float, slope: Float, fixed: Float) -> Float:
+    """Return the covariance of quantities, (n, n_derived, n_derived), from whitened sums and their derivative.
+
+    NaN where a flare adds no light, or its temperature and amplitudes cannot be told apart.
+    """
+    n, m = linear.shape
+    jacobian = np.zeros((n, m + 1, hot.shape[1]))
+    jacobian[:, 0], jacobian[:, 1:m], jacobian[:, m] = hot, fixed, linear[:, :1] * slope
+    information = np.einsum("nik,njk->nij", jacobian, jacobian)
+    scale = np.sqrt(np.einsum("nii->ni", information))
+    good = (scale > 0.0).all(axis=1)
+    scale[~good] = 1.0
+    normal = information / scale[:, :, None] / scale[:, None, :]
+    good &= np.linalg.eigvalsh(normal)[:, 0] > 1e-13
+    normal[~good] = np.eye(m + 1)
+    inverse = np.linalg.inv(normal) / scale[:, :, None] / scale[:, None, :]
+    inverse[~good] = np.nan
+    gradient = gradient_of(model, log_k, linear)
+    return np.asarray(np.einsum("nqi,nij,nrj->nqr", gradient, inverse, gradient))
+
+
+def gradient_of(model: FlareModel, log_k: Float, linear: Float) -> Float:
+    """Return derivatives of quantities by the amplitudes and log temperature, (n, n_derived, n_linear + 1)."""
+    n, m = linear.shape
+    gradient = np.zeros((n, len(model.derived), m + 1))
+    values = derived_values(model, log_k, linear)
+    for q, (one, spline) in enumerate(zip(model.derived, model.splines, strict=True)):
+        if spline is None:
+            gradient[:, q, m] = np.exp(log_k)
+        elif one.ratio is None:
+            gradient[:, q, :m] = spline(log_k)
+            gradient[:, q, m] = np.einsum("nl,nl->n", spline(log_k, 1), linear)
+        else:
+            amplitude = np.where(linear[:, 0] > 0, linear[:, 0], np.nan)
+            gradient[:, q, 0] = (1.0 - values[:, q]) / amplitude
+            gradient[:, q, 1] = spline(log_k) / amplitude
+            gradient[:, q, m] = spline(log_k, 1) * linear[:, 1] / amplitude
+    return gradient

@@ -1,0 +1,142 @@
+"""The few weighted sums of a frame that hold all that it tells about a flare.
+
+The whitened spectra of flares of all temperatures span about seven directions to one part in 10^9; a fit needs the
+frame's sums along them, and chi-squared of the rest. Unknown amplitudes of known spectra are marginalised over in the
+weights (generalised least squares).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import TYPE_CHECKING, Self
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from mauvecl.host.errors import InputError
+from mauvecl.statistics.nuisances import Nuisances, joined
+
+if TYPE_CHECKING:
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.results.measurements.model import FlareModel
+
+Float = NDArray[np.float64]
+
+#: Temperatures whose spectra span the directions: one in so many of the model's nodes.
+EVERY = 4
+#: Directions with less than this share of the largest eigenvalue hold rounding only.
+LEAST = 1e-11
+#: Pixels this near to saturation, in standard deviations of a frame, are left out.
+NEAR_SIGMA = 5.0
+#: Share of S/N^2 that a flare must keep when the unknowns are marginalised over.
+LEAST_KEPT = 1e-10
+
+
+@dataclass(frozen=True, eq=False)
+class Reduction:
+    """Weights of sums, and what a model's flares do to these sums.
+
+    Attributes
+    ----------
+    variance : ndarray, shape (n_pixel,)
+        Of the exposure, zero in pixels that are not used.
+    weights : ndarray, shape (n_sum, n_pixel)
+        Per DN; sums have covariance one.
+    rows : ndarray, shape (k, n_pixel)
+        What marginalisation subtracts from chi-squared.
+    hot : ndarray, shape (n_node, n_sum)
+        Mean sums for a blackbody of amplitude 1, at each of the model's temperatures.
+    fixed : ndarray, shape (n_linear - 1, n_sum)
+        Those of the other components.
+    log_k : ndarray, shape (n_node,)
+    n_free : int
+        Unknowns that are projected out.
+    """
+
+    variance: Float
+    weights: Float
+    rows: Float
+    hot: Float
+    fixed: Float
+    log_k: Float
+    n_free: int
+
+    @classmethod
+    def of(
+        cls, model: FlareModel, quiet: Expectation, added_dn: Float | None = None, nuisances: Nuisances | None = None
+    ) -> Self:
+        """Return the reduction of exposures with the variance of a flare that adds some counts.
+
+        Parameters
+        ----------
+        model : FlareModel
+        quiet : Expectation
+        added_dn : ndarray, shape (n_pixel,), optional
+            Mean DN of the flare; none by default.
+        nuisances : Nuisances, optional
+
+        Raises
+        ------
+        InputError
+            If every pixel saturates, or a flare cannot be told from what is unknown.
+        """
+        variance, used = variance_of(quiet, added_dn)
+        if not used.any():
+            raise InputError(f"every pixel of {quiet.name} saturates, expected some that do not")
+        inverse = np.divide(1.0, variance, out=np.zeros_like(variance), where=used)
+        rows = nuisances.rows(variance, nuisances.spectra * used) if nuisances else np.zeros((0, variance.size))
+        spanning = np.vstack([model.hot[::EVERY], model.fixed]) * used
+        plain = spanning * inverse
+        optimal = plain - (spanning @ rows.T) @ rows
+        gram = optimal @ spanning.T
+        power = np.diag(gram)
+        if not (power > LEAST_KEPT * np.einsum("tp,tp->t", plain, spanning)).all():
+            unknown = joined(nuisances.names) if nuisances else "nothing"
+            raise InputError(f"the light of a flare cannot be told from {unknown}, expected fewer unknowns")
+        length = np.sqrt(power)
+        values, vectors = np.linalg.eigh(gram / np.outer(length, length))
+        kept = values > LEAST * values[-1]
+        weights = (vectors[:, kept] / length[:, None] / np.sqrt(values[kept])).T @ optimal
+        free = nuisances.free if nuisances else 0
+        return cls(variance, weights, rows, model.hot @ weights.T, model.fixed @ weights.T, model.log_k, free)
+
+    def sums(self, excess_dn: Float) -> tuple[Float, Float]:
+        """Return the sums of frames less the quiescent mean, (n, n_sum), and chi-squared of what these leave, (n,)."""
+        sums = excess_dn @ self.weights.T
+        used = self.variance > 0.0
+        inverse = np.divide(1.0, self.variance, out=np.zeros_like(self.variance), where=used)
+        whole = excess_dn**2 @ inverse
+        unknown = excess_dn @ self.rows.T
+        return sums, whole - np.einsum("nk,nk->n", unknown, unknown) - np.einsum("nk,nk->n", sums, sums)
+
+    @property
+    def n_used(self) -> int:
+        """Number of pixels that count."""
+        return int((self.variance > 0.0).sum())
+
+    @cached_property
+    def basis(self) -> tuple[Float, Float]:
+        """Orthonormal directions of the fixed components, (n_linear - 1, n_sum), and their triangular factor."""
+        if not len(self.fixed):
+            return np.zeros((0, self.weights.shape[0])), np.zeros((0, 0))
+        q, r = np.linalg.qr(self.fixed.T)
+        return q.T, r
+
+    @cached_property
+    def spline(self) -> scipy.interpolate.CubicSpline:
+        """Sums of the blackbody over log temperature."""
+        return scipy.interpolate.CubicSpline(self.log_k, self.hot)
+
+
+def variance_of(quiet: Expectation, added_dn: Float | None = None) -> tuple[Float, NDArray[np.bool_]]:
+    """Return the variance of an exposure with a flare, DN^2, zero where a pixel saturates, and which do not."""
+    added = np.zeros(quiet.wavelength_nm.size) if added_dn is None else added_dn
+    light = np.maximum(quiet.light_dn + added, 0.0)
+    constant = quiet.unsaturated_variance_dn2 - quiet.gain_dn_per_electron * quiet.light_dn
+    variance = constant + quiet.gain_dn_per_electron * light
+    # Frames of a pixel that comes near the ceiling are cut off now and then: it tells nothing reliable.
+    raw = light / quiet.n_frames + quiet.dark_dn + quiet.bias_dn
+    used = raw + NEAR_SIGMA * np.sqrt(variance / quiet.n_frames) < quiet.ceiling_dn
+    return np.where(used, variance, 0.0), used
