@@ -36,8 +36,8 @@ from mauvecl.results.requests.requests import (
 from mauvecl.results.snr import Counts, SnrResult, elements, observers
 from mauvecl.results.sums import Arrays, DetectionSums, SnrSums, packed_detection, packed_snr
 from mauvecl.statistics.linear import Linear
-from mauvecl.statistics.names import USUAL_STATISTICS
-from mauvecl.statistics.nuisances import Nuisances, known
+from mauvecl.statistics.names import DEFAULT_STATISTICS
+from mauvecl.statistics.nuisances import Nuisances, as_nuisances
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -270,7 +270,7 @@ class Engine:
         *,
         realisations: int,
         seed: int,
-        statistics: Sequence[str | Linear] = USUAL_STATISTICS,
+        statistics: Sequence[str | Linear] = DEFAULT_STATISTICS,
         start: int = 0,
         comparison: Comparison = NOISE_FREE,
         tails: Tails = "counted",
@@ -344,7 +344,7 @@ class Engine:
         start: int = 0,
         count: int,
         seed: int,
-        statistics: Sequence[str | Linear] = USUAL_STATISTICS,
+        statistics: Sequence[str | Linear] = DEFAULT_STATISTICS,
         comparison: Comparison = NOISE_FREE,
         nuisances: Nuisances | Mapping[str, float] | None = None,
         **drawing: Unpack[DrawingWords],
@@ -377,7 +377,7 @@ class Engine:
         scene = prepare([quiet, *flares], comparison=comparison, **drawing)
         if len(flares) >= BATCH[scene.frames]:
             raise InputError(f"{len(flares)} flares, expected at most {BATCH[scene.frames] - 1} in one launch")
-        asked = Hypotheses(quiet, flares, statistics, scene, nuisances=known(nuisances, quiet))
+        asked = Hypotheses(quiet, flares, statistics, scene, nuisances=as_nuisances(nuisances, quiet))
         plan = plan_channels(asked, range(len(flares)), first=True)
         out = np.empty((plan.n_rows, count), np.float32)
 

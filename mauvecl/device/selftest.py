@@ -28,7 +28,7 @@ from mauvecl.results.counts.tally import Tally
 from mauvecl.results.requests.channels import ChannelPlan, plan_channels
 from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.results.snr import Counts, elements, observers
-from mauvecl.statistics.nuisances import known
+from mauvecl.statistics.nuisances import as_nuisances
 from mauvecl.statistics.registry import STATISTICS
 
 if TYPE_CHECKING:
@@ -182,7 +182,7 @@ def _statistics(name: str, scene: Scene) -> tuple[NDArray[np.float32], ChannelPl
     """Every statistic of a case by the twin, and which is which."""
     options, how = CASES[name]
     quiet, flare = toy(**options), toy(flare=0.3, **options)
-    unknown = known(how.get("nuisances"), quiet)
+    unknown = as_nuisances(how.get("nuisances"), quiet)
     hypotheses = Hypotheses(quiet, (flare,), _asked(how), scene, nuisances=unknown)
     plan = plan_channels(hypotheses, range(1), first=True)
     index = np.arange(START, START + COUNT, dtype=np.uint64)

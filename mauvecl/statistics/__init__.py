@@ -1,1 +1,1 @@
-"""What is asked of draws: the detection statistics and their distributions for Gaussian noise."""
+"""Detection statistics and their distributions for Gaussian noise."""

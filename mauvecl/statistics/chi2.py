@@ -1,4 +1,4 @@
-"""Chi-squared over pixels, over resolution elements, and against one noisy exposure."""
+"""Chi-squared statistics of pixels, of resolution elements, and relative to a noisy exposure."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
 
 
-#: Pixels whose ratios of true to assumed variance differ by less, relatively, are taken together in closed forms.
-ALIKE = 0.005
+#: Relative width of the groups of pixels, by ratio of true to assumed variance, in closed forms.
+GROUP_WIDTH = 0.005
 
 
 class Chi2(QuadraticStatistic):
-    """Sum over pixels of the squared difference over its variance."""
+    """Sum over pixels of the squared difference divided by its variance."""
 
     name = "chi2"
     definition: ClassVar[str] = "sum over pixels of (observed - reference)^2 / variance"
@@ -51,7 +51,7 @@ class Chi2(QuadraticStatistic):
     def _marginal_form(
         nuisances: Nuisances, spectra: Float, delta: Float, model: Float, true: Float, scatter: Float | None
     ) -> QuadraticForm:
-        """Of x^T C^-1 x, x normal of mean delta and of the true variances with the unknowns' own."""
+        """Return the distribution of x^T C^-1 x for normal x of mean `delta`, true variance and nuisance scatter."""
         if scatter is None and not delta.any() and np.array_equal(model, true):
             size = delta.size - nuisances.free
             return QuadraticForm(np.ones(size), np.zeros(size))
@@ -59,11 +59,11 @@ class Chi2(QuadraticStatistic):
         rows = nuisances.rows(model, spectra) * scale
         drawn = (nuisances.finite(spectra) if scatter is None else scatter) / scale
         basis, rest = _span(np.vstack([spectra / scale, drawn, delta / scale]), true / model)
-        # In the span: the covariance, and what the statistic multiplies.
+        # Covariance and quadratic form within the span.
         noise = basis.T @ ((true / model)[:, None] * basis) + (drawn @ basis).T @ (drawn @ basis)
         taken, root = rows @ basis, np.linalg.cholesky(noise)
         weight, vectors = np.linalg.eigh(root.T @ root - (taken @ root).T @ (taken @ root))
-        # What is projected out has no weight.
+        # Projected-out directions have no weight.
         kept = weight > 1e-9 * weight[-1]
         shift = vectors.T @ solve_triangular(root, basis.T @ (delta / scale), lower=True)
         weights, shifts = np.append(weight[kept], rest), np.append(shift[kept], np.zeros(rest.size))
@@ -71,14 +71,14 @@ class Chi2(QuadraticStatistic):
 
     def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
         x, variance = x * setting.used, variance * setting.used
-        subtracted = np.sum((x @ self.subtracted(setting).T) ** 2, axis=-1)
+        subtracted = np.sum((x @ self.subtracted_rows(setting).T) ** 2, axis=-1)
         x, variance = (self._grouped(setting, values) for values in (x, variance))
         total = np.sum(np.divide(x**2, variance, out=np.zeros_like(x), where=variance > 0), axis=-1)
         return np.asarray(total - subtracted)
 
-    def subtracted(self, setting: Setting) -> Float:
+    def subtracted_rows(self, setting: Setting) -> Float:
         if not setting.nuisances:
-            return super().subtracted(setting)
+            return super().subtracted_rows(setting)
         model = self._grouped(setting, self.variance(setting) * setting.used)
         return self._per_pixel(setting, setting.nuisances.rows(model, self._spectra(setting)))
 
@@ -88,49 +88,49 @@ class Chi2(QuadraticStatistic):
         directions = eye_array(setting.used.size, format="csr")[setting.used]
         return Tilt(directions, np.ones(directions.shape[0]))
 
-    def own(self, setting: Setting, flare: Expectation | None = None) -> Float:
+    def square_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
         model = self._grouped(setting, self.variance(setting) * setting.used)
         inverse = np.divide(1.0, model, out=np.zeros_like(model), where=model > 0)
-        own = self._per_pixel(setting, inverse) - np.sum(self.subtracted(setting) ** 2, axis=0)
-        return np.asarray(own * setting.used)
+        weights = self._per_pixel(setting, inverse) - np.sum(self.subtracted_rows(setting) ** 2, axis=0)
+        return np.asarray(weights * setting.used)
 
     def _grouped(self, setting: Setting, values: Float) -> Float:
-        """What is squared, from values per pixel along the last axis."""
+        """Convert values per pixel, along the last axis, to values per squared term."""
         return values
 
     def _per_pixel(self, setting: Setting, values: Float) -> Float:
-        """For each pixel the value of what it belongs to."""
+        """Convert values per squared term to values per pixel."""
         return values
 
     def _spectra(self, setting: Setting) -> Float:
-        """Of the unknowns, in what is squared."""
+        """Return the nuisance spectra per squared term."""
         assert setting.nuisances is not None
         return self._grouped(setting, setting.nuisances.spectra * setting.used)
 
 
 def _span(vectors: Float, ratio: Float) -> tuple[Float, Float]:
-    """Orthonormal vectors that hold some vectors' parts in pixels of nearly equal ratios, and the other weights.
+    """Return an orthonormal basis of the vectors' parts in groups of pixels, and the weights outside its span.
 
     Parameters
     ----------
     vectors : ndarray, shape (k, n)
-        In standard deviations of each value.
+        Vectors in standard deviations of each value.
     ratio : ndarray, shape (n,)
-        Of the true variances to the model's.
+        True variances divided by the model's.
 
     Returns
     -------
     basis : ndarray, shape (n, m)
     rest : ndarray, shape (n - m,)
-        What multiplies a square along each direction beside them: its group's mean, so that the sum is kept.
+        Coefficients of squares along the directions outside the span: the mean of the group, which preserves the sum.
 
     Notes
     -----
-    Exact where the ratios of a group are equal. Groups are `ALIKE` wide, and what couples the span and the rest moves
-    eigenvalues by the square of that.
+    The result is exact if ratios are equal within groups. Groups are `GROUP_WIDTH` wide, and the coupling of the span
+    to the rest changes eigenvalues by the square of this width.
     """
     order = np.argsort(ratio)
-    group = np.floor(np.log(ratio[order] / ratio[order[0]]) / ALIKE)
+    group = np.floor(np.log(ratio[order] / ratio[order[0]]) / GROUP_WIDTH)
     parts, rest = [], []
     for members in np.split(order, np.flatnonzero(np.diff(group)) + 1):
         basis, sizes, _ = np.linalg.svd(vectors[:, members].T, full_matrices=False)
@@ -145,7 +145,7 @@ def _span(vectors: Float, ratio: Float) -> tuple[Float, Float]:
 
 
 class Chi2Element(Chi2):
-    """The same over sums of resolution elements."""
+    """Sum over resolution elements of the squared difference divided by its variance."""
 
     name = "chi2_element"
     definition: ClassVar[str] = "the same over sums of 10.5 nm resolution elements"
@@ -171,7 +171,7 @@ class Chi2Element(Chi2):
 
 
 class Chi2Pair(Chi2):
-    """Chi-squared over pixels of the difference of two exposures."""
+    """Chi-squared over pixels of the difference between two exposures."""
 
     name = "chi2_pair"
     definition: ClassVar[str] = "against a noisy quiescent exposure: twice the variance"

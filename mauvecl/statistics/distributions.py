@@ -1,4 +1,4 @@
-"""The distributions that detection statistics have for Gaussian noise."""
+"""Distributions of detection statistics for Gaussian noise."""
 
 from __future__ import annotations
 
@@ -12,25 +12,17 @@ from scipy import special
 
 from mauvecl.statistics.inversion import Squares
 
-#: Standard deviations from the mean within which a transform is computed once for all values, if there are as many
-#: effective terms and the probability is as large.
+#: Limits of the precomputed transform: distance from the mean in standard deviations, least number of effective terms,
+#: least probability.
 NEAR, MANY, RARE = 40.0, 30.0, 1e-9
 
 
 @dataclass(frozen=True, eq=False)
 class QuadraticForm:
-    """sum_i weight_i (z_i + shift_i)^2 with independent standard normals z_i: a generalised chi-squared.
+    """Generalised chi-squared variable: sum_i weight_i (z_i + shift_i)^2 with independent standard normals z_i."""
 
-    Attributes
-    ----------
-    weight : ndarray, shape (n,)
-        Positive.
-    shift : ndarray, shape (n,)
-        Means in standard deviations.
-    """
-
-    weight: NDArray[np.float64]
-    shift: NDArray[np.float64]
+    weight: NDArray[np.float64]  # positive, shape (n,)
+    shift: NDArray[np.float64]  # means in standard deviations, shape (n,)
 
     @property
     def mean(self) -> float:
@@ -47,26 +39,26 @@ class QuadraticForm:
 
     @property
     def effective_terms(self) -> float:
-        """How many equal terms would scatter as much for their sum: (sum of weights)^2 / sum of their squares."""
+        """Number of equal terms with the same relative scatter: (sum of weights)^2 / sum of squared weights."""
         return float(self.weight.sum() ** 2 / np.sum(self.weight**2))
 
     def sf(self, value: float) -> float:
-        """Probability of exceeding `value`.
+        """Return the probability of exceeding `value`.
 
         Notes
         -----
-        Of many terms, and not far out, Davies's inversion of the characteristic function (1973, doi
-        10.1093/biomet/60.2.415), computed once for all values: a trapezoidal sum whose aliasing error is the
-        probability of lying more than 2 pi / spacing away. The spacing puts that 40 standard deviations out, below
-        1e-15 for ten terms or more; the sum stops where its terms have fallen below 1e-15. Of few terms, and far out,
-        the integral of `inversion`, which keeps its digits.
+        For many terms and values near the mean, the characteristic function is inverted by a trapezoidal sum (Davies
+        1973, doi 10.1093/biomet/60.2.415), whose terms are computed once for all values. Its aliasing error is the
+        probability of a distance above 2 pi / spacing. The spacing makes this distance 40 standard deviations, for an
+        error below 1e-15 with ten terms or more, and the sum ends when its terms are below 1e-15. Otherwise the
+        integral of `inversion` is used, which is accurate far in the tail.
         """
         if value <= 0.0:
             return 1.0
         if self._is_chi_squared():
             if not self.shift.any():
                 return float(special.chdtrc(self.weight.size, value))
-            # scipy.stats takes a second to load, and is not needed by most studies.
+            # scipy.stats takes a second to import, and most studies do not need it.
             from scipy.stats import ncx2
 
             return float(ncx2.sf(value, self.weight.size, np.sum(self.shift**2)))
@@ -85,12 +77,12 @@ class QuadraticForm:
 
     @cached_property
     def _near(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-        """Frequencies, and the characteristic function's modulus and phase there, for all values that are near."""
+        """Frequencies, and modulus and phase of the characteristic function, for values near the mean."""
         spacing = 2.0 * np.pi / ((40.0 + NEAR) * self.std)
         weight, count, pull = self.weight, np.ones(self.weight.size), self.shift**2 * self.weight
         values, member = np.unique(weight, return_inverse=True)
         if values.size < weight.size / 2:
-            # Equal weights count together: of marginalised statistics most are.
+            # Most weights of marginalised statistics are equal.
             weight, count = values, np.bincount(member).astype(np.float64)
             pull = np.bincount(member, pull).astype(np.float64)
         parts = []
@@ -108,7 +100,7 @@ class QuadraticForm:
                 return np.concatenate(us), np.concatenate(sizes), np.concatenate(phases)
 
     def isf(self, probability: float) -> float:
-        """The value exceeded with this probability, 0 < probability < 1."""
+        """Return the value that is exceeded with a probability in (0, 1)."""
         if self._is_chi_squared() and not self.shift.any():
             return float(special.chdtri(self.weight.size, probability))
         if self.effective_terms >= MANY and RARE < probability < 1.0 - RARE:
@@ -126,34 +118,27 @@ class QuadraticForm:
 
 @dataclass(frozen=True)
 class Gaussian:
-    """A normal distribution, with the same face as `QuadraticForm`."""
+    """A normal distribution with the interface of `QuadraticForm`."""
 
     mean: float
     std: float
     third: ClassVar[float] = 0.0
 
     def sf(self, value: float) -> float:
-        """Probability of exceeding `value`."""
+        """Return the probability of exceeding `value`."""
         return float(special.ndtr((self.mean - value) / self.std))
 
     def isf(self, probability: float) -> float:
-        """The value exceeded with this probability."""
+        """Return the value that is exceeded with a probability in (0, 1)."""
         return float(self.mean - self.std * special.ndtri(probability))
 
 
 @dataclass(frozen=True, eq=False)
 class Mixture:
-    """One of several distributions, with the same face: what a statistic is where the noise depends on what is drawn.
-
-    Attributes
-    ----------
-    parts : tuple of QuadraticForm or Gaussian
-    weights : ndarray, shape (n,)
-        Probability of each.
-    """
+    """A mixture of distributions, for statistics whose noise depends on drawn factors."""
 
     parts: tuple[QuadraticForm | Gaussian, ...]
-    weights: NDArray[np.float64]
+    weights: NDArray[np.float64]  # probability of each part, shape (n,)
 
     @cached_property
     def mean(self) -> float:
@@ -171,11 +156,11 @@ class Mixture:
         return float(self.weights @ each)
 
     def sf(self, value: float) -> float:
-        """Probability of exceeding `value`."""
+        """Return the probability of exceeding `value`."""
         return min(float(self.weights @ [part.sf(value) for part in self.parts]), 1.0)
 
     def isf(self, probability: float) -> float:
-        """The value exceeded with this probability, 0 < probability < 1."""
+        """Return the value that is exceeded with a probability in (0, 1)."""
         from scipy.optimize import brentq
 
         low, high = self.mean - self.std, self.mean + self.std
@@ -186,5 +171,5 @@ class Mixture:
         return float(brentq(lambda x: np.log(self.sf(x) / probability), low, high, xtol=1e-9 * self.std))
 
 
-#: What a closed form is.
+#: Closed form of a statistic's distribution.
 Form = QuadraticForm | Gaussian | Mixture

@@ -1,4 +1,4 @@
-"""Weighted sums: the matched filter, the excess in the ultraviolet, and statistics of one's own."""
+"""Weighted sums: matched filter, ultraviolet excess and user-defined statistics."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from mauvecl.statistics.statistic import Float, LinearStatistic, Setting
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
 
-#: Where `uv_excess` looks, nm.
+#: Range of `uv_excess`, nm.
 UV_NM = (200.0, 360.0)
 
 
 class Matched(LinearStatistic):
-    """The flare's own shape as weights, delta / v / sqrt(lambda), with lambda = sum delta^2 / v.
+    """Matched filter with weights delta / v / sqrt(lambda), where delta is the flare and lambda = sum delta^2 / v.
 
-    It has variance one without a flare, and mean sqrt(lambda) with it; v is the variance of the difference, that of
-    what is subtracted included.
+    The statistic has unit variance without a flare and mean sqrt(lambda) with it. The variance v of the difference
+    includes that of the subtracted reference.
     """
 
     name = "matched"
@@ -41,7 +41,7 @@ class Matched(LinearStatistic):
 
 
 class UvExcess(LinearStatistic):
-    """Net counts in the ultraviolet over the noise of their sum."""
+    """Net counts in the ultraviolet divided by the noise of their sum."""
 
     name = "uv_excess"
     definition: ClassVar[str] = f"net counts from {UV_NM[0]:g} to {UV_NM[1]:g} nm, in standard deviations"
@@ -67,13 +67,13 @@ class UvExcess(LinearStatistic):
 @public
 @dataclass(frozen=True, eq=False)
 class Linear(ContentEquality, LinearStatistic):
-    """A statistic of one's own: the sum over pixels of weight times (observed - reference), DN of the exposure.
+    """A user-defined statistic: the sum over pixels of weight times (observed - reference), DN of the exposure.
 
     Attributes
     ----------
     name : str
     weights : ndarray, shape (n_pixel,)
-        Per DN; pixels that a reference saturates are left out.
+        Weights per DN; pixels that saturate in the reference are not used.
     """
 
     name: str

@@ -1,17 +1,14 @@
-"""Names of the statistics, and of what they are marginalised over, for whoever asks for some.
-
-`registry` and `nuisances` have what is behind them, and take longer to load.
-"""
+"""Names of statistics and nuisance parameters; `registry` and `nuisances`, which define them, take longer to import."""
 
 from __future__ import annotations
 
 from mauvecl.host.errors import InputError
 
-#: In the order of tables and pictures.
+#: All statistics in the order of tables and plots.
 STATISTIC_NAMES = ("chi2", "chi2_element", "chi2_pair", "matched", "uv_excess", "paper")
-#: Computed where nobody names any.
-USUAL_STATISTICS = ("chi2", "chi2_element", "matched")
-#: Spectra of the unknowns that a setting brings along, and the unit of their amplitudes.
+#: Statistics computed by default.
+DEFAULT_STATISTICS = ("chi2", "chi2_element", "matched")
+#: Nuisance parameters with built-in spectra, and the units of their amplitudes.
 NUISANCES = {
     "dark": "detector temperature, deg C",
     "light": "throughput, pointing or the star's own level, relative",
@@ -21,12 +18,6 @@ NUISANCES = {
 
 
 def check_statistic(name: str) -> None:
-    """Refuse what is no statistic's name.
-
-    Raises
-    ------
-    InputError
-        With the names that there are.
-    """
+    """Raise InputError for an unknown statistic."""
     if name not in STATISTIC_NAMES:
         raise InputError(f"statistic {name!r} is unknown, expected one of {', '.join(STATISTIC_NAMES)}")

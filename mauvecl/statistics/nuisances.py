@@ -1,7 +1,7 @@
-"""What the observer does not know: amplitudes of known spectra, which statistics marginalise over (METHODS section 7).
+"""Nuisance parameters: unknown amplitudes of known spectra, which statistics marginalise over (METHODS section 7).
 
-An exposure's covariance is C = V + U^T S U: V the diagonal of the noise, U the spectra of the unknowns, S the variances
-of their amplitudes; an amplitude of infinite variance is projected out.
+The covariance of an exposure is C = V + U^T S U with the diagonal V of the noise, the nuisance spectra U and the
+variances S of their amplitudes. An amplitude of infinite variance is projected out.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Half of the output's range, over which `tilt` counts, and its middle, nm.
+#: Half-width and middle of the output range, nm, which normalise the spectrum of `tilt`.
 TILT_NM, MIDDLE_NM = 250.0, 450.0
 
 
@@ -36,9 +36,9 @@ class Nuisances(ContentEquality):
     ----------
     names : tuple of str
     spectra : ndarray, shape (k, n_pixel)
-        DN of the exposure for an amplitude of one.
+        DN of the exposure for unit amplitude.
     sd : ndarray, shape (k,)
-        Prior standard deviations of the amplitudes; infinite where nothing is known.
+        Prior standard deviations of the amplitudes; infinite for a flat prior.
     """
 
     names: tuple[str, ...]
@@ -64,20 +64,20 @@ class Nuisances(ContentEquality):
     def of(
         cls, quiet: Expectation, sd: Mapping[str, float], own: Mapping[str, NDArray[np.float64]] | None = None
     ) -> Nuisances:
-        """Of a quiescent exposure.
+        """Compute the nuisance spectra of a quiescent exposure.
 
         Parameters
         ----------
         quiet : Expectation
         sd : mapping of str to float
-            Of `NUISANCES` and of one's own; infinite for what is projected out.
+            Prior standard deviations by name, of `NUISANCES` or `own`; infinite to project a parameter out.
         own : mapping of str to ndarray, shape (n_pixel,), optional
-            Spectra of one's own, DN of the exposure for an amplitude of one.
+            User-defined spectra, DN of the exposure for unit amplitude.
 
         Raises
         ------
         InputError
-            For a name without a spectrum, or a spectrum that is zero everywhere.
+            If a name has no spectrum, or a spectrum is zero everywhere.
         """
         own = own or {}
         spectra = []
@@ -108,40 +108,36 @@ class Nuisances(ContentEquality):
 
     @property
     def free(self) -> int:
-        """How many are projected out."""
+        """Number of projected-out parameters."""
         return int(np.isinf(self.sd).sum())
 
     def without(self, names: Collection[str]) -> Nuisances:
-        """The others."""
+        """Return all parameters but those named."""
         kept = [i for i, name in enumerate(self.names) if name not in names]
         return Nuisances(tuple(self.names[i] for i in kept), self.spectra[kept], self.sd[kept])
 
     def finite(self, spectra: Float) -> Float:
-        """Spectra of those with a prior, times their standard deviations, shape (k_finite, n)."""
+        """Return the spectra with finite priors times their standard deviations, shape (k_finite, n)."""
         known = np.isfinite(self.sd)
         return np.asarray(spectra[known] * self.sd[known, None])
 
     def rows(self, variance: Float, spectra: Float) -> Float:
-        """What is subtracted from chi-squared: x^T C^-1 x = sum x^2 / v - sum (rows @ x)^2 (Woodbury).
+        """Return the rows of x^T C^-1 x = sum x^2 / v - sum (rows @ x)^2 (Woodbury identity), shape (k, n).
 
         Parameters
         ----------
         variance : ndarray, shape (n,)
-            Positive where a value counts, zero elsewhere.
+            Diagonal v; zero for unused values.
         spectra : ndarray, shape (k, n)
-
-        Returns
-        -------
-        ndarray, shape (k, n)
 
         Raises
         ------
         InputError
-            If two that are projected out have the same shape.
+            If projected-out spectra are linearly dependent.
         """
         inverse = np.divide(1.0, variance, out=np.zeros_like(variance), where=variance > 0)
         information = np.diag(self.sd**-2.0) + (spectra * inverse) @ spectra.T
-        # Amplitudes have units of their own: compared in standard deviations.
+        # Scaled to standard deviations, because amplitudes have different units.
         scale = np.sqrt(np.diag(information))
         eigenvalues = np.linalg.eigvalsh(information / np.outer(scale, scale))
         if eigenvalues[0] < 1e-10:
@@ -153,13 +149,7 @@ class Nuisances(ContentEquality):
 
 
 def spectrum_of(name: str, quiet: Expectation) -> Float:
-    """One of `NUISANCES`, DN of the exposure for an amplitude of one, shape (n_pixel,).
-
-    Raises
-    ------
-    InputError
-        For another name.
-    """
+    """Return the spectrum of one of `NUISANCES`, DN of the exposure for unit amplitude, shape (n_pixel,)."""
     if name == "dark":
         return np.asarray(quiet.n_frames * quiet.dark_dn * quiet.conditions["dark_slope_per_c"])
     if name == "light":
@@ -171,13 +161,13 @@ def spectrum_of(name: str, quiet: Expectation) -> Float:
     raise InputError(f"the unknown {name!r} has no spectrum, expected one of {', '.join(NUISANCES)} or a file")
 
 
-def known(given: Nuisances | Mapping[str, float] | None, quiet: Expectation) -> Nuisances | None:
-    """What a caller names, as a setting takes it."""
+def as_nuisances(given: Nuisances | Mapping[str, float] | None, quiet: Expectation) -> Nuisances | None:
+    """Convert standard deviations by name to nuisance parameters; an empty mapping becomes None."""
     if given is None or isinstance(given, Nuisances):
         return given
     return Nuisances.of(quiet, given) if given else None
 
 
-def joined(names: Sequence[str]) -> str:
-    """Names in a sentence."""
+def join_names(names: Sequence[str]) -> str:
+    """Join names for a sentence: "a, b and c"."""
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"

@@ -1,4 +1,4 @@
-"""The MauveSim paper's own comparison, as a statistic."""
+"""The MauveSim paper's comparison as a statistic."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
 
 class Paper(QuadraticStatistic):
-    """Sum of (F - Q)^2 / F on smoothed spectra, F an exposure with a flare and Q one without."""
+    """Sum of (F - Q)^2 / F of smoothed spectra, where F is an exposure with a flare and Q one without."""
 
     name = "paper"
     definition: ClassVar[str] = (
@@ -28,11 +28,11 @@ class Paper(QuadraticStatistic):
     marginal: ClassVar[bool] = False
 
     def smoothing(self, setting: Setting) -> Smoothing:
-        """The paper's, on the pixels that count."""
-        return setting.remembered("smoothing", lambda: Smoothing.of(setting.quiet, setting.used, setting.flares))
+        """Return the paper's smoothing of the used pixels."""
+        return setting.cached("smoothing", lambda: Smoothing.of(setting.quiet, setting.used, setting.flares))
 
     def scale(self, setting: Setting, flare: Expectation | None) -> Float:
-        """Factors of the squares of smoothed DN, shape (n_centre,)."""
+        """Return the factors of the squares of smoothed DN, shape (n_centre,)."""
         assert flare is not None
         return self.smoothing(setting).scale(flare)
 
@@ -50,5 +50,5 @@ class Paper(QuadraticStatistic):
         square, modes = self.smoothing(setting).modes(self.scale(setting, flare), sd**2)
         return Tilt(modes * sd / np.sqrt(square)[:, None], square)
 
-    def own(self, setting: Setting, flare: Expectation | None = None) -> Float:
+    def square_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
         return np.asarray(self.scale(setting, flare) @ self.smoothing(setting).rows ** 2)

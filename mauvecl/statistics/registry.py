@@ -1,4 +1,4 @@
-"""Every statistic by its name; a new one is added here."""
+"""Registry of the statistics by name."""
 
 from __future__ import annotations
 
@@ -11,24 +11,17 @@ from mauvecl.statistics.names import check_statistic
 from mauvecl.statistics.paper import Paper
 from mauvecl.statistics.statistic import Statistic
 
-#: In the order of tables and pictures.
+#: All statistics in the order of tables and plots; add a new one here.
 STATISTICS: dict[str, Statistic] = {
     one.name: one for one in (Chi2(), Chi2Element(), Chi2Pair(), Matched(), UvExcess(), Paper())
 }
 
 
-def chosen(asked: Sequence[str | Linear]) -> dict[str, Statistic]:
-    """The statistics asked for, by name, each once.
+def statistics_by_name(asked: Sequence[str | Linear]) -> dict[str, Statistic]:
+    """Return the requested statistics by name.
 
-    Parameters
-    ----------
-    asked : sequence of str or Linear
-        Names of `STATISTICS`, and statistics of one's own.
-
-    Raises
-    ------
-    InputError
-        If none is asked for, a name is unknown, or one's own has the name of another.
+    `asked` holds names of `STATISTICS` and user-defined statistics. Raises InputError if it is empty, or a name is
+    unknown or not unique.
     """
     named: dict[str, Statistic] = {}
     own: set[str] = set()
@@ -49,5 +42,5 @@ def chosen(asked: Sequence[str | Linear]) -> dict[str, Statistic]:
 
 
 def label(name: str) -> str:
-    """What the axis of a statistic's values is called; one's own go by their names."""
+    """Return the axis label of a statistic; that of a user-defined one is its name."""
     return STATISTICS[name].label if name in STATISTICS else name

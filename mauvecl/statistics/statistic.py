@@ -1,4 +1,4 @@
-"""What all detection statistics have in common: a definition, weights or sums, a distribution for Gaussian noise."""
+"""Base classes of detection statistics."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.drawn import Drawn
 from mauvecl.statistics.distributions import Form, Gaussian, Mixture, QuadraticForm
-from mauvecl.statistics.nuisances import Nuisances, joined
+from mauvecl.statistics.nuisances import Nuisances, join_names
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -25,184 +25,133 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, eq=False)
 class Setting:
-    """What the statistics of one detection look at.
+    """Common input of the statistics of one detection."""
 
-    Attributes
-    ----------
-    quiet : Expectation
-        The star without a flare: the reference, and the model of the variances.
-    used : ndarray of bool, shape (n_pixel,)
-        Pixels that count.
-    comparison : Comparison
-        What is subtracted, and by whose variances.
-    flares : sequence of Expectation
-        What may be looked for.
-    nuisances : Nuisances, optional
-        What is marginalised over.
-    drawn : Drawn, optional
-        Factors on light, dark and sky that scatter, which closed forms of marginalised statistics integrate over.
-    """
-
-    quiet: Expectation
-    used: NDArray[np.bool_]
-    comparison: Comparison = NOISE_FREE
-    flares: Sequence[Expectation] = ()
-    nuisances: Nuisances | None = None
-    drawn: Drawn | None = None
-    _kept: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
+    quiet: Expectation  # the quiescent star: the reference and the model of the variances
+    used: NDArray[np.bool_]  # pixels that statistics use, shape (n_pixel,)
+    comparison: Comparison = NOISE_FREE  # the subtracted reference and the choice of variances
+    flares: Sequence[Expectation] = ()  # possible templates
+    nuisances: Nuisances | None = None  # parameters that statistics marginalise over
+    drawn: Drawn | None = None  # random factors over which closed forms of marginalised statistics integrate
+    _cache: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:
-        # What is remembered is known by where it lies in this process's memory.
-        return vars(self) | {"_kept": {}}
+        # Keys of the cache hold identities of objects, which are valid in this process only.
+        return vars(self) | {"_cache": {}}
 
     @property
     def integrates(self) -> bool:
-        """Whether closed forms integrate over what is drawn."""
+        """Whether closed forms integrate over the drawn factors."""
         return bool(self.nuisances and self.drawn and not self.comparison.exposures)
 
-    def remembered(self, name: str, make: Callable[[], T]) -> T:
-        """What is dear to make and asked for again."""
-        if name not in self._kept:
-            self._kept[name] = make()
-        return cast("T", self._kept[name])
+    def cached(self, name: str, make: Callable[[], T]) -> T:
+        """Cache an expensive intermediate result."""
+        if name not in self._cache:
+            self._cache[name] = make()
+        return cast("T", self._cache[name])
 
 
 @dataclass(frozen=True, eq=False)
 class Tilt:
-    """Directions along which importance sampling moves or stretches the noise.
+    """Directions along which importance sampling shifts or stretches the noise."""
 
-    Attributes
-    ----------
-    directions : ndarray or sparse array, shape (n_direction, n_pixel)
-        Orthonormal, in standard deviations of each pixel's difference.
-    square : ndarray, shape (n_direction,), optional
-        What the square of a standard normal along each direction adds to a quadratic statistic; none for a linear one.
-    per_sigma : float
-        What a linear statistic gains by one standard deviation along its direction.
-    """
-
+    # Orthonormal in standard deviations of each pixel's difference, dense or sparse, shape (n_direction, n_pixel).
     directions: Any
+    # Coefficients of squared standard normals along the directions in a quadratic statistic, shape (n_direction,).
     square: Float | None = None
-    per_sigma: float = 1.0
+    per_sigma: float = 1.0  # change of a linear statistic for one standard deviation along its direction
 
 
 @dataclass(frozen=True, eq=False)
-class Odds:
-    """What a statistic makes of one flare, for Gaussian noise.
-
-    Attributes
-    ----------
-    null, seen : Form
-        Its distribution without and with the flare.
-    threshold : float
-    """
+class DetectionForms:
+    """Distributions of a statistic without and with a flare for Gaussian noise, and its threshold."""
 
     null: Form
-    seen: Form
+    flaring: Form
     threshold: float
 
     @property
     def probability(self) -> float:
-        """Of detection."""
-        return self.seen.sf(self.threshold)
+        """Detection probability."""
+        return self.flaring.sf(self.threshold)
 
 
 @dataclass(frozen=True, eq=False)
 class Differences:
-    """Of each pixel from the quiescent star.
+    """Distribution of each pixel's difference from the quiescent star."""
 
-    Attributes
-    ----------
-    mean, variance : ndarray, shape (n_pixel,)
-        DN, and the true one, DN^2.
-    estimated : bool
-        Whether a statistic divides by the true variances or by the model's.
-    scatter : ndarray, shape (k, n_pixel), optional
-        Standard deviations of normal amplitudes that they hold, DN; by default those of the finite priors that are
-        marginalised over.
-    """
-
-    mean: Float
-    variance: Float
-    estimated: bool = False
+    mean: Float  # DN, shape (n_pixel,)
+    variance: Float  # true variance, DN^2, shape (n_pixel,)
+    estimated: bool = False  # whether a statistic divides by the true variances instead of the model's
+    # Standard deviations of normal amplitudes, DN, shape (k, n_pixel); None means the finite priors of the nuisances.
     scatter: Float | None = None
 
 
 class Statistic(ABC):
-    """One detection statistic; it holds no data, so that one object serves every detection.
+    """A detection statistic without data, so that one object serves every detection.
 
-    `flare` is the expectation whose shape is looked for; statistics that are not `shaped` take none.
+    The argument `flare` of its methods is the template; statistics that are not `shaped` have none.
     """
 
-    #: As studies, tables and flags call it.
+    #: Name in studies, tables and flags.
     name: str
-    #: What it is, for users.
+    #: Definition for users.
     definition: ClassVar[str]
-    #: For the axes of pictures.
+    #: Label of axes in plots.
     label: ClassVar[str]
-    #: Whether it looks for one flare's shape: each flare then has a null of its own.
+    #: Whether the statistic uses a flare as template, so that each flare has its own null distribution.
     shaped: ClassVar[bool] = False
-    #: Whether it compares with one noisy quiescent exposure, whatever the others are compared with.
+    #: Whether the reference is always one noisy quiescent exposure.
     paired: ClassVar[bool] = False
-    #: Which of the sums that kernels always know it is (`layout.FIXED_STATISTICS`); none where it brings weights.
+    #: Name of the sum that kernels always compute (`layout.FIXED_STATISTICS`); None if the statistic has weights.
     kernel_sum: ClassVar[str | None] = None
-    #: Whether it looks at sums of resolution elements, not at pixels.
+    #: Whether the statistic uses sums over resolution elements instead of pixels.
     by_element: ClassVar[bool] = False
-    #: Whether it can be marginalised over what is unknown.
+    #: Whether the statistic can be marginalised over nuisance parameters.
     marginal: ClassVar[bool] = True
 
     def added_variance(self, setting: Setting) -> float:
-        """Variance of what is subtracted, in that of one exposure."""
+        """Return the variance of the subtracted reference relative to that of one exposure."""
         return 1.0 if self.paired else setting.comparison.added_variance
 
     def variance(self, setting: Setting) -> Float:
-        """Of a pixel's difference without a flare, DN^2, shape (n_pixel,)."""
+        """Return the variance of each pixel's difference without a flare, DN^2, shape (n_pixel,)."""
         return np.asarray((1.0 + self.added_variance(setting)) * setting.quiet.variance_dn2)
 
     def check(self, setting: Setting) -> None:
-        """Refuse a setting in which the statistic says nothing.
-
-        Raises
-        ------
-        InputError
-        """
+        """Raise InputError if the statistic is undefined in this setting."""
         if setting.nuisances and (setting.comparison.estimated or not self.marginal):
             why = "with estimated variances" if self.marginal else "which compares with one noisy exposure"
             raise InputError(
-                f"statistic {self.name!r} {why} cannot be marginalised over {joined(setting.nuisances.names)}, "
+                f"statistic {self.name!r} {why} cannot be marginalised over {join_names(setting.nuisances.names)}, "
                 "expected no unknowns, or another statistic by the model's variances"
             )
 
     def closed_form(self, setting: Setting, observed: Expectation, flare: Expectation | None = None) -> Form:
-        """The distribution for Gaussian noise (METHODS section 6).
+        """Return the distribution for Gaussian noise (METHODS section 6).
 
-        Parameters
-        ----------
-        setting : Setting
-        observed : Expectation
-            What is on the sky; the quiescent star for the null.
-        flare : Expectation, optional
-
-        Notes
-        -----
-        Estimated variances are taken for the true ones, which is what they are on average. What is marginalised over
-        scatters as it is drawn, the variances with it; by its Gaussian prior where it is not drawn, or where noisy
-        exposures are subtracted, which share the factors of a realisation.
+        `observed` is the quiescent star for the null distribution, else a flare. Estimated variances are replaced by
+        the true ones, which they equal on average. Nuisance parameters scatter as they are drawn, and so do the
+        variances. Parameters that are not drawn scatter by their Gaussian priors, as do all parameters if noisy
+        exposures are subtracted, since these share the factors of a realisation.
         """
         delta = np.where(setting.used, observed.recorded_light_dn - setting.quiet.recorded_light_dn, 0.0)
         true = observed.variance_dn2 + self.added_variance(setting) * setting.quiet.variance_dn2
         return self.as_drawn(setting, observed, Differences(delta, true, setting.comparison.estimated), flare)
 
-    def odds(self, setting: Setting, flare: Expectation, fap: float) -> Odds:
-        """Closed forms without and with a flare, and the threshold of a false-alarm probability between them."""
-        shape = flare if self.shaped else None
+    def detection_forms(self, setting: Setting, flare: Expectation, fap: float) -> DetectionForms:
+        """Return the closed forms without and with a flare, and the threshold at a false-alarm probability."""
+        template = flare if self.shaped else None
 
-        def cut() -> tuple[Form, float]:
-            null = self.closed_form(setting, setting.quiet, shape)
+        def null_and_threshold() -> tuple[Form, float]:
+            null = self.closed_form(setting, setting.quiet, template)
             return null, null.isf(fap)
 
-        null, threshold = cut() if self.shaped else setting.remembered(f"cut of {self.name} at {fap!r}", cut)
-        return Odds(null, self.closed_form(setting, flare, shape), threshold)
+        if self.shaped:
+            null, threshold = null_and_threshold()
+        else:
+            null, threshold = setting.cached(f"null of {self.name} at {fap!r}", null_and_threshold)
+        return DetectionForms(null, self.closed_form(setting, flare, template), threshold)
 
     def as_drawn(
         self,
@@ -213,16 +162,16 @@ class Statistic(ABC):
         *,
         priors: bool = True,
     ) -> Form:
-        """`form`, integrated over what is drawn where that is marginalised over.
+        """Return `form` integrated over those nuisance parameters that are drawn.
 
-        Without `priors` what is marginalised over and not drawn does not scatter.
+        Without `priors`, nuisance parameters that are not drawn do not scatter.
         """
         if not setting.integrates:
             return self.form(setting, seen if priors else replace(seen, scatter=np.zeros((0, seen.mean.size))), flare)
         assert setting.nuisances
         assert setting.drawn
         nodes, rows = setting.drawn.nodes(observed, weighted=isinstance(self, LinearStatistic))
-        # Other unknowns keep their Gaussian priors.
+        # Parameters that are not drawn keep their Gaussian priors.
         others = setting.nuisances.without(tuple(setting.drawn.spreads))
         if priors:
             rows = np.vstack([rows, others.finite(others.spectra)])
@@ -235,58 +184,43 @@ class Statistic(ABC):
 
     @abstractmethod
     def dof(self, setting: Setting) -> int:
-        """Degrees of freedom without a flare."""
+        """Return the degrees of freedom without a flare."""
 
     @abstractmethod
     def form(self, setting: Setting, seen: Differences, flare: Expectation | None = None) -> QuadraticForm | Gaussian:
-        """The distribution for differences that are Gaussian."""
+        """Return the distribution for Gaussian differences."""
 
     @abstractmethod
     def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
-        """The statistic of given differences, on the host.
+        """Compute the statistic of differences on the host, shape (n,).
 
-        Parameters
-        ----------
-        setting : Setting
-        x, variance : ndarray, shape (n, n_pixel)
-            Differences, DN, and the variances that are divided by, DN^2.
-        flare : Expectation, optional
-
-        Returns
-        -------
-        ndarray, shape (n,)
+        `x` and `variance` are the differences, DN, and the variances by which they are divided, DN^2, both of shape
+        (n, n_pixel).
         """
 
     @abstractmethod
     def tilt(self, setting: Setting, flare: Expectation | None = None) -> Tilt:
-        """Where importance sampling looks for alarms."""
+        """Return the directions of importance sampling."""
 
 
 class LinearStatistic(Statistic):
-    """A weighted sum of the differences: normal for Gaussian noise."""
+    """A weighted sum of the differences, which is normal for Gaussian noise."""
 
-    #: Whether its weights are scaled such that it has variance one without a flare.
+    #: Whether the weights are scaled to unit variance without a flare.
     normalised: ClassVar[bool] = True
 
     @abstractmethod
     def plain_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
-        """Weights per DN where all is known, shape (n_pixel,); zero for pixels that do not count."""
+        """Return the weights per DN without nuisance parameters, shape (n_pixel,); zero for unused pixels."""
 
     def weights_per_dn(self, setting: Setting, flare: Expectation | None = None) -> Float:
-        """Weights per DN, shape (n_pixel,); zero for pixels that do not count.
+        """Return the weights per DN, shape (n_pixel,); zero for unused pixels.
 
-        Raises
-        ------
-        InputError
-            If what is looked for cannot be told from what is unknown.
-
-        Notes
-        -----
-        Plain weights w look for the spectrum V w. Marginalised they are C^-1 V w (generalised least squares), which for
-        the matched filter is C^-1 delta.
+        Plain weights w search for the spectrum V w. Marginalised weights are C^-1 V w (generalised least squares),
+        which for the matched filter is C^-1 delta. Raises InputError if the nuisance spectra span V w.
         """
-        # The flare is kept with them, so that no other has its identity.
-        made = setting.remembered(
+        # The cached value holds the flare, so that no other object can get its identity.
+        made = setting.cached(
             f"weights of {self.name} for {id(flare)}", lambda: (flare, self._weights_per_dn(setting, flare))
         )
         return made[1]
@@ -302,7 +236,7 @@ class LinearStatistic(Statistic):
         power = float(left @ sought)
         if power <= 1e-10 * float(weights @ sought):
             raise InputError(
-                f"statistic {self.name!r} looks for what cannot be told from {joined(setting.nuisances.names)}, "
+                f"statistic {self.name!r} looks for what cannot be told from {join_names(setting.nuisances.names)}, "
                 "expected fewer unknowns or smaller standard deviations"
             )
         return np.asarray(left / np.sqrt(power) if self.normalised else left)
@@ -318,7 +252,7 @@ class LinearStatistic(Statistic):
         if scatter is not None:
             variance += float(np.sum((scatter @ weights) ** 2))
         spread = float(np.sqrt(variance))
-        # By estimated variances a linear statistic comes in its own standard deviations.
+        # With estimated variances a linear statistic is in units of its standard deviation.
         return Gaussian(mean / spread, 1.0) if seen.estimated else Gaussian(mean, spread)
 
     def values(self, setting: Setting, x: Float, variance: Float, flare: Expectation | None = None) -> Float:
@@ -333,15 +267,15 @@ class LinearStatistic(Statistic):
 
 
 class QuadraticStatistic(Statistic):
-    """A sum of squares of the differences: a generalised chi-squared for Gaussian noise."""
+    """A sum of squares of the differences, a generalised chi-squared variable for Gaussian noise."""
 
     @abstractmethod
-    def own(self, setting: Setting, flare: Expectation | None = None) -> Float:
-        """What multiplies each pixel's own square, per DN^2, shape (n_pixel,)."""
+    def square_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
+        """Return the coefficient of each pixel's squared difference, per DN^2, shape (n_pixel,)."""
 
-    def subtracted(self, setting: Setting) -> Float:
-        """Weights per DN of the sums whose squares are subtracted to marginalise, shape (k, n_pixel).
+    def subtracted_rows(self, setting: Setting) -> Float:
+        """Return the weights per DN of the sums whose squares marginalisation subtracts, shape (k, n_pixel).
 
-        They apply to pixels that count, and are the same for all of an element where the statistic is `by_element`.
+        The weights apply to used pixels. They are equal within an element if the statistic is `by_element`.
         """
         return np.zeros((0, setting.used.size))

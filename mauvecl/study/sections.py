@@ -11,7 +11,7 @@ from mauvecl.host.quantities import is_quantity, numbers, unit_of
 from mauvecl.host.records import Record
 from mauvecl.host.sky import DEFAULT_SKY
 from mauvecl.noise.varied import VARIED
-from mauvecl.statistics.names import STATISTIC_NAMES, USUAL_STATISTICS
+from mauvecl.statistics.names import DEFAULT_STATISTICS, STATISTIC_NAMES
 
 if TYPE_CHECKING:
     from mauvecl.host.sky.zodiacal import Sky
@@ -223,7 +223,7 @@ class Run(Part):
 
     realisations: Annotated[int, Field(ge=1)] = 1_000_000
     seed: Annotated[int, Field(ge=0, lt=2**64)] = 1
-    statistics: Annotated[tuple[str, ...], Field(min_length=1)] = USUAL_STATISTICS
+    statistics: Annotated[tuple[str, ...], Field(min_length=1)] = DEFAULT_STATISTICS
     fap: Annotated[float, Field(gt=0, lt=1)] = 1e-3
     tails: Literal["counted", "sampled"] = "counted"
     reference: str = "template"

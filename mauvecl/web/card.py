@@ -35,7 +35,7 @@ def card(closed: Closed, answers: Answers) -> dict[str, Any]:
         facts.append(("Closed form", percent(closed.chance)))
     facts += [
         ("Threshold", f"{cut:.4g}" if cut == cut else "none"),
-        ("Expected with flare", f"{closed.odds.seen.mean:.4g}"),
+        ("Expected with flare", f"{closed.odds.flaring.mean:.4g}"),
         ("Best S/N per pixel", short(x.snr().max())),
         ("Best S/N per element", short(x.snr_per_element().max())),
     ]

@@ -21,7 +21,7 @@ from mauvecl.web.smooth import Smooth
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
     from mauvecl.host.stars.source import Source
-    from mauvecl.statistics.statistic import Odds
+    from mauvecl.statistics.statistic import DetectionForms
     from mauvecl.study.study import Study
     from mauvecl.web.question import Question
 
@@ -39,7 +39,7 @@ class Closed:
     light : tuple of Source
         The star at the telescope, without and with the flare.
     quiet, flare : Expectation
-    odds : Odds
+    odds : DetectionForms
         Of the asked statistic, for Gaussian noise.
     chance : float
         Probability of detection; NaN where the flare saturates every pixel that counts.
@@ -50,7 +50,7 @@ class Closed:
     light: tuple[Source, Source]
     quiet: Expectation
     flare: Expectation
-    odds: Odds
+    odds: DetectionForms
     chance: float
 
     @classmethod
@@ -77,7 +77,7 @@ class Closed:
         if not setting.used.any():
             raise InputError(f"every pixel of {quiet.name} is saturated, expected a fainter star")
         one.check(setting)
-        odds = one.odds(setting, flare, q.fap)
+        odds = one.detection_forms(setting, flare, q.fap)
         chance = float("nan") if flare.saturated[setting.used].all() else odds.probability
         return cls(q, study, light, quiet, flare, odds, chance)
 
@@ -89,7 +89,7 @@ class Closed:
     @cached_property
     def seen(self) -> Smooth:
         """The statistic with the flare, for pictures."""
-        return Smooth(self.odds.seen)
+        return Smooth(self.odds.flaring)
 
     @cached_property
     def messages(self) -> list[str]:
@@ -108,7 +108,7 @@ class Closed:
             f"in {x.exposure_s:g} s ({frames})"
         )
 
-    def at(self, light: float, rises: Float, *, sky: bool = False) -> list[Odds]:
+    def at(self, light: float, rises: Float, *, sky: bool = False) -> list[DetectionForms]:
         """The odds with other light, which is linear; none where the star saturates every pixel.
 
         Parameters
@@ -128,7 +128,7 @@ class Closed:
         if not setting.used.any():
             return []
         electrons = (light * (base.source_electrons + more * rise) for more in rises)
-        return [one.odds(setting, replace(quiet, source_electrons=light), q.fap) for light in electrons]
+        return [one.detection_forms(setting, replace(quiet, source_electrons=light), q.fap) for light in electrons]
 
     @property
     def slow(self) -> bool:

@@ -137,7 +137,7 @@ def test_what_cannot_be_is_refused_in_a_sentence() -> None:
         Nuisances.of(quiet, {"own": 1.0}, {"own": np.ones(3)})
     twice = Nuisances.of(quiet, {"light": FREE, "own": FREE}, {"own": 2.0 * quiet.recorded_light_dn})
     with pytest.raises(InputError, match="cannot be told apart"):
-        STATISTICS["chi2"].subtracted(Setting(quiet, ~quiet.saturated, nuisances=twice))
+        STATISTICS["chi2"].subtracted_rows(Setting(quiet, ~quiet.saturated, nuisances=twice))
     shape = flare.signal_dn - quiet.signal_dn
     same = Setting(quiet, ~quiet.saturated, nuisances=Nuisances.of(quiet, {"own": FREE}, {"own": shape}))
     with pytest.raises(InputError, match="looks for what cannot be told from own"):

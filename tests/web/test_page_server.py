@@ -292,7 +292,7 @@ def test_the_curve_and_the_map_are_the_closed_form(statistic: str, tmp_path: Pat
 def test_the_excess_is_the_matched_statistics_own(closed: Closed) -> None:
     """Squares of the excess per pixel add up to the matched S/N, squared."""
     pixel, _ = closed.excess
-    assert np.sqrt(np.sum(pixel**2)) == pytest.approx(closed.odds.seen.mean, rel=1e-9)
+    assert np.sqrt(np.sum(pixel**2)) == pytest.approx(closed.odds.flaring.mean, rel=1e-9)
 
 
 def test_the_trade_claims_no_half_beyond_its_axis(closed: Closed, tmp_path: Path) -> None:

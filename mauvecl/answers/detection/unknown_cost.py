@@ -13,7 +13,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.noise.usual import USUAL
 from mauvecl.statistics.linear import Matched
 from mauvecl.statistics.names import NUISANCES
-from mauvecl.statistics.nuisances import Nuisances, joined
+from mauvecl.statistics.nuisances import Nuisances, join_names
 from mauvecl.statistics.statistic import Setting
 from mauvecl.study.nuisances import NuisanceChoice
 
@@ -112,7 +112,7 @@ def spoken(choice: NuisanceChoice) -> str:
     sd: dict[str, float | str] = {u.nuisance: u.sd for u in USUAL} if choice.usual else {}
     sd |= {name: value for name in NUISANCES if (value := getattr(choice, name)) is not None}
     sizes = [f"{CALLED[name]} ({_size(value, '%' if name != 'dark' else 'deg C')})" for name, value in sd.items()]
-    return joined(sizes + [f"{name!r} ({_size(one.sd, '')})" for name, one in choice.own.items()])
+    return join_names(sizes + [f"{name!r} ({_size(one.sd, '')})" for name, one in choice.own.items()])
 
 
 def _size(sd: float | str, unit: str) -> str:

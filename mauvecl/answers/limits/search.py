@@ -114,7 +114,7 @@ class LimitSearch:
         one.check(setting)
         if one.shaped and not flare.saturated[setting.used].all():
             check_shape(quiet, flare, setting.used)
-        return one.odds(setting, flare, self.fap).probability
+        return one.detection_forms(setting, flare, self.fap).probability
 
     def simulated(self, value: float, seed: int) -> Interval:
         """Detection probability with its interval, by the engine."""

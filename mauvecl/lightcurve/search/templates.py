@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.usual import RANK
-from mauvecl.statistics.nuisances import Nuisances, joined
+from mauvecl.statistics.nuisances import Nuisances, join_names
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -97,7 +97,7 @@ class Templates:
         gram = optimal @ flares.T
         power = np.diag(gram)
         if not (power > 1e-10 * np.einsum("tp,tp->t", plain, flares)).all():
-            names = joined(nuisances.names) if nuisances else "nothing"
+            names = join_names(nuisances.names) if nuisances else "nothing"
             raise InputError(f"a flare cannot be told from {names} in one frame, expected fewer unknowns of frames")
         length = np.sqrt(power)
         values, vectors = np.linalg.eigh(gram / np.outer(length, length))

@@ -204,10 +204,10 @@ def _skewed(detection: Detection, statistic: str, template: int, null: Form, cut
         return float(null.sf(cut) + np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) * series)
     assert isinstance(one, QuadraticStatistic)
     # Each pixel's own square has more variance and more skew than a normal's.
-    own = one.own(detection.setting, flare)
+    weights = one.square_weights(detection.setting, flare)
     second = null.std**2
     skewed = null.third
-    more = own**2 @ fourth, own**3 @ (12.0 * fourth * variance + 10.0 * third**2 + sixth)
+    more = weights**2 @ fourth, weights**3 @ (12.0 * fourth * variance + 10.0 * third**2 + sixth)
     plain, there = (
         _gamma_sf(cut, null.mean, second + part * float(more[0]), skewed + part * float(more[1])) for part in (0.0, 1.0)
     )

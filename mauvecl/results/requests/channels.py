@@ -114,7 +114,7 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
                 if isinstance(one, LinearStatistic):
                     weighted.add(one.name, scenario, flare, one.weights_per_dn(hypotheses.setting, looked_for))
                 elif isinstance(one, QuadraticStatistic) and one.kernel_sum is not None:
-                    for number, own in enumerate(one.subtracted(hypotheses.setting)):
+                    for number, own in enumerate(one.subtracted_rows(hypotheses.setting)):
                         weighted.add(one.name, scenario, number, own)
                 elif isinstance(one, Paper):
                     smoothed.add(one.name, scenario, flare, one.scale(hypotheses.setting, looked_for))

@@ -17,7 +17,7 @@ from mauvecl.noise.scene import Scene
 from mauvecl.statistics.distributions import Form
 from mauvecl.statistics.linear import Linear
 from mauvecl.statistics.nuisances import Nuisances
-from mauvecl.statistics.registry import chosen
+from mauvecl.statistics.registry import statistics_by_name
 from mauvecl.statistics.statistic import LinearStatistic, Setting, Statistic
 
 
@@ -56,7 +56,7 @@ class Hypotheses:
     _forms: dict[tuple[str, int | None, int], Form] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        self._chosen = chosen(self.asked)
+        self._chosen = statistics_by_name(self.asked)
         self.statistics = tuple(self._chosen)
         drawn = Drawn.of(self.scene) if self.nuisances else None
         self.setting = Setting(self.quiet, self.scene.used, self.scene.comparison, self.flares, self.nuisances, drawn)

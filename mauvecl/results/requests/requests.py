@@ -21,8 +21,8 @@ from mauvecl.results.requests.channels import ChannelPlan, plan_channels
 from mauvecl.results.requests.fap import Tails
 from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.statistics.linear import Linear
-from mauvecl.statistics.names import USUAL_STATISTICS
-from mauvecl.statistics.nuisances import Nuisances, known
+from mauvecl.statistics.names import DEFAULT_STATISTICS
+from mauvecl.statistics.nuisances import Nuisances, as_nuisances
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,7 @@ class DetectRequest(_Drawn):
     flares: tuple[Expectation, ...]
     realisations: int
     seed: int
-    statistics: Sequence[str | Linear] = USUAL_STATISTICS
+    statistics: Sequence[str | Linear] = DEFAULT_STATISTICS
     start: int = 0
     drawing: Drawing = AUTOMATIC
     comparison: Comparison = NOISE_FREE
@@ -125,13 +125,13 @@ class DetectRequest(_Drawn):
         object.__setattr__(self, "flares", flares)
         if isinstance(self.statistics, str | Linear):
             object.__setattr__(self, "statistics", (self.statistics,))
-        object.__setattr__(self, "nuisances", known(self.nuisances, self.quiet))
+        object.__setattr__(self, "nuisances", as_nuisances(self.nuisances, self.quiet))
 
     @cached_property
     def hypotheses(self) -> Hypotheses:
         """What is drawn, and what is computed of it."""
         scene = prepare([self.quiet, *self.flares], self.drawing, comparison=self.comparison)
-        nuisances = known(self.nuisances, self.quiet)
+        nuisances = as_nuisances(self.nuisances, self.quiet)
         return Hypotheses(self.quiet, self.flares, self.statistics, scene, nuisances=nuisances)
 
     @cached_property

@@ -17,7 +17,7 @@ from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from mauvecl.statistics.statistic import Odds
+    from mauvecl.statistics.statistic import DetectionForms
     from mauvecl.study.study import Study
     from mauvecl.web.closed import Closed
 
@@ -35,7 +35,7 @@ FIRST, HALVINGS, CHANGE = 9, 5, 0.25
 FREE = {"magnitude", "amplitude_percent", "realisations", "seed", "see", "hours", "uploaded"}
 
 
-def odds(closed: Closed, magnitude: float, rises: Float) -> list[Odds]:
+def odds(closed: Closed, magnitude: float, rises: Float) -> list[DetectionForms]:
     """`Closed.at` a magnitude."""
     return closed.at(10 ** (-0.4 * (magnitude - closed.question.magnitude)), rises)
 
@@ -100,7 +100,7 @@ def _map(kept: _Kept) -> tuple[Float, Float, Float]:
     known[0], known[2] = -30.0, 3.0
     for i, magnitude in enumerate(x):
         for j, one in enumerate(odds(kept.closed, magnitude, 10**y / kept.closed.question.amplitude_percent)):
-            unit, seen = one.null.std, one.seen
+            unit, seen = one.null.std, one.flaring
             part, cut = max(seen.mean - one.null.mean, 1e-9 * unit) / unit, (one.threshold - one.null.mean) / unit
             known[:, j, i] = np.log(part), np.log(seen.std / unit), cut, seen.third / seen.std**3
     fine = np.linspace(*MAGNITUDES, 97), np.linspace(low, high, 61)
