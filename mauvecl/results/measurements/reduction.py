@@ -16,7 +16,7 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
-from mauvecl.statistics.nuisances import Nuisances, joined
+from mauvecl.statistics.nuisances import Nuisances, join_names
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -93,7 +93,7 @@ class Reduction:
         gram = optimal @ spanning.T
         power = np.diag(gram)
         if not (power > LEAST_KEPT * np.einsum("tp,tp->t", plain, spanning)).all():
-            unknown = joined(nuisances.names) if nuisances else "nothing"
+            unknown = join_names(nuisances.names) if nuisances else "nothing"
             raise InputError(f"the light of a flare cannot be told from {unknown}, expected fewer unknowns")
         length = np.sqrt(power)
         values, vectors = np.linalg.eigh(gram / np.outer(length, length))
