@@ -18,7 +18,7 @@ import pytest
 
 import mauvecl
 from mauvecl import bulk
-from mauvecl.device.program import DeviceError
+from mauvecl.device.errors import DeviceError
 from mauvecl.host.errors import InputError
 from mauvecl.host.records import Record
 

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.device.errors import DeviceError
 from mauvecl.device.forms import ELEMENT_CHUNK, detection_launches, scene_launches
 from mauvecl.device.opened import Device
-from mauvecl.device.program import DeviceError, DeviceRecord, devices
+from mauvecl.device.program import DeviceRecord, devices
 from mauvecl.device.stares import Stares
 from mauvecl.device.tiles import Progress, Tile, Tiles
 from mauvecl.host.arguments import public

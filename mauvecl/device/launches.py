@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.device.errors import DeviceError
 from mauvecl.device.opened import Device
-from mauvecl.device.program import DeviceError, out_of_memory
+from mauvecl.device.program import out_of_memory
 from mauvecl.device.tiles import Tile
 from mauvecl.noise import layout
 from mauvecl.noise.pixels import PIXEL_BLOCK

@@ -6,7 +6,8 @@ import os
 from typing import Any
 
 from mauvecl.device import program
-from mauvecl.device.program import DeviceError, Variant
+from mauvecl.device.errors import DeviceError
+from mauvecl.device.program import Variant
 from mauvecl.noise.pixels import PIXEL_BLOCK
 
 #: Vectors of realisations that one work-item of the kernels of a detection follows on a processor, at most.

@@ -16,7 +16,8 @@ from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
-from mauvecl.device import processor
+from mauvecl.device.errors import BuildError, DeviceError
+from mauvecl.device.first_build import settle
 from mauvecl.device.kernel_cache import kernel_cache
 from mauvecl.host.version import VERSION
 from mauvecl.noise import layout
@@ -30,14 +31,6 @@ POCL = "Portable Computing Language"
 
 #: What a device with strict arithmetic promises: every draw, statistic and table as on any other such device.
 SAME_BITS = "same bits"
-
-
-class DeviceError(RuntimeError):
-    """The device or its driver cannot do what is asked; the message is one sentence."""
-
-
-class BuildError(DeviceError):
-    """A kernel did not compile; the message holds the numbered source and the device's log."""
 
 
 @dataclass(frozen=True)
@@ -148,9 +141,6 @@ def _devices() -> list[Any]:
         raise DeviceError(
             "no OpenCL device found: install PoCL with `pip install 'pyopencl[pocl]'` or a driver for your device"
         )
-    for device in handles:
-        if device.platform.name == POCL and processor.flags():
-            processor.give_name(device, processor.levels(processor.flags())[0])
     # PoCL on the CPU first: it is the default.
     return sorted(handles, key=lambda d: (d.platform.name != POCL, "cpu" not in _kind(d)))
 
@@ -303,8 +293,7 @@ def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
     # A store shared by several machines holds what each processor can run; names such as "AMD EPYC" do not tell.
     # PoCL tells its programs apart by the place of its own libraries too: what another installation has compiled would
     # be brought back and compiled again at every start.
-    levels = processor.levels(processor.flags())
-    target = (device.name, device.version, device.driver_version, levels[0], sys.prefix)
+    target = (device.name, device.version, device.driver_version, str(settle(device, _devices)), sys.prefix)
     key = hashlib.sha256("\0".join((source, *options, *target)).encode()).hexdigest()[:32]
     restored = kept.restore(key)
     try:

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from typing import Any
 
 from mauvecl.device.engine import Engine, devices
-from mauvecl.device.program import DeviceError
+from mauvecl.device.errors import DeviceError
 from mauvecl.device.selftest import toy
 
 PIXELS = 1600

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mauvecl.device.errors import DeviceError
 from mauvecl.device.opened import Device
-from mauvecl.device.program import DeviceError, out_of_memory
+from mauvecl.device.program import out_of_memory
 
 Progress = Callable[[int, int], None]
 

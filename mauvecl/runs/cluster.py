@@ -15,7 +15,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from urllib.parse import urlsplit
 
-from mauvecl.device.program import DeviceError, DeviceRecord
+from mauvecl.device.errors import DeviceError
+from mauvecl.device.first_build import THREADS
+from mauvecl.device.program import DeviceRecord
 from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
@@ -38,8 +40,6 @@ PATIENCE_S, WORKER_PATIENCE_S = 30.0, 120.0
 TRIES = 8
 #: Seconds between two looks at how many workers there are; requests kept with the workers at a time.
 RECOUNT_S, REQUESTS = 5.0, 32
-#: What tells PoCL, old and new, how many threads it may use.
-THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
 
 
 @public

@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
-from mauvecl.device.program import DeviceError
+from mauvecl.device.errors import DeviceError
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.version import VERSION

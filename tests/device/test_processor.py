@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from mauvecl.device import processor, program
-from mauvecl.device.program import DeviceError
+from mauvecl.device.errors import DeviceError
 
 V2 = {"cx16", "lahf_lm", "popcnt", "sse4_1", "sse4_2", "ssse3"}
 AVX = V2 | {"avx", "xsave"}

@@ -83,7 +83,8 @@ def test_a_forked_child_leaves_the_kernels_to_its_parent(engine: Engine) -> None
 
 
 def test_a_failing_build_shows_the_numbered_source(engine: Engine) -> None:
-    from mauvecl.device.program import BuildError, build
+    from mauvecl.device.errors import BuildError
+    from mauvecl.device.program import build
 
     with pytest.raises(BuildError, match=r"   2  nonsense here"):
         build(engine.opened.context, "// a comment\nnonsense here\n")

@@ -1,0 +1,182 @@
+"""Whatever a driver's compiler does in the first build, the user's process goes on or ends with one sentence."""
+
+from __future__ import annotations
+
+import os
+import stat
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from mauvecl.device import processor
+
+#: Draws on the default device after `before` and prints the level and the digest of the counts, or the sentence.
+RUN = """
+import hashlib, sys
+from mauvecl.device import first_build, kernel_cache, processor, selftest
+from mauvecl.device.engine import DeviceError, Engine
+from mauvecl.host.errors import InputError
+{before}
+try:
+    engine = Engine()
+    print("digest", hashlib.sha256(engine.realise(selftest.toy(), count=64, seed=1).tobytes()).hexdigest())
+    print("level", *first_build._settled.values())
+except (DeviceError, InputError) as error:
+    print("sentence", str(error).count(chr(10)), error)
+"""
+#: A child that misbehaves in its own way where it is asked to compile for the first name, and does nothing otherwise.
+CHILD = """
+import json, sys, os, ctypes, time; asked = json.loads(sys.argv[1]); sys.path[:] = asked["path"]
+from mauvecl.device import first_build
+first_build.limit(asked)
+if asked["name"] == "bad" or asked["name"] is None:
+    {act}
+"""
+#: What compilers of drivers do, and the words for it.
+ACTS = {
+    "os.abort()": "crashed: aborted",
+    "ctypes.string_at(0)": "crashed: segmentation fault",
+    "os.kill(os.getpid(), 4)": "crashed: illegal instruction",
+    "bytearray(6 * 2**30)": "failed",
+    "\n    while True: pass": "of processor time",
+    "time.sleep(60)": "not built after",
+    "os._exit(3)": "failed",
+    "print('no kernels today'); sys.exit(1)": "no kernels today",
+    "os.write(2, b'198 warnings generated.'); os.abort()": "crashed: aborted",
+}
+
+
+def run(cache: Path | str, before: str = "", *, code: str = RUN, **environment: str) -> dict[str, str]:
+    """What a process of its own prints."""
+    child = subprocess.run(
+        [sys.executable, "-c", code.format(before=before)],
+        env=os.environ | {"MAUVECL_CACHE_DIR": str(cache)} | environment,
+        capture_output=True,
+        text=True,
+        timeout=120,
+    )
+    assert child.returncode == 0, child.stderr
+    assert child.stderr == ""
+    return dict(line.split(" ", 1) for line in child.stdout.splitlines())
+
+
+@pytest.fixture(scope="module")
+def chooses() -> None:
+    """Skip where mauvecl does not choose what PoCL compiles for."""
+    from mauvecl.device import program
+
+    if processor.target(program.choose_device(None)[0]) is None:
+        pytest.skip("the default device chooses what it compiles for by itself")
+
+
+@pytest.fixture(scope="module")
+def plain(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, str]]:
+    """A cache after a first start, and what that printed."""
+    cache = tmp_path_factory.mktemp("plain")
+    return cache, run(cache)
+
+
+def misbehaving(act: str, names: str) -> str:
+    # Two seconds by the clock for each of processor time, so that sleeping ends soon.
+    clock = "first_build.CLOCK = 2.0; " if "sleep" in act else ""
+    return f"{clock}first_build.CHILD = {CHILD.format(act=act)!r}; first_build._names = lambda device: {names}"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("act", [act for act in ACTS if "sleep" not in act and "True" not in act])
+def test_next_level_is_tried_where_the_compiler_fails(act: str, tmp_path: Path, plain, chooses) -> None:
+    best = plain[1]["level"]
+    found = run(tmp_path, misbehaving(act, f"('bad', {best!r})"), MAUVECL_BUILD_LIMIT_S="2")
+    assert found == plain[1]
+
+
+@pytest.mark.parametrize("act", ACTS)
+def test_one_sentence_where_no_level_works(act: str, tmp_path: Path) -> None:
+    found = run(tmp_path, misbehaving(act, "(None,)"), MAUVECL_BUILD_LIMIT_S="2")
+    assert found.keys() == {"sentence"}
+    lines, sentence = found["sentence"].split(" ", 1)
+    assert lines == "0"
+    for word in ("processor", "driver", ACTS[act], "mauvecl[intel]", "conda-forge", "--device"):
+        assert word in sentence
+
+
+def test_outcome_is_kept_until_driver_or_version_change(plain: tuple[Path, dict[str, str]]) -> None:
+    cache, first = plain
+    count = "first_build._try = lambda *a: print('tried', a[0]) or ''; "
+    assert run(cache, count) == first
+    changed = run(cache, count + "first_build.VERSION = 'another'")
+    assert changed.keys() == first.keys() | {"tried"}
+
+
+def test_failure_is_kept_for_a_week(tmp_path: Path) -> None:
+    fails = misbehaving("os.abort()", "(None,)")
+    count = "first_build._names = lambda device: (None,); first_build._try = lambda *a: print('tried', a[0]) or ''; "
+    assert "sentence" in run(tmp_path, fails)
+    assert run(tmp_path, count).keys() == {"sentence"}
+    later = "import time; now = time.time; time.time = lambda: now() + 8 * 86400; "
+    assert "tried" in run(tmp_path, count + later)
+
+
+def test_read_only_store_is_enough(plain: tuple[Path, dict[str, str]]) -> None:
+    cache, first = plain
+    folders = [cache, *(path for path in cache.rglob("*") if path.is_dir())]
+    modes = {path: stat.S_IMODE(path.stat().st_mode) for path in folders}
+    # Root may write anywhere; the store is made unwritable for it too.
+    refuse = "kernel_cache._writable = lambda folder: False; " if os.getuid() == 0 else ""
+    try:
+        for path in folders:
+            path.chmod(0o555)
+        assert run(cache, refuse)["digest"] == first["digest"]
+    finally:
+        for path, mode in modes.items():
+            path.chmod(mode)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("how", ["stdin", "thread", "no executable"])
+def test_first_build_works_however_python_was_started(how: str, tmp_path: Path, plain) -> None:
+    code = RUN.format(before="sys.executable = None" if how == "no executable" else "")
+    if how == "thread":
+        code = f"import threading\nt = threading.Thread(target=exec, args=({code!r}, {{}}))\nt.start(); t.join()"
+    child = subprocess.run(
+        [sys.executable, *([] if how == "stdin" else ["-c", code])],
+        input=code if how == "stdin" else None,
+        env=os.environ | {"MAUVECL_CACHE_DIR": str(tmp_path)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert child.stderr == ""
+    assert dict(line.split(" ", 1) for line in child.stdout.splitlines()) == plain[1]
+
+
+@pytest.mark.long
+def test_processes_started_together_try_once(tmp_path: Path, plain: tuple[Path, dict[str, str]]) -> None:
+    log = tmp_path / "log"
+    count = f"real = first_build._try; first_build._try = lambda *a: (open({str(log)!r}, 'a').write('.'), real(*a))[1]"
+    command = [sys.executable, "-c", RUN.format(before=count)]
+    environment = os.environ | {"MAUVECL_CACHE_DIR": str(tmp_path / "cache")}
+    together = [subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True) for _ in range(2)]
+    for one in together:
+        assert f"digest {plain[1]['digest']}" in one.communicate(timeout=120)[0]
+    assert log.read_text() == "."
+
+
+@pytest.mark.long
+def test_zen_4_is_contained(tmp_path: Path, plain: tuple[Path, dict[str, str]], chooses) -> None:
+    """PoCL 3.0 with AVX-512 crashes for the name znver3 after minutes and gigabytes; its child is stopped before."""
+    if "avx512f" not in processor.flags():
+        pytest.skip("this processor has no AVX-512")
+    names = f"first_build._names = lambda device: ('znver3', {plain[1]['level']!r})"
+    start = time.monotonic()
+    assert run(tmp_path, names, MAUVECL_BUILD_LIMIT_S="6") == plain[1]
+    assert time.monotonic() - start < 100
+
+
+def test_limits_that_cannot_be_are_refused(tmp_path: Path) -> None:
+    for wrong in ("-1", "inf", "nan"):
+        assert "MAUVECL_BUILD_LIMIT_S" in run(tmp_path, MAUVECL_BUILD_LIMIT_S=wrong)["sentence"]
