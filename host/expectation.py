@@ -291,6 +291,14 @@ class Expectation(ContentEquality):
         sd = np.sqrt(self.unsaturated_variance_dn2 / self.n_frames)
         return np.asarray(special.ndtr((self.mean_raw_dn - self.highest_dn - 0.5) / sd))
 
+    @property
+    def saturation_clause(self) -> str:
+        """End of a refusal's sentence, ``; N of M pixels of NAME saturate ...``, empty where none does."""
+        many = int(self.saturated.sum())
+        if not many:
+            return ""
+        return f"; {many} of {self.saturated.size} pixels of {self.name} saturate in a frame of {self.frame_s:g} s"
+
     def snr(self) -> Float:
         """Return the signal-to-noise ratio per pixel, shape (n_pixel,).
 

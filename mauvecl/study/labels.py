@@ -20,6 +20,9 @@ if TYPE_CHECKING:
 #: Read noise, DN, from which rounding is like noise whatever the light: the wave that it leaves of the sawtooth's first
 #: harmonic is exp(-2 pi^2), 3e-9, or less.
 NOISY_DN = 1.0
+#: How messages on saturation begin, and how many of them an answer has at most.
+SATURATED = "SATURATED"
+MOST_SATURATED = 12
 
 
 def label(star: Star, x: Expectation) -> str:
@@ -30,9 +33,22 @@ def label(star: Star, x: Expectation) -> str:
 
 
 def told(expectations: list[Expectation]) -> list[str]:
-    """Their messages and where closed forms do not hold, each once, saturation first."""
-    messages = list(dict.fromkeys(message for x in expectations for message in (*x.messages, *_coarse(x))))
-    return sorted(messages, key=lambda m: not m.startswith("SATURATED"))
+    """Return their messages and where closed forms do not hold, as `worst_first` has them.
+
+    Every answer reports the saturation of its stars and flares through this function.
+    """
+    return worst_first(message for x in expectations for message in (*x.messages, *_coarse(x)))
+
+
+def worst_first(messages: Iterable[str]) -> list[str]:
+    """Return messages once each, those on saturation first; of many of these, as a large map has, the rest as one."""
+    once = list(dict.fromkeys(messages))
+    saturated = [text for text in once if text.startswith(SATURATED)]
+    rest = len(saturated) - MOST_SATURATED
+    if rest > 0:
+        more = f"{SATURATED}: pixels of {rest} more stars, flares or exposures of this answer saturate."
+        saturated = [*saturated[:MOST_SATURATED], more]
+    return saturated + [text for text in once if not text.startswith(SATURATED)]
 
 
 def _coarse(x: Expectation) -> tuple[str, ...]:

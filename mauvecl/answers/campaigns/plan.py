@@ -27,7 +27,7 @@ from mauvecl.host.orbit.conditions import PARTICLES_SOURCE, THERMAL_SOURCE
 from mauvecl.host.tables import make_table
 from mauvecl.lightcurve.search.null import DAY_S
 from mauvecl.lightcurve.search.yields import Yield, recovered_per_day
-from mauvecl.study.labels import described, stacked, told
+from mauvecl.study.labels import SATURATED, described, stacked, told
 from mauvecl.study.sections import Rays
 from mauvecl.study.study import Study
 
@@ -242,7 +242,7 @@ class PlanAnswer(Answer):
     @property
     def messages(self) -> list[str]:
         """What saturates, which targets have no answer and why, what is extrapolated, what is said of visibility."""
-        lines = [text for text in told(self.inputs) if text.startswith("SATURATED")]
+        lines = [text for text in told(self.inputs) if text.startswith(SATURATED)]
         typical = [one.name for one in self.planned if one.rates is not None and "typical" in one.rates.source]
         if typical:
             lines.append(

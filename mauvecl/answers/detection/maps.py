@@ -15,7 +15,7 @@ from mauvecl.host.arguments import public
 from mauvecl.host.tables import make_table
 from mauvecl.results.requests.fap import check_fap
 from mauvecl.statistics.intervals import Interval
-from mauvecl.study.labels import described, label, told
+from mauvecl.study.labels import SATURATED, described, label, told, worst_first
 from mauvecl.study.quantities import UNITS
 from mauvecl.study.study import Study
 from mauvecl.study.unknowns import average, drawn, shares
@@ -134,6 +134,7 @@ def detection_map(
     unknown = drawn(study) if study.unknowns.draws else None
     studies = (study,) if unknown is None else unknown.studies
     seen: list[Expectation] = []
+    of_flares: list[str] = []
     maps = []
     for number, one in enumerate(studies):
 
@@ -142,7 +143,7 @@ def detection_map(
                 cells = len(x) * len(y)
                 progress(number * cells + done, len(studies) * cells)
 
-        maps.append(_map(one, x, y, engine, seen, told_of))
+        maps.append(_map(one, x, y, engine, seen, of_flares, told_of))
     values, parts = maps[0], {}
     if unknown is not None:
         values = _averaged(maps)
@@ -163,7 +164,7 @@ def detection_map(
         messages=[
             *_blinded(values),
             *_without_threshold(study, values),
-            *told(seen),
+            *worst_first([*told(seen), *of_flares]),
             *marginal_lines(study),
             *_cost(study, x, y),
         ],
@@ -216,23 +217,25 @@ def _map(
     y: tuple[float | str, ...],
     engine: Engine | Pool,
     seen: list[Expectation],
+    of_flares: list[str],
     told_of: Callable[[int], None],
 ) -> Arrays:
-    """The map on one instrument; quiescent stars are added to `seen`."""
+    """Compute the map on one instrument; add quiescent stars to `seen`, and flares' saturation to `of_flares`."""
     from mauvecl.runs.pool import together
 
     shape = (len(study.run.statistics), len(y), len(x))
     values = {name: np.full(shape, np.nan) for name in ("probability", "low", "high", "closed_form")}
 
-    def filled(cells: list[tuple[int, int]]) -> tuple[Expectation, int]:
+    def filled(cells: list[tuple[int, int]]) -> tuple[Expectation, int, list[str]]:
         quiet, flares = _expectations(study, [(x[i], y[j]) for i, j in cells])
         if not quiet.saturated.all():
             _fill(values, cells, study, quiet, flares, engine)
-        return quiet, len(cells)
+        return quiet, len(cells), [text for text in told(flares) if text.startswith(SATURATED)]
 
     done = 0
-    for quiet, count in together(engine, filled, _groups(study, x, y)):
+    for quiet, count, texts in together(engine, filled, _groups(study, x, y)):
         seen.append(quiet)
+        of_flares.extend(texts)
         done += count
         told_of(done)
     return values

@@ -17,7 +17,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.tables import make_table
 from mauvecl.results.requests.fap import check_fap
 from mauvecl.statistics.intervals import Interval
-from mauvecl.study.labels import described, label, stacked, told
+from mauvecl.study.labels import SATURATED, described, label, stacked, told, worst_first
 from mauvecl.study.quantities import UNITS
 from mauvecl.study.sections import Star
 from mauvecl.study.study import Study
@@ -182,11 +182,10 @@ class LimitResult(Answer):
     @property
     def messages(self) -> list[str]:
         """What holds at the limits, what is told of the stars, and what is unknown."""
-        saturated = dict.fromkeys(text for one in self.limits for text in one.messages)
-        stars = [text for text in told(self.inputs) if not text.startswith("SATURATED")]
+        stars = worst_first([*(text for one in self.limits for text in one.messages), *told(self.inputs)])
         costs = [one.cost for one in self.limits if one.cost is not None]
         failed = [f"NO LIMIT: {text}." for text in self.failed]
-        return [*failed, *saturated, *stars, *marginal_lines(self.study), *cost_lines(costs, self.study)]
+        return [*failed, *stars, *marginal_lines(self.study), *cost_lines(costs, self.study)]
 
     @property
     def pictures(self) -> dict[str, tuple[Any, ...]]:
@@ -247,7 +246,7 @@ def solve(
         curve=question.curve(value.value),
         at=at or {},
         unknown=question.unknown(theory) if isinstance(question, MarginalLimitSearch) else None,
-        messages=tuple(m for m in told([quiet, flare]) if m.startswith("SATURATED")),
+        messages=tuple(m for m in told([quiet, flare]) if m.startswith(SATURATED)),
         quiet=quiet,
         cost=unknown_cost(where, quiet, flare, question.study),
     )

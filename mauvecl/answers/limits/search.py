@@ -179,8 +179,13 @@ class LimitSearch:
         flare = "" if self.of == "amplitude" else f" with a flare of {100 * self.study.flare.amplitudes[0]:.3g} %"
         return InputError(
             f"the detection probability of {name}{flare} by {self.statistic} {verb} {self.power:g} at {self.of} = "
-            f"{value:g}, expected a limit between {_span(self.of)}"
+            f"{value:g}, expected a limit between {_span(self.of)}{self.saturation_clause(value)}"
         )
+
+    def saturation_clause(self, value: float) -> str:
+        """Return what a refusal says of saturation at a value, of the star or else of the flare."""
+        quiet, flare = self.scaled(value)
+        return quiet.saturation_clause or flare.saturation_clause.replace(" saturate ", " saturate with the flare ")
 
     def _bright(self, star: Star) -> bool:
         return self.of != "magnitude" and star.magnitude is not None
@@ -271,6 +276,7 @@ def _settle(question: LimitSearch, start: float) -> Interval:
     if not slope > 0:
         raise InputError(
             f"the detection probability does not rise towards an easier {of} at {start:g}, expected a slope there"
+            f"{question.saturation_clause(start)}"
         )
     at = _coordinate(of, start)
     n = question.study.run.realisations
@@ -285,7 +291,10 @@ def _settle(question: LimitSearch, start: float) -> Interval:
             ends = [_value(of, at + (goal - q) / slope) for q in (low, high)]
             return Interval(_value(of, at + move), min(ends), max(ends))
         at += float(np.clip(move, -0.75, 0.75))
-    raise InputError(f"the limit of {of} did not settle in {MOST_EVALUATIONS} simulations near {_value(of, at):g}")
+    raise InputError(
+        f"the limit of {of} did not settle in {MOST_EVALUATIONS} simulations near {_value(of, at):g}"
+        f"{question.saturation_clause(_value(of, at))}"
+    )
 
 
 def _settle_frames(question: LimitSearch, start: float) -> Interval:

@@ -179,7 +179,7 @@ def _one(study: Study, star: Star, snr: float, wavelength_nm: float, per: Per) -
     if not one > 0 or (snr / one) ** 2 * frame_s > longest:
         raise InputError(
             f"{label(star, frame)} has an S/N of {one:.3g} per {per} at {wavelength_nm:g} nm in one frame, "
-            f"expected enough for {snr:g} within {longest:g} s"
+            f"expected enough for {snr:g} within {longest:g} s{frame.saturation_clause}"
         )
     # S/N grows with the root of the frames, to rounding: the neighbours settle it.
     frames = max(int(np.ceil((snr / one) ** 2)), 1)

@@ -176,7 +176,10 @@ def seen(staring: Staring, bands_nm: Sequence[tuple[float, float]], draw: Draw) 
     for low, high in bands_nm:
         row = used * ((quiet.wavelength_nm >= low) & (quiet.wavelength_nm < high))
         if not row.any():
-            raise InputError(f"the band of {low:g} to {high:g} nm holds no pixel that is used, expected some")
+            raise InputError(
+                f"the band of {low:g} to {high:g} nm holds no pixel that is used, expected some"
+                f"{quiet.saturation_clause}"
+            )
         rows.append(row)
     elements = used * (quiet.element == np.arange(quiet.element_wavelength_nm.size)[:, None])
     filled = np.flatnonzero(elements.any(axis=1))

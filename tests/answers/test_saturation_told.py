@@ -1,0 +1,118 @@
+"""Every verb that has a star says where the star, or a flare, saturates: in its messages, or in its refusal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from mauvecl.answers.campaigns.plan import plan
+from mauvecl.answers.detection.detect import detect
+from mauvecl.answers.detection.gaussian import gaussian_report
+from mauvecl.answers.detection.maps import detection_map
+from mauvecl.answers.limits.limits import limiting_magnitude
+from mauvecl.answers.signal.exposures import exposure_for
+from mauvecl.answers.signal.simulate import simulate
+from mauvecl.answers.signal.snr import snr
+from mauvecl.answers.stares.inject import inject
+from mauvecl.answers.stares.stare import stare
+from mauvecl.device.engine import Engine
+from mauvecl.device.stares import Stares
+from mauvecl.host.errors import InputError
+from mauvecl.store.bulk import realise_file
+from mauvecl.study.labels import told
+from mauvecl.study.study import Study
+
+Messages = Callable[[Study, Engine, Path], list[str]]
+
+FLARING = {"amplitudes": [12.0]}
+MAP = {"x": {"quantity": "amplitude", "values": [1e-4, 12.0]}, "y": {"quantity": "exposure", "values": [5.0, 10.0]}}
+INJECTIONS = {"count": 10, "sizes": 2, "widths": 2, "positions": 4}
+SHORT = {"stare": {"duration_s": 600.0}, "injections": INJECTIONS, "search": {"nulls": 0}}
+
+
+def limits(study: Study, engine: Engine, _: Path) -> list[str]:
+    return list(limiting_magnitude(study, engine).messages)
+
+
+#: Verb: how its messages are had, and what its study needs.
+VERBS: dict[str, tuple[Messages, dict[str, Any]]] = {
+    "simulate": (lambda study, *_: list(simulate(study, flaring=True).messages), {}),
+    "snr": (lambda study, engine, _: list(snr(study, engine).messages), {}),
+    "exposure": (lambda study, *_: list(exposure_for(study, 10.0, 320.0).messages), {}),
+    "detect": (lambda study, engine, _: list(detect(study, engine).messages), {}),
+    "limit of amplitude": (limits, {"limit": {"of": "amplitude"}}),
+    "limit of exposure": (limits, {"limit": {"of": "exposure"}}),
+    "limit of magnitude": (limits, {"limit": {"of": "magnitude"}}),
+    "map": (lambda study, engine, _: list(detection_map(study, engine).messages), {"map": MAP}),
+    "gaussian": (
+        lambda study, engine, _: list(gaussian_report(study, engine).messages),
+        {"sweep": {"axes": [{"quantity": "exposure", "values": [5.0]}]}},
+    ),
+    "stare": (lambda study, *_: list(stare(study, Stares()).messages), SHORT),
+    "inject": (lambda study, *_: list(inject(study, Stares()).messages), SHORT),
+    "realise": (
+        lambda study, engine, folder: told(
+            [scene.expectation for scene in realise_file(study, folder / "frames.h5", engine).scenes]
+        ),
+        {},
+    ),
+}  # fmt: skip
+
+
+def question(magnitude: float, changes: dict[str, float], **sections: Any) -> Study:
+    """A hot star on a part of the pixels."""
+    data: dict[str, Any] = {
+        "star": [{"library": "A0V", "magnitude": magnitude, "distance_pc": 7.7}],
+        "flare": {"amplitudes": [0.01]},
+        "observation": {"exposure_s": 5.0, "changes": changes},
+        "run": {"realisations": 10_000, "seed": 3, "fap": 0.01, "statistics": ["matched"]},
+    }
+    return Study.build(data | sections, "test")
+
+
+@pytest.mark.parametrize("verb", VERBS)
+@pytest.mark.parametrize("low_nm", [250.0, 300.0])
+def test_a_star_that_saturates_is_reported(engine: Engine, tmp_path: Path, verb: str, low_nm: float) -> None:
+    """Where some pixels are left, and where few or none are."""
+    ask, needs = VERBS[verb]
+    # A limit of magnitude searches its own star: one that no bright one satisfies.
+    flare = {"flare": {"amplitudes": [1e-5]}} if verb == "limit of magnitude" else {}
+    study = question(0.03, {"output_min_nm": low_nm, "output_max_nm": 340.0}, **(needs | flare))
+    try:
+        said = ask(study, engine, tmp_path)
+    except InputError as refusal:
+        said = [str(refusal)]
+    assert any("saturate" in text.lower() for text in said), said
+
+
+@pytest.mark.parametrize("verb", ["simulate", "detect", "map", "realise", "gaussian"])
+def test_a_flare_that_saturates_alone_is_reported(engine: Engine, tmp_path: Path, verb: str) -> None:
+    """The star does not saturate; its flare does, and the message names the flare."""
+    ask, needs = VERBS[verb]
+    range_nm = {"output_min_nm": 300.0, "output_max_nm": 340.0}
+    study = question(3.3, range_nm, **(needs | {"flare": FLARING}))
+    quiet, flare = study.expectations(study.star[0])
+    assert not quiet.messages or not quiet.messages[0].startswith("SATURATED")
+    assert flare.saturated.any()
+    said = ask(study, engine, tmp_path)
+    assert any(text.startswith("SATURATED") and "flare" in text for text in said), said
+
+
+def test_many_messages_become_few(engine: Engine) -> None:
+    """A map of 64 cells, each with a flare that saturates: one on all cells, a dozen sentences, one on the others."""
+    axes = {"x": {"quantity": "amplitude", "values": [12.0 + 0.1 * n for n in range(32)]},
+            "y": {"quantity": "exposure", "values": [5.0, 10.0]}}  # fmt: skip
+    study = question(3.3, {"output_min_nm": 300.0, "output_max_nm": 340.0}, map=axes)
+    said = [text for text in detection_map(study, engine).messages if text.startswith("SATURATED")]
+    assert len(said) == 14
+    assert said[-1].startswith("SATURATED: pixels of ")
+
+
+def test_a_plan_reports_it() -> None:
+    study = Study().with_settings(
+        ["plan.targets=[{name = 'Vega'}]", "orbit.days=31", "plan.hours=100", "plan.completeness='closed form'"]
+    )
+    assert any(text.startswith("SATURATED") for text in plan(study).messages)
