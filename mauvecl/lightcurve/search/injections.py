@@ -20,13 +20,14 @@ from numpy.typing import NDArray
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.search.places import Place, place_of
 from mauvecl.lightcurve.search.recoveries import KEPT, Refit
-from mauvecl.lightcurve.search.survey import part_of
+from mauvecl.lightcurve.search.survey import net_of, part_of
 from mauvecl.lightcurve.stares.components import STEADY, Components
 from mauvecl.lightcurve.stares.requests import Method, StaresRequest
 from mauvecl.lightcurve.stares.sums import method_for
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.search.survey import Survey
+    from mauvecl.lightcurve.search.trend import Trend
     from mauvecl.noise.processes import CosmicRays
 
 Float = NDArray[np.float64]
@@ -161,6 +162,7 @@ class Injections:
             None if survey.curves is None else survey.curves[:, window],
             start,
             refit,
+            None if survey.trend is None else survey.trend.part(window),
         )
         return StaresRequest(
             self.quiescent,
@@ -199,6 +201,8 @@ class Injecting:
         Number of the first stare.
     refit : Refit, optional
         Which flares are fitted, and how.
+    trend : Trend, optional
+        What unknowns of these frames do beyond first order.
     """
 
     adds: ClassVar[bool] = False
@@ -215,6 +219,7 @@ class Injecting:
     curves: Float | None
     start: int
     refit: Refit | None = None
+    trend: Trend | None = None
 
     def __call__(self, values: Single, first: int, glow: Single) -> dict[str, NDArray[Any]]:
         """The amplitude from which on each flare is found, (n_stare, n_half_width), and fits where they are asked for.
@@ -240,7 +245,7 @@ class Injecting:
     def drawn(self, values: Single, glow: Single) -> Drawn:
         """A few stares."""
         n_sum = values.shape[2]
-        noise = np.moveaxis(values, 2, 0) - self.known.T[:, None]
+        noise = np.moveaxis(net_of(values, self.known, self.trend), 2, 0)
         own, light = np.ascontiguousarray(np.moveaxis(glow[:, :, :n_sum], 2, 0)), glow[:, :, n_sum]
         return Drawn(_multiple(noise, NOISE_STEP).astype(np.float64), own, light if light.any() else None)
 

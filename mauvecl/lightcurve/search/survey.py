@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import combinations_with_replacement
-from math import factorial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -15,6 +13,7 @@ from mauvecl.lightcurve.search.null import DAY_S
 from mauvecl.lightcurve.search.sampled import Sampled, sampled
 from mauvecl.lightcurve.search.scatter import Scatter
 from mauvecl.lightcurve.search.search import Search
+from mauvecl.lightcurve.search.trend import Trend
 from mauvecl.lightcurve.stares.requests import StaresRequest
 from mauvecl.lightcurve.stares.sums import method_for
 
@@ -31,8 +30,6 @@ Float = NDArray[np.float64]
 LEAST_CURVE = 1e-6
 #: Star-days of a stare that importance sampling looks at, at most.
 SAMPLED_DAYS = 2.0
-#: S/N over a window from which on what is neglected would raise false alarms.
-SEEN = 0.3
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,25 +80,10 @@ class Survey:
 
     @cached_property
     def curves(self) -> Float | None:
-        """Curves of unknown amplitude, shape (n_curve, n_frame): of the stare's unknowns that are no straight line.
-
-        The dark is exponential in the temperature, so that products of two and three curves of it count as well, where
-        their dark could be seen in a window.
-        """
+        """Curves of unknown amplitude, shape (n_curve, n_frame): of the stare's unknowns that are no straight line."""
         if not self.bank.level.cycle:
             return None
         every = [unknown.curve for unknown in self.stare.unknowns]
-        warm = [unknown for unknown in self.stare.unknowns if unknown.of == "temperature"]
-        slope = self.components.quiet.conditions["dark_slope_per_c"]
-        frames = min(self.stare.n_frames, self.bank.level.window_s / self.stare.frame_s)
-        # S/N of a change of the dark by exp(1) over a window.
-        dark = float(np.linalg.norm(self.directions["temperature"], axis=1).max()) / slope * np.sqrt(frames)
-        for order in (2, 3):
-            for some in combinations_with_replacement(warm, order):
-                curve = np.prod([one.curve for one in some], axis=0)
-                amount = np.prod([slope * one.sd for one in some]) / factorial(order)
-                if dark * amount * np.std(curve) > SEEN:
-                    every.append(curve)
         # What is left of each beside a straight line and those before it.
         basis = np.linalg.qr(np.vander(self.stare.start_s / max(self.stare.duration_s, 1.0), 2))[0]
         curves: list[Float] = []
@@ -118,13 +100,21 @@ class Survey:
         """The bank on the stare's frames."""
         return Search(self.bank, self.stare, self.curves, self.variance)
 
+    @cached_property
+    def trend(self) -> Trend | None:
+        """What the stare's unknowns do beyond first order; None where that cannot be seen."""
+        slope = self.components.quiet.conditions["dark_slope_per_c"]
+        return Trend.of_unknowns(
+            self.stare.unknowns, self.directions, self.variance, self.stare.numbers, self.stare.frame_s, slope
+        )
+
     def net(self, sums: NDArray[Any]) -> NDArray[np.float32]:
-        """Sums as drawn less what is known, (..., n_frame, n_sum)."""
-        return np.asarray(sums - self.known, np.float32)
+        """Sums as drawn, (n_stare, n_frame, n_sum), less what is known and what unknowns do beyond first order."""
+        return net_of(sums, self.known, self.trend)
 
     def null(self, count: int, seed: int, cosmic_rays: CosmicRays | None = None) -> StaresRequest:
         """Stares without a flare, and the largest value of each."""
-        largest = Largest(self.bank, self.stare, self.curves, self.variance, self.known)
+        largest = Largest(self.bank, self.stare, self.curves, self.variance, self.known, self.trend)
         method = method_for(self.components, self.stare, cosmic_rays)
         return StaresRequest(
             self.components, self.stare, count, seed, method=method, cosmic_rays=cosmic_rays, reduction=largest
@@ -151,6 +141,7 @@ class Largest:
     curves: Float | None
     variance: Float
     known: Float
+    trend: Trend | None = None
 
     @cached_property
     def search(self) -> Search:
@@ -159,7 +150,13 @@ class Largest:
 
     def __call__(self, values: NDArray[np.float32], first: int) -> dict[str, NDArray[Any]]:
         """As ``maximum``, shape (n_stare,)."""
-        return {"maximum": self.search.largest(np.asarray(values - self.known, np.float32)).maximum}
+        return {"maximum": self.search.largest(net_of(values, self.known, self.trend)).maximum}
+
+
+def net_of(sums: NDArray[Any], known: NDArray[Any], trend: Trend | None) -> NDArray[np.float32]:
+    """Return sums as drawn, (n_stare, n_frame, n_sum), less what is known and what unknowns do beyond first order."""
+    left = sums - known
+    return np.asarray(left if trend is None else trend.subtracted(left), np.float32)
 
 
 def part_of(stare: Stare, part: slice) -> Stare:
