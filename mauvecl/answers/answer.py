@@ -18,6 +18,7 @@ if TYPE_CHECKING:
     from astropy.table import Table
 
     from mauvecl.host.expectation import Expectation
+    from mauvecl.study.assumed import Use
     from mauvecl.study.study import Study
 
 
@@ -39,6 +40,8 @@ class Answer(ContentEquality, ABC):
 
     #: Endings of the files of each table; the first table's alone in some answers.
     ENDINGS: ClassVar[tuple[str, ...]] = ("ecsv",)
+    #: Parts of the study that the answer uses.
+    USES: ClassVar[tuple[Use, ...]]
 
     if TYPE_CHECKING:
 
@@ -64,6 +67,13 @@ class Answer(ContentEquality, ABC):
     @abstractmethod
     def pictures(self) -> dict[str, tuple[Any, ...]]:
         """Every picture by the name of its file: a function of `mauvecl.pictures`, and what it takes before a path."""
+
+    @property
+    def assumed(self) -> str:
+        """One line with what the study assumes of the parts that the answer uses."""
+        from mauvecl.study.assumed import assumption_line
+
+        return assumption_line(self.study, self.USES)
 
     @property
     def remarks(self) -> list[str]:

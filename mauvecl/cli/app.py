@@ -72,5 +72,8 @@ def main() -> None:
     gc.set_threshold(10_000)
     # Threads of linear algebra wait for each other in a loop where kernels, or visitors of the page, have the cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    # Pictures are files: whatever a notebook's kernel wants figures to be shown by is not for this process, and
+    # matplotlib fails at its import where it lacks that.
+    os.environ.pop("MPLBACKEND", None)
     atexit.register(gc.freeze)
     sys.exit(guarded(app))

@@ -141,12 +141,12 @@ class Session:
         """What tables and pictures are made with: three quarters of a second that would be waited for at the end."""
         from importlib import import_module
 
-        from mauvecl.pictures.style import available, pyplot
+        from mauvecl.pictures.style import available, canvas
 
         for name in ("astropy.table", "astropy.io.misc.yaml", "rich.table"):
             import_module(name)
         if self.pictures and available():
-            pyplot()
+            canvas()
 
     def metered(self, unit: str) -> Meter:
         """Progress in a unit, to be used in a `with` block."""
@@ -226,14 +226,15 @@ class Session:
         show : callable
             Prints its tables.
         """
-        self.say(answer.messages)
+        self.say([*answer.messages, answer.assumed])
         with told_of_interrupts(self._written):
             self._leave_all(answer)
         if self.as_json:
             from mauvecl.cli.naming import with_flags
 
             content = answer.as_json()
-            self.print_json(content | {"messages": [with_flags(line) for line in content["messages"]]})
+            told = {"assumed": answer.assumed, "messages": [with_flags(line) for line in content["messages"]]}
+            self.print_json(told | {key: value for key, value in content.items() if key != "messages"})
             return
         show()
         self.say(answer.remarks)

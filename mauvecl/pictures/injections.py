@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.pictures.style import COLOURS, MOST_COLUMNS, STYLE, finished, headline, legend_below, pyplot
+from mauvecl.pictures.style import COLOURS, MOST_COLUMNS, STYLE, canvas, finished, headline, legend_below
 
 if TYPE_CHECKING:
     from mauvecl.answers.stares.inject import InjectAnswer
@@ -30,7 +30,7 @@ def _panels(answer: InjectAnswer) -> tuple[Any, list[Any], list[Any]]:
     stars = answer.stars[:MOST_DRAWN]
     columns = min(len(stars), MOST_COLUMNS)
     rows = -(-len(stars) // columns)
-    figure, axes = pyplot().subplots(rows, columns, figsize=(3.6 * columns + 0.8, 3.2 * rows), squeeze=False)
+    figure, axes = canvas().subplots(rows, columns, figsize=(3.6 * columns + 0.8, 3.2 * rows), squeeze=False)
     for axis in axes.flat[len(stars) :]:
         axis.set_visible(False)
     return figure, stars, list(axes.flat)
@@ -48,7 +48,7 @@ def _titled(figure: Any, answer: InjectAnswer) -> None:
 
 def maps(answer: InjectAnswer, path: str | Path | None) -> Any:
     """Completeness over half-width and size, one panel per star; the figure where no path is given."""
-    with pyplot().rc_context(STYLE):
+    with canvas().rc_context(STYLE):
         figure, stars, axes = _panels(answer)
         mesh = None
         for star, axis in zip(stars, axes, strict=False):
@@ -70,7 +70,7 @@ def maps(answer: InjectAnswer, path: str | Path | None) -> Any:
 
 def energies(answer: InjectAnswer, path: str | Path | None) -> Any:
     """Recovered over injected energy of found flares over half-width and size; the figure where no path is given."""
-    with pyplot().rc_context(STYLE):
+    with canvas().rc_context(STYLE):
         figure, stars, axes = _panels(answer)
         mesh = None
         for star, axis in zip(stars, axes, strict=False):
@@ -93,7 +93,7 @@ def _edges(middles: Any) -> Any:
 
 def curves(answer: InjectAnswer, path: str | Path | None) -> Any:
     """Completeness over size at some half-widths, with 95 % intervals; the figure where no path is given."""
-    with pyplot().rc_context(STYLE):
+    with canvas().rc_context(STYLE):
         figure, stars, axes = _panels(answer)
         for star, axis in zip(stars, axes, strict=False):
             f = star.injected

@@ -12,7 +12,7 @@ import numpy as np
 
 from mauvecl.answers.campaigns.plan_text import LEGEND, SUMMARY, heading, summary_rows, target_lines
 from mauvecl.host.version import VERSION
-from mauvecl.pictures.style import COLOURS, NULL, STYLE, finished, pyplot
+from mauvecl.pictures.style import COLOURS, NULL, STYLE, canvas, finished
 
 if TYPE_CHECKING:
     from mauvecl.answers.campaigns.plan import PlanAnswer
@@ -28,7 +28,7 @@ ASSUMED_AT = (0.0, 0.24, 0.5)
 
 def overview(answer: PlanAnswer, path: str | Path | None) -> Any:
     """Flares expected of each target with 95 % of campaigns, and E50 to E90."""
-    plt = pyplot()
+    plt = canvas()
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(1, 2, figsize=(7.4, 0.24 * len(answer.planned) + 1.5), sharey=True)
         _overview(axes, answer)
@@ -37,7 +37,7 @@ def overview(answer: PlanAnswer, path: str | Path | None) -> Any:
 
 def overview_png(answer: PlanAnswer) -> bytes:
     """The same as PNG."""
-    plt = pyplot()
+    plt = canvas()
     with plt.rc_context(STYLE):
         figure = overview(answer, None)
         return _png(plt, figure)
@@ -73,7 +73,7 @@ def pdf_bytes(answer: PlanAnswer) -> bytes:
     """The report as PDF: the summary, a page for each target, every assumption."""
     from matplotlib.backends.backend_pdf import PdfPages
 
-    plt, made = pyplot(), io.BytesIO()
+    plt, made = canvas(), io.BytesIO()
     # Without a date the same plan is the same file.
     about = {"Title": f"Mauve: {heading(answer)}", "Creator": f"mauvecl {VERSION}", "CreationDate": None}
     with plt.rc_context(STYLE | {"pdf.fonttype": 42}), PdfPages(made, metadata=about) as pages:
@@ -86,7 +86,7 @@ def pdf_bytes(answer: PlanAnswer) -> bytes:
 
 def target_png(answer: PlanAnswer, k: int) -> bytes:
     """The pictures of one target as PNG."""
-    plt = pyplot()
+    plt = canvas()
     with plt.rc_context(STYLE):
         figure = plt.figure(figsize=(7.4, 5.4))
         _panels(figure, answer, k)

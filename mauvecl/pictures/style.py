@@ -48,22 +48,44 @@ def available() -> bool:
     return find_spec("matplotlib") is not None
 
 
-def pyplot() -> Any:
-    """Matplotlib's pyplot, without windows unless a notebook or the user has chosen how figures are shown."""
-    import os
-
-    import matplotlib as mpl
-
-    if "MPLBACKEND" not in os.environ:
-        mpl.use("Agg")
-    import matplotlib.pyplot as plt
-
+def canvas() -> Any:
+    """Return what makes figures: independent ones, or parts of the caller's axes."""
     ax = AXES.get()
-    return plt if ax is None else Within(plt, ax)
+    return Canvas() if ax is None else Within(Canvas(), ax)
+
+
+class Canvas:
+    """The functions of pyplot that pictures need, without its windows, its backend and its list of open figures."""
+
+    def __init__(self) -> None:
+        import matplotlib as mpl
+        from matplotlib.lines import Line2D
+
+        self.rc_context, self.rcParams, self.Line2D = mpl.rc_context, mpl.rcParams, Line2D
+
+    def figure(self, **how: Any) -> Any:
+        """Return an empty figure that Agg draws."""
+        from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+        from mauvecl.pictures.figure import Picture
+
+        figure = Picture(**how)
+        FigureCanvasAgg(figure)
+        return figure
+
+    def subplots(self, rows: int = 1, columns: int = 1, **how: Any) -> Any:
+        """Return a figure and its panels."""
+        of_panels = ("squeeze", "sharex", "sharey", "width_ratios", "height_ratios", "subplot_kw", "gridspec_kw")
+        panels = {key: how.pop(key) for key in of_panels if key in how}
+        figure = self.figure(**how)
+        return figure, figure.subplots(rows, columns, **panels)
+
+    def close(self, figure: Any) -> None:
+        """Do nothing: no list holds the figure."""
 
 
 class Within:
-    """Pyplot, whose new figures are the caller's axes."""
+    """A canvas whose new figures are the caller's axes."""
 
     def __init__(self, plt: Any, ax: Any) -> None:
         self._plt, self._ax = plt, ax
@@ -170,11 +192,11 @@ def _renderer(figure: Any) -> Any:
 
 
 def drawn(draw: Callable[Concatenate[Any, P], Any]) -> Callable[..., Any]:
-    """A picture of what draws with pyplot and gives the figure: in our style, saved where a path is given."""
+    """A picture of what draws on a canvas and gives the figure: in our style, saved where a path is given."""
 
     @wraps(draw)
     def picture(*what: Any, path: str | Path | None = None, **how: Any) -> Any:
-        plt = pyplot()
+        plt = canvas()
         with plt.rc_context(STYLE):
             return finished(draw(plt, *what, **how), path)
 
@@ -182,14 +204,14 @@ def drawn(draw: Callable[Concatenate[Any, P], Any]) -> Callable[..., Any]:
 
 
 def finished(figure: Any, path: str | Path | None) -> Any:
-    """Save a figure under a path, in the form of its ending (.png, .pdf, .svg), or hand it out; pyplot forgets it.
+    """Save a figure under a path, in the form of its ending (.png, .pdf, .svg), or hand it out.
 
     Raises
     ------
     InputError
         If it cannot be written; what was at its place is still there.
     """
-    pyplot().close(figure)
+    canvas().close(figure)
     if path is None:
         return figure
     drawn, place, whole = io.BytesIO(), Path(path), figure.figure
@@ -197,7 +219,7 @@ def finished(figure: Any, path: str | Path | None) -> Any:
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
         # As savefig makes it, which draws each picture twice.
-        whole.set_dpi(pyplot().rcParams["savefig.dpi"])
+        whole.set_dpi(canvas().rcParams["savefig.dpi"])
         FigureCanvasAgg(whole).print_png(drawn)  # type: ignore[no-untyped-call]
     else:
         whole.savefig(drawn, format=place.suffix[1:] or None)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.pictures.style import STYLE, finished, headline, pyplot
+from mauvecl.pictures.style import STYLE, canvas, finished, headline
 
 if TYPE_CHECKING:
     from mauvecl.answers.campaigns.visible import VisibleAnswer
@@ -19,7 +19,7 @@ MOST_CALENDARS = 6
 
 def calendar(answer: VisibleAnswer, path: str | Path | None) -> Any:
     """Hours of exposure a day: a calendar for each target, or a row where there are many."""
-    plt = pyplot()
+    plt = canvas()
     draw = _calendars if len(answer.targets) <= MOST_CALENDARS else _rows
     with plt.rc_context(STYLE):
         figure = draw(plt, answer)

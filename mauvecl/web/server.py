@@ -9,6 +9,10 @@ from typing import Any
 
 #: Bytes of one message: an upload, and room; and of a request's body, for the page takes none.
 MESSAGE, BODY = 8 * 2**20, 2**16
+#: Seconds that a connection may take for the headers of a request and for its body, also where it is kept for another.
+REQUEST_S = 20.0
+#: Open connections; of more, the oldest that is not a visitor's page is closed. Browsers open up to six each.
+MAX_CONNECTIONS = 512
 #: Seconds after which a page that nobody uses is let go, and between two looks.
 IDLE_S, SWEEP_S = 3600, 5
 #: Seconds between two signs of life on a connection; one that gives none is ended.
@@ -40,9 +44,9 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
     from mauvecl.web.doors import Door, Refused, hosts
 
     let_in = hosts(address, port, allowed)
-    from tornado.httpserver import HTTPServer
     from tornado.web import Application
 
+    from mauvecl.web.connections import BoundedServer
     from mauvecl.web.served import Asset, Figure, Front
     from mauvecl.web.visitor import Visitor
 
@@ -62,7 +66,14 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
     )
     # The door is asked before anything else.
     application.default_router.rules.insert(0, Door.rule(let_in))
-    server = HTTPServer(application, max_body_size=BODY, max_buffer_size=MESSAGE)
+    server = BoundedServer(
+        application,
+        max_body_size=BODY,
+        max_buffer_size=MESSAGE,
+        idle_connection_timeout=REQUEST_S,
+        body_timeout=REQUEST_S,
+    )
+    server.max_connections = MAX_CONNECTIONS
     server.listen(port, address)
     return server
 

@@ -120,7 +120,9 @@ class Visitor(WebSocketHandler):
         try:
             asked = json.loads(message)
             ask = getattr(self, f"_ask_{asked['ask']}")
-            if not (isinstance(asked.get("n", 0), int) and isinstance(asked.get("link", ""), str)):
+            # A message need not hold both.
+            asked = {"n": 0, "link": ""} | asked
+            if not (isinstance(asked["n"], int) and isinstance(asked["link"], str)):
                 raise TypeError
         except (ValueError, KeyError, TypeError, AttributeError, RecursionError):
             log.warning("a message is no question of the page's: %s", shortened(message))
@@ -152,7 +154,7 @@ class Visitor(WebSocketHandler):
             self._answering = False
 
     async def _answer(self, asked: dict[str, Any]) -> None:
-        n, state = asked.get("n", 0), self.state(asked.get("link", ""))
+        n, state = asked["n"], self.state(asked["link"])
         told: dict[str, Any] = {"n": n, "stray": state.stray, "faults": state.faults}
         if state.faults:
             self.tell(**told)
@@ -210,8 +212,8 @@ class Visitor(WebSocketHandler):
 
     def _ask_pinned(self, asked: dict[str, Any]) -> None:
         """What a tab's pictures show of a scenario beside the question."""
-        n = asked.get("n", 0)
-        self._give(self._pinned(n, self.state(asked.get("link", "")), str(asked.get("tab"))), n=n, pins={})
+        n = asked["n"]
+        self._give(self._pinned(n, self.state(asked["link"]), str(asked.get("tab"))), n=n, pins={})
 
     async def _pinned(self, n: int, state: State, name: str) -> None:
         tab = tab_of(name)
@@ -237,13 +239,13 @@ class Visitor(WebSocketHandler):
             if self._closed is None or self._closed[1] is not closed or future.cancelled() or future.exception():
                 return
             answers = self._answers.get(self._key(state), {}) | {"draw": future.result()}
-            self.tell(n=asked.get("n", 0), **shown(str(asked.get("tab")), closed, answers))
+            self.tell(n=asked["n"], **shown(str(asked.get("tab")), closed, answers))
 
         self._when_done(self._drawing, came)
 
     def _ask_simulate(self, asked: dict[str, Any]) -> None:
         """Simulate, tell how far it is, and answer."""
-        n, kind, state = asked.get("n", 0), asked.get("kind"), self.state(asked.get("link", ""))
+        n, kind, state = asked["n"], asked.get("kind"), self.state(asked["link"])
         if self.job is not None or kind not in SIMULATED or state.faults:
             self.tell(n=n, ended="", refused="there is a simulation already, or nothing to simulate")
             return
@@ -285,7 +287,7 @@ class Visitor(WebSocketHandler):
     def _ask_upload(self, asked: dict[str, Any]) -> None:
         """A file comes with the next message."""
         if asked.get("field") in UPLOADS:
-            self._coming = asked.get("n", 0), asked["field"], str(asked.get("name"))
+            self._coming = asked["n"], asked["field"], str(asked.get("name"))
 
     def _content(self, content: bytes) -> None:
         """The file; it is read beside the event loop, and what it is for has nothing until then."""
@@ -315,9 +317,9 @@ class Visitor(WebSocketHandler):
         future.add_done_callback(lambda future: loop.call_soon_threadsafe(came, future))
 
     def _ask_file(self, asked: dict[str, Any]) -> None:
-        n = asked.get("n", 0)
+        n = asked["n"]
         which = (str(asked.get(word)) for word in ("tab", "name", "ending"))
-        self._give(self._file(n, self.state(asked.get("link", "")), *which), n=n, file="")
+        self._give(self._file(n, self.state(asked["link"]), *which), n=n, file="")
 
     async def _file(self, n: int, state: State, tab: str, name: str, ending: str) -> None:
         file, content = await self._beside(partial(self.file, state, tab, name, ending))
@@ -342,11 +344,11 @@ class Visitor(WebSocketHandler):
         try:
             question = self.state(asked["link"]).question()
         except InputError as error:
-            self.tell(n=asked.get("n", 0), refused=str(error))
+            self.tell(n=asked["n"], refused=str(error))
             return
         uploaded = question.uploaded is not None
         self.tell(
-            n=asked.get("n", 0), python=as_python(question), command=as_command(question), uploaded=uploaded,
+            n=asked["n"], python=as_python(question), command=as_command(question), uploaded=uploaded,
             study="" if uploaded else question.study().toml(),
         )  # fmt: skip
 

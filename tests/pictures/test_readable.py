@@ -25,7 +25,7 @@ from mauvecl.answers.signal.simulate import simulate
 from mauvecl.answers.signal.snr import snr
 from mauvecl.device.engine import Engine
 from mauvecl.host.plotting import picture
-from mauvecl.pictures.style import COLUMN, STYLE, finished, headline, legend_below, pyplot
+from mauvecl.pictures.style import COLUMN, STYLE, canvas, finished, headline, legend_below
 from mauvecl.study.study import Study
 
 FEW = ("run.realisations=2000", "run.fap=0.1")
@@ -134,7 +134,7 @@ def test_a_flare_that_is_detected_is_seen(engine: Engine) -> None:
 
 def test_a_picture_is_what_savefig_makes_of_it(tmp_path: Path) -> None:
     """Drawn once, where savefig draws twice; to the last byte."""
-    plt = pyplot()
+    plt = canvas()
 
     def made() -> Any:
         figure, axes = plt.subplots(1, 2, figsize=(5, 2.5))

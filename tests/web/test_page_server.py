@@ -838,6 +838,70 @@ def test_nonsense_gives_no_traceback_and_no_path(served: Any, caplog: pytest.Log
     assert all("\n" not in line and len(line) < 1500 for line in lines)
 
 
+def test_every_question_may_lack_its_fields(served: Any, caplog: pytest.LogCaptureFixture) -> None:
+    """Messages that hold only what they ask are answered or refused, and no handler fails."""
+    questions = [name.removeprefix("_ask_") for name in dir(visitor.Visitor) if name.startswith("_ask_")]
+    assert len(questions) >= 8
+
+    async def work(host: str) -> None:
+        for ask in questions:
+            connection = await opened(host, Origin=f"http://{host}")
+            await connection.read_message()
+            await connection.write_message(json.dumps({"ask": ask}))
+            # Whoever is still there answers the next message.
+            await connection.write_message(json.dumps({"ask": "export", "n": 7, "link": "?star=M3V&magnitude=9"}))
+            told: Any = {}
+            while told.get("n") != 7:
+                message = await asyncio.wait_for(connection.read_message(), 60)
+                assert message is not None, ask
+                # A file that was asked for comes as bytes.
+                told = json.loads(message) if isinstance(message, str) else {}
+            connection.close()
+
+    with caplog.at_level(logging.ERROR):
+        served(work)
+    assert not [record.getMessage() for record in caplog.records if record.levelno >= logging.ERROR]
+
+
+def test_half_open_connections_are_dropped(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Those that never end their headers, or their body, and those beyond the bound; a page stays."""
+    monkeypatch.setattr(server, "REQUEST_S", 1.0)
+
+    async def work(host: str) -> None:
+        page = await opened(host, Origin=f"http://{host}")
+        await page.read_message()
+        place = host.rsplit(":", 1)
+        begun = f"POST / HTTP/1.1\r\nHost: {host}\r\nContent-Length: 100\r\n\r\nx".encode()
+        parts = (b"", b"GET / HTTP/1.1\r\nHost:", begun)
+        some = [(await asyncio.open_connection(*place), part) for part in parts for _ in range(100)]
+        for (_, writer), part in some:
+            writer.write(part)
+        for (reader, _), _ in some:
+            await asyncio.wait_for(reader.read(), 20)
+        assert (await got(f"http://{host}/"))[0] == 200
+        await page.write_message(json.dumps({"ask": "export", "n": 7}))
+        assert json.loads(await asyncio.wait_for(page.read_message(), 60))["n"] == 7
+
+    served(work)
+
+
+def test_connections_are_bounded(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(server, "MAX_CONNECTIONS", 8)
+
+    async def work(host: str) -> None:
+        page = await opened(host, Origin=f"http://{host}")
+        await page.read_message()
+        some = [await asyncio.open_connection(*host.rsplit(":", 1)) for _ in range(20)]
+        await asyncio.sleep(0.5)
+        ended = [reader.at_eof() for reader, _ in some]
+        assert ended == [True] * 13 + [False] * 7, "the oldest are closed, and the page is not"
+        assert (await got(f"http://{host}/"))[0] == 200
+        await page.write_message(json.dumps({"ask": "export", "n": 7}))
+        assert json.loads(await asyncio.wait_for(page.read_message(), 60))["n"] == 7
+
+    served(work)
+
+
 def test_the_first_load_is_small_and_packed(served: Any) -> None:
     """2.5 MB is the most that the issue allows; nothing for formulas is among it."""
 

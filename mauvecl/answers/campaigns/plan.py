@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -35,6 +35,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
     from mauvecl.host.expectation import Expectation
+    from mauvecl.study.assumed import Use
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +48,8 @@ class PlanAnswer(Answer):
     seen : VisibleAnswer
     planned : tuple of Planned
     """
+
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "flare", "orbit", "seed")
 
     study: Study
     seen: VisibleAnswer

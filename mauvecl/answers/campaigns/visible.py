@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
     from mauvecl.host.expectation import Expectation
+    from mauvecl.study.assumed import Use
 
 Float = NDArray[np.float64]
 
@@ -47,6 +48,8 @@ class VisibleAnswer(Answer):
     visibility : Visibility
         Columns in the order of the targets.
     """
+
+    USES: ClassVar[tuple[Use, ...]] = ("orbit",)
 
     study: Study
     targets: tuple[Target, ...]

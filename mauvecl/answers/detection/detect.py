@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
 
     from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
+    from mauvecl.study.assumed import Use
     from mauvecl.study.questions import CampaignQuestion
 
 
@@ -66,6 +67,8 @@ class DetectAnswer(Answer):
     paper : list of str
         The comparison with the paper's values, where the study holds its G2V star.
     """
+
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "unknowns", "seed")
 
     study: Study
     stars: list[StarDetection]

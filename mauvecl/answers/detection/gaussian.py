@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,6 +33,7 @@ if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
     from mauvecl.results.snr import SnrResult
     from mauvecl.runs.pool import Pool
+    from mauvecl.study.assumed import Use
 
 #: Share of normal values within one standard deviation.
 ONE_SIGMA = float(special.ndtr(1.0) - special.ndtr(-1.0))
@@ -153,6 +154,8 @@ class GaussianReport(Answer):
     signal : SnrAnswer
     detection : DetectAnswer
     """
+
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "unknowns", "seed")
 
     study: Study
     signal: SnrAnswer

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
     from mauvecl.runs.pool import Pool
+    from mauvecl.study.assumed import Use
 
 #: Quantities of the flare alone: cells that differ in them share their quiescent star, and one launch.
 OF_FLARE = ("amplitude", "flare_temperature")
@@ -52,6 +53,8 @@ class MapResult(Answer):
     quiet : Expectation, optional
         The star of the first cell.
     """
+
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "unknowns", "seed")
 
     study: Study
     star: str
@@ -88,6 +91,13 @@ class MapResult(Answer):
         return described(table)
 
     ENDINGS = ("ecsv", "fits")
+
+    @property
+    def assumed(self) -> str:
+        """One line with what the study assumes beside the two quantities of the map."""
+        from mauvecl.study.assumed import assumption_line
+
+        return assumption_line(self.study, self.USES, (self.study.map.x.quantity, self.study.map.y.quantity))
 
     @property
     def tables(self) -> dict[str, Table]:

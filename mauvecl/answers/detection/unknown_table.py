@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
     from mauvecl.host.expectation import Expectation
+    from mauvecl.study.assumed import Use
     from mauvecl.study.study import Study
 
 #: What is looked at where nothing else is named: METHODS' table, and more.
@@ -55,6 +56,8 @@ class UnknownTable(Answer):
     quiets : tuple of Expectation
         The stars without a flare.
     """
+
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "unknowns", "seed")
 
     study: Study
     costs: dict[tuple[str, float], dict[str, Cost]]

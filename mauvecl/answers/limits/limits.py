@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
     from mauvecl.runs.pool import Pool
+    from mauvecl.study.assumed import Use
 
 
 @dataclass(frozen=True)
@@ -116,6 +117,8 @@ class LimitResult(Answer):
     failed : tuple of str
         Why there is no limit of some of the stars, flares or statistics.
     """
+
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "unknowns", "seed")
 
     study: Study
     limits: list[Limit] = field(default_factory=list)

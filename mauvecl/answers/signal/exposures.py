@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any, ClassVar, Literal
 
 import numpy as np
 
@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
     from mauvecl.host.expectation import Expectation
+    from mauvecl.study.assumed import Use
 
 Per = Literal["pixel", "element"]
 
@@ -54,6 +55,8 @@ class ExposureResult(Answer):
     expectations : tuple of Expectation
         Each star at its exposure.
     """
+
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky")
 
     study: Study
     exposures: tuple[Exposure, ...]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from mauvecl.answers.answer import Answer
 from mauvecl.host.arguments import public
@@ -18,17 +18,28 @@ if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
     from mauvecl.host.expectation import Expectation
+    from mauvecl.study.assumed import Use
 
 
 @dataclass(eq=False)
 class SimulateAnswer(Answer):
     """What `mauvecl simulate` answers: one table of components per star and stage."""
 
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "unknowns", "seed")
+
     ENDINGS = ("ecsv", "fits")
 
     study: Study
     observations: list[tuple[str, Expectation, QTable]]
     messages: list[str]
+
+    @property
+    def assumed(self) -> str:
+        """One line with what the study assumes, of flares too where the observations have any."""
+        from mauvecl.study.assumed import assumption_line
+
+        flaring = len(self.observations) > len(self.study.star)
+        return assumption_line(self.study, (*self.USES, "flare") if flaring else self.USES)
 
     @property
     def tables(self) -> dict[str, Table]:

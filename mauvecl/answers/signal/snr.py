@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 from mauvecl.answers.answer import Answer, InCell
 from mauvecl.answers.signal.exposures import place_of
@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
     from mauvecl.results.snr import SnrResult
+    from mauvecl.study.assumed import Use
 
 
 #: Wavelengths of the elements that terminal and pictures show, nm; the tables hold all of them.
@@ -54,6 +55,8 @@ class SnrAnswer(Answer):
         Every star in every cell of the sweep.
     messages : list of str
     """
+
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "unknowns", "seed")
 
     study: Study
     stars: list[StarSnr]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from mauvecl.device.stares import Stares
     from mauvecl.host.expectation import Expectation
     from mauvecl.lightcurve.stares.requests import StaresRequest
+    from mauvecl.study.assumed import Use
     from mauvecl.study.sections import Star
 
 Float = NDArray[np.float64]
@@ -109,6 +110,8 @@ class InjectAnswer(Answer):
     stars : list of StarCompleteness
     messages : list of str
     """
+
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "unknowns", "seed")
 
     study: Study
     stars: list[StarCompleteness]

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from mauvecl.device.stares import Stares
     from mauvecl.host.expectation import Expectation
     from mauvecl.host.stars.source import Source
+    from mauvecl.study.assumed import Use
     from mauvecl.study.sections import Star
 
 KINDS: tuple[Kind, ...] = ("band", "bolometric")
@@ -94,6 +95,8 @@ class StareAnswer(Answer):
         Every star in every cell of the sweep.
     messages : list of str
     """
+
+    USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "unknowns", "seed")
 
     study: Study
     stares: list[StarStare]

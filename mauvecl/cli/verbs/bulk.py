@@ -72,10 +72,12 @@ def realise(study: Study, session: Session) -> None:
 
 def _tell(store: Store, place: Path, session: Session) -> None:
     from mauvecl.cli.console import show_table
+    from mauvecl.study.assumed import assumption_line
     from mauvecl.study.labels import told
 
     messages = told([scene.expectation for scene in store.scenes])
-    session.say(messages)
+    assumed = assumption_line(store.study, ("instrument", "sky", "flare", "unknowns", "seed"))
+    session.say([*messages, assumed])
     rows = [
         {
             "array": scene.path,
@@ -87,7 +89,9 @@ def _tell(store: Store, place: Path, session: Session) -> None:
         for scene in store.scenes
     ]
     if session.as_json:
-        session.print_json({"messages": messages, "store": str(place), "bytes": store.n_bytes, "arrays": rows})
+        session.print_json(
+            {"assumed": assumed, "messages": messages, "store": str(place), "bytes": store.n_bytes, "arrays": rows}
+        )
         return
     show_table(
         f"Raw spectra, DN; seed {store.study.run.seed}. Rows of the same number share their random numbers, rows of "
