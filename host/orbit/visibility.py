@@ -69,7 +69,7 @@ class Visibility:
         """True where the satellite is in the Earth's shadow, shape (n,)."""
         return in_shadow(self.track)
 
-    @property
+    @cached_property
     def share(self) -> NDArray[np.float64]:
         """Fraction of the time in which each target is visible, without the duty cycle, shape (k,)."""
         return np.asarray(self.seen.mean(axis=0))

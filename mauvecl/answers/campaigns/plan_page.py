@@ -29,14 +29,14 @@ def report_html(answer: PlanAnswer) -> bytes:
         f"<!doctype html><html lang=en><meta charset=utf-8><title>Mauve: {escape(heading(answer))}</title>",
         f"<style>{STYLE}</style><h1>Mauve: yields of a campaign</h1>",
         f"<p>{escape(heading(answer))}; mauvecl {VERSION}.</p>",
-        _table(SUMMARY, summary_rows(answer), "numbers"),
+        _table(SUMMARY, summary_rows(answer), "numbers", link=True),
         f"<p class=from>{escape(LEGEND)}</p>",
         _image("plan_report.overview_png", answer, text="flares expected and energies of all targets"),
         *(f"<p>{escape(message)}</p>" for message in answer.messages),
     ]
     for k, one in enumerate(answer.planned):
         lines = _table(("", "", "table: column"), target_lines(answer, k))
-        parts.append(f"<section><h2>{escape(one.name)}</h2>{lines}")
+        parts.append(f"<section id=target-{k}><h2>{escape(one.name)}</h2>{lines}")
         if one.seen_h > 0:
             parts.append(_image("plan_report.target_png", answer, k, text=f"hours and energies of {one.name}"))
         parts.append("</section>")
@@ -49,9 +49,15 @@ def report_html(answer: PlanAnswer) -> bytes:
     return "\n".join(parts).encode()
 
 
-def _table(names: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "") -> str:
+def _table(names: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "", *, link: bool = False) -> str:
+    """Return a table; `link` makes the first cell of row k lead to the section of target k."""
     head = "".join(f"<th>{escape(name)}</th>" for name in names)
-    body = "".join("<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>" for row in rows)
+    body = ""
+    for k, row in enumerate(rows):
+        cells = [escape(cell) for cell in row]
+        if link:
+            cells[0] = f"<a href='#target-{k}'>{cells[0]}</a>"
+        body += "<tr>" + "".join(f"<td>{cell}</td>" for cell in cells) + "</tr>"
     return f"<table class='{kind}'><tr>{head}</tr>{body}</table>"
 
 
