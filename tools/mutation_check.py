@@ -201,7 +201,7 @@ MUTATIONS = {
     "the sky counted as signal": Mutation(
         (
             ("kernels/histogram.cl.mako", "        signal -= (floatv)element.sky;\n", ""),
-            ("mauvecl/results/twin.py", '        signal = signal - element["sky"]\n', ""),
+            ("mauvecl/results/numpy_kernels.py", '        signal = signal - element["sky"]\n', ""),
         ),
         "tests/device/test_engine.py::test_snr_of_each_realisation_takes_the_sky_for_noise",
     ),
@@ -290,7 +290,7 @@ MUTATIONS = {
         (
             ("kernels/comparison.cl.mako", "[k][s + 3u] = d;", "[k][s + 3u] = 0.0f;"),
             (
-                "mauvecl/results/twin.py",
+                "mauvecl/results/numpy_kernels.py",
                 "for centre, row in enumerate(self.rows):",
                 "for centre, row in enumerate([]):",
             ),

@@ -31,11 +31,11 @@ from mauvecl.results.requests.requests import (
     RealiseRequest,
     Shard,
     SnrRequest,
-    checked,
+    check_numbers,
     expectation_of,
 )
 from mauvecl.results.snr import Counts, SnrResult, elements, observers
-from mauvecl.results.sums import Arrays, DetectionSums, SnrSums, packed_detection, packed_snr
+from mauvecl.results.sums import Arrays, DetectionSums, SnrSums, pack_detection, pack_snr
 from mauvecl.statistics.linear import Linear
 from mauvecl.statistics.names import DEFAULT_STATISTICS
 from mauvecl.statistics.nuisances import Nuisances, as_nuisances
@@ -221,7 +221,7 @@ class Engine:
         """
         request = SnrRequest(expectation, realisations, seed, start, Drawing(**drawing))
         sums = SnrSums(request)
-        sums.add(0, packed_snr(self._snr(request, Shard(0, request.start, request.realisations))))
+        sums.add(0, pack_snr(self._snr(request, Shard(0, request.start, request.realisations))))
         return sums.answer()
 
     def count(self, request: Countable, shard: Shard, *, out: NDArray[Any] | None = None) -> Arrays:
@@ -242,9 +242,9 @@ class Engine:
         """
         match request:
             case DetectRequest():
-                return packed_detection(*self._detection(request, shard))
+                return pack_detection(*self._detection(request, shard))
             case SnrRequest():
-                return packed_snr(self._snr(request, shard))
+                return pack_snr(self._snr(request, shard))
             case RealiseRequest():
                 x, seed = request.expectation, request.seed
                 how = request.drawing.words
@@ -315,7 +315,7 @@ class Engine:
         total = request.parts * each
         for part in range(request.parts):
             shard = Shard(part, request.start, each)
-            sums.add(part, packed_detection(*self._detection(request, shard, before=part * each, total=total)))
+            sums.add(part, pack_detection(*self._detection(request, shard, before=part * each, total=total)))
         return sums.answer()
 
     def _detection(
@@ -394,5 +394,5 @@ class Engine:
     def _checked(self, start: int, count: int, seed: int) -> tuple[int, int, int]:
         """Whole numbers, in a process that may draw."""
         self.opened.check_process()
-        whole = checked(count, seed, start)
+        whole = check_numbers(count, seed, start)
         return whole["start"], whole["realisations"], whole["seed"]

@@ -23,7 +23,7 @@ from mauvecl.noise import layout, twin
 from mauvecl.noise.comparison import Comparison
 from mauvecl.noise.processes import CosmicRays, Processes, Uniform
 from mauvecl.noise.scene import Scene, prepare
-from mauvecl.results import twin as sums_twin
+from mauvecl.results import numpy_kernels
 from mauvecl.results.counts.tally import Tally
 from mauvecl.results.requests.channels import ChannelPlan, plan_channels
 from mauvecl.results.requests.hypotheses import Hypotheses
@@ -162,10 +162,10 @@ def twin_digests(name: str) -> dict[str, str]:
     both = prepare([quiet, flare], **_laid_out(how))
     raw = twin.realise(scene, index, SEED)
     clipped = twin.clipped(scene, index, SEED)
-    seen = sums_twin.histograms(scene, observers(quiet, scene), elements(quiet), index, SEED)
+    seen = numpy_kernels.histograms(scene, observers(quiet, scene), elements(quiet), index, SEED)
     values, plan = _statistics(name, both)
     tally = Tally(plan.grids[plan.keys.index(("chi2", "null", 0)) :][:1])
-    counts, sums, _ = sums_twin.tally(values, tally.packed)
+    counts, sums, _ = numpy_kernels.tally(values, tally.packed)
     tally.add(counts, sums, COUNT)
     tally.add_far(0, values[tally.grids[0].channel])
     null = tally.distribution(0)
@@ -186,10 +186,10 @@ def _statistics(name: str, scene: Scene) -> tuple[NDArray[np.float32], ChannelPl
     hypotheses = Hypotheses(quiet, (flare,), _asked(how), scene, nuisances=unknown)
     plan = plan_channels(hypotheses, range(1), first=True)
     index = np.arange(START, START + COUNT, dtype=np.uint64)
-    smoothed = sums_twin.Smoothed.of(hypotheses, plan) if len(plan.scales) else None
+    smoothed = numpy_kernels.Smoothed.of(hypotheses, plan) if len(plan.scales) else None
     paired = "chi2_pair" in _asked(how)
-    sums = sums_twin.statistics(scene, index, SEED, plan, pair=paired, smoothed=smoothed)
-    return sums_twin.marginalise(sums, plan.subtractions), plan
+    sums = numpy_kernels.statistics(scene, index, SEED, plan, pair=paired, smoothed=smoothed)
+    return numpy_kernels.marginalise(sums, plan.subtractions), plan
 
 
 def _drawing(how: dict[str, Any]) -> dict[str, Any]:

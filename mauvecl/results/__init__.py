@@ -1,1 +1,1 @@
-"""What is made of what a device counted: detections, S/N, ROC, rare tails, departures from the closed forms."""
+"""Results of simulations: detections, S/N, ROC curves, rare tails, departures from closed forms, measurements."""

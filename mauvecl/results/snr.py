@@ -1,4 +1,4 @@
-"""Signal-to-noise distributions: what the device is asked, and the tables made of its answer."""
+"""Distributions of signal-to-noise ratios."""
 
 from __future__ import annotations
 
@@ -17,25 +17,26 @@ from mauvecl.host.tables import make_table, set_descriptions
 from mauvecl.noise import layout
 from mauvecl.noise.scene import Scene
 from mauvecl.noise.twin import Floats, fma
-from mauvecl.results.counts.far import Sparse
+from mauvecl.results.counts.far import SparseCounts
 
 if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.host.expectation import Expectation
 
-#: Bins of an element's S/N to its standard deviation: +-8 of these.
+#: Bins per standard deviation of an element's S/N, which cover +-8 standard deviations.
 BINS_PER_SIGMA = 128.0
-#: Percentages of the quantiles reported: the median and one, two and three sigma.
+#: Percentages of the reported quantiles: the median and one, two and three sigma.
 PERCENTAGES = (0.135, 2.5, 16.0, 50.0, 84.0, 97.5, 99.865)
 
 
 def observers(x: Expectation, scene: Scene) -> NDArray[np.void]:
-    """What an observer subtracts (bias and dark; the sky by element) and assumes in each pixel, for the device.
+    """Return the bias and dark that an observer subtracts, and the noise model, of each pixel.
 
     Returns
     -------
     ndarray of layout.OBSERVER, shape (n_padded,)
+        The sky is subtracted per resolution element.
     """
     table = np.zeros(len(scene.pixels), layout.OBSERVER)
     table["variance"] = 1.0  # padding: 0 / 1
@@ -43,14 +44,14 @@ def observers(x: Expectation, scene: Scene) -> NDArray[np.void]:
     real["net_offset"] = scene.n_draws * scene.base_dn[0] - x.n_frames * (x.bias_dn + x.dark_dn)
     real["gain"] = x.gain_dn_per_electron
     real["variance"] = x.n_frames * (x.read_noise_dn**2 + x.dark_variance_dn2)
-    # The fewest whole DN to a bin that still reach +-8 sigma: sigma / 128 to sigma / 64.
+    # The narrowest bins of whole DN that cover +-8 sigma: sigma / 128 to sigma / 64.
     wanted = 16.0 * np.sqrt(x.variance_dn2) / layout.OBSERVER_BINS
     real["bin_shift"] = np.ceil(np.log2(np.maximum(wanted, 1.0)))
     return table
 
 
 def elements(x: Expectation) -> NDArray[np.void]:
-    """The resolution elements, each with bins around its closed-form S/N, scaled to its linearised spread.
+    """Return the resolution elements with bins centred on the closed-form S/N and scaled to its linearised spread.
 
     Returns
     -------
@@ -67,44 +68,34 @@ def elements(x: Expectation) -> NDArray[np.void]:
     with np.errstate(invalid="ignore", divide="ignore"):
         slope = 1.0 / noise - signal * gain / (2.0 * noise**3)
         table["centre"] = np.nan_to_num(signal / noise)
-        # A noiseless element has no S/N to speak of; its bins do not matter.
+        # The bins of a noiseless element do not matter.
         table["bins_per_unit"] = np.nan_to_num(BINS_PER_SIGMA / (np.sqrt(x.per_element(x.variance_dn2)) * slope))
     return table
 
 
-#: Bins that count: number 0 holds what is expected.
+#: First and last dense bin; bin 0 contains the expected value.
 FIRST_BIN, LAST_BIN = 1 - layout.OBSERVER_BINS // 2, layout.OBSERVER_BINS // 2 - 2
-#: Bins further out than this have no number.
-MOST_BINS = 2**31
+#: Limit of the absolute value of bin numbers.
+MAX_BIN = 2**31
 
 
 class Counts:
-    """Histograms of all pixels and elements, added up tile by tile.
-
-    Attributes
-    ----------
-    pixel : ndarray of int64, shape (n_pixel, OBSERVER_BINS)
-    element : ndarray of int64, shape (n_element, OBSERVER_BINS)
-        The first and the last bin are empty.
-    far : dict of str to Sparse
-        ``pixel`` and ``element``: bins as wide beyond those, by pixel or element and number.
-    clipped : ndarray of int64, shape (n_pixel, 2)
-        Frames below zero and above saturation.
-    n : int
-        Realisations.
-    """
+    """Accumulator of the histograms of all pixels and elements."""
 
     def __init__(self, n_pixel: int, n_element: int) -> None:
+        # Dense bins; the first and the last stay empty.
         self.pixel = np.zeros((n_pixel, layout.OBSERVER_BINS), np.int64)
         self.element = np.zeros((n_element, layout.OBSERVER_BINS), np.int64)
-        self.far = {"pixel": Sparse(), "element": Sparse()}
+        # Bins of the same width beyond, with keys made of the pixel or element and the bin.
+        self.far = {"pixel": SparseCounts(), "element": SparseCounts()}
+        # Frames clipped at zero and at saturation.
         self.clipped = np.zeros((n_pixel, 2), np.int64)
         self.n = 0
 
     def add(
         self, pixel: NDArray[np.integer], element: NDArray[np.integer], clipped: NDArray[np.integer], n: int
     ) -> None:
-        """Add what one or more tiles counted."""
+        """Add the counts of one or more tiles."""
         inner = slice(1, layout.OBSERVER_BINS - 1)
         self.pixel[:, inner] += pixel[:, inner]
         self.element[:, inner] += element[:, inner]
@@ -114,16 +105,9 @@ class Counts:
     def add_far(
         self, dn: NDArray[np.integer], observers: NDArray[np.void], elements: NDArray[np.void], asked: NDArray[np.intp]
     ) -> None:
-        """Count what lies outside the bins of some elements and their pixels.
+        """Count the values outside the dense bins of some elements and their pixels.
 
-        Parameters
-        ----------
-        dn : ndarray of int, shape (n_pixel, n)
-            Raw DN less the scene's base, of some realisations.
-        observers : ndarray of layout.OBSERVER, shape (n_padded,)
-        elements : ndarray of layout.ELEMENT, shape (n_element,)
-        asked : ndarray of int
-            Which elements.
+        `dn`, shape (n_pixel, n), holds raw DN minus the scene's base. `asked` holds the indices of the elements.
         """
         for e in asked:
             element = elements[e]
@@ -132,7 +116,7 @@ class Counts:
                 self._count_far("pixel", p, dn[p].astype(np.int64) >> int(observers[p]["bin_shift"]))
             ratio = signal_to_noise(dn[first:end], observers[first:end], element["sky"])
             steps = np.rint((ratio - element["centre"]) * element["bins_per_unit"])
-            if not (np.abs(steps) < MOST_BINS).all():
+            if not (np.abs(steps) < MAX_BIN).all():
                 raise InputError(
                     f"the S/N of resolution element {e} is {ratio[np.abs(steps).argmax()]:g} in a realisation, "
                     f"expected something nearer to its closed form of {element['centre']:g}"
@@ -142,68 +126,58 @@ class Counts:
     def _count_far(self, kind: str, which: int, bins: NDArray[np.int64]) -> None:
         outside = bins[(bins < FIRST_BIN) | (bins > LAST_BIN)]
         if outside.size:
-            self.far[kind].count(which * (2 * MOST_BINS) + MOST_BINS + outside)
+            self.far[kind].count(which * (2 * MAX_BIN) + MAX_BIN + outside)
 
     def spread_out(self, kind: str) -> NDArray[np.int64]:
-        """Pixels or elements that have something outside their bins."""
-        return np.unique(self.far[kind].keys // (2 * MOST_BINS))
+        """Return the pixels or elements with values outside the dense bins."""
+        return np.unique(self.far[kind].keys // (2 * MAX_BIN))
 
     def filled(self, kind: str, which: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Bins of one pixel or element that hold anything, rising from the expected number 0, and how much."""
+        """Return the filled bins of a pixel or element, ascending, with 0 at the expected value, and their counts."""
         dense = (self.pixel if kind == "pixel" else self.element)[which]
         inner = np.flatnonzero(dense)
         numbers, counts = inner - layout.OBSERVER_BINS // 2, dense[inner]
-        far, offset = self.far[kind], which * (2 * MOST_BINS) + MOST_BINS
-        mine = slice(*np.searchsorted(far.keys, (offset - MOST_BINS, offset + MOST_BINS)))
+        far, offset = self.far[kind], which * (2 * MAX_BIN) + MAX_BIN
+        mine = slice(*np.searchsorted(far.keys, (offset - MAX_BIN, offset + MAX_BIN)))
         outside = far.keys[mine] - offset
         below = int(np.count_nonzero(outside < 0))
         return np.insert(outside, below, numbers), np.insert(far.counts[mine], below, counts)
 
 
 def signal_to_noise(dn: NDArray[np.integer], observers: NDArray[np.void], sky: np.float32) -> Floats:
-    """An element's S/N as the device sums it, shape (n,), of its pixels' DN less the scene's base, (n_pixel, n)."""
+    """Compute an element's S/N in the device's order, shape (n,), from DN above the base, shape (n_pixel, n)."""
     signal, variance = (np.zeros(dn.shape[1], np.float32) for _ in range(2))
     for n, observer in zip(dn, observers, strict=True):
         net = n.astype(np.float32) + observer["net_offset"]
         signal = signal + net
         variance = variance + fma(np.maximum(net, np.float32(0.0)), observer["gain"], observer["variance"])
     signal = signal - sky
-    # Zero where the observer knows of no noise.
+    # The ratio is zero if the estimated noise is zero.
     return np.divide(signal, np.sqrt(variance), out=np.zeros_like(signal), where=variance > 0)
 
 
 @dataclass(frozen=True, eq=False)
 class SnrResult(ContentEquality):
-    """Distributions of the S/N over realisations.
-
-    Attributes
-    ----------
-    expectation : Expectation
-    scene : Scene
-    observers : ndarray of layout.OBSERVER, shape (n_padded,)
-    elements : ndarray of layout.ELEMENT, shape (n_element,)
-    counts : Counts
-    """
+    """Distributions of the S/N over realisations."""
 
     expectation: Expectation
     scene: Scene
-    observers: NDArray[np.void]
-    elements: NDArray[np.void]
+    observers: NDArray[np.void]  # layout.OBSERVER, shape (n_padded,)
+    elements: NDArray[np.void]  # layout.ELEMENT, shape (n_element,)
     counts: Counts
 
     @property
     def pixel(self) -> QTable:
         """S/N per pixel: wavelength, closed form, simulated mean, standard deviation, quantiles, clipped frames.
 
-        The signal is what the expectation's `signal` says: the star's, the sky's mean being subtracted.
-
-        The histogram is of whole DN, of which the S/N is a function; its bins are 1/64 of a standard deviation or less.
+        The expectation's `signal` defines the signal. The histogram counts whole DN, of which the S/N is a function, in
+        bins of at most 1/64 of a standard deviation.
         """
         x, seen = self.expectation, self.observers[: self.scene.n_pixel]
         width, sky = 2.0 ** seen["bin_shift"].astype(float), x.subtracted_dn
 
         def snr(which: NDArray[np.intp], place: NDArray[np.number]) -> NDArray[np.float64]:
-            # A bin holds the whole DN from its lower edge to one below the next.
+            # A bin contains the whole DN from its lower edge up to the next.
             dn = width[which] * place - 0.5
             net = dn + seen["net_offset"].astype(float)[which]
             noise2 = np.maximum(net, 0.0) * seen["gain"][which] + seen["variance"][which]
@@ -217,7 +191,7 @@ class SnrResult(ContentEquality):
 
     @property
     def element(self) -> QTable:
-        """The same per resolution element of 10.5 nm, without the clipped frames."""
+        """S/N per resolution element of 10.5 nm, with the columns of `pixel` except clipped frames."""
         x = self.expectation
         step = np.divide(
             1.0,
@@ -232,7 +206,7 @@ class SnrResult(ContentEquality):
         return self._table("element", x.element_wavelength_nm, x.snr_per_element(), snr)
 
     def plot(self, path: str | Path | None = None, *, ax: Any = None) -> object:
-        """S/N per pixel and element, closed form and realisations; needs matplotlib."""
+        """Plot the S/N per pixel and element, in closed form and simulated; needs matplotlib."""
         return picture("answers.signal_to_noise", [(self.expectation.name, self)], path=path, ax=ax)
 
     def _line(self) -> str:
@@ -245,7 +219,7 @@ class SnrResult(ContentEquality):
         expected: NDArray[np.float64],
         snr: Callable[[NDArray[np.intp], NDArray[np.number]], NDArray[np.float64]],
     ) -> QTable:
-        """A row for each pixel or element; `snr` of those, at places between the edges of bins, which are whole."""
+        """Make the table of pixels or elements; `snr` converts fractional bin numbers to ratios."""
         counts = self.counts.pixel if kind == "pixel" else self.counts.element
         numbers, every = (
             np.arange(layout.OBSERVER_BINS + 1) - layout.OBSERVER_BINS // 2,
@@ -284,13 +258,13 @@ class SnrResult(ContentEquality):
 
 
 def _quantiles(cumulative: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Quantiles of one histogram, linear within a bin."""
+    """Return the quantiles of a histogram, interpolated linearly within bins."""
     filled = np.flatnonzero(np.diff(cumulative))
     span = slice(filled[0], filled[-1] + 2)
     return np.asarray(np.interp(np.array(PERCENTAGES) / 100, cumulative[span], edges[span]))
 
 
 def steps_of(counts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Realisations below the lower and the upper edge of each bin, one after the other, shape (2 m,)."""
+    """Return the number of realisations below the lower and the upper edge of each bin, alternating, shape (2 m,)."""
     above = np.cumsum(counts)
     return np.column_stack([above - counts, above]).ravel()

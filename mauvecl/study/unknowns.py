@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.host.errors import InputError
-from mauvecl.results.requests.fap import FEWEST_IN_TAIL
+from mauvecl.results.requests.fap import MIN_IN_TAIL
 from mauvecl.statistics.intervals import CONFIDENCE, Interval
 
 if TYPE_CHECKING:
@@ -84,7 +84,7 @@ def drawn(study: Study) -> DrawnStudies:
 def realisations_each(study: Study) -> int:
     """Realisations for each draw: as many in all as asked for, but enough to count each draw's threshold."""
     run = study.run
-    fewest = int(np.ceil(FEWEST_IN_TAIL / run.fap)) if run.tails == "counted" else 1000
+    fewest = int(np.ceil(MIN_IN_TAIL / run.fap)) if run.tails == "counted" else 1000
     return max(run.realisations // study.unknowns.draws, fewest)
 
 

@@ -25,7 +25,7 @@ from mauvecl.noise import twin as reference
 from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.processes import CosmicRays, Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare
-from mauvecl.results import twin as reference_sums
+from mauvecl.results import numpy_kernels
 from mauvecl.results.counts.tally import Tally
 from mauvecl.results.requests.channels import ChannelPlan, plan_channels
 from mauvecl.results.requests.requests import DetectRequest
@@ -148,8 +148,8 @@ def _twin(name: str, comparison: Comparison) -> tuple[ChannelPlan, np.ndarray]:
         quiet, tuple(flares), INDEX.size, SEED, tuple(STATISTICS), START, comparison=comparison, **how
     ).hypotheses
     plan = plan_channels(asked, range(len(flares)), first=True)
-    smoothed = reference_sums.Smoothed.of(asked, plan)
-    values = reference_sums.statistics(asked.scene, INDEX, SEED, plan, smoothed=smoothed)
+    smoothed = numpy_kernels.Smoothed.of(asked, plan)
+    values = numpy_kernels.statistics(asked.scene, INDEX, SEED, plan, smoothed=smoothed)
     values.setflags(write=False)
     return plan, values
 
@@ -185,7 +185,7 @@ def check_statistics(engine: Engine, name: str) -> None:
     same = [row for row in range(len(alone)) if row % 3 != 2 or row >= 9]
     np.testing.assert_array_equal(alone[same], values[: len(alone)][same])
     tally = Tally(plan.grids)
-    histogram, sums, outside = reference_sums.tally(values, tally.packed)
+    histogram, sums, outside = numpy_kernels.tally(values, tally.packed)
     tally.add(histogram, sums, INDEX.size)
     for i, (statistic, role, flare) in enumerate(plan.keys):
         if role == "flare_on_null_grid":
@@ -228,7 +228,7 @@ def test_signal_to_noise_is_the_twins(any_width: Engine, name: str) -> None:
     (quiet, *_), how = case(name)
     scene = prepare([quiet], **how)
     found = any_width.snr(quiet, realisations=INDEX.size, start=START, seed=SEED, **how)
-    twin = reference_sums.histograms(scene, observers(quiet, scene), elements(quiet), INDEX, SEED)
+    twin = numpy_kernels.histograms(scene, observers(quiet, scene), elements(quiet), INDEX, SEED)
     same_counts(found.counts, twin)
     assert all(
         each.sum() + found.counts.far[kind].counts.sum() == INDEX.size * len(each)

@@ -11,7 +11,7 @@ from scenes import instrument, star
 from mauvecl.device.engine import Engine
 from mauvecl.noise.processes import Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare
-from mauvecl.results import twin
+from mauvecl.results import numpy_kernels
 from mauvecl.results.requests.channels import plan_channels
 from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.statistics.linear import Linear
@@ -42,8 +42,8 @@ def test_every_marginalised_statistic_is_the_twins(any_width: Engine, exposure: 
     scene = prepare([quiet, *flares])
     hypotheses = Hypotheses(quiet, tuple(flares), asked, scene, nuisances=Nuisances.of(quiet, sd))
     plan = plan_channels(hypotheses, range(len(flares)), first=True)
-    sums = twin.statistics(scene, INDEX, SEED, plan, pair=False)
-    np.testing.assert_array_equal(values, twin.marginalise(sums, plan.subtractions))
+    sums = numpy_kernels.statistics(scene, INDEX, SEED, plan, pair=False)
+    np.testing.assert_array_equal(values, numpy_kernels.marginalise(sums, plan.subtractions))
     # What is taken away matters.
     assert (values[0] < sums[0]).all()
 

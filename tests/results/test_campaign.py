@@ -118,6 +118,6 @@ def test_a_detection_tells_both(engine: Engine) -> None:
     assert "173 false alarms are expected" in said[0]
     assert "at 0.01 per test" in said[0]
     assert "with the overlap of its stacks" in said[0]
-    assert "`--fap 5.79e-07`" in said[1]
-    assert "`--fap 0.0001158`" in said[2]
+    assert "`fap=5.79e-07`" in said[1]
+    assert "`fap=0.0001158`" in said[2]
     assert Study.build(study.model_dump(), "again") == study

@@ -14,7 +14,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import expect
 from mauvecl.host.sky.zodiacal import Sky
 from mauvecl.host.stars.source import Source
-from mauvecl.results import twin as reference_sums
+from mauvecl.results import numpy_kernels
 from mauvecl.results.counts.tally import Distribution, Grid, Tally
 from mauvecl.results.detection.detection import Detection
 from mauvecl.results.detection.roc import Roc
@@ -143,7 +143,7 @@ def test_delongs_interval_is_that_of_draws_made_apart() -> None:
         for centre in (0.0, 1.0):
             tally = Tally([grid])
             values = rng.normal(centre, 1.0, (1, 400)).astype(np.float32)
-            tally.add(*reference_sums.tally(values, Grid.pack([grid]))[:2], 400)
+            tally.add(*numpy_kernels.tally(values, Grid.pack([grid]))[:2], 400)
             parts.append(tally.distribution(0))
         area = Roc.of(*parts).area
         held += area.low <= exact <= area.high

@@ -11,7 +11,7 @@ from scipy import stats
 
 from mauvecl.host.errors import InputError
 from mauvecl.noise import layout
-from mauvecl.results import twin as reference_sums
+from mauvecl.results import numpy_kernels
 from mauvecl.results.counts.tally import Distribution, Grid, Tally
 from mauvecl.results.detection.roc import Roc
 
@@ -19,7 +19,7 @@ from mauvecl.results.detection.roc import Roc
 def distribution(values: np.ndarray, grid: Grid) -> Distribution:
     tally = Tally([grid])
     values = values.astype(np.float32)
-    histogram, sums, outside = reference_sums.tally(values[None], tally.packed)
+    histogram, sums, outside = numpy_kernels.tally(values[None], tally.packed)
     tally.add(histogram, sums, values.size)
     assert tally.add_far(0, values) == outside[0]
     return tally.distribution(0)

@@ -1,1 +1,1 @@
-"""Histograms and moments of whole numbers: what a device counted of a statistic or a pixel."""
+"""Histograms and moments in integer arithmetic, from the counts of a device."""

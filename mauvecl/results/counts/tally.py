@@ -1,4 +1,4 @@
-"""Histograms and moments made of whole numbers, so that neither order nor tiling can change them."""
+"""Histograms and moments in integer arithmetic, independent of order and tiling."""
 
 from __future__ import annotations
 
@@ -13,76 +13,56 @@ from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
 from mauvecl.noise import layout
-from mauvecl.results.counts.far import UNIT_BITS, Far, FarCounts, is_above
+from mauvecl.results.counts.far import UNIT_BITS, FarCounts, FarTally, is_above
 from mauvecl.statistics.intervals import Interval, central_counts
 
 
 @dataclass(frozen=True)
 class Grid:
-    """Where one histogram lies: the channel it reads, its centre, and the spread it is scaled to."""
+    """Bins of a histogram."""
 
-    channel: int
+    channel: int  # channel whose values are counted
     centre: float
-    sigma: float
+    sigma: float  # standard deviation to which the bins are scaled
 
     @staticmethod
     def pack(grids: Sequence[Grid]) -> NDArray[np.void]:
-        """The grids as the device reads them, shape (n_grid,)."""
+        """Return the grids in the layout of the device, shape (n_grid,)."""
         packed = np.zeros(len(grids), layout.GRID)
         packed["channel"] = [grid.channel for grid in grids]
         with np.errstate(over="ignore", divide="ignore"):
             packed["centre"] = [grid.centre for grid in grids]
             packed["steps_per_unit"] = layout.STEPS_PER_SIGMA / np.array([grid.sigma for grid in grids], float)
-        # Where float32 has no such steps every value is far.
+        # If float32 cannot represent the steps, all values count as far.
         scale = packed["steps_per_unit"]
         bad = ~(np.isfinite(packed["centre"]) & np.isfinite(scale) & (scale >= np.finfo(np.float32).tiny))
         packed["centre"][bad], scale[bad] = 0.0, np.nan
         return packed
 
 
-#: The fine bins that count, and the steps in them.
+#: First and last fine bin, and their range of steps.
 FIRST_BIN, LAST_BIN = 1, layout.BINS - 2
 LOW_STEP, HIGH_STEP = ((n - layout.BINS // 2) * 2**layout.FINE_BITS for n in (FIRST_BIN, LAST_BIN + 1))
 
 
 class Tally:
-    """Counts and sums of many channels, added up tile by tile.
-
-    Parameters
-    ----------
-    grids : sequence of Grid
-
-    Attributes
-    ----------
-    counts : ndarray of int64, shape (n_grid, BINS)
-        Of the fine bins; the first and the last are empty.
-    sums : ndarray of Python integers, shape (n_grid, 2)
-        Of the steps counted there, and of their squares.
-    far : list of Far
-        Everything else.
-    n : int
-        Realisations.
-    """
+    """Accumulator of the histograms and sums of many channels."""
 
     def __init__(self, grids: Sequence[Grid]) -> None:
         self.grids = tuple(grids)
         self.packed = Grid.pack(self.grids)
+        # Fine bins; the first and the last stay empty.
         self.counts = np.zeros((len(grids), layout.BINS), np.int64)
-        # Python integers: squares outgrow 64 bits in long runs.
+        # Sums of steps in fine bins and of their squares; Python integers, since squares may exceed 64 bits.
         self.sums = np.zeros((len(grids), 2), object)
-        self.far = [Far() for _ in grids]
+        self.far = [FarTally() for _ in grids]
         self.n = 0
 
     def add(self, histogram: NDArray[np.integer], sums: NDArray[np.generic], n: int) -> None:
-        """Add what one or more tiles counted in fine bins.
+        """Add the counts of one or more tiles in fine bins.
 
-        Parameters
-        ----------
-        histogram : ndarray of uint32 or int64, shape (n_grid, BINS)
-        sums : ndarray of int64 or Python integers, shape (n_grid, 2)
-            Sums of fine steps and of their squares.
-        n : int
-            Realisations counted, there or by `add_far`.
+        `histogram` has the shape (n_grid, BINS). `sums`, shape (n_grid, 2), holds sums of fine steps and of their
+        squares. `n` is the number of realisations, including those counted by `add_far`.
         """
         inner = slice(FIRST_BIN, LAST_BIN + 1)
         self.counts[:, inner] += histogram[:, inner]
@@ -90,12 +70,12 @@ class Tally:
         self.n += n
 
     def add_far(self, index: int, values: NDArray[np.float32]) -> int:
-        """Count those values of one grid's channel that lie outside its fine bins, and tell how many these are."""
+        """Count the values of a grid's channel that lie outside its fine bins, and return their number."""
         grid = self.packed[index]
         with np.errstate(over="ignore", invalid="ignore"):
             steps = np.rint((values - grid["centre"]) * grid["steps_per_unit"])
         above = steps >= HIGH_STEP
-        # What is no number is not above.
+        # The complement counts NaN as below.
         below = ~(steps >= LOW_STEP)
         for there, side in ((above, True), (below, False)):
             if there.any():
@@ -103,7 +83,7 @@ class Tally:
         return int(above.sum() + below.sum())
 
     def distribution(self, index: int) -> Distribution:
-        """The distribution of one grid."""
+        """Return the distribution of a grid."""
         packed = self.packed[index]
         first, second = (int(value) for value in self.sums[index])
         return Distribution(
@@ -119,35 +99,23 @@ class Tally:
 
 @dataclass(frozen=True, eq=False)
 class Distribution:
-    """A histogram without ends, with exact integer moments.
+    """A histogram of unlimited range with exact integer moments.
 
-    Bins are 1/512 of a standard deviation wide to 32 of them around the centre, and 2**-13 of the value beyond.
-
-    Attributes
-    ----------
-    centre, step : float
-        The statistic's value at step 0, and the size of a fine step.
-    counts : ndarray of int64, shape (bins,)
-        Of the fine bins.
-    first, second : int
-        Sums of the fine steps counted there, and of their squares.
-    n : int
-        Realisations.
-    far : FarCounts
-        What lies outside the fine bins.
+    Bins are 1/512 of a standard deviation wide within 32 standard deviations of the centre, and 2**-13 of the value
+    beyond.
     """
 
-    centre: float
-    step: float
-    counts: NDArray[np.int64]
-    first: int
-    second: int
-    n: int
-    far: FarCounts
+    centre: float  # value of the statistic at step 0
+    step: float  # size of a fine step
+    counts: NDArray[np.int64]  # of the fine bins, shape (bins,)
+    first: int  # sum of the fine steps
+    second: int  # sum of their squares
+    n: int  # number of realisations
+    far: FarCounts  # values outside the fine bins
 
     @cached_property
     def _moments(self) -> tuple[Fraction, Fraction]:
-        """Exact mean, and mean of squares less its square, of steps inside and values outside."""
+        """Exact mean and variance of all values."""
         total, squares = Fraction(self.far.first, 2**UNIT_BITS), Fraction(self.far.second, 2 ** (2 * UNIT_BITS))
         inside = self.n - self.far.n
         if inside:
@@ -158,13 +126,7 @@ class Distribution:
         return mean, squares / self.n - mean**2
 
     def refuse_undefined(self, what: str = "the statistic") -> None:
-        """Refuse a distribution that is none.
-
-        Raises
-        ------
-        InputError
-            If a value is infinite or no number.
-        """
+        """Raise InputError if values are not finite."""
         if self.far.undefined:
             raise InputError(
                 f"{what} is infinite or no number in {self.far.undefined} of {self.n} realisations, expected finite "
@@ -185,19 +147,19 @@ class Distribution:
         self.refuse_undefined()
         if self.far.n:
             return math.sqrt(self._moments[1])
-        # In whole numbers, so that a narrow distribution far from the centre keeps its digits.
+        # Integer arithmetic keeps the precision of a narrow distribution far from the centre.
         variance = (self.second * self.n - self.first**2) / self.n**2
         return self.step * float(np.sqrt(variance))
 
     def edge(self, index: int | NDArray[np.intp]) -> float | NDArray[np.float64]:
-        """Lower edge of a fine bin."""
+        """Return the lower edge of a fine bin."""
         steps = (np.asarray(index) - self.counts.size // 2) * 2.0**layout.FINE_BITS - 0.5
         edges: NDArray[np.float64] = self.centre + self.step * steps
         return edges if np.ndim(index) else float(edges)
 
     @cached_property
     def bins(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-        """All bins that hold anything, rising: lower edges, upper edges, counts; each shape (m,)."""
+        """Lower edges, upper edges and counts of all filled bins, ascending; each shape (m,)."""
         self.refuse_undefined()
         filled = np.flatnonzero(self.counts)
         lower, upper, counts = np.asarray(self.edge(filled)), np.asarray(self.edge(filled + 1)), self.counts[filled]
@@ -218,13 +180,13 @@ class Distribution:
 
     @cached_property
     def _below(self) -> NDArray[np.int64]:
-        """Realisations below each bin that holds anything, and all of them; shape (m + 1,)."""
+        """Number of realisations below each filled bin, and in total; shape (m + 1,)."""
         return np.concatenate([[0], np.cumsum(self.bins[2])])
 
     def above(self, value: float) -> float:
-        """Realisations at or above a value: whole and exact at edges of bins, linear within a bin."""
+        """Return the number of realisations at or above a value: exact at edges of bins, interpolated between."""
         lower, upper, counts = self.bins
-        # The first bin that reaches above it.
+        # The first bin with an upper edge above the value.
         index = int(np.searchsorted(upper, value, side="right"))
         if index == counts.size:
             return 0.0
@@ -234,7 +196,7 @@ class Distribution:
         return float(self._below[-1] - self._below[index + 1] + share * counts[index])
 
     def edge_with_at_most(self, n_above: int) -> float:
-        """The lowest edge of a bin with at most so many realisations at or above it, minus infinity if all may be."""
+        """Return the lowest edge of a bin with at most `n_above` realisations at or above it, or minus infinity."""
         more = np.flatnonzero(self._below[-1] - self._below[:-1] > n_above)
         return float(self.bins[1][more[-1]]) if more.size else -math.inf
 
@@ -244,17 +206,17 @@ class Distribution:
         return int(self._below[-1] - self._below[at]), int(self.bins[2][at - 1]) if at else 0
 
     def quantile(self, probability: float | NDArray[np.float64]) -> NDArray[np.float64]:
-        """Quantiles, linear within a bin; exact to a bin's width."""
+        """Return quantiles, interpolated linearly within bins."""
         lower, upper, _ = self.bins
         edges = np.column_stack([lower, upper]).ravel()
         cumulative = np.column_stack([self._below[:-1], self._below[1:]]).ravel() / self.n
         return np.asarray(np.interp(probability, cumulative, edges))
 
     def quantile_interval(self, probability: float) -> Interval:
-        """One quantile with the 95 % interval of order statistics, its ends rounded outwards to edges of bins."""
+        """Return a quantile with the 95 % interval of order statistics, rounded outwards to edges of bins."""
         if not 0.0 < probability < 1.0:
             raise InputError(f"quantile at {probability!r}, expected a probability between 0 and 1")
-        # As many values lie below the quantile as a binomial variable counts: between these ranks with 95 %.
+        # The number of values below the quantile is binomial, so it lies between these ranks with 95 %.
         low, high = central_counts(self.n, probability)
         lower, upper, _ = self.bins
         first, last = (int(np.searchsorted(self._below[1:], rank)) for rank in (low, high + 1))
@@ -262,16 +224,10 @@ class Distribution:
         return Interval(float(self.quantile(probability)), *ends)
 
     def histogram(self, bins: int = 200) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Edges and counts over the filled range, in at most `bins` equal bins, for pictures.
-
-        Returns
-        -------
-        edges : ndarray, shape (m + 1,)
-        counts : ndarray of int64, shape (m,)
-        """
+        """Return edges, shape (m + 1,), and counts, shape (m,), in at most `bins` equal bins, for plots."""
         lower, upper, _ = self.bins
         if self.far.n:
-            # None narrower than what is counted there.
+            # No bin is narrower than the widest bin of the counts.
             span = upper[-1] - lower[0]
             edges = np.linspace(lower[0], upper[-1], max(min(bins, int(span / (upper - lower).max())), 1) + 1)
         else:
@@ -283,18 +239,12 @@ class Distribution:
         return edges, -np.diff(np.rint(above)).astype(np.int64)
 
 
-#: Values of each tail that are kept as they are, with their realisations.
+#: Number of extreme values of each tail that are kept with their realisations.
 TAIL_SAMPLES = 1000
 
 
 class TailSamples:
-    """The most extreme values of a channel and the realisations they came from.
-
-    Parameters
-    ----------
-    largest : bool
-        The largest values, or the smallest.
-    """
+    """The largest (or smallest) values of a channel and their realisations."""
 
     def __init__(self, *, largest: bool) -> None:
         self._sign = np.float32(1.0 if largest else -1.0)
@@ -302,12 +252,12 @@ class TailSamples:
         self.realisations = np.empty(0, np.int64)
 
     def add(self, values: NDArray[np.float32], first: int) -> None:
-        """Look through the values of realisations `first` and on; of equal ones the earlier realisation stays."""
+        """Add the values of realisations from `first` on; of equal values the earlier realisation is kept."""
         signed = self._sign * values
         if self.values.size == TAIL_SAMPLES:
             beyond = np.flatnonzero(signed > self._sign * self.values[-1])
         elif values.size > TAIL_SAMPLES:
-            # None below the thousandth can be kept, and sorting few is fast.
+            # Partitioning before sorting is faster.
             beyond = np.flatnonzero(signed >= np.partition(signed, -TAIL_SAMPLES)[-TAIL_SAMPLES])
         else:
             beyond = np.arange(values.size)
@@ -318,7 +268,7 @@ class TailSamples:
         self._keep(merged, realisations)
 
     def merge(self, values: NDArray[np.float32], realisations: NDArray[np.int64]) -> None:
-        """Add what was found in other realisations, in any order."""
+        """Add the extreme values of other realisations, in any order."""
         self._keep(np.concatenate([self.values, values]), np.concatenate([self.realisations, realisations]))
 
     def _keep(self, values: NDArray[np.float32], realisations: NDArray[np.int64]) -> None:

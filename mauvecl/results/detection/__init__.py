@@ -1,1 +1,1 @@
-"""Detections: thresholds, probabilities, ROC, rare tails, departures from the closed forms, campaigns of many tests."""
+"""Detections: thresholds, probabilities, ROC curves, rare tails, departures from closed forms, campaigns."""

@@ -1,4 +1,4 @@
-"""From one test to a campaign of many and back: false alarms expected, the chance of any, what a test may have."""
+"""False-alarm probabilities of campaigns of many tests, and of a single test in a campaign."""
 
 from __future__ import annotations
 
@@ -11,69 +11,40 @@ from scipy import special
 from mauvecl.host.errors import InputError
 from mauvecl.statistics.intervals import Interval, central_counts, clopper_pearson
 
-#: Campaigns drawn where stacks overlap.
-DRAWN = 20_000
-#: Tests of one simulated stretch of overlapping stacks; longer campaigns are made of such stretches.
+#: Number of simulated campaigns with overlapping stacks.
+SIMULATIONS = 20_000
+#: Tests per simulated stretch of overlapping stacks; longer campaigns consist of several stretches.
 STRETCH = 4_096
-#: A per-test probability is read off simulated maxima only where so many lie beyond.
-FEWEST = 100
+#: Smallest number of simulated maxima beyond a threshold.
+MIN_BEYOND = 100
 
 
 @dataclass(frozen=True)
 class Campaign:
-    """False alarms of a whole campaign.
-
-    Attributes
-    ----------
-    tests : int
-        Statistics compared with the threshold.
-    fap : float
-        Of one test.
-    expected : float
-        Tests with a false alarm to be expected, whatever their dependence.
-    at_most : float
-        Campaign false-alarm probability if all tests excluded each other (Bonferroni): no campaign exceeds it.
-    independent : float
-        If all tests were independent.
-    overlapping : Interval or None
-        With the correlation of overlapping stacks, for a normal statistic; None where stacks do not overlap.
-    """
+    """False alarms of a whole campaign."""
 
     tests: int
-    fap: float
-    expected: float
-    at_most: float
-    independent: float
-    overlapping: Interval | None
+    fap: float  # of one test
+    expected: float  # expected number of false alarms, for any dependence of the tests
+    at_most: float  # upper limit of the campaign's false-alarm probability (Bonferroni)
+    independent: float  # campaign's false-alarm probability for independent tests
+    overlapping: Interval | None  # the same for a normal statistic of overlapping stacks; None without overlap
 
 
 @dataclass(frozen=True)
 class PerTest:
-    """What one test's false-alarm probability may be for a wanted value of the campaign.
-
-    Attributes
-    ----------
-    tests : int
-    wanted : float
-        Probability of any false alarm in the campaign.
-    at_least : float
-        Enough whatever the tests' dependence (Bonferroni).
-    independent : float
-        For independent tests; enough for overlapping stacks of a linear statistic too, whose tests alarm together.
-    overlapping : Interval or None
-        With the correlation of overlapping stacks, for a normal statistic; None where stacks do not overlap, or too few
-        of the simulated campaigns lie beyond.
-    """
+    """False-alarm probability of one test that gives a campaign a wanted false-alarm probability."""
 
     tests: int
-    wanted: float
-    at_least: float
-    independent: float
+    wanted: float  # probability of any false alarm in the campaign
+    at_least: float  # sufficient for any dependence of the tests (Bonferroni)
+    independent: float  # for independent tests; sufficient too for overlapping stacks of a linear statistic
+    # For a normal statistic of overlapping stacks; None without overlap or with too few simulated maxima beyond.
     overlapping: Interval | None
 
 
 def per_test(wanted: float, frames: int, stack: int = 1, *, step: int | None = None, seed: int = 1) -> PerTest:
-    """The false-alarm probability that each test may have: the inverse of `campaign`.
+    """Return the false-alarm probability per test for a wanted one of the campaign; the inverse of `campaign`.
 
     Parameters
     ----------
@@ -81,11 +52,6 @@ def per_test(wanted: float, frames: int, stack: int = 1, *, step: int | None = N
         Probability of any false alarm in the whole campaign.
     frames, stack, step, seed
         As for `campaign`.
-
-    Raises
-    ------
-    InputError
-        For numbers that cannot be.
 
     Examples
     --------
@@ -103,41 +69,36 @@ def per_test(wanted: float, frames: int, stack: int = 1, *, step: int | None = N
     if step < stack and tests > 1:
         stretch = min(tests, STRETCH)
         share = float(-np.expm1(stretch / tests * np.log1p(-wanted)))
-        if share * DRAWN >= FEWEST:
+        if share * SIMULATIONS >= MIN_BEYOND:
             maxima = np.sort(_maxima(stretch, stack, step, seed)) / np.sqrt(stack)
-            low, high = central_counts(DRAWN, share)
-            counts = (round(share * DRAWN), low, high)
-            overlapping = Interval(*(float(special.ndtr(-maxima[DRAWN - k])) for k in counts))
+            low, high = central_counts(SIMULATIONS, share)
+            counts = (round(share * SIMULATIONS), low, high)
+            overlapping = Interval(*(float(special.ndtr(-maxima[SIMULATIONS - k])) for k in counts))
     return PerTest(tests, wanted, wanted / tests, float(-np.expm1(np.log1p(-wanted) / tests)), overlapping)
 
 
 def campaign(fap: float, frames: int, stack: int = 1, *, step: int | None = None, seed: int = 1) -> Campaign:
-    """Campaign false-alarm probability of a search through consecutive frames.
+    """Return the false-alarm probability of a search through consecutive frames.
 
     Parameters
     ----------
     fap : float
-        Of one test.
+        False-alarm probability of one test.
     frames : int
-        Searched; a day of 5 s frames has 17 280.
+        Number of searched frames; a day of 5 s frames has 17 280.
     stack : int
         Frames summed in one test.
     step : int, optional
-        Frames from one stack to the next; a whole stack by default. Fewer make stacks overlap, which correlates
-        neighbouring tests by the share of frames that they have in common.
+        Frames from one stack to the next. The default is `stack`. Smaller steps make stacks overlap, so that
+        neighbouring tests are correlated by their fraction of common frames.
     seed : int
-        Of the simulation where stacks overlap.
+        Seed of the simulation of overlapping stacks.
 
     Notes
     -----
-    Sums of frames are nearly normal, so a linear statistic over overlapping stacks is a moving average of independent
-    normals; the chance that its maximum exceeds the threshold is simulated. For chi-squared statistics the correlation
-    is the square of that, nearer to independence: between the two numbers given.
-
-    Raises
-    ------
-    InputError
-        For numbers that cannot be.
+    Sums of frames are nearly normal, so a linear statistic of overlapping stacks is a moving average of independent
+    normals. The probability that its maximum exceeds the threshold is simulated. The correlation of chi-squared
+    statistics is the square of this one, so their probability lies between `overlapping` and `independent`.
 
     Examples
     --------
@@ -161,13 +122,7 @@ def _check(what: str, value: float) -> None:
 
 
 def count_tests(frames: int, stack: int, step: int) -> int:
-    """Stacks of so many frames, so many apart, that fit into a campaign.
-
-    Raises
-    ------
-    InputError
-        For numbers that cannot be.
-    """
+    """Return the number of stacks in a campaign."""
     if not (1 <= stack <= frames and 1 <= step <= stack):
         raise InputError(
             f"a campaign of {frames} frames in stacks of {stack}, {step} apart, expected 1 <= step <= stack <= frames"
@@ -176,11 +131,11 @@ def count_tests(frames: int, stack: int, step: int) -> int:
 
 
 def _overlapping(fap: float, tests: int, stack: int, step: int, seed: int) -> Interval:
-    """Simulated, stretch by stretch; stretches are joined as if independent."""
+    """Simulate the probability of an alarm in a stretch, and combine stretches as if they were independent."""
     stretch = min(tests, STRETCH)
     cut = -special.ndtri(fap) * np.sqrt(stack)
     alarms = int((_maxima(stretch, stack, step, seed) >= cut).sum())
-    chance = clopper_pearson(alarms, DRAWN)
+    chance = clopper_pearson(alarms, SIMULATIONS)
     power = tests / stretch
     return Interval(
         *(float(-np.expm1(power * np.log1p(-min(p, 1 - 1e-16)))) for p in (chance.value, chance.low, chance.high))
@@ -188,13 +143,13 @@ def _overlapping(fap: float, tests: int, stack: int, step: int, seed: int) -> In
 
 
 def _maxima(stretch: int, stack: int, step: int, seed: int) -> NDArray[np.float64]:
-    """Largest sum of normals over a stretch of overlapping stacks, shape (DRAWN,)."""
+    """Draw the largest sum of normals over a stretch of overlapping stacks, shape (SIMULATIONS,)."""
     generator = np.random.default_rng(seed)
     size = (stretch - 1) * step + stack
     block = max(2**22 // size, 1)
     parts = []
-    for start in range(0, DRAWN, block):
-        sums = np.cumsum(generator.standard_normal((min(block, DRAWN - start), size)), axis=1)
+    for start in range(0, SIMULATIONS, block):
+        sums = np.cumsum(generator.standard_normal((min(block, SIMULATIONS - start), size)), axis=1)
         sums = np.pad(sums, ((0, 0), (1, 0)))
         parts.append((sums[:, stack:] - sums[:, :-stack])[:, ::step].max(axis=1))
     return np.concatenate(parts)

@@ -1,4 +1,4 @@
-"""Where a simulation differs from the closed form for Gaussian noise, by how much, and why."""
+"""Compare simulated false-alarm probabilities with the closed form for Gaussian noise."""
 
 from __future__ import annotations
 
@@ -26,62 +26,44 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: A difference of so many standard errors is one.
+#: Differences above this many standard errors are significant.
 SIGNIFICANT = 4.0
 
 
 @dataclass(frozen=True)
 class Departure:
-    """The null of one statistic at the threshold for Gaussian noise.
-
-    Attributes
-    ----------
-    statistic : str
-    template : int
-        The flare whose shape is looked for, or any.
-    threshold : float
-        At the wanted false-alarm probability for Gaussian noise.
-    fap : float
-        The one wanted.
-    simulated : Interval
-        The false-alarm probability that the simulation finds there.
-    skew, rounding, clipping : float
-        Predicted changes of the false-alarm probability there, relative to the one wanted: by the noise's third and
-        fourth cumulants, by the ADC's steps, by its ends.
-    others : tuple of str
-        What the closed form does not know, and no prediction is made for.
-    realisations : int
-    """
+    """False-alarm probability of a statistic at the threshold for Gaussian noise."""
 
     statistic: str
-    template: int
-    threshold: float
-    fap: float
-    simulated: Interval
-    skew: float
-    rounding: float
-    clipping: float
-    others: tuple[str, ...]
+    template: int  # flare that a shaped statistic uses as template
+    threshold: float  # for Gaussian noise
+    fap: float  # wanted false-alarm probability
+    simulated: Interval  # simulated false-alarm probability at the threshold
+    # Predicted changes of the false-alarm probability at the threshold, relative to `fap`.
+    skew: float  # due to third and fourth cumulants of the noise
+    rounding: float  # due to the steps of the ADC
+    clipping: float  # due to the ends of its range
+    others: tuple[str, ...]  # effects that the closed form does not include and that have no prediction
     realisations: int
 
     @property
     def ratio(self) -> float:
-        """Simulated over wanted false-alarm probability."""
+        """Simulated divided by wanted false-alarm probability."""
         return self.simulated.value / self.fap
 
     @property
     def error(self) -> float:
-        """Standard error of the ratio, if the closed form holds."""
+        """Standard error of the ratio if the closed form is exact."""
         return float(np.sqrt((1.0 - self.fap) / (self.fap * self.realisations)))
 
     @property
     def differs(self) -> bool:
-        """Whether chance does not explain the ratio."""
+        """True if the ratio deviates significantly from 1."""
         return abs(self.ratio - 1.0) > SIGNIFICANT * self.error
 
     @property
     def why(self) -> str:
-        """The largest of the causes where the simulation differs, and nothing elsewhere."""
+        """Largest cause of a significant deviation, else an empty string."""
         if not self.differs:
             return ""
         causes = {"skew of the noise": self.skew, "rounding": self.rounding, "clipping": self.clipping}
@@ -94,18 +76,15 @@ class Departure:
 
 @public
 def departures(detection: Detection, fap: float) -> list[Departure]:
-    """One row per statistic, and per flare for those that look for a flare's shape.
+    """Return the departures of all statistics from the closed forms.
+
+    Shaped statistics have one departure per flare.
 
     Parameters
     ----------
     detection : Detection
     fap : float
-        Wanted, per test.
-
-    Raises
-    ------
-    InputError
-        As `Detection.threshold`, for one that cannot be counted.
+        Wanted false-alarm probability per test.
     """
     scene = detection.scene
     others = []
@@ -117,7 +96,7 @@ def departures(detection: Detection, fap: float) -> list[Departure]:
         others.append("priors that the reference does not know")
     elif detection.nuisances is not None and not scene.modulations:
         others.append("unknowns that are marginalised over and not drawn")
-    digital = _digital(detection.quiet) if scene.clip else None
+    digital = _adc_moments(detection.quiet) if scene.clip else None
     rows = []
     for statistic in detection.statistics:
         for template in range(len(detection.flares)) if detection.statistic(statistic).shaped else (0,):
@@ -125,8 +104,8 @@ def departures(detection: Detection, fap: float) -> list[Departure]:
             cut = null.isf(fap)
             rounding = clipping = 0.0
             if digital is not None:
-                rounding = _moved(detection, statistic, template, *digital[0], cut) / fap - 1.0
-                clipping = _moved(detection, statistic, template, *digital[1], cut) / fap - 1.0 - rounding
+                rounding = _shifted_fap(detection, statistic, template, *digital[0], cut) / fap - 1.0
+                clipping = _shifted_fap(detection, statistic, template, *digital[1], cut) / fap - 1.0 - rounding
             rows.append(
                 Departure(
                     statistic,
@@ -134,7 +113,7 @@ def departures(detection: Detection, fap: float) -> list[Departure]:
                     cut,
                     fap,
                     detection.false_alarm_probability(cut, statistic, template=template),
-                    _skewed(detection, statistic, template, null, cut) / fap - 1.0,
+                    _skewed_fap(detection, statistic, template, null, cut) / fap - 1.0,
                     rounding,
                     clipping,
                     tuple(others),
@@ -145,14 +124,9 @@ def departures(detection: Detection, fap: float) -> list[Departure]:
 
 
 def departure_table(detection: Detection, amplitudes: Sequence[float], fap: float) -> QTable:
-    """The departures of a detection, one row each; none where thresholds cannot be counted.
+    """Return the departures of a detection as a table, without rows if too few realisations lie beyond thresholds.
 
-    Parameters
-    ----------
-    detection : Detection
-    amplitudes : sequence of float
-        Of its flares.
-    fap : float
+    `amplitudes` are those of the detection's flares.
     """
     rows = departures(detection, fap) if countable(fap, detection.realisations) else []
     shaped = [detection.statistic(d.statistic).shaped for d in rows]
@@ -183,13 +157,13 @@ def departure_table(detection: Detection, amplitudes: Sequence[float], fap: floa
     )
 
 
-def _skewed(detection: Detection, statistic: str, template: int, null: Form, cut: float) -> float:
-    """False-alarm probability at a threshold with the noise's third and fourth cumulants."""
+def _skewed_fap(detection: Detection, statistic: str, template: int, null: Form, cut: float) -> float:
+    """Return the false-alarm probability at a threshold with the noise's third and fourth cumulants."""
     scene, quiet = detection.scene, detection.quiet
     each = 1 if scene.frames else quiet.n_frames
     c, draws = Cumulants.of(quiet, each), quiet.n_frames // each
     one, flare = detection.statistic(statistic), detection.shape(statistic, template)
-    # Of the difference from the mean of some exposures.
+    # Cumulants of the difference between an exposure and the mean of reference exposures.
     added = one.added_variance(detection.setting)
     third, fourth, sixth = (
         draws * (c.photon_cumulant(r) + c.dark_cumulant(r)) * (1.0 + (-1.0) ** r * added ** (r - 1)) for r in (3, 4, 6)
@@ -199,11 +173,11 @@ def _skewed(detection: Detection, statistic: str, template: int, null: Form, cut
         weights = one.weights_per_dn(detection.setting, flare)
         sd = float(np.sqrt(weights**2 @ variance))
         z, skew, excess = cut / null.std, weights**3 @ third / sd**3, weights**4 @ fourth / sd**4
-        # Edgeworth's series (Abramowitz & Stegun 26.2.48).
+        # Edgeworth series (Abramowitz & Stegun 26.2.48).
         series = skew * (z**2 - 1) / 6 + excess * (z**3 - 3 * z) / 24 + skew**2 * (z**5 - 10 * z**3 + 15 * z) / 72
         return float(null.sf(cut) + np.exp(-(z**2) / 2) / np.sqrt(2 * np.pi) * series)
     assert isinstance(one, QuadraticStatistic)
-    # Each pixel's own square has more variance and more skew than a normal's.
+    # The square of a skewed variable has more variance and skew than that of a normal one.
     weights = one.square_weights(detection.setting, flare)
     second = null.std**2
     skewed = null.third
@@ -215,23 +189,25 @@ def _skewed(detection: Detection, statistic: str, template: int, null: Form, cut
 
 
 def _gamma_sf(value: float, mean: float, variance: float, third: float) -> float:
-    """Probability of exceeding a value, of a shifted gamma distribution with these cumulants."""
+    """Return the probability of exceeding a value for a shifted gamma distribution with given cumulants."""
     shape = 4.0 * variance**3 / third**2
     return float(special.gammaincc(shape, max(shape + (value - mean) / np.sqrt(variance) * np.sqrt(shape), 0.0)))
 
 
-def _moved(detection: Detection, statistic: str, template: int, shift: Float, variance: Float, cut: float) -> float:
-    """False-alarm probability at a threshold if the exposure's counts had another mean and variance, per pixel."""
+def _shifted_fap(
+    detection: Detection, statistic: str, template: int, shift: Float, variance: Float, cut: float
+) -> float:
+    """Return the false-alarm probability at a threshold for a changed mean and variance of each pixel."""
     one, used = detection.statistic(statistic), detection.scene.used
     added = one.added_variance(detection.setting)
     moved = Differences(np.where(used, (1.0 - (added > 0)) * shift, 0.0), (1.0 + added) * variance)
     return one.as_drawn(detection.setting, detection.quiet, moved, detection.shape(statistic, template)).sf(cut)
 
 
-def _digital(x: Expectation) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
-    """What the ADC does to an exposure's mean and variance, DN, with steps alone and with its low end as well.
+def _adc_moments(x: Expectation) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
+    """Compute the mean shift and the variance of an exposure behind the ADC, without and with its lower limit, in DN.
 
-    Saturation, the high end, is in the closed forms.
+    Saturation at the upper limit is part of the closed forms.
 
     Returns
     -------
@@ -243,7 +219,7 @@ def _digital(x: Expectation) -> tuple[tuple[Float, Float], tuple[Float, Float]]:
     for low, high in ((-np.inf, float(x.highest_dn)), (0.0, float(x.highest_dn))):
         shift, variance = np.zeros_like(mean), np.zeros_like(mean)
         for p, (m, s) in enumerate(zip(mean, sd, strict=True)):
-            # Whole numbers around the mean, the outermost taking all that lies beyond.
+            # Integers around the mean; the outermost ones include the tails.
             dn = np.arange(np.floor(m - 9 * s) - 1, np.ceil(m + 9 * s) + 2)
             below = special.ndtr((dn[:-1] + 0.5 - m) / s) if s > 0 else (dn[:-1] + 0.5 >= m).astype(float)
             chance = np.diff(below, prepend=0.0, append=1.0)

@@ -33,17 +33,17 @@ if TYPE_CHECKING:
 @public
 @dataclass(eq=False)
 class Detection(ContentEquality, Hypotheses):
-    """Null and flare distributions as they were counted; made by `Engine.detect`.
+    """Simulated null and flare distributions, as returned by `Engine.detect`.
 
-    Parameters and attributes are those of `Hypotheses` and these.
+    Attributes are those of `Hypotheses` and the following.
 
     Attributes
     ----------
     realisations : int
     tails : {"counted", "sampled"}
-        Whether a threshold beyond what was drawn is refused, or found by importance sampling.
+        Whether a threshold with too few realisations beyond it raises InputError, or is found by importance sampling.
     seed : int
-        Of the draws.
+        Seed of the draws.
     """
 
     realisations: int
@@ -55,7 +55,7 @@ class Detection(ContentEquality, Hypotheses):
 
     @classmethod
     def of(cls, hypotheses: Hypotheses, realisations: int, tails: Tails, seed: int) -> Self:
-        """Of hypotheses as they are: nothing is prepared again, and closed forms that one computes the other has."""
+        """Make a detection that shares the prepared state and closed forms of `hypotheses`."""
         made = object.__new__(cls)
         counts: dict[str, Any] = {"_tails": {}, "_distributions": {}, "_samples": {}}
         vars(made).update(vars(hypotheses) | counts, realisations=realisations, tails=tails, seed=seed)
@@ -68,22 +68,22 @@ class Detection(ContentEquality, Hypotheses):
         )
 
     def collect(self, plan: ChannelPlan, tally: Tally, samples: Sequence[TailSamples | None]) -> None:
-        """Take over the distributions and tails of one batch."""
+        """Add the distributions and tails of one batch."""
         for index, (key, kept) in enumerate(zip(plan.keys, samples, strict=True)):
             self._distributions[key] = tally.distribution(index)
             if kept is not None:
                 self._samples[key] = kept
 
     def distribution(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Distribution:
-        """The simulated distribution of a statistic.
+        """Return the simulated distribution of a statistic.
 
         Parameters
         ----------
         statistic : str
         flare : int, optional
-            Which flare; None for the null.
+            Index of the flare; None for the null distribution.
         template : int
-            For the null of shaped statistics: the flare whose shape is looked for.
+            Index of the flare that shaped statistics use as template, for the null distribution.
         """
         self._check(statistic, flare, template)
         if flare is None:
@@ -91,7 +91,7 @@ class Detection(ContentEquality, Hypotheses):
         return self._at((statistic, "flare", flare))
 
     def _at(self, key: Key) -> Distribution:
-        """What was counted; InputError where it has values that are no finite numbers."""
+        """Return a counted distribution; raises InputError if values are not finite."""
         statistic, role, flare = key
         counted = self._distributions[key]
         of = "without a flare" if role == "null" else f"with flare {flare + 1}"
@@ -101,26 +101,26 @@ class Detection(ContentEquality, Hypotheses):
     def histogram(
         self, statistic: str, flare: int | None = None, *, template: int = 0, bins: int = 200
     ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-        """Edges and counts for pictures; parameters as for `distribution`."""
+        """Return edges and counts for plots; parameters as for `distribution`."""
         return self.distribution(statistic, flare, template=template).histogram(count("bins", bins, low=1))
 
     def threshold(self, fap: float = 1e-3, statistic: str = "chi2", *, template: int = 0) -> Interval:
-        """The value exceeded with false-alarm probability `fap` in one test.
+        """Return the threshold at a false-alarm probability.
 
         Parameters
         ----------
         fap : float
-            Per test.
+            False-alarm probability per test.
         statistic : str
         template : int
-            For shaped statistics: the flare whose shape is looked for.
+            Index of the flare that shaped statistics use as template.
 
         Returns
         -------
         Interval
             The simulated upper quantile, rounded up to a bin's edge (1/512 of a standard deviation, or 2**-13 of the
-            value beyond 32 of them), and an order-statistic interval; where tails are sampled and few lie beyond, what
-            importance sampling found.
+            value beyond 32 of them), with an order-statistic interval; or the result of importance sampling, if tails
+            are sampled and too few realisations lie beyond.
 
         Raises
         ------
@@ -132,7 +132,7 @@ class Detection(ContentEquality, Hypotheses):
         return self._cut(fap, statistic, template)
 
     def tail(self, fap: float, statistic: str = "chi2", *, template: int = 0) -> Tail | None:
-        """The importance sampling behind a threshold, or None where realisations were counted."""
+        """Return the importance sampling behind a threshold, or None if realisations were counted."""
         self._check(statistic, None, template)
         check_fap(fap, self.realisations, self.tails)
         if countable(fap, self.realisations):
@@ -145,24 +145,18 @@ class Detection(ContentEquality, Hypotheses):
         return self._tails[key]
 
     def false_alarm_probability(self, threshold: float, statistic: str = "chi2", *, template: int = 0) -> Interval:
-        """Fraction of null realisations at or above a threshold, with its interval; the inverse of `threshold`.
+        """Return the fraction of null realisations at or above a threshold; the inverse of `threshold`.
 
-        Exact at edges of bins, as thresholds that were counted are; linear within a bin.
+        The fraction is exact at edges of bins, such as counted thresholds, and interpolated linearly within a bin.
         """
         null = self.distribution(statistic, template=template)
         return self._share_above(null, Interval(threshold, threshold, threshold))
 
     def detection_probability(self, fap: float = 1e-3, statistic: str = "chi2") -> list[Interval]:
-        """For each flare, the fraction of realisations at or above the threshold; NaN where there is no number.
+        """Return the fraction of realisations at or above the threshold for each flare.
 
-        That is for `blinding` flares, and where no threshold has the probability (`without_threshold`).
-
-        The interval holds the probability above the true threshold with 95 %: see `intervals.detection_interval`.
-
-        Raises
-        ------
-        InputError
-            As `threshold`, but for `NoThresholdError`.
+        The interval has 95 % coverage for the probability above the true threshold; see `detection_interval`. The
+        values are NaN for `blinding` flares, and if no threshold has the false-alarm probability (`without_threshold`).
         """
         probabilities = []
         for flare in range(len(self.flares)):
@@ -178,7 +172,7 @@ class Detection(ContentEquality, Hypotheses):
             above = [counted.above(value) for value in (cut.value, cut.high, cut.low)]
             shared = 0.0
             if countable(fap, self.realisations) and counted.std > 0:
-                # A flare adds what is not correlated with the null; tilted draws are others than the flares'.
+                # A flare only adds uncorrelated noise; tilted draws are independent of the flare's.
                 shared = min(self._at(self._null_key(statistic, flare)).std / counted.std, 1.0)
             probabilities.append(detection_interval(above, counted.n, fap, shared))
         return probabilities
@@ -196,7 +190,7 @@ class Detection(ContentEquality, Hypotheses):
 
     @staticmethod
     def _share_above(distribution: Distribution, cut: Interval) -> Interval:
-        """The share at or above a threshold; its interval is of whole counts, at the ends of the threshold's own."""
+        """Return the fraction at or above a threshold, with an interval that includes the threshold's."""
         value, low, high = (distribution.above(x) for x in (cut.value, cut.high, cut.low))
         return Interval(
             value / distribution.n,
@@ -207,13 +201,13 @@ class Detection(ContentEquality, Hypotheses):
     def quantile(
         self, probability: float, statistic: str = "chi2", flare: int | None = None, *, template: int = 0
     ) -> Interval:
-        """A quantile of a simulated distribution with its order-statistic interval; others as for `distribution`."""
+        """Return a quantile of a simulated distribution with its order-statistic interval; see `distribution`."""
         return self.distribution(statistic, flare, template=template).quantile_interval(probability)
 
     def tail_samples(self, statistic: str = "chi2", flare: int | None = None, *, template: int = 0) -> QTable:
-        """The 1000 largest values of a null or the smallest of a flare, exactly, with their realisations.
+        """Return the 1000 largest values of a null, or the smallest of a flare, with their realisations.
 
-        The realisation's number brings its spectrum back: `Engine.realise` with the same seed.
+        `Engine.realise` with the same seed draws the spectrum of a realisation again.
 
         Returns
         -------
@@ -228,25 +222,20 @@ class Detection(ContentEquality, Hypotheses):
         return make_table([("realisation", kept.realisations), ("value", kept.values, told)])
 
     def roc(self, statistic: str = "chi2", flare: int = 0) -> Roc:
-        """False-alarm probability against detection probability, and the area under the curve."""
+        """Return the ROC curve and the area under it."""
         self._check(statistic, flare)
         null = self._at(self._null_key(statistic, flare))
         return Roc.of(null, self._at((statistic, "flare_on_null_grid", flare)))
 
     def plot(self, path: str | Path | None = None, *, fap: float = 1e-3, ax: Any = None) -> object:
-        """Null and flare distributions by every statistic, with thresholds; needs matplotlib."""
+        """Plot the null and flare distributions of all statistics with their thresholds; needs matplotlib."""
         flares = [f"flare {k + 1}" for k in range(len(self.flares))]
         return picture("answers.detection", [(self.quiet.name, self, flares)], fap, path=path, ax=ax)
 
     def table(self, fap: float = 1e-3) -> QTable:
-        """One row per flare and statistic: expected and simulated values, threshold and probability.
+        """Return expected and simulated values, thresholds and probabilities, one row per flare and statistic.
 
-        NaN where there is no number; see `detection_probability`.
-
-        Raises
-        ------
-        InputError
-            As `detection_probability`.
+        Undefined values are NaN; see `detection_probability`.
         """
         from astropy.table import QTable
 
@@ -266,7 +255,7 @@ class Detection(ContentEquality, Hypotheses):
                 theory = self.closed_form(statistic, flare)
                 limit = self.closed_form(statistic, template=flare).isf(fap)
                 dof = self.dof(statistic)
-                # A weighted sum has no degrees of freedom to be divided by.
+                # A weighted sum has no reduced value.
                 reduced = np.nan if isinstance(self.statistic(statistic), LinearStatistic) else d.mean / dof
                 of_flare, power = (theory.mean, d.mean, d.std, reduced), theory.sf(limit)
                 if flare in self.blinding:
@@ -296,7 +285,7 @@ class Detection(ContentEquality, Hypotheses):
         return template if self.statistic(statistic).shaped else 0
 
     def _cut(self, fap: float, statistic: str, template: int) -> Interval:
-        """The threshold: as it was sampled, or the null's lowest edges with so many at or above them."""
+        """Return the sampled threshold, or the lowest edges of the null's bins with few enough counts above."""
         sampled = self.tail(fap, statistic, template=template)
         if sampled is not None:
             return sampled.threshold

@@ -1,4 +1,4 @@
-"""The MauveSim paper's own chi-squared, beside a calibrated answer."""
+"""The MauveSim paper's chi-squared values, for comparison with a calibrated result."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from mauvecl.statistics.smoothing import Smoothing
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
 
-#: Amplitude: chi-squared and reduced chi-squared of the G2V star, V = 7.4, 50 s (the paper, section "G2V star").
+#: Chi-squared and reduced chi-squared by amplitude, for the G2V star, V = 7.4, 50 s (the paper, section "G2V star").
 PAPER_G2V = {0.24: (6159.88, 3.75), 0.081: (1078.36, 0.66)}
 
 WHY = (
@@ -23,17 +23,11 @@ WHY = (
 
 
 def reconstruct(quiet: Expectation, flare: Expectation) -> Interval:
-    """The median and the central 95 % of the reduced statistic `paper` under a flare, for Gaussian noise.
+    """Return the median and central 95 % of the reduced statistic `paper` with a flare, for Gaussian noise.
 
-    Parameters
-    ----------
-    quiet, flare : Expectation
-
-    Notes
-    -----
-    The paper does not define its chi-squared. Of the forms tried this one comes nearest to its pair of G2V values: both
-    noisy spectra are smoothed with a Gaussian of 10.5 nm FWHM, as its figure says, and compared as
-    `scipy.stats.chisquare` would, with the flare's mean as the expected values.
+    The paper does not define its chi-squared. Of the definitions that were tried, this one is nearest to its two G2V
+    values: both noisy spectra are smoothed with a Gaussian of 10.5 nm FWHM, as stated in its figure, and compared as in
+    `scipy.stats.chisquare`, with the flare's mean as expected values.
     """
     smoothing = Smoothing.of(quiet, np.ones(quiet.wavelength_nm.size, bool), (flare,))
     delta, variance = flare.recorded_light_dn - quiet.recorded_light_dn, flare.variance_dn2 + quiet.variance_dn2

@@ -1,4 +1,4 @@
-"""Receiver operating characteristics of simulated distributions, with intervals."""
+"""Receiver operating characteristic (ROC) curves of simulated distributions."""
 
 from __future__ import annotations
 
@@ -24,35 +24,23 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Roc:
-    """False-alarm probability against detection probability, from the lowest threshold to the highest.
+    """ROC curve from the lowest threshold to the highest, at edges of filled bins."""
 
-    Attributes
-    ----------
-    threshold, fap, probability : ndarray, shape (n,)
-        At edges of bins; those between which nothing lies are left out.
-    realisations : int
-        Of the null, and of the flare.
-    area : Interval
-        The probability that a flare's value exceeds a null's, ties counted half, with DeLong's interval.
-    """
-
-    threshold: Float
-    fap: Float
-    probability: Float
-    realisations: int
-    area: Interval
+    threshold: Float  # shape (n,)
+    fap: Float  # false-alarm probability, shape (n,)
+    probability: Float  # detection probability, shape (n,)
+    realisations: int  # of the null, and of the flare
+    area: Interval  # probability that a flare's value exceeds a null's, counting ties half
 
     @classmethod
     def of(cls, null: Distribution, flare: Distribution) -> Roc:
-        """From two histograms on one grid.
+        """Compute the curve of two histograms on the same grid.
 
-        Notes
-        -----
-        The area's variance is that of DeLong et al. (1988, doi 10.2307/2531595) for null and flare drawn apart. Here
-        they share their draws, so that the interval errs on the wide side. Without any overlap the lower end is
-        Clopper and Pearson's for as many pairs as there are realisations.
+        The area's variance follows DeLong et al. (1988, doi 10.2307/2531595) for independent null and flare. Here they
+        share their draws, so the interval is conservative. Without any overlap, its lower end is that of Clopper and
+        Pearson for as many pairs as there are realisations.
         """
-        # Bins of both that hold anything; those of one grid are the same.
+        # Union of the filled bins.
         lower, first = np.unique(np.concatenate([null.bins[0], flare.bins[0]]), return_index=True)
         upper = np.concatenate([null.bins[1], flare.bins[1]])[first]
         share, above = np.zeros((2, lower.size)), np.zeros((2, lower.size + 1))
@@ -60,7 +48,7 @@ class Roc:
             counts = np.zeros(lower.size, np.int64)
             counts[np.searchsorted(lower, d.bins[0])] = d.bins[2]
             share[i] = counts / d.n
-            # Whole numbers above each edge, so that the ends of the curve are 1 and 0.
+            # Integer counts above each edge make the ends of the curve exactly 1 and 0.
             above[i, :-1] = counts[::-1].cumsum()[::-1] / d.n
         beaten, beating = 1.0 - above[0, :-1] + 0.5 * share[0], above[1, :-1] - 0.5 * share[1]
         area = float(np.clip(share[1] @ beaten, 0.0, 1.0))
@@ -75,16 +63,13 @@ class Roc:
         return cls(np.append(lower[0], upper), above[0], above[1], null.n, Interval(area, low, high))
 
     def plot(self, path: str | Path | None = None, *, name: str = "", ax: Any = None) -> object:
-        """Detection probability against false-alarm probability; needs matplotlib."""
+        """Plot detection probability against false-alarm probability; needs matplotlib."""
         return picture("answers.roc", [(name, self)], path=path, ax=ax)
 
     def table(self, rows: int = 200) -> QTable:
-        """Some rows of the curve, both probabilities with their Clopper-Pearson intervals; the area in the meta data.
+        """Return at most `rows` rows of the curve, evenly spaced in the logarithm of the false-alarm probability.
 
-        Parameters
-        ----------
-        rows : int
-            At most so many, even in the logarithm of the false-alarm probability; the ends are always there.
+        Both ends are included. Probabilities have Clopper-Pearson intervals; the metadata contain the area.
         """
         n = self.realisations
         wanted = np.append(np.geomspace(1.0, 1.0 / n, max(rows - 1, 1)), 0.0)

@@ -30,52 +30,42 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Realisations to begin with, and at most; each step doubles them.
-FEWEST, MOST = 8_000, 512_000
-#: Relative standard error of the false-alarm probability that is aimed at.
+#: Initial and largest number of realisations, which is doubled in each step.
+FIRST_REALISATIONS, MAX_REALISATIONS = 8_000, 512_000
+#: Target relative standard error of the false-alarm probability.
 WANTED_ERROR = 0.02
-#: Realisations drawn at once, from one run of counters.
+#: Realisations drawn at once, from one range of counters.
 BLOCK = 500
-#: Second half of the generator's key: draws of tails are no draws of the engine.
+#: Second half of the generator's key, which separates these draws from the engine's.
 TAIL_KEY = 0x7461696C
-#: Quiescent exposures averaged at most: each is drawn on the host.
-MOST_AVERAGED = 30
-#: Smaller ones lie beyond what the polynomial of the draw was tested for.
+#: Largest number of averaged quiescent exposures, since each is drawn on the host.
+MAX_AVERAGED = 30
+#: Smallest false-alarm probability for which the polynomial of the draw was tested.
 SMALLEST_FAP = 1e-10
 
 
 @dataclass(frozen=True)
 class Tail:
-    """A threshold from tilted draws.
-
-    Attributes
-    ----------
-    threshold : Interval
-    fap : float
-    relative_error : float
-        Standard error of the false-alarm probability at the threshold, over that probability.
-    realisations : int
-        Tilted draws.
-    """
+    """A threshold from importance sampling."""
 
     threshold: Interval
     fap: float
-    relative_error: float
-    realisations: int
+    relative_error: float  # of the false-alarm probability at the threshold
+    realisations: int  # number of tilted draws
 
 
 def tail(detection: Detection, fap: float, statistic: str, *, template: int = 0, seed: int) -> Tail:
-    """The threshold that a statistic's null exceeds with a small probability.
+    """Find the threshold of a small false-alarm probability by importance sampling.
 
     Parameters
     ----------
     detection : Detection
-        Of which only the scene and the quiescent star matter.
+        Detection of which only the scene and the quiescent star are used.
     fap : float
         1e-10 to 0.1.
     statistic : str
     template : int
-        For ``matched``: the flare whose shape is looked for.
+        Index of the flare that ``matched`` uses as template.
     seed : int
 
     Raises
@@ -83,15 +73,15 @@ def tail(detection: Detection, fap: float, statistic: str, *, template: int = 0,
     NoThresholdError
         If no threshold has the probability.
     InputError
-        If the noise is not drawn jointly and as stacks, cosmic rays act, priors are drawn that the statistics are not
-        marginalised over, more than 30 quiescent exposures are averaged, or the error stays too large.
+        If noise is not drawn jointly and in stacks, cosmic rays are drawn, priors are drawn that the statistics are not
+        marginalised over, more than 30 quiescent exposures are averaged, or the error remains too large.
     """
     if not SMALLEST_FAP <= fap <= 0.1:
         raise InputError(f"fap = {fap:g}, expected {SMALLEST_FAP:g} to 0.1 for importance sampling")
     _check(detection)
     how = _Tilt.towards(fap, detection, statistic, template)
     values, logs = np.empty(0), np.empty(0)
-    goal = FEWEST
+    goal = FIRST_REALISATIONS
     while True:
         more = _tilted(detection, statistic, template, how, seed, values.size, goal)
         values, logs = (np.concatenate(pair) for pair in zip((values, logs), more, strict=True))
@@ -100,7 +90,7 @@ def tail(detection: Detection, fap: float, statistic: str, *, template: int = 0,
         check_atom(f"{statistic} of {detection.quiet.name}", fap, beyond, at)
         if error <= WANTED_ERROR:
             return Tail(Interval(cut, low, high), fap, error, values.size)
-        if goal >= MOST:
+        if goal >= MAX_REALISATIONS:
             raise InputError(
                 f"the threshold of {statistic} at fap = {fap:g} has a relative error of {error:.2g} after {goal} "
                 f"tilted draws, expected {WANTED_ERROR:g}"
@@ -115,29 +105,29 @@ def _check(detection: Detection) -> None:
         "frames drawn one by one": scene.frames,
         "cosmic rays": scene.cosmic,
         "priors that statistics are not marginalised over": bool(scene.modulations) and not setting.integrates,
-        f"{scene.comparison.exposures} averaged exposures": scene.comparison.exposures > MOST_AVERAGED,
+        f"{scene.comparison.exposures} averaged exposures": scene.comparison.exposures > MAX_AVERAGED,
     }
     for reason, holds in reasons.items():
         if holds:
             raise InputError(
-                f"importance sampling with {reason}, expected stacks of joint draws and at most {MOST_AVERAGED} "
+                f"importance sampling with {reason}, expected stacks of joint draws and at most {MAX_AVERAGED} "
                 "averaged exposures: draw enough realisations"
             )
 
 
 def _threshold(values: Float, logs: Float, fap: float) -> tuple[float, float, float, float]:
-    """The value with a weighted fraction `fap` at or above it, its interval, and that fraction's relative error."""
+    """Return the value with a weighted fraction `fap` at or above, its interval, and the fraction's relative error."""
     order = np.argsort(-values, kind="stable")
     ordered, weight = values[order], np.exp(logs[order])
     above = np.cumsum(weight) / values.size
-    # The variance of a mean of weights, over the draws that exceed each value.
+    # Variance of the mean weight of the draws that exceed each value.
     variance = np.maximum(np.cumsum(weight**2) / values.size - above**2, 0.0) / values.size
     error = np.sqrt(variance)
     if above[-1] < fap:
         return float("nan"), float("nan"), float("nan"), float("inf")
     at = int(np.searchsorted(above, fap))
     relative = float(error[at] / above[at])
-    # The ends are where the fraction is off by its own error at the threshold.
+    # The fraction at the ends differs by its error at the threshold.
     reach = float(special.ndtri(0.5 + CONFIDENCE / 2)) * relative
     ends = np.searchsorted(above, (fap * (1.0 + reach), fap * (1.0 - reach)))
     low, high = (float(ordered[min(int(end), values.size - 1)]) for end in ends)
@@ -155,36 +145,28 @@ def _around(values: Float, logs: Float, cut: float) -> tuple[float, float]:
 
 @dataclass(frozen=True, eq=False)
 class _Tilt:
-    """How draws are moved towards an alarm: by `shift` along the first direction, or `stretch`ed along all of them.
+    """Change of the distribution of draws that makes alarms common: a shift along one direction, or a stretch."""
 
-    Attributes
-    ----------
-    directions : ndarray or sparse array, shape (n_direction, n_pixel)
-        Orthonormal, in standard deviations of each pixel's difference.
-    stretch : ndarray, shape (n_direction,)
-    shift : float
-    scores : dict of str to (float, float)
-        Mean and standard deviation of the normal scores that factors on light, sky and dark have in alarms.
-    """
-
+    # Orthonormal in standard deviations of each pixel's difference, dense or sparse, shape (n_direction, n_pixel).
     directions: Any
-    stretch: Float
-    shift: float = 0.0
+    stretch: Float  # factor on the spread along each direction, shape (n_direction,)
+    shift: float = 0.0  # along the first direction
+    # Mean and standard deviation of the normal scores of factors on light, sky and dark in alarms.
     scores: dict[str, tuple[float, float]] = field(default_factory=dict)
 
     @classmethod
     def towards(cls, fap: float, detection: Detection, statistic: str, template: int) -> _Tilt:
-        """Such that alarms of this probability are common."""
+        """Choose a tilt that makes alarms of a given probability common."""
         one, setting, flare = detection.statistic(statistic), detection.setting, detection.shape(statistic, template)
         tilt = one.tilt(setting, flare)
         nothing = Differences(np.zeros(setting.used.size), one.variance(setting), setting.comparison.estimated)
-        # What is marginalised over and not drawn does not scatter.
+        # Nuisance parameters that are not drawn do not scatter.
         null = one.as_drawn(setting, detection.quiet, nothing, flare, priors=False)
         goal = null.isf(fap)
         parts, chance, scores = null.parts if isinstance(null, Mixture) else (null,), np.ones(1), {}
         if isinstance(null, Mixture):
             assert setting.drawn
-            # Which factors an alarm has: Bayes's theorem.
+            # Posterior probability of the factors given an alarm.
             chance = null.weights * [part.sf(goal) for part in parts]
             chance = chance / chance.sum()
             nodes = setting.drawn.nodes(detection.quiet, weighted=tilt.square is None)[0]
@@ -193,40 +175,40 @@ class _Tilt:
                 mean = float(chance @ score)
                 scores[name] = mean, max(float(np.sqrt(chance @ (score - mean) ** 2)), 1.0)
         if tilt.square is None:
-            # Linear: the mean moves along the statistic's own direction, by what it has in alarms.
+            # Linear statistic: shift the mean along its direction, by the mean in alarms.
             moves = [_hazard((goal - part.mean) / part.std) for part in parts] if scores else [goal / tilt.per_sigma]
             return cls(tilt.directions, np.ones(1), float(chance @ moves), scores)
         if setting.nuisances:
-            # Squares that are taken away, and those that factors bring.
+            # Account for squares that marginalisation subtracts and factors add.
             goal = float(tilt.square.sum() * (chance @ [_growth(part, goal) for part in parts]))
-        # Quadratic: the spread grows, by exponential tilting of each independent square.
+        # Quadratic statistic: exponential tilting of each independent square increases the spread.
         return cls(tilt.directions, _stretch(tilt.square, goal), scores=scores)
 
     def moved(self, difference: Float) -> tuple[Float, Float]:
-        """What is added to differences, shape (n, n_pixel), and the logarithms of the draws' weights."""
+        """Return the change of differences, shape (n, n_pixel), and the logarithms of the draws' weights."""
         along = difference @ self.directions.T
         if self.shift:
             there = along + self.shift
             return self.shift * self.directions[0], self.shift**2 / 2 - self.shift * there[:, 0]
         there = along * self.stretch
-        # The ratio of standard normal densities to those of spread `stretch`.
+        # Ratio of standard normal densities to those of spread `stretch`.
         logs = np.log(self.stretch).sum() - 0.5 * there**2 @ (1.0 - 1.0 / self.stretch**2)
         return (there - along) @ self.directions, np.asarray(logs)
 
 
 def _hazard(z: float) -> float:
-    """The mean of a standard normal that exceeds z."""
+    """Return the mean of a standard normal variable given that it exceeds z."""
     return float(np.exp(-(z**2) / 2 - special.log_ndtr(-z)) / np.sqrt(2 * np.pi))
 
 
 def _growth(form: Form, goal: float) -> float:
-    """By how much central squares must grow for a sum of squares to reach a value on average, at least one."""
+    """Return the factor, at least one, on central squares that makes the mean of a sum of squares equal to `goal`."""
     assert isinstance(form, QuadraticForm)
     return max((goal - float(form.weight @ form.shift**2)) / float(form.weight.sum()), 1.0)
 
 
 def _stretch(square: Float, goal: float) -> Float:
-    """Spreads of normals whose weighted squares then sum to `goal` on average."""
+    """Return the spreads of normals whose weighted squares have a sum of mean `goal`."""
     from scipy.optimize import brentq
 
     most = float(square.max())
@@ -241,7 +223,7 @@ def _stretch(square: Float, goal: float) -> Float:
 def _tilted(
     detection: Detection, statistic: str, template: int, tilt: _Tilt, seed: int, start: int, stop: int
 ) -> tuple[Float, Float]:
-    """Values of tilted draws number start to stop - 1, whole blocks, and the logarithms of their weights."""
+    """Return the values of tilted draws `start` to `stop - 1`, whole blocks, and the logarithms of their weights."""
     parts = [_block(detection, statistic, template, tilt, seed, b) for b in range(start // BLOCK, stop // BLOCK)]
     values, logs = (np.concatenate(part) for part in zip(*parts, strict=True))
     return values, logs
@@ -255,7 +237,7 @@ def _block(
     exposures = 1 if one.paired else scene.comparison.exposures
     z, *others = (_normals(scene.n_pixel, seed, block, exposure) for exposure in range(1 + exposures))
     added = one.added_variance(detection.setting)
-    # Only the difference is tilted; what it does not see stays as drawn.
+    # Only the difference is tilted; orthogonal combinations remain as drawn.
     root = np.sqrt(1.0 + added)
     difference = (z - added * sum(others)) / root
     move, logs = tilt.moved(difference)
@@ -270,7 +252,7 @@ def _block(
 
 
 def _value(detection: Detection, statistic: str, template: int, excess: Float, mean: Float) -> Float:
-    """The statistic of each draw, from observed less reference and subtracted less reference, DN, (n, n_pixel)."""
+    """Return the statistic of draws from observed and subtracted counts, DN above the reference, shape (n, n_pixel)."""
     scene, one = detection.scene, detection.statistic(statistic)
     x, added = excess - mean, one.added_variance(detection.setting)
     variance = np.broadcast_to(one.variance(detection.setting), x.shape)
@@ -280,14 +262,14 @@ def _value(detection: Detection, statistic: str, template: int, excess: Float, m
 
 
 def _estimated(scene: Scene, excess: Float) -> Float:
-    """Variances as an observer estimates them, DN^2, shape (n, n_pixel)."""
+    """Return the variances that an observer estimates, DN^2, shape (n, n_pixel)."""
     estimate = scene.estimates[0, : scene.n_pixel]
     net = excess - scene.fraction[0, : scene.n_pixel] + estimate["net_offset"]
     return np.asarray(np.maximum(net, 0.0) * estimate["gain"] + estimate["variance"])
 
 
 def _normals(n_pixel: int, seed: int, block: int, exposure: int, purpose: int = 0) -> Float:
-    """Normals of a block of draws, shape (BLOCK, n_pixel), from counters of their own (Philox4x64, Box-Muller)."""
+    """Return the normals of a block of draws, shape (BLOCK, n_pixel), addressed by counter (Philox4x64, Box-Muller)."""
     counter = [0, purpose, exposure, block]
     words = np.random.Philox(key=[seed, TAIL_KEY], counter=counter).random_raw(BLOCK * (n_pixel + 1))
     uniform = ((words >> np.uint64(11)) + 0.5) * 2.0**-53
@@ -300,10 +282,10 @@ def _normals(n_pixel: int, seed: int, block: int, exposure: int, purpose: int = 
 def _factors(
     scene: Scene, towards: dict[str, tuple[float, float]], seed: int, block: int
 ) -> tuple[dict[str, Float], Float]:
-    """Factors on light, sky and dark, each less one and of shape (BLOCK, 1), and the logarithms of their weights."""
+    """Draw factors on light, sky and dark, each minus one, shape (BLOCK, 1), and the logarithms of their weights."""
     factors = {name: np.ones((BLOCK, 1)) for name in ("light", "sky", "dark")}
     kinds = [factor for _, factor in scene.modulations]
-    # Every second realisation has its scores moved: no weight exceeds two.
+    # The scores of every second realisation are moved, which limits weights to two.
     moved = np.arange(BLOCK)[:, None] % 2 == 1
     ratio = np.zeros(BLOCK)
     for row, ((name, factor), table) in enumerate(zip(scene.modulations, scene.priors, strict=True)):
@@ -311,14 +293,14 @@ def _factors(
         if name != "jitter" and kinds.count(factor) == 1 and factor in towards:
             mean, sd = towards[factor]
             score = np.where(moved, mean + sd * score, score)
-            # Of the density that it is moved to and the prior's.
+            # Ratio of the moved density to the prior's.
             ratio += (score[:, 0] ** 2 - ((score[:, 0] - mean) / sd) ** 2) / 2 - np.log(sd)
         factors[factor] *= 1.0 + at_score(table, score).mean(axis=1, keepdims=True)
     return {name: values - 1.0 for name, values in factors.items()}, np.log(2.0) - np.logaddexp(0.0, ratio)
 
 
 def _responding(scene: Scene, z: Float, factors: dict[str, Float]) -> Float:
-    """`_excess` where factors are drawn: the expansion of `analogue` in kernels/detector.cl.mako."""
+    """Return `_excess` with drawn factors, by the expansion of `analogue` in kernels/detector.cl.mako."""
     n = scene.n_pixel
     r = {name: scene.responses[name][0, :n].astype(np.float64) for name in scene.responses.dtype.names or ()}
     sky = factors["sky"] * r["sky_share"]
@@ -335,7 +317,7 @@ def _responding(scene: Scene, z: Float, factors: dict[str, Float]) -> Float:
 
 
 def _excess(scene: Scene, z: Float) -> Float:
-    """Observed less reference, DN, for the quiescent scenario."""
+    """Return the observed counts minus the reference, DN, for the quiescent scenario."""
     n = scene.n_pixel
     level = scene.levels[0, :n]
     drawn = level["c4"].astype(np.float64) if scene.quartic else np.zeros(n)
@@ -345,7 +327,7 @@ def _excess(scene: Scene, z: Float) -> Float:
 
 
 def _counted(scene: Scene, drawn: Float) -> Float:
-    """What the ADC makes of counts above the base, less the reference."""
+    """Digitise counts above the base and subtract the reference."""
     n, edge = scene.n_pixel, scene.edges[0, : scene.n_pixel]
     counts = np.rint(drawn)
     if scene.clip:

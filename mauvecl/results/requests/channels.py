@@ -1,4 +1,4 @@
-"""What one launch computes for a batch of flares: weights, scales and the grids that count each statistic."""
+"""Plan of the channels that a launch computes for a batch of flares: weights, scales and histogram grids."""
 
 from __future__ import annotations
 
@@ -16,70 +16,53 @@ from mauvecl.statistics.distributions import Form
 from mauvecl.statistics.paper import Paper
 from mauvecl.statistics.statistic import LinearStatistic, QuadraticStatistic, Statistic
 
-#: Which distribution: without a flare; with it, binned around the null; with it, around its own mean.
+#: Distributions: without a flare, with a flare in the bins of the null, with a flare in bins around its mean.
 Role = Literal["null", "flare_on_null_grid", "flare"]
 Key = tuple[str, Role, int]
 
 
 @dataclass(frozen=True)
 class ChannelPlan:
-    """What one launch computes for a batch of flares, and how its grids are called.
+    """Channels that a launch computes for a batch of flares."""
 
-    Attributes
-    ----------
-    weights : ndarray of float32, shape (n_linear, n_padded)
-    linear_end : ndarray of uint32, shape (n_scenario,)
-        One past the last linear statistic of each scenario.
-    pixels_end : ndarray of uint32, shape (n_scenario,)
-        One past the last of them that weighs pixels; those behind it weigh sums of resolution elements, at an element's
-        last pixel.
-    scales : ndarray of float32, shape (n_smoothed, n_centre)
-        Of the statistic `paper`; see `smoothing.Smoothing`.
-    scale_end : ndarray of uint32, shape (n_scenario,)
-    grids : list of Grid
-    keys : list of (statistic, role, flare)
-        What each grid holds.
-    subtractions : ndarray of uint32, shape (3, n)
-        Rows of chi-squared, and the first and one past the last of the rows whose squares are taken away from it.
-    """
-
-    weights: NDArray[np.float32]
-    linear_end: NDArray[np.uint32]
+    weights: NDArray[np.float32]  # shape (n_linear, n_padded)
+    linear_end: NDArray[np.uint32]  # one past the last linear statistic of each scenario, shape (n_scenario,)
+    # One past the last linear statistic with weights per pixel, shape (n_scenario,). Later ones have weights per
+    # resolution element, stored at the element's last pixel.
     pixels_end: NDArray[np.uint32]
-    scales: NDArray[np.float32]
-    scale_end: NDArray[np.uint32]
+    scales: NDArray[np.float32]  # of the statistic `paper` (see `Smoothing`), shape (n_smoothed, n_centre)
+    scale_end: NDArray[np.uint32]  # one past the last smoothed statistic of each scenario, shape (n_scenario,)
     grids: list[Grid]
-    keys: list[Key]
+    keys: list[Key]  # distribution that each grid counts
+    # Row of chi-squared, and first and one past the last row whose squares are subtracted from it, shape (3, n).
     subtractions: NDArray[np.uint32]
 
     def tails(self) -> list[TailSamples | None]:
-        """What keeps the extremes of each grid: a null's largest values, a flare's smallest."""
+        """Return accumulators of each grid's extremes: the largest values of a null, the smallest of a flare."""
         kinds: dict[Role, bool] = {"null": True, "flare": False}
         return [TailSamples(largest=kinds[role]) if role in kinds else None for _, role, _ in self.keys]
 
     @property
     def n_rows(self) -> int:
-        """Channels."""
+        """Number of channels."""
         return len(FIXED_STATISTICS) * len(self.linear_end) + len(self.weights) + len(self.scales)
 
 
 @dataclass(eq=False)
 class _Rows:
-    """Rows of weights of one kind, scenario by scenario."""
+    """Rows of weights of one kind, ordered by scenario."""
 
     rows: list[NDArray[np.float64]] = field(default_factory=list)
-    ends: list[int] = field(default_factory=list)
-    #: One past the last of each scenario that weighs pixels.
-    pixels_end: list[int] = field(default_factory=list)
-    #: Where a statistic of a scenario is found; `shaped` ones by the flare looked for.
-    places: dict[tuple[str, int, int], int] = field(default_factory=dict)
+    ends: list[int] = field(default_factory=list)  # one past the last row of each scenario
+    pixels_end: list[int] = field(default_factory=list)  # one past the last row with weights per pixel
+    index: dict[tuple[str, int, int], int] = field(default_factory=dict)  # by statistic, scenario and template
 
     def add(self, statistic: str, scenario: int, flare: int, row: NDArray[np.float64]) -> None:
-        self.places[statistic, scenario, flare] = len(self.rows)
+        self.index[statistic, scenario, flare] = len(self.rows)
         self.rows.append(row)
 
     def end_pixels(self) -> None:
-        """End what weighs pixels of a scenario."""
+        """End the rows of a scenario with weights per pixel."""
         self.pixels_end.append(len(self.rows))
 
     def end(self) -> None:
@@ -90,22 +73,16 @@ class _Rows:
 
 
 def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) -> ChannelPlan:
-    """Lay out the channels of a batch of flares; scenario 0 is always the quiescent one.
+    """Plan the channels of a batch of flares; scenario 0 is always the quiescent one.
 
-    Parameters
-    ----------
-    hypotheses : Hypotheses
-    batch : sequence of int
-        Flares of this launch.
-    first : bool
-        Whether nulls shared by all batches are counted in this one.
+    If `first`, the batch also counts the null distributions that all batches share.
     """
     asked = [hypotheses.statistic(name) for name in hypotheses.statistics]
     weighted, smoothed = _Rows(), _Rows()
     for scenario in range(1 + len(batch)):
-        # The quiescent draws meet every flare's shape, each flare only its own.
+        # Quiescent draws are compared with every flare's template, draws of a flare only with its own.
         shapes = [flare for i, flare in enumerate(batch) if scenario in (0, i + 1)]
-        # Those that look for a shape come first: the kernel sums the first row on its way. Sums of elements come last.
+        # Shaped statistics come first, since the kernel fuses the first row, and sums over elements last.
         for one in sorted(asked, key=lambda s: (s.by_element, not s.shaped)):
             if one.by_element:
                 weighted.end_pixels()
@@ -127,14 +104,14 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
             return fixed * scenario + FIXED_STATISTICS.index(one.kernel_sum)
         where = one.name, scenario, flare if one.shaped else 0
         if isinstance(one, LinearStatistic):
-            return fixed * n_scenario + weighted.places[where]
-        return fixed * n_scenario + len(weighted.rows) + smoothed.places[where]
+            return fixed * n_scenario + weighted.index[where]
+        return fixed * n_scenario + len(weighted.rows) + smoothed.index[where]
 
     nuisances = hypotheses.setting.nuisances
     subtractions = []
     for one in asked if nuisances else []:
         for scenario in range(n_scenario) if one.kernel_sum is not None else []:
-            begin = fixed * n_scenario + weighted.places[one.name, scenario, 0]
+            begin = fixed * n_scenario + weighted.index[one.name, scenario, 0]
             subtractions.append((row(one, scenario, 0), begin, begin + len(nuisances.names if nuisances else ())))
     grids: list[Grid] = []
     keys: list[Key] = []
@@ -156,7 +133,7 @@ def plan_channels(hypotheses: Hypotheses, batch: Sequence[int], *, first: bool) 
     weights = np.zeros((len(weighted.rows), len(hypotheses.scene.pixels)), np.float32)
     weights[:, : hypotheses.scene.n_pixel] = np.array(weighted.rows).reshape(len(weights), hypotheses.scene.n_pixel)
     scales = np.array(smoothed.rows, np.float32) if smoothed.rows else np.zeros((0, 1), np.float32)
-    ends = (np.array(places, np.uint32) for places in (weighted.ends, weighted.pixels_end, smoothed.ends))
+    ends = (np.array(ends, np.uint32) for ends in (weighted.ends, weighted.pixels_end, smoothed.ends))
     linear_end, pixels_end, scale_end = ends
     taken = np.array(subtractions, np.uint32).reshape(len(subtractions), 3).T
     return ChannelPlan(weights, linear_end, pixels_end, scales, scale_end, grids, keys, taken)

@@ -1,4 +1,4 @@
-"""Which false-alarm probabilities a number of realisations settles, and which a statistic can have."""
+"""Checks of false-alarm probabilities against the number of realisations and the values of a statistic."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from typing import Literal
 
 from mauvecl.host.errors import InputError
 
-#: A threshold needs this many realisations beyond it; a rarer tail is refused, never extrapolated.
-FEWEST_IN_TAIL = 100
+#: Smallest number of realisations beyond a threshold; rarer tails raise InputError and are never extrapolated.
+MIN_IN_TAIL = 100
 
-#: Thresholds with fewer than `FEWEST_IN_TAIL` beyond them: refused, or by importance sampling.
+#: Treatment of thresholds with fewer than `MIN_IN_TAIL` realisations beyond: InputError, or importance sampling.
 Tails = Literal["counted", "sampled"]
 
 
@@ -19,20 +19,10 @@ class NoThresholdError(InputError):
 
 
 def check_atom(what: str, fap: float, beyond: float, at: float) -> None:
-    """Refuse a false-alarm probability that lies within the probability of a single value.
+    """Raise NoThresholdError if a single value of a statistic is more probable than a false-alarm probability.
 
-    Parameters
-    ----------
-    what : str
-        The statistic and the star.
-    fap : float
-    beyond, at : float
-        Probabilities of larger values, and of the value at which the probability is passed.
-
-    Raises
-    ------
-    NoThresholdError
-        If that value alone is more probable than `fap`: as where saturation gives many exposures the same counts.
+    This happens if saturation gives many exposures the same counts. `what` names the statistic and the star; `beyond`
+    is the probability of values above the threshold, and `at` that of the threshold itself.
     """
     if at > fap:
         fewer = f"at most {rounded(beyond, up=False):g} or " if beyond > 0 else ""
@@ -52,18 +42,12 @@ def rounded(value: float, *, up: bool) -> float:
 
 
 def countable(fap: float, realisations: int) -> bool:
-    """Whether enough realisations lie beyond the threshold to count them."""
-    return fap * realisations >= FEWEST_IN_TAIL * (1 - 1e-9)
+    """Return whether at least `MIN_IN_TAIL` realisations lie beyond the threshold."""
+    return fap * realisations >= MIN_IN_TAIL * (1 - 1e-9)
 
 
 def check_fap(fap: float, realisations: int, tails: Tails = "counted") -> None:
-    """Refuse a false-alarm probability that this many realisations cannot settle.
-
-    Raises
-    ------
-    InputError
-        If it is none, or fewer than 100 realisations would lie beyond the threshold and tails are not sampled.
-    """
+    """Raise InputError if `fap` is no probability, or too small for counted tails."""
     if not 0.0 < fap < 1.0:
         raise InputError(f"fap = {fap!r}, expected a probability between 0 and 1")
     if tails not in ("counted", "sampled"):
@@ -71,6 +55,6 @@ def check_fap(fap: float, realisations: int, tails: Tails = "counted") -> None:
     if tails == "counted" and not countable(fap, realisations):
         raise InputError(
             f"fap = {fap:g} leaves {fap * realisations:.3g} of {realisations} realisations beyond the threshold, "
-            f"expected at least {FEWEST_IN_TAIL}: ask for {math.ceil(FEWEST_IN_TAIL / fap)} realisations, or for "
+            f"expected at least {MIN_IN_TAIL}: ask for {math.ceil(MIN_IN_TAIL / fap)} realisations, or for "
             "`tails='sampled'`"
         )

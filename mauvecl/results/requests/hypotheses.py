@@ -1,4 +1,4 @@
-"""Stars with and without flares as statistics see them: definitions, weights, closed forms. Nothing is counted here."""
+"""Null hypothesis and flares with their statistics, weights and closed forms."""
 
 from __future__ import annotations
 
@@ -24,24 +24,19 @@ from mauvecl.statistics.statistic import LinearStatistic, Setting, Statistic
 @public
 @dataclass(eq=False)
 class Hypotheses:
-    """The null hypothesis, the flares, and what tells them apart.
+    """The null hypothesis, the flares, and the statistics that distinguish them.
 
     Attributes
     ----------
     quiet : Expectation
     flares : tuple of Expectation
     asked : sequence of str or Linear
-        Statistics.
+        Requested statistics.
     scene : Scene
     nuisances : Nuisances, optional
-        What the statistics are marginalised over.
+        Parameters over which the statistics are marginalised.
     statistics : tuple of str
-        Their names.
-
-    Raises
-    ------
-    InputError
-        For an unknown statistic, one that needs a flare where there is none, or a star that saturates every pixel.
+        Names of the statistics.
     """
 
     quiet: Expectation
@@ -71,36 +66,30 @@ class Hypotheses:
             self._check_shapes()
 
     def _check_shapes(self) -> None:
-        """A flare that changes nothing has no shape to look for; one that saturates every pixel is told of."""
+        """Raise InputError for a flare without effect, unless it saturates every pixel, which `messages` report."""
         for k, flare in enumerate(self.flares):
             if k not in self.blinding:
                 check_shape(self.quiet, flare, self.scene.used, k)
 
     def statistic(self, name: str) -> Statistic:
-        """One of those computed.
-
-        Raises
-        ------
-        InputError
-            If it was not.
-        """
+        """Return a statistic by name; raises InputError if it was not requested."""
         if name not in self._chosen:
             raise InputError(f"statistic {name!r} was not simulated, expected one of {', '.join(self.statistics)}")
         return self._chosen[name]
 
     def shape(self, statistic: str, template: int = 0) -> Expectation | None:
-        """The flare whose shape a statistic looks for; None for those that look for none."""
+        """Return the flare that a shaped statistic uses as template; None for other statistics."""
         self._check(statistic, None, template)
         return self.flares[template] if self.statistic(statistic).shaped else None
 
     def weights(self, statistic: str, template: int = 0) -> NDArray[np.float64] | None:
-        """Weights per DN of a linear statistic, shape (n_pixel,); None for the others.
+        """Return the weights per DN of a linear statistic, shape (n_pixel,); None for others.
 
         Parameters
         ----------
         statistic : str
         template : int
-            For shaped statistics: the flare whose shape is looked for.
+            Index of the flare that shaped statistics use as template.
         """
         one = self.statistic(statistic)
         return (
@@ -111,13 +100,13 @@ class Hypotheses:
 
     @cached_property
     def blinding(self) -> tuple[int, ...]:
-        """Flares that saturate every pixel that counts."""
+        """Indices of flares that saturate every used pixel."""
         used = self.scene.used
         return tuple(k for k, x in enumerate(self.flares) if x.saturated[used].all())
 
     @property
     def messages(self) -> tuple[str, ...]:
-        """What the reader must be told of these flares."""
+        """Remarks on saturating flares."""
         return tuple(
             f"SATURATED: flare {k + 1} saturates every pixel of {self.quiet.name} that counts: what is recorded no "
             "longer depends on the flare, and no number is given."
@@ -125,9 +114,9 @@ class Hypotheses:
         )
 
     def closed_form(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Form:
-        """A statistic's distribution for Gaussian noise; parameters as for `Detection.distribution`."""
+        """Return a statistic's distribution for Gaussian noise; parameters as for `Detection.distribution`."""
         self._check(statistic, flare, template)
-        # Only the null of what looks for a shape depends on whose shape that is.
+        # Of the nulls, only those of shaped statistics depend on the template.
         key = statistic, flare, template if flare is None and self.statistic(statistic).shaped else 0
         if key not in self._forms:
             self._forms[key] = self._closed_form(statistic, flare, template)
@@ -139,7 +128,7 @@ class Hypotheses:
         return self.statistic(statistic).closed_form(self.setting, observed, looked_for)
 
     def dof(self, statistic: str) -> int:
-        """Degrees of freedom without a flare: pixels, resolution elements, or one."""
+        """Return the degrees of freedom without a flare: pixels, resolution elements, or one."""
         return self.statistic(statistic).dof(self.setting)
 
     def _check(self, statistic: str, flare: int | None, template: int = 0) -> None:
@@ -150,12 +139,7 @@ class Hypotheses:
 
 
 def check_shape(quiet: Expectation, flare: Expectation, used: NDArray[np.bool_], number: int = 0) -> None:
-    """Refuse a flare that changes no pixel that counts: it has no shape to look for.
-
-    Raises
-    ------
-    InputError
-    """
+    """Raise InputError if a flare changes no used pixel, since it cannot be a template."""
     if not (flare.recorded_light_dn != quiet.recorded_light_dn)[used].any():
         raise InputError(
             f"flare {number + 1} of {quiet.name} changes no pixel that counts, expected an amplitude above 0 for the "

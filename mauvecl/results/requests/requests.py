@@ -1,7 +1,7 @@
-"""What is asked of an engine, as data: no answer, no counts. A worker anywhere makes the same of it.
+"""Requests to an engine as plain data, from which every worker computes the same result.
 
-A shard is a range of realisations of one part of a request. What is counted of it holds whole numbers, and extremes
-with their realisations, so that shards may be counted in any order, on any device, and twice; `sums` adds them up.
+A shard is a range of realisations of one part of a request. Its counts are integers, and its extreme values carry their
+realisations, so shards can be counted in any order, on any device, and more than once; `sums` adds them up.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from mauvecl.statistics.nuisances import Nuisances, as_nuisances
 
 @dataclass(frozen=True)
 class Shard:
-    """Realisations start to start + count - 1 of one part of a request."""
+    """Range of realisations, `start` to `start + count - 1`, of one part of a request."""
 
     part: int
     start: int
@@ -35,7 +35,7 @@ class Shard:
 
     @property
     def name(self) -> str:
-        """For files."""
+        """Name in files."""
         return f"{self.part}-{self.start}-{self.count}"
 
     def __str__(self) -> str:
@@ -43,12 +43,7 @@ class Shard:
 
 
 def expectation_of(what: str, given: Any) -> Expectation:
-    """The expectation that is given, or one sentence for what is none.
-
-    Raises
-    ------
-    InputError
-    """
+    """Return an expectation unchanged; raises InputError for other objects."""
     if not isinstance(given, Expectation):
         kind = type(given).__name__
         raise InputError(
@@ -57,14 +52,8 @@ def expectation_of(what: str, given: Any) -> Expectation:
     return given
 
 
-def checked(realisations: Any, seed: Any, start: Any) -> dict[str, int]:
-    """The numbers of a request, whole.
-
-    Raises
-    ------
-    InputError
-        For what is no whole number, or impossible.
-    """
+def check_numbers(realisations: Any, seed: Any, start: Any) -> dict[str, int]:
+    """Return the numbers of a request as integers; raises InputError for other or impossible numbers."""
     number = count("realisations", realisations, low=1)
     return {
         "realisations": number,
@@ -74,26 +63,27 @@ def checked(realisations: Any, seed: Any, start: Any) -> dict[str, int]:
 
 
 class Countable:
-    """What travels to a worker: the question without anything made of it."""
+    """Base class of requests, which are pickled without cached results."""
 
     least: ClassVar[int] = 2**12
 
     @classmethod
     def of(cls, *what: Any, **how: Any) -> Self:
-        """With the fields of a `Drawing` among the keywords."""
+        """Make a request from keywords that may include the fields of a `Drawing`."""
         words = {name: how.pop(name) for name in DrawingWords.__annotations__ if name in how}
         return cls(*what, **how | {"drawing": Drawing(**words)})
 
     def __getstate__(self) -> dict[str, Any]:
+        """Return the state to pickle: request fields only, no caches."""
         return {each.name: getattr(self, each.name) for each in fields(self)}  # type: ignore[arg-type]
 
 
 class _Drawn(Countable):
-    """Realisations of expectations: whatever was given for a number is whole, and an expectation is one."""
+    """Base class of requests for realisations, which validates numbers and expectations."""
 
     def __post_init__(self) -> None:
         given = vars(self)
-        for name, value in checked(given["realisations"], given["seed"], given["start"]).items():
+        for name, value in check_numbers(given["realisations"], given["seed"], given["start"]).items():
             object.__setattr__(self, name, value)
         self._check_stars()
 
@@ -103,7 +93,7 @@ class _Drawn(Countable):
 
 @dataclass(frozen=True, eq=False)
 class DetectRequest(_Drawn):
-    """What `Engine.detect` takes; parameters as there."""
+    """Arguments of `Engine.detect`."""
 
     quiet: Expectation
     flares: tuple[Expectation, ...]
@@ -117,7 +107,7 @@ class DetectRequest(_Drawn):
     nuisances: Nuisances | Mapping[str, float] | None = None
 
     def _check_stars(self) -> None:
-        # One flare needs no list of its own.
+        # A single flare need not be in a list.
         flares = (self.flares,) if isinstance(self.flares, Expectation) else tuple(self.flares)
         expectation_of("the quiescent star", self.quiet)
         for number, flare in enumerate(flares):
@@ -129,14 +119,14 @@ class DetectRequest(_Drawn):
 
     @cached_property
     def hypotheses(self) -> Hypotheses:
-        """What is drawn, and what is computed of it."""
+        """Scene and statistics of the request."""
         scene = prepare([self.quiet, *self.flares], self.drawing, comparison=self.comparison)
         nuisances = as_nuisances(self.nuisances, self.quiet)
         return Hypotheses(self.quiet, self.flares, self.statistics, scene, nuisances=nuisances)
 
     @cached_property
     def plans(self) -> list[tuple[ChannelPlan, Scene]]:
-        """What each part's launches compute: as many flares at a time as one launch holds."""
+        """Channels and scene of each part, with as many flares as a launch can process."""
         scene, count = self.hypotheses.scene, len(self.flares)
         size = BATCH[scene.frames] - 1
         batches = [range(i, min(i + size, count)) for i in range(0, count, size)] or [range(0)]
@@ -147,18 +137,18 @@ class DetectRequest(_Drawn):
 
     @property
     def parts(self) -> int:
-        """Launches of different kind."""
+        """Number of parts, whose launches differ."""
         return len(self.plans)
 
     @property
     def work(self) -> int:
-        """Pixels times scenarios."""
+        """Work per realisation: pixels times scenarios."""
         return self.hypotheses.scene.n_pixel * max(len(scene.levels) for _, scene in self.plans)
 
 
 @dataclass(frozen=True, eq=False)
 class SnrRequest(_Drawn):
-    """What `Engine.snr` takes; parameters as there."""
+    """Arguments of `Engine.snr`."""
 
     expectation: Expectation
     realisations: int
@@ -170,18 +160,18 @@ class SnrRequest(_Drawn):
 
     @cached_property
     def scene(self) -> Scene:
-        """What is drawn."""
+        """Scene to draw."""
         return prepare([self.expectation], self.drawing)
 
     @property
     def work(self) -> int:
-        """Pixels."""
+        """Work per realisation: pixels."""
         return self.scene.n_pixel
 
 
 @dataclass(frozen=True, eq=False)
 class RealiseRequest(_Drawn):
-    """What `Engine.realise` takes; parameters as there. One shard: callers ask for as much as travels well."""
+    """Arguments of `Engine.realise`, computed as a single shard, so callers limit the number of realisations."""
 
     expectation: Expectation
     realisations: int
@@ -191,17 +181,17 @@ class RealiseRequest(_Drawn):
 
 
 class Divisible(Protocol):
-    """What is cut into shards.
+    """Request that can be divided into shards.
 
     Attributes
     ----------
     realisations, start : int
     parts : int
-        Launches of different kind.
+        Number of parts, whose launches differ.
     work : int
-        About pixels times scenarios of one realisation.
+        Approximate work per realisation: pixels times scenarios.
     least : int
-        Realisations of a shard, at least: a power of two.
+        Smallest number of realisations of a shard, a power of two.
     """
 
     @property

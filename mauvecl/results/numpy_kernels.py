@@ -1,4 +1,4 @@
-"""The slow twin of what kernels make of draws: statistics, S/N histograms and tallies, summed in the device's order."""
+"""NumPy reference of the kernels for statistics, S/N histograms and tallies, in the device's order of summation."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def statistics(
     pair: bool = True,
     smoothed: Smoothed | None = None,
 ) -> NDArray[np.float32]:
-    """Every channel of the kernels `statistics` and `comparison`, in their order.
+    """Compute all channels of the kernels `statistics` and `comparison`, in their order.
 
     Parameters
     ----------
@@ -36,11 +36,10 @@ def statistics(
     realisation : ndarray of uint64, shape (n,)
     seed : int
     plan : ChannelPlan
-        Its weights.
     pair : bool
-        Whether `chi2_pair` is wanted; its rows are zero otherwise.
+        Whether to compute `chi2_pair`; its rows are zero otherwise.
     smoothed : Smoothed, optional
-        Where `paper` is wanted.
+        Input of the statistic `paper`, if it is computed.
 
     Returns
     -------
@@ -106,7 +105,7 @@ def statistics(
 
 
 def _variance(x: Floats, estimate: NDArray[np.void]) -> Floats:
-    """What an observer takes counts for, shape (n_padded, n)."""
+    """Return the variances that an observer estimates from counts, shape (n_padded, n)."""
     gain, known, offset = (estimate[name][:, None] for name in ("gain", "variance", "net_offset"))
     return fma(np.maximum(x + offset, np.float32(0.0)), gain, known)
 
@@ -114,7 +113,7 @@ def _variance(x: Floats, estimate: NDArray[np.void]) -> Floats:
 def _element_sums(
     scene: Scene, k: int, y: Floats, variance: Floats, weights: NDArray[np.float32]
 ) -> tuple[Floats, Floats]:
-    """The statistic `chi2_element` of a scenario, shape (n,), and weighted sums of its elements, shape (m, n)."""
+    """Return `chi2_element` of a scenario, shape (n,), and weighted sums of its elements, shape (m, n)."""
     total: Floats = np.zeros_like(y[0])
     weighted: Floats = np.zeros((len(weights), total.size), np.float32)
     inside, noise = total, total
@@ -137,7 +136,7 @@ def _element_sums(
 
 
 def marginalise(values: NDArray[np.float32], subtractions: NDArray[np.uint32]) -> NDArray[np.float32]:
-    """The kernel of that name: the channels with squares taken away, shape as given."""
+    """Subtract the squares of channels as the kernel `marginalise` does."""
     out = values.copy()
     for base, first, end in subtractions.T:
         for row in out[first:end]:
@@ -147,22 +146,22 @@ def marginalise(values: NDArray[np.float32], subtractions: NDArray[np.uint32]) -
 
 @dataclass(frozen=True, eq=False)
 class Smoothed:
-    """What the statistic `paper` needs: weights of each centre, shape (n_centre, n_padded), and factors of squares."""
+    """Input of the statistic `paper`."""
 
-    rows: NDArray[np.float32]
-    scales: NDArray[np.float32]
+    rows: NDArray[np.float32]  # weights of each centre, shape (n_centre, n_padded)
+    scales: NDArray[np.float32]  # factors of squares, as in `ChannelPlan`
     scale_end: NDArray[np.uint32]
 
     @classmethod
     def of(cls, hypotheses: Hypotheses, plan: ChannelPlan) -> Smoothed:
-        """Of a detection's channels."""
+        """Return the input for a detection's channels."""
         smoothing = Paper().smoothing(hypotheses.setting)
         rows = np.zeros((len(smoothing.rows), len(hypotheses.scene.pixels)), np.float32)
         rows[:, : hypotheses.scene.n_pixel] = smoothing.rows
         return cls(rows, plan.scales, plan.scale_end)
 
     def sums(self, difference: Floats, k: int) -> list[Floats]:
-        """The smoothed statistics of a scenario, each shape (n,)."""
+        """Return the smoothed statistics of a scenario, each of shape (n,)."""
         begin = int(self.scale_end[k - 1]) if k else 0
         out = [np.zeros(difference.shape[1], np.float32) for _ in range(begin, int(self.scale_end[k]))]
         for centre, row in enumerate(self.rows):
@@ -182,7 +181,7 @@ def _above_reference(scene: Scene, counts: NDArray[np.int64]) -> NDArray[np.floa
 
 
 def _summed(values: NDArray[np.float32], weights: NDArray[np.float32]) -> Floats:
-    """Weighted sums over pixels, shape (n_pixel, n) to (n,): four side by side, by pixel number modulo four."""
+    """Return weighted sums over pixels, shape (n,), from four partial sums by pixel index modulo four."""
     parts = [np.zeros(values.shape[1], np.float32) for _ in range(4)]
     for p, weight in enumerate(weights):
         parts[p % 4] = fma(values[p], weight, parts[p % 4])
@@ -197,7 +196,7 @@ def histograms(
     realisation: NDArray[np.uint64],
     seed: int,
 ) -> Counts:
-    """The kernel `histogram`: each pixel's counts, each element's S/N, and frames clipped; nothing has an end."""
+    """Count pixels, S/N of elements and clipped frames as the kernel `histogram` does, including far values."""
     counts, half = Counts(scene.n_pixel, len(elements)), layout.OBSERVER_BINS // 2
     n = observed(scene, realisation, seed, scenarios=[0])[0]
 
@@ -227,7 +226,7 @@ def histograms(
 def tally(
     values: NDArray[np.float32], grids: NDArray[np.void]
 ) -> tuple[NDArray[np.uint32], NDArray[np.int64], NDArray[np.uint32]]:
-    """The kernel `tally`: what each grid counts.
+    """Count values on grids as the kernel `tally` does.
 
     Parameters
     ----------
@@ -237,10 +236,11 @@ def tally(
     Returns
     -------
     histogram : ndarray of uint32, shape (n_grid, BINS)
-        The first and last bins with everything outside.
+        The first and last bins include all values outside.
     sums : ndarray of int64, shape (n_grid, 2)
-        Of fine steps and of their squares, without those.
+        Sums of fine steps and of their squares, without values outside.
     outside : ndarray of uint32, shape (n_grid,)
+        Number of values outside.
     """
     bins = layout.BINS
     histogram = np.zeros((len(grids), bins), np.uint32)
@@ -250,7 +250,7 @@ def tally(
     for g, grid in enumerate(grids):
         with np.errstate(over="ignore", invalid="ignore"):
             steps = (values[int(grid["channel"])] - grid["centre"]) * grid["steps_per_unit"]
-        # What is no number lies at the lower end.
+        # NaN is counted at the lower end.
         steps = np.where(steps > -end, np.minimum(steps, end - np.float32(1.0)), -end)
         step = nearest(steps).astype(np.int64)
         bin_index = (step >> layout.FINE_BITS) + bins // 2
