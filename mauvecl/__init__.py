@@ -5,10 +5,16 @@ The public names are loaded when first used: importing mauvecl loads neither Ope
 
 from __future__ import annotations
 
+import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.host.version import VERSION
+
+if sys.platform == "win32":
+    from mauvecl.device.drivers import sources
+
+    raise ImportError(f"mauvecl does not run on Windows itself, expected {sources('Windows')}")
 
 if TYPE_CHECKING:
     from mauvecl.answers.campaigns.plan import plan

@@ -24,6 +24,7 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from mauvecl.device import processor
+from mauvecl.device.drivers import sources
 from mauvecl.device.errors import DeviceError
 from mauvecl.device.kernel_cache import kernel_cache
 from mauvecl.host.errors import InputError
@@ -230,9 +231,8 @@ def _sentence(device: Any, outcome: Outcome) -> str:
     tried = "; ".join(f"{name or 'its own choice'} {why}" for name, why in outcome.tried)
     return (
         f"{device.platform.version.strip()}, driver {device.driver_version.strip()}, cannot build kernels for the "
-        f"processor {device.name.strip()} (compiled for {tried}), expected another driver: `pip install "
-        "'mauvecl[intel]'`, PoCL from your distribution or from conda-forge, or another device (--device, `mauvecl "
-        f"devices`); {LIMIT} sets the limit, and mauvecl tries again after a week or with another driver"
+        f"processor {device.name.strip()} (compiled for {tried}), expected another device (--device, `mauvecl "
+        f"devices`) or driver: {sources()}; {LIMIT} sets the limit, and mauvecl tries again after a week"
     )
 
 
@@ -267,7 +267,9 @@ def _lower(what: int, soft: int, hard: int) -> None:
     """Lower a limit; one that is lower already stays."""
     now = resource.getrlimit(what)[1]
     most = hard if now == resource.RLIM_INFINITY else min(hard, now)
-    resource.setrlimit(what, (min(soft, most), most))
+    # macOS knows some limits by name only.
+    with contextlib.suppress(OSError, ValueError):
+        resource.setrlimit(what, (min(soft, most), most))
 
 
 def _build(asked: dict[str, Any]) -> str:

@@ -16,6 +16,8 @@ from functools import cache
 from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
+from mauvecl.device import vendors
+from mauvecl.device.drivers import sources
 from mauvecl.device.errors import BuildError, DeviceError
 from mauvecl.device.first_build import settle
 from mauvecl.device.kernel_cache import kernel_cache
@@ -121,14 +123,15 @@ def load_opencl() -> Any:
     try:
         import pyopencl
     except ImportError as error:
-        raise DeviceError(f"pyopencl cannot be loaded ({error}): install `pyopencl[pocl]`") from error
+        raise DeviceError(f"pyopencl cannot be loaded ({error}): install {sources()}") from error
     return pyopencl
 
 
 def _devices() -> list[Any]:
     cl = load_opencl()
     try:
-        platforms = cl.get_platforms()
+        with vendors.shown():
+            platforms = cl.get_platforms()
     except cl.Error:
         platforms = []
     handles = []
@@ -138,9 +141,10 @@ def _devices() -> list[Any]:
         except cl.Error:
             continue
     if not handles:
-        raise DeviceError(
-            "no OpenCL device found: install PoCL with `pip install 'pyopencl[pocl]'` or a driver for your device"
-        )
+        # Loaders look in the folder that a variable names, and then nowhere else.
+        places = ", ".join(f"{name}={os.environ[name]}" for name in vendors.FOLDERS if os.environ.get(name))
+        searched = f" ({places})" if places else ""
+        raise DeviceError(f"no OpenCL device found{searched}: install {sources()}")
     # PoCL on the CPU first: it is the default.
     return sorted(handles, key=lambda d: (d.platform.name != POCL, "cpu" not in _kind(d)))
 
