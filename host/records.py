@@ -5,7 +5,15 @@ from __future__ import annotations
 import difflib
 from typing import TYPE_CHECKING, Any, cast, get_args
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    ValidationError,
+    ValidationInfo,
+    ValidatorFunctionWrapHandler,
+    field_validator,
+)
+from pydantic_core import PydanticCustomError
 
 from .errors import InputError
 from .files.bounded import shortened
@@ -35,6 +43,16 @@ class Record(BaseModel, metaclass=_InputErrorMeta):
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
+    @field_validator("*", mode="wrap")
+    @classmethod
+    def _no_truth_as_number(cls, given: Any, validate: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
+        """Refuse true and false where a number or text is expected; pydantic takes them for 1 and 0."""
+        annotation = cls.model_fields[str(info.field_name)].annotation
+        values = list(given.values()) if isinstance(given, dict) and not _model_in(annotation) else given
+        if holds_truth(values) and not _takes_truth(annotation):
+            raise PydanticCustomError("truth", "Input should be no truth value")
+        return validate(given)
+
     def __setattr__(self, name: str, value: Any) -> None:
         try:
             super().__setattr__(name, value)
@@ -42,6 +60,18 @@ class Record(BaseModel, metaclass=_InputErrorMeta):
             raise InputError(
                 f"{type(self).__name__}.{name} is not set in place, expected a changed copy: with_, with_settings, at"
             ) from None
+
+
+def holds_truth(given: Any) -> bool:
+    """Return whether a value is true or false, or a list that has one; records within look at their own."""
+    if isinstance(given, list | tuple):
+        return any(map(holds_truth, given))
+    # NumPy's own too, which need not be loaded.
+    return type(given).__name__ in ("bool", "bool_")
+
+
+def _takes_truth(annotation: Any) -> bool:
+    return annotation in (bool, Any) or any(map(_takes_truth, get_args(annotation)))
 
 
 def input_error(where: str, model: type[BaseModel], error: ValidationError) -> InputError:
@@ -78,6 +108,8 @@ def _sentence(model: type[BaseModel], error: ValidationError) -> str:
     value = f"{key} = {shown(first['input'])}"
     if first["type"] in ("too_long", "too_short"):
         return f"{value}, expected {told.partition('should have ')[2].partition(' after')[0]}"
+    if first["type"] == "truth":
+        return f"{value}, expected a number or text, not true or false"
     if first["type"] == "path_type":
         return f"{value}, expected a path"
     return f"{value}: {told.lower()}" if told == first["msg"] else f"{value}, expected {told}"

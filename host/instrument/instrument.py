@@ -231,6 +231,10 @@ class Instrument(Record):
             raise InputError(f"bias_dn = {self.bias_dn:g}, expected below saturation")
         if self.pixel_map is not None and self.pixel_map.size != self.pixels:
             raise InputError(f"pixel_map has {self.pixel_map.size} pixels, expected the array's {self.pixels}")
+        if not (self.throughput(self.wavelength_nm) * self.per_pixel("response", 1.0) > 0).any():
+            dark = [name for name in CURVES if not (getattr(self, name).at(self.wavelength_nm) > 0).any()]
+            what = f"{' and '.join(dark) or 'the throughput'} = 0 from {low:g} to {high:g} nm"
+            raise InputError(f"{what}, expected a throughput above 0 in some pixel, where else all S/N are 0")
         return self
 
     @cached_property

@@ -12,7 +12,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import shown
 from mauvecl.host.files.text_table import read_text_table
-from mauvecl.host.records import input_error
+from mauvecl.host.records import holds_truth, input_error
 from mauvecl.study.sections import Part
 
 if TYPE_CHECKING:
@@ -49,6 +49,9 @@ class LimitsText(Part):
     def _number_or_none(cls, given: Any, info: ValidationInfo) -> Any:
         if isinstance(given, str) and given.strip().lower() == "none":
             return "none"
+        if holds_truth(given):
+            # Refused by `Record`.
+            return given
         try:
             return float(given)
         except (TypeError, ValueError):

@@ -102,6 +102,11 @@ class Study(Part):
         path = Path(path)
         text = study_of(path) if path.suffix == ".ecsv" else read_text(path, "study file")
         data = toml(text, f"study file {shortened(path.name)}")
+        if not _has_values(data):
+            raise InputError(
+                f"study file {shortened(path.name)} sets nothing, expected at least one key, such as magnitude in "
+                "[[star]]; a verb without a study file answers the paper's question"
+            )
         if path.suffix == ".ecsv":
             find_files(data, path)
         for star in data.get("star", []) if isinstance(data.get("star"), list) else []:
@@ -344,6 +349,11 @@ class Study(Part):
         instrument, sky, o = self.load_instrument(), self.sky.sky(), self.observation
         how: dict[str, Any] = {"exposure": o.exposure_s, "sky": sky, "order": o.order, "signal": o.signal}
         return [expect(s, instrument, **how) for s in sources]
+
+
+def _has_values(data: Any) -> bool:
+    """Return whether nested tables hold any key."""
+    return any(map(_has_values, data.values())) if isinstance(data, dict) else True
 
 
 #: The paper's noise budgets (its section "Noise"): the Be star HD 37202 and both flare stars, 50 s and 600 s.

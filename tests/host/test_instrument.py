@@ -10,7 +10,7 @@ import pytest
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.instrument.curve import Curve
-from mauvecl.host.instrument.instrument import LABELS, Instrument
+from mauvecl.host.instrument.instrument import CURVES, LABELS, Instrument
 
 # Computed independently of this code: wavelength nm, total efficiency, effective area cm^2.
 PUBLISHED = [
@@ -242,3 +242,17 @@ def test_units_of_curves_in_any_spelling(
 def test_a_spectrum_is_no_curve(tmp_path: Path, length: str, value: str, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         Curve.read(curve_file(tmp_path, length, value))
+
+
+@pytest.mark.parametrize("name", CURVES)
+def test_an_instrument_without_throughput_is_refused(name: str) -> None:
+    """By any curve that is 0 over the band, or by two that are 0 where the other is not: every S/N would be 0."""
+    mauve = Instrument.load("mauve")
+    with pytest.raises(InputError, match=rf"{name} = 0 from 200 to 700 nm, expected a throughput above 0"):
+        mauve.with_(**{name: 0.0})
+    below = Curve(np.array([100.0, 450.0, 450.1, 900.0]), np.array([0.03, 0.03, 0.0, 0.0]))
+    above = Curve(np.array([100.0, 450.0, 450.2, 900.0]), np.array([0.0, 0.0, 0.03, 0.03]))
+    other = "window_efficiency" if name != "window_efficiency" else "grating_efficiency"
+    with pytest.raises(InputError, match="the throughput = 0"):
+        mauve.with_(**{name: below, other: above})
+    assert mauve.with_(**{name: below}).throughput(300.0) > 0

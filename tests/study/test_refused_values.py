@@ -1,0 +1,92 @@
+"""Values that no study can mean: truth for a number, and a file that sets nothing."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any, get_args, get_origin
+
+import numpy as np
+import pytest
+from commands import run
+from pydantic import BaseModel, ValidationError
+
+import mauvecl
+from mauvecl.host.errors import InputError
+from mauvecl.host.instrument.instrument import Instrument
+from mauvecl.host.records import Record
+from mauvecl.study.study import Study
+
+
+def records(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
+    """A model and all those that its fields hold."""
+    yield model
+    for field in model.model_fields.values():
+        for inner in models_in(field.annotation):
+            yield from records(inner)
+
+
+def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
+    if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+        yield annotation
+    for part in get_args(annotation):
+        yield from models_in(part)
+
+
+def plain(annotation: Any) -> set[Any]:
+    """The types of single values in an annotation."""
+    if get_origin(annotation) is Annotated:
+        return plain(get_args(annotation)[0])
+    parts = get_args(annotation)
+    return set().union(*map(plain, parts)) if parts else {annotation}
+
+
+NUMERIC = sorted(
+    {
+        (model, name)
+        for root in (Study, Instrument)
+        for model in records(root)
+        for name, field in model.model_fields.items()
+        if plain(field.annotation) & {int, float} and bool not in plain(field.annotation)
+    },
+    key=lambda one: (one[0].__name__, one[1]),
+)
+
+
+def test_the_walk_finds_the_keys() -> None:
+    names = {f"{model.__name__}.{name}" for model, name in NUMERIC}
+    assert {"Star.bin_nm", "Flare.amplitudes", "Run.seed", "Instrument.read_noise_dn", "Axis.values"} <= names
+    assert len(names) > 100
+
+
+@pytest.mark.parametrize(("model", "name"), NUMERIC)
+@pytest.mark.parametrize("value", [True, False, np.True_, [True], [0.5, True], (False,)])
+def test_truth_is_no_number(model: type[Record], name: str, value: Any) -> None:
+    """Every numeric key of every section of studies and instruments; Python's and NumPy's truth, alone and in lists."""
+    with pytest.raises(ValidationError) as error:
+        model.model_validate({name: value})
+    assert any(fault["loc"][0] == name for fault in error.value.errors())
+
+
+def test_truth_is_no_number_wherever_it_is_given(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"star\.0\.bin_nm = True"):
+        Study().with_settings(["star.0.bin_nm=true"])
+    with pytest.raises(InputError, match=r"observation\.changes = "):
+        Study().with_settings(["observation.changes.read_noise_dn=true"]).load_instrument()
+    study = tmp_path / "study.toml"
+    study.write_text("[flare]\namplitudes = [true]\n", encoding="utf-8")
+    assert "flare.amplitudes" in run("simulate", study, folder=tmp_path, code=2).stderr
+    # Truth itself stays.
+    assert Study().with_settings(["orbit.simbad=true"]).orbit.simbad
+
+
+@pytest.mark.parametrize("text", ["", "\n\n", "# only a remark\n", "[flare]\n", "[run]\n[run.weights]\n"])
+def test_a_study_file_that_sets_nothing_is_refused(tmp_path: Path, text: str) -> None:
+    """The default study stays what verbs without a file, and `Study()`, have."""
+    study = tmp_path / "empty.toml"
+    study.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match=r"empty\.toml.*sets nothing, expected at least one key"):
+        Study.read(study)
+    assert "sets nothing" in run("simulate", study, folder=tmp_path, code=2).stderr
+    study.write_text("[run]\nseed = 1\n", encoding="utf-8")
+    assert Study.read(study) == mauvecl.Study()
