@@ -36,6 +36,7 @@ if TYPE_CHECKING:
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.instrument.pixel_map import PixelMap
     from mauvecl.host.sky.zodiacal import Sky
+    from mauvecl.host.stars.flare_spectra import BalmerFlare, Blackbody, FlareWithLines, ObservedFlare, TwoBlackbodies
     from mauvecl.host.stars.source import Source
     from mauvecl.lightcurve.flares.energies import EnergyScale
     from mauvecl.lightcurve.flares.events import Cooling, Event
@@ -47,6 +48,8 @@ if TYPE_CHECKING:
     from mauvecl.noise.processes import CosmicRays, Processes
     from mauvecl.results.detection.departures import departures
     from mauvecl.results.detection.detection import Detection
+    from mauvecl.results.measurements.fit import fit, forecast
+    from mauvecl.results.measurements.model import FlareModel
     from mauvecl.runs.cluster import DaskWorkers
     from mauvecl.runs.pool import LocalWorkers, Pool
     from mauvecl.statistics.linear import Linear
@@ -58,6 +61,8 @@ __version__ = VERSION
 __all__ = [
     "PAPER_BUDGETS",
     "SHAPES",
+    "BalmerFlare",
+    "Blackbody",
     "Comparison",
     "Cooling",
     "CosmicRays",
@@ -67,12 +72,15 @@ __all__ = [
     "Engine",
     "Event",
     "Expectation",
+    "FlareModel",
+    "FlareWithLines",
     "InputError",
     "Instrument",
     "Linear",
     "LocalWorkers",
     "Normal",
     "Nuisances",
+    "ObservedFlare",
     "PixelMap",
     "Pool",
     "Processes",
@@ -83,6 +91,7 @@ __all__ = [
     "Stares",
     "Study",
     "TableShape",
+    "TwoBlackbodies",
     "Uniform",
     "bulk",
     "departures",
@@ -90,6 +99,8 @@ __all__ = [
     "detection_map",
     "expect",
     "exposure_for",
+    "fit",
+    "forecast",
     "gaussian_report",
     "inject",
     "limiting_magnitude",
@@ -105,6 +116,14 @@ __all__ = [
 
 #: Where each is at home; `bulk` is a module.
 _HOMES = {
+    "BalmerFlare": "host.stars.flare_spectra",
+    "Blackbody": "host.stars.flare_spectra",
+    "FlareModel": "results.measurements.model",
+    "FlareWithLines": "host.stars.flare_spectra",
+    "ObservedFlare": "host.stars.flare_spectra",
+    "TwoBlackbodies": "host.stars.flare_spectra",
+    "fit": "results.measurements.fit",
+    "forecast": "results.measurements.fit",
     "Comparison": "noise.comparison",
     "Cooling": "lightcurve.flares.events",
     "CosmicRays": "noise.processes",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import astropy.units as u
 import numpy as np
@@ -15,7 +15,11 @@ from ..errors import InputError
 from ..ranges import check_amplitude, check_temperature
 from .bands import ANGSTROM, photons
 
+if TYPE_CHECKING:
+    from .flare_spectra import FlareSpectrum
+
 Geometry = Literal["added", "replaces"]
+Float = NDArray[np.float64]
 
 
 @array_cache(32)
@@ -33,16 +37,16 @@ def blackbody(wavelength_nm: NDArray[np.float64], temperature_k: float) -> NDArr
 
 
 def with_flare(
-    wavelength_nm: NDArray[np.float64],
-    flux_flam: NDArray[np.float64],
+    wavelength_nm: Float,
+    flux_flam: Float,
     *,
     amplitude: float,
-    temperature_k: float,
+    spectrum: FlareSpectrum,
     band: str,
     geometry: Geometry,
     photosphere_temperature_k: float | None,
-) -> NDArray[np.float64]:
-    """Return the flux of a flaring star, shape (n,).
+) -> tuple[Float, Float]:
+    """Return wavelengths and flux of a flaring star, each of shape (n,); the spectrum may need more wavelengths.
 
     Parameters
     ----------
@@ -50,70 +54,82 @@ def with_flare(
         The quiescent star, erg s-1 cm-2 A-1.
     amplitude : float
         Relative rise of the photons in the band: 0.24 is 24 %.
-    temperature_k : float
-        Temperature of the flare's blackbody.
+    spectrum : FlareSpectrum
+        The light of the flare, B.
     band : str
         Band in which the amplitude is measured.
     geometry : {"added", "replaces"}
         With ``added``, the flux is F + k B, as in the paper. With ``replaces``, a region of filling factor
         f = A / (R - 1) replaces photosphere: F (1 - f) + f R (N_F / N_B) B, where N are photons in the band and R is
-        the ratio of the surface fluxes of the two blackbodies there.
+        the ratio of the surface fluxes of flare and photosphere there.
     photosphere_temperature_k : float, optional
         Temperature of the photosphere, which ``replaces`` requires.
     """
     check_amplitude(amplitude)
-    light = _photons_in_band(
-        wavelength_nm,
-        flux_flam,
-        temperature_k=temperature_k,
-        band=band,
-        geometry=geometry,
-        photosphere_temperature_k=photosphere_temperature_k,
-    )
-    body = blackbody(wavelength_nm, temperature_k)
+    light = _photons_in_band(wavelength_nm, flux_flam, spectrum, band, geometry, photosphere_temperature_k)
+    grid, quiescent = _on_grid(wavelength_nm, flux_flam, spectrum)
+    body = spectrum.flux(grid)
+    if spectrum.fixed_lines:
+        lines = spectrum.flux_at_telescope(grid)
+        rise = photons(grid, lines, band) / light.star
+        if rise > amplitude:
+            raise InputError(
+                f"flare amplitude = {amplitude:g} is less than the rise of {rise:g} by its lines in {band}, "
+                "expected more"
+            )
+        return grid, quiescent + lines + (amplitude - rise) * light.star / light.hot * body
     if light.ratio is None:
-        return flux_flam + amplitude * light.star / light.hot * body
+        return grid, quiescent + amplitude * light.star / light.hot * body
     filling = amplitude / (light.ratio - 1.0)
     if filling > 1.0:
         raise InputError(
-            f"flare amplitude = {amplitude:g} needs {filling:.2f} of the star's disc at {temperature_k:g} K, "
+            f"flare amplitude = {amplitude:g} needs {filling:.2f} of the star's disc at {spectrum.describe()}, "
             f"expected at most {light.ratio - 1.0:.3g}"
         )
-    return flux_flam * (1.0 - filling) + filling * light.ratio * light.star / light.hot * body
+    return grid, quiescent * (1.0 - filling) + filling * light.ratio * light.star / light.hot * body
+
+
+def _on_grid(wavelength_nm: Float, flux_flam: Float, spectrum: FlareSpectrum) -> tuple[Float, Float]:
+    """Return wavelengths that hold all that a flare's spectrum needs, and the star's flux there."""
+    grid = spectrum.grid(wavelength_nm)
+    return grid, flux_flam if grid is wavelength_nm else np.interp(grid, wavelength_nm, flux_flam)
 
 
 @dataclass(frozen=True)
 class AddedLight:
-    """The light that a flare of amplitude 1 adds to a star: `hot` blackbodies of the flare less `lost` of the star."""
+    """The light that a flare of amplitude 1 adds to a star: `hot` times its spectrum less `lost` of the star."""
 
-    hot: float  # multiple of the flare's surface flux pi B_lambda
+    hot: float  # multiple of the flare spectrum's flux
     lost: float  # share of the star's own light
 
 
 def added_light(
-    wavelength_nm: NDArray[np.float64],
-    flux_flam: NDArray[np.float64],
+    wavelength_nm: Float,
+    flux_flam: Float,
     *,
-    temperature_k: float,
+    spectrum: FlareSpectrum,
     band: str,
     geometry: Geometry,
     photosphere_temperature_k: float | None,
 ) -> AddedLight:
     """Return the light of a flare of amplitude 1, with the arguments and errors of `with_flare`.
 
-    `with_flare` adds it times the amplitude, whose largest value it checks.
+    `with_flare` adds it times the amplitude, whose largest value it checks. Lines must scale with the amplitude.
     """
-    light = _photons_in_band(
-        wavelength_nm,
-        flux_flam,
-        temperature_k=temperature_k,
-        band=band,
-        geometry=geometry,
-        photosphere_temperature_k=photosphere_temperature_k,
-    )
+    check_scales(spectrum)
+    light = _photons_in_band(wavelength_nm, flux_flam, spectrum, band, geometry, photosphere_temperature_k)
     if light.ratio is None:
         return AddedLight(light.star / light.hot, 0.0)
     return AddedLight(light.ratio / (light.ratio - 1.0) * light.star / light.hot, 1.0 / (light.ratio - 1.0))
+
+
+def check_scales(spectrum: FlareSpectrum) -> None:
+    """Raise InputError if some lines of a flare do not scale with its amplitude."""
+    if spectrum.fixed_lines:
+        raise InputError(
+            f"a flare of {spectrum.describe()} has lines that do not scale with its amplitude, expected lines as a "
+            "fraction of its continuum"
+        )
 
 
 @dataclass(frozen=True)
@@ -121,35 +137,40 @@ class _Photons:
     """Photons in the band in which amplitudes are measured."""
 
     star: float
-    hot: float  # of the flare's surface
+    hot: float  # of the flare's spectrum
     ratio: float | None  # flare's surface to photosphere's; None where the flare replaces nothing
 
 
 def _photons_in_band(
-    wavelength_nm: NDArray[np.float64],
-    flux_flam: NDArray[np.float64],
-    *,
-    temperature_k: float,
+    wavelength_nm: Float,
+    flux_flam: Float,
+    spectrum: FlareSpectrum,
     band: str,
     geometry: Geometry,
     photosphere_temperature_k: float | None,
 ) -> _Photons:
-    check_temperature("flare temperature", temperature_k)
-    star = photons(wavelength_nm, flux_flam, band)
+    grid, quiescent = _on_grid(wavelength_nm, flux_flam, spectrum)
+    star = photons(grid, quiescent, band)
     if not star > 0.0:
         raise InputError(f"the star has no light in the band {band}, expected some to measure the flare against")
-    hot = photons(wavelength_nm, blackbody(wavelength_nm, temperature_k), band)
+    hot = photons(grid, spectrum.flux(grid), band)
+    if not hot > 0.0:
+        raise InputError(f"the flare, {spectrum.describe()}, has no light in the band {band}, expected some to scale")
     if geometry == "added":
         return _Photons(star, hot, None)
     if geometry != "replaces":
         raise InputError(f"flare geometry = {geometry!r}, expected 'added' or 'replaces'")
     if photosphere_temperature_k is None:
         raise InputError("flare geometry 'replaces' needs a photosphere temperature, expected one in K")
+    if not spectrum.surface or spectrum.fixed_lines:
+        raise InputError(
+            f"flare geometry 'replaces' with {spectrum.describe()}, expected 'added': its surface flux is unknown"
+        )
     check_temperature("photosphere temperature", photosphere_temperature_k)
     ratio = hot / photons(wavelength_nm, blackbody(wavelength_nm, photosphere_temperature_k), band)
     if ratio <= 1.0:
         raise InputError(
-            f"flare temperature = {temperature_k:g} K is no hotter than the photosphere it replaces, "
+            f"flare temperature = {spectrum.describe()} is no hotter than the photosphere it replaces, "
             f"expected more than {photosphere_temperature_k:g} K"
         )
     return _Photons(star, hot, ratio)

@@ -33,6 +33,8 @@ HC_OVER_K_NM_K, STEFAN_BOLTZMANN = 1.438776877e7, 5.670374419e-5
 BALMER_EDGE_NM, ELECTRON_TEMPERATURE_K = 364.6, 10_000.0
 #: Largest Balmer jump ratio; observed ones are 1 to 4 (Kowalski 2024).
 LARGEST_JUMP = 100.0
+#: Wavelengths closer to each other than this are one, nm.
+SAME_NM = 1e-6
 #: Steps across the Balmer edge are this wide, nm.
 EDGE_WIDTH_NM = 1e-3
 #: Full width at half maximum of the triangular profile of a line, nm: far below the resolution, 10.5 nm.
@@ -105,7 +107,10 @@ class FlareSpectrum:
         """Return wavelengths with those that the spectrum needs in between, nm."""
         nodes = self.nodes_nm
         inside = nodes[(nodes > wavelength_nm[0]) & (nodes < wavelength_nm[-1])]
-        return np.union1d(wavelength_nm, inside) if inside.size else wavelength_nm
+        # A node next to one of the wavelengths adds nothing but rounding.
+        after = np.searchsorted(wavelength_nm, inside)
+        alone = np.minimum(wavelength_nm[after] - inside, inside - wavelength_nm[after - 1]) > SAME_NM
+        return np.union1d(wavelength_nm, inside[alone]) if alone.any() else wavelength_nm
 
     def describe(self) -> str:
         """Return the spectrum in a few words."""

@@ -33,6 +33,7 @@ from ..spectra.formats import read_spectrum
 from ..spectra.range import SPAN_NM
 from . import bands, catalogue, own_stars
 from .flare import Geometry, with_flare
+from .flare_spectra import Blackbody, FlareSpectrum
 
 if TYPE_CHECKING:
     import astropy.units as u
@@ -393,6 +394,7 @@ class Source(ContentEquality):
         amplitude: u.Quantity | float,
         temperature: u.Quantity | float = 10_000.0,
         *,
+        spectrum: FlareSpectrum | None = None,
         band: str = "Kepler",
         geometry: Geometry = "added",
         photosphere_temperature: u.Quantity | float | None = None,
@@ -405,6 +407,8 @@ class Source(ContentEquality):
             Relative rise of the photons in the band: 0.24 is 24 %.
         temperature : Quantity or float in K
             Temperature of the flare's blackbody.
+        spectrum : FlareSpectrum, optional
+            Light of the flare in place of a blackbody of that temperature.
         band : str
             Band in which the amplitude is measured.
         geometry : {"added", "replaces"}
@@ -412,22 +416,25 @@ class Source(ContentEquality):
             For ``replaces``; the default is the star's `temperature_k`.
         """
         amplitude, kelvin = number("flare amplitude", amplitude), number("flare temperature", temperature, "K")
+        light = Blackbody(kelvin) if spectrum is None else spectrum
         photosphere = self.temperature_k
         if photosphere_temperature is not None:
             photosphere = number("photosphere temperature", photosphere_temperature, "K")
-        flux = with_flare(
+        nm, flux = with_flare(
             self.wavelength_nm,
             self.flux_flam,
             amplitude=amplitude,
-            temperature_k=kelvin,
+            spectrum=light,
             band=band,
             geometry=geometry,
             photosphere_temperature_k=photosphere,
         )
-        title = f"flare of {100 * amplitude:g} % in {bands.band(band).name} at {kelvin:g} K, {geometry}"
+        title = f"flare of {100 * amplitude:g} % in {bands.band(band).name} at {light.describe()}, {geometry}"
         if geometry == "replaces":
             title += f" photosphere of {photosphere:g} K"
-        return self._with_flux(flux, title)
+        return replace(
+            self, wavelength_nm=nm, flux_flam=flux, history=(*self.history, title), told=(*self.told, *light.messages)
+        )
 
     def reddened(self, ebv: u.Quantity | float, *, rv: float = 3.1, law: str = "G23") -> Self:
         """Return the star reddened by dust (needs the extra ``extinction``).

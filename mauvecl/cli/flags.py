@@ -9,7 +9,7 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 
-from mauvecl.cli.values import amplitudes_of, axis_of, frames_of, gap_of, names_of
+from mauvecl.cli.values import amplitudes_of, axis_of, frames_of, gap_of, lines_of, names_of
 
 StudyFile = Annotated[
     Path | None,
@@ -125,6 +125,25 @@ FLARE = group(
     flag(float, "--photosphere-temperature", "Of the star, K, where a flare replaces some of it.",
          "flare.photosphere_temperature_k"),
 )  # fmt: skip
+#: The light of a flare in place of one blackbody.
+SPECTRUM = group(
+    flag(float, "--balmer-jump", "Flux of the flare below the Balmer edge over that above [1].",
+         "flare.spectrum.balmer_jump"),
+    flag(float, "--second-temperature", "Of a second blackbody of the flare, K, with --second-area.",
+         "flare.spectrum.second_temperature_k"),
+    flag(float, "--second-area", "Area of the second blackbody over that of the first.", "flare.spectrum.second_area"),
+    flag(list[str], "--line", "Emission line as a fraction of the continuum in 200-700 nm, as in 'Mg II=0.05'; may be "
+         "repeated.", "flare.spectrum.lines", partial(lines_of, flag="--line")),
+    flag(list[str], "--line-flux", "Emission line in erg/s/cm2 at the telescope, as in '280=1e-12'; may be repeated.",
+         "flare.spectrum.line_fluxes", partial(lines_of, flag="--line-flux")),
+    flag(Path, "--flare-file", "Spectrum of an observed or computed flare.", "flare.spectrum.file"),
+    flag(Path, "--flare-quiescent", "Spectrum of its star without the flare, to subtract.", "flare.spectrum.quiescent"),
+    flag(str, "--flare-wavelength-unit", "Of these files' wavelengths.", "flare.spectrum.wavelength_unit"),
+    flag(str, "--flare-flux-unit", "Of these files' fluxes.", "flare.spectrum.flux_unit"),
+    flag(float, "--continue-at", "Temperature of a blackbody that continues the flare's file where it ends, K.",
+         "flare.spectrum.continue_at_k"),
+)  # fmt: skip
+FLARE = FLARE | SPECTRUM
 DRAWS = group(
     flag(int, "--realisations -n", "Noise realisations [1000000].", "run.realisations"),
     flag(int, "--seed", "Seed [1].", "run.seed"),

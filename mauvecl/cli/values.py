@@ -111,6 +111,17 @@ def axis_of(text: str, flag: str) -> dict[str, Any]:
     return axis | {"log": bool(rest)}
 
 
+def lines_of(texts: Sequence[str], flag: str) -> dict[str, float]:
+    """Read fluxes of emission lines, as in 'Mg II=0.05'."""
+    lines = {}
+    for text in texts:
+        name, equals, value = (part.strip() for part in text.rpartition("="))
+        if not (name and equals):
+            raise InputError(f"{flag} {shortened(text)}, expected NAME=FLUX, such as 'Mg II=0.05'")
+        lines[name] = number(value, f"{flag} {shortened(text)}:")
+    return lines
+
+
 def gap_of(text: str) -> tuple[float, float]:
     """A gap as a word: 1000:2000."""
     try:

@@ -41,7 +41,7 @@ def _titled(figure: Any, answer: InjectAnswer) -> None:
     alarms = "false alarm" if choice.false_alarms == 1 else "false alarms"
     headline(
         figure,
-        f"Flares of {flare.temperature_k:g} K, {choice.false_alarms:g} {alarms} per star-{choice.per}; nominal "
+        f"Flares of {flare.light().describe()}, {choice.false_alarms:g} {alarms} per star-{choice.per}; nominal "
         "throughput",
     )
 

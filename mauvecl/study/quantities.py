@@ -39,6 +39,14 @@ QUANTITIES: dict[str, Quantity] = {
     "flare_temperature": Quantity(
         "blackbody temperature of the flare", "flare temperature (K)", 1_000.0, 100_000.0, "K", " K"
     ),
+    "balmer_jump": Quantity(
+        "flux of the flare just below the Balmer edge over that just above", "Balmer jump ratio", 1.0, 100.0
+    ),
+    "second_temperature": Quantity(
+        "temperature of the flare's second blackbody", "second temperature (K)", 1_000.0, 100_000.0, "K", " K"
+    ),
+    "second_area": Quantity("area of the flare's second blackbody over that of the first", "second area", 0.0, 1e6),
+    "line_scale": Quantity("factor of all line fluxes of the flare", "line fluxes", 0.0, 1e6),
     "exposure": Quantity("length of the exposure", "exposure (s)", 1e-3, 1e7, "s", " s"),
     "detector_temperature": Quantity(
         "temperature of the detector", "detector temperature (deg C)", -100.0, 60.0, "deg_C", " deg C"
@@ -49,5 +57,12 @@ QUANTITIES: dict[str, Quantity] = {
     ),
     "star": Quantity("library name or file, with its magnitude", "star"),
 }  # fmt: skip
+#: Those of the flare's spectrum, as [flare.spectrum] calls them.
+OF_SPECTRUM = {
+    "balmer_jump": "balmer_jump",
+    "second_temperature": "second_temperature_k",
+    "second_area": "second_area",
+    "line_scale": "line_scale",
+}
 #: Units of those that have any.
 UNITS = {name: quantity.unit for name, quantity in QUANTITIES.items() if quantity.unit}

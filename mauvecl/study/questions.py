@@ -82,7 +82,10 @@ class LimitQuestion(Part):
 class Axis(Part):
     """One axis of a map: values, or so many steps from start to stop."""
 
-    quantity: Literal["magnitude", "amplitude", "flare_temperature", "exposure", "detector_temperature", "sky", "star"]
+    quantity: Literal[
+        "magnitude", "amplitude", "flare_temperature", "balmer_jump", "second_temperature", "second_area", "line_scale",
+        "exposure", "detector_temperature", "sky", "star",
+    ]  # fmt: skip
     values: tuple[float | str, ...] | None = None
     start: float | None = None
     stop: float | None = None

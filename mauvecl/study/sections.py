@@ -5,45 +5,21 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import Field, ValidationInfo, create_model, field_validator, model_validator
+from pydantic import Field, create_model, field_validator, model_validator
 
-from mauvecl.host.quantities import is_quantity, numbers, unit_of
-from mauvecl.host.records import Record
 from mauvecl.host.sky import DEFAULT_SKY
 from mauvecl.noise.varied import VARIED
 from mauvecl.statistics.names import DEFAULT_STATISTICS, STATISTIC_NAMES
+from mauvecl.study.flare_text import FlareLight
+from mauvecl.study.part import Part as Part
 
 if TYPE_CHECKING:
     from mauvecl.host.sky.zodiacal import Sky
+    from mauvecl.host.stars.flare_spectra import FlareSpectrum
     from mauvecl.host.stars.source import Source
     from mauvecl.noise.comparison import Comparison
     from mauvecl.noise.priors import Prior
     from mauvecl.noise.processes import CosmicRays, Processes
-
-
-def plain(key: str, given: Any) -> Any:
-    """What a study holds of a value: Quantities, times and places are kept as numbers and text."""
-    if is_quantity(given):
-        return numbers(key, given, unit_of(key)).tolist()
-    if isinstance(given, list | tuple) and any(map(is_quantity, given)):
-        return [plain(key, one) for one in given]
-    if hasattr(given, "tolist"):
-        return given.tolist()
-    if hasattr(given, "utc") and hasattr(given, "isot"):
-        return str(given.utc.isot)
-    if hasattr(given, "icrs") and hasattr(given, "to_string"):
-        return str(given.icrs.to_string("decimal", precision=6))
-    return given
-
-
-class Part(Record):
-    """A section of a study."""
-
-    @field_validator("*", mode="before")
-    @classmethod
-    def _in_its_unit(cls, given: Any, info: ValidationInfo) -> Any:
-        """A Quantity as plain numbers in the unit of the key; other objects of astropy's as text."""
-        return plain(info.field_name or "", given)
 
 
 #: What a star from a file has and one of the library has not.
@@ -109,6 +85,26 @@ class Flare(Part):
     band: str = "Kepler"
     geometry: Literal["added", "replaces"] = "added"
     photosphere_temperature_k: float | None = None
+    spectrum: FlareLight = FlareLight()
+
+    def light(self, temperature_k: float | None = None) -> FlareSpectrum:
+        """Return the spectrum of a flare, of the study's temperature by default."""
+        return self.spectrum.form(self.temperature_k if temperature_k is None else temperature_k)
+
+    @property
+    def is_blackbody(self) -> bool:
+        """Whether the flare shines as one blackbody and nothing else."""
+        return self.spectrum == FlareLight()
+
+    def with_spectrum(self, key: str, value: Any) -> Self:
+        """Return the flare with one key of its spectrum changed.
+
+        Raises
+        ------
+        InputError
+            For a value that cannot be with the others.
+        """
+        return self.model_copy(update={"spectrum": self.spectrum.with_value(key, value)})
 
 
 class Observation(Part):

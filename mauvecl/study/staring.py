@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
+from mauvecl.host.stars.flare import check_scales
 from mauvecl.lightcurve.flares.energies import EnergyScale, Kind, amplitude_of, amplitude_of_peak
 from mauvecl.lightcurve.flares.events import Cooling, Event, check_seen, coefficients, temperatures_of
 from mauvecl.lightcurve.stares.observed import Staring
@@ -108,6 +109,7 @@ def staring_of(study: Study, star: Star) -> tuple[Staring, list[Event]]:
     source, stare = star.source(), stare_of(study)
     events = events_of(study, star, source)
     check_seen(events, stare.start_s, stare.frame_s)
+    check_scales(study.flare.light())
     kelvin = temperatures_of(events)
     frames = study.model_copy(
         update={"observation": study.observation.model_copy(update={"exposure_s": stare.frame_s})}
@@ -155,7 +157,7 @@ def energy_scale(study: Study, star: Star, source: Source, kind: Kind, flare_k: 
     """
     flare = study.flare
     how: dict[str, Any] = {
-        "band": flare.band, "flare_k": flare_k, "kind": kind, "geometry": flare.geometry,
+        "band": flare.band, "flare": flare.light(flare_k), "kind": kind, "geometry": flare.geometry,
         "photosphere_k": flare.photosphere_temperature_k,
     }  # fmt: skip
     if star.distance_pc is not None:
@@ -211,6 +213,8 @@ def _event(study: Study, text: EventText) -> Event:
     shape, flare = text.form(study.stare.shape), study.flare
     half = study.stare.half_width_s if text.half_width_s is None else text.half_width_s
     kelvin = flare.temperature_k if text.temperature_k is None else text.temperature_k
+    if text.cooling is not None and flare.spectrum.file is not None:
+        raise InputError("events.cooling with a flare's spectrum from a file, expected a flare that has a temperature")
     temperature = kelvin if text.cooling is None else Cooling(kelvin, text.cooling.end_k, text.cooling.fold_s)
     amplitude = flare.amplitudes[0] if text.amplitude is None else text.amplitude
     if text.peak is not None:

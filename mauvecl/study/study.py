@@ -14,9 +14,10 @@ from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import possible, read_text, toml
 from mauvecl.host.quantities import number
 from mauvecl.host.records import input_error
+from mauvecl.study.flare_text import find_spectrum_files, without_usual_spectrum
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.study.orbits import OrbitQuestion, PlanQuestion, find_plan_files, without_usual_plan
-from mauvecl.study.quantities import QUANTITIES
+from mauvecl.study.quantities import OF_SPECTRUM, QUANTITIES
 from mauvecl.study.questions import (
     Axis,
     BulkQuestion,
@@ -123,6 +124,7 @@ class Study(Part):
                 one["file"] = str(path.parent / one["file"])
         find_curves(data, path.parent)
         find_plan_files(data, path.parent)
+        find_spectrum_files(data, path.parent)
         return cls.build(data, path.name)
 
     @classmethod
@@ -194,6 +196,7 @@ class Study(Part):
         without_usual(data, self)
         without_usual_search(data, self)
         without_usual_plan(data, self)
+        without_usual_spectrum(data, self.flare.spectrum)
         for section in ("processes", "campaign"):
             if not data[section]:
                 del data[section]
@@ -218,8 +221,8 @@ class Study(Part):
     __str__ = __repr__
 
     def text(self) -> str:
-        """The study as answers' tables hold it: stars' files by name and digest, the same wherever they are."""
-        return in_table(self.toml(), [star.file for star in self.star])
+        """Return the study as answers' tables hold it: files of spectra by name and digest, wherever they are."""
+        return in_table(self.toml())
 
     def load_instrument(self) -> Instrument:
         """The instrument with what the study changes of it: its ``changes``, and the detector's temperature."""
@@ -265,6 +268,8 @@ class Study(Part):
         if quantity in ("amplitude", "flare_temperature"):
             change = {"amplitudes": (value,)} if quantity == "amplitude" else {"temperature_k": value}
             return self.model_copy(update={"flare": self.flare.model_copy(update=change)})
+        if quantity in OF_SPECTRUM:
+            return self.model_copy(update={"flare": self.flare.with_spectrum(OF_SPECTRUM[quantity], value)})
         if quantity == "sky":
             return self.model_copy(update={"sky": SkyLight(surface_brightness=value)})
         change = {{"exposure": "exposure_s", "detector_temperature": "temperature_c"}[quantity]: value}
@@ -336,7 +341,7 @@ class Study(Part):
         f = self.flare
         return source.flaring(
             amplitude,
-            f.temperature_k,
+            spectrum=f.light(),
             band=f.band,
             geometry=f.geometry,
             photosphere_temperature=f.photosphere_temperature_k,

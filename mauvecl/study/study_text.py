@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import tomllib
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,25 +23,34 @@ def study_of(path: Path) -> str:
     return study
 
 
-def in_table(text: str, files: Sequence[Path | None]) -> str:
-    """A study's text with its stars' files by name and digest: where they are is no part of an answer."""
+def in_table(text: str) -> str:
+    """Return a study's text with files of spectra by name and digest: where they are is no part of an answer."""
     import tomli_w
 
-    if not any(files):
-        return text
     data = tomllib.loads(text)
-    for star, file in zip(data["star"], files, strict=True):
-        if file is not None:
-            place, _ = without_columns(file)
-            star["file"] = file.name
-            # An answer is not lost for a file that is gone by now.
-            with contextlib.suppress(InputError):
-                star["file_sha256"] = _digest(place)
+    named = _named_files(data)
+    if not named:
+        return text
+    for section, key in named:
+        place, _ = without_columns(Path(section[key]))
+        section[key] = Path(section[key]).name
+        # An answer is not lost for a file that is gone by now.
+        with contextlib.suppress(InputError):
+            section[f"{key}_sha256"] = _digest(place)
     return tomli_w.dumps(data)
 
 
+def _named_files(data: dict[str, Any]) -> list[tuple[dict[str, Any], str]]:
+    """List sections of a study that name a file of a spectrum, stars' and the flare's, with their keys."""
+    stars, flare = data.get("star"), data.get("flare")
+    sections = [(star, "file") for star in (stars if isinstance(stars, list) else [])]
+    light = flare.get("spectrum") if isinstance(flare, dict) else None
+    sections += [(light, "file"), (light, "quiescent")]
+    return [(one, key) for one, key in sections if isinstance(one, dict) and isinstance(one.get(key), str)]
+
+
 def find_files(data: dict[str, Any], table: Path) -> None:
-    """Put the places of stars' files into the study of an answer's table, which names them by name and digest.
+    """Put the places of spectra's files into the study of an answer's table, which names them by name and digest.
 
     They are looked for beside the table, above it, in the current folder, and where the ``study.toml`` beside the table
     has them.
@@ -52,19 +60,18 @@ def find_files(data: dict[str, Any], table: Path) -> None:
     InputError
         If none of that name is there as it was.
     """
-    stars = data.get("star")
-    for star in stars if isinstance(stars, list) else ():
-        if not (isinstance(star, dict) and "file_sha256" in star and isinstance(star.get("file"), str)):
+    for section, key in _named_files(data):
+        if f"{key}_sha256" not in section:
             continue
-        name, digest = Path(star["file"]).name, star.pop("file_sha256")
+        name, digest = Path(section[key]).name, section.pop(f"{key}_sha256")
         places = [table.parent / name, table.parent.parent / name, Path(name), *_beside(table, name)]
         for place in places:
             if without_columns(place)[0].is_file() and _digest(without_columns(place)[0]) == digest:
-                star["file"] = str(place.resolve())
+                section[key] = str(place.resolve())
                 break
         else:
             raise InputError(
-                f"{shortened(table.name)}: its star's file {shortened(name)} is not there as it was (sha256 "
+                f"{shortened(table.name)}: its file {shortened(name)} is not there as it was (sha256 "
                 f"{shortened(str(digest))}), expected it beside the table"
             )
 
@@ -74,9 +81,9 @@ def _beside(table: Path, name: str) -> list[Path]:
     study = table.parent / "study.toml"
     if not study.is_file():
         return []
-    stars = toml(read_text(study, "study file"), "study file 'study.toml'").get("star")
-    files = [star.get("file") for star in stars if isinstance(star, dict)] if isinstance(stars, list) else []
-    return [table.parent / file for file in files if isinstance(file, str) and Path(file).name == name]
+    data = toml(read_text(study, "study file"), "study file 'study.toml'")
+    files = [section[key] for section, key in _named_files(data)]
+    return [table.parent / file for file in files if Path(file).name == name]
 
 
 def _digest(file: Path) -> str:

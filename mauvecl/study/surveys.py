@@ -9,19 +9,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
+from mauvecl.host.stars.flare import check_scales
 from mauvecl.lightcurve.flares.shapes import shape_of
 from mauvecl.lightcurve.search.bank import Bank
 from mauvecl.lightcurve.search.recovery import Fit
 from mauvecl.lightcurve.search.survey import Survey
 from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates, frame_nuisances
 from mauvecl.lightcurve.stares.components import Components
+from mauvecl.study.flare_text import FlareLight
 from mauvecl.study.staring import energy_scale, stare_of
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
     from mauvecl.host.stars.source import Source
     from mauvecl.study.searches import Size
-    from mauvecl.study.sections import Star
+    from mauvecl.study.sections import Flare, Star
     from mauvecl.study.study import Study
 
 #: Smallest and largest flare of a map that is not told, in sizes that the search finds half of.
@@ -74,12 +76,15 @@ def surveyed(study: Study, star: Star) -> Surveyed:
     frames = study.model_copy(
         update={"observation": study.observation.model_copy(update={"exposure_s": stare.frame_s})}
     )
-    kelvin = (*TEMPERATURES_K, study.flare.temperature_k)
-    quiet, electrons = flare_electrons(frames, source, kelvin)
+    check_scales(study.flare.light())
+    # A search looks for blackbodies where the flare of the study has no temperature that can be varied.
+    hot = frames if study.flare.spectrum.file is None else frames.model_copy(update={"flare": _blackbody(study.flare)})
+    quiet, electrons = flare_electrons(hot, source, TEMPERATURES_K)
+    _, own = flare_electrons(frames, source, (study.flare.temperature_k,))
     nuisances = frame_nuisances(quiet, stare, choice.spreads())
     templates = Templates.of(
         quiet,
-        electrons[:-1] * quiet.gain_dn_per_electron,
+        electrons * quiet.gain_dn_per_electron,
         TEMPERATURES_K,
         nuisances=nuisances,
         rank=choice.sums,
@@ -88,10 +93,14 @@ def surveyed(study: Study, star: Star) -> Surveyed:
     bank = Bank(
         choice.half_widths_s, templates.directions[list(templates.chosen)], shape_of(choice.shape), stare.frame_s, level
     )
-    survey = Survey(Components(quiet, electrons[-1:], templates.weights), stare, bank)
+    survey = Survey(Components(quiet, own, templates.weights), stare, bank)
     if level.cycle and not len(survey.curves if survey.curves is not None else ()):
         raise InputError("search.cycle without a curve, expected unknown cycles in the stare")
     return Surveyed(source, quiet, templates, survey)
+
+
+def _blackbody(flare: Flare) -> Flare:
+    return flare.model_copy(update={"spectrum": FlareLight()})
 
 
 def flare_electrons(study: Study, source: Source, kelvin: tuple[float, ...]) -> tuple[Expectation, NDArray[np.float64]]:

@@ -177,7 +177,7 @@ class PlanAnswer(Answer):
             ("shape of flares", self.study.search.shape, "every flare alike, no bursts"),
             (
                 "light of flares",
-                f"blackbody of {self.study.flare.temperature_k:g} K",
+                ("blackbody of " if self.study.flare.is_blackbody else "") + self.study.flare.light().describe(),
                 "assumption; energies are those of all its light, spread alike in all directions",
             ),
             ("noise of a stare", "white", "beside what the study says is unknown of a stare; see completeness"),

@@ -137,7 +137,7 @@ def rates_of(study: Study, text: PlanTarget, looked: Looked) -> tuple[Rates | No
         if any(getattr(text, name) is not None for name in ("mass_msun", "alpha", "rates_file", "rates")):
             raise
         return None, str(error)
-    return rates.in_band(BOLOMETRIC, study.flare.temperature_k), ""
+    return rates.in_band(BOLOMETRIC, flare=study.flare.light()), ""
 
 
 def star_of(study: Study, text: PlanTarget) -> Star:

@@ -269,7 +269,7 @@ def _template_costs(study: Study, star: StarDetection) -> list[str]:
         name = f"matched {temperature:g} K"
         kept = detection.closed_form(name, 0).mean / detection.closed_form(name).std / right if right else 0.0
         lines.append(
-            f"{star.label}: looking for a flare of {temperature:g} K in one of {study.flare.temperature_k:g} K keeps "
+            f"{star.label}: looking for a flare of {temperature:g} K in one of {study.flare.light().describe()} keeps "
             f"{100 * kept:.1f} % of the matched statistic's S/N."
         )
     return lines

@@ -16,7 +16,7 @@ from mauvecl.host.tables import make_table
 from mauvecl.results.requests.fap import check_fap
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import SATURATED, described, label, told, worst_first
-from mauvecl.study.quantities import UNITS
+from mauvecl.study.quantities import OF_SPECTRUM, UNITS
 from mauvecl.study.study import Study
 from mauvecl.study.unknowns import average, drawn, shares
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from mauvecl.study.assumed import Use
 
 #: Quantities of the flare alone: cells that differ in them share their quiescent star, and one launch.
-OF_FLARE = ("amplitude", "flare_temperature")
+OF_FLARE = ("amplitude", "flare_temperature", *OF_SPECTRUM)
 
 
 @dataclass(frozen=True, eq=False)

@@ -137,7 +137,7 @@ class InjectAnswer(Answer):
         choice = self.study.search
         meta = {
             "false_alarms": f"{choice.false_alarms:g} per star-{choice.per}",
-            "flare": f"{self.study.flare.temperature_k:g} K, {choice.shape}, amplitudes in {self.study.flare.band}",
+            "flare": f"{self.study.flare.light().describe()}, {choice.shape}, amplitudes in {self.study.flare.band}",
             "study": self.study.text(),
         }
         return stacked(parts, **meta)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from mauvecl.cli.flags import DRAWS, FLARE, SHAPES, SIZE, STARE, SWEEP, flag, group
+from mauvecl.cli.flags import DRAWS, FLARE, SHAPES, SIZE, SPECTRUM, STARE, SWEEP, flag, group
 from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
@@ -45,7 +45,8 @@ def _day(_: dict[str, Any]) -> Study:
 
 
 @takes_study(
-    {name: FLARE[name] for name in ("flare_temperature", "flare_band", "geometry", "photosphere_temperature")},
+    {name: FLARE[name] for name in ("flare_temperature", "flare_band", "geometry", "photosphere_temperature")}
+    | SPECTRUM,
     LOOKED,
     SIZE,
     SEARCH,

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mauvecl.cli.flags import FLARE, OBSERVATION, flag, group
+from mauvecl.cli.flags import FLARE, OBSERVATION, SPECTRUM, flag, group
 from mauvecl.cli.verb import takes_study
 from mauvecl.cli.verbs.injections import SEARCH
 
@@ -81,6 +81,7 @@ PLAN = group(
     OBSERVATION["temperature"],
     FLARE["flare_temperature"],
     FLARE["flare_band"],
+    *SPECTRUM.values(),
 )
 
 

@@ -29,14 +29,15 @@ from mauvecl.host.ranges import FLARE_TEMPERATURES_K
 from mauvecl.host.stars.bands import band as find_band
 from mauvecl.host.stars.bands import photons
 from mauvecl.host.stars.flare import Geometry, added_light, blackbody
+from mauvecl.host.stars.flare_spectra import STEFAN_BOLTZMANN, Blackbody, FlareSpectrum
 from mauvecl.lightcurve.flares.shapes import Shape, shape_of
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
 
 Float = NDArray[np.float64]
-#: CODATA 2018: erg s-1 cm-2 K-4; IAU 2015 (resolution B3) nominal solar radius, and parsec, cm.
-STEFAN_BOLTZMANN, SUN_CM, PARSEC_CM = 5.670374419e-5, 6.957e10, 3.0856775814913674e18
+#: IAU 2015 (resolution B3) nominal solar radius, and parsec, cm.
+SUN_CM, PARSEC_CM = 6.957e10, 3.0856775814913674e18
 #: What an integral over a band weights the response with.
 Weighted = Literal["energy", "photons"]
 #: Which light of a flare: that in the band of its amplitude, or all of it.
@@ -74,6 +75,7 @@ class EnergyScale:
         *,
         band: str = "Kepler",
         flare_k: float = 10_000.0,
+        flare: FlareSpectrum | None = None,
         kind: Kind = "bolometric",
         geometry: Geometry = "added",
         photosphere_k: float | None = None,
@@ -88,6 +90,8 @@ class EnergyScale:
         band : str
         flare_k : float
             Temperature of the flare's blackbody.
+        flare : FlareSpectrum, optional
+            Light of the flare in place of that blackbody.
         kind : {"band", "bolometric"}
         geometry : {"added", "replaces"}
             As `Source.flaring`. The photosphere that a flare replaces is subtracted; for bolometric energies it is a
@@ -110,7 +114,7 @@ class EnergyScale:
             sphere_cm2=4 * np.pi * (distance_pc * PARSEC_CM) ** 2,
             star=f"{source.name} at {distance_pc:g} pc",
             band=band,
-            flare_k=flare_k,
+            flare=_spectrum(flare_k) if flare is None else flare,
             kind=kind,
             geometry=geometry,
             photosphere_k=source.temperature_k if photosphere_k is None else photosphere_k,
@@ -124,6 +128,7 @@ class EnergyScale:
         *,
         band: str = "Kepler",
         flare_k: float = 10_000.0,
+        flare: FlareSpectrum | None = None,
         kind: Kind = "bolometric",
         geometry: Geometry = "added",
         photosphere_k: float | None = None,
@@ -133,7 +138,7 @@ class EnergyScale:
         Parameters
         ----------
         radius_rsun, temperature_k : float
-        band, flare_k, kind, geometry
+        band, flare_k, flare, kind, geometry
             As `of_star`.
         photosphere_k : float, optional
             For ``replaces``; the star's temperature by default.
@@ -152,7 +157,7 @@ class EnergyScale:
             sphere_cm2=4 * np.pi * (radius_rsun * SUN_CM) ** 2,
             star=f"a blackbody of {temperature_k:g} K and {radius_rsun:g} solar radii",
             band=band,
-            flare_k=flare_k,
+            flare=_spectrum(flare_k) if flare is None else flare,
             kind=kind,
             geometry=geometry,
             photosphere_k=temperature_k if photosphere_k is None else photosphere_k,
@@ -190,28 +195,27 @@ class EnergyScale:
         sphere_cm2: float,
         star: str,
         band: str,
-        flare_k: float,
+        flare: FlareSpectrum,
         kind: Kind,
         geometry: Geometry,
         photosphere_k: float | None,
     ) -> Self:
         """Return the energy of what a flare of amplitude 1 adds to a flux, through a sphere around the star."""
-        _check("flare_k", flare_k, *FLARE_TEMPERATURES_K)
         light = added_light(
             wavelength_nm,
             flux_flam,
-            temperature_k=flare_k,
+            spectrum=flare,
             band=band,
             geometry=geometry,
             photosphere_temperature_k=photosphere_k,
         )
         if kind == "band":
-            flux = light.hot * in_band(band, flare_k)
+            flux = light.hot * flux_in_band(band, flare)
             lost = light.lost and light.lost * _through(wavelength_nm, flux_flam, band)
         else:
-            flux = light.hot * STEFAN_BOLTZMANN * flare_k**4
+            flux = light.hot * flare.bolometric_flux()
             lost = light.lost and light.lost * _bolometric(wavelength_nm, flux_flam, band, photosphere_k)
-        how = f"{star}, flare of {flare_k:g} K"
+        how = f"{star}, flare of {flare.describe()}"
         if geometry == "replaces":
             how += f" in place of photosphere of {photosphere_k:g} K"
         return cls(find_band(band).name, kind, sphere_cm2 * (flux - lost), how)
@@ -273,6 +277,15 @@ def in_band(band: str, temperature_k: float, weighted: Weighted = "energy") -> f
     return _integral(wavelength, weight * blackbody(wavelength, temperature_k))
 
 
+def flux_in_band(band: str, flare: FlareSpectrum) -> float:
+    """Return the flux of a flare's spectrum through a band, erg s-1 cm-2; the highest response is 1."""
+    if isinstance(flare, Blackbody):
+        return in_band(band, flare.temperature_k)
+    wavelength, response = _response(band)
+    grid = flare.grid(wavelength)
+    return _integral(grid, np.interp(grid, wavelength, response) * flare.flux(grid))
+
+
 def share_within(low_nm: float, high_nm: float, temperature_k: float) -> float:
     """Share of a blackbody's light between two wavelengths."""
     # 15 / pi^4 times the integral of x^3 / (e^x - 1) over x = h c / (wavelength k T), CODATA 2018.
@@ -281,6 +294,11 @@ def share_within(low_nm: float, high_nm: float, temperature_k: float) -> float:
     ends = [1.438776877e7 / (nm * temperature_k) for nm in (high_nm, low_nm)]
     value = quad(lambda x: x**3 / np.expm1(x), ends[0], ends[1], epsabs=0.0, epsrel=1e-12, limit=200)[0]
     return float(15 / np.pi**4 * value)
+
+
+def _spectrum(flare_k: float) -> Blackbody:
+    _check("flare_k", flare_k, *FLARE_TEMPERATURES_K)
+    return Blackbody(flare_k)
 
 
 def _response(band: str) -> tuple[Float, Float]:

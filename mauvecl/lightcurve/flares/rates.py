@@ -18,7 +18,8 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.text_table import read_text_table
 from mauvecl.host.ranges import FLARE_TEMPERATURES_K
-from mauvecl.lightcurve.flares.energies import STEFAN_BOLTZMANN, in_band
+from mauvecl.host.stars.flare_spectra import Blackbody, FlareSpectrum
+from mauvecl.lightcurve.flares.energies import flux_in_band
 
 Float = NDArray[np.float64]
 
@@ -68,7 +69,7 @@ class Rates(ABC):
     def times_energy(self, factor: float) -> Self:
         """The same flares with energies that are so many times as large."""
 
-    def in_band(self, band: str, flare_k: float = 10_000.0) -> Self:
+    def in_band(self, band: str, flare_k: float = 10_000.0, flare: FlareSpectrum | None = None) -> Self:
         """The same flares with their energies in another band, or bolometric ones.
 
         Parameters
@@ -77,13 +78,15 @@ class Rates(ABC):
             A name of `host.stars.bands`, or "bolometric".
         flare_k : float
             Temperature of the flares, blackbodies.
+        flare : FlareSpectrum, optional
+            Light of the flares in place of those blackbodies.
 
         Raises
         ------
         InputError
             For an unknown band, or a temperature that no flare has.
         """
-        return replace(self.times_energy(band_factor(self.band, band, flare_k)), band=band)
+        return replace(self.times_energy(band_factor(self.band, band, flare_k, flare)), band=band)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -225,8 +228,8 @@ class RateTable(Rates):
         return replace(self, energy_erg=self.energy_erg * factor, measured_erg=(low * factor, high * factor))
 
 
-def band_factor(old: str, new: str, flare_k: float = 10_000.0) -> float:
-    """Energy in one band over that in another, of a blackbody; either may be "bolometric".
+def band_factor(old: str, new: str, flare_k: float = 10_000.0, flare: FlareSpectrum | None = None) -> float:
+    """Energy in one band over that in another, of a blackbody or another spectrum; either may be "bolometric".
 
     Raises
     ------
@@ -237,8 +240,10 @@ def band_factor(old: str, new: str, flare_k: float = 10_000.0) -> float:
     if not low <= flare_k <= high:
         raise InputError(f"flare_k = {flare_k}, expected {low:g} to {high:g} K")
 
+    light = Blackbody(flare_k) if flare is None else flare
+
     def flux(band: str) -> float:
-        return STEFAN_BOLTZMANN * flare_k**4 if band == BOLOMETRIC else in_band(band, flare_k)
+        return light.bolometric_flux() if band == BOLOMETRIC else flux_in_band(band, light)
 
     return 1.0 if old == new else flux(new) / flux(old)
 

@@ -1,0 +1,54 @@
+"""Flags of the flare's spectrum reach the study of every verb that takes a flare temperature."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import typer
+from commands import ended, run
+from typer.main import get_command
+
+from mauvecl import Study
+from mauvecl.cli.app import app
+from mauvecl.cli.flags import SPECTRUM
+
+STAR = ("--star", "M3V", "--magnitude", "9", "--amplitude", "0.05", "--no-pictures", "-n", "20000", "--fap", "0.01")
+
+
+def test_flags_set_the_spectrum(tmp_path: Path) -> None:
+    lines = ("--line", "Mg II=0.03", "--line", "280.5 = 0.01", "--line-flux", "H beta=1e-13")
+    run("detect", *STAR, "--balmer-jump", "2.5", *lines, "--output", "out", folder=tmp_path)
+    (file,) = (tmp_path / "out").glob("study.toml")
+    light = Study.read(file).flare.spectrum
+    assert light.balmer_jump == 2.5
+    assert light.lines == {"Mg II": 0.03, "280.5": 0.01}
+    assert light.line_fluxes == {"H beta": 1e-13}
+
+
+@pytest.mark.parametrize(
+    ("words", "text"),
+    [
+        (("--line", "Mg II"), "--line"),
+        (("--line", "Mg II=x"), "expected a number"),
+        (("--balmer-jump", "0.2"), "--balmer-jump 0.2"),
+        (("--second-area", "0.2"), "second_temperature_k"),
+        (("--flare-file", "missing.txt"), "missing.txt"),
+    ],
+)
+def test_a_wrong_one_is_named(words: tuple[str, ...], text: str, tmp_path: Path) -> None:
+    code, _, told = ended("detect", *STAR, *words, folder=tmp_path)
+    assert code == 2
+    assert text in told
+
+
+def test_every_verb_with_a_flare_temperature_takes_them() -> None:
+    group = get_command(app)
+    context = typer.Context(group)
+    seen = 0
+    for name in group.list_commands(context):  # type: ignore[attr-defined]
+        names = {one.name for one in group.get_command(context, name).params}  # type: ignore[attr-defined]
+        if "flare_temperature" in names:
+            seen += 1
+            assert names >= set(SPECTRUM), name
+    assert seen >= 8

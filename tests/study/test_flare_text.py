@@ -1,0 +1,219 @@
+"""Flares of any spectrum in studies, flags and answers."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import tomli_w
+from astropy.table import Table
+
+import mauvecl
+from mauvecl import EnergyScale, InputError, Instrument, Source, Study, expect
+from mauvecl.host.stars.bands import photons
+from mauvecl.host.stars.flare_spectra import (
+    BalmerFlare,
+    Blackbody,
+    FlareSpectrum,
+    FlareWithLines,
+    ObservedFlare,
+    TwoBlackbodies,
+)
+from mauvecl.lightcurve.flares.rates import band_factor
+from mauvecl.study.staring import energy_of, staring_of
+
+DATA = Path(__file__).parent.parent / "data"
+FILE, QUIET = DATA / "spectra" / "ADLeo_912s.dat", DATA / "flares" / "adleo_quiescent2.dat"
+OF_FILE: dict[str, Any] = {
+    "file": str(FILE), "quiescent": str(QUIET), "wavelength_unit": "Angstrom", "continue_at_k": 9500.0
+}  # fmt: skip
+#: What a study says of a flare's spectrum, and the spectrum at 9000 K.
+TEXTS: dict[str, tuple[dict[str, Any], FlareSpectrum]] = {
+    "blackbody": ({}, Blackbody(9000.0)),
+    "jump": ({"balmer_jump": 2.5, "electron_temperature_k": 8000.0}, BalmerFlare(9000.0, 2.5, 8000.0)),
+    "two": ({"second_temperature_k": 25_000.0, "second_area": 0.1}, TwoBlackbodies(9000.0, 25_000.0, 0.1)),
+    "lines": (
+        {"lines": {"Mg II": 0.04, "H alpha": 0.1}, "line_scale": 0.5, "balmer_jump": 2.0},
+        FlareWithLines(BalmerFlare(9000.0, 2.0), {"Mg II": 0.02, "H alpha": 0.05}),
+    ),
+    "file": (OF_FILE, ObservedFlare.read(FILE, QUIET, wavelength_unit="Angstrom", continue_at_k=9500.0)),
+}
+TOGETHER = pytest.mark.parametrize("name", TEXTS)
+
+
+def study_of(name: str, **flare: Any) -> Study:
+    return Study.build(
+        {
+            "star": [{"library": "M3V", "magnitude": 9.0, "distance_pc": 5.0}],
+            "flare": {"temperature_k": 9000.0, "amplitudes": [0.3], "spectrum": TEXTS[name][0], **flare},
+        },
+        "test",
+    )
+
+
+@TOGETHER
+def test_a_study_means_its_spectrum_and_comes_back_from_its_text(name: str, tmp_path: Path) -> None:
+    study, spectrum = study_of(name), TEXTS[name][1]
+    nm = spectrum.grid(np.linspace(200.0, 700.0, 1001))
+    np.testing.assert_array_equal(study.flare.light().flux(nm), spectrum.flux(nm))
+    (tmp_path / "study.toml").write_text(study.toml())
+    assert Study.read(tmp_path / "study.toml") == study
+    assert ("spectrum" in study.toml()) == (name != "blackbody")
+
+
+@TOGETHER
+@pytest.mark.parametrize("band", ["Kepler", "GALEX NUV"])
+def test_the_amplitude_is_the_rise_of_the_bands_photons(name: str, band: str) -> None:
+    star, spectrum = Source.from_library("M3V").at_magnitude(9), TEXTS[name][1]
+    lit = star.flaring(0.3, spectrum=spectrum, band=band)
+    quiet = np.interp(lit.wavelength_nm, star.wavelength_nm, star.flux_flam)
+    rise = photons(lit.wavelength_nm, lit.flux_flam, band) / photons(lit.wavelength_nm, quiet, band) - 1
+    assert rise == pytest.approx(0.3, rel=1e-9)
+    added = lit.flux_flam - quiet
+    shape = spectrum.flux(lit.wavelength_nm)
+    used = shape > 0.01 * shape.max()
+    np.testing.assert_allclose(added[used] / shape[used], (added[used] / shape[used])[0], rtol=1e-6)
+
+
+@TOGETHER
+def test_energies_are_those_of_the_light(name: str) -> None:
+    """The light that `flaring` adds, integrated here; beyond the star's spectrum by the flare's own."""
+    star, spectrum = Source.from_library("M3V").at_magnitude(9), TEXTS[name][1]
+    lit = star.flaring(1.0, spectrum=spectrum)
+    nm = lit.wavelength_nm
+    added = lit.flux_flam - np.interp(nm, star.wavelength_nm, star.flux_flam)
+    sphere = 4 * np.pi * (5.0 * 3.0856775814913674e18) ** 2
+    from mauvecl.host.stars.bands import band as find
+
+    kepler = find("Kepler")
+    fine = np.union1d(nm, kepler.wavelength_nm)
+    response = np.interp(fine, kepler.wavelength_nm, kepler.throughput / kepler.throughput.max(), 0, 0)
+    band = 10 * np.trapezoid(response * np.interp(fine, nm, added), fine) * sphere
+    far = spectrum.grid(np.geomspace(20.0, 200_000.0, 30_001))
+    share = np.trapezoid(added[(nm > 400) & (nm < 600)], nm[(nm > 400) & (nm < 600)])
+    inside = spectrum.grid(np.linspace(400.0, 600.0, 40_001))
+    whole = 10 * share * np.trapezoid(spectrum.flux(far), far) / np.trapezoid(spectrum.flux(inside), inside) * sphere
+    for kind, energy in (("band", band), ("bolometric", whole)):
+        scale = EnergyScale.of_star(star, 5.0, flare=spectrum, kind=kind)
+        assert scale.erg_per_s == pytest.approx(energy, rel=5e-3), kind
+    ratio = band_factor("Kepler", "bolometric", flare=spectrum)
+    assert ratio == pytest.approx(whole / band, rel=1e-2)
+
+
+@TOGETHER
+def test_answers_take_any_spectrum(name: str) -> None:
+    """A closed-form detection against the sum of the flare's counts over the noise, and a stare's energies."""
+    study = study_of(name, amplitudes=[0.05])
+    star, mauve = Source.from_library("M3V").at_magnitude(9), Instrument.load("mauve")
+    quiet, lit = (expect(s, mauve, exposure=50.0) for s in (star, star.flaring(0.05, spectrum=TEXTS[name][1])))
+    wanted = np.sqrt(np.sum((lit.signal_dn - quiet.signal_dn) ** 2 / quiet.variance_dn2))
+    seen, flare = study.expectations(study.star[0])
+    got = np.sqrt(np.sum((flare.signal_dn - seen.signal_dn) ** 2 / seen.variance_dn2))
+    assert got == pytest.approx(wanted, rel=1e-9)
+    one = study.with_settings(["stare.duration_s=600", "observation.exposure_s=5"])
+    staring, (event,) = staring_of(one, one.star[0])
+    frames = [x.source_electrons for x in one.expectations(one.star[0])]
+    np.testing.assert_allclose(0.05 * staring.flare_electrons[0], frames[1] - frames[0], rtol=1e-6, atol=1e-9)
+    scale = EnergyScale.of_star(star, 5.0, flare=TEXTS[name][1])
+    energy = energy_of(one, one.star[0], star, event, "bolometric")
+    assert energy == pytest.approx(scale.erg_per_s * event.equivalent_duration_s, rel=1e-9)
+
+
+def test_a_search_injects_the_flare_of_the_file_and_looks_for_blackbodies() -> None:
+    from mauvecl.study.surveys import surveyed
+
+    found = {name: surveyed(study_of(name), study_of(name).star[0]) for name in ("blackbody", "file", "jump")}
+    np.testing.assert_array_equal(found["file"].templates.directions, found["blackbody"].templates.directions)
+    assert not np.array_equal(found["jump"].templates.directions, found["blackbody"].templates.directions)
+    assert found["file"].unit_snr > found["blackbody"].unit_snr
+
+
+@pytest.mark.parametrize(
+    ("quantity", "values", "name"),
+    [
+        ("balmer_jump", [1.0, 2.0, 4.0], "blackbody"),
+        ("second_temperature", [10_000.0, 30_000.0], "two"),
+        ("second_area", [0.0, 0.1], "two"),
+        ("line_scale", [0.0, 1.0], "lines"),
+    ],
+)
+def test_sweeps_over_the_spectrum(quantity: str, values: list[float], name: str) -> None:
+    """More ultraviolet light for one amplitude is more S/N."""
+    study = study_of(name).model_copy(
+        update={
+            "sweep": mauvecl.study.questions.Sweep.model_validate({"axes": [{"quantity": quantity, "values": values}]})
+        }
+    )
+    snr = []
+    for _, cell in study.cells():
+        quiet, lit = cell.expectations(cell.star[0])
+        snr.append(float(np.sqrt(np.sum((lit.signal_dn - quiet.signal_dn) ** 2 / quiet.variance_dn2))))
+    assert (np.diff(snr) > 0).all() if quantity != "line_scale" else snr[0] != snr[1]
+    nothing = study_of("blackbody")
+    if quantity != "balmer_jump":
+        with pytest.raises(InputError):
+            nothing.at(quantity, values[-1])
+
+
+def test_lines_of_a_fixed_flux_do_not_scale() -> None:
+    star = Source.from_library("M3V").at_magnitude(9)
+    fixed = FlareWithLines(Blackbody(9000.0), {}, {"Mg II": 1e-12, "H beta": 2e-12})
+    for amplitude in (0.01, 0.1):
+        plain, lit = star.flaring(amplitude, 9000.0), star.flaring(amplitude, spectrum=fixed)
+        near = (lit.wavelength_nm > 279) & (lit.wavelength_nm < 281)
+        nm = lit.wavelength_nm[near]
+        extra = lit.flux_flam[near] - np.interp(nm, plain.wavelength_nm, plain.flux_flam)
+        assert 10 * np.trapezoid(extra, nm) == pytest.approx(1e-12, rel=0.01)
+    with pytest.raises(InputError, match="less than the rise"):
+        star.flaring(1e-9, spectrum=fixed)
+    study = study_of("blackbody").with_settings(['flare.spectrum.line_fluxes={"Mg II" = 1e-12}'])
+    with pytest.raises(InputError, match="do not scale"):
+        staring_of(study, study.star[0])
+
+
+def test_a_flare_of_a_file_is_found_again_from_an_answers_table(tmp_path: Path) -> None:
+    for path in (FILE, QUIET):
+        shutil.copy(path, tmp_path / path.name)
+    text = OF_FILE | {"file": FILE.name, "quiescent": QUIET.name}
+    data = {"star": [{"library": "M3V", "magnitude": 9.0}], "flare": {"spectrum": text}}
+    (tmp_path / "own.toml").write_text(tomli_w.dumps(data))
+    study = Study.read(tmp_path / "own.toml")
+    assert study.flare.spectrum.file == tmp_path / FILE.name
+    table = Table({"x": [1.0]}, meta={"study": study.text()})
+    assert str(tmp_path) not in table.meta["study"]
+    (tmp_path / "out").mkdir()
+    table.write(tmp_path / "out" / "table.ecsv", format="ascii.ecsv")
+    again = Study.read(tmp_path / "out" / "table.ecsv")
+    assert again.flare.light().name == study.flare.light().name  # type: ignore[attr-defined]
+    (tmp_path / QUIET.name).write_text("1 1\n2 2\n")
+    with pytest.raises(InputError, match="is not there as it was"):
+        Study.read(tmp_path / "out" / "table.ecsv")
+
+
+@pytest.mark.parametrize(
+    ("spectrum", "text"),
+    [
+        ({"file": "x.txt", "balmer_jump": 2.0}, "file and balmer_jump"),
+        ({"quiescent": "x.txt"}, "quiescent without a file"),
+        ({"second_area": 0.1}, "only one of second_temperature_k and second_area"),
+        ({"second_area": 0.1, "second_temperature_k": 2e4, "balmer_jump": 2.0}, "balmer_jump and second_area"),
+        ({"balmer_jump": 0.5}, "balmer_jump"),
+        ({"lines": {"X": 0.1}}, "'X' is unknown"),
+        ({"lines": {"Mg II": -0.1}}, "Mg II"),
+        ({"lines": {"Mg II": 0.1}, "line_fluxes": {"Mg II": 1e-12}}, "a fraction and a flux"),
+        ({"electron_temperature_k": 1.0, "balmer_jump": 2.0}, "electron temperature"),
+    ],
+)
+def test_what_cannot_be_is_named(spectrum: dict[str, Any], text: str) -> None:
+    with pytest.raises(InputError, match=text):
+        Study.build({"flare": {"spectrum": spectrum}}, "test")
+
+
+def test_replacing_photosphere_needs_a_surface() -> None:
+    for name in ("jump", "two", "lines"):
+        assert study_of(name, geometry="replaces").expectations(study_of(name).star[0])
+    with pytest.raises(InputError, match="surface flux is unknown"):
+        study_of("file", geometry="replaces").expectations(study_of("file").star[0])
