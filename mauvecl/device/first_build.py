@@ -96,7 +96,7 @@ def settle(device: Any, others: Callable[[], Sequence[Any]]) -> str | None:
     if place not in _settled:
         with _one_at_a_time:
             if place not in _settled:
-                names = _names(device)
+                names = processor.names(device)
                 outcome = _outcome(device, names, others)
                 if not outcome.succeeded:
                     raise DeviceError(_sentence(device, outcome))
@@ -105,12 +105,6 @@ def settle(device: Any, others: Callable[[], Sequence[Any]]) -> str | None:
                     processor.give_name(device, name)
                 _settled[place] = name
     return _settled[place]
-
-
-def _names(device: Any) -> tuple[str | None, ...]:
-    """Names to try, highest first."""
-    known = processor.flags()
-    return processor.levels(known) if known and processor.target(device) is not None else (None,)
 
 
 def _outcome(device: Any, names: tuple[str | None, ...], others: Callable[[], Sequence[Any]]) -> Outcome:

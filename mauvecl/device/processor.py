@@ -7,7 +7,8 @@ library because the processor has it: a build then takes minutes and gigabytes a
 calls a processor that it does not know "generic", which its own compiler refuses for x86-64 (PoCL issue 1049).
 
 No setting gives another name. This module writes the highest level of the x86-64 psABI that fits both the processor and
-the library into PoCL's record of the device in memory. From version 5 on PoCL names the processor after the library.
+the library into PoCL's record of the device in memory. From version 5 on, and in Debian's 3.1, PoCL names the processor
+after the library, and its record is left alone.
 """
 
 from __future__ import annotations
@@ -73,6 +74,16 @@ def target(device: Any) -> tuple[str, str] | None:
     return found[1], found[2]
 
 
+def names(device: Any) -> tuple[str | None, ...]:
+    """Return the names to compile for, best first; None alone if PoCL had better choose.
+
+    Parameters
+    ----------
+    device : pyopencl.Device
+    """
+    return levels(flags()) if flags() and _place(device) is not None else (None,)
+
+
 def give_name(device: Any, name: str) -> bool:
     """Let PoCL compile for a processor of this name; return whether its record of the device was understood.
 
@@ -82,26 +93,35 @@ def give_name(device: Any, name: str) -> bool:
     name : str
         A name that LLVM knows, such as one of `LEVELS`.
     """
+    place = _place(device)
+    if place is None:
+        return False
+    text = _names.setdefault(name, ctypes.create_string_buffer(name.encode()))
+    ctypes.c_void_p.from_address(place).value = ctypes.addressof(text)
+    return True
+
+
+def _place(device: Any) -> int | None:
+    """Return the address of the pointer to the processor's name in PoCL's record, or None if it is not where it was."""
     found = target(device)
     if found is None:
-        return False
+        return None
     triple, own = found
     record = int(device.int_ptr)
     try:
         memory = os.open("/proc/self/mem", os.O_RDONLY)
     except OSError:
-        return False
+        return None
     try:
-        # Until PoCL 5 the pointer to the triple stands before that to the processor's name.
+        # The pointer to the triple stands before that to the name, unless PoCL names the processor after the library:
+        # that of version 5, and Debian's of 3.1.
         pointers = [int.from_bytes(_bytes(memory, record + at, 8), "little") for at in range(0, RECORD_BYTES, 8)]
         for place, (first, second) in enumerate(itertools.pairwise(pointers), 1):
             if _text(memory, first) == triple and _text(memory, second) in (own, *_names):
-                text = _names.setdefault(name, ctypes.create_string_buffer(name.encode()))
-                ctypes.c_void_p.from_address(record + 8 * place).value = ctypes.addressof(text)
-                return True
+                return record + 8 * place
     finally:
         os.close(memory)
-    return False
+    return None
 
 
 def _bytes(memory: int, address: int, size: int) -> bytes:

@@ -68,7 +68,7 @@ def chooses() -> None:
     """Skip where mauvecl does not choose what PoCL compiles for."""
     from mauvecl.device import program
 
-    if processor.target(program.choose_device(None)[0]) is None:
+    if processor.names(program.choose_device(None)[0]) == (None,):
         pytest.skip("the default device chooses what it compiles for by itself")
 
 
@@ -82,7 +82,7 @@ def plain(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, str
 def misbehaving(act: str, names: str) -> str:
     # Two seconds by the clock for each of processor time, so that sleeping ends soon.
     clock = "first_build.CLOCK = 2.0; " if "sleep" in act else ""
-    return f"{clock}first_build.CHILD = {CHILD.format(act=act)!r}; first_build._names = lambda device: {names}"
+    return f"{clock}first_build.CHILD = {CHILD.format(act=act)!r}; processor.names = lambda device: {names}"
 
 
 @pytest.mark.long
@@ -113,7 +113,7 @@ def test_outcome_is_kept_until_driver_or_version_change(plain: tuple[Path, dict[
 
 def test_failure_is_kept_for_a_week(tmp_path: Path) -> None:
     fails = misbehaving("os.abort()", "(None,)")
-    count = "first_build._names = lambda device: (None,); first_build._try = lambda *a: print('tried', a[0]) or ''; "
+    count = "processor.names = lambda device: (None,); first_build._try = lambda *a: print('tried', a[0]) or ''; "
     assert "sentence" in run(tmp_path, fails)
     assert run(tmp_path, count).keys() == {"sentence"}
     later = "import time; now = time.time; time.time = lambda: now() + 8 * 86400; "
@@ -171,7 +171,7 @@ def test_zen_4_is_contained(tmp_path: Path, plain: tuple[Path, dict[str, str]], 
     """PoCL 3.0 with AVX-512 crashes for the name znver3 after minutes and gigabytes; its child is stopped before."""
     if "avx512f" not in processor.flags():
         pytest.skip("this processor has no AVX-512")
-    names = f"first_build._names = lambda device: ('znver3', {plain[1]['level']!r})"
+    names = f"processor.names = lambda device: ('znver3', {plain[1]['level']!r})"
     start = time.monotonic()
     assert run(tmp_path, names, MAUVECL_BUILD_LIMIT_S="6") == plain[1]
     assert time.monotonic() - start < 100
