@@ -23,7 +23,7 @@ def engine() -> Engine:
 @pytest.fixture
 def small_shards(monkeypatch: pytest.MonkeyPatch) -> None:
     """Shards of 4096 realisations."""
-    monkeypatch.setattr(shards, "SHARD", 1)
+    monkeypatch.setattr(shards, "SHARD_WORK", 1)
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
     from rich.table import Table
 
-    from mauvecl.runs.pool import Standing
+    from mauvecl.runs.pool import PoolProgress
 
 #: Work shorter than this shows no progress.
 PATIENCE_S = 2.0
@@ -32,7 +32,7 @@ class Meter:
         Tells how far a pool is: what it had from a checkpoint, what it counted again.
     """
 
-    standing: Callable[[], Standing] | None = None
+    standing: Callable[[], PoolProgress] | None = None
 
     def __init__(self, *, quiet: bool = False, unit: str = "realisations") -> None:
         self._quiet, self._unit = quiet, unit

@@ -97,11 +97,11 @@ class Session:
     def folder(self) -> Path:
         """Where everything is written; held from now on."""
         from mauvecl.answers.report import make_folder
-        from mauvecl.runs.durable import alone
+        from mauvecl.runs.durable import locked
 
         folder = make_folder(self.output or Path(f"mauvecl-{self.verb}"))
         writes_to(folder)
-        self._held.enter_context(alone(folder, "output folder"))
+        self._held.enter_context(locked(folder, "output folder"))
         return folder
 
     @contextmanager

@@ -1,1 +1,1 @@
-"""Work cut into shards: who counts them, and what is kept for a resume."""
+"""Division of work into shards, workers that count them, and checkpoints."""

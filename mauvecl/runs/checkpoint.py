@@ -1,8 +1,8 @@
-"""What a long run has counted so far, kept so that it can go on after any end: one file per shard, never changed.
+"""Checkpoints of long runs: one immutable file per shard, from which an interrupted run continues.
 
-A file is named by the request's fingerprint and the shard's range, written whole or not at all, and ends in its own
-digest; so it says by itself whether it can be used. Requests follow from the study and from earlier answers alone, so
-a run that is started again asks the same and finds what is there.
+A file is named by the request's fingerprint and the range of the shard. It is written atomically and ends with a
+digest, which shows whether it is intact. Requests depend on the study and earlier results only, so a run that is
+started again makes the same requests and finds the files.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from mauvecl.host.files.bounded import read_bytes
 from mauvecl.host.files.parsed import json_data, read_text
 from mauvecl.host.files.whole import UNFINISHED, write_whole
 from mauvecl.host.version import VERSION
-from mauvecl.runs.durable import alone, differing_keys
+from mauvecl.runs.durable import differing_keys, locked
 from mauvecl.runs.shards import FORM
 
 if TYPE_CHECKING:
@@ -37,37 +37,37 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
 FOLDER, MANIFEST = "checkpoint", "manifest.json"
-#: What shards are called: fingerprint, part, start, count.
+#: Names of shards: fingerprint, part, start, count.
 SHARD_NAME = re.compile(r"[0-9a-f]{32}-[0-9]+-[0-9]+-[0-9]+\.npz")
-#: Shards are held back so long before the first is written: short runs leave no files.
+#: Time before the first shard is written, s, so that short runs write no files.
 PATIENCE_S = 20.0
 DIGEST_BYTES = 32
 
 
 class Checkpoint:
-    """Shards of one run, in a folder; use it in a `with` block.
+    """Context manager of the shards of one run in a folder.
 
     Parameters
     ----------
     folder : Path
-        The run's output folder, which is there.
+        Existing output folder of the run.
     verb : str
     study : Study
     resume : bool
-        Go on with what is there.
+        Whether to continue an unfinished run.
     restart : bool
-        Forget what is there.
+        Whether to discard an unfinished run.
     patience_s : float
         See `PATIENCE_S`.
     held : bool
-        Whether the caller holds the folder, so that no other process writes there.
+        Whether the caller has locked the folder.
 
     Attributes
     ----------
     resumed, damaged : int
-        Shards taken from files so far, and files that could not be used.
+        Number of shards read from files, and of unusable files.
     messages : list of str
-        What the user must be told.
+        Remarks for the user.
     """
 
     def __init__(
@@ -90,16 +90,16 @@ class Checkpoint:
         self._stack = ExitStack()
 
     def __enter__(self) -> Self:
-        """Take hold of the output folder, and look at what is there.
+        """Lock the output folder and read its state.
 
         Raises
         ------
         InputError
-            If another process writes there; if there is a run to resume and it is not said what to do with it; or if
-            it is another study's, with the keys that differ.
+            If another process writes to the folder, or it contains an unfinished run without `resume` or `restart`, or
+            one of another study (the message lists the keys that differ).
         """
         if not self._is_held:
-            self._stack.enter_context(alone(self.parent, "output folder"))
+            self._stack.enter_context(locked(self.parent, "output folder"))
         try:
             self._look()
         except BaseException:
@@ -111,10 +111,10 @@ class Checkpoint:
     def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
         try:
             if kind is not None:
-                # Interrupted or failed: what is held back is worth keeping, unless it took no time.
+                # After an interruption or error, write pending shards unless the run was short.
                 self._write_held(only_if_late=not self._written)
         except InputError:
-            # The reason to stop is told already.
+            # The original exception is more important.
             pass
         finally:
             self._stack.close()
@@ -136,7 +136,7 @@ class Checkpoint:
             theirs = {"mauvecl": manifest["mauvecl"], "verb": manifest["verb"], **manifest["study"]}
             form = manifest.get("form", 1)
         except (OSError, ValueError, KeyError, TypeError):
-            # Files are named by what they answer: those of another study are never asked for.
+            # Names of files include the fingerprint, so shards of another study are never used.
             self.messages.append(
                 f"The manifest of {str(self.folder)!r} was damaged or missing and is written anew; the shards that "
                 "belong to this study are used."
@@ -157,7 +157,7 @@ class Checkpoint:
             )
 
     def get(self, name: str) -> Arrays | None:
-        """A shard that was counted before, or None."""
+        """Return a shard that was counted before, or None."""
         path = self.folder / f"{name}.npz"
         try:
             data = path.read_bytes()
@@ -177,13 +177,7 @@ class Checkpoint:
         return shard
 
     def put(self, name: str, shard: Arrays) -> None:
-        """Keep a shard; on the disk once the run has lasted `patience_s`.
-
-        Raises
-        ------
-        InputError
-            If it cannot be written.
-        """
+        """Keep a shard, and write it to disk once the run has lasted `patience_s`."""
         with self._lock:
             self._held.append((name, shard))
             self._write_held(only_if_late=not self._written)
@@ -204,21 +198,18 @@ class Checkpoint:
 
     @property
     def kept(self) -> int:
-        """Files of shards that are there."""
+        """Number of files of shards."""
         return sum(1 for path in self._files() if path.suffix == ".npz")
 
     def forget(self) -> None:
-        """Remove it: the answer is written."""
+        """Remove the checkpoint, which is no longer needed once the result is written."""
         self._held = []
         self._remove()
 
     def _files(self) -> Iterator[Path]:
-        """The files in its folder that are a checkpoint's own, by their names.
+        """Yield the files in the folder that belong to a checkpoint, by name.
 
-        Raises
-        ------
-        InputError
-            If there is a manifest of something else.
+        Raises InputError if the manifest is not one of mauvecl's.
         """
         names = sorted(os.listdir(self.folder)) if self.folder.is_dir() else []
         shards = [name for name in names if SHARD_NAME.fullmatch(name)]
@@ -227,7 +218,7 @@ class Checkpoint:
         yield from (self.folder / name for name in names if name in shards or name == MANIFEST)
 
     def _remove(self) -> None:
-        """Remove its own files, and its folder where nothing else is in it."""
+        """Remove the checkpoint's files, and the folder if it is then empty."""
         for path in [*self._files(), *self.folder.glob(f"{UNFINISHED}*")]:
             name = path.name.removeprefix(UNFINISHED)
             if name == MANIFEST or SHARD_NAME.fullmatch(name):
@@ -245,7 +236,7 @@ class Checkpoint:
 
 
 def _is_ours(manifest: Path) -> bool:
-    """Whether a manifest is whole and a checkpoint's."""
+    """Return whether a manifest is an intact one of a checkpoint."""
     try:
         content = json.loads(read_bytes(manifest, "manifest"))
         return bool(content["digest"] == _digest_of(content))
@@ -254,7 +245,7 @@ def _is_ours(manifest: Path) -> bool:
 
 
 def _named(name: str, body: bytes) -> bytes:
-    """Digest of a file with its name: a file in another's place is noticed."""
+    """Return the digest of a file and its name, which detects renamed files."""
     return hashlib.sha256(name.encode() + b"\0" + body).digest()
 
 

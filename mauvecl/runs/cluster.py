@@ -1,4 +1,4 @@
-"""Dask workers as the workers of a pool: processes of this machine, or of a cluster that is there already."""
+"""Dask workers of a pool: processes of this machine, or of an existing cluster."""
 
 from __future__ import annotations
 
@@ -34,17 +34,17 @@ if TYPE_CHECKING:
 
     from mauvecl.device.engine import Engine
 
-#: Seconds to find a scheduler, and then a first worker.
+#: Timeouts of the scheduler and of the first worker, s.
 PATIENCE_S, WORKER_PATIENCE_S = 30.0, 120.0
-#: A shard is sent out so often before the run ends: workers die by twos and threes on a cluster that is taken back.
-TRIES = 8
-#: Seconds between two looks at how many workers there are; requests kept with the workers at a time.
-RECOUNT_S, REQUESTS = 5.0, 32
+#: Number of attempts at a shard before the run fails; a shrinking cluster may lose several workers at once.
+MAX_TRIES = 8
+#: Interval between counts of the workers, s, and largest number of requests kept on the workers.
+RECOUNT_S, MAX_REQUESTS = 5.0, 32
 
 
 @public
 class DaskWorkers:
-    """Workers of a Dask cluster, each with an engine of its own.
+    """Workers of a Dask cluster, each with its own engine.
 
     Parameters
     ----------
@@ -52,12 +52,10 @@ class DaskWorkers:
         ``local:N`` for N processes of this machine; the address of a scheduler, such as ``tcp://host:8786``; or a
         scheduler file.
     device : str, optional
-        As `Engine` takes it, on each worker.
+        Device of each worker, as for `Engine`.
 
     Raises
     ------
-    InputError
-        For another word, or where Dask is missing.
     DeviceError
         If no scheduler or worker answers, a worker has another version of mauvecl, or has no such device.
     """
@@ -100,7 +98,7 @@ class DaskWorkers:
 
     @property
     def count(self) -> int:
-        """Workers, as they were not long ago."""
+        """Recent number of workers."""
         if time.monotonic() > self._counted[1] + RECOUNT_S:
             try:
                 self._counted = max(len(self._client.nthreads()), 1), time.monotonic()
@@ -112,11 +110,11 @@ class DaskWorkers:
         return DeviceError(f"the scheduler of cluster {self._where} is gone, expected it to stay to the end")
 
     def describe(self) -> list[DeviceRecord]:
-        """The devices of the workers that were there at the beginning."""
+        """Return the devices of the initial workers."""
         return self._devices
 
     def submit(self, task: Task) -> Future[Arrays]:
-        """Have a shard counted by whichever worker is free; raw spectra travel, and the task's `out` stays as it is."""
+        """Submit a shard to any free worker; raw spectra are returned, and the task's `out` is not used."""
         awaited: Future[Arrays] = Future()
         self._send(awaited, task, 1)
         return awaited
@@ -129,14 +127,14 @@ class DaskWorkers:
                 return
             try:
                 if key not in self._given:
-                    # A task rather than scattered data: the scheduler can make it again where a worker took it along.
+                    # A task instead of scattered data, since the scheduler can repeat it if its worker is lost.
                     self._given[key] = self._client.submit(_keep, task.request, key=f"mauvecl-request-{key}")
-                    if len(self._given) > REQUESTS:
+                    if len(self._given) > MAX_REQUESTS:
                         del self._given[next(iter(self._given))]
                 name = f"mauvecl-{task.name}-{tried}"
                 sent = self._client.submit(_count, self._given[key], task.shard, self._device, key=name, pure=False)
             except (OSError, RuntimeError) as error:
-                # Dask raises either where its client has lost the scheduler.
+                # Dask raises either if its client has lost the scheduler.
                 awaited.set_exception(self._gone().with_traceback(error.__traceback__))
                 return
             self._sent[sent] = awaited
@@ -145,7 +143,7 @@ class DaskWorkers:
     def _came(self, awaited: Future[Arrays], task: Task, tried: int, sent: DaskFuture[Any]) -> None:
         with self._lock:
             if self._sent.pop(sent, None) is None:
-                # Nobody waits for it any longer.
+                # The result is no longer needed.
                 return
         try:
             if sent.status == "finished":
@@ -153,7 +151,7 @@ class DaskWorkers:
                 return
             error = sent.exception() if sent.status == "error" else None
             known = isinstance(error, InputError | DeviceError)
-            if known or tried == TRIES:
+            if known or tried == MAX_TRIES:
                 told = error if known else f"{error or 'the scheduler is gone'}"
                 awaited.set_exception(DeviceError(f"cluster {self._where} failed at {task.shard}: {told}"))
             elif sent.status in ("cancelled", "lost") and self._client.status != "running":
@@ -162,7 +160,7 @@ class DaskWorkers:
                 with self._lock:
                     self.retries += 1
                     if error is None:
-                        # The request itself was lost with its worker.
+                        # The request was lost with its worker.
                         self._given.pop(task.key, None)
                 self._send(awaited, task, tried + 1)
         except BaseException as error:
@@ -170,17 +168,16 @@ class DaskWorkers:
                 awaited.set_exception(error)
 
     def stop(self) -> None:
-        """Take back what was sent out; a worker of another machine ends the shard in its hands."""
+        """Cancel submitted shards; workers of other machines complete the shard in progress."""
         with self._lock:
             self._closing = True
             sent, self._sent = self._sent, {}
-        # Whoever waits is told here: nothing that Dask does or fails to do, and no future that is merely cancelled,
-        # would wake concurrent.futures.wait.
+        # Set the exception here, because neither Dask nor a cancelled future wakes concurrent.futures.wait.
         for awaited in sent.values():
             awaited.set_exception(Stopped())
         with contextlib.suppress(OSError, RuntimeError, TimeoutError):
             self._client.cancel(list(sent))
-        # Those of this machine need not end the shard in their hands, which takes seconds.
+        # Kill workers of this machine, since completing a shard takes seconds.
         for nanny in getattr(self._client.cluster, "workers", {}).values():
             nanny.auto_restart = False
             if nanny.pid is not None:
@@ -188,7 +185,7 @@ class DaskWorkers:
                     os.kill(nanny.pid, signal.SIGKILL)
 
     def close(self) -> None:
-        """Let the workers go; those of this machine end."""
+        """Disconnect from the workers; those of this machine end."""
         self._closing = True
         self._given.clear()
         self._open.close()
@@ -196,11 +193,11 @@ class DaskWorkers:
 
 @contextlib.contextmanager
 def _client(where: str, distributed: Any) -> Iterator[Client]:
-    """A connection to the cluster, which is made first where it is this machine's."""
+    """Connect to a cluster, starting it first if it is local."""
     import dask
 
     for name in LOGS:
-        # What the user must know is told in a sentence.
+        # Errors reach the user as exceptions.
         logging.getLogger(name).setLevel(logging.CRITICAL)
     how: dict[str, Any]
     with contextlib.ExitStack() as stack:
@@ -209,9 +206,9 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
             if not (number.isdecimal() and len(number) <= 4 and 1 <= int(number) <= 1024):
                 raise InputError(f"cluster = {where!r}, expected local:N with N from 1 to 1024")
             threads = max((os.cpu_count() or 1) // int(number), 1)
-            # Deaths are counted and shards sent out again here, so that they are told.
+            # The pool counts failures and submits shards again, so that it can report them.
             how = {"distributed.scheduler.allowed-failures": 0, "distributed.admin.tick.limit": "1h"}
-            # Nothing to look at by HTTP, which asks nobody who they are.
+            # No HTTP pages, since they have no authentication.
             how |= {"distributed.scheduler.http.routes": [], "distributed.worker.http.routes": []}
             stack.enter_context(dask.config.set(how | {"logging": dict.fromkeys(LOGS, "critical")}))
             cluster = distributed.LocalCluster(
@@ -250,7 +247,7 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
 
 
 def _is_address(where: str) -> bool:
-    """Whether it names a host and a port, in one of Dask's ways to talk."""
+    """Return whether an address has a scheme of Dask, a host and a port."""
     try:
         parts = urlsplit(where)
         host, port = parts.hostname, parts.port
@@ -260,14 +257,14 @@ def _is_address(where: str) -> bool:
     return plain and parts.scheme in SCHEMES and bool(host) and bool(port) and parts.path in ("", "/")
 
 
-#: Dask's ways to talk between machines.
+#: Schemes of Dask's network protocols.
 SCHEMES = ("tcp", "tls", "ucx", "ucxx", "ws", "wss")
 
 
 def _private(distributed: Any) -> Any:
-    """Certificates for this run alone, kept in memory: other users of the machine cannot connect.
+    """Make temporary certificates, so that other users of the machine cannot connect.
 
-    A worker runs whatever the scheduler is sent, with the rights of whoever started it.
+    A worker executes everything that the scheduler receives, with the rights of the user who started it.
     """
     try:
         return distributed.Security.temporary()
@@ -279,13 +276,13 @@ def _private(distributed: Any) -> Any:
 
 LOGS = ("distributed", *(f"distributed.{part}" for part in ("client", "nanny", "worker", "scheduler", "core")))
 
-# On a worker.
+# Functions below run on a worker.
 
 
 def dask_setup(worker: Any) -> None:
-    """Dask calls this on each worker of this machine: it leaves the run's process group, so that Ctrl-C stays there.
+    """Leave the run's process group, so that Ctrl-C does not reach workers; Dask calls this on local workers.
 
-    To ignore the signal would not do: LLVM sets handlers of its own while PoCL builds, and the linker would be struck.
+    Ignoring the signal would not suffice: LLVM sets its own handlers during a build, and the linker would be killed.
     """
     os.setpgid(0, 0)
 
@@ -299,7 +296,7 @@ def _keep(request: Countable) -> Countable:
 
 
 def _engine_here(device: str | None, threads: int) -> Engine:
-    """The worker's engine, with as many of PoCL's threads as Dask gives it."""
+    """Return the worker's engine, with PoCL limited to the threads that Dask assigns."""
     from mauvecl.device.engine import Engine
 
     global _engine

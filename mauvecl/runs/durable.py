@@ -1,4 +1,4 @@
-"""Writers that are alone in their folder, and what differs between two studies."""
+"""Locks on folders, and differences between studies."""
 
 from __future__ import annotations
 
@@ -13,13 +13,10 @@ from mauvecl.host.errors import InputError
 
 
 @contextlib.contextmanager
-def alone(folder: Path, what: str) -> Iterator[None]:
-    """Hold a folder for this process; the operating system lets go of it whatever becomes of the process.
+def locked(folder: Path, what: str) -> Iterator[None]:
+    """Lock a folder for this process; the operating system releases the lock however the process ends.
 
-    Raises
-    ------
-    InputError
-        If another process holds it, or the file system has no locks.
+    Raises InputError if another process holds the lock, or the file system has no locks.
     """
     try:
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
@@ -42,7 +39,7 @@ def alone(folder: Path, what: str) -> Iterator[None]:
 
 
 def differing_keys(ours: Any, theirs: Any) -> list[str]:
-    """Dotted keys at which two nested data differ."""
+    """Return the dotted keys at which two nested structures differ."""
     mine, other = dict(_flat(ours)), dict(_flat(theirs))
     missing = object()
     return sorted(key for key in mine.keys() | other.keys() if mine.get(key, missing) != other.get(key, missing))

@@ -1,4 +1,4 @@
-"""Many engines as one: requests cut into shards, counted by whoever is free, kept as they come, added up exactly."""
+"""Pools of engines that divide requests into shards and add up the counts exactly."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ if TYPE_CHECKING:
     from mauvecl.results.snr import SnrResult
     from mauvecl.runs.checkpoint import Checkpoint
 
-#: A shard is tried so often before the run ends with what went wrong.
-TRIES = 3
-#: Shards under way for each worker: one in hand and one waiting.
-AHEAD = 2
-#: Items of `together` under way beyond the workers: what one needs is prepared while the devices count others.
+#: Number of attempts at a shard before the run fails.
+MAX_TRIES = 3
+#: Submitted shards per worker: one being counted and one waiting.
+SHARDS_PER_WORKER = 2
+#: Items of `map_in_order` in progress beyond the number of workers, which are prepared while devices count others.
 PREPARED = 1
 
 
@@ -45,47 +45,47 @@ Answer = TypeVar("Answer")
 
 
 class Stopped(Exception):  # noqa: N818
-    """Raised between two tiles of a shard that nobody waits for any longer."""
+    """Raised between two tiles of a shard whose result is no longer needed."""
 
 
 class Workers(Protocol):
-    """Who counts shards."""
+    """Interface of the workers that count shards."""
 
     @property
     def count(self) -> int:
-        """How many work at the same time."""
+        """Number of concurrent workers."""
 
     @property
     def retries(self) -> int:
-        """Shards that had to be counted again so far."""
+        """Number of shards that were counted again."""
 
     @property
     def first(self) -> Engine | None:
-        """An engine of this process, for what is not divided."""
+        """An engine of this process, for work that is not divided, or None."""
 
     def describe(self) -> list[DeviceRecord]:
-        """The devices, for run records."""
+        """Return the devices, for run records."""
 
     def submit(self, task: Task) -> Future[Arrays]:
-        """Have a shard counted."""
+        """Submit a shard for counting."""
 
     def stop(self) -> None:
-        """End what is under way as soon as may be."""
+        """Stop work in progress as soon as possible."""
 
     def close(self) -> None:
-        """Let go of everything."""
+        """Release all resources."""
 
 
 @public
 class LocalWorkers:
-    """The OpenCL devices of this machine, in a thread each.
+    """OpenCL devices of this machine, each used by one thread.
 
     Parameters
     ----------
     devices : sequence of str or None
-        As `Engine` takes them.
+        Devices as for `Engine`.
     make : callable, optional
-        Makes an engine from a device and a progress callback, for tests.
+        Factory of engines from a device and a progress callback, for tests.
     """
 
     def __init__(self, devices: Sequence[str | None] = (None,), *, make: Callable[..., Engine] = Engine) -> None:
@@ -109,20 +109,20 @@ class LocalWorkers:
 
     @property
     def count(self) -> int:
-        """Devices."""
+        """Number of devices."""
         return len(self._engines)
 
     @property
     def first(self) -> Engine:
-        """The first device's engine."""
+        """Engine of the first device."""
         return self._engines[0]
 
     def describe(self) -> list[DeviceRecord]:
-        """The devices."""
+        """Return the devices, for run records."""
         return [engine.device for engine in self._engines]
 
     def submit(self, task: Task) -> Future[Arrays]:
-        """Count a shard, as soon as a device is free."""
+        """Count a shard as soon as a device is free."""
         return self._threads.submit(self._count, task)
 
     def _count(self, task: Task) -> Arrays:
@@ -130,7 +130,7 @@ class LocalWorkers:
             place = self._free.pop(0)
         self._ticks[place] = task.tick
         try:
-            for tried in range(1, TRIES + 1):
+            for tried in range(1, MAX_TRIES + 1):
                 try:
                     return self._engines[place].count(task.request, task.shard, out=task.out)
                 except Exception as error:
@@ -138,14 +138,14 @@ class LocalWorkers:
                     launch = isinstance(error, engine.opened.cl.Error)
                     if not launch or self._stopping:
                         raise
-                    if tried == TRIES:
+                    if tried == MAX_TRIES:
                         raise DeviceError(
-                            f"{engine.device_name} failed {TRIES} times at {task.shard} ({error}), expected a device "
-                            "that works"
+                            f"{engine.device_name} failed {MAX_TRIES} times at {task.shard} ({error}), expected a "
+                            "device that works"
                         ) from error
                     with self._lock:
                         self.retries += 1
-                    # Nothing of a failed launch is trusted: a new context, and the shard from its beginning.
+                    # A failed launch may have corrupted the context, so count the whole shard again in a new one.
                     self._engines[place] = self._made(place)
             raise AssertionError
         finally:
@@ -154,52 +154,40 @@ class LocalWorkers:
                 self._free.append(place)
 
     def stop(self) -> None:
-        """End what is under way between two tiles."""
+        """Stop work in progress between two tiles."""
         self._stopping = True
 
     def close(self) -> None:
-        """Let the threads go."""
+        """Stop the threads."""
         self._threads.shutdown(wait=True, cancel_futures=True)
 
 
 @dataclass(frozen=True)
-class Standing:
-    """How far the work is.
+class PoolProgress:
+    """Progress of a pool."""
 
-    Attributes
-    ----------
-    done, total : int
-        Realisations, of all requests known or announced.
-    shards, of : int
-        Shards done, of all requests known.
-    retries : int
-        Shards that were counted again, because a device failed or a worker died.
-    resumed : int
-        Of the realisations done, those taken from a checkpoint.
-    """
-
-    done: int
-    total: int
-    shards: int
-    of: int
-    retries: int
-    resumed: int
+    done: int  # realisations
+    total: int  # realisations of all known or announced requests
+    shards: int  # counted shards
+    of: int  # shards of all known requests
+    retries: int  # shards that were counted again, because a device failed or a worker died
+    resumed: int  # realisations taken from a checkpoint
 
 
 @public
 class Pool:
-    """Answers what an `Engine` answers, with all workers, and the same to the last bit.
+    """Several workers with the interface of an `Engine`, which return bit-identical results.
 
     Parameters
     ----------
     workers : Workers, optional
-        The default device of this machine unless told otherwise.
+        The default is the default device of this machine.
     checkpoint : Checkpoint, optional
-        Where shards are kept, and looked for.
+        Checkpoint from which shards are read and to which they are written.
     progress : callable, optional
-        Called as ``progress(done, total)`` in realisations of all requests known so far; may raise to stop the work.
+        Called as ``progress(done, total)`` in realisations of all known requests; may raise to stop the work.
     meanwhile : callable, optional
-        Done once, in a thread of its own, as soon as devices are busy: what would keep them waiting before.
+        Function called once in a separate thread as soon as the devices are busy.
     """
 
     def __init__(
@@ -222,48 +210,48 @@ class Pool:
         self._stopping = False
 
     def expect(self, realisations: int) -> None:
-        """Announce how much will be asked for, so that the time left can be told from the beginning."""
+        """Announce the total number of realisations, for an estimate of the remaining time."""
         self._expected = self._total + whole("realisations", realisations)
 
     def stop(self) -> None:
-        """End everything that is under way, in other threads too."""
+        """Stop all work in progress, including that of other threads."""
         self._stopping = True
         self.workers.stop()
 
     @property
     def kernel_digest(self) -> str:
-        """Short sha256 of the kernels rendered in this process; empty where others draw."""
+        """Short SHA-256 of the kernels rendered in this process; empty if only other processes draw."""
         first = self.workers.first
         return "" if first is None else first.kernel_digest
 
     @property
     def devices(self) -> list[DeviceRecord]:
-        """Who counts."""
+        """Devices of all workers."""
         return self.workers.describe()
 
     @property
-    def standing(self) -> Standing:
-        """How far the work is."""
+    def standing(self) -> PoolProgress:
+        """Progress of the work."""
         partly = sum(self._partly.values())
         total = max(self._total, self._expected)
-        return Standing(self._done + partly, total, self._shards, self._of, self.workers.retries, self._resumed)
+        return PoolProgress(self._done + partly, total, self._shards, self._of, self.workers.retries, self._resumed)
 
     def detect(self, quiet: Expectation, flares: Sequence[Expectation] | Expectation, **how: Any) -> Detection:
-        """As `Engine.detect`, with the same keywords."""
+        """Compute a detection; parameters as for `Engine.detect`."""
         request = DetectRequest.of(quiet, flares, **how)
         sums = DetectionSums(request)
         self._add_up(request, sums)
         return sums.answer()
 
     def snr(self, expectation: Expectation, **how: Any) -> SnrResult:
-        """As `Engine.snr`, with the same keywords."""
+        """Compute distributions of the S/N; parameters as for `Engine.snr`."""
         request = SnrRequest.of(expectation, **how)
         sums = SnrSums(request)
         self._add_up(request, sums)
         return sums.answer()
 
     def stares(self, request: StaresRequest) -> Arrays:
-        """As `Stares.reduced`, of all stares of a request."""
+        """Reduce all stares of a request; see `Stares.reduced`."""
         sums = StareSums(request)
         self._add_up(request, sums)
         return sums.answer()
@@ -271,7 +259,10 @@ class Pool:
     def realise(
         self, expectation: Expectation, *, count: int, out: NDArray[Any] | None = None, **how: Any
     ) -> NDArray[Any]:
-        """As `Engine.realise`, with the same keywords, by one worker; several calls at a time keep all of them busy."""
+        """Draw raw spectra with one worker; parameters as for `Engine.realise`.
+
+        Concurrent calls use several workers.
+        """
         request = RealiseRequest.of(expectation, count, **how)
         task = Task(request, uuid.uuid4().hex, Shard(0, request.start, request.realisations), out=out)
         rows: NDArray[Any] = self.workers.submit(task).result()["rows"]
@@ -286,7 +277,7 @@ class Pool:
         with self._lock:
             self._total += sum(shard.count for shard in todo)
             self._of += len(todo)
-        self._told()
+        self._report_progress()
         waiting: dict[Future[Arrays], Task] = {}
         for shard in todo:
             task = Task(request, key, shard, partial(self._tick, f"{key}-{shard.name}"))
@@ -297,7 +288,7 @@ class Pool:
                 continue
             if self._stopping:
                 raise Stopped
-            while len(waiting) >= self.workers.count * AHEAD:
+            while len(waiting) >= self.workers.count * SHARDS_PER_WORKER:
                 self._collect(sums, waiting)
             waiting[self.workers.submit(task)] = task
         while waiting:
@@ -319,7 +310,7 @@ class Pool:
             aside, self._meanwhile = self._meanwhile, None
         if aside is not None:
             threading.Thread(target=aside, name="mauvecl-aside", daemon=True).start()
-        self._told()
+        self._report_progress()
 
     def _finished(self, task: Task, *, resumed: bool = False) -> None:
         with self._lock:
@@ -327,16 +318,18 @@ class Pool:
             self._done += task.shard.count
             self._shards += 1
             self._resumed += task.shard.count if resumed else 0
-        self._told()
+        self._report_progress()
 
-    def _told(self) -> None:
+    def _report_progress(self) -> None:
         if self._progress is not None:
             standing = self.standing
             self._progress(standing.done, standing.total)
 
 
-def together(engine: Engine | Pool | Stares, work: Callable[[Item], Answer], items: Iterable[Item]) -> Iterator[Answer]:
-    """What `work` makes of each item, in their order; by a pool some at a time, so that devices need not wait."""
+def map_in_order(
+    engine: Engine | Pool | Stares, work: Callable[[Item], Answer], items: Iterable[Item]
+) -> Iterator[Answer]:
+    """Apply `work` to items and yield the results in order; with a pool, several items are in progress at once."""
     if not isinstance(engine, Pool):
         yield from map(work, items)
         return
@@ -345,7 +338,7 @@ def together(engine: Engine | Pool | Stares, work: Callable[[Item], Answer], ite
         try:
             for item in items:
                 ahead.append(threads.submit(work, item))
-                # No more answers wait for their turn than are worked on.
+                # Limit the number of results that wait to be yielded.
                 if len(ahead) > engine.workers.count + PREPARED:
                     yield ahead.popleft().result()
             while ahead:

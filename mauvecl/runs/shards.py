@@ -1,4 +1,4 @@
-"""Requests cut into shards, whatever counts them, and the fingerprints that shards are kept under."""
+"""Division of requests into shards, and fingerprints of requests."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from numpy.typing import NDArray
 
 from mauvecl.results.requests.requests import Countable, Divisible, Shard
 
-#: What a shard holds, and how: raised with every change, so that none of an older form is ever added.
+#: Version of the content of a shard, raised with every change, so that shards of older versions are never added.
 FORM = 2
-#: Realisations times pixels times scenarios of one shard, about: some seconds of a processor's work.
-SHARD = 2**34
-#: Shards of one part of a request, about, at most: larger requests have larger shards, so that one process can add up
-#: what a thousand count.
-MOST = 2**13
+#: Approximate work of a shard, realisations times pixels times scenarios: some seconds on a processor.
+SHARD_WORK = 2**34
+#: Approximate largest number of shards per part. Larger requests have larger shards, so that one process can add up
+#: the counts of a thousand.
+MAX_SHARDS = 2**13
 
 
 def shards(request: Divisible) -> list[Shard]:
-    """All shards of a request: cut at multiples of a power of two, whatever counts them."""
-    wanted = max(SHARD // request.work, request.realisations // MOST)
+    """Divide a request into shards at multiples of a power of two, independently of the workers."""
+    wanted = max(SHARD_WORK // request.work, request.realisations // MAX_SHARDS)
     size = 1 << (max(wanted, request.least).bit_length() - 1)
     first, end = request.start, request.start + request.realisations
     cuts = [first, *range(first - first % size + size, end, size), end]
@@ -33,40 +33,28 @@ def shards(request: Divisible) -> list[Shard]:
 
 @dataclass(frozen=True, eq=False)
 class Task:
-    """A shard to be counted.
-
-    Attributes
-    ----------
-    request : Countable
-    key : str
-        The request's fingerprint.
-    shard : Shard
-    tick : callable
-        Told how many realisations are done of it, where a worker can.
-    out : ndarray, optional
-        Where raw spectra go that a worker of this process draws.
-    """
+    """A shard to count."""
 
     request: Countable
-    key: str
+    key: str  # fingerprint of the request
     shard: Shard
-    tick: Callable[[int], None] = lambda done: None
-    out: NDArray[Any] | None = None
+    tick: Callable[[int], None] = lambda done: None  # called with the number of counted realisations, if possible
+    out: NDArray[Any] | None = None  # array for raw spectra, if a worker of this process draws them
 
     @property
     def name(self) -> str:
-        """What it is kept under."""
+        """Name in a checkpoint."""
         return f"{self.key}-{self.shard.name}"
 
 
-#: What describes an input and does not change a draw.
-_TOLD = ("provenance", "messages")
+#: Fields that do not affect a draw.
+_DESCRIPTIVE = ("provenance", "messages")
 
 
 def fingerprint(request: Countable) -> str:
-    """Sha256 of everything in a request that its answer depends on, to the last bit.
+    """Return the SHA-256 of everything in a request that affects its counts.
 
-    Realisations are left out: the same shards are counted of more of them.
+    The number of realisations is excluded, since runs of different length share shards.
     """
     digest = hashlib.sha256(f"form {FORM}".encode())
     _feed(digest, request, leave=("realisations", "start", "tails"))
@@ -77,7 +65,7 @@ def _feed(digest: Any, value: Any, leave: tuple[str, ...] = ()) -> None:
     if is_dataclass(value) and not isinstance(value, type):
         digest.update(f"<{type(value).__name__}".encode())
         for each in fields(value):
-            if each.name not in (*leave, *_TOLD):
+            if each.name not in (*leave, *_DESCRIPTIVE):
                 digest.update(each.name.encode())
                 _feed(digest, getattr(value, each.name))
     elif isinstance(value, np.ndarray):
@@ -94,5 +82,5 @@ def _feed(digest: Any, value: Any, leave: tuple[str, ...] = ()) -> None:
     elif isinstance(value, float):
         digest.update(value.hex().encode())
     else:
-        # None, whole numbers, words.
+        # None, integers, text.
         digest.update(repr(value).encode())

@@ -1,1 +1,1 @@
-"""Raw spectra in bulk: the form of a store, writing, verifying and exporting it."""
+"""Stores of raw spectra: layout, writing, verification and export."""

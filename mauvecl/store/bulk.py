@@ -1,4 +1,4 @@
-"""Raw spectra in bulk: what is missing of a store is drawn and written; what is damaged is found and mended."""
+"""Raw spectra in bulk: writing, completing, verifying and repairing a store."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.whole import UNFINISHED, write_whole
 from mauvecl.host.quantities import count as whole
-from mauvecl.runs.durable import alone
-from mauvecl.runs.pool import Pool, together
+from mauvecl.runs.durable import locked
+from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.store.export import Selection, export
 from mauvecl.store.form import CRC_BYTES, Chunk, Store, StoredScene, crc, digest
 from mauvecl.study.study import Study
@@ -28,32 +28,32 @@ if TYPE_CHECKING:
 
 Progress = Callable[[int, int], None]
 
-#: Chunks drawn in one go, and threads that write while the next are drawn.
-TOGETHER, WRITERS = 4, 2
-#: `verify` names missing chunks one by one, so many at most: a study can ask for any number.
-MOST_MISSING = 100_000
+#: Chunks drawn at once, and threads that write them while the next are drawn.
+CHUNKS_AT_ONCE, WRITERS = 4, 2
+#: Largest number of missing chunks that `verify` lists, since a study can ask for any number.
+MAX_MISSING = 100_000
 
 
 @public
 def draw(
     study: Study, scene: StoredScene, engine: Engine | Pool, start: int, count: int, out: NDArray[Any] | None = None
 ) -> NDArray[Any]:
-    """Rows of one array, from the engine alone.
+    """Draw rows of an array without a store.
 
     Parameters
     ----------
     study : Study
-        Its seed, mode, recipe and processes.
+        Study that gives seed, mode, recipe and processes.
     scene : StoredScene
     engine : Engine or Pool
     start, count : int
-        Realisations start to start + count - 1.
+        Range of realisations, `start` to `start + count - 1`.
     out : ndarray, shape (count, *scene.row), optional
-        Where to write.
+        Array to fill.
 
     Returns
     -------
-    ndarray of uint16 or int32, shape (count, n_pixel), or (count, n_frame, n_pixel) where frames are kept apart
+    ndarray of uint16 or int32, shape (count, n_pixel), or (count, n_frame, n_pixel) if single frames are stored
         Raw DN.
     """
     start, count = whole("start", start), whole("count", count, low=1)
@@ -77,30 +77,30 @@ def realise(
     restart: bool = False,
     progress: Progress | None = None,
 ) -> Store:
-    """Draw a study's spectra into a store, or what is missing of it.
+    """Draw a study's spectra into a store, or complete a store.
 
     Parameters
     ----------
     study : Study
-        Its ``run.realisations`` are the rows of each array; its ``bulk`` says what is kept.
+        Its ``run.realisations`` is the number of rows of each array, and its ``bulk`` selects the stored data.
     path : str or Path
-        A new folder, or the store of the same study that was begun before.
+        A new folder, or an unfinished store of the same study.
     engine : Engine or Pool
     resume : bool
-        Whether a store that was begun before is continued, or refused.
+        Whether to complete an unfinished store; otherwise it raises InputError.
     restart : bool
-        Remove the store that is there, whatever its study.
+        Whether to remove an existing store first, whatever its study.
     progress : callable, optional
-        Called as ``progress(done, total)`` in spectra. It may raise to stop the work; what was written is kept.
+        Called as ``progress(done, total)`` in spectra. It may raise to stop the work, which keeps written chunks.
 
     Raises
     ------
     InputError
-        If the place holds something else or is being written by another process, or cannot be written.
+        If the folder contains other files, is being written by another process, or cannot be written.
     """
     store = Store(Path(path), study)
     store.make_folder()
-    with alone(store.path, "store"):
+    with locked(store.path, "store"):
         _complete(store, engine, resume, restart, progress)
     return store
 
@@ -115,19 +115,17 @@ def realise_file(
     restart: bool = False,
     progress: Progress | None = None,
 ) -> Store:
-    """As `realise`, into one FITS or HDF5 file; an unfinished store beside it is there until the file is.
+    """Draw a study's spectra into a FITS or HDF5 file; parameters as for `realise`.
 
-    Raises
-    ------
-    InputError
-        As `realise`; and if the file is there already and is not to be written anew.
+    A temporary store next to the file exists until the file is complete. Raises InputError if the file exists, unless
+    `restart` is true.
     """
     file = Path(file)
     if file.exists() and not restart:
         raise InputError(f"{str(file)!r} is there already, expected another place, or `restart=True` to write it anew")
     store = Store(unfinished(file), study)
     store.make_folder()
-    with alone(store.path, "store"):
+    with locked(store.path, "store"):
         _complete(store, engine, resume, restart, progress)
         export(Selection.of(store), file, replace=restart)
         store.clear()
@@ -136,12 +134,12 @@ def realise_file(
 
 
 def unfinished(file: Path) -> Path:
-    """The store beside a file that is not yet written."""
+    """Return the path of the temporary store of a file."""
     return file.with_name(f"{UNFINISHED}{file.name}.zarr")
 
 
 def _complete(store: Store, engine: Engine | Pool, resume: bool, restart: bool, progress: Progress | None) -> None:
-    """Draw what is missing of a store that this process holds."""
+    """Draw the missing chunks of a store that this process has locked."""
     if restart and any(store.path.iterdir()):
         Store.open(store.path).clear()
     begun = (store.path / "zarr.json").exists()
@@ -159,15 +157,12 @@ def _complete(store: Store, engine: Engine | Pool, resume: bool, restart: bool, 
 def forget(path: str | Path) -> None:
     """Remove a store.
 
-    Raises
-    ------
-    InputError
-        If something else is there, or another process is writing it: then nothing is removed.
+    Raises InputError, without removing anything, if the folder contains other files or another process is writing it.
     """
     path = Path(path)
     if path.exists():
         Store.open(path)
-        with alone(path, "store"):
+        with locked(path, "store"):
             Store.open(path).clear()
             path.rmdir()
 
@@ -191,14 +186,14 @@ def _fill(store: Store, todo: list[Chunk], engine: Engine | Pool, progress: Prog
     with ThreadPoolExecutor(WRITERS) as writers:
         try:
             for block, rows in _drawn(store.study, todo, engine):
-                # The block before has left its buffer when none of its chunks wait.
+                # The buffer of the previous block is free once all its chunks are written.
                 collect(0)
                 for chunk in block:
                     part = rows[chunk.start - block[0].start : chunk.stop - block[0].start]
                     waiting.append((chunk, writers.submit(store.place, chunk, part)))
             collect(0)
         except BaseException:
-            # What is being written is finished and listed; the rest is left for a resume.
+            # Chunks that are being written are completed and listed; the rest is left for a resume.
             for _, placed in waiting:
                 placed.cancel()
             writers.shutdown()
@@ -209,18 +204,18 @@ def _fill(store: Store, todo: list[Chunk], engine: Engine | Pool, progress: Prog
 
 
 def _drawn(study: Study, todo: Sequence[Chunk], engine: Engine | Pool) -> Iterator[tuple[list[Chunk], NDArray[Any]]]:
-    """Blocks of neighbouring chunks and their rows, in order."""
+    """Yield blocks of neighbouring chunks and their rows, in order."""
     if isinstance(engine, Pool) and engine.workers.count > 1:
-        # Chunk by chunk: as much as travels well.
+        # A single chunk per request limits the size of transfers.
         def rows_of(block: list[Chunk]) -> NDArray[Any]:
             return draw(study, block[0].scene, engine, block[0].start, block[0].stop - block[0].start)
 
         blocks = list(_blocks(todo, 1))
-        yield from zip(blocks, together(engine, rows_of, blocks), strict=True)
+        yield from zip(blocks, map_in_order(engine, rows_of, blocks), strict=True)
         return
-    # Two buffers in turn: one is drawn into while the other is written, so that memory stays flat.
+    # Two alternating buffers, one being drawn while the other is written, keep the memory constant.
     buffers: list[NDArray[Any]] = [np.empty(0)] * 2
-    for number, block in enumerate(_blocks(todo, TOGETHER)):
+    for number, block in enumerate(_blocks(todo, CHUNKS_AT_ONCE)):
         scene, count = block[0].scene, block[-1].stop - block[0].start
         there = buffers[number % 2]
         if there.shape[1:] != scene.row or there.dtype != scene.dtype or len(there) < count:
@@ -228,11 +223,11 @@ def _drawn(study: Study, todo: Sequence[Chunk], engine: Engine | Pool) -> Iterat
         yield block, draw(study, scene, engine, block[0].start, count, there[:count])
 
 
-def _blocks(chunks: Sequence[Chunk], most: int) -> Iterator[list[Chunk]]:
-    """Neighbouring chunks of one scene, several at a time."""
+def _blocks(chunks: Sequence[Chunk], max_chunks: int) -> Iterator[list[Chunk]]:
+    """Yield blocks of at most `max_chunks` neighbouring chunks of one scene."""
     block: list[Chunk] = []
     for chunk in chunks:
-        if block and (len(block) == most or chunk.scene is not block[0].scene or chunk.start != block[-1].stop):
+        if block and (len(block) == max_chunks or chunk.scene is not block[0].scene or chunk.start != block[-1].stop):
             yield block
             block = []
         block.append(chunk)
@@ -242,16 +237,18 @@ def _blocks(chunks: Sequence[Chunk], most: int) -> Iterator[list[Chunk]]:
 
 @dataclass(frozen=True)
 class Fault:
-    """One file of a store that is not as it should be.
+    """A faulty file of a store.
 
     Attributes
     ----------
     key : str
-        Its place in the store.
+        Path in the store.
     state : str
-        ``missing``; ``damaged``: its CRC or its text fails; ``foreign``: whole, but not what was written; ``unlisted``:
-        whole, but not in the list of digests; ``differs``: not what the engine draws; or ``not of this store``.
+        ``missing``; ``damaged``: wrong CRC or unreadable text; ``foreign``: intact, but not what was written;
+        ``unlisted``: intact, but not in the list of digests; ``differs``: not what the engine draws; or ``not of this
+        store``.
     mended : bool
+        Whether the file was repaired.
     """
 
     key: str
@@ -260,7 +257,7 @@ class Fault:
 
 
 def state(store: Store, chunk: Chunk) -> str:
-    """``good``, or what a chunk's bytes show to be wrong; see `Fault`."""
+    """Return ``good``, or the fault of a chunk's file; see `Fault`."""
     try:
         data = (store.path / chunk.key).read_bytes()
     except FileNotFoundError:
@@ -283,47 +280,48 @@ def verify(
     rows: tuple[int, int] | None = None,
     progress: Progress | None = None,
 ) -> list[Fault]:
-    """Look at every file of a store; draw again what is wrong, or everything.
+    """Check every file of a store, and optionally repair it.
 
     Parameters
     ----------
     path : str or Path
     engine : Engine or Pool, optional
-        Needed to repair or redraw.
+        Required to repair or redraw.
     repair : bool
-        Write what is wrong anew.
+        Whether to write faulty files again.
     redraw : bool
-        Compare every spectrum with what the engine draws, not only with its digest.
+        Whether to compare every spectrum with what the engine draws, not only with its digest.
     rows : (int, int), optional
-        Look only at chunks with realisations of this half-open range.
+        Half-open range of realisations to which the check of chunks is restricted.
     progress : callable, optional
         Called as ``progress(done, total)`` in chunks.
 
     Returns
     -------
     list of Fault
-        Empty where everything is as it was written.
+        Empty for an intact store.
 
     Raises
     ------
     InputError
-        If the folder is no store, is being written, or cannot be written to repair it; if its study contradicts
-        another copy of it, or does not draw what was written; or if more than `MOST_MISSING` chunks are missing.
+        If the folder is no store, is being written, or cannot be written for a repair; if copies of its study
+        contradict each other, or the study does not draw what was written; or if more than `MAX_MISSING` chunks are
+        missing.
     """
     if engine is None and (repair or redraw):
         raise InputError("no engine is given, expected one to repair or redraw")
     Store.open(path)
-    with alone(Path(path), "store"):
+    with locked(Path(path), "store"):
         store = Store.open(path)
         first, last = rows or (0, store.rows)
         if not 0 <= first < last <= store.rows:
             raise InputError(f"rows {first}:{last}, expected a range within 0:{store.rows}")
         files = list(store.files())
         total, there = store.count(first, last), sum(store.owns(key) for key, _ in files)
-        if total - there > MOST_MISSING:
+        if total - there > MAX_MISSING:
             raise InputError(
                 f"store {str(store.path)!r} holds {there} chunks where its study asks for {total}, expected at most "
-                f"{MOST_MISSING} missing: choose `rows`, or `mauvecl realise --resume` draws them"
+                f"{MAX_MISSING} missing: choose `rows`, or `mauvecl realise --resume` draws them"
             )
         faults = list(_faults_of_description(store, repair))
         for number, chunk in enumerate(store.chunks(first, last)):
@@ -363,7 +361,7 @@ def _fault(store: Store, chunk: Chunk, engine: Engine | Pool | None, repair: boo
 
 
 def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
-    """Groups, arrays' descriptions and calibration, beside what the study makes them."""
+    """Compare groups, descriptions of arrays and calibration with those of the study."""
     for name, content in sorted(store.description().items()):
         there = store.path / name
         try:
@@ -384,23 +382,18 @@ def _faults_of_description(store: Store, repair: bool) -> Iterator[Fault]:
 
 @public
 def read(path: str | Path, scene: str = "star-1/quiescent") -> Any:
-    """The spectra of one array, read from the disk when looked at.
+    """Open an array of spectra, which is read from disk on access.
 
     Parameters
     ----------
     path : str or Path
     scene : str
-        Such as ``"star-1/flare-2"``.
+        Path of the array, such as ``"star-1/flare-2"``.
 
     Returns
     -------
     xarray.DataArray, dimensions (realisation, pixel) or (realisation, frame, pixel)
-        Raw DN, with the wavelengths, nm, as a coordinate. NumPy's array is its ``.values``, also of a slice.
-
-    Raises
-    ------
-    InputError
-        If the folder is no store, or holds no such array.
+        Raw DN, with the wavelengths, nm, as a coordinate. ``.values`` is a NumPy array, also of a slice.
     """
     import xarray
 

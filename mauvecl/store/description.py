@@ -1,4 +1,4 @@
-"""What a store of raw spectra says of itself: groups, arrays, calibration, and the study that made it."""
+"""Description of a store of raw spectra: groups, arrays, calibration and study."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mauvecl.study.labels import told as messages_of
 if TYPE_CHECKING:
     from mauvecl.store.form import Store
 
-#: Per pixel and frame, kept with each star, with their units.
+#: Units of the calibration per pixel and frame, which each star's group contains.
 CALIBRATION = {
     "wavelength_nm": "nm",
     "bias_dn": "DN",
@@ -35,13 +35,13 @@ NOMINAL = "the throughput is nominal, not a flight calibration"
 
 
 def describe(store: Store, folder: Path) -> None:
-    """Everything of a store but its spectra: groups, arrays' descriptions, calibration."""
+    """Write groups, descriptions of arrays and calibration of a store to a folder."""
     import zarr
     from zarr.codecs import Crc32cCodec
 
     study = store.study.toml()
     with warnings.catch_warnings():
-        # A folder that holds nothing yet.
+        # Zarr warns of an empty folder.
         warnings.simplefilter("ignore", zarr.errors.ZarrUserWarning)
         root = zarr.open_group(folder, mode="w", zarr_format=3)
         run: dict[str, Any] = signed(study) | {"seed": store.study.run.seed, "realisations": store.rows}
@@ -88,12 +88,12 @@ def _values(group: Any, name: str, values: NDArray[Any], unit: str, dimensions: 
 
 
 def signed(study: str) -> dict[str, str]:
-    """A study's text with its digest, as a store keeps it in several places."""
+    """Return a study's text and its digest, of which a store has several copies."""
     return {"study": study, "study_sha256": hashlib.sha256(study.encode()).hexdigest()}
 
 
 def study_in(place: Path) -> str | None:
-    """The study's text in a description, where it has its digest."""
+    """Return the study's text in a description if its digest is correct, else None."""
     try:
         kept = json.loads(read_bytes(place, "description"))["attributes"]
         text = kept["study"]

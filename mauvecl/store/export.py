@@ -1,4 +1,4 @@
-"""Smaller sets of raw spectra as one FITS or HDF5 file."""
+"""Export of raw spectra to a FITS or HDF5 file."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 
     from mauvecl.study.study import Study
 
-#: Bytes of spectra in one file, at most; more belongs into the store.
-LARGEST = 4 * 2**30
-#: What an export may be, by its ending.
+#: Largest size of the spectra in a file, bytes; larger sets belong in a store.
+MAX_BYTES = 4 * 2**30
+#: Accepted endings of file names.
 ENDINGS = (".fits", ".h5", ".hdf5")
 
 
@@ -42,20 +42,20 @@ class Selection:
 
     @classmethod
     def of(cls, store: Store, scenes: Sequence[str] | None = None, rows: tuple[int, int] | None = None) -> Selection:
-        """All of a store unless told otherwise.
+        """Select arrays and rows of a store; the default is everything.
 
         Parameters
         ----------
         store : Store
         scenes : sequence of str, optional
-            Such as ``"star-1/flare-2"``.
+            Paths such as ``"star-1/flare-2"``.
         rows : (int, int), optional
-            A half-open range of realisations.
+            Half-open range of realisations.
 
         Raises
         ------
         InputError
-            For an unknown array, an impossible range, more than `LARGEST`, or rows that are not there.
+            For an unknown array, an invalid range, a size above `MAX_BYTES`, or missing chunks.
         """
         first, stop = rows or (0, store.rows)
         if not 0 <= first < stop <= store.rows:
@@ -63,9 +63,9 @@ class Selection:
         chosen = [store.scene(name) for name in scenes] if scenes else store.scenes
         selection = cls(store, chosen, first, stop)
         size = sum((stop - first) * scene.row_bytes for scene in chosen)
-        if size > LARGEST:
+        if size > MAX_BYTES:
             raise InputError(
-                f"{size / 2**30:.1f} GiB of spectra, expected at most {LARGEST // 2**30} GiB in one file: choose rows"
+                f"{size / 2**30:.1f} GiB of spectra, expected at most {MAX_BYTES // 2**30} GiB in one file: choose rows"
             )
         for chunk in store.chunks(first, stop):
             if any(chunk.scene is s for s in chosen) and not store.has(chunk):
@@ -73,7 +73,7 @@ class Selection:
         return selection
 
     def rows(self, scene: StoredScene) -> NDArray[Any]:
-        """The spectra of one array."""
+        """Read the spectra of an array."""
         import zarr
 
         array = zarr.open_array(self.store.path / scene.path, mode="r")
@@ -81,21 +81,21 @@ class Selection:
 
 
 def export(selection: Selection, path: str | Path, *, replace: bool = False) -> Path:
-    """Write spectra, calibration and origin into one file, whole or not at all.
+    """Write spectra, calibration and origin to a file, atomically.
 
     Parameters
     ----------
     selection : Selection
     path : str or Path
-        Ending in .fits, .h5 or .hdf5. In FITS an image per array, its wavelengths as a spectral axis looked up in a
-        table (the -TAB form of the FITS standard, section 8.3), and a table of the calibration per star.
+        File name ending in .fits, .h5 or .hdf5. A FITS file has an image per array, whose spectral axis refers to a
+        table of wavelengths (-TAB, FITS standard, section 8.3), and a table of the calibration per star.
     replace : bool
-        Take the place of a file that is there.
+        Whether to replace an existing file.
 
     Raises
     ------
     InputError
-        For another ending, if there is such a file already, or if the file cannot be written.
+        For another ending, or if the file exists or cannot be written.
     """
     path = Path(path)
     if path.suffix not in ENDINGS:
@@ -104,7 +104,7 @@ def export(selection: Selection, path: str | Path, *, replace: bool = False) -> 
         expected = "another name, or `replace=True`" if path.is_file() else "a file's name"
         raise InputError(f"export {str(path)!r} exists already, expected {expected}")
     if path.suffix != ".fits":
-        # In memory first: on a full disk the HDF5 library ends the whole process.
+        # Written to memory first, because the HDF5 library aborts the process on a full disk.
         packed = io.BytesIO()
         _hdf5(selection, packed)
         write_whole(path, packed.getbuffer(), shared=True)
@@ -144,16 +144,16 @@ def _fits(selection: Selection) -> HDUList:
 
 
 def _study(study: Study) -> BinTableHDU:
-    """A study's lines as a table: a card holds 72 letters of a line, and a file's name may be longer."""
+    """Make a table of a study's lines, which may exceed the 72 characters of a FITS card."""
     from astropy.io import fits
 
-    # FITS has ASCII alone; TOML spells other letters so within its strings.
-    lines = [re.sub(r"[^\x00-\x7f]", _spelt, line) for line in study.toml().splitlines()]
+    # FITS is restricted to ASCII; TOML strings accept escapes of other characters.
+    lines = [re.sub(r"[^\x00-\x7f]", _escaped, line) for line in study.toml().splitlines()]
     column = fits.Column("LINE", f"{max(map(len, lines))}A", array=lines)
     return fits.BinTableHDU.from_columns([column], name="STUDY")
 
 
-def _spelt(letter: re.Match[str]) -> str:
+def _escaped(letter: re.Match[str]) -> str:
     return f"\\U{ord(letter[0]):08X}"
 
 
@@ -168,7 +168,7 @@ def _image(selection: Selection, scene: StoredScene, table: str) -> ImageHDU:
     header["AMPLITUD"] = (scene.amplitude, "flare amplitude, 0 without a flare")
     header["EXPTIME"] = (x.frame_s if scene.frames is not None else x.exposure_s, "[s] of one row")
     header["NFRAMES"] = (1 if scene.frames is not None else x.n_frames, "frames summed in one row")
-    # Axis 1: vacuum wavelength, looked up by pixel in the calibration's table.
+    # Axis 1 is the vacuum wavelength, by pixel from the calibration table.
     header["CTYPE1"], header["CUNIT1"] = "WAVE-TAB", "nm"
     header["CRPIX1"], header["CRVAL1"], header["CDELT1"] = 1.0, 1.0, 1.0
     header["PS1_0"] = (table, "extension of the coordinates")
@@ -185,12 +185,12 @@ def _image(selection: Selection, scene: StoredScene, table: str) -> ImageHDU:
 
 
 def _calibration(scene: StoredScene) -> BinTableHDU:
-    """Calibration of the pixels, a row each, and all wavelengths in one cell, as the -TAB axis wants them."""
+    """Make the calibration table, with all wavelengths in one cell as the -TAB axis requires."""
     from astropy.io import fits
 
     x = scene.expectation
     name = f"{scene.group}-calibration".upper().replace("-", "_")
-    # A cell of (1, n_pixel) coordinates: one row, so that the pixels' own columns are vectors too.
+    # The coordinates are a cell of shape (1, n_pixel), so the table has one row and all columns are vectors.
     n = x.wavelength_nm.size
     columns = [fits.Column("COORDS", f"{n}D", unit="nm", dim=f"(1,{n})", array=x.wavelength_nm.reshape(1, n, 1))]
     units = {"nm": "nm", "DN": "adu", "DN / electron": "adu/electron"}

@@ -1,8 +1,8 @@
-"""The form of a store of raw spectra: a Zarr v3 hierarchy, its chunks and their digests.
+"""Layout of a store of raw spectra: a Zarr v3 hierarchy, its chunks and their digests.
 
-A group per star holds an array per scene (``quiescent``, ``flare-1``, ...), one row per realisation, and its pixels'
-calibration. Each chunk ends in its own CRC, which any Zarr reader checks; beside each array a list of its chunks'
-digests tells a foreign chunk from ours. Chunks are written whole or not at all.
+A group per star holds an array per scene (``quiescent``, ``flare-1``, ...) with one row per realisation, and the
+calibration of its pixels. Each chunk ends with a CRC, which every Zarr reader checks. A list of digests next to each
+array distinguishes its chunks from foreign ones. Chunks are written atomically.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from mauvecl.study.study import Study
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
 
-#: Bytes of one chunk, about.
+#: Approximate size of a chunk, bytes.
 CHUNK_BYTES = 16 * 2**20
 DIGESTS = "digests.txt"
 CRC_BYTES = 4
@@ -40,7 +40,7 @@ CRC_BYTES = 4
 
 @dataclass(frozen=True, eq=False)
 class StoredScene:
-    """One array of a store: a star without a flare, or with one."""
+    """An array of a store: a star with or without a flare."""
 
     group: str
     name: str
@@ -52,7 +52,7 @@ class StoredScene:
 
     @property
     def path(self) -> str:
-        """Its place in the store."""
+        """Path in the store."""
         return f"{self.group}/{self.name}"
 
     @property
@@ -63,23 +63,23 @@ class StoredScene:
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """16 bits for single frames of a 16-bit ADC, 32 for sums of several."""
+        """Type of a value: 16 bits for single frames of a 16-bit ADC, 32 bits for sums."""
         x = self.expectation
         single = self.frames is not None or x.n_frames == 1
         return np.dtype("<u2" if single and x.adc_max_dn < 2**16 else "<i4")
 
     @property
     def row_bytes(self) -> int:
-        """Bytes of one realisation."""
+        """Size of a realisation, bytes."""
         return int(np.prod(self.row)) * self.dtype.itemsize
 
     def chunk_rows(self, realisations: int) -> int:
-        """Realisations in one chunk."""
+        """Return the number of realisations per chunk."""
         return max(min(CHUNK_BYTES // self.row_bytes, realisations), 1)
 
 
 def scenes(study: Study) -> list[StoredScene]:
-    """What a study's store holds: every star in every cell of the sweep, without and with each of its flares."""
+    """Return the arrays of a study's store: every star and sweep value, without and with each flare."""
     stored = []
     number = 0
     for at, cell in study.cells():
@@ -87,7 +87,7 @@ def scenes(study: Study) -> list[StoredScene]:
             number += 1
             quiet, *flares = cell.expectations(star)
             chosen = cell.bulk.chosen(quiet.n_frames)
-            # A flare's amplitude stands with its own array.
+            # The amplitude is an attribute of the flare's array.
             swept = {name: value for name, value in at.items() if name != "amplitude"}
             name = titled(label(star, quiet), swept)
             stored.append(StoredScene(f"star-{number}", "quiescent", name, 0.0, quiet, chosen, swept))
@@ -98,7 +98,7 @@ def scenes(study: Study) -> list[StoredScene]:
 
 @dataclass(frozen=True, eq=False)
 class Chunk:
-    """One chunk of one scene: rows `start` to `stop` - 1 of its array."""
+    """A chunk of a scene: rows `start` to `stop - 1` of its array."""
 
     scene: StoredScene
     number: int
@@ -107,30 +107,22 @@ class Chunk:
 
     @property
     def name(self) -> str:
-        """Its file under the array's folder."""
+        """Path of the file in the array's folder."""
         return "/".join(["c", str(self.number), *["0"] * len(self.scene.row)])
 
     @property
     def key(self) -> str:
-        """Its file in the store."""
+        """Path of the file in the store."""
         return f"{self.scene.path}/{self.name}"
 
 
 @dataclass(eq=False)
 class Store:
-    """A store and the study that made it, whose ``run.realisations`` are the rows of each array.
-
-    Attributes
-    ----------
-    path : Path
-    study : Study
-    digests : dict of str
-        By chunk, of what was written.
-    """
+    """A store and its study, whose ``run.realisations`` is the number of rows of each array."""
 
     path: Path
     study: Study
-    digests: dict[str, str] = field(default_factory=dict)
+    digests: dict[str, str] = field(default_factory=dict)  # of written chunks, by path
 
     def __post_init__(self) -> None:
         missing = [name for name in ("zarr", "xxhash", "google_crc32c") if find_spec(name) is None]
@@ -139,12 +131,12 @@ class Store:
 
     @classmethod
     def open(cls, path: str | Path) -> Store:
-        """One that was written before, from the copies of its study that have their digest: they must agree.
+        """Open an existing store.
 
         Raises
         ------
         InputError
-            If it is none of mauvecl's, no copy of its study is intact, or intact copies contradict each other.
+            If the folder is no store, no copy of its study is intact, or intact copies contradict each other.
         """
         path = Path(path)
         copies: dict[str, Path] = {}
@@ -171,17 +163,11 @@ class Store:
 
     @cached_property
     def scenes(self) -> list[StoredScene]:
-        """Its arrays of spectra."""
+        """Arrays of spectra."""
         return scenes(self.study)
 
     def scene(self, path: str) -> StoredScene:
-        """One of them, such as ``star-1/flare-2``.
-
-        Raises
-        ------
-        InputError
-            If there is none.
-        """
+        """Return an array by path, such as ``star-1/flare-2``."""
         known = next((scene for scene in self.scenes if scene.path == path), None)
         if known is None:
             raise InputError(
@@ -191,23 +177,23 @@ class Store:
 
     @property
     def rows(self) -> int:
-        """Realisations of each array."""
+        """Number of realisations of each array."""
         return self.study.run.realisations
 
     @property
     def n_bytes(self) -> int:
-        """Bytes of all spectra."""
+        """Size of all spectra, bytes."""
         return sum(self.rows * scene.row_bytes for scene in self.scenes)
 
     def chunks(self, first: int = 0, stop: int | None = None) -> Iterator[Chunk]:
-        """All chunks, scene by scene, or those with rows `first` to `stop` - 1."""
+        """Yield the chunks of all scenes that contain rows `first` to `stop - 1`; all chunks by default."""
         for scene in self.scenes:
             rows = scene.chunk_rows(self.rows)
             for number in self._numbers(scene, first, stop):
                 yield Chunk(scene, number, number * rows, min((number + 1) * rows, self.rows))
 
     def count(self, first: int = 0, stop: int | None = None) -> int:
-        """How many chunks `chunks` goes through; known without going through them."""
+        """Return the number of chunks that `chunks` yields, without iterating."""
         return sum(len(self._numbers(scene, first, stop)) for scene in self.scenes)
 
     def _numbers(self, scene: StoredScene, first: int = 0, stop: int | None = None) -> range:
@@ -215,12 +201,12 @@ class Store:
         return range(first // rows, -(-(self.rows if stop is None else stop) // rows))
 
     def make(self) -> None:
-        """Write what describes the arrays, nothing of them yet; or see that it is there already.
+        """Write the description of the arrays, or check that an existing one is the same.
 
         Raises
         ------
         InputError
-            If another study's store is there, with the keys that differ; or the folder cannot be written.
+            If the store exists and is another study's (the message lists keys that differ), or cannot be written.
         """
         root = self.path / "zarr.json"
         if root.exists():
@@ -232,19 +218,13 @@ class Store:
         other = [p.name for p in self.path.iterdir() if p.name not in ours and not p.name.startswith(UNFINISHED)]
         if other:
             raise InputError(f"{str(self.path)!r} holds {min(other)!r} and no store, expected an empty or a new folder")
-        # The root comes last: where it is, everything else is.
+        # The root comes last, so that its presence means that the description is complete.
         made = self.description()
         for name in sorted(made, key=lambda name: name == root.name):
             write_whole(self.path / name, made[name])
 
     def make_folder(self) -> None:
-        """Its folder, which may be there.
-
-        Raises
-        ------
-        InputError
-            If it cannot be made, or its file system is smaller than the spectra.
-        """
+        """Make the folder if needed; raises InputError if its file system is smaller than the spectra."""
         try:
             self.path.mkdir(parents=True, exist_ok=True)
             room = shutil.disk_usage(self.path).total
@@ -259,7 +239,7 @@ class Store:
             )
 
     def description(self) -> dict[str, bytes]:
-        """Every file of the store but its spectra, by its place."""
+        """Return the content of every file except spectra, by path."""
         with tempfile.TemporaryDirectory() as folder:
             describe(self, Path(folder))
             files = [p for p in Path(folder).rglob("*") if p.is_file()]
@@ -275,7 +255,7 @@ class Store:
             )
 
     def read_digests(self) -> None:
-        """Look up what was written; lines that are not whole say nothing."""
+        """Read the digests of written chunks; incomplete lines are ignored."""
         self.digests = {}
         for scene in self.scenes:
             try:
@@ -293,7 +273,7 @@ class Store:
         self.digests[chunk.key] = digest_text
         line = f"{chunk.name} {digest_text} {_check(chunk.name, digest_text)}\n"
         try:
-            # One short write at the end of the file; a line cut short by a full disk is closed by the next.
+            # A single short write at the end. A line that a full disk cut short is terminated first.
             with (self.path / chunk.scene.path / DIGESTS).open("a+b", buffering=0) as file:
                 file.seek(0, 2)
                 if file.tell():
@@ -307,7 +287,7 @@ class Store:
             ) from error
 
     def encode(self, chunk: Chunk, rows: NDArray[Any]) -> tuple[memoryview, bytes]:
-        """A chunk as Zarr's codecs `bytes` and `crc32c` have it: whole, the last one filled with zeros."""
+        """Encode a chunk by Zarr's codecs `bytes` and `crc32c`, padding the last chunk with zeros."""
         full = chunk.scene.chunk_rows(self.rows)
         if len(rows) < full:
             rows = np.concatenate([rows, np.zeros((full - len(rows), *chunk.scene.row), rows.dtype)])
@@ -315,13 +295,13 @@ class Store:
         return memoryview(whole.data).cast("B"), crc(whole)
 
     def place(self, chunk: Chunk, rows: NDArray[Any]) -> str:
-        """Write a chunk, whole or not at all; returns its digest."""
+        """Write a chunk atomically and return its digest."""
         data, check = self.encode(chunk, rows)
         write_whole(self.path / chunk.key, data, check)
         return digest(data, check)
 
     def has(self, chunk: Chunk) -> bool:
-        """Whether a chunk was written, by the list of digests and its size; `verify.state` looks into it."""
+        """Return whether a chunk was written, by digest list and file size; `bulk.state` checks its content."""
         try:
             size = (self.path / chunk.key).stat().st_size
         except OSError:
@@ -329,16 +309,16 @@ class Store:
         return chunk.key in self.digests and size == self.chunk_bytes(chunk)
 
     def owns(self, key: str) -> bool:
-        """Whether a file at this place of the store would be a chunk's."""
+        """Return whether a path in the store is that of a chunk."""
         scene = next((scene for scene in self.scenes if key.startswith(f"{scene.path}/c/")), None)
         number = key.removeprefix(f"{scene.path}/c/").partition("/")[0] if scene else ""
-        # Twenty digits hold any number of a chunk; int() of a name without end would take its time.
+        # Twenty digits suffice for any chunk; int() of a very long name would be slow.
         if scene is None or not (number.isascii() and number.isdigit() and len(number) <= 20):
             return False
         return int(number) in self._numbers(scene) and key == Chunk(scene, int(number), 0, 0).key
 
     def files(self) -> Iterator[tuple[str, bool]]:
-        """Every file and link in its folder, and whether it is of this store."""
+        """Yield every file and link in the folder, and whether it belongs to this store."""
         described = self.description()
         lists = {f"{scene.path}/{DIGESTS}" for scene in self.scenes}
         for folder, folders, names in os.walk(self.path):
@@ -349,12 +329,9 @@ class Store:
                 yield str(here / name), whole in described or whole in lists or self.owns(whole)
 
     def clear(self) -> None:
-        """Remove every file of it, its study last, so that it is a store to the end; its folder stays.
+        """Remove all files but not the folder; the study is last, so that an interrupted removal leaves a store.
 
-        Raises
-        ------
-        InputError
-            If something else is in the folder: then nothing is removed.
+        Raises InputError, without removing anything, if the folder contains other files.
         """
         files = list(self.files())
         other = [key for key, own in files if not own]
@@ -371,19 +348,19 @@ class Store:
         self.digests = {}
 
     def chunk_bytes(self, chunk: Chunk) -> int:
-        """Bytes of a chunk's file: whole rows, and their CRC."""
+        """Return the size of a chunk's file, bytes: rows and CRC."""
         return chunk.scene.chunk_rows(self.rows) * chunk.scene.row_bytes + CRC_BYTES
 
 
 def crc(data: bytes | NDArray[Any]) -> bytes:
-    """CRC-32C as Zarr's codec of that name writes it."""
+    """Return the CRC-32C in the format of Zarr's codec."""
     import google_crc32c
 
     return int(google_crc32c.value(data)).to_bytes(CRC_BYTES, "little")
 
 
 def digest(*parts: bytes | memoryview) -> str:
-    """XXH3, 128 bits, of some parts together."""
+    """Return the 128-bit XXH3 hash of concatenated parts."""
     import xxhash
 
     hashed = xxhash.xxh3_128()

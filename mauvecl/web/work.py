@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from mauvecl.device.engine import Engine
-from mauvecl.runs.pool import LocalWorkers, Pool, Standing
+from mauvecl.runs.pool import LocalWorkers, Pool, PoolProgress
 
 #: Simulations that a server computes at the same time; others wait.
 TOGETHER = 2
@@ -103,7 +103,7 @@ class Job:
         self.future.cancel()
 
     @property
-    def standing(self) -> Standing | None:
+    def standing(self) -> PoolProgress | None:
         """How far it is, or None while it waits for its turn."""
         return None if self._pool is None else self._pool.standing
 

@@ -444,7 +444,7 @@ def test_bad_studies_are_a_sentence(text: str, sentence: str, tmp_path: Path) ->
 SMALL_SHARDS = [
     sys.executable,
     "-c",
-    "import mauvecl.runs.shards as s; s.SHARD = 2**27; from mauvecl.cli.app import main; main()",
+    "import mauvecl.runs.shards as s; s.SHARD_WORK = 2**27; from mauvecl.cli.app import main; main()",
 ]
 LONG = (
     "detect",

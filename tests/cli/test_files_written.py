@@ -15,7 +15,7 @@ from mauvecl.cli.app import app
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.whole import write_whole
 from mauvecl.runs.checkpoint import Checkpoint
-from mauvecl.runs.durable import alone
+from mauvecl.runs.durable import locked
 from mauvecl.store.export import Selection, export
 
 FEW = ("--star", "G2V", "-m", "7.4", "--exposure", "5", "--seed", "1")
@@ -119,14 +119,14 @@ def test_one_process_writes_a_folder_from_beginning_to_end(tmp_path: Path, monke
     """Tables too, and of verbs that draw nothing."""
     out = tmp_path / "out"
     out.mkdir()
-    with alone(out, "output folder"), pytest.raises(InputError, match="is being written by another process"):
+    with locked(out, "output folder"), pytest.raises(InputError, match="is being written by another process"):
         app([*VERBS["exposure"], "--output", str(out)], standalone_mode=False)
     assert list(out.iterdir()) == []
     held: list[bool] = []
 
     def noted(path: Path, *parts: Any) -> None:
         try:
-            with alone(out, "output folder"):
+            with locked(out, "output folder"):
                 held.append(False)
         except InputError:
             held.append(True)
@@ -135,7 +135,7 @@ def test_one_process_writes_a_folder_from_beginning_to_end(tmp_path: Path, monke
     monkeypatch.setattr("mauvecl.answers.report.write_whole", noted)
     app([*VERBS["detect"], "--no-pictures", "--output", str(out)], standalone_mode=False)
     assert held == [True] * 6
-    with alone(out, "output folder"):
+    with locked(out, "output folder"):
         pass
 
 

@@ -32,7 +32,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.results.requests.requests import RealiseRequest, Shard
 from mauvecl.runs.cluster import DaskWorkers
-from mauvecl.runs.pool import Pool, Stopped, together
+from mauvecl.runs.pool import Pool, Stopped, map_in_order
 from mauvecl.runs.shards import Task
 from mauvecl.store import bulk
 
@@ -173,7 +173,7 @@ def test_whoever_waits_is_woken_at_the_end(scene: list[Expectation], monkeypatch
     works = [
         detect,
         lambda: pool.realise(scene[0], start=0, count=3, seed=1),
-        lambda: list(together(pool, lambda work: work(), [detect, detect, detect])),
+        lambda: list(map_in_order(pool, lambda work: work(), [detect, detect, detect])),
     ]
     threads = [threading.Thread(target=ask, args=(work,), daemon=True) for work in works]
     for thread in threads:
@@ -192,7 +192,7 @@ def test_an_interrupted_cluster_ends_in_order(stop: signal.Signals, tmp_path: Pa
 
     Ctrl-C in a terminal reaches the whole process group: workers are not of it, or what they build is cut off aloud.
     """
-    script = "import mauvecl.runs.shards as s; s.SHARD = 2**27; from mauvecl.cli.app import main; main()"
+    script = "import mauvecl.runs.shards as s; s.SHARD_WORK = 2**27; from mauvecl.cli.app import main; main()"
     words = [
         "detect",
         "--star",

@@ -33,7 +33,7 @@ from mauvecl.results.requests.requests import DetectRequest, Shard, SnrRequest
 from mauvecl.results.sums import Arrays
 from mauvecl.runs import shards
 from mauvecl.runs.checkpoint import Checkpoint, _digest_of
-from mauvecl.runs.pool import LocalWorkers, Pool, Stopped, together
+from mauvecl.runs.pool import LocalWorkers, Pool, Stopped, map_in_order
 from mauvecl.runs.shards import fingerprint
 from mauvecl.statistics.linear import Linear
 from mauvecl.study.study import Study
@@ -221,10 +221,10 @@ def test_shards_do_not_depend_on_the_number_of_realisations(scene: list[Expectat
 
 def test_large_requests_have_larger_shards(scene: list[Expectation], monkeypatch: pytest.MonkeyPatch) -> None:
     """So that there are never more than one process can add up."""
-    monkeypatch.setattr(shards, "SHARD", 2**34)
+    monkeypatch.setattr(shards, "SHARD_WORK", 2**34)
     for n in (10**6, 10**9, 10**12, 10**15):
         found = shards.shards(DetectRequest(scene[0], tuple(scene[1:]), n, 5, ("chi2",)))
-        assert len(found) <= 2 * shards.MOST + 1
+        assert len(found) <= 2 * shards.MAX_SHARDS + 1
         assert sum(shard.count for shard in found) == n
         assert all(shard.count & (shard.count - 1) == 0 for shard in found[:-1])
 
@@ -412,7 +412,7 @@ def test_answers_keep_their_order_and_errors_end_the_rest(engine: Engine) -> Non
         time.sleep(pauses[number])
         return number
 
-    assert list(together(pool, slow, range(6))) == list(range(6))
+    assert list(map_in_order(pool, slow, range(6))) == list(range(6))
 
     def bad(number: int) -> int:
         if number == 2:
@@ -420,7 +420,7 @@ def test_answers_keep_their_order_and_errors_end_the_rest(engine: Engine) -> Non
         return number
 
     with pytest.raises(InputError, match="number = 2"):
-        list(together(pool, bad, range(6)))
+        list(map_in_order(pool, bad, range(6)))
     quiet, *flares = small().expectations(small().star[0])
     with pytest.raises(Stopped):
         pool.detect(quiet, flares, realisations=N, seed=5)

@@ -24,7 +24,7 @@ from mauvecl.cli.app import app
 from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError
 from mauvecl.host.files import whole
-from mauvecl.runs.durable import alone
+from mauvecl.runs.durable import locked
 from mauvecl.store import bulk
 from mauvecl.store import form as store
 from mauvecl.store.export import Selection, _study, export
@@ -199,7 +199,7 @@ def test_places_that_cannot_be(tmp_path: Path, engine: Engine) -> None:
 def test_two_writers_on_one_store(tmp_path: Path, engine: Engine) -> None:
     path = tmp_path / "frames.zarr"
     bulk.realise(study(), path, engine)
-    with alone(path, "store"):
+    with locked(path, "store"):
         with pytest.raises(InputError, match="being written by another process"):
             bulk.realise(study(), path, engine)
         with pytest.raises(InputError, match="being written by another process"):
@@ -375,7 +375,7 @@ def test_exports_that_cannot_be(tmp_path: Path, engine: Engine, monkeypatch: pyt
     (tmp_path / "s.zarr" / "star-1/quiescent/c/0/0").unlink()
     with pytest.raises(InputError, match=r"star-1/quiescent/c/0/0 is missing"):
         Selection.of(made)
-    monkeypatch.setattr("mauvecl.store.export.LARGEST", 1000)
+    monkeypatch.setattr("mauvecl.store.export.MAX_BYTES", 1000)
     with pytest.raises(InputError, match="GiB in one file: choose rows"):
         Selection.of(made)
 

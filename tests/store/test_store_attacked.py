@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 
 from mauvecl.cli.app import app
 from mauvecl.host.errors import InputError
-from mauvecl.runs.durable import alone
+from mauvecl.runs.durable import locked
 from mauvecl.store import bulk
 from mauvecl.store.description import signed
 from mauvecl.store.export import Selection
@@ -128,7 +128,7 @@ def test_a_store_that_is_being_written_is_not_removed(made: Path, how: str, monk
         "forget": lambda: bulk.forget(made),
         "command": lambda: app(words, standalone_mode=False),
     }[how]
-    with alone(made, "store"), pytest.raises(InputError, match="is being written by another process"):
+    with locked(made, "store"), pytest.raises(InputError, match="is being written by another process"):
         restart()
     assert tree(made) == before
 

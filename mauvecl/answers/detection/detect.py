@@ -18,7 +18,7 @@ from mauvecl.results.detection.departures import departure_table
 from mauvecl.results.detection.detection import Detection
 from mauvecl.results.detection.paper import PAPER_G2V, WHY, reconstruct
 from mauvecl.results.requests.fap import check_fap, countable
-from mauvecl.runs.pool import Pool, together
+from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.statistics.distributions import QuadraticForm
 from mauvecl.statistics.linear import Linear, Matched
 from mauvecl.statistics.statistic import Setting
@@ -203,7 +203,7 @@ def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
         engine.expect(len(prepared) * run.realisations)
     stars: list[StarDetection] = []
     paper: list[str] = []
-    for star in together(engine, answered, prepared):
+    for star in map_in_order(engine, answered, prepared):
         if not stars:
             # What is drawn nothing for is computed while the devices count the next star.
             paper = _paper(study, [group for *_, group in prepared])

@@ -231,7 +231,7 @@ def _map(
     told_of: Callable[[int], None],
 ) -> Arrays:
     """Compute the map on one instrument; add quiescent stars to `seen`, and flares' saturation to `of_flares`."""
-    from mauvecl.runs.pool import together
+    from mauvecl.runs.pool import map_in_order
 
     shape = (len(study.run.statistics), len(y), len(x))
     values = {name: np.full(shape, np.nan) for name in ("probability", "low", "high", "closed_form")}
@@ -243,7 +243,7 @@ def _map(
         return quiet, len(cells), [text for text in told(flares) if text.startswith(SATURATED)]
 
     done = 0
-    for quiet, count, texts in together(engine, filled, _groups(study, x, y)):
+    for quiet, count, texts in map_in_order(engine, filled, _groups(study, x, y)):
         seen.append(quiet)
         of_flares.extend(texts)
         done += count

@@ -275,7 +275,7 @@ def limiting_magnitude(
         As `solve`, if it holds of every limit; else `LimitResult.failed` tells.
     """
     from mauvecl.device.engine import Engine as Default
-    from mauvecl.runs.pool import together
+    from mauvecl.runs.pool import map_in_order
 
     engine = engine or Default()
     result = LimitResult(study)
@@ -298,7 +298,7 @@ def limiting_magnitude(
             return error
 
     outcomes: list[Limit | InputError] = []
-    for one in together(engine, solved, asked):
+    for one in map_in_order(engine, solved, asked):
         outcomes.append(one)
         if progress is not None:
             progress(len(outcomes), len(asked))

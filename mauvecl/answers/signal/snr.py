@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from mauvecl.answers.answer import Answer, InCell
 from mauvecl.answers.signal.exposures import place_of
 from mauvecl.host.arguments import public
-from mauvecl.runs.pool import Pool, together
+from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.study.labels import label, stacked, told
 from mauvecl.study.study import Study
 
@@ -136,7 +136,7 @@ def snr(study: Study, engine: Engine | Pool) -> SnrAnswer:
 
     if isinstance(engine, Pool):
         engine.expect(len(prepared) * run.realisations)
-    stars = list(together(engine, answered, prepared))
+    stars = list(map_in_order(engine, answered, prepared))
     return SnrAnswer(study, stars, [*told([x for _, _, x in prepared]), *filter(None, map(_cut_off, stars))])
 
 

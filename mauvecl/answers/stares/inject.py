@@ -19,7 +19,7 @@ from mauvecl.lightcurve.search.injections import Injections
 from mauvecl.lightcurve.search.null import DAY_S, Counted, in_a_row_rate
 from mauvecl.lightcurve.search.recoveries import Fitted, Refit
 from mauvecl.lightcurve.stares.requests import Arrays
-from mauvecl.runs.pool import Pool, together
+from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, stacked, told
 from mauvecl.study.staring import orbit_lines
@@ -290,7 +290,7 @@ def _star(
         return _reduced(engine, injections.request(position, refit if refit.count else None))
 
     parts: list[Arrays] = []
-    for part in together(engine, at_one_peak, range(positions)):
+    for part in map_in_order(engine, at_one_peak, range(positions)):
         parts.append(part)
         told_of(len(parts) / positions)
     critical = np.stack([part["critical"].T for part in parts], axis=1)
