@@ -1,4 +1,4 @@
-"""What the documentation shows runs: its code word for word, but for the number of realisations and injections."""
+"""What the documentation names, imports and links exists; `test_docs_run.py` runs what it shows."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pytest
 from typer.main import get_command
 
 from mauvecl.cli.app import app
@@ -19,8 +17,6 @@ from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.study.study import Study
 
 ROOT = Path(__file__).parent.parent
-#: Pages whose Python needs a store or a cluster; that of all others runs as it stands.
-APART = ("bulk.md", "cluster.md")
 #: `mauvecl/results/detection/roc.py`, or with a name in it: `mauvecl/results/detection/roc.py: Roc`.
 NAMED = re.compile(r"`((?:host|kernels|mauvecl|tests|bench|tools|docs)/[\w./*-]+\.\w+)(?::\s*(\w+))?[^`]*`")
 #: What defines a name, by a file's ending.
@@ -37,29 +33,6 @@ def all_pages() -> list[Path]:
 def blocks(page: Path, language: str) -> list[str]:
     text = page.read_text(encoding="utf-8")
     return re.findall(rf"```{language}\n(.*?)```", text, flags=re.DOTALL)
-
-
-TUTORIAL = ROOT / "docs" / "tutorial.md"
-PAGES = [page for page in all_pages() if blocks(page, "python") and page.name not in APART]
-
-
-@pytest.mark.parametrize(
-    "page",
-    [pytest.param(p, marks=pytest.mark.long) if p.name == "flares-in-time.md" else p for p in PAGES],
-    ids=lambda page: page.name,
-)
-def test_python_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """In a folder with a study, and after the tutorial, as a reader comes to the other pages."""
-    monkeypatch.chdir(tmp_path)
-    study = {"star": [{"library": "G2V", "magnitude": 9.0}], "run": {"realisations": 100_000, "statistics": ["chi2"]}}
-    Path("study.toml").write_text(Study.build(study, "test").toml())
-    names: dict[str, object] = {}
-    if page not in (ROOT / "README.md", TUTORIAL):
-        exec(blocks(TUTORIAL, "python")[0].replace("1_000_000", "100_000"), names)
-        names |= {"flares": [names["flare"]], "weights": np.ones(names["quiet"].wavelength_nm.size)}  # type: ignore[attr-defined]
-    for text in blocks(page, "python"):
-        fewer = text.replace("1_000_000", "100_000").replace("injections.count=100", "injections.count=20")
-        exec(compile(fewer, page.name, "exec"), names)
 
 
 def test_no_page_is_left_out_of_the_contents() -> None:
