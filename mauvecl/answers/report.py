@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import datetime
-import hashlib
 import io
 import json
 import math
@@ -14,6 +13,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mauvecl.answers.checked import OWN_DIGEST, RECORD, digest_of, record_digest
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.parsed import read_text
 from mauvecl.host.files.whole import write_whole
@@ -129,6 +129,7 @@ def write_record(
     seconds: float,
     messages: Sequence[str],
     files: Sequence[Path] | None = None,
+    whole: bool = True,
 ) -> Path:
     """The run record: what made this answer.
 
@@ -148,9 +149,11 @@ def write_record(
     messages : sequence of str
         What the reader was told.
     files : sequence of Path, optional
-        Of a whole answer: what was written beside it. What the record of another run in the folder names, as that run
-        left it, is removed where this one has written nothing of that name: no picture or table of another run stays
-        beside these.
+        What was written next to the record, which holds their digests and one of itself; see `checked.verify_answer`.
+    whole : bool
+        Whether these are all files of the answer. What the record of another run in the folder names, as that run left
+        it, is then removed where this one has written nothing of that name: no picture or table of another run stays
+        next to these.
     """
     record: dict[str, Any] = {
         "mauvecl": VERSION,
@@ -177,24 +180,24 @@ def write_record(
         record["selftest"] = [last(device) or told for device in devices]
     stale: list[Path] = []
     if files is not None:
-        record["files"] = {path.name: _digest(path) for path in files}
-        stale = [path for path in _left_by_another(folder) if path.name not in record["files"]]
-    written = write_json(record, folder / "run.json")
+        record["files"] = {path.name: digest_of(path) for path in files}
+        if whole:
+            stale = [path for path in _left_by_another(folder) if path.name not in record["files"]]
+    # Numbers and names as JSON has them, so that the record that is read again has the same digest.
+    record = json.loads(json_text(record))
+    record[OWN_DIGEST] = record_digest(record)
+    written = write_json(record, folder / RECORD)
     for path in stale:
         path.unlink(missing_ok=True)
     return written
 
 
-def _digest(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
-
-
 def _left_by_another(folder: Path) -> list[Path]:
     """Files that the record in a folder names, as they were written then."""
     try:
-        named = json.loads(read_text(folder / "run.json", "run record")).get("files", {})
+        named = json.loads(read_text(folder / RECORD, "run record")).get("files", {})
         files = [(folder / name, digest) for name, digest in named.items() if Path(name).name == name]
-        return [path for path, digest in files if path.is_file() and _digest(path) == digest]
+        return [path for path, digest in files if path.is_file() and digest_of(path) == digest]
     except (InputError, OSError, ValueError, AttributeError, RecursionError):
         # No record, or none of ours.
         return []

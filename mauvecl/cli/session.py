@@ -212,7 +212,7 @@ class Session:
         pool = self._pool
         how: dict[str, Any] = {"pool": pool, "opened": self.opened, "seconds": seconds, "messages": messages}
         # Only a whole answer takes the place of another's.
-        how["files"] = None if self._lost else self.files
+        how |= {"files": self.files, "whole": not self._lost}
         self.leave(lambda: write_record(self.verb, study, inputs, self.folder, **how))
         if self._pool is not None and not self._lost:
             self._checkpoint.forget()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import time
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -109,7 +110,9 @@ def _tell(store: Store, place: Path, session: Session) -> None:
 
 
 def verify(
-    store: StoreArgument,
+    store: Annotated[
+        Path, typer.Argument(help="Store that `mauvecl realise` wrote, or output folder of any other verb.")
+    ],
     repair: Annotated[bool, typer.Option("--repair", help="Draw again what is wrong, to the same bits.")] = False,
     redraw: Annotated[
         bool, typer.Option("--redraw", help="Draw every spectrum again and compare, not only digests.")
@@ -119,17 +122,27 @@ def verify(
     as_json: JsonFlag = False,
     quiet: QuietFlag = False,
 ) -> None:
-    """Whether a store is as it was written; can repair it.
+    """Whether a store or an answer's folder is as it was written.
 
-    Finds flipped bytes, missing and foreign chunks.
+    In a store, finds flipped bytes, missing and foreign chunks, and can repair them. In the output folder of another
+    verb, finds files that were changed or removed, by the digests in its run.json.
 
     Exit code 1 if anything is wrong and not repaired.
 
     Example: mauvecl verify frames.zarr --repair
     """
-    from dataclasses import asdict
-
+    from mauvecl.answers.checked import is_answer
     from mauvecl.cli.console import Meter, show, show_table
+    from mauvecl.host.errors import InputError
+
+    if is_answer(store):
+        if repair or redraw or rows is not None:
+            raise InputError(
+                f"{str(store)!r} is the folder of an answer, expected no --repair, --redraw or --rows, which are for "
+                "stores: the same command with --restart writes the answer again"
+            )
+        _verify_answer(store, as_json=as_json)
+        return
     from mauvecl.device.engine import Engine
     from mauvecl.store import bulk
 
@@ -146,6 +159,22 @@ def verify(
         told = "with what was written" if not redraw else "with what the engine draws"
         show([f"{len(faults) - left} repaired, {left} left as found." if faults else f"Everything agrees {told}."])
     if left:
+        raise typer.Exit(1)
+
+
+def _verify_answer(folder: Path, *, as_json: bool) -> None:
+    """Print what is not as the run record has it; exit code 1 if anything."""
+    from mauvecl.answers.checked import verify_answer
+    from mauvecl.cli.console import show, show_table
+
+    faults = verify_answer(folder)
+    if as_json:
+        print(json.dumps([asdict(fault) for fault in faults], indent=2))
+    elif faults:
+        show_table(f"Not as it was written: {folder}", ("file", "what"), [(one.file, one.state) for one in faults])
+    else:
+        show(["Every file agrees with the run record, and the record with its own digest."])
+    if faults:
         raise typer.Exit(1)
 
 

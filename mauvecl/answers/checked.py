@@ -1,0 +1,100 @@
+"""Whether an answer's folder is as its run wrote it: digests of its files, and of the run record itself."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from mauvecl.host.arguments import public
+from mauvecl.host.errors import InputError
+from mauvecl.host.files.parsed import read_text
+
+#: Name of the run record in a folder, and its key that holds the digest of all others.
+RECORD, OWN_DIGEST = "run.json", "record_digest"
+
+
+@dataclass(frozen=True)
+class FileFault:
+    """A file that is not as the run wrote it.
+
+    Attributes
+    ----------
+    file : str
+    state : str
+        "changed", "missing", or what else is wrong.
+    """
+
+    file: str
+    state: str
+
+
+def digest_of(path: Path) -> str:
+    """Return the SHA-256 of a file, in hexadecimal."""
+    with path.open("rb") as opened:
+        return hashlib.file_digest(opened, "sha256").hexdigest()
+
+
+def record_digest(record: Mapping[str, Any]) -> str:
+    """Return the SHA-256 of a run record as canonical JSON: sorted keys, no spaces, without its own digest."""
+    rest = {key: value for key, value in record.items() if key != OWN_DIGEST}
+    text = json.dumps(rest, sort_keys=True, separators=(",", ":"), allow_nan=False)
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def is_answer(folder: Path) -> bool:
+    """Return whether a folder holds a run record, or a study that one belongs to; stores hold neither."""
+    return (folder / RECORD).is_file() or ((folder / "study.toml").is_file() and not (folder / "zarr.json").exists())
+
+
+@public
+def verify_answer(folder: str | Path) -> list[FileFault]:
+    """Compare an answer's folder with the digests in its run record.
+
+    Notices any change of a file that the run wrote, and of the record itself. It is no signature: who changes a file
+    and computes the digests anew is not noticed. Other files in the folder are not looked at.
+
+    Parameters
+    ----------
+    folder : str or Path
+        As a verb's ``--output`` names it.
+
+    Returns
+    -------
+    list of FileFault
+        Empty if everything is as it was written.
+    """
+    from mauvecl.answers.report import json_text
+
+    folder = Path(folder)
+    if not is_answer(folder):
+        raise InputError(
+            f"{str(folder)!r} holds no {RECORD}, expected the output folder of a verb",
+            key="folder",
+            value=str(folder),
+            expected="the output folder of a verb",
+        )
+    if not (folder / RECORD).is_file():
+        return [FileFault(RECORD, "missing")]
+    text = read_text(folder / RECORD, "run record")
+    try:
+        record = json.loads(text)
+        named = record.get("files", {})
+        files = {Path(name).name: digest for name, digest in named.items()}
+    except (ValueError, AttributeError, RecursionError):
+        return [FileFault(RECORD, "cannot be read")]
+    faults = []
+    if OWN_DIGEST not in record:
+        faults.append(FileFault(RECORD, "holds no digest of itself: changed, or of an earlier version"))
+    elif record[OWN_DIGEST] != record_digest(record) or text != json_text(record) + "\n":
+        faults.append(FileFault(RECORD, "changed"))
+    for name, digest in files.items():
+        path = folder / name
+        if not path.is_file():
+            faults.append(FileFault(name, "missing"))
+        elif digest_of(path) != digest:
+            faults.append(FileFault(name, "changed"))
+    return faults

@@ -1,0 +1,95 @@
+"""`mauvecl verify` on the folders of all verbs: whatever is changed or removed afterwards is noticed."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+from commands import run
+from test_files_written import VERBS
+
+from mauvecl.answers.checked import verify_answer
+from mauvecl.host.errors import InputError
+
+MORE = {
+    "gaussian": ("gaussian", "--star", "G2V", "-m", "7.4", "-n", "10000", "--fap", "0.01", "--sweep", "exposure=5"),
+    "inject": (
+        "inject", "--star", "M3V", "-m", "9", "--distance", "5", "--duration", "2000", "-n", "20",
+        "--set", "injections.sizes=2", "--set", "injections.widths=2",
+    ),
+    "visible": ("visible", "--look-at", "eps Eri", "--start", "2027-01-01", "--days", "2"),
+    "plan": ("plan", "targets.csv", "--hours", "20", "--start", "2027-01-01", "--days", "20",
+             "--completeness", "closed form"),
+}  # fmt: skip
+
+
+def ask(verb: str, folder: Path) -> Path:
+    (folder / "targets.csv").write_text("name\neps Eri\n", encoding="utf-8")
+    words = (VERBS | MORE)[verb]
+    pictures = () if "--no-pictures" in words else ("--no-pictures",)
+    run(*words, *pictures, "--output", "out", folder=folder)
+    return folder / "out"
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("verb", [*VERBS, *MORE])
+def test_every_changed_or_missing_file_is_noticed(verb: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of every verb; without the packages for stores."""
+    for package in ("zarr", "h5py", "xarray"):
+        monkeypatch.setitem(sys.modules, package, None)
+    out = ask(verb, tmp_path)
+    assert "agrees" in run("verify", out, folder=tmp_path).stdout
+    written = sorted(path for path in out.iterdir() if path.is_file() and path.name[0] != ".")
+    assert {path.name for path in written} >= {"study.toml", "run.json"}
+    for path in written:
+        content = path.read_bytes()
+        middle = len(content) // 2
+        for changed in (content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :], content + b"\n", b""):
+            path.write_bytes(changed)
+            assert [one.file for one in verify_answer(out)] == [path.name], path
+        told = json.loads(run("verify", out, "--json", folder=tmp_path, code=1).stdout)
+        assert told[0]["file"] == path.name
+        path.unlink()
+        assert [(one.file, one.state) for one in verify_answer(out)] == [(path.name, "missing")]
+        path.write_bytes(content)
+    assert verify_answer(out) == []
+
+
+def test_every_value_of_the_record_counts(tmp_path: Path) -> None:
+    """Each entry of the record changed or removed, and digests of files changed along with the files."""
+    out = ask("exposure", tmp_path)
+    place = out / "run.json"
+    text = place.read_text(encoding="utf-8")
+    record = json.loads(text)
+    for key in record:
+        for other in ({**record, key: "other"}, {k: v for k, v in record.items() if k != key}):
+            place.write_text(json.dumps(other, indent=2) + "\n", encoding="utf-8")
+            assert any(one.file == "run.json" for one in verify_answer(out)), key
+    # The same values in another layout, and a key that is there twice.
+    for changed in (json.dumps(record), text.replace("{", '{"verb": "detect",', 1), text[:-3], "[]"):
+        place.write_text(changed, encoding="utf-8")
+        assert [one.file for one in verify_answer(out)] == ["run.json"]
+    place.write_text(text, encoding="utf-8")
+    assert verify_answer(out) == []
+
+
+def test_what_verify_takes(tmp_path: Path) -> None:
+    """Flags of stores are refused for an answer, and a folder of neither kind is; files of a user do not matter."""
+    out = ask("exposure", tmp_path)
+    (out / "notes.txt").write_text("mine", encoding="utf-8")
+    assert verify_answer(out) == []
+    assert "--repair" in run("verify", out, "--repair", folder=tmp_path, code=2).stderr
+    (tmp_path / "empty").mkdir()
+    with pytest.raises(InputError, match=r"holds no run\.json"):
+        verify_answer(tmp_path / "empty")
+
+
+def test_a_run_again_is_verified_again(tmp_path: Path) -> None:
+    """Another answer in the same folder takes the place of the first with its digests."""
+    out = ask("exposure", tmp_path)
+    first = json.loads((out / "run.json").read_text(encoding="utf-8"))
+    run(*VERBS["exposure"], "--no-pictures", "--set", "run.seed=5", "--output", "out", folder=tmp_path)
+    assert verify_answer(out) == []
+    assert json.loads((out / "run.json").read_text(encoding="utf-8"))["record_digest"] != first["record_digest"]
