@@ -100,6 +100,11 @@ class StareQuestion(Part):
                 raise ValueError(f"stare.bands_nm holds {low:g} to {high:g} nm, expected ascending wavelengths")
         return self
 
+    @property
+    def has_unknowns(self) -> bool:
+        """Whether anything of the stare is unknown."""
+        return bool(self.jitters or self.offsets or self.drifts or self.cycles)
+
     def all_gaps(self) -> list[tuple[float, float]]:
         """The gaps that are named, and the end of every orbit."""
         every = [*self.gaps]

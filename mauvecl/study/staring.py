@@ -150,6 +150,15 @@ def orbit_lines(study: Study) -> list[str]:
     return [*o.orbit().messages(times), assumed]
 
 
+def shifted_line(title: str, threshold: float) -> str:
+    """Return what must be told where a threshold allows for trends that the search leaves in."""
+    return (
+        f"FALSE ALARMS of {title} come from what is unknown of the stare, too: the search does not marginalise over "
+        "all of it (see search.cycle, slope, offset and window_s). The threshold of "
+        f"{threshold:.2f} allows for it, so that alarms are as often as asked for to a factor of 1.5."
+    )
+
+
 def energy_scale(study: Study, star: Star, source: Source, kind: Kind, flare_k: float) -> EnergyScale | None:
     """Return the energy of flares of a temperature per second of equivalent duration.
 

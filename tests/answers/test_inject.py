@@ -62,6 +62,10 @@ def test_tables(found):
     row = found.search[0]
     assert row["threshold_low"] < row["threshold"] < row["threshold_high"]
     assert row["in_a_row"] == pytest.approx(4.245e-5, rel=1e-3)
+    assert row["alarmed"] == np.sum(found.stars[0].alarmed) <= 30
+    assert row["alarmed_expected"] == pytest.approx(
+        30 * -np.expm1(-found.stars[0].surveyed.survey.stare.observed_s / 86_400)
+    )
     assert not [m for m in found.messages if m.startswith("FALSE ALARMS")]
     assert Study.build(__import__("tomllib").loads(found.study.toml()), "text") == found.study
 
@@ -118,13 +122,17 @@ def test_sweep_over_magnitude_and_temperature(stares):
 
 @pytest.mark.long
 def test_search_that_leaves_out_a_cycle_is_told(stares):
-    """A thermal cycle that the search does not know: false alarms are not those of normal noise."""
+    """A thermal cycle that the search does not know raises the threshold, or is refused where none is high enough."""
     quick = {"count": 10, "positions": 2, "fitted": 0, "widths": 2, "sizes": 2}
     changes = {"stare": {"cycles": {"temperature": 0.5}}, "injections": quick}
-    blind = inject(study(search={"cycle": False}, **changes), stares)
+    with pytest.raises(InputError, match="the search does not marginalise over"):
+        inject(study(search={"cycle": False}, **changes), stares)
+    small = {"stare": {"cycles": {"temperature": 0.002}}, "injections": quick}
+    blind = inject(study(search={"cycle": False}, **small), stares)
     assert blind.messages[0].startswith("FALSE ALARMS")
     known = inject(study(**changes), stares)
     assert not known.messages[0].startswith("FALSE ALARMS")
+    assert blind.stars[0].threshold.value > known.stars[0].threshold.value + 0.1
 
 
 def test_rays_and_saturation(stares):

@@ -65,6 +65,12 @@ def test_numbers_follow_from_each_other(answer: PlanAnswer) -> None:
     assert answer.seen.table["hours"].value == pytest.approx(table["seen"].value)
 
 
+def test_a_closed_form_says_that_it_takes_the_stare_for_known(study: Study, answer: PlanAnswer) -> None:
+    assert not any(line.startswith("FALSE ALARMS") for line in answer.messages)
+    drifting = plan(study.with_changes({"stare": {"drifts": {"temperature": 0.3}}}, None))
+    assert any(line.startswith("FALSE ALARMS") for line in drifting.messages)
+
+
 def test_the_rates_are_those_asked_for(answer: PlanAnswer) -> None:
     law = davenport2019(mass_msun=0.82, age_myr=500).in_band("bolometric", 10_000.0)
     energies = answer.by_energy

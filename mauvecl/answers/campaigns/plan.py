@@ -261,6 +261,12 @@ class PlanAnswer(Answer):
                     f"E50 of {one.name}, {one.energy_at(0.5):.2g} erg, lies outside the {low:.2g} to {high:.2g} erg "
                     "for which its flare rates are published: they are extrapolated."
                 )
+        study = self.study
+        if study.plan.completeness == "closed form" and (study.stare.has_unknowns or study.nuisances.usual):
+            lines.append(
+                "FALSE ALARMS may be more than stated: the closed form takes the stare for known, and it has unknowns; "
+                "plan.completeness = 'injections' allows for them."
+            )
         lines += self.seen.messages
         return list(dict.fromkeys(lines))
 

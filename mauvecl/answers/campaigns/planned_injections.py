@@ -45,6 +45,7 @@ def injected(study: Study, looked: Looked) -> Completeness:
         f"{question.injections.count} injections of each of {WIDTHS} half-widths into stretches of "
         f"{looked.window_s / 60:.0f} min, found above {star.threshold.value:.2f} sigma, "
         f"{study.search.false_alarms:g} false alarms per {study.search.per}"
+        + (", allowing for unknowns that the search leaves in" if star.shifted else "")
     )
     energy = 10 ** np.arange(24.0, 40.0, 1 / PER_DECADE)
     widths = np.array(star.injected.half_widths_s)

@@ -8,6 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer, InCell
@@ -22,7 +23,7 @@ from mauvecl.lightcurve.stares.requests import Arrays
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import described, label, stacked, told
-from mauvecl.study.staring import orbit_lines
+from mauvecl.study.staring import orbit_lines, shifted_line
 from mauvecl.study.study import Study
 from mauvecl.study.surveys import Sizes, Surveyed, sizes_of, surveyed
 
@@ -43,6 +44,8 @@ POWERS = (0.5, 0.9)
 SIZE_UNITS = {"amplitude": "", "duration": "s", "energy": "erg", "band_energy": "erg"}
 #: Standard errors of the number of alarms beyond which the two differ.
 DIFFERS = 4.0
+#: Chance of as many alarms at the threshold below which they are too many.
+LEAST_CHANCE = 1e-5
 #: Maps in one picture.
 MOST_DRAWN = 6
 
@@ -62,6 +65,12 @@ class StarCompleteness(InCell):
     asked : float
         What it should be there by importance sampling.
     checked : float
+    alarmed : int
+        Drawn stares with an alarm at the threshold.
+    expected : float
+        How many should have one; NaN where none are drawn.
+    shifted : bool
+        Whether the threshold allows for what the search neither subtracts nor marginalises over.
     saturates : float
         Amplitude from which on flares saturate a used pixel, which injections leave out.
     in_a_row : float
@@ -76,6 +85,9 @@ class StarCompleteness(InCell):
     simulated: Interval
     asked: float
     checked: float
+    alarmed: int
+    expected: float
+    shifted: bool
     saturates: float
     in_a_row: float
     injected: Injected
@@ -92,6 +104,14 @@ class StarCompleteness(InCell):
                 "marginalise over what changes in the stare (see [search] frame, cycle, window_s), or set "
                 'search.null = "counted".'
             )
+        # The chance of as many alarms or more where so many are expected.
+        if scipy.special.gammainc(max(self.alarmed, 1e-300), self.expected) < LEAST_CHANCE:
+            messages.append(
+                f"FALSE ALARMS of {self.title} are more than were asked for: {self.alarmed} of the drawn stares have "
+                f"one at the threshold, {self.expected:.2g} should: set search.null = 'counted' with more search.nulls."
+            )
+        if self.shifted:
+            messages.append(shifted_line(self.title, self.threshold.value))
         if self.injected.amplitudes.max() > self.saturates:
             messages.append(
                 f"SATURATED: flares of {self.title} with an amplitude above {self.saturates:.3g} saturate a pixel, "
@@ -202,6 +222,8 @@ def _search(star: StarCompleteness) -> QTable:
         ("alarms_simulated", star.simulated.value, "false alarms per star-day there, drawn stares"),
         ("alarms_low", star.simulated.low, "lower end: 4 standard errors"),
         ("alarms_high", star.simulated.high, "upper end: 4 standard errors"),
+        ("alarmed", star.alarmed, "drawn stares with a false alarm at the threshold"),
+        ("alarmed_expected", star.expected, "how many should have one"),
         ("in_a_row", star.in_a_row, "false alarms per star-day of the common rule, white noise"),
         ("templates", s.search.n_filters, "templates of the bank"),
         ("sums", s.components.n_statistics, "weighted sums of a frame"),
@@ -297,6 +319,8 @@ def _star(
     # Where a few stares in ten have an alarm, drawn ones say most of whether the two agree.
     checked, likely, error = tail.likely
     simulated, expected = _checked(drawn, checked, likely, error, survey.stare.observed_s / DAY_S / tail.days)
+    alarmed = 0 if drawn is None else int(np.sum(drawn.maxima >= threshold.value))
+    should = float("nan") if drawn is None else drawn.maxima.size * -np.expm1(-choice.rate * drawn.days)
     return StarCompleteness(
         label(star, known.quiet),
         at,
@@ -306,6 +330,9 @@ def _star(
         simulated,
         expected,
         checked,
+        alarmed,
+        float(should),
+        tail.shifted and choice.null == "sampled",
         injections.saturates,
         in_a_row_rate(choice.points, choice.sigma, survey.stare.frame_s),
         Injected(injections.half_widths_s, values, amplitudes, sizes.of_amplitude(critical, widths[:, None, None])),

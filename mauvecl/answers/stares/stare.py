@@ -19,7 +19,7 @@ from mauvecl.lightcurve.search.alarms import Alarm, alarms
 from mauvecl.lightcurve.stares.observed import Draw, Light, Staring, seen
 from mauvecl.study.labels import described, label, stacked, told
 from mauvecl.study.stares import check_sweep
-from mauvecl.study.staring import energy_of, orbit_lines, stare_of, staring_of, unused_lines
+from mauvecl.study.staring import energy_of, orbit_lines, shifted_line, stare_of, staring_of, unused_lines
 from mauvecl.study.study import Study
 from mauvecl.study.surveys import surveyed
 
@@ -66,12 +66,15 @@ class Searched:
         Of each, by its fit; NaN where the star's size is unknown.
     events : tuple of int
         The flare put in that each is nearest to, from 1 on, within a half-width and two frames; 0 for none.
+    shifted : bool
+        Whether the threshold allows for what the search neither subtracts nor marginalises over.
     """
 
     threshold: float
     alarms: list[Alarm]
     bolometric_erg: tuple[float, ...]
     events: tuple[int, ...]
+    shifted: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -289,6 +292,11 @@ def stare(study: Study, stares: Stares) -> StareAnswer:
         line for *_, cell, staring, events in prepared for line in unused_lines(cell, staring, events)
     )
     messages += [one.searched for one in drawn if isinstance(one.searched, str)]
+    messages += [
+        shifted_line(one.title, one.searched.threshold)
+        for one in drawn
+        if isinstance(one.searched, Searched) and one.searched.shifted
+    ]
     for one in drawn:
         cut = int(np.count_nonzero(one.staring.quality))
         if cut:
@@ -322,7 +330,8 @@ def _searched(study: Study, star: Star, staring: Staring, events: list[Event], d
     try:
         known = surveyed(study, star)
         survey = replace(known.survey, components=staring.components(known.templates.weights))
-        threshold = survey.tail(study.run.seed).threshold(study.search.rate).value
+        tail = survey.tail(study.run.seed)
+        threshold = tail.threshold(study.search.rate).value
     except InputError as error:
         return f"{label(star, staring.quiet)} is not searched: {error}."
     raised = alarms(survey, known.templates, draw(survey.components), threshold)
@@ -338,7 +347,7 @@ def _searched(study: Study, star: Star, staring: Staring, events: list[Event], d
         near = int(np.argmin(away)) if away else -1
         close = near >= 0 and away[near] <= events[near].half_width_s + 2 * staring.stare.frame_s
         nearest.append(near + 1 if close else 0)
-    return Searched(threshold, raised, tuple(energies), tuple(nearest))
+    return Searched(threshold, raised, tuple(energies), tuple(nearest), tail.shifted)
 
 
 def _found_energy(study: Study, star: Star, source: Source, event: Event) -> float:

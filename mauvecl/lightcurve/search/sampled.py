@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.search.null import DAY_S
 from mauvecl.lightcurve.search.search import BATCH
-from mauvecl.lightcurve.search.trials import Trials
+from mauvecl.lightcurve.search.trials import WEIGHED_AT, Trials
 from mauvecl.statistics.intervals import CONFIDENCE, Interval
 
 if TYPE_CHECKING:
@@ -52,8 +52,8 @@ NULL_KEY = 0x6E756C6C
 BELOW = 4.0
 #: Nodes of the integral over a template's own value, above the one at which the maximum reaches the threshold.
 NODES = 6
-#: Threshold whose local maxima weigh the templates, and the least weight, of the largest.
-WEIGHED_AT, LEAST_WEIGHT = 5.0, 1e-3
+#: Least weight of a template, of the largest.
+LEAST_WEIGHT = 1e-3
 #: Correlation with the chosen template from which on a value can cross the threshold as the template's does.
 LEAST_RISE = 0.05
 
@@ -70,12 +70,15 @@ class Sampled:
         P(max > threshold) of a stare, and its standard error.
     days : float
         Star-days of the stare.
+    shifted : bool
+        Whether the level of a stare does what the search neither subtracts nor marginalises over.
     """
 
     thresholds: Float
     probability: Float
     error: Float
     days: float
+    shifted: bool = False
 
     @property
     def likely(self) -> tuple[float, float, float]:
@@ -106,26 +109,30 @@ class Sampled:
         if scatter.known:
             return self
         # The rate at any u, finely enough to be straight in between.
-        ends = self.thresholds[0] / scatter.scales.max(), self.thresholds[-1] / scatter.scales.min()
-        fine = np.linspace(*ends, FINE)
+        shifted = bool(scatter.shifts.any())
+        low, high = self.thresholds[0] / scatter.scales.max(), self.thresholds[-1] / scatter.scales.min()
+        # Values that are shifted exceed a threshold as unshifted ones exceed one far below.
+        fine = np.linspace(0.0 if shifted else low, high, FINE)
         polynomial = np.polynomial.polynomial.polyval(fine - self.thresholds[self._trusted].mean(), self._fit())
         rates = np.exp(scipy.special.log_ndtr(-fine) + polynomial)
         probability, error = np.zeros((2, self.thresholds.size))
         for k, threshold in enumerate(self.thresholds):
-            rate = np.interp(threshold / scatter.scales, fine, rates).mean(axis=1)
-            each = -np.expm1(-self.days * rate)
+            each = scatter.alarmed(threshold, self.days, lambda u: np.interp(u, fine, rates))
             probability[k] = scatter.weights @ each
             spread = np.sqrt(np.sum((scatter.weights * (each - probability[k])) ** 2))
             error[k] = np.hypot(spread, probability[k] * self.error[k] / self.probability[k])
-        return Sampled(self.thresholds, probability, error, self.days)
+        return Sampled(self.thresholds, probability, error, self.days, shifted)
 
     def log_rate(self, threshold: float) -> tuple[float, float]:
         """Return the logarithm of false alarms per star-day, and its standard error."""
         kept = self._trusted
-        coefficients = self._fit()
-        at = (threshold - self.thresholds[kept].mean()) ** np.arange(coefficients.size)
         # All thresholds share their draws, so that errors move together: none is gained by their number.
         error = float(np.interp(threshold, self.thresholds[kept], self._relative))
+        if self.shifted:
+            logs = np.log(-np.log1p(-self.probability[kept]) / self.days)
+            return float(scipy.interpolate.PchipInterpolator(self.thresholds[kept], logs)(threshold)), error
+        coefficients = self._fit()
+        at = (threshold - self.thresholds[kept].mean()) ** np.arange(coefficients.size)
         return float(scipy.special.log_ndtr(-threshold) + at @ coefficients), error
 
     def rate(self, threshold: float) -> Interval:
@@ -147,10 +154,19 @@ class Sampled:
         Raises
         ------
         InputError
-            If it lies beyond the thresholds sampled, or so low that alarms can be counted.
+            If it lies beyond the thresholds sampled, or so low that alarms can be counted; or if what is unknown of the
+            level raises more alarms at any of them.
         """
         from scipy.optimize import brentq
 
+        most = float(self.probability[-1])
+        if self.shifted and most >= -np.expm1(-rate * self.days):
+            least = -np.log1p(-min(most, 1 - 1e-16)) / self.days
+            raise InputError(
+                f"{rate:g} false alarms per star-day, expected at least {least:.2g}: "
+                "what is unknown of the stare moves the level in ways that the search does not marginalise over (see "
+                "search.cycle, slope, offset and window_s)"
+            )
         low, high = self._ends
         goal = np.log(rate)
         if not self.log_rate(high)[0] <= goal <= self.log_rate(low)[0]:

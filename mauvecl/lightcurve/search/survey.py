@@ -101,12 +101,30 @@ class Survey:
         return Search(self.bank, self.stare, self.curves, self.variance)
 
     @cached_property
-    def trend(self) -> Trend | None:
-        """What the stare's unknowns do beyond first order; None where that cannot be seen."""
+    def unknowns(self) -> Trend | None:
+        """What the stare's unknowns do; None where there are none."""
         slope = self.components.quiet.conditions["dark_slope_per_c"]
         return Trend.of_unknowns(
             self.stare.unknowns, self.directions, self.variance, self.stare.numbers, self.stare.frame_s, slope
         )
+
+    @property
+    def trend(self) -> Trend | None:
+        """What the stare's unknowns do, where they do something to be seen beyond first order."""
+        return self.unknowns if self.unknowns is not None and self.unknowns.bends else None
+
+    def left(self, amplitudes: Float) -> Float:
+        """Return what unknowns do to the sums that is not subtracted before the search, (n_stare, n_frame, n_sum).
+
+        Parameters
+        ----------
+        amplitudes : ndarray, shape (n_stare, n_unknown)
+            In standard deviations.
+        """
+        if self.unknowns is None:
+            return np.zeros((len(amplitudes), self.stare.n_frames, self.components.n_statistics))
+        moved = self.unknowns.moved(amplitudes)
+        return moved if self.trend is None else self.trend.subtracted(moved)
 
     def net(self, sums: NDArray[Any]) -> NDArray[np.float32]:
         """Sums as drawn, (n_stare, n_frame, n_sum), less what is known and what unknowns do beyond first order."""
@@ -122,7 +140,8 @@ class Survey:
 
     def tail(self, seed: int) -> Sampled:
         """The null by importance sampling, under what is unknown of the stare."""
-        return sampled(self.of_days(SAMPLED_DAYS).search, seed=seed).under(Scatter.of(self, seed))
+        part = self.of_days(SAMPLED_DAYS)
+        return sampled(part.search, seed=seed).under(Scatter.of(self, seed, part))
 
     def of_days(self, days: float) -> Survey:
         """The same with the first star-days of the stare alone, where it is longer."""

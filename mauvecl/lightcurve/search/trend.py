@@ -78,7 +78,7 @@ class Trend:
         frame_s: float,
         slope_per_c: float,
     ) -> Trend | None:
-        """Return the trend of a stare's unknowns; None where they do nothing to be seen beyond first order.
+        """Return the trend of a stare's unknowns; None where there are none.
 
         Parameters
         ----------
@@ -94,11 +94,29 @@ class Trend:
         dark = directions["temperature"] / slope_per_c if slope_per_c else np.zeros_like(sky)
         curves = np.array([one.sd * one.curve for one in unknowns])
         of = tuple(one.of for one in unknowns)
-        trend = cls(frames, frame_s, variance, of, curves, directions["star"], sky, dark, slope_per_c)
-        # All of them far out, and each alone, with either sign.
-        rows = np.vstack([np.eye(len(of)), np.ones(len(of))])
-        beyond = trend.beyond(REACH * np.vstack([rows, -rows]))
-        return trend if (np.sum(beyond**2 / variance[:, None], axis=(1, 2)) > LEAST**2).any() else None
+        return cls(frames, frame_s, variance, of, curves, directions["star"], sky, dark, slope_per_c)
+
+    @cached_property
+    def far(self) -> Float:
+        """Amplitudes that are far out: all together and each alone, with either sign, (n, n_unknown)."""
+        rows = np.vstack([np.eye(len(self.of)), np.ones(len(self.of))])
+        return np.asarray(REACH * np.vstack([rows, -rows]))
+
+    @cached_property
+    def bends(self) -> bool:
+        """Whether unknowns do anything to be seen beyond first order."""
+        beyond = self.beyond(self.far)
+        return bool((np.sum(beyond**2 / self.variance[:, None], axis=(1, 2)) > LEAST**2).any())
+
+    def moved(self, amplitudes: Float) -> Float:
+        """Return what unknowns do to the sums, (n_stare, n_frame, n_sum).
+
+        Parameters
+        ----------
+        amplitudes : ndarray, shape (n_stare, n_unknown)
+            In standard deviations.
+        """
+        return self._moved(self._changes(amplitudes))
 
     def part(self, part: slice) -> Trend:
         """Return that of some frames."""
@@ -129,7 +147,7 @@ class Trend:
         """
         linear = np.array([self._linear[of] for of in self.of])
         first = np.einsum("nu,ut,uk->ntk", amplitudes, self.curves, linear, optimize=True)
-        return np.asarray(self._moved(self._changes(amplitudes)) - first)
+        return np.asarray(self.moved(amplitudes) - first)
 
     def fitted(self, sums: Float) -> Float:
         """Return the most likely amplitudes, shape (n_stare, n_unknown), in standard deviations."""

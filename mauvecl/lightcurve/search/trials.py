@@ -25,6 +25,8 @@ Float = NDArray[np.float64]
 
 #: Nodes of the integral over z, in (z^2 - u^2) / 2.
 NODES = 32
+#: Threshold whose local maxima weigh templates.
+WEIGHED_AT = 5.0
 #: Largest correlation that is told from one.
 ALIKE = 1 - 1e-12
 
