@@ -357,3 +357,5 @@ WORKERS = {
         False,
     ),
 }
+#: Of verbs that can be resumed, and draw no realisations.
+RESUMING = {name: WORKERS[name] for name in ("resume", "restart", "keep_after")}

@@ -72,6 +72,7 @@ class Session:
     started: float = field(default_factory=time.perf_counter)
     opened: Device | None = None
     _pool: Pool | None = None
+    _checkpoint: Checkpoint | None = None
     _lost: list[str] = field(default_factory=list)
     _held: ExitStack = field(default_factory=ExitStack)
 
@@ -113,24 +114,29 @@ class Session:
         unit : str
             What progress counts: realisations, which the pool tells, or something that the caller tells `meter`.
         """
-        from mauvecl.runs.checkpoint import Checkpoint
         from mauvecl.runs.pool import Pool
 
-        how: dict[str, Any] = {"resume": self.resume, "restart": self.restart}
-        if self.keep_after is not None:
-            how["patience_s"] = self.keep_after
-        checkpoint = Checkpoint(self.folder, self.verb, self.study, held=True, **how)
         self.meter = self.metered(unit)
-        with ExitStack() as stack:
-            stack.enter_context(told_of_interrupts(lambda: self._kept(checkpoint)))
-            stack.enter_context(checkpoint)
-            self.say(checkpoint.messages)
+        with self.checkpoint() as checkpoint, ExitStack() as stack:
             stack.enter_context(self.meter)
             workers = stack.enter_context(working(self.device, self.cluster))
             progress = self.meter if unit == "realisations" else None
             self._pool = Pool(workers, checkpoint=checkpoint, progress=progress, meanwhile=self._load)
             self.meter.standing = lambda: self._pool.standing
             yield self._pool
+
+    @contextmanager
+    def checkpoint(self) -> Iterator[Checkpoint]:
+        """What is kept of the work in the output folder; interruptions are told."""
+        from mauvecl.runs.checkpoint import Checkpoint
+
+        how: dict[str, Any] = {"resume": self.resume, "restart": self.restart}
+        if self.keep_after is not None:
+            how["patience_s"] = self.keep_after
+        checkpoint = Checkpoint(self.folder, self.verb, self.study, held=True, **how)
+        with told_of_interrupts(lambda: self._kept(checkpoint)), checkpoint:
+            self.say(checkpoint.messages)
+            yield checkpoint
             if checkpoint.damaged:
                 self.say(
                     [f"{checkpoint.damaged} files of {str(checkpoint.folder)!r} were damaged and are drawn again."]
@@ -214,7 +220,7 @@ class Session:
         # Only a whole answer takes the place of another's.
         how |= {"files": self.files, "whole": not self._lost}
         self.leave(lambda: write_record(self.verb, study, inputs, self.folder, **how))
-        if self._pool is not None and not self._lost:
+        if self._checkpoint is not None and not self._lost:
             self._checkpoint.forget()
 
     def answer(self, answer: Answer, show: Callable[[], None]) -> None:
@@ -256,7 +262,7 @@ class Session:
     def _written(self) -> str:
         """What an interruption while files are written leaves."""
         whole = ", ".join(path.name for path in self.files) or "nothing"
-        kept = None if self._pool is None else self._checkpoint.kept
+        kept = None if self._checkpoint is None else self._checkpoint.kept
         again = "the same command with --resume" if kept else "the same command"
         return f"{whole} written to {str(self.folder)!r}, each file whole, and {again} writes all of them"
 

@@ -12,6 +12,7 @@ from mauvecl.cli.flags import (
     FEWER_DRAWS,
     OBSERVATION,
     PICTURES,
+    RESUMING,
     SETTINGS,
     TELLING,
     WORKERS,
@@ -34,6 +35,7 @@ def takes_study(
     writes: str = "",
     default: Callable[[dict[str, Any]], Study] | None = None,
     draws: bool = True,
+    resumes: bool = False,
     pictures: bool = True,
     observation: Mapping[str, Flag] = OBSERVATION,
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
@@ -55,6 +57,8 @@ def takes_study(
         Makes the study where no file is given, from the flags; the paper's question by default.
     draws, pictures : bool
         Whether the verb draws realisations, and pictures.
+    resumes : bool
+        Whether a verb that draws no realisations can be resumed.
     observation : mapping of Flag
         In place of the flags of an observation. Where one is called `targets`, a table may stand for the study file.
 
@@ -70,7 +74,12 @@ def takes_study(
     def decorate(verb: Callable[..., None]) -> Callable[..., None]:
         called = name or verb.__name__
         output = output_flag(writes or f"the folder mauvecl-{called}")
-        around = {"output": (output, None)} | TELLING | (PICTURES if pictures else {}) | (WORKERS if draws else {})
+        around = (
+            {"output": (output, None)}
+            | TELLING
+            | (PICTURES if pictures else {})
+            | (WORKERS if draws else RESUMING if resumes else {})
+        )
         kinds = get_type_hints(verb, localns={"Study": Any, "Session": Any}, include_extras=True)
         _, _, *own = inspect.signature(verb).parameters.values()
 

@@ -17,7 +17,7 @@ import threading
 import time
 import tomllib
 import zipfile
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Self
@@ -30,7 +30,7 @@ from mauvecl.host.files.parsed import json_data, read_text
 from mauvecl.host.files.whole import UNFINISHED, write_whole
 from mauvecl.host.version import VERSION
 from mauvecl.runs.durable import differing_keys, locked
-from mauvecl.runs.shards import FORM
+from mauvecl.runs.shards import FORM, fingerprint
 
 if TYPE_CHECKING:
     from mauvecl.results.sums import Arrays
@@ -233,6 +233,27 @@ class Checkpoint:
         manifest = {"mauvecl": VERSION, "form": FORM, "verb": self.verb, "study": self._plain_study()}
         text = json.dumps(manifest | {"digest": _digest_of(manifest)}, indent=2)
         write_whole(self.folder / MANIFEST, text.encode())
+
+
+def kept(checkpoint: Checkpoint | None, question: object, compute: Callable[[], Arrays]) -> Arrays:
+    """Return the arrays of a computation, from the checkpoint where an earlier run has finished it.
+
+    Parameters
+    ----------
+    checkpoint : Checkpoint, optional
+        Without one, everything is computed.
+    question : object
+        Everything that the answer depends on, as `fingerprint` takes it.
+    compute : callable
+    """
+    if checkpoint is None:
+        return compute()
+    name = f"{fingerprint(question)}-0-0-1"
+    found = checkpoint.get(name)
+    if found is None:
+        found = compute()
+        checkpoint.put(name, found)
+    return found
 
 
 def _is_ours(manifest: Path) -> bool:

@@ -51,8 +51,8 @@ class Task:
 _DESCRIPTIVE = ("provenance", "messages")
 
 
-def fingerprint(request: Countable) -> str:
-    """Return the SHA-256 of everything in a request that affects its counts.
+def fingerprint(request: object) -> str:
+    """Return the SHA-256 of everything in a request, or in a tuple, that affects its answer.
 
     The number of realisations is excluded, since runs of different length share shards.
     """

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -34,7 +34,9 @@ from mauvecl.study.study import Study
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
+    from mauvecl.device.stares import Stares
     from mauvecl.host.expectation import Expectation
+    from mauvecl.runs.pool import Pool
     from mauvecl.study.assumed import Use
 
 
@@ -291,6 +293,7 @@ def plan(
     study: Study,
     completeness: CompletenessOf | None = None,
     *,
+    engine: Stares | Pool | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> PlanAnswer:
     """A campaign on a study's targets.
@@ -302,6 +305,8 @@ def plan(
     completeness : callable, optional
         The share of flares recovered by bolometric energy; as the study's ``plan.completeness`` has it unless given: by
         injections into drawn noise, or in closed form.
+    engine : Stares or Pool, optional
+        Who draws injections; the default device. The checkpoint of a pool keeps each target that is finished.
     progress : callable, optional
         Called as ``progress(done, total)`` in targets.
 
@@ -325,7 +330,7 @@ def plan(
     stars = [star_of(study, text) for text in study.plan.targets]
     seen = visible(study)
     names, hours = seen.visibility.by_month()
-    completeness = completeness or _completeness(study)
+    completeness = completeness or _completeness(study, engine)
     met = Met.along(seen.visibility.track) if study.plan.along_orbit else None
     planned: list[Planned] = []
     for k, (text, star, target) in enumerate(zip(study.plan.targets, stars, seen.targets, strict=True)):
@@ -348,10 +353,14 @@ def plan(
     return PlanAnswer(study, seen, tuple(planned))
 
 
-def _completeness(study: Study) -> CompletenessOf:
+def _completeness(study: Study, engine: Stares | Pool | None) -> CompletenessOf:
     """That which a study asks for."""
     if study.plan.completeness == "closed form":
         return closed_form
     from mauvecl.answers.campaigns.planned_injections import injected
 
-    return injected
+    if engine is None:
+        from mauvecl.device.stares import Stares as Default
+
+        engine = Default()
+    return partial(injected, engine=engine)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,9 +11,15 @@ from mauvecl.answers.campaigns.planned import Looked, stared_at
 from mauvecl.answers.stares.inject import inject
 from mauvecl.lightcurve.flares.rates import BOLOMETRIC
 from mauvecl.lightcurve.search.completeness import PER_DECADE, Completeness, DurationLaw
+from mauvecl.runs.checkpoint import kept
+from mauvecl.runs.pool import Pool
 from mauvecl.study.searches import InjectionQuestion
 from mauvecl.study.stares import CurveText
 from mauvecl.study.study import Study
+
+if TYPE_CHECKING:
+    from mauvecl.device.stares import Stares
+    from mauvecl.results.sums import Arrays
 
 Float = NDArray[np.float64]
 
@@ -23,7 +29,7 @@ ORBITS = 3
 WIDTHS, WIDTH_RANGE_S, POSITIONS = 10, (5.0, 3000.0), 20
 
 
-def injected(study: Study, looked: Looked) -> Completeness:
+def injected(study: Study, looked: Looked, engine: Stares | Pool | None = None) -> Completeness:
     """The share of injected flares that the study's search finds, by bolometric energy.
 
     The stare is some orbits with one stretch in each, as long as the target's median; the search, its false alarms and
@@ -33,6 +39,8 @@ def injected(study: Study, looked: Looked) -> Completeness:
     ----------
     study : Study
     looked : Looked
+    engine : Stares or Pool, optional
+        Who draws; the default device. The checkpoint of a pool keeps what is found for each target.
 
     Raises
     ------
@@ -40,17 +48,28 @@ def injected(study: Study, looked: Looked) -> Completeness:
         As `inject`.
     """
     question = question_of(study, looked)
-    star = inject(question).stars[0]
+    energy = 10 ** np.arange(24.0, 40.0, 1 / PER_DECADE)
+
+    def computed() -> Arrays:
+        star = inject(question, engine).stars[0]
+        widths = np.array(star.injected.half_widths_s)
+        critical = star.injected.critical.reshape(widths.size, -1)
+        probability = found_by_energy(critical, widths, energy, study.plan.law())
+        return {
+            "probability": probability,
+            "threshold": np.array(star.threshold.value),
+            "shifted": np.array(star.shifted),
+        }
+
+    depends_on = ("completeness of a target", question.text(), looked.quiet, looked.scale)
+    found = kept(engine.checkpoint if isinstance(engine, Pool) else None, depends_on, computed)
     how = (
         f"{question.injections.count} injections of each of {WIDTHS} half-widths into stretches of "
-        f"{looked.window_s / 60:.0f} min, found above {star.threshold.value:.2f} sigma, "
+        f"{looked.window_s / 60:.0f} min, found above {float(found['threshold']):.2f} sigma, "
         f"{study.search.false_alarms:g} false alarms per {study.search.per}"
-        + (", allowing for unknowns that the search leaves in" if star.shifted else "")
+        + (", allowing for unknowns that the search leaves in" if found["shifted"] else "")
     )
-    energy = 10 ** np.arange(24.0, 40.0, 1 / PER_DECADE)
-    widths = np.array(star.injected.half_widths_s)
-    critical = star.injected.critical.reshape(widths.size, -1)
-    return Completeness(energy, found_by_energy(critical, widths, energy, study.plan.law()), BOLOMETRIC, how)
+    return Completeness(energy, found["probability"], BOLOMETRIC, how)
 
 
 def question_of(study: Study, looked: Looked) -> Study:

@@ -17,6 +17,7 @@ from mauvecl.lightcurve.flares.energies import Kind
 from mauvecl.lightcurve.flares.events import Event, coefficients, temperatures_of
 from mauvecl.lightcurve.search.alarms import Alarm, alarms
 from mauvecl.lightcurve.stares.observed import Draw, Light, Staring, seen
+from mauvecl.runs.checkpoint import kept
 from mauvecl.study.labels import described, label, stacked, told
 from mauvecl.study.stares import check_sweep
 from mauvecl.study.staring import energy_of, orbit_lines, shifted_line, stare_of, staring_of, unused_lines
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from mauvecl.device.stares import Stares
     from mauvecl.host.expectation import Expectation
     from mauvecl.host.stars.source import Source
+    from mauvecl.results.sums import Arrays
+    from mauvecl.runs.checkpoint import Checkpoint
     from mauvecl.study.assumed import Use
     from mauvecl.study.sections import Star
 
@@ -264,7 +267,7 @@ class StareAnswer(Answer):
 
 
 @public
-def stare(study: Study, stares: Stares) -> StareAnswer:
+def stare(study: Study, stares: Stares, *, checkpoint: Checkpoint | None = None) -> StareAnswer:
     """One simulated stare at every star of a study, in every cell of its sweep.
 
     Parameters
@@ -273,6 +276,8 @@ def stare(study: Study, stares: Stares) -> StareAnswer:
         Its section `stare`, `events`, star, flare, sky, observation; `run.seed` and `stare.number` say which stare.
     stares : Stares
         Draws it.
+    checkpoint : Checkpoint, optional
+        Keeps the frames that are drawn and the thresholds of searches.
 
     Raises
     ------
@@ -286,7 +291,7 @@ def stare(study: Study, stares: Stares) -> StareAnswer:
         raise InputError(f"a stare of {frames} frames, each with a spectrum, expected at most {MOST_SHOWN}")
     # Everything is looked at before anything is drawn: bad input shows at once.
     prepared = [(star, at, cell, *staring_of(cell, star)) for at, cell in study.cells() for star in cell.star]
-    drawn = [_drawn(study, stares, *one) for one in prepared]
+    drawn = [_drawn(study, stares, checkpoint, *one) for one in prepared]
     messages = told([staring.quiet for _, _, _, staring, _ in prepared]) + orbit_lines(study)
     messages += dict.fromkeys(
         line for *_, cell, staring, events in prepared for line in unused_lines(cell, staring, events)
@@ -307,6 +312,7 @@ def stare(study: Study, stares: Stares) -> StareAnswer:
 def _drawn(
     study: Study,
     stares: Stares,
+    checkpoint: Checkpoint | None,
     star: Star,
     at: Mapping[str, float | str],
     cell: Study,
@@ -316,22 +322,32 @@ def _drawn(
     q, rays = study.stare, study.processes.processes().cosmic_rays
 
     def draw(components: Any) -> Any:
-        return stares.frames(
-            components, staring.stare, staring.flare, first=q.number, count=1, seed=study.run.seed, cosmic_rays=rays
-        )[0]
+        def computed() -> Arrays:
+            what = components, staring.stare, staring.flare
+            return {"frames": stares.frames(*what, first=q.number, count=1, seed=study.run.seed, cosmic_rays=rays)[0]}
+
+        depends_on = ("frames", components, staring.stare, staring.flare, q.number, study.run.seed, rays)
+        return kept(checkpoint, depends_on, computed)["frames"]
 
     light = seen(staring, q.bands_nm, draw)
-    searched = _searched(cell, star, staring, events, draw) if q.search else None
+    searched = _searched(cell, star, staring, events, draw, checkpoint) if q.search else None
     return StarStare(label(star, staring.quiet), at, staring, _flares(cell, star, staring, events), light, searched)
 
 
-def _searched(study: Study, star: Star, staring: Staring, events: list[Event], draw: Draw) -> Searched | str:
+def _searched(
+    study: Study, star: Star, staring: Staring, events: list[Event], draw: Draw, checkpoint: Checkpoint | None
+) -> Searched | str:
     """What the study's search finds, or why it cannot be made."""
     try:
         known = surveyed(study, star)
         survey = replace(known.survey, components=staring.components(known.templates.weights))
-        tail = survey.tail(study.run.seed)
-        threshold = tail.threshold(study.search.rate).value
+
+        def computed() -> Arrays:
+            tail = survey.tail(study.run.seed)
+            return {"threshold": np.array(tail.threshold(study.search.rate).value), "shifted": np.array(tail.shifted)}
+
+        tail = kept(checkpoint, ("threshold", survey, study.text()), computed)
+        threshold = float(tail["threshold"])
     except InputError as error:
         return f"{label(star, staring.quiet)} is not searched: {error}."
     raised = alarms(survey, known.templates, draw(survey.components), threshold)
@@ -347,7 +363,7 @@ def _searched(study: Study, star: Star, staring: Staring, events: list[Event], d
         near = int(np.argmin(away)) if away else -1
         close = near >= 0 and away[near] <= events[near].half_width_s + 2 * staring.stare.frame_s
         nearest.append(near + 1 if close else 0)
-    return Searched(threshold, raised, tuple(energies), tuple(nearest), tail.shifted)
+    return Searched(threshold, raised, tuple(energies), tuple(nearest), bool(tail["shifted"]))
 
 
 def _found_energy(study: Study, star: Star, source: Source, event: Event) -> float:

@@ -122,7 +122,7 @@ def _show_visible(answer: VisibleAnswer) -> None:
         )
 
 
-@takes_study(TABLE, PLAN, observation=ORBIT, draws=False)
+@takes_study(TABLE, PLAN, observation=ORBIT)
 def plan(study: Study, session: Session) -> None:
     """A campaign: hours, flares expected, false alarms; a report.
 
@@ -137,8 +137,12 @@ def plan(study: Study, session: Session) -> None:
     if study.plan.report == "pdf" and not available():
         study = study.with_settings(["plan.report=html"])
         session.say(["The report is HTML: matplotlib is missing, `pip install 'mauvecl[plot]'` brings it."])
-    with session.metered("targets") as meter:
-        answer = compute(study, progress=meter)
+    if study.plan.completeness == "closed form":
+        with session.metered("targets") as meter:
+            answer = compute(study, progress=meter)
+    else:
+        with session.pool(unit="targets") as engine:
+            answer = compute(study, engine=engine, progress=session.meter)
     session.answer(answer, lambda: _show_plan(answer))
 
 

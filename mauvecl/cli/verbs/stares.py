@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
 
-@takes_study(FLARE, STARE, SIZE, {"seed": DRAWS["seed"]}, SWEEP, without="exposure", draws=False)
+@takes_study(FLARE, STARE, SIZE, {"seed": DRAWS["seed"]}, SWEEP, without="exposure", draws=False, resumes=True)
 def stare(
     study: Study,
     session: Session,
@@ -38,7 +38,8 @@ def stare(
 
     stares = Stares(device)
     session.opened = stares.opened
-    answer = compute(study, stares)
+    with session.checkpoint() as checkpoint:
+        answer = compute(study, stares, checkpoint=checkpoint)
     session.answer(answer, lambda: _show(answer))
 
 
