@@ -225,8 +225,8 @@ def _sentence(device: Any, outcome: Outcome) -> str:
     tried = "; ".join(f"{name or 'its own choice'} {why}" for name, why in outcome.tried)
     return (
         f"{device.platform.version.strip()}, driver {device.driver_version.strip()}, cannot build kernels for the "
-        f"processor {device.name.strip()} (compiled for {tried}), expected another device (--device, `mauvecl "
-        f"devices`) or driver: {sources()}; {LIMIT} sets the limit, and mauvecl tries again after a week"
+        f"processor {device.name.strip()} (compiled for {tried}), expected another device (`mauvecl "
+        f"devices` lists them) or driver: {sources()}; {LIMIT} sets the limit, and mauvecl tries again after a week"
     )
 
 

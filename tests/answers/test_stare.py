@@ -294,7 +294,7 @@ def test_unknowns_of_a_stare_are_drawn_where_asked_for():
     [
         (["--gap", "10"], "--gap '10', expected two times in s, such as 1000:2000"),
         (["--gap", "20:10"], "a gap from 20 to 10 s, expected two times, ascending"),
-        (["--duration", "-3"], "stare.duration_s = -3.0, expected greater than 0"),
+        (["--duration", "-3"], "--duration -3.0, expected greater than 0"),
         (["--shape", "gauss"], "flare shape 'gauss' is unknown, expected one of davenport2014"),
         (["--energy", "1e33"], "a flare of 1e+33 erg at K2.5V of unknown size, expected the star's distance_pc"),
         (["--set", "stare.bands_nm=[[10,20]]"], "the band of 10 to 20 nm holds no pixel that is used"),

@@ -21,7 +21,7 @@ ROOT = Path(mauvecl.__file__).parent
 OF_FLAGS = ("cli/", "web/downloads.py")
 FLAG = re.compile(r"(?<![\w-])--[a-z][a-z-]+")
 #: Whole commands are named as they are typed.
-COMMAND = re.compile(r"`mauvecl [^`]*`")
+COMMAND = re.compile(r"`(?:mauvecl|wsl) [^`]*`")
 
 
 def texts(file: Path) -> list[str]:
