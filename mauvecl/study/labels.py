@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mauvecl.noise.cumulants import Cumulants, stack_is_exact
+from mauvecl.noise.varied import VARIED
 from mauvecl.study.quantities import QUANTITIES, UNITS
 from mauvecl.study.sections import Star
 
@@ -15,11 +16,14 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.host.expectation import Expectation
+    from mauvecl.noise.processes import Processes
 
 
 #: Read noise, DN, from which rounding is like noise whatever the light: the wave that it leaves of the sawtooth's first
 #: harmonic is exp(-2 pi^2), 3e-9, or less.
 NOISY_DN = 1.0
+#: Rounding of a prior's ends.
+TINY = 1e-9
 #: How messages on saturation begin, and how many of them an answer has at most.
 SATURATED = "SATURATED"
 MOST_SATURATED = 12
@@ -32,12 +36,29 @@ def label(star: Star, x: Expectation) -> str:
     return name if star.magnitude is None else f"{name} {star.band} = {star.magnitude:g}{system}"
 
 
-def told(expectations: list[Expectation]) -> list[str]:
+def told(expectations: list[Expectation], processes: Processes | None = None) -> list[str]:
     """Return their messages and where closed forms do not hold, as `worst_first` has them.
 
     Every answer reports the saturation of its stars and flares through this function.
     """
-    return worst_first(message for x in expectations for message in (*x.messages, *_coarse(x)))
+    texts = [message for x in expectations for message in (*x.messages, *_coarse(x))]
+    return worst_first([*(_off_centre(expectations, processes) if processes else ()), *texts])
+
+
+def _off_centre(expectations: list[Expectation], processes: Processes) -> list[str]:
+    """Return a sentence for each prior that does not contain what an expectation has, which the observer expects."""
+    sentences = []
+    for name, _ in processes.modulations:
+        first, last = getattr(processes, name).quantile(np.array([0.0, 1.0]))
+        values = {VARIED[name].expected_in(x.conditions) for x in expectations}
+        outside = sorted(value for value in values if not first - TINY <= value <= last + TINY)
+        if outside:
+            sentences.append(
+                f"OUTSIDE THE PRIOR: {name} is drawn from {first:g} to {last:g}, and the expectation, which is "
+                f"subtracted, has {', '.join(f'{value:g}' for value in outside)}: every exposure differs from it, and "
+                "thresholds hold that difference."
+            )
+    return sentences
 
 
 def worst_first(messages: Iterable[str]) -> list[str]:

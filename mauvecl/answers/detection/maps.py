@@ -174,7 +174,7 @@ def detection_map(
         messages=[
             *_blinded(values),
             *_without_threshold(study, values),
-            *worst_first([*told(seen), *of_flares]),
+            *worst_first([*told(seen, study.processes.processes()), *of_flares]),
             *marginal_lines(study),
             *_cost(study, x, y),
         ],

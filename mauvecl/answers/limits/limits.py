@@ -185,7 +185,12 @@ class LimitResult(Answer):
     @property
     def messages(self) -> list[str]:
         """What holds at the limits, what is told of the stars, and what is unknown."""
-        stars = worst_first([*(text for one in self.limits for text in one.messages), *told(self.inputs)])
+        stars = worst_first(
+            [
+                *(text for one in self.limits for text in one.messages),
+                *told(self.inputs, self.study.processes.processes()),
+            ]
+        )
         costs = [one.cost for one in self.limits if one.cost is not None]
         failed = [f"NO LIMIT: {text}." for text in self.failed]
         return [*failed, *stars, *marginal_lines(self.study), *cost_lines(costs, self.study)]

@@ -99,4 +99,4 @@ def simulate(study: Study, *, realisation: int = 0, flaring: bool = False) -> Si
             table.meta["study"] = study.text()
             observations.append((title, x, described(table)))
         everything += xs
-    return SimulateAnswer(study, observations, told(everything))
+    return SimulateAnswer(study, observations, told(everything, study.processes.processes()))

@@ -137,7 +137,11 @@ def snr(study: Study, engine: Engine | Pool) -> SnrAnswer:
     if isinstance(engine, Pool):
         engine.expect(len(prepared) * run.realisations)
     stars = list(map_in_order(engine, answered, prepared))
-    return SnrAnswer(study, stars, [*told([x for _, _, x in prepared]), *filter(None, map(_cut_off, stars))])
+    return SnrAnswer(
+        study,
+        stars,
+        [*told([x for _, _, x in prepared], study.processes.processes()), *filter(None, map(_cut_off, stars))],
+    )
 
 
 def _cut_off(star: StarSnr) -> str:

@@ -76,7 +76,7 @@ def _tell(store: Store, place: Path, session: Session) -> None:
     from mauvecl.study.assumed import assumption_line
     from mauvecl.study.labels import told
 
-    messages = told([scene.expectation for scene in store.scenes])
+    messages = told([scene.expectation for scene in store.scenes], store.study.processes.processes())
     assumed = assumption_line(store.study, ("instrument", "sky", "flare", "unknowns", "seed"))
     session.say([*messages, assumed])
     rows = [

@@ -1,0 +1,63 @@
+"""A prior that does not contain what the expectation has: the reader is told, by every verb that draws it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from answers import small
+
+from mauvecl.answers.detection.detect import detect
+from mauvecl.answers.detection.maps import detection_map
+from mauvecl.answers.limits.limits import limiting_magnitude
+from mauvecl.answers.signal.simulate import simulate
+from mauvecl.answers.signal.snr import snr
+from mauvecl.device.engine import Engine
+from mauvecl.noise.varied import VARIED
+from mauvecl.study.study import Study
+
+#: Priors that contain the expectation's own value, and that do not.
+PRIORS = {
+    "jitter": ([0.0, 0.05], [0.01, 0.05]),
+    "detector_temperature": ([13.0, 22.0], [5.0, 20.0]),
+    "light_loss": ([0.34, 0.5], [0.35, 0.5]),
+    "pointing_loss": ([0.0, 0.05], [0.1, 0.2]),
+    "qe_scale": ([0.9, 1.1], [1.05, 1.2]),
+    "sky_level": ([0.5, 1.0], [1.1, 2.0]),
+}
+MAP = {"x": {"quantity": "amplitude", "values": [0.05, 0.24]}, "y": {"quantity": "exposure", "values": [50.0]}}
+VERBS: dict[str, tuple[Callable[[Study, Engine], Any], dict[str, Any]]] = {
+    "simulate": (lambda study, _: simulate(study), {}),
+    "snr": (snr, {}),
+    "detect": (detect, {}),
+    "map": (detection_map, {"map": MAP}),
+    "limit": (limiting_magnitude, {"limit": {"of": "magnitude", "power": 0.5}}),
+}
+
+
+def said(verb: str, engine: Engine, **sections: Any) -> list[str]:
+    ask, needs = VERBS[verb]
+    study = small(**({"star": [{"library": "G2V", "magnitude": 7.4}]} | needs | sections))
+    return [text for text in ask(study, engine).messages if text.startswith("OUTSIDE THE PRIOR")]
+
+
+def test_every_prior_is_looked_at() -> None:
+    assert PRIORS.keys() == VARIED.keys()
+
+
+# Far from the expectation no limit settles, which is refused: one prior near it.
+@pytest.mark.parametrize(("verb", "name"), [(v, n) for v in VERBS for n in PRIORS if v != "limit" or n == "light_loss"])
+def test_a_prior_away_from_the_expectation_is_named(engine: Engine, verb: str, name: str) -> None:
+    holds, misses = ({"processes": {name: {"uniform": ends}}} for ends in PRIORS[name])
+    assert said(verb, engine, **holds) == []
+    (sentence,) = said(verb, engine, **misses)
+    assert name in sentence
+
+
+def test_a_swept_value_counts(engine: Engine) -> None:
+    """The prior contains the study's temperature, and one of the two that are swept over."""
+    sweep = {"axes": [{"quantity": "detector_temperature", "values": [20.0, 10.0]}]}
+    prior = {"detector_temperature": {"uniform": [18.0, 22.0]}}
+    (sentence,) = said("detect", engine, processes=prior, sweep=sweep)
+    assert "has 10:" in sentence
