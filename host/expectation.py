@@ -460,7 +460,7 @@ def expect(
     electrons = per_frame(source)
     plain = Expectation(
         wavelength_nm=instrument.wavelength_nm,
-        source_electrons=np.maximum(electrons, 0.0),
+        source_electrons=_faint_enough(np.maximum(electrons, 0.0), source.name),
         sky_electrons=np.zeros(n_pixel) if zodiacal is None else np.maximum(per_frame(zodiacal), 0.0),
         dark_dn=instrument.per_pixel("dark", instrument.dark_dn_per_s * instrument.frame_s),
         dark_unit=instrument.dark_unit,
@@ -605,3 +605,15 @@ def _saturation(x: Expectation) -> tuple[str, ...]:
         f"SATURATED: {int(x.saturated.sum())} of {x.saturated.size} pixels at {', '.join(runs)} nm reach "
         f"{x.ceiling_dn:.0f} DN in a {x.frame_s:g} s frame of {name}; {advice}; {often}.",
     )
+
+
+def _faint_enough(electrons: Float, name: str) -> Float:
+    """Return mean electrons of a frame; raise InputError if a star is brighter than any pixel could take."""
+    if (electrons > MAX_PER_FRAME).any():
+        why = "; at 1 au it has V = -26.76 (Willmer 2018)" if name == "Sun" else ""
+        raise InputError(
+            f"{name} is too bright: it makes {float(electrons.max()):.3g} electrons in one frame of a pixel{why}, "
+            f"expected at most {MAX_PER_FRAME:g}: `magnitude` makes it a star at a distance, as in `magnitude=7.4`",
+            key="magnitude",
+        )
+    return electrons

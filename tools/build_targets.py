@@ -100,6 +100,13 @@ HD 97658      | 54906  | K1V    | Leo |
 WASP-33       | 11397  | A5V    | And | HD 15082
 """
 
+#: Stars without a number of Hipparcos, transcribed from SIMBAD: name, ICRS degrees at epoch 2000, pc, V, type, others.
+SIMBAD = (
+    ("AD Leo", 154.90117, 19.87000, 4.965, 9.52, "M3V", "GJ 388, BD+20 2465"),
+    ("Wolf 359", 164.12050, 7.01472, 2.409, 13.51, "M6V", "GJ 406, CN Leo"),
+    ("TRAPPIST-1", 346.62237, -5.04140, 12.467, 18.80, "M8V", "2MASS J23062928-0502285"),
+)
+
 
 def main() -> None:
     """Read the catalogues, look each star up, compare, write."""
@@ -124,8 +131,11 @@ def main() -> None:
         if here != constellation or abs(hp - v) > 0.45:
             sys.stderr.write(f"{name}: HIP {hip} lies in {here} with Hp = {hp}\n")
         others = ", ".join([f"HIP {hip}", *filter(None, [others])])
-        rows.append((name, round(right, 5), round(north, 5), round(1000 / parallax, 3), v, kind, others))
-    table = Table(rows=rows, names=("name", "ra", "dec", "distance", "V", "spectral_type", "other_names"))
+        rows.append(
+            (name, round(right, 5), round(north, 5), round(1000 / parallax, 3), v, kind, others, "Hipparcos, I/311")
+        )
+    rows += [(*star, "SIMBAD") for star in SIMBAD]
+    table = Table(rows=rows, names=("name", "ra", "dec", "distance", "V", "spectral_type", "other_names", "source"))
     for column, unit in (("ra", "deg"), ("dec", "deg"), ("distance", "pc"), ("V", "mag")):
         table[column].info.unit = unit
     table.meta = {

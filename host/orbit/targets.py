@@ -88,12 +88,17 @@ def _names() -> dict[str, Target]:
     stars = {}
     for row in _list():
         star = Target(
-            str(row["name"]), float(row["ra"]), float(row["dec"]), "embedded list (Hipparcos, I/311)",
+            str(row["name"]), float(row["ra"]), float(row["dec"]), f"embedded list ({row['source']})",
             float(row["distance"]), float(row["V"]), str(row["spectral_type"]),
         )  # fmt: skip
         for name in (star.name, *str(row["other_names"]).split(",")):
             stars[_key(name)] = star
     return stars
+
+
+def known_target(name: str) -> Target | None:
+    """Return the embedded star of that name, or None."""
+    return _names().get(_key(name))
 
 
 def target_table() -> Table:
@@ -102,7 +107,7 @@ def target_table() -> Table:
     Returns
     -------
     Table
-        Columns name, ra, dec (deg, ICRS), distance (pc), V, spectral_type and other_names.
+        Columns name, ra, dec (deg, ICRS), distance (pc), V, spectral_type, other_names and source.
     """
     return _list().copy()
 

@@ -13,7 +13,10 @@ from mauvecl.cli.values import amplitudes_of, axis_of, frames_of, gap_of, lines_
 
 StudyFile = Annotated[
     Path | None,
-    typer.Argument(help="Study (TOML), or the ECSV table of an answer; flags override it.", show_default=False),
+    typer.Argument(
+        help="Study (TOML), the ECSV table of an answer, or a star as for --star; flags override it.",
+        show_default=False,
+    ),
 ]
 DeviceFlag = Annotated[
     str | None,

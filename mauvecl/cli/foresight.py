@@ -44,10 +44,11 @@ def question_values(study: Study, *, detects: bool) -> None:
     from mauvecl.host.stars.band_names import known_band
     from mauvecl.results.requests.fap import check_fap
     from mauvecl.statistics.names import check_statistic
+    from mauvecl.study.star_names import check_spectrum
 
     for star in study.star:
         if star.library is not None:
-            _check_library(star.library)
+            check_spectrum(star.library)
         elif star.file is not None:
             _check_file(star.file)
         if star.magnitude is not None:
@@ -65,16 +66,6 @@ def question_values(study: Study, *, detects: bool) -> None:
     for name in run.statistics:
         check_statistic(name)
     check_fap(run.fap, run.realisations, run.tails)
-
-
-def _check_library(name: str) -> None:
-    from mauvecl.host.stars import catalogue
-
-    if catalogue.embedded(name) is None:
-        from mauvecl.host.stars import own_stars
-
-        if own_stars.find(name) is None:
-            catalogue.find(name)
 
 
 def _check_file(file: Path) -> None:

@@ -42,6 +42,34 @@ def study_of(
     return changed.with_settings(given["set"], "--set") if given["set"] else changed
 
 
+def is_star(given: Path) -> bool:
+    """Return whether what stands in place of the study is a star: a name of the library or a spectrum file."""
+    from mauvecl.host.orbit.targets import known_target
+    from mauvecl.study.star_names import has_spectrum
+
+    text = str(given)
+    if given.suffix.lower() == ".toml" or given.is_dir():
+        return False
+    if not _is_there(text):
+        # The first name decides: a wrong one among others has a sentence of its own.
+        first = text.split(",")[0].strip()
+        return bool(first) and (has_spectrum(first) or known_target(first) is not None)
+    if given.suffix.lower() == ".ecsv":
+        return not holds_study(given)
+    return not given.is_file() or not _is_toml(given)
+
+
+def _is_toml(file: Path) -> bool:
+    """Return whether a file holds TOML: a study, whatever it is called."""
+    import tomllib
+
+    try:
+        tomllib.loads(file.read_bytes()[:1_000_000].decode())
+    except (OSError, ValueError):
+        return False
+    return True
+
+
 def holds_study(file: Path) -> bool:
     """Whether a file is no mere table: CSV is one, and ECSV that no answer wrote."""
     suffix = file.suffix.lower()

@@ -20,7 +20,7 @@ from mauvecl.cli.flags import (
     StudyFile,
     output_flag,
 )
-from mauvecl.cli.question import holds_study, study_of
+from mauvecl.cli.question import holds_study, is_star, study_of
 from mauvecl.cli.values import as_text
 
 if TYPE_CHECKING:
@@ -86,6 +86,7 @@ def takes_study(
         def command(study_file: Path | None = None, **values: Any) -> None:
             from mauvecl.cli.foresight import question_time, question_values
             from mauvecl.cli.session import Session
+            from mauvecl.host.errors import InputError
 
             for key, (shown, read) in readers.items():
                 if values.get(key) is not None and not isinstance(values[key], int | float):
@@ -93,6 +94,10 @@ def takes_study(
             given = {key: values.pop(key, None) for key in flags}
             if "targets" in flags and study_file is not None and not holds_study(study_file):
                 given["targets"], study_file = study_file, None
+            if "star" in flags and study_file is not None and is_star(study_file):
+                if given["star"]:
+                    raise InputError(f"{str(study_file)!r} and --star are both stars, expected one of them")
+                given["star"], study_file = [str(study_file)], None
             if fewer and study_file is None and given["realisations"] is None:
                 given["realisations"] = FEWER
             how = {key: values.pop(key, usual) for key, (_, usual) in around.items()}

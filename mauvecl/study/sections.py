@@ -59,8 +59,10 @@ class Star(Part):
         from dataclasses import replace
 
         from mauvecl.host.stars.source import Source
+        from mauvecl.study.star_names import check_spectrum
 
         if self.library is not None:
+            check_spectrum(self.library)
             source = Source.from_library(self.library)
         else:
             source = Source.read(

@@ -1,0 +1,88 @@
+"""Stars in place of a study, and names that people try."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import ended, run
+from typer.main import get_command
+
+from mauvecl import InputError
+from mauvecl.cli.app import app
+from mauvecl.host.orbit.targets import target_table
+from mauvecl.study.sections import Star
+from mauvecl.study.study import Study
+
+VERBS = [name for name, one in get_command(app).commands.items()  # type: ignore[attr-defined]
+         if {"study_file", "star"} <= {p.name for p in one.params}]  # fmt: skip
+
+
+def spectrum(folder: Path, name: str) -> str:
+    nm = np.linspace(170.0, 1150.0, 800)
+    flux = 1e-12 * np.exp(-(((nm - 560) / 250) ** 2))
+    np.savetxt(folder / name, np.transpose([nm, flux]))
+    return name
+
+
+@pytest.mark.parametrize("verb", VERBS)
+def test_a_star_may_stand_in_place_of_the_study(verb: str, tmp_path: Path) -> None:
+    """Every verb takes one as far as its magnitude, which is wrong here."""
+    for star in ("G2V", "sun", "G2V,M3V", spectrum(tmp_path, "star.txt"), spectrum(tmp_path, "noname")):
+        code, _, told = ended(verb, star, "-m", "99", folder=tmp_path)
+        assert (code, told) == (2, "mauvecl: --magnitude 99.0, expected -30 to 40\n"), star
+    code, _, told = ended(verb, "G2V", "--star", "M3V", "-m", "7", folder=tmp_path)
+    assert (code, told) == (2, "mauvecl: 'G2V' and --star are both stars, expected one of them\n")
+
+
+def test_it_is_the_star_of_the_study(tmp_path: Path) -> None:
+    name = spectrum(tmp_path, "star.txt")
+    for given in ("G2V", name):
+        run("exposure", given, "-m", "8", "--snr", "10", "--at", "300", "--no-pictures", folder=tmp_path)
+        (star,) = Study.read(tmp_path / "mauvecl-exposure" / "study.toml").star
+        assert (star.library or (star.file and star.file.name), star.magnitude) == (given, 8.0)
+    # A study is still one, whatever it is called.
+    (tmp_path / "mauvecl-exposure" / "study.toml").rename(tmp_path / "study")
+    told = run("exposure", "study", "--no-pictures", folder=tmp_path).stdout
+    assert "star V = 8" in told
+
+
+def test_a_missing_study_is_still_a_missing_study(tmp_path: Path) -> None:
+    for name in ("no.toml", "nothing", "G3V"):
+        code, _, told = ended("detect", name, folder=tmp_path)
+        assert (code, f"study file {name!r} does not exist" in told) == (2, True), told
+
+
+@pytest.mark.parametrize("name", ["AD Leo", "ad leo", "Proxima", "Proxima Cen", "EV Lac", "YZ CMi", "AU Mic", "GJ 388",
+                                  "CN Leo", "TRAPPIST-1", "eps Eri", "Barnard's star"])  # fmt: skip
+def test_well_known_stars_say_what_stands_for_them(name: str, tmp_path: Path) -> None:
+    with pytest.raises(InputError) as caught:
+        Star(library=name).source()
+    assert (caught.value.key, caught.value.value) == ("star", name)
+    for words in (("--star", name), (name,)):
+        code, _, told = ended("simulate", *words, folder=tmp_path)
+        assert code == 2
+        found = re.search(r"(--star \S+) with (--magnitude \S+) ", told)
+        assert found, told
+    # What it says to pass can be passed.
+    run("simulate", *shlex.split(f"{found[1]} {found[2]}"), "--no-pictures", folder=tmp_path)
+
+
+def test_every_listed_star_has_what_the_sentence_needs() -> None:
+    for row in target_table():
+        if str(row["name"]) in ("Vega", "HD 40307", "GJ 581"):
+            continue  # the library has them
+        with pytest.raises(InputError, match="has no spectrum of its own in the library, expected"):
+            Star(library=str(row["name"])).source()
+
+
+def test_the_sun_says_what_to_pass(tmp_path: Path) -> None:
+    for verb in ("simulate", "detect"):
+        code, _, told = ended(verb, "--star", "Sun", folder=tmp_path)
+        assert code == 2
+        assert told.startswith("mauvecl: Sun is too bright: ")
+        assert "V = -26.76" in told
+        assert told.rstrip().endswith("as in --magnitude 7.4")
