@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from mauvecl.answers.detection.maps import detection_map
     from mauvecl.answers.limits.assumptions import what_matters
     from mauvecl.answers.limits.limits import limiting_magnitude, shortest_exposure, smallest_amplitude
+    from mauvecl.answers.measurements.measure import measure
     from mauvecl.answers.signal.exposures import exposure_for
     from mauvecl.answers.signal.simulate import simulate
     from mauvecl.answers.signal.snr import snr
@@ -104,6 +105,7 @@ __all__ = [
     "gaussian_report",
     "inject",
     "limiting_magnitude",
+    "measure",
     "plan",
     "shortest_exposure",
     "simulate",
@@ -161,6 +163,7 @@ _HOMES = {
     "gaussian_report": "answers.detection.gaussian",
     "inject": "answers.stares.inject",
     "limiting_magnitude": "answers.limits.limits",
+    "measure": "answers.measurements.measure",
     "shortest_exposure": "answers.limits.limits",
     "plan": "answers.campaigns.plan",
     "simulate": "answers.signal.simulate",

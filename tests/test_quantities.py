@@ -45,7 +45,7 @@ NAMES = re.compile(
     r"|^start$|seed|frames|pixels|^bins$|realisation|_arcsec2?$|_pc$|_rsun$|_erg$"
 )
 #: Made by other public functions, which have cases: arrays and numbers are already in the units of their names.
-MADE = ("Expectation", "Source", "Detection", "Sky", "Instrument", "Stare", "TableShape", "EnergyScale")
+MADE = ("Expectation", "Source", "Detection", "Sky", "Instrument", "Stare", "TableShape", "EnergyScale", "FlareModel")
 REASONS = {
     "Source.read.wavelength_unit": "a unit, no wavelength",
     "Processes.detector_temperature": "a prior, whose ends have cases",
@@ -67,6 +67,16 @@ REASONS = {
     "Detection.of.seed": "made by Engine.detect",
     "bulk.draw.start": "hands on to Engine.realise, once whole",
     "bulk.draw.count": "hands on to Engine.realise, once whole",
+    "FlareModel.of.bands_nm": "pairs of plain numbers, as a study has them",
+    "ObservedFlare.wavelength_nm": "as ObservedFlare.from_arrays",
+    "ObservedFlare.measured_nm": "made by ObservedFlare.from_arrays",
+    "ObservedFlare.read.wavelength_unit": "a unit, no wavelength",
+    "ObservedFlare.read.continue_at_k": "handed on to ObservedFlare.from_arrays",
+    "fit.frames": "raw DN, as Engine.realise gives them",
+} | {
+    f"{name}.{method}.wavelength_nm": "grids of spectra, as Source has them"
+    for name in ("BalmerFlare", "Blackbody", "FlareWithLines", "ObservedFlare", "TwoBlackbodies")
+    for method in ("flux", "flux_at_telescope", "grid")
 }
 
 
@@ -94,6 +104,11 @@ def payload() -> Any:
 @cache
 def pair() -> Any:
     return tuple(mauvecl.expect(s, payload(), exposure=5) for s in (star(), star().flaring(0.5)))
+
+
+@cache
+def model(**how: Any) -> Any:
+    return mauvecl.FlareModel.of(star(), payload(), pair()[0], **how)
 
 
 @cache
@@ -270,6 +285,40 @@ CASES: dict[str, Case] = {
         lambda v: mauvecl.EnergyScale.shibayama2013(1.0, 5700.0, flare_k=v).erg_per_s, "K", 6000, 20_000
     ),
     "EnergyScale.of_star.distance_pc": Case(lambda v: mauvecl.EnergyScale.of_star(star(), v).erg_per_s, "pc", 1, 100),
+    "Blackbody.temperature_k": Case(lambda v: mauvecl.Blackbody(v).bolometric_flux(), "K", 6000, 20_000),
+    "BalmerFlare.temperature_k": Case(lambda v: mauvecl.BalmerFlare(v).bolometric_flux(), "K", 6000, 20_000),
+    "BalmerFlare.electron_temperature_k": Case(
+        lambda v: mauvecl.BalmerFlare(9000.0, electron_temperature_k=v).bolometric_flux(), "K", 6000, 20_000
+    ),
+    "TwoBlackbodies.temperature_k": Case(lambda v: mauvecl.TwoBlackbodies(v).bolometric_flux(), "K", 6000, 20_000),
+    "TwoBlackbodies.second_temperature_k": Case(
+        lambda v: mauvecl.TwoBlackbodies(9000.0, v).bolometric_flux(), "K", 6000, 20_000
+    ),
+    "ObservedFlare.from_arrays.wavelength_nm": Case(
+        lambda v: mauvecl.ObservedFlare.from_arrays(v, np.ones(5)).wavelength_nm,
+        "nm",
+        np.array([150.0, 300.0, 450.0, 600.0, 800.0]),
+        0.0,
+    ),
+    "ObservedFlare.from_arrays.continue_at_k": Case(
+        lambda v: mauvecl.ObservedFlare.from_arrays([150.0, 500.0], [1.0, 1.0], continue_at_k=v).bolometric_flux(),
+        "K",
+        6000,
+        20_000,
+    ),
+    "FlareModel.of.distance_pc": Case(lambda v: model(distance_pc=v).values(9000.0, [0.1])["area"], "pc", 1, 100),
+    "FlareModel.of.radius_rsun": Case(
+        lambda v: model(distance_pc=10.0, radius_rsun=v).values(9000.0, [0.1])["filling factor"], "solRad", 0.2, 3
+    ),
+    "FlareModel.of.electron_temperature_k": Case(
+        lambda v: model(jump=True, electron_temperature_k=v).fixed[0], "K", 6000, 20_000
+    ),
+    "FlareModel.counts.temperature_k": Case(lambda v: model().counts(v, [0.1]), "K", 6000, 20_000),
+    "FlareModel.values.temperature_k": Case(lambda v: model().values(v, [0.1])["temperature"], "K", 6000, 20_000),
+    "FlareModel.amplitudes.temperature_k": Case(
+        lambda v: model(jump=True).amplitudes(v, 0.1, jump=2.0), "K", 6000, 20_000
+    ),
+    "forecast.temperature_k": Case(lambda v: mauvecl.forecast(pair()[0], model(), v, [0.1]).errors, "K", 6000, 20_000),
     "Sinusoid.period_s": Case(lambda v: mauvecl.Sinusoid(0.1, v).period_s, "s", 100, 9000),
     "Stare.of.duration_s": Case(lambda v: mauvecl.Stare.of(v).start_s[-1], "s", 10, 9000),
     "Stare.of.frame_s": Case(lambda v: mauvecl.Stare.of(600.0, frame_s=v).frame_s, "s", 1, 100),

@@ -329,14 +329,14 @@ class FlareWithLines(FlareSpectrum):
         return np.unique(np.concatenate([self.continuum.nodes_nm, *lines]))
 
     @property
-    def _continuum_flux(self) -> float:
+    def continuum_flux(self) -> float:
         at = self.continuum.grid(np.linspace(*LINE_RANGE_NM, RANGE_POINTS))
         return 10.0 * float(np.trapezoid(self.continuum.flux(at), at))
 
     def flux(self, wavelength_nm: Float) -> Float:
         """Return the flux of the continuum and the lines that scale with it, erg s-1 cm-2 A-1."""
         continuum = self.continuum.flux(wavelength_nm)
-        return np.asarray(continuum + self._continuum_flux * _sum_of_lines(self.fractions, wavelength_nm))
+        return np.asarray(continuum + self.continuum_flux * _sum_of_lines(self.fractions, wavelength_nm))
 
     def flux_at_telescope(self, wavelength_nm: Float) -> Float:
         """Return the flux of the lines that do not scale with the amplitude, erg s-1 cm-2 A-1."""
@@ -344,7 +344,7 @@ class FlareWithLines(FlareSpectrum):
 
     def bolometric_flux(self) -> float:
         """Return the flux of the continuum and of the lines that scale with it, erg s-1 cm-2."""
-        return self.continuum.bolometric_flux() + self._continuum_flux * sum(self.fractions.values())
+        return self.continuum.bolometric_flux() + self.continuum_flux * sum(self.fractions.values())
 
     def describe(self) -> str:
         """Return the spectrum in a few words."""
@@ -509,7 +509,11 @@ def _continued(name: str, nm: Float, flux: Float, kelvin: float) -> tuple[Float,
             continue
         join = nm <= end + JOIN_NM if first else nm >= end - JOIN_NM
         body = blackbody(nm[join], kelvin)
-        scale = float(np.trapezoid(flux[join], nm[join]) / np.trapezoid(body, nm[join]))
+        # A coarse spectrum may have its last point alone within that width.
+        alone = body.size == 1
+        scale = float(
+            flux[join][0] / body[0] if alone else np.trapezoid(flux[join], nm[join]) / np.trapezoid(body, nm[join])
+        )
         if first and end <= NEEDED_NM[0]:
             continue
         if not scale > 0.0:

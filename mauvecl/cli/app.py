@@ -20,6 +20,7 @@ from mauvecl.cli.verbs.detect import detect, gaussian
 from mauvecl.cli.verbs.injections import inject
 from mauvecl.cli.verbs.library import app as library
 from mauvecl.cli.verbs.limits import detection_map, limit
+from mauvecl.cli.verbs.measurements import measure
 from mauvecl.cli.verbs.observe import exposure, simulate, snr
 from mauvecl.cli.verbs.orbits import plan, visible
 from mauvecl.cli.verbs.serve import serve
@@ -44,8 +45,8 @@ def _help(verb: Callable[..., None]) -> str:
 
 
 # In the order of `--help`: one star, flares, hours and campaigns, bulk, mauvecl itself.
-for verb in (simulate, snr, exposure, detect, limit, detection_map, gaussian, stare, inject, visible, plan, realise,
-             verify, export, serve, devices, selftest, schema):  # fmt: skip
+for verb in (simulate, snr, exposure, detect, limit, detection_map, gaussian, measure, stare, inject, visible, plan,
+             realise, verify, export, serve, devices, selftest, schema):  # fmt: skip
     app.command("map" if verb is detection_map else None, help=_help(verb))(verb)
 app.add_typer(library, name="library")
 

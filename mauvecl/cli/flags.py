@@ -292,6 +292,13 @@ SWEEP = group(
         lambda wanted: "list" if wanted else None,
     ),
 )
+MEASURE = group(
+    flag(list[str], "--model", "Fitted: blackbody, balmer, lines [the flare's, and simpler ones]; may be repeated.",
+         "measure.models", names_of),
+    flag(list[str], "--fit-line", "Line that the model 'lines' fits [the flare's]; may be repeated.", "measure.lines",
+         names_of),
+    flag(int, "--fits", "Simulated exposures of each flare [1000].", "measure.fits"),
+)  # fmt: skip
 BULK = group(
     flag(
         str,

@@ -58,7 +58,7 @@ def _sky(study: Study, swept: set[str]) -> str:
 
 def _flare(study: Study, swept: set[str]) -> str:
     f, replaces = study.flare, "replacing photosphere"
-    temperature = "of swept temperature" if "flare_temperature" in swept else f"of {f.temperature_k:g} K"
+    temperature = "of swept temperature" if "flare_temperature" in swept else f"of {f.light().describe()}"
     if f.geometry == "replaces" and f.photosphere_temperature_k is not None:
         replaces += f" of {f.photosphere_temperature_k:g} K"
     geometry = "added to the star" if f.geometry == "added" else replaces

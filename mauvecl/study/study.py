@@ -15,6 +15,7 @@ from mauvecl.host.files.parsed import possible, read_text, toml
 from mauvecl.host.quantities import number
 from mauvecl.host.records import input_error
 from mauvecl.study.flare_text import find_spectrum_files, without_usual_spectrum
+from mauvecl.study.measuring import MeasureQuestion, without_usual_measure
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.study.orbits import OrbitQuestion, PlanQuestion, find_plan_files, without_usual_plan
 from mauvecl.study.quantities import OF_SPECTRUM, QUANTITIES
@@ -80,6 +81,7 @@ class Study(Part):
     injections: InjectionQuestion = InjectionQuestion()
     orbit: OrbitQuestion = OrbitQuestion()
     plan: PlanQuestion = PlanQuestion()
+    measure: MeasureQuestion = MeasureQuestion()
 
     @model_validator(mode="after")
     def _one_photosphere(self) -> Self:
@@ -196,6 +198,7 @@ class Study(Part):
         without_usual(data, self)
         without_usual_search(data, self)
         without_usual_plan(data, self)
+        without_usual_measure(data, self)
         without_usual_spectrum(data, self.flare.spectrum)
         for section in ("processes", "campaign"):
             if not data[section]:

@@ -13,6 +13,7 @@ from mauvecl.answers.detection.detect import detect
 from mauvecl.answers.detection.gaussian import gaussian_report
 from mauvecl.answers.detection.maps import detection_map
 from mauvecl.answers.limits.limits import limiting_magnitude
+from mauvecl.answers.measurements.measure import measure
 from mauvecl.answers.signal.exposures import exposure_for
 from mauvecl.answers.signal.simulate import simulate
 from mauvecl.answers.signal.snr import snr
@@ -51,6 +52,7 @@ VERBS: dict[str, tuple[Messages, dict[str, Any]]] = {
         lambda study, engine, _: list(gaussian_report(study, engine).messages),
         {"sweep": {"axes": [{"quantity": "exposure", "values": [5.0]}]}},
     ),
+    "measure": (lambda study, engine, _: list(measure(study, engine).messages), {"measure": {"fits": 10}}),
     "stare": (lambda study, *_: list(stare(study, Stares()).messages), SHORT),
     "inject": (lambda study, *_: list(inject(study, Stares()).messages), SHORT),
     "realise": (

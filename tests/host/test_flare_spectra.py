@@ -111,6 +111,12 @@ def test_a_short_flare_is_not_continued_unless_asked() -> None:
         ad_leo(912, continue_at_k=None)
 
 
+def test_a_coarse_spectrum_is_continued_from_its_last_point() -> None:
+    flare = ObservedFlare.from_arrays([150.0, 300.0, 500.0], [1.0, 2.0, 3.0], continue_at_k=8000.0)
+    far = blackbody(np.array([500.0, flare.wavelength_nm[-1]]), 8000.0)
+    assert flare.flux_flam[-1] == pytest.approx(3.0 * far[1] / far[0])
+
+
 def test_a_quiescent_spectrum_is_subtracted(tmp_path: Path) -> None:
     nm, other = np.linspace(150.0, 800.0, 1301), np.linspace(190.0, 820.0, 2001)
     for name, at, flux in (("both", nm, 3e-14 * nm), ("star", other, 1e-14 * other)):

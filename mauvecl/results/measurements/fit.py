@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import scipy
@@ -84,6 +84,16 @@ class Measurement:
     def one_sided(self) -> NDArray[np.bool_]:
         """Intervals with one end, shape (n_level, n, n_derived)."""
         return np.asarray(np.isinf(self.low) != np.isinf(self.high))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Self]) -> Self:
+        """Return the measurements of several batches of frames as one."""
+        values: dict[str, Any] = {one.name: getattr(parts[0], one.name) for one in fields(cls)}
+        for name, value in values.items():
+            if isinstance(value, np.ndarray):
+                axis = 1 if name in ("low", "high") else 0
+                values[name] = np.concatenate([getattr(part, name) for part in parts], axis)
+        return cls(**values)
 
     def column(self, name: str) -> int:
         """Return the place of a quantity.

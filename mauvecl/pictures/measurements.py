@@ -1,0 +1,95 @@
+"""Pictures of measurements: a fit with its residuals, contours, pulls, errors against amplitude."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mauvecl.answers.measurements.measure import contour
+from mauvecl.pictures.style import COLOURS, NULL, drawn
+from mauvecl.results.measurements.fit import forecast
+from mauvecl.results.measurements.reduction import variance_of
+
+if TYPE_CHECKING:
+    from mauvecl.answers.measurements.measure import MeasuredFlare
+
+#: Rises of chi-squared that enclose 68.27 and 95 % in two dimensions.
+RISES = (2.30, 5.99)
+#: Factors of the amplitude over which errors are drawn.
+FACTORS = np.geomspace(0.1, 10.0, 25)
+
+
+@drawn
+def fits(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
+    """The first exposure per resolution element, less unknowns, with the fitted flare; residuals; a column per fit."""
+    figure, axes = plt.subplots(
+        2, len(flares), figsize=(3.6 * len(flares), 4.6), squeeze=False, sharex=True, height_ratios=(2, 1)
+    )
+    for (upper, lower), one in zip(axes.T, flares, strict=True):
+        quiet, found = one.quiet, one.found
+        mean, unknown = one.fitted_dn()
+        sums = [quiet.per_element(values) for values in (one.frame - unknown, mean, variance_of(quiet, mean)[0])]
+        nm, noise = quiet.element_wavelength_nm, np.sqrt(sums[2])
+        upper.errorbar(nm, sums[0], noise, fmt=".", color=NULL, label="exposure less star and unknowns")
+        upper.plot(nm, sums[1], color=COLOURS[0], label=f"fit: {found.estimates[0, 0]:.0f} K")
+        good = noise > 0
+        lower.plot(nm[good], (sums[0] - sums[1])[good] / noise[good], ".", color=COLOURS[0])
+        lower.axhline(0.0, color=NULL, linewidth=0.8)
+        lower.set(xlabel="wavelength (nm)", ylabel="residual / noise")
+        upper.set(title=one.name, ylabel="DN per resolution element")
+        upper.legend(loc="best")
+    return figure
+
+
+@drawn
+def contours(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
+    """Expected confidence regions of temperature and amplitude, unknowns marginalised over."""
+    figure, axes = plt.subplots(1, len(flares), figsize=(3.4 * len(flares), 3.2), squeeze=False)
+    for axis, one in zip(axes[0], flares, strict=True):
+        kelvin, amplitude, rise = contour(one)
+        axis.contour(kelvin, amplitude, rise, levels=RISES, colors=[COLOURS[0]], linestyles=["-", "--"])
+        axis.plot(one.perfect.estimates[0, 0], one.perfect.estimates[0, 1], "+", color=COLOURS[4])
+        if np.isfinite(one.truth[:2]).all():
+            axis.plot(*one.truth[:2], "x", color="black")
+        axis.set(xlabel="temperature (K)", ylabel="amplitude", title=one.name)
+    return figure
+
+
+@drawn
+def pulls(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
+    """Estimates less the truth over their standard errors, beside the standard normal."""
+    figure, axes = plt.subplots(1, len(flares), figsize=(3.4 * len(flares), 3.0), squeeze=False)
+    x = np.linspace(-5.0, 5.0, 201)
+    for axis, one in zip(axes[0], flares, strict=True):
+        # Temperature, amplitude, and the jump where it is fitted.
+        for colour, q in zip(COLOURS, range(min(3, len(one.truth))), strict=False):
+            if one.found.names[q].startswith("flux") or not np.isfinite(one.truth[q]):
+                continue
+            with np.errstate(invalid="ignore", divide="ignore"):
+                pull = (one.found.estimates[:, q] - one.truth[q]) / one.found.errors[:, q]
+            pull = pull[np.isfinite(pull)]
+            axis.hist(np.clip(pull, -5, 5), bins=40, range=(-5, 5), density=True, histtype="step", color=colour,
+                      label=one.found.names[q])  # fmt: skip
+        axis.plot(x, np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi), color=NULL, linestyle="--", label="normal")
+        axis.set(xlabel="(estimate - truth) / error", ylabel="density", title=one.name)
+        axis.legend(loc="best")
+    return figure
+
+
+@drawn
+def errors(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
+    """Errors of temperature and amplitude in advance against the amplitude: everything known, and unknowns not."""
+    figure, axes = plt.subplots(1, len(flares), figsize=(3.4 * len(flares), 3.0), squeeze=False)
+    for axis, one in zip(axes[0], flares, strict=True):
+        kelvin, linear = float(np.exp(one.perfect.log_k[0])), one.perfect.amplitudes[0]
+        for unknown, line in {None: "--", one.unknown: "-"}.items():
+            ahead = [forecast(one.quiet, one.fitted, kelvin, factor * linear, unknown) for factor in FACTORS]
+            for colour, q in zip(COLOURS, range(2), strict=False):
+                whose = "all known" if unknown is None else "unknowns free"
+                relative = [f.errors[q] / f.values[q] for f in ahead]
+                axis.plot(FACTORS * linear[0], relative, line, color=colour, label=f"{one.fitted.names[q]}, {whose}")
+        axis.set(xscale="log", yscale="log", xlabel="amplitude", ylabel="relative error", title=one.name)
+        axis.legend(loc="best")
+    return figure

@@ -1,0 +1,142 @@
+"""What would be measured: forecasts, simulated fits, detected flares, too simple models."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import ended, run
+from scipy import stats
+
+from mauvecl import Engine, InputError, Study, measure
+from mauvecl.answers.measurements.measure import MeasureAnswer
+from mauvecl.host.stars.bands import photons
+
+
+def study_of(*settings: str, **flare: object) -> Study:
+    data = {
+        "star": [{"library": "M3V", "magnitude": 9.0, "distance_pc": 5.0, "radius_rsun": 0.4}],
+        "flare": {"temperature_k": 9500.0, "amplitudes": [0.5], **flare},
+        "nuisances": {"dark": "free", "light": "free"},
+        "measure": {"fits": 400},
+    }
+    return Study.build(data, "test").with_settings(settings)
+
+
+@pytest.fixture(scope="module")
+def jump(engine: Engine) -> MeasureAnswer:
+    return measure(study_of(spectrum={"balmer_jump": 2.5}), engine)
+
+
+def test_the_right_model_covers_and_the_simple_one_is_rejected(jump: MeasureAnswer) -> None:
+    """400 fits of drawn pixels. False failures: 11 quantities whose coverage is 93 to 97 %, 2e-6 each."""
+    simple, right = jump.flares
+    assert (simple.model, right.model) == ("blackbody", "balmer")
+    rows = right.rows()
+    covered = np.rint(400 * np.array(rows["coverage_95"])).astype(int)
+    low, high = stats.binom.ppf(1e-6, 400, 0.93), stats.binom.isf(1e-6, 400, 0.97)
+    assert ((low <= covered) & (covered <= high)).all()
+    np.testing.assert_allclose(rows["perfect"], rows["truth"], rtol=2e-3)
+    np.testing.assert_allclose(rows["scatter"] / rows["error"], 1.0, atol=0.25)
+    quality = {row["model"]: row for row in jump.fits}
+    assert quality["blackbody"]["rejected"] > 0.99
+    assert quality["balmer"]["rejected"] < 0.05
+    assert any("'blackbody' gives" in text for text in jump.messages)
+    # Known: MEASURE's table of a jump of 2.5 has S/N 134.56 and a blackbody of 12 170 K with everything known.
+    assert quality["balmer"]["snr"] == pytest.approx(134.56, rel=0.01)
+
+
+def test_truths_are_those_of_the_light_that_is_added(jump: MeasureAnswer) -> None:
+    study = jump.study
+    source = study.star[0].source()
+    lit = study.flaring(source, 0.5)
+    nm = np.union1d(lit.wavelength_nm, [200.0, 320.0, 700.0])
+    added = np.interp(nm, lit.wavelength_nm, lit.flux_flam) - np.interp(nm, source.wavelength_nm, source.flux_flam)
+    truth = dict(zip(jump.flares[1].found.names, jump.flares[1].truth, strict=True))
+    for low, high in study.measure.bands_nm:
+        inside = (nm >= low) & (nm <= high)
+        flux = 10 * np.trapezoid(added[inside], nm[inside])
+        assert truth[f"flux {low:g}-{high:g} nm"] == pytest.approx(flux, rel=1e-3)
+        sphere = 4 * np.pi * (5 * 3.0856775814913674e18) ** 2
+        assert truth[f"energy {low:g}-{high:g} nm"] == pytest.approx(flux * sphere * 50.0, rel=1e-3)
+    assert truth["jump"] == 2.5
+    assert truth["amplitude"] == pytest.approx(0.5, rel=1e-3)
+    assert truth["filling factor"] == pytest.approx(truth["area"] / (np.pi * (0.4 * 6.957e10) ** 2), rel=1e-12)
+    assert photons(lit.wavelength_nm, lit.flux_flam, "Kepler") > 0
+
+
+def test_detected_flares_near_the_threshold_are_too_bright(engine: Engine) -> None:
+    """At a detection probability near one half; the median of detected flares exceeds that of all (false: < 1e-6)."""
+    answer = measure(study_of("run.fap=1e-4", "flare.amplitudes=[0.045]", "measure.fits=2000"), engine)
+    (one,) = answer.flares
+    share = one.selected.mean()
+    expected = stats.norm.sf(stats.norm.isf(1e-4) - one.snr[1])
+    assert abs(share - expected) < 5 * np.sqrt(expected * (1 - expected) / 2000) + 0.03
+    assert 0.1 < share < 0.95
+    rows = {row["quantity"]: row for row in one.rows()}
+    assert rows["flux 200-320 nm"]["bias_selected"] > rows["flux 200-320 nm"]["bias"]
+    assert rows["flux 200-320 nm"]["bias_selected"] > 0
+
+
+def test_lines_and_absolute_fluxes(engine: Engine) -> None:
+    spectrum = {"balmer_jump": 2.0, "lines": {"H alpha": 0.05}, "line_fluxes": {"Mg II": 2e-11}}
+    answer = measure(study_of("measure.fits=50", "nuisances={}", spectrum=spectrum), engine)
+    assert [one.model for one in answer.flares] == ["blackbody", "balmer", "lines"]
+    rows = {row["quantity"]: row for row in answer.flares[-1].rows()}
+    assert rows["line Mg II"]["truth"] == 2e-11
+    assert rows["line Mg II"]["perfect"] == pytest.approx(2e-11, rel=0.02)
+    assert rows["line H alpha"]["perfect"] == pytest.approx(rows["line H alpha"]["truth"], rel=0.02)
+
+
+def test_a_flare_of_a_file_has_fluxes_and_no_temperature(engine: Engine) -> None:
+    data = Path(__file__).parent.parent / "data"
+    spectrum = {
+        "file": str(data / "spectra" / "ADLeo_912s.dat"), "quiescent": str(data / "flares" / "adleo_quiescent2.dat"),
+        "wavelength_unit": "Angstrom", "continue_at_k": 9500.0,
+    }  # fmt: skip
+    answer = measure(study_of("measure.fits=50", spectrum=spectrum), engine)
+    truth = dict(zip(answer.flares[1].found.names, answer.flares[1].truth, strict=True))
+    assert np.isnan([truth[name] for name in ("temperature", "amplitude", "jump", "area")]).all()
+    assert truth["flux 200-320 nm"] > 0
+
+
+def test_sweeps_seeds_and_files(engine: Engine, tmp_path: Path) -> None:
+    study = study_of("measure.fits=30").with_settings(['sweep.axes=[{quantity="exposure", values=[50, 300]}]'])
+    answer = measure(study, engine)
+    assert len(answer.flares) == 2
+    errors = [one.ahead.errors[0] for one in answer.flares]
+    assert errors[0] > 2 * errors[1]
+    assert measure(study, engine) == answer
+    answer.write(tmp_path)
+    assert Study.read(tmp_path / "measure.ecsv") == study
+    for name in answer.pictures:
+        assert answer.pictures[name][0].startswith("measurements.")
+    answer.plot(tmp_path / "fit.png")
+    assert (tmp_path / "fit.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("settings", "text"),
+    [
+        (["flare.geometry=replaces"], "expected 'added'"),
+        (["measure.bands_nm=[[300, 200]]"], "bands_nm"),
+        (['measure.lines=["X"]'], "'X' is unknown"),
+        (["measure.fits=0"], "measure.fits"),
+    ],
+)
+def test_what_cannot_be_is_named(settings: list[str], text: str, engine: Engine) -> None:
+    with pytest.raises(InputError, match=text):
+        measure(study_of(*settings), engine)
+
+
+def test_the_command(tmp_path: Path) -> None:
+    words = ("--star", "M3V", "--magnitude", "9", "--amplitude", "0.5", "--balmer-jump", "2", "--fits", "40")
+    done = run("measure", *words, "--nuisance", "dark=free", "-o", "out", folder=tmp_path)
+    assert "jump" in done.stdout
+    assert {path.name for path in (tmp_path / "out").iterdir()} >= {
+        "measure.ecsv", "fits.ecsv", "fit.png", "contours.png", "pulls.png", "errors.png", "study.toml", "run.json"
+    }  # fmt: skip
+    code, _, told = ended("measure", *words, "--model", "spots", folder=tmp_path)
+    assert code == 2
+    assert "spots" in told
