@@ -81,7 +81,7 @@ class Fit:
     templates: Templates
 
     @cached_property
-    def _response(self) -> tuple[Any, Any, float, float]:
+    def response(self) -> tuple[Any, Any, float, float]:
         """The sums of a flare of one amplitude over log temperature, their derivative, and the ends."""
         logs = np.log(self.templates.temperatures_k)
         if logs.size == 1:
@@ -128,7 +128,7 @@ class Fit:
         weight, level, start_s = weight[:, used], level[:, used], start_s[used]
         edges = np.column_stack([start_s, start_s + several * self.bank.frame_s])
         y = _beside(np.asarray(sums[:, used], np.float64), weight, level)
-        response, slope, coolest, hottest = self._response
+        response, slope, coolest, hottest = self.response
         log_kelvin = np.clip(log_kelvin, coolest, hottest)
         amplitude = np.full(n, np.nan)
 

@@ -48,12 +48,15 @@ class Templates:
         Mean sums for a flare of one amplitude.
     best : ndarray, shape (n_temperature,)
         S/N of that flare in one frame with weights of its own: what `directions` would be as long as without loss.
+    noise : ndarray, shape (n_temperature, n_sum, n_sum)
+        Covariance that the photons of a flare of one amplitude add to the sums of a frame.
     """
 
     temperatures_k: tuple[float, ...]
     weights: Float
     directions: Float
     best: Float
+    noise: Float
 
     @classmethod
     def of(
@@ -105,7 +108,9 @@ class Templates:
         weights = (vectors[:, kept] / length[:, None] / np.sqrt(values[kept])).T @ optimal
         # Signs are free: the hottest flare adds to each sum.
         weights *= np.where(weights @ flares[-1] < 0, -1.0, 1.0)[:, None]
-        return cls(tuple(temperatures_k), weights, flares @ weights.T, length)
+        photons = flares * quiet.gain_dn_per_electron
+        noise = np.einsum("kp,lp,tp->tkl", weights, weights, photons, optimize=True)
+        return cls(tuple(temperatures_k), weights, flares @ weights.T, length, noise)
 
     @cached_property
     def chosen(self) -> tuple[int, ...]:
@@ -122,6 +127,10 @@ class Templates:
     def loss(self) -> Float:
         """Share of S/N lost to the few sums, shape (n_temperature,)."""
         return np.asarray(1.0 - np.linalg.norm(self.directions, axis=1) / self.best)
+
+    def noise_of(self, kelvin: float) -> Float:
+        """Return what the photons of a flare add to the covariance, by the nearest temperature, (n_sum, n_sum)."""
+        return self.noise[int(np.argmin(np.abs(np.log(np.array(self.temperatures_k) / kelvin))))]
 
     def of_flares(self, flares_dn: Float) -> Float:
         """Mean sums for flares of other temperatures, shape (n, n_sum), from their spectra, DN, (n, n_pixel)."""

@@ -1,0 +1,400 @@
+"""Flares that overlap, fitted together: non-linear least squares, with intervals by profile likelihood.
+
+A block is what is fitted at once: flares whose light overlaps, over the union of their windows, on a level that is
+marginalised as the search marginalises it (a straight line over the window of the widest flare, a continuous line of
+such pieces where the block is longer). Light of flares outside of the block is subtracted. The noise of a frame holds
+the photons of the flares themselves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from mauvecl.lightcurve.search.recovery import Fit
+
+if TYPE_CHECKING:
+    from mauvecl.lightcurve.search.survey import Survey
+    from mauvecl.lightcurve.search.templates import Templates
+
+Float = NDArray[np.float64]
+
+#: Columns of a flare's parameters: logarithm of the amplitude, time of the peak in s, logarithms of the half-width in s
+#: and of the temperature in K.
+AMPLITUDE, PEAK, WIDTH, KELVIN = range(4)
+#: Factor beyond the bank's half-widths up to which a half-width is measured.
+BEYOND_BANK = 1.25
+#: Half-widths before and after a peak between which flares are taken to overlap, and beyond which light is neglected.
+OVERLAP_BEFORE, OVERLAP_AFTER = 2.0, 10.0
+LIGHT_BEFORE, LIGHT_AFTER = 5.0, 80.0
+#: Ends of the logarithm of an amplitude.
+LOG_AMPLITUDES = (-27.0, 14.0)
+#: Relative change of chi-squared at which a fit ends, and evaluations after which it has not converged.
+CONVERGED, MOST_EVALUATIONS = 1e-7, 100
+#: Difference from 1 of the root of what chi-squared rises by, at which an end of an interval is found; most refits.
+CLOSE, MOST_REFITS = 0.02, 12
+#: Fall of chi-squared during profiling that shows a better fit than the one that was thought the best.
+BETTER = 0.05
+
+#: Logarithm of a further factor of a profiled product, over the logarithm of the temperature, with its derivative.
+Factor = Callable[[float], tuple[float, float]]
+
+
+@dataclass(frozen=True, eq=False)
+class Blended:
+    """A block's flares as fitted.
+
+    Attributes
+    ----------
+    theta : ndarray, shape (n_flare, 4)
+        Columns as `AMPLITUDE` and those after it.
+    chi2 : float
+    dof : int
+        Sums of frames, less terms of the level and parameters of flares.
+    converged : bool
+    """
+
+    theta: Float
+    chi2: float
+    dof: int
+    converged: bool
+
+    @property
+    def p_value(self) -> float:
+        """Probability of a chi-squared at least as large."""
+        return float(scipy.stats.chi2.sf(self.chi2, self.dof)) if self.dof > 0 else float("nan")
+
+
+@dataclass(frozen=True, eq=False)
+class Interval:
+    """A 68 % interval by profile likelihood.
+
+    Attributes
+    ----------
+    low, high : float
+    open_low, open_high : bool
+        Whether the interval runs into the end of what is fitted.
+    """
+
+    low: float
+    high: float
+    open_low: bool = False
+    open_high: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Sums:
+    """The sums of a stare in which flares are fitted.
+
+    Attributes
+    ----------
+    survey : Survey
+    templates : Templates
+    net : ndarray, shape (n_frame, n_sum)
+        Less what is known.
+    """
+
+    survey: Survey
+    templates: Templates
+    net: Float
+
+    @cached_property
+    def response(self) -> tuple[Any, Any, float, float]:
+        """Sums of a flare of one amplitude over log temperature, their derivative, and the ends."""
+        return Fit(self.survey.bank, self.templates).response
+
+    @cached_property
+    def edges(self) -> Float:
+        """Start and end of each frame, s, shape (n_frame, 2)."""
+        start = self.survey.stare.start_s
+        return np.column_stack([start, start + self.survey.stare.frame_s])
+
+    @cached_property
+    def covariance(self) -> Float:
+        """Of each frame's sums without a flare, shape (n_frame, n_sum, n_sum)."""
+        return self.survey.covariance()
+
+    @property
+    def free(self) -> list[int]:
+        """Columns of parameters that are fitted."""
+        return [AMPLITUDE, PEAK, WIDTH, *([KELVIN] if len(self.templates.temperatures_k) > 1 else [])]
+
+    @cached_property
+    def bounds(self) -> tuple[Float, Float]:
+        """Ends of a flare's parameters: the stare, the bank and the templates, shape (4,) each."""
+        widths, (_, _, coolest, hottest) = self.survey.bank.half_widths_s, self.response
+        first, last = self.edges[0, 0], self.edges[-1, 1]
+        narrow, wide = np.log(widths[0] / BEYOND_BANK), np.log(widths[-1] * BEYOND_BANK)
+        low, high = LOG_AMPLITUDES
+        return np.array([low, first, narrow, coolest]), np.array([high, last, wide, hottest])
+
+    def frames(self, first_s: float, last_s: float) -> slice:
+        """Frames that touch a span of time."""
+        ends = np.searchsorted(self.edges[:, 0], [first_s - self.survey.stare.frame_s, last_s])
+        return slice(int(ends[0]), int(ends[1]))
+
+    def mean(self, one: Float, frames: Any) -> Float:
+        """Mean of a flare's shape over frames, throughput included, shape (n_frame,)."""
+        shape = self.survey.bank.shape
+        return self.survey.stare.light[frames] * shape.mean_over(self.edges[frames], one[PEAK], np.exp(one[WIDTH]))
+
+    def light(self, theta: Float) -> Float:
+        """Sums of flares, shape (n_frame, n_sum)."""
+        total = np.zeros_like(self.net)
+        for one in theta:
+            width = np.exp(one[WIDTH])
+            frames = self.frames(one[PEAK] - LIGHT_BEFORE * width, one[PEAK] + LIGHT_AFTER * width)
+            mean = np.exp(one[AMPLITUDE]) * self.mean(one, frames)
+            total[frames] += mean[:, None] * self.response[0](np.array([one[KELVIN]]))[0]
+        return total
+
+    def noise(self, theta: Float, light: Float) -> Float:
+        """Covariance of each frame's sums with flares of some light, shape (n_frame, n_sum, n_sum)."""
+        total = self.covariance.copy()
+        for one in theta:
+            width = np.exp(one[WIDTH])
+            frames = self.frames(one[PEAK] - LIGHT_BEFORE * width, one[PEAK] + LIGHT_AFTER * width)
+            mean = np.exp(one[AMPLITUDE]) * self.mean(one, frames)
+            total[frames] += mean[:, None, None] * self.templates.noise_of(float(np.exp(one[KELVIN])))
+        jitter = self.survey.stare.light_jitter
+        if jitter and len(theta):
+            # All light jitters together: that of the star is in the covariance.
+            star = self.survey.directions["light"]
+            both = star + light
+            total += jitter**2 * (both[:, :, None] * both[:, None, :] - star[:, :, None] * star[:, None, :])
+        return total
+
+    def window(self, one: Float) -> tuple[float, float]:
+        """Start and end of a flare's window, s."""
+        lead, tail = self.survey.bank.window(float(np.exp(one[WIDTH])))
+        frame_s = self.survey.stare.frame_s
+        return one[PEAK] - (lead + 1) * frame_s, one[PEAK] + (tail + 1) * frame_s
+
+    def overlap(self, one: Float) -> tuple[float, float]:
+        """Start and end of a flare's light, as far as it makes others uncertain, s."""
+        width = np.exp(one[WIDTH])
+        return one[PEAK] - OVERLAP_BEFORE * width, one[PEAK] + OVERLAP_AFTER * width
+
+    def block(self, inside: Float, every: Float) -> Block:
+        """The block of some flares among all."""
+        light = self.light(every)
+        others = light - self.light(inside)
+        windows = [self.window(one) for one in inside]
+        used = np.zeros(len(self.net), np.bool_)
+        for first, last in windows:
+            used[self.frames(first, last)] = True
+        noise = self.noise(every, light)[used]
+        whiten = np.linalg.inv(np.linalg.cholesky(noise))
+        data = np.einsum("tij,tj->ti", whiten, (self.net - others)[used])
+        terms = self._level(used, max(last - first for first, last in windows))
+        columns = np.einsum("tij,tp->tijp", whiten, terms).reshape(data.size, -1)
+        basis = np.zeros((data.size, 0))
+        if columns.shape[1]:
+            left, size, _ = np.linalg.svd(columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300), False)
+            basis = left[:, size > 1e-9 * size[0]]
+        flat = data.ravel()
+        return Block(self, used, whiten, basis, flat - basis @ (basis.T @ flat))
+
+    def _level(self, used: NDArray[np.bool_], length_s: float) -> Float:
+        """Terms of the level in a block: powers of time in pieces of a length, and curves, shape (n_frame, n_term)."""
+        powers = self.survey.bank.level.powers
+        time = self.edges[used].mean(axis=1)
+        terms: list[Float] = []
+        if powers:
+            span = float(time[-1] - time[0]) or 1.0
+            pieces = max(1, round(span / length_s))
+            place = np.clip((time - time[0]) / span, 0.0, 1.0) * pieces
+            degree = max(powers)
+            inner = np.arange(pieces + 1, dtype=np.float64)
+            knots = np.concatenate([np.zeros(degree), inner, np.full(degree, float(pieces))])
+            design = scipy.interpolate.BSpline.design_matrix(place, knots, degree).toarray()
+            terms += list(design.T)
+        if self.survey.bank.level.cycle and self.survey.curves is not None:
+            terms += list(self.survey.curves[:, used])
+        return np.array(terms).reshape(len(terms), time.size).T
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Frames and noise of flares that are fitted together.
+
+    Attributes
+    ----------
+    sums : Sums
+    used : ndarray of bool, shape (n_frame,)
+        Frames of the stare.
+    whiten : ndarray, shape (n_used, n_sum, n_sum)
+    basis : ndarray, shape (n_used * n_sum, n_term)
+        Orthonormal columns of the whitened level.
+    data : ndarray, shape (n_used * n_sum,)
+        Whitened, less its projection on the level.
+    """
+
+    sums: Sums
+    used: NDArray[np.bool_]
+    whiten: Float
+    basis: Float
+    data: Float
+
+    def model(self, theta: Float) -> tuple[Float, Float]:
+        """Whitened light of flares less its projection on the level, (n_row,), and its derivatives, (n_row, n, 4)."""
+        edges, light = self.sums.edges[self.used], self.sums.survey.stare.light[self.used]
+        shape, (value, slope, _, _) = self.sums.survey.bank.shape, self.sums.response
+        derivatives = np.zeros((self.data.size, len(theta), 4))
+        for k, one in enumerate(theta):
+            width, amplitude = np.exp(one[WIDTH]), np.exp(one[AMPLITUDE])
+            tau = (edges - one[PEAK]) / width
+            mean = shape.integral(tau[:, 0], tau[:, 1]) / (tau[:, 1] - tau[:, 0])
+            ends = shape.at(tau) * (width / (edges[:, 1] - edges[:, 0]))[:, None]
+            later = (ends[:, 0] - ends[:, 1]) / width
+            wider = mean - (tau[:, 1] * ends[:, 1] - tau[:, 0] * ends[:, 0])
+            kelvin = np.array([one[KELVIN]])
+            along = self.whiten @ value(kelvin)[0]
+            time = amplitude * light * np.array([mean, later, wider])
+            rows = time[:, :, None] * along
+            hotter = time[0][:, None] * (self.whiten @ slope(kelvin)[0])
+            derivatives[:, k] = np.stack([*rows, hotter]).reshape(4, -1).T
+        flat = derivatives.reshape(self.data.size, -1)
+        flat = flat - self.basis @ (self.basis.T @ flat)
+        derivatives = flat.reshape(derivatives.shape)
+        return derivatives[:, :, AMPLITUDE].sum(axis=1), derivatives
+
+    def chi2(self, theta: Float) -> float:
+        """Of the whitened residuals."""
+        left = self.data - self.model(theta)[0]
+        return float(left @ left)
+
+    def fit(self, theta: Float, fixed: tuple[int, int, float, Factor | None] | None = None) -> Blended:
+        """The best flares from some start.
+
+        Parameters
+        ----------
+        theta : ndarray, shape (n_flare, 4)
+        fixed : (int, int, float, callable or None), optional
+            Flare, column, value, factor: the column keeps the value; with a factor, the logarithm of the amplitude
+            plus that of the half-width plus the factor does.
+        """
+        low, high = (np.tile(end, (len(theta), 1)) for end in self.sums.bounds)
+        moved = np.zeros(theta.shape, np.bool_)
+        moved[:, self.sums.free] = True
+        if fixed is not None:
+            moved[fixed[0], fixed[1] if fixed[3] is None else AMPLITUDE] = False
+        margin = 1e-9 * (high - low)
+        start = np.clip(theta, low + margin, high - margin)
+
+        def whole(x: Float) -> Float:
+            every = start.copy()
+            every[moved] = x
+            if fixed is not None:
+                j, column, value, factor = fixed
+                if factor is None:
+                    every[j, column] = value
+                else:
+                    every[j, AMPLITUDE] = value - every[j, WIDTH] - factor(every[j, KELVIN])[0]
+            return every
+
+        def residual(x: Float) -> Float:
+            return np.asarray(self.data - self.model(whole(x))[0])
+
+        def jacobian(x: Float) -> Float:
+            every = whole(x)
+            derivatives = self.model(every)[1]
+            if fixed is not None and fixed[3] is not None:
+                j = fixed[0]
+                tied = derivatives[:, j, AMPLITUDE].copy()
+                derivatives[:, j, WIDTH] -= tied
+                derivatives[:, j, KELVIN] -= fixed[3](every[j, KELVIN])[1] * tied
+            return -derivatives[:, moved]
+
+        scale = np.ones(theta.shape)
+        scale[:, PEAK] = np.exp(start[:, WIDTH])
+        dof = self.data.size - self.basis.shape[1] - theta.shape[0] * len(self.sums.free)
+        if not moved.any():
+            return Blended(whole(start[moved]), self.chi2(whole(start[moved])), dof, True)
+        found = scipy.optimize.least_squares(
+            residual, start[moved], jacobian, bounds=(low[moved], high[moved]), x_scale=scale[moved],
+            ftol=CONVERGED, xtol=1e-9, gtol=None, max_nfev=MOST_EVALUATIONS,
+        )  # fmt: skip
+        return Blended(whole(found.x), 2 * float(found.cost), dof, bool(found.status > 0))
+
+    def covariance(self, theta: Float) -> Float:
+        """Of all parameters, by the inverse of the information, shape (n, 4, n, 4)."""
+        jacobian = self.model(theta)[1]
+        n, free = len(theta), self.sums.free
+        rows = jacobian[:, :, free].reshape(len(jacobian), -1)
+        scale = np.maximum(np.linalg.norm(rows, axis=0), 1e-300)
+        inverse = np.linalg.pinv((rows / scale).T @ (rows / scale), hermitian=True) / np.outer(scale, scale)
+        covariance = np.zeros((n, 4, n, 4))
+        covariance[np.ix_(range(n), free, range(n), free)] = inverse.reshape(n, len(free), n, len(free))
+        return covariance
+
+    def interval(
+        self, best: Blended, j: int, column: int, factor: Factor | None = None
+    ) -> tuple[Interval, Blended | None]:
+        """A parameter's interval, or that of a product; a better fit where profiling comes across one.
+
+        Parameters
+        ----------
+        best : Blended
+        j, column : int
+            Flare and column.
+        factor : callable, optional
+            In place of the column: amplitude times half-width times this.
+        """
+        covariance, theta = self.covariance(best.theta), best.theta
+        weights = np.zeros(theta.shape)
+        if factor is None:
+            weights[j, column], middle = 1.0, theta[j, column]
+            ends = self.sums.bounds[0][column], self.sums.bounds[1][column]
+        else:
+            value, slope = factor(theta[j, KELVIN])
+            weights[j, [AMPLITUDE, WIDTH, KELVIN]] = 1.0, 1.0, slope
+            middle, ends = theta[j, AMPLITUDE] + theta[j, WIDTH] + value, (-np.inf, np.inf)
+        along = np.einsum("iajb,jb->ia", covariance, weights)
+        variance = float(np.sum(weights * along))
+        sd = np.sqrt(variance) if variance > 0 else 1e-3
+        found: list[tuple[float, bool]] = []
+        for sign, end in zip((-1.0, 1.0), ends, strict=True):
+            inner, outer, root_inner, root_outer = 0.0, np.inf, 0.0, np.inf
+            step, start, at_end = sd, theta, False
+            for _ in range(MOST_REFITS):
+                at_end = sign * (middle + sign * step - end) >= 0
+                step = abs(end - middle) if at_end else step
+                guess = start if start is not theta or variance <= 0 else theta + along * sign * step / variance
+                one = self.fit(guess, (j, column, float(middle + sign * step), factor))
+                rise = one.chi2 - best.chi2
+                if rise < -BETTER:
+                    return Interval(np.nan, np.nan), self.fit(one.theta)
+                root = np.sqrt(max(rise, 0.0))
+                if abs(root - 1.0) < CLOSE or (at_end and root < 1.0):
+                    break
+                start = one.theta
+                if root < 1.0:
+                    inner, root_inner = step, root
+                else:
+                    outer, root_outer = step, root
+                if np.isinf(outer):
+                    step = step * min(1.0 / max(root, 0.25), 4.0) * 1.02
+                else:
+                    # Nearly straight between the two: regula falsi, away from the ends.
+                    share = (1.0 - root_inner) / (root_outer - root_inner)
+                    step = inner + (outer - inner) * float(np.clip(share, 0.08, 0.92))
+            else:
+                at_end = True
+            found.append((float(middle + sign * step), bool(at_end and root < 1.0 - CLOSE)))
+        (low, open_low), (high, open_high) = found
+        return Interval(low, high, open_low, open_high), None
+
+    def without(self, blended: Blended, j: int) -> Blended:
+        """The best fit of all flares but one."""
+        rest = np.delete(blended.theta, j, axis=0)
+        if not len(rest):
+            left = float(self.data @ self.data)
+            return replace(blended, theta=rest, chi2=left, dof=self.data.size - self.basis.shape[1])
+        return self.fit(rest)
