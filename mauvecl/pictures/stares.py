@@ -42,7 +42,7 @@ def light_curves(plt: Any, one: StarStare) -> Any:
         for flare in one.flares:
             axis.axvline(flare.event.peak_s / scale, color=NULL, linewidth=0.5, linestyle=":")
         if isinstance(one.searched, Searched):
-            peaks = [float(alarm.recovered.peak_s[0]) / scale for alarm in one.searched.alarms]
+            peaks = [float(alarm.recovered.peak_s[0]) / scale for alarm in one.searched.alarms if alarm.measured]
             top = [1.0] * len(peaks)
             axis.plot(peaks, top, "v", color=COLOURS[4], markersize=4, transform=axis.get_xaxis_transform())
         axis.set_title(light.bands[k])

@@ -8,6 +8,7 @@ from functools import partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 
 from mauvecl.answers.answer import Answer, InCell
 from mauvecl.host.arguments import public
@@ -30,10 +31,13 @@ if TYPE_CHECKING:
     from mauvecl.device.stares import Stares
     from mauvecl.host.expectation import Expectation
     from mauvecl.host.stars.source import Source
+    from mauvecl.lightcurve.search.blends import Factor
+    from mauvecl.lightcurve.search.recovery import Recovered
     from mauvecl.results.sums import Arrays
     from mauvecl.runs.checkpoint import Checkpoint
     from mauvecl.study.assumed import Use
     from mauvecl.study.sections import Star
+    from mauvecl.study.surveys import Surveyed
 
 KINDS: tuple[Kind, ...] = ("band", "bolometric")
 #: Light curves in text, at most; longer ones are in their FITS files alone.
@@ -161,11 +165,15 @@ class StareAnswer(Answer):
 
     @property
     def found(self) -> QTable:
-        """One row per flare that the search found: what it was by a fit, with standard errors, and which was put in."""
+        """One row per flare that the search found: what it was by a fit, with 68 % intervals, and which was put in.
+
+        Values are NaN where the fit does not measure the flare: `note` says why.
+        """
 
         def rows(one: StarStare) -> QTable:
             searched = one.searched if isinstance(one.searched, Searched) else Searched(np.nan, [], (), ())
-            fits = [alarm.recovered for alarm in searched.alarms]
+            raised = searched.alarms
+            fits = [alarm.recovered for alarm in raised]
             fitted = (
                 ("peak_time", "peak{}_s", "from the start of the stare", "s"),
                 ("amplitude", "amplitude{}", "in the flare's band", ""),
@@ -173,18 +181,36 @@ class StareAnswer(Answer):
                 ("temperature", "temperature{}_k", "blackbody temperature", "K"),
                 ("equivalent_duration", "equivalent_duration{}_s", "in the flare's band", "s"),
             )
-            best = "of the search's statistic: S/N of the template that fits best"
+            best = "the search's statistic when it was found: S/N of the template that fits best"
             nearest = "row of the star's flares that it is nearest to, from 1 on; 0: none near"
             columns: list[tuple[object, ...]] = []
+
+            def interval(name: str, key: str, unit: str) -> list[tuple[object, ...]]:
+                ends = np.array([alarm.intervals[key] for alarm in raised], np.float64).reshape(len(raised), 2)
+                return [
+                    (f"{name}_{end}", ends[:, k], f"{end}er end of its 68 % interval", unit)
+                    for k, end in enumerate(("low", "high"))
+                ]
+
             for name, key, text, unit in fitted:
-                for end, more in (("", ""), ("_error", "; standard error")):
+                for end, more in (("", ""), ("_error", "; standard error by curvature")):
                     values = [float(getattr(fit, key.format(end))[0]) for fit in fits]
                     columns.append((name + end, np.array(values, np.float64), text + more, unit))
+                columns += interval(name, key.format(""), unit)
             columns += [
                 ("energy_bolometric", np.array(searched.bolometric_erg, np.float64), "", "erg"),
-                ("value", np.array([alarm.rho for alarm in searched.alarms], np.float64), best),
+                *interval("energy_bolometric", "energy", "erg"),
+                ("value", np.array([alarm.rho for alarm in raised], np.float64), best),
                 ("event", np.array(searched.events, np.int64), nearest),
-            ]
+                ("window", np.array([alarm.block for alarm in raised], np.int64),
+                 "number of the window that it was fitted in; flares of one number were fitted together"),
+                ("chi2", np.array([alarm.chi2 for alarm in raised], np.float64), "of this fit"),
+                ("dof", np.array([alarm.dof for alarm in raised], np.int64), "degrees of freedom of this fit"),
+                ("p_value", np.array([alarm.p_value for alarm in raised], np.float64),
+                 "probability of a chi-squared at least as large where the model is right"),
+                ("note", np.array([alarm.note for alarm in raised], dtype="U160"),
+                 "what is special: a flare that is not measured, an interval that ends where the fit does"),
+            ]  # fmt: skip
             return make_table(columns)
 
         return self._together(rows)
@@ -350,20 +376,43 @@ def _searched(
         threshold = float(tail["threshold"])
     except InputError as error:
         return f"{label(star, staring.quiet)} is not searched: {error}."
-    raised = alarms(survey, known.templates, draw(survey.components), threshold)
+    scale = _log_energy(study, star, known)
+    raised = alarms(survey, known.templates, draw(survey.components), threshold, scale)
     energies, nearest = [], []
     for alarm in raised:
         fit = alarm.recovered
-        kelvin = float(np.nan_to_num(fit.temperature_k[0], nan=study.flare.temperature_k))
-        event = Event(
-            float(fit.peak_s[0]), float(fit.half_width_s[0]), float(fit.amplitude[0]), kelvin, study.search.shape
-        )
+        if not alarm.measured:
+            energies.append(float("nan"))
+            nearest.append(0)
+            continue
+        event = _event_of(study, fit)
         energies.append(_found_energy(study, star, known.source, event))
         away = [abs(one.peak_s - event.peak_s) for one in events]
         near = int(np.argmin(away)) if away else -1
         close = near >= 0 and away[near] <= events[near].half_width_s + 2 * staring.stare.frame_s
         nearest.append(near + 1 if close else 0)
     return Searched(threshold, raised, tuple(energies), tuple(nearest), bool(tail["shifted"]))
+
+
+def _event_of(study: Study, fit: Recovered) -> Event:
+    """Return a fitted flare as an event."""
+    kelvin = float(np.nan_to_num(fit.temperature_k[0], nan=study.flare.temperature_k))
+    return Event(float(fit.peak_s[0]), float(fit.half_width_s[0]), float(fit.amplitude[0]), kelvin, study.search.shape)
+
+
+def _log_energy(study: Study, star: Star, known: Surveyed) -> Factor | None:
+    """Return the logarithm of the energy of a second of equivalent duration over that of the temperature, or None.
+
+    None where the star's size is unknown, or a template's temperature gives no energy.
+    """
+    kelvin = known.templates.temperatures_k
+    one = Event(0.0, 1.0, 1.0, kelvin[0], study.search.shape)
+    events = [replace(one, temperature=k) for k in kelvin]
+    energies = np.array([_found_energy(study, star, known.source, event) for event in events])
+    if len(kelvin) < 2 or not (np.isfinite(energies) & (energies > 0)).all():
+        return None
+    spline = CubicSpline(np.log(kelvin), np.log(energies / one.equivalent_duration_s))
+    return lambda x: (float(spline(x)), float(spline(x, 1)))
 
 
 def _found_energy(study: Study, star: Star, source: Source, event: Event) -> float:

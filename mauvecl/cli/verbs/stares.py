@@ -75,6 +75,7 @@ def _show(answer: StareAnswer) -> None:
                 f"Found at {one.title} above {one.searched.threshold:.2f}, {_rate(answer)}",
                 ("peak at (s)", "amplitude", "half-width (s)", "temperature (K)", "bolometric (erg)", "value", "flare"),
                 [
+                    ("not measured", "", "", "", "", f"{a.rho:.2f}", "none") if not a.measured else
                     (f"{a.recovered.peak_s[0]:.6g}",
                      f"{_with_error(100 * a.recovered.amplitude[0], 100 * a.recovered.amplitude_error[0])} %",
                      _with_error(a.recovered.half_width_s[0], a.recovered.half_width_error_s[0]),

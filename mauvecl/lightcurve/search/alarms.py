@@ -9,13 +9,14 @@ nothing alarms.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.lightcurve.search.bank import LEAD, TAIL
 from mauvecl.lightcurve.search.blends import AMPLITUDE, KELVIN, PEAK, WIDTH, Blended, Block, Factor, Interval, Sums
 from mauvecl.lightcurve.search.recovery import Recovered
 
@@ -26,16 +27,24 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Share of the fitted light, as a template sees it, that a fit of a wrong shape may leave behind, and that is no alarm.
+#: A fit that measures nothing.
+NOTHING = Recovered(**{each.name: np.full(1, np.nan) for each in fields(Recovered)})
+#: Share of a flare's S/N that its fit may leave behind anywhere within its reach, and that is no alarm of its own:
+#: shapes and temperatures that the fit does not have.
 LEFT_BEHIND = 0.05
+#: The same for what a template sees of the fitted light itself, where a flare may be two.
+LEFT_UNSEEN = 0.15
 #: Flares that are fitted at once, at most: more that overlap are fitted in parts, in turns.
 TOGETHER = 6
 #: Turns of fitting parts and their neighbours after each pass.
 TURNS = 2
+#: Half-widths from the peak of a flare at an end of what is fitted, and factors between half-widths, within which
+#: further alarms are taken for the rest of this flare.
+NEAR, WIDER = 5.0, 8.0
 #: Starts of a further flare that are tried in each block.
-SPLITS = 4
+SPLITS = 3
 #: Parameters this close to an end of what is fitted, as a share of its range, are at it.
-AT_END = 1e-6
+AT_END = 1e-3
 #: S/N of a fit up to which intervals are by profile likelihood; above it they are by curvature, which agrees there.
 PROFILED_SNR = 40.0
 #: Quantities with intervals, by their names in `Recovered`.
@@ -49,11 +58,12 @@ class Alarm:
     Attributes
     ----------
     rho : float
-        The search's statistic; in a blend, the root of what chi-squared rises by without this flare.
+        The search's statistic when it was found; for one of two that a first fit took for one, the root of what
+        chi-squared fell by.
     recovered : Recovered
         What it was, by a fit; arrays of one value, NaN where the fit does not measure it.
     intervals : dict
-        68 % interval of each of `QUANTITIES`, and of "energy" where the alarms were raised with a factor for it.
+        68 % interval of each of `QUANTITIES`, and of "energy"; NaN where there is no factor for it.
     note : str
         What is wrong or special with the fit; empty in most cases.
     block : int
@@ -74,6 +84,11 @@ class Alarm:
     chi2: float
     dof: int
     p_value: float
+
+    @property
+    def measured(self) -> bool:
+        """Whether the fit gives values."""
+        return bool(np.isfinite(self.recovered.peak_s[0]))
 
 
 @dataclass(eq=False)
@@ -148,16 +163,28 @@ class _Hunt:
             reach = max(reach, last)
         return [block[k : k + TOGETHER] for block in blocks for k in range(0, len(block), TOGETHER)]
 
-    def _values(self) -> Iterator[tuple[Float, Float, Float, NDArray[np.int64], Row]]:
+    def _near(self, peaks: Float, width_s: float) -> Float:
+        """Sum of the values of flares within the reach of templates, shape of the templates' peaks."""
+        total = np.zeros(peaks.shape)
+        for one in self.found:
+            reach = TAIL * np.exp(one.theta[WIDTH]) + LEAD * width_s
+            total += np.where(np.abs(peaks - one.theta[PEAK]) < reach, one.rho, 0.0)
+        return total
+
+    def _values(self, near_share: float = 0.0) -> Iterator[tuple[Float, Float, Float, NDArray[np.int64], Row]]:
         """Values in the residuals, those above what fits leave behind, peaks, temperatures: the best of each onset."""
         light = self.sums.light(self.thetas)
-        both = np.stack([self._evened(self.sums.net - light, light), light])
+        # Of what no flare of the bank fits, all may be left.
+        wrong = self.sums.light(self.thetas[self._at_end(self.thetas)])
+        both = np.stack([self._evened(self.sums.net - light, light), LEFT_UNSEEN * light + wrong])
         for row, rho in self._whole.values(both.astype(np.float32)):
-            excess = rho[0] - LEFT_BEHIND * np.abs(np.where(np.isfinite(rho[1]), rho[1], 0.0))
+            peaks = self._whole.stare.numbers[0] + row.peaks + row.template.phases[row.phase]
+            peaks = peaks * self.sums.survey.bank.frame_s
+            rests = np.abs(np.where(np.isfinite(rho[1]), rho[1], 0.0))
+            excess = rho[0] - np.maximum(rests, near_share * self._near(peaks, row.template.half_width_s))
             which = excess.argmax(axis=0)
             onsets = np.arange(excess.shape[1])
-            peaks = self._whole.stare.numbers[0] + row.peaks + row.template.phases[row.phase]
-            yield rho[0, which, onsets], excess[which, onsets], peaks * self.sums.survey.bank.frame_s, which, row
+            yield rho[0, which, onsets], excess[which, onsets], peaks, which, row
 
     def _candidate(self, rho: float, peak: float, row: Row, onset: int, direction: int) -> Found:
         """A flare as its template has it."""
@@ -172,7 +199,7 @@ class _Hunt:
         """What alarms in the residuals: at most one flare within the reach of another."""
         sums, bank = self.sums, self.sums.survey.bank
         candidates = []
-        for rho, excess, peaks, which, row in self._values():
+        for rho, excess, peaks, which, row in self._values(LEFT_BEHIND):
             for k in np.flatnonzero(excess >= self.threshold):
                 one = self._candidate(float(rho[k]), float(peaks[k]), row, int(k), int(which[k]))
                 candidates.append((float(excess[k]), one))
@@ -226,7 +253,8 @@ class _Hunt:
         # The light of the others, as this flare sees it, may be of another shape.
         mine, others = rows.model(best.theta[-1:])[0], rows.model(best.theta[:-1])[0]
         seen = abs(float(mine @ others)) / max(float(np.linalg.norm(mine)), 1e-300)
-        if fall < (self.threshold + LEFT_BEHIND * seen) ** 2:
+        rests = max(LEFT_UNSEEN * seen, LEFT_BEHIND * max(each.rho for each in block))
+        if fall < (self.threshold + rests) ** 2:
             for each, theta in zip(block, alone.theta, strict=True):
                 each.theta = theta
             return False
@@ -241,6 +269,12 @@ class _Hunt:
     @staticmethod
     def _key(block: list[Found]) -> tuple[float, ...]:
         return tuple(np.round([one.theta for one in block], 2).ravel().tolist())
+
+    def _at_end(self, theta: Float) -> NDArray[np.bool_]:
+        """Which flares peak at an end of the stare or are at an end of the bank, shape (n_flare,)."""
+        low, high = self.sums.bounds
+        at_end: NDArray[np.bool_] = np.minimum(theta - low, high - theta) <= AT_END * (high - low)
+        return np.asarray(at_end[:, [PEAK, WIDTH]].any(axis=1))
 
     def _was_refused(self, peak: float, width: float) -> bool:
         return any(abs(peak - other) <= max(width, wide) and 1 / 3 < width / wide < 3 for other, wide in self.refused)
@@ -336,13 +370,12 @@ def _told(hunt: _Hunt, energy: Factor | None) -> list[Alarm]:
             best, measured = better, []
             for j in range(len(block)):
                 gain = rows.without(best, j).chi2 - best.chi2
-                one, better = _measured(rows, best, j, gain, energy)
+                values, better = _measured(rows, best, j, gain, energy)
                 if better is not None:
                     break
-                measured.append((one, gain))
-        for one, (values, gain) in zip(block, measured, strict=True):
-            rho = one.rho if len(block) == 1 else float(np.sqrt(max(gain, 0.0)))
-            told.append(Alarm(rho, *values, number, len(block), best.chi2, best.dof, best.p_value))
+                measured.append(values)
+        for one, values in zip(block, measured, strict=True):
+            told.append(Alarm(one.rho, *values, number, len(block), best.chi2, best.dof, best.p_value))
     return told
 
 
@@ -362,9 +395,8 @@ def _measured(
     elif not best.converged:
         missing = "its fit did not converge"
     if missing:
-        none = np.full(1, np.nan)
         nowhere = dict.fromkeys((*QUANTITIES, "energy"), (np.nan, np.nan))
-        return (Recovered(*[none] * 10, np.array([snr])), nowhere, f"detected but not measured: {missing}"), None
+        return (replace(NOTHING, snr=np.array([snr])), nowhere, f"detected but not measured: {missing}"), None
     area = sums.survey.bank.shape.equivalent_duration
     several = KELVIN in sums.free
     covariance = best_covariance(rows, best, j)
@@ -378,7 +410,7 @@ def _measured(
     }  # fmt: skip
     if energy is not None:
         factors["energy"] = (AMPLITUDE, energy, np.log(area))
-    intervals, notes = {}, []
+    intervals, notes = {"energy": (np.nan, np.nan)}, []
     for name, (column, factor, offset) in factors.items():
         if column == KELVIN and not several:
             intervals[name] = (np.nan, np.nan)
@@ -388,7 +420,7 @@ def _measured(
         else:
             found, better = rows.interval(best, j, column, factor)
             if better is not None:
-                return (Recovered(*[np.full(1, np.nan)] * 11), {}, ""), better
+                return (NOTHING, {}, ""), better
         ends = np.array([found.low, found.high])
         low_end, high_end = ends if column == PEAK else np.exp(ends + offset)
         intervals[name] = (float(low_end), float(high_end))

@@ -8,7 +8,7 @@ the photons of the flares themselves.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -142,33 +142,39 @@ class Sums:
     def mean(self, one: Float, frames: Any) -> Float:
         """Mean of a flare's shape over frames, throughput included, shape (n_frame,)."""
         shape = self.survey.bank.shape
-        return self.survey.stare.light[frames] * shape.mean_over(self.edges[frames], one[PEAK], np.exp(one[WIDTH]))
+        mean = shape.mean_over(self.edges[frames], one[PEAK], np.exp(one[WIDTH]))
+        return np.asarray(self.survey.stare.light[frames] * mean)
 
-    def light(self, theta: Float) -> Float:
-        """Sums of flares, shape (n_frame, n_sum)."""
-        total = np.zeros_like(self.net)
-        for one in theta:
-            width = np.exp(one[WIDTH])
-            frames = self.frames(one[PEAK] - LIGHT_BEFORE * width, one[PEAK] + LIGHT_AFTER * width)
-            mean = np.exp(one[AMPLITUDE]) * self.mean(one, frames)
-            total[frames] += mean[:, None] * self.response[0](np.array([one[KELVIN]]))[0]
+    def light(self, theta: Float, frames: slice = slice(None)) -> Float:
+        """Sums of flares over some frames, shape (n_frame, n_sum)."""
+        total = np.zeros_like(self.net)[frames]
+        for one, inside, mean in self._shining(theta, frames):
+            total[inside] += mean[:, None] * self.response[0](np.array([one[KELVIN]]))[0]
         return total
 
-    def noise(self, theta: Float, light: Float) -> Float:
-        """Covariance of each frame's sums with flares of some light, shape (n_frame, n_sum, n_sum)."""
-        total = self.covariance.copy()
-        for one in theta:
-            width = np.exp(one[WIDTH])
-            frames = self.frames(one[PEAK] - LIGHT_BEFORE * width, one[PEAK] + LIGHT_AFTER * width)
-            mean = np.exp(one[AMPLITUDE]) * self.mean(one, frames)
-            total[frames] += mean[:, None, None] * self.templates.noise_of(float(np.exp(one[KELVIN])))
+    def noise(self, theta: Float, light: Float, frames: slice = slice(None)) -> Float:
+        """Covariance of frames' sums with flares of some light, shape (n_frame, n_sum, n_sum)."""
+        total = self.covariance[frames].copy()
+        for one, inside, mean in self._shining(theta, frames):
+            total[inside] += mean[:, None, None] * self.templates.noise_of(float(np.exp(one[KELVIN])))
         jitter = self.survey.stare.light_jitter
         if jitter and len(theta):
             # All light jitters together: that of the star is in the covariance.
-            star = self.survey.directions["light"]
+            star = self.survey.directions["light"][frames]
             both = star + light
             total += jitter**2 * (both[:, :, None] * both[:, None, :] - star[:, :, None] * star[:, None, :])
         return total
+
+    def _shining(self, theta: Float, frames: slice) -> Iterator[tuple[Float, slice, Float]]:
+        """Flares that shed light on some frames, where among these, and their mean amplitude there."""
+        first, last, _ = frames.indices(len(self.net))
+        for one in theta:
+            width = np.exp(one[WIDTH])
+            reach = self.frames(one[PEAK] - LIGHT_BEFORE * width, one[PEAK] + LIGHT_AFTER * width)
+            there = slice(max(reach.start, first), min(reach.stop, last))
+            if there.start < there.stop:
+                mean = np.exp(one[AMPLITUDE]) * self.mean(one, there)
+                yield one, slice(there.start - first, there.stop - first), mean
 
     def window(self, one: Float) -> tuple[float, float]:
         """Start and end of a flare's window, s."""
@@ -183,15 +189,17 @@ class Sums:
 
     def block(self, inside: Float, every: Float) -> Block:
         """The block of some flares among all."""
-        light = self.light(every)
-        others = light - self.light(inside)
         windows = [self.window(one) for one in inside]
         used = np.zeros(len(self.net), np.bool_)
         for first, last in windows:
             used[self.frames(first, last)] = True
-        noise = self.noise(every, light)[used]
+        there = np.flatnonzero(used)
+        span = slice(int(there[0]), int(there[-1]) + 1)
+        light = self.light(every, span)
+        others = light - self.light(inside, span)
+        noise = self.noise(every, light, span)[used[span]]
         whiten = np.linalg.inv(np.linalg.cholesky(noise))
-        data = np.einsum("tij,tj->ti", whiten, (self.net - others)[used])
+        data = np.einsum("tij,tj->ti", whiten, (self.net[span] - others)[used[span]])
         terms = self._level(used, max(last - first for first, last in windows))
         columns = np.einsum("tij,tp->tijp", whiten, terms).reshape(data.size, -1)
         basis = np.zeros((data.size, 0))
@@ -299,12 +307,21 @@ class Block:
                     every[j, AMPLITUDE] = value - every[j, WIDTH] - factor(every[j, KELVIN])[0]
             return every
 
+        held: dict[bytes, tuple[Float, Float]] = {}
+
+        def modelled(x: Float) -> tuple[Float, Float]:
+            # Residuals and derivatives are asked for at the same place, one after the other.
+            if x.tobytes() not in held:
+                held.clear()
+                held[x.tobytes()] = self.model(whole(x))
+            return held[x.tobytes()]
+
         def residual(x: Float) -> Float:
-            return np.asarray(self.data - self.model(whole(x))[0])
+            return np.asarray(self.data - modelled(x)[0])
 
         def jacobian(x: Float) -> Float:
             every = whole(x)
-            derivatives = self.model(every)[1]
+            derivatives = modelled(x)[1].copy()
             if fixed is not None and fixed[3] is not None:
                 j = fixed[0]
                 tied = derivatives[:, j, AMPLITUDE].copy()

@@ -130,7 +130,7 @@ class Templates:
 
     def noise_of(self, kelvin: float) -> Float:
         """Return what the photons of a flare add to the covariance, by the nearest temperature, (n_sum, n_sum)."""
-        return self.noise[int(np.argmin(np.abs(np.log(np.array(self.temperatures_k) / kelvin))))]
+        return np.asarray(self.noise[int(np.argmin(np.abs(np.log(np.array(self.temperatures_k) / kelvin))))])
 
     def of_flares(self, flares_dn: Float) -> Float:
         """Mean sums for flares of other temperatures, shape (n, n_sum), from their spectra, DN, (n, n_pixel)."""
