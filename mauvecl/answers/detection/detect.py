@@ -212,6 +212,7 @@ def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
     answer = DetectAnswer(study, stars)
     blinding = [f"{text[:-1]} ({star.title})." for star in stars for text in star.detection.messages]
     blinding += [f"{t[:-1]} ({star.title})." for star in stars for t in star.detection.without_threshold(run.fap)]
+    blinding += [f"{t[:-1]} ({star.title})." for star in stars for t in star.detection.lowered]
     messages = [*blinding, *told([x for *_, group in prepared for x in group], study.processes.processes())]
     errors = answer.table["fap_error"][np.isfinite(answer.table["fap_error"])]
     if not countable(run.fap, run.realisations) and errors.size:

@@ -15,10 +15,13 @@ from mauvecl.host.expectation import Expectation
 from mauvecl.noise.drawn import Drawn
 from mauvecl.noise.scene import Scene
 from mauvecl.statistics.distributions import Form
-from mauvecl.statistics.linear import Linear
+from mauvecl.statistics.linear import Linear, Matched
 from mauvecl.statistics.nuisances import Nuisances
 from mauvecl.statistics.registry import statistics_by_name
 from mauvecl.statistics.statistic import LinearStatistic, Setting, Statistic
+
+#: Standard deviations by which a flare lowers a weighted sum before it is reported; less is rounding.
+LEAST_SHIFT = 1e-3
 
 
 @public
@@ -112,6 +115,26 @@ class Hypotheses:
             "longer depends on the flare, and no number is given."
             for k in self.blinding
         )
+
+    @cached_property
+    def lowered(self) -> tuple[str, ...]:
+        """Sentences on weighted sums that a flare lowers, so that it is never detected however bright it is."""
+        sentences = []
+        for name in self.statistics:
+            if not isinstance(self.statistic(name), LinearStatistic):
+                continue
+            for k, flare in enumerate(self.flares):
+                null = self.closed_form(name, template=k)
+                shift = (self.closed_form(name, k).mean - null.mean) / null.std
+                if k not in self.blinding and shift < -LEAST_SHIFT:
+                    matched = Matched().closed_form(self.setting, flare, flare)
+                    told = "marginalised over unknowns, " if self.nuisances else ""
+                    sentences.append(
+                        f"WRONG SIGN: {told}{name} falls by {-shift:.3g} standard deviations with flare {k + 1} of "
+                        f"{self.quiet.name}, and only higher values are alarms: its detection probability says nothing "
+                        f"of the flare, which matched has at {matched.mean / matched.std:.3g}."
+                    )
+        return tuple(sentences)
 
     def closed_form(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Form:
         """Return a statistic's distribution for Gaussian noise; parameters as for `Detection.distribution`."""

@@ -1,0 +1,60 @@
+"""Weighted sums that a flare lowers are named: their detection probability of 0 says nothing of the flare."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pytest
+from answers import small
+
+from mauvecl.answers.detection.detect import detect
+from mauvecl.device.engine import Engine
+
+NUISANCES: dict[str, dict[str, Any]] = {
+    "known": {},
+    "light": {"nuisances": {"light": "free"}},
+    "both": {"nuisances": {"light": "free", "dark": "free"}},
+}
+
+
+@pytest.mark.parametrize("unknown", NUISANCES)
+@pytest.mark.parametrize("temperature_k", [3000.0, 4000.0, 6000.0, 10_000.0, 20_000.0])
+def test_a_lowered_sum_is_named_where_the_simulation_finds_it_lower(
+    engine: Engine, unknown: str, temperature_k: float
+) -> None:
+    """By the simulated means, where they differ by more than five standard errors: by chance once in 1e6."""
+    study = small(
+        star=[{"library": "G2V", "magnitude": 7.4}],
+        flare={"amplitudes": [0.3], "temperature_k": temperature_k},
+        observation={"exposure_s": 50.0},
+        run={"realisations": 10_000, "seed": 3, "fap": 0.01, "statistics": ["uv_excess", "matched", "chi2"]},
+        **NUISANCES[unknown],
+    )
+    answer = detect(study, engine)
+    (one,) = answer.stars
+    named = {text.split(" falls by ")[0].split()[-1] for text in answer.messages if text.startswith("WRONG SIGN")}
+    for statistic in ("uv_excess", "matched"):
+        null, flare = (one.detection.distribution(statistic, k) for k in (None, 0))
+        gap, error = flare.mean - null.mean, np.hypot(flare.std, null.std) / 100
+        if abs(gap) > 5 * error:
+            assert (statistic in named) == (gap < 0), (statistic, gap)
+    assert named <= {"uv_excess"}
+
+
+def test_some_are_lowered_and_some_are_not(engine: Engine) -> None:
+    """The test above meets both, and a lowered one has no detections where matched has all."""
+    found = {}
+    for temperature_k in (4000.0, 10_000.0):
+        study = small(
+            star=[{"library": "G2V", "magnitude": 7.4}],
+            flare={"amplitudes": [0.3], "temperature_k": temperature_k},
+            observation={"exposure_s": 50.0},
+            run={"realisations": 10_000, "seed": 3, "fap": 0.01, "statistics": ["uv_excess", "matched"]},
+            **NUISANCES["both"],
+        )
+        answer = detect(study, engine)
+        found[temperature_k] = any(text.startswith("WRONG SIGN") for text in answer.messages)
+        if found[temperature_k]:
+            assert answer.table["probability"][0] < 0.01 < 0.9 < answer.table["probability"][1]
+    assert found == {4000.0: True, 10_000.0: False}
