@@ -15,6 +15,7 @@ from mauvecl.answers.campaigns.planned import Looked
 from mauvecl.answers.campaigns.planned_injections import question_of
 from mauvecl.answers.report import write_study, write_table
 from mauvecl.host.errors import InputError
+from mauvecl.lightcurve.flares.energies import EnergyScale, quiescent_luminosity
 from mauvecl.lightcurve.flares.rates import davenport2019
 from mauvecl.lightcurve.search.completeness import Completeness
 from mauvecl.lightcurve.stares.along import stare_along
@@ -72,7 +73,11 @@ def test_a_closed_form_says_that_it_takes_the_stare_for_known(study: Study, answ
 
 
 def test_the_rates_are_those_asked_for(answer: PlanAnswer) -> None:
-    law = davenport2019(mass_msun=0.82, age_myr=500).in_band("bolometric", 10_000.0)
+    star = next(one.looked.star for one in answer.planned if one.name == "eps Eri")
+    source, distance = star.source(), star.distance_pc
+    assert distance is not None
+    scale = EnergyScale.of_star(source, distance, flare_k=10_000.0)
+    law = davenport2019(mass_msun=0.82, age_myr=500).of_light(scale.erg_per_s, quiescent_luminosity(source, distance))
     energies = answer.by_energy
     mine = energies[energies["target"] == "eps Eri"]
     assert mine["rate_above"].value == pytest.approx(law.per_day_above(mine["energy"].value))

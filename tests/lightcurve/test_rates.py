@@ -217,3 +217,25 @@ def test_a_fit_needs_flares() -> None:
         fit_power_law(np.array([1e33, 1e34]), step_at(1e32), 10.0)
     with pytest.raises(InputError, match="time that was observed"):
         fit_power_law(np.array([1e33, 1e34, 1e35]), step_at(1e32), 0.0)
+
+
+@pytest.mark.parametrize(("name", "factor"), [("M3V", 1.187), ("G2V", 1.049)])
+def test_published_energies_become_those_of_light(name: str, factor: float) -> None:
+    """One flare, of one equivalent duration, has one rate, by whichever energy it is looked up."""
+    from mauvecl.host.stars.source import Source
+    from mauvecl.lightcurve.flares.energies import quiescent_luminosity
+
+    star, duration = Source.from_library(name).at_magnitude(8.0), 37.0
+    light = EnergyScale.of_star(star, 10.0, flare_k=10_000.0)
+    luminosity = quiescent_luminosity(star, 10.0)
+    davenport = davenport2019(mass_msun=0.5, age_myr=100)
+    found = davenport.of_light(light.erg_per_s, luminosity)
+    assert (found.band, found.definition) == ("bolometric", "light")
+    assert found.per_day_above(light.energy(duration)) == pytest.approx(
+        float(davenport.per_day_above(duration * luminosity)), rel=1e-12
+    )
+    # A patch seen face on, weighted with energies: by a blackbody of the star's luminosity in the band.
+    patch = sunlike().of_light(light.erg_per_s, luminosity)
+    assert patch.measured_erg[0] == pytest.approx(4 * factor * 1e33, rel=1e-3)
+    with pytest.raises(InputError, match="expected a published definition"):
+        patch.of_light(light.erg_per_s, luminosity)

@@ -11,7 +11,7 @@ import numpy as np
 from mauvecl.answers.campaigns.conditions import Conditions, Met, hits_variance_dn2
 from mauvecl.host.errors import InputError
 from mauvecl.host.orbit.targets import Target
-from mauvecl.lightcurve.flares.energies import EnergyScale
+from mauvecl.lightcurve.flares.energies import EnergyScale, quiescent_luminosity
 from mauvecl.lightcurve.flares.rates import BOLOMETRIC, Rates
 from mauvecl.lightcurve.search.completeness import Completeness, frame_signal
 from mauvecl.lightcurve.search.yields import Yield
@@ -137,7 +137,14 @@ def rates_of(study: Study, text: PlanTarget, looked: Looked) -> tuple[Rates | No
         if any(getattr(text, name) is not None for name in ("mass_msun", "alpha", "rates_file", "rates")):
             raise
         return None, str(error)
-    return rates.in_band(BOLOMETRIC, flare=study.flare.light()), ""
+    if rates.definition == "light":
+        return rates.in_band(BOLOMETRIC, flare=study.flare.light()), ""
+    source, band = looked.star.source(), rates.amplitude_band
+    measured = study.model_copy(update={"flare": study.flare.model_copy(update={"band": band})})
+    scale = energy_scale(measured, looked.star, source, "bolometric", study.flare.temperature_k)
+    assert scale is not None
+    assert looked.star.distance_pc is not None
+    return rates.of_light(scale.erg_per_s, quiescent_luminosity(source, looked.star.distance_pc, band)), ""
 
 
 def star_of(study: Study, text: PlanTarget) -> Star:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -22,6 +22,8 @@ from mauvecl.host.stars.flare_spectra import Blackbody, FlareSpectrum
 from mauvecl.lightcurve.flares.energies import flux_in_band
 
 Float = NDArray[np.float64]
+#: What published energies are; see `Rates`.
+Definition = Literal["light", "quiescent", "patch"]
 
 #: What an energy may be of beside a band: the whole light of the flare's blackbody.
 BOLOMETRIC = "bolometric"
@@ -47,12 +49,17 @@ class Rates(ABC):
         Energies between which it was measured; elsewhere it is extrapolated.
     scatter_dex : float
         Standard deviation of its rate's logarithm for a single star.
+    definition : {"light", "quiescent", "patch"}
+        Energy of the flares' light, alike in all directions; equivalent duration times the star's luminosity in the
+        band (Davenport); or the bolometric energy of a blackbody of 10 000 K, a patch seen face on (Shibayama).
+        `of_star` converts to the first.
     """
 
     band: str = "Kepler"
     source: str = "given"
     measured_erg: tuple[float, float] = ENERGIES
     scatter_dex: float = 0.0
+    definition: Definition = "light"
 
     def __post_init__(self) -> None:
         low, high = self.measured_erg
@@ -87,6 +94,33 @@ class Rates(ABC):
             For an unknown band, or a temperature that no flare has.
         """
         return replace(self.times_energy(band_factor(self.band, band, flare_k, flare)), band=band)
+
+    def of_light(self, erg_per_s: float, luminosity_erg_s: float) -> Self:
+        """Return the same flares by the bolometric energy of their light at one star.
+
+        Parameters
+        ----------
+        erg_per_s : float
+            Bolometric energy per second of equivalent duration in `amplitude_band`: an `EnergyScale`.
+        luminosity_erg_s : float
+            The star's in that band, `quiescent_luminosity`.
+
+        Raises
+        ------
+        InputError
+            If the energies are those of light already; see `in_band`.
+        """
+        if self.definition == "light":
+            raise InputError(f"rates of {self.source} are by the energy of light, expected a published definition")
+        published = luminosity_erg_s
+        if self.definition == "patch":
+            published *= band_factor(self.amplitude_band, BOLOMETRIC) / 4
+        return replace(self.times_energy(erg_per_s / published), band=BOLOMETRIC, definition="light")
+
+    @property
+    def amplitude_band(self) -> str:
+        """Band in which equivalent durations were measured: for bolometric energies Kepler's."""
+        return "Kepler" if self.band == BOLOMETRIC else self.band
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -283,6 +317,7 @@ def davenport2019(*, mass_msun: float, age_myr: float) -> PowerLaw:
         source=f"Davenport et al. 2019 (arXiv 1901.00890), {mass_msun:g} Msun, {age_myr:g} Myr",
         measured_erg=(1e32, 1e37),
         scatter_dex=SCATTER_DEX,
+        definition="quiescent",
     )
 
 
@@ -294,7 +329,7 @@ def sunlike() -> PowerLaw:
     return PowerLaw.through(
         2.0, 7e33, 1 / (3000 * DAYS_PER_YEAR), band=BOLOMETRIC,
         source="Sun-like G dwarfs: 7e33 erg per 3000 yr (Okamoto et al. 2021), exponent 2 (Shibayama et al. 2013)",
-        measured_erg=(1e33, 1e36), scatter_dex=SCATTER_DEX,
+        measured_erg=(1e33, 1e36), scatter_dex=SCATTER_DEX, definition="patch",
     )  # fmt: skip
 
 
