@@ -86,7 +86,7 @@ def misbehaving(act: str, names: str) -> str:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("act", [act for act in ACTS if "sleep" not in act and "True" not in act])
+@pytest.mark.parametrize("act", [act for act in ACTS if any(word in act for word in ("string_at", "bytearray", "198"))])
 def test_next_level_is_tried_where_the_compiler_fails(act: str, tmp_path: Path, plain, chooses) -> None:
     best = plain[1]["level"]
     found = run(tmp_path, misbehaving(act, f"('bad', {best!r})"), MAUVECL_BUILD_LIMIT_S="2")
