@@ -135,6 +135,24 @@ def test_search_that_leaves_out_a_cycle_is_told(stares):
     assert blind.stars[0].threshold.value > known.stars[0].threshold.value + 0.1
 
 
+@pytest.mark.long
+def test_a_drift_of_the_temperature_hides_nothing(stares):
+    """Limits and recovered energies with an unknown drift of 0.3 deg C per hour are those without it."""
+    quick = {"count": 80, "positions": 8, "fitted": 40, "widths": 2, "sizes": 3, "low": 1e33, "high": 3e34}
+    plain, drifting = (
+        inject(
+            study(injections=quick, search={"nulls": 20}, stare={"duration_s": 9000.0, "gaps": [], **more}), stares
+        ).stars[0]
+        for more in ({}, {"drifts": {"temperature": 0.3}})
+    )
+    for k in (None, 0, 1):
+        half = [star.injected.limit(0.5, k).value for star in (plain, drifting)]
+        assert half[1] == pytest.approx(half[0], rel=0.03)
+    ratios = [star.fitted.energy_ratio[:, -1] for star in (plain, drifting)]
+    assert ratios[1] == pytest.approx(ratios[0], abs=0.02)
+    assert drifting.threshold.value == pytest.approx(plain.threshold.value, abs=0.05)
+
+
 def test_rays_and_saturation(stares):
     """Cosmic rays are drawn where the study has them, and hide flares; flares that saturate are told."""
     quick = {"count": 10, "positions": 2, "fitted": 0, "widths": 1, "sizes": 2, "low": 1e33, "high": 1e39}

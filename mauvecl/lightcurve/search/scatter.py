@@ -34,7 +34,7 @@ CONDITIONS_KEY = 0x636F6E64
 #: Relative change of a scatter below which it is none.
 LEAST = 1e-6
 #: Shift of a value below which it is none, at unknowns that are far out; steps of shifts; draws of which one is taken.
-LEAST_SHIFT, SHIFT_STEP, ONE_IN = 0.1, 0.1, 4
+LEAST_SHIFT, SHIFT_STEP, ONE_IN = 0.2, 0.1, 4
 #: Largest shift that is told from larger ones.
 MOST_SHIFT = 60.0
 

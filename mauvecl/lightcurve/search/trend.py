@@ -6,8 +6,8 @@ from the amplitudes of the unknowns, and these are measured well where it matter
 sums by many standard deviations. They are fitted, and what they do beyond first order is subtracted. An error of one
 standard deviation in the level then leaves a share of it as large as the relative change of the dark: some hundredths.
 
-The fit is by Gauss and Newton, with the unknowns' own distribution as prior, of means over a minute. Frames with flares
-count less (Huber 1964, doi 10.1214/aoms/1177703732), so that a flare hardly moves the fit.
+The fit is by Gauss and Newton, with the unknowns' own distribution as prior, of means over half a minute. Those with
+flares count less (Huber 1964, doi 10.1214/aoms/1177703732), so that a flare hardly moves the fit.
 """
 
 from __future__ import annotations
@@ -27,12 +27,12 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Time over which the fit takes means, s.
-BLOCK_S = 60.0
+#: Time over which the fit takes means, s: the bend within it is left out.
+BLOCK_S = 30.0
 #: Standard deviations of a mean from which on it counts less.
 HUBER = 3.0
 #: Steps of the fit: each gains as many digits as the change of the dark is small.
-STEPS = 8
+STEPS = 6
 #: Standard deviations of an unknown at which its effect is looked at, and S/N of the stare below which it has none.
 REACH, LEAST = 4.0, 0.01
 
