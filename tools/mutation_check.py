@@ -55,7 +55,7 @@ MUTATIONS = {
     ),
     "unknowns marginalised without their prior": Mutation(
         (("mauvecl/statistics/nuisances.py", "np.diag(self.sd**-2.0) + ", "np.diag(0.0 * self.sd**-2.0) + "),),
-        "tests/statistics/test_nuisances.py::test_the_sums_subtracted_are_the_inverse_covariance[chi2]",
+        "tests/statistics/test_nuisances.py::test_subtracted_rows_give_the_inverse_covariance[chi2]",
     ),
     "sums of stares without their skewness": Mutation(
         (
@@ -162,15 +162,15 @@ MUTATIONS = {
     ),
     "skew-only expansion of the dark": Mutation(
         (("mauvecl/noise/pixels.py", "= -1 / (72 * root)", "= 0.0"),),
-        "tests/kernels/test_poisson.py::test_no_number_of_draws_would_tell_the_expansion",
+        "tests/kernels/test_poisson.py::test_expansion_cannot_be_distinguished_from_exact_draws",
     ),
     "joint draw allowed by its skew alone": Mutation(
         ((CUMULANTS, " & ~shows(left_out(c, fourth_power=True), c.variance))", ")"),),
-        "tests/kernels/test_joint_bound.py::test_the_worst_that_is_allowed",
+        "tests/kernels/test_joint_bound.py::test_worst_draws_that_the_region_allows",
     ),
     "fourth power left out too early": Mutation(
         ((CUMULANTS, "345 * fourth**2", "34.5 * fourth**2"),),
-        "tests/kernels/test_joint_bound.py::test_the_worst_that_is_allowed",
+        "tests/kernels/test_joint_bound.py::test_worst_draws_that_the_region_allows",
     ),
     "rounding taken for noise everywhere": Mutation(
         ((CUMULANTS, "return ~shows(loss, n * frame)", "return frame > 0"),),
@@ -189,7 +189,7 @@ MUTATIONS = {
     ),
     "skew-only expansion of the joint draw": Mutation(
         ((CUMULANTS, SHAPE, SHAPE.replace("    sd =", "    g2, g3 = 0 * g2, 0 * g3\n    sd =")),),
-        "tests/kernels/test_joint.py::test_no_number_of_draws_would_tell",
+        "tests/kernels/test_joint.py::test_joint_draws_cannot_be_distinguished_from_exact_ones",
     ),
     "24-bit uniforms": Mutation(
         (

@@ -107,7 +107,7 @@ def test_read_right(name: str, options: dict[str, Any], read: Any, v: float | No
 
 
 @pytest.mark.parametrize(("name", "options", "sentence"), REFUSED, ids=[entry[0] for entry in REFUSED])
-def test_refused_in_a_sentence(name: str, options: dict[str, Any], sentence: str) -> None:
+def test_unusable_archive_files_raise(name: str, options: dict[str, Any], sentence: str) -> None:
     with pytest.raises(InputError, match=sentence) as caught:
         Source.read(HERE / name, **options)
     assert "\n" not in str(caught.value)
@@ -130,7 +130,7 @@ def test_short_spectra_suffice_for_a_narrower_range() -> None:
     assert any("its own points cover 290.033-2497.72 nm, 82% of 200-700 nm" in text for text in one.messages)
 
 
-def test_what_is_told_of_them() -> None:
+def test_messages_of_archive_files() -> None:
     told = {name: Source.read(HERE / name, **options).told for name, options, *_ in RIGHT}
     assert told["18sco_stis_004.fits"] == ("its own points cover 171.042-31891.2 nm",)
     assert told["sun_reference_stis_002.fits"] == ("its own points cover 119.5-2695.74 nm",)
@@ -153,7 +153,7 @@ def test_start_and_step_in_one_row() -> None:
     np.testing.assert_allclose(read.flux_flam, flux, rtol=1e-12)
 
 
-def test_gaias_arrays_in_a_cell() -> None:
+def test_gaia_arrays_in_a_cell() -> None:
     """336 + 2 i nm, W m-2 nm-1: 100 erg s-1 cm-2 A-1 each."""
     star = Source.read(f"{HERE / 'XP_SAMPLED_RAW_dr3int6.csv'}[4]", extend="K5V")
     with (HERE / "XP_SAMPLED_RAW_dr3int6.csv").open() as file:
@@ -164,7 +164,7 @@ def test_gaias_arrays_in_a_cell() -> None:
     np.testing.assert_allclose(star.flux_flam[inside], flux, rtol=1e-12)
 
 
-def test_fluxes_at_the_surface_or_of_no_scale_need_a_magnitude() -> None:
+def test_surface_or_relative_fluxes_need_a_magnitude() -> None:
     mauve = Instrument.load("mauve")
     for name, options, why in (
         ("ckp00_5750.fits[g45]", {}, "flux at the star's surface"),
@@ -176,7 +176,7 @@ def test_fluxes_at_the_surface_or_of_no_scale_need_a_magnitude() -> None:
         assert expect(star.at_magnitude(7.5), mauve, exposure=5.0).signal_dn.max() > 0
 
 
-def test_starts_of_calspec_files_within_the_reach() -> None:
+def test_calspec_files_that_start_within_the_line_function_are_continued() -> None:
     """Three start at 180.02-180.10 nm and P330E at 199.95: a whole file, cut there."""
     star = Source.read(HERE / "18sco_stis_004.fits")
     mauve = Instrument.load("mauve")

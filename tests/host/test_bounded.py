@@ -18,14 +18,14 @@ PACKERS = pytest.mark.parametrize("pack", [gzip.compress, bz2.compress, lzma.com
 
 @pytest.mark.long
 @PACKERS
-def test_what_is_packed_comes_back_also_from_several_streams(pack) -> None:
+def test_compressed_files_of_several_streams_are_unpacked(pack) -> None:
     content = half_noise(3_000_000)
     assert unpacked(pack(content), "f") == content
     assert unpacked(pack(content) + pack(content), "f") == 2 * content
 
 
 @PACKERS
-def test_cut_files_end_in_a_sentence(pack) -> None:
+def test_truncated_files_raise(pack) -> None:
     packed = pack(half_noise(100_000))
     for size in (8, len(packed) // 2, len(packed) - 1):
         with pytest.raises(InputError, match="damaged"):
@@ -34,7 +34,7 @@ def test_cut_files_end_in_a_sentence(pack) -> None:
 
 @pytest.mark.long
 @PACKERS
-def test_a_bomb_is_noticed_while_it_is_small(pack, monkeypatch) -> None:
+def test_decompression_bomb_raises_early(pack, monkeypatch) -> None:
     import tracemalloc
 
     bomb = pack(bytes(200 << 20))
@@ -47,7 +47,7 @@ def test_a_bomb_is_noticed_while_it_is_small(pack, monkeypatch) -> None:
     assert peak < 40 << 20
 
 
-def test_only_regular_files_of_bounded_size(tmp_path: Path, monkeypatch) -> None:
+def test_only_regular_files_of_limited_size_are_read(tmp_path: Path, monkeypatch) -> None:
     fifo = tmp_path / "fifo"
     os.mkfifo(fifo)
     for path in ("/dev/zero", fifo, tmp_path, tmp_path / "none", "a\0b", "x" * 5000, tmp_path / ("y" * 300), "\ud800"):
@@ -64,7 +64,7 @@ def test_only_regular_files_of_bounded_size(tmp_path: Path, monkeypatch) -> None
 
 
 @pytest.mark.parametrize("value", ["", "-1", "0", "1e3", "99999999", "٣"])
-def test_a_limit_that_is_none_is_refused(value: str, tmp_path: Path, monkeypatch) -> None:
+def test_invalid_limit_raises(value: str, tmp_path: Path, monkeypatch) -> None:
     (tmp_path / "f").write_bytes(b"x")
     monkeypatch.setenv("MAUVECL_LARGEST_FILE_MIB", value)
     with pytest.raises(InputError, match="MAUVECL_LARGEST_FILE_MIB"):

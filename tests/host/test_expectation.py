@@ -61,7 +61,7 @@ def test_signal_is_linear_in_the_light(sunlike: Source, mauve: Instrument) -> No
     assert not faint.sky_electrons.any()
 
 
-def test_one_sky_where_nothing_is_said(sunlike: Source, mauve: Instrument) -> None:
+def test_default_sky(sunlike: Source, mauve: Instrument) -> None:
     """`expect` and studies, and so the command line, have the same default."""
     (study,) = Study().expect([sunlike])
     np.testing.assert_array_equal(expect(sunlike, mauve, exposure=50).sky_electrons, study.sky_electrons)
@@ -84,7 +84,7 @@ def test_closed_form_signal_to_noise(quiet: Expectation, signal: Any) -> None:
     assert x.mean_raw_dn[p] == pytest.approx(light / 10 + 445.5337 * 5 + 600, rel=1e-6)
 
 
-def test_the_sky_alone_has_no_signal(sunlike: Source, mauve: Instrument) -> None:
+def test_sky_alone_has_no_net_signal(sunlike: Source, mauve: Instrument) -> None:
     """A star of nothing has an S/N of nothing however bright the sky, unless the paper's convention is asked for."""
     star = [expect(sunlike, mauve, exposure=50, sky=Sky.of_brightness(v)) for v in (22.1, 15.0)]
     for x in star:
@@ -96,7 +96,7 @@ def test_the_sky_alone_has_no_signal(sunlike: Source, mauve: Instrument) -> None
     assert (star[1].snr() < star[0].snr()).all(), "a brighter sky is noise"
 
 
-def test_the_papers_convention_is_told(sunlike: Source, mauve: Instrument) -> None:
+def test_paper_signal_is_reported(sunlike: Source, mauve: Instrument) -> None:
     sky = Sky.of_brightness(22.1)
     told = expect(sunlike, mauve, exposure=50, sky=sky, signal="paper").messages
     assert any("counts the zodiacal light as signal" in text for text in told)
@@ -130,7 +130,7 @@ def test_noise_budget(quiet: Expectation) -> None:
     assert budget["source_photon"][800].value == pytest.approx(photon, rel=1e-6)
 
 
-def test_dark_in_electrons_is_quieter(sunlike: Source, quiet: Expectation) -> None:
+def test_dark_in_electrons_is_less_noisy(sunlike: Source, quiet: Expectation) -> None:
     electrons = expect(sunlike, Instrument.load("mauve-electrons"), exposure=50)
     np.testing.assert_array_equal(electrons.dark_dn, quiet.dark_dn)
     ratio = quiet.noise_budget()["dark"] / electrons.noise_budget()["dark"]
@@ -158,7 +158,7 @@ def test_exposures_are_whole_frames(sunlike: Source, mauve: Instrument, exposure
     assert any("rounded up" in message for message in x.messages) is told
 
 
-def test_a_sum_of_floats_is_not_rounded_up(sunlike: Source, mauve: Instrument) -> None:
+def test_float_sum_of_frames_is_not_rounded_up(sunlike: Source, mauve: Instrument) -> None:
     x = expect(sunlike, mauve.with_(frame_s=0.1), exposure=0.1 + 0.2)
     assert x.n_frames == 3
     assert not any("rounded up" in message for message in x.messages)
@@ -167,7 +167,7 @@ def test_a_sum_of_floats_is_not_rounded_up(sunlike: Source, mauve: Instrument) -
 @pytest.mark.parametrize(
     "exposure", [0, -5, np.nan, np.inf, 86_401, 2 * u.day, 3 * u.m, "50", True, None, [50, 60], [5, 6] * u.s]
 )
-def test_impossible_exposures(sunlike: Source, mauve: Instrument, exposure: Any) -> None:
+def test_invalid_exposure_raises(sunlike: Source, mauve: Instrument, exposure: Any) -> None:
     with pytest.raises(InputError, match=r"exposure = .*, expected a time above 0 and up to one day"):
         expect(sunlike, mauve, exposure=exposure)
 
@@ -177,7 +177,7 @@ def test_impossible_exposures(sunlike: Source, mauve: Instrument, exposure: Any)
     ("saturation_v", "rate_dn_per_s"),
     [(2.2, 12_541), (2.0, 11_350)],
 )
-def test_the_rate_that_saturates_a_frame(
+def test_rate_that_saturates_a_frame(
     sunlike: Source, mauve: Instrument, saturation_v: float, rate_dn_per_s: float
 ) -> None:
     x = expect(sunlike, mauve.with_(saturation_v=saturation_v), exposure=5)
@@ -186,7 +186,7 @@ def test_the_rate_that_saturates_a_frame(
     assert replace(x, source_electrons=electrons * 1.001).saturated.all()
 
 
-def test_saturation_is_told_first(mauve: Instrument) -> None:
+def test_saturation_is_the_first_message(mauve: Instrument) -> None:
     star = Source.from_library("B2IV").at_magnitude(1.5)
     x = expect(star, mauve, exposure=7)
     assert x.messages[0].startswith("SATURATED: ")
@@ -204,13 +204,13 @@ def test_saturation_is_told_first(mauve: Instrument) -> None:
     assert expect(star, mauve.with_(frame_s=safe + 0.002), exposure=1).saturated.any()
 
 
-def test_a_faint_star_saturates_nothing(quiet: Expectation) -> None:
+def test_faint_star_does_not_saturate(quiet: Expectation) -> None:
     assert not quiet.saturated.any()
     assert not any("SATURATED" in message for message in quiet.messages)
     assert quiet.longest_safe_frame_s > 60
 
 
-def test_where_it_all_came_from(quiet: Expectation, sunlike: Source, mauve: Instrument) -> None:
+def test_provenance(quiet: Expectation, sunlike: Source, mauve: Instrument) -> None:
     assert quiet.name == sunlike.name
     assert quiet.instrument == "mauve"
     assert quiet.provenance["source digest"] == sunlike.digest
@@ -235,14 +235,14 @@ def test_survives_pickling(quiet: Expectation) -> None:
     assert again.messages == quiet.messages
 
 
-def test_bad_means_are_named(quiet: Expectation) -> None:
+def test_negative_mean_raises(quiet: Expectation) -> None:
     bad = quiet.source_electrons.copy()
     bad[17] = -0.2
     with pytest.raises(InputError, match=r"source_electrons of pixel 17 = -0\.2, expected 0 to 1e\+12"):
         replace(quiet, source_electrons=bad)
 
 
-def test_a_spectrum_that_stops_short(sunlike: Source, mauve: Instrument) -> None:
+def test_short_spectrum_raises(sunlike: Source, mauve: Instrument) -> None:
     wide = mauve.with_(
         output_max_nm=2000.0,
         pixels=8000,
@@ -259,7 +259,7 @@ def test_a_spectrum_that_stops_short(sunlike: Source, mauve: Instrument) -> None
         expect(short, wide, exposure=5)
 
 
-def test_order_changes_little_but_in_the_ultraviolet(sunlike: Source, mauve: Instrument, quiet: Expectation) -> None:
+def test_order_matters_only_in_the_ultraviolet(sunlike: Source, mauve: Instrument, quiet: Expectation) -> None:
     physical = expect(sunlike, mauve, exposure=50, order="physical")
     ratio = physical.net_source_dn / quiet.net_source_dn
     assert np.abs(ratio[quiet.wavelength_nm > 250] - 1).max() < 0.04

@@ -33,7 +33,7 @@ def read_fits(path: Path, wavelength_unit: str, flux_unit: str, per_nm: float = 
     return Source.read(path)
 
 
-def test_what_a_mask_hides_is_not_read(tmp_path: Path) -> None:
+def test_masked_values_are_not_read(tmp_path: Path) -> None:
     masked = MaskedColumn(FLUX, mask=HIDDEN, unit=FLAM)
     with pytest.raises(InputError, match="flux nan at point 131"):
         read_ecsv(tmp_path / "a.ecsv", NM * u.nm, masked)
@@ -59,7 +59,7 @@ def test_wavelength_units_as_archives_spell_them(tmp_path: Path, unit: str, per_
     np.testing.assert_allclose(read_fits(tmp_path / "a.fits", unit, "FLAM", per_nm).wavelength_nm, NM, rtol=1e-12)
 
 
-def test_an_unknown_unit_is_one_sentence(tmp_path: Path) -> None:
+def test_unknown_unit_raises(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"^a\.fits: flux \(FLUX\): unit 'banana' is unknown, expected") as caught:
         read_fits(tmp_path / "a.fits", "ANGSTROMS", "banana")
     assert len(str(caught.value)) < 140
@@ -84,7 +84,7 @@ def test_text_from_other_editors(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", ["x", None, np.array([1.0, 2.0])])
-def test_arguments_that_are_no_number(value: object) -> None:
+def test_arguments_that_are_not_numbers_raise(value: object) -> None:
     star = Source.from_arrays(NM, FLUX)
     for call in (star.at_magnitude, star.flaring, star.reddened, lambda v: star.flaring(0.1, v)):
         with pytest.raises(InputError, match=r"expected (a number|magnitudes|0 to 10 mag|kelvin)"):

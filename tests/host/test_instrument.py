@@ -35,7 +35,7 @@ def test_efficiency_and_effective_area(mauve: Instrument, nm: float, efficiency:
     assert mauve.effective_area_cm2(nm) == pytest.approx(area_cm2, rel=0.02)
 
 
-def test_efficiency_is_the_papers_product(mauve: Instrument) -> None:
+def test_efficiency_is_the_product_of_the_paper(mauve: Instrument) -> None:
     # The knots at 300 nm, by hand.
     by_hand = 0.80 * 0.977 * 0.96**4 * 0.910**2 * 0.888**2 * 0.92 * 0.999 * 0.66
     assert mauve.efficiency(300.0) == pytest.approx(by_hand, rel=1e-12)
@@ -72,14 +72,14 @@ def test_every_value_has_a_source(name: str) -> None:
     assert "not a flight calibration" in instrument.notice
 
 
-def test_electrons_differ_in_their_counting_alone(mauve: Instrument) -> None:
+def test_mauve_electrons_differs_only_in_counting(mauve: Instrument) -> None:
     electrons = Instrument.load("mauve-electrons")
     assert (mauve.dark_unit, electrons.dark_unit) == ("DN", "electrons")
     assert electrons != mauve
     assert electrons.with_(dark_unit="DN", photon_noise="gaussian") == mauve
 
 
-def test_a_changed_copy(mauve: Instrument) -> None:
+def test_with_returns_a_marked_copy(mauve: Instrument) -> None:
     cold = mauve.with_(temperature_c=13, grating_efficiency=0.5)
     assert (mauve.temperature_c, cold.temperature_c) == (21, 13)
     assert cold.grating_efficiency.at([200, 700]).tolist() == [0.5, 0.5]
@@ -111,7 +111,7 @@ def test_a_changed_copy(mauve: Instrument) -> None:
         ({"bias_dn": 60_000}, "bias_dn = 60000, expected below saturation"),
     ],
 )
-def test_bad_values(mauve: Instrument, changes: dict[str, Any], message: str) -> None:
+def test_invalid_values_raise(mauve: Instrument, changes: dict[str, Any], message: str) -> None:
     with pytest.raises(InputError, match=message) as caught:
         mauve.with_(**changes)
     assert "\n" not in str(caught.value)
@@ -132,7 +132,7 @@ wavelength efficiency
 """
 
 
-def test_a_users_file(tmp_path: Path, mauve: Instrument) -> None:
+def test_user_file_extends_an_embedded_instrument(tmp_path: Path, mauve: Instrument) -> None:
     (tmp_path / "grating.ecsv").write_text(CURVE)
     file = tmp_path / "mine.toml"
     file.write_text(
@@ -174,7 +174,7 @@ def test_a_users_file(tmp_path: Path, mauve: Instrument) -> None:
         ('extends = "mauve"\nsources = {}', "unknown key 'sources'"),
     ],
 )
-def test_bad_files(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_files_raise(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "short.ecsv").write_text(CURVE.replace("1900", "2500"))
     (tmp_path / "falling.ecsv").write_text(CURVE.replace("1900", "7900"))
     (tmp_path / "negative.ecsv").write_text(CURVE.replace(" 0.2", " -0.2"))
@@ -186,14 +186,14 @@ def test_bad_files(tmp_path: Path, text: str, message: str) -> None:
         Instrument.load(file)
 
 
-def test_unknown_names() -> None:
+def test_unknown_instrument_raises() -> None:
     with pytest.raises(InputError, match=r"unknown instrument 'mauv', expected .*nearest: 'mauve'"):
         Instrument.load("mauv")
     with pytest.raises(InputError, match=r"no-such.toml' does not exist"):
         Instrument.load("no-such.toml")
 
 
-def test_curves_hold_their_ends() -> None:
+def test_curves_keep_their_end_values() -> None:
     curve = Curve((200.0, 300.0), (0.2, 0.4))
     assert curve.at([100.0, 200.0, 250.0, 900.0]).tolist() == pytest.approx([0.2, 0.2, 0.3, 0.4])
     assert curve.covers(200, 300)
@@ -221,7 +221,7 @@ def curve_file(tmp_path: Path, length: str, value: str, wavelengths: str = "2000
         ("Nanometers", "percent", "200 500 800", 0.005),
     ],
 )
-def test_units_of_curves_in_any_spelling(
+def test_curve_units_in_any_spelling(
     tmp_path: Path, length: str, value: str, wavelengths: str, expected: float
 ) -> None:
     """Where A is Angstrom of a wavelength and ampere of a sensitivity."""
@@ -239,13 +239,13 @@ def test_units_of_curves_in_any_spelling(
         ("s", "A / W", "column 'wavelength' has the unit 's', expected nm"),
     ],
 )
-def test_a_spectrum_is_no_curve(tmp_path: Path, length: str, value: str, sentence: str) -> None:
+def test_spectrum_as_curve_raises(tmp_path: Path, length: str, value: str, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         Curve.read(curve_file(tmp_path, length, value))
 
 
 @pytest.mark.parametrize("name", CURVES)
-def test_an_instrument_without_throughput_is_refused(name: str) -> None:
+def test_instrument_without_throughput_raises(name: str) -> None:
     """By any curve that is 0 over the band, or by two that are 0 where the other is not: every S/N would be 0."""
     mauve = Instrument.load("mauve")
     with pytest.raises(InputError, match=rf"{name} = 0 from 200 to 700 nm, expected a throughput above 0"):

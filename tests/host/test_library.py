@@ -28,14 +28,14 @@ def near_ultraviolet(name: str) -> float:
     return mean(290, 310) / mean(540, 560)
 
 
-def test_no_star_is_out_of_line_with_its_neighbours() -> None:
+def test_library_stars_agree_with_their_neighbours() -> None:
     """From G5V to M4V the ratio falls by class; one twice its warmer neighbour would be a fault of its file."""
     order = ["G5V", "G8V", "K1V", "K2.5V", "K5V", "K6V", "M0V", "M1V", "M3V", "M4V"]
     ratios = [near_ultraviolet(name) for name in order]
     assert all(own < 2 * warm for warm, own in pairwise(ratios))
 
 
-def test_what_noise_rules_is_told() -> None:
+def test_noise_dominated_ultraviolet_is_reported() -> None:
     """M5V and M6V are brighter at 300 nm than M4V: their files say that this is noise, and so does every answer."""
     limits = {"M0V": 0.0, "M1V": 240.0, "M3V": 0.0, "M4V": 240.0, "M5V": 300.0, "M6V": 300.0}
     for name, limit in limits.items():
@@ -67,7 +67,7 @@ def test_colours_are_those_of_the_classes() -> None:
     assert all(a < b for a, b in pairwise(gaia))
 
 
-def test_each_star_has_a_photosphere_of_its_own_with_its_source() -> None:
+def test_each_star_has_a_photosphere_temperature_with_source() -> None:
     for row in catalogue.library_table():
         assert row["temperature_source"]
         assert 2500 < float(row["temperature_k"]) < 30_000
@@ -81,7 +81,7 @@ def test_galex_in_both_systems() -> None:
     assert star.magnitude("GALEX NUV") - 12.0 == pytest.approx(1.69, abs=0.08)
 
 
-def test_a_library_star_without_a_magnitude_is_asked_for_one() -> None:
+def test_unscaled_library_star_needs_a_magnitude() -> None:
     """Templates are kept at V = 0, and would be as bright as Vega; Vega itself is as it is seen."""
     mauve = Instrument.load("mauve")
     for row in catalogue.library_table():
@@ -104,14 +104,14 @@ def test_muscles_entries_admit_their_model_and_cite_their_data() -> None:
 
 
 @pytest.mark.parametrize("name", ALIASES)
-def test_bands_say_where_they_are_from_and_what_they_mean(name: str) -> None:
+def test_bands_state_source_and_system(name: str) -> None:
     meta = catalogue.band_table(f"{name.lower().replace(' ', '_')}.ecsv").meta
     assert all(meta[field] for field in ("origin", "licence", "system", "zero_point"))
     assert ("vega" in meta) == (meta["system"] == "Vega")
     assert "per photon" in meta["response"]
 
 
-def test_the_sun_has_its_magnitude() -> None:
+def test_magnitude_of_the_sun() -> None:
     """V = -26.76 +- 0.02 (Willmer 2018): ties Vega, the band and the absolute scale together."""
     assert Source.from_library("Sun").magnitude("V") == pytest.approx(-26.76, abs=0.02)
 
@@ -138,7 +138,7 @@ def test_the_response_of_v_is_per_photon() -> None:
     assert np.ptp([star.magnitude("V") for star in stars]) < 2e-4
 
 
-def test_every_spectrum_and_band_tells_the_file_it_is_from() -> None:
+def test_every_spectrum_and_band_names_its_source_file() -> None:
     """By package, wheel and digests, as the headers' own words have it."""
     library = Path(catalogue.__file__).parent / "library"
     table = Table.read(library / "inputs.ecsv", format="ascii.ecsv")

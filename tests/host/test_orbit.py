@@ -57,7 +57,7 @@ def test_verification_vectors() -> None:
     assert seen > 400
 
 
-def test_a_track_goes_through_the_verification_vectors() -> None:
+def test_track_matches_the_verification_vectors() -> None:
     """A satellite in low orbit, by the times of a plan: the text of its epoch is good to 20 m."""
     first, second, rows = next(one for one in verification() if one[0][2:7] == "06251")
     elements = Elements(first, second, "SGP4-VER")
@@ -68,7 +68,7 @@ def test_a_track_goes_through_the_verification_vectors() -> None:
     assert np.abs(track.of_date_km - np.array(rows)[:, 1:]).max() < 0.02
 
 
-def test_frames_are_astropys(day: Track) -> None:
+def test_frames_agree_with_astropy(day: Track) -> None:
     with offline():
         import astropy.units as u
         from astropy.coordinates import GCRS, ITRS, TEME, CartesianRepresentation, get_body
@@ -127,7 +127,7 @@ def test_mean_orbit(orbit: Orbit) -> None:
     assert orbit.elements.node_drift_deg_per_day == pytest.approx(0.98565, abs=0.002)
 
 
-def test_the_mean_orbit_follows_sgp4_for_a_fortnight(orbit: Orbit) -> None:
+def test_mean_orbit_follows_sgp4_for_a_fortnight(orbit: Orbit) -> None:
     """Its node, and its place along the orbit but for drag, which SGP4 has and it has not."""
     fortnight = TimeGrid("2026-09-28T00:00", 0.1, 30.0)
     mean, exact = (Orbit(orbit.elements, kind).track(fortnight) for kind in ("mean", "tle"))
@@ -136,7 +136,7 @@ def test_the_mean_orbit_follows_sgp4_for_a_fortnight(orbit: Orbit) -> None:
     assert apart < 3 * orbit.along_track_km(14)
 
 
-def test_what_is_told_of_the_epoch(orbit: Orbit) -> None:
+def test_messages_about_the_epoch(orbit: Orbit) -> None:
     assert orbit.messages(TimeGrid("2026-09-20", 5.0)) == []
     told = orbit.messages(TimeGrid("2026-10-10", 5.0))
     assert len(told) == 1
@@ -153,20 +153,20 @@ def test_what_is_told_of_the_epoch(orbit: Orbit) -> None:
         ("1 66756U\n2 66756", "69 characters"),
     ],
 )
-def test_bad_elements(tmp_path: Path, text: str, words: str) -> None:
+def test_invalid_elements_raise(tmp_path: Path, text: str, words: str) -> None:
     (tmp_path / "bad.tle").write_text(text)
     with pytest.raises(InputError, match=words):
         Orbit.load(tmp_path / "bad.tle")
 
 
-def test_own_elements(tmp_path: Path, orbit: Orbit) -> None:
+def test_elements_from_a_file(tmp_path: Path, orbit: Orbit) -> None:
     text = f"MAUVE\n{orbit.elements.first}\n{orbit.elements.second}\n"
     (tmp_path / "own.tle").write_text(text)
     assert Orbit.load(tmp_path / "own.tle").elements.satellite.ndot == orbit.elements.satellite.ndot
 
 
 @pytest.mark.parametrize("kwargs", [{"days": 0.0}, {"days": float("nan")}, {"step_s": 1e-3}, {"start": "yesterday"}])
-def test_impossible_times(kwargs: dict[str, float | str]) -> None:
+def test_invalid_time_grid_raises(kwargs: dict[str, float | str]) -> None:
     with pytest.raises(InputError):
         TimeGrid(**({"start": "2027-01-01", "days": 365.0} | kwargs))  # type: ignore[arg-type]
 
@@ -182,7 +182,7 @@ def test_days_begin_at_midnight(start: str) -> None:
     assert np.floor(times.julian[1][0]) == 0 or start.endswith("59.5")
 
 
-def test_nothing_global_is_left_changed(orbit: Orbit) -> None:
+def test_global_state_is_restored(orbit: Orbit) -> None:
     from astropy.coordinates import solar_system_ephemeris
     from astropy.utils import iers
 

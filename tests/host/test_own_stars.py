@@ -57,7 +57,7 @@ def archive_file(units: tuple[str, str], **header: Any) -> bytes:
     return out.getvalue()
 
 
-def test_a_kept_star_is_a_star_of_the_library(tmp_path: Path, own_folder: Path) -> None:
+def test_kept_star_is_part_of_the_library(tmp_path: Path, own_folder: Path) -> None:
     file = text_file(tmp_path / "mine.txt")
     kept = own_stars.add(file, "HD 1234")
     assert kept.path.parent == own_folder
@@ -76,7 +76,7 @@ def test_a_kept_star_is_a_star_of_the_library(tmp_path: Path, own_folder: Path) 
         own_stars.remove("HD 1234")
 
 
-def test_names_that_cannot_be(tmp_path: Path) -> None:
+def test_invalid_star_names_raise(tmp_path: Path) -> None:
     file = text_file(tmp_path / "mine.txt")
     with pytest.raises(InputError, match="'g2v' is one of the embedded library's"):
         own_stars.add(file, "g2v")
@@ -92,7 +92,7 @@ def test_names_that_cannot_be(tmp_path: Path) -> None:
         own_stars.add(file, "a b") and own_stars.add(file, "a_b")
 
 
-def test_a_changed_file_is_noticed(tmp_path: Path) -> None:
+def test_changed_file_raises(tmp_path: Path) -> None:
     kept = own_stars.add(text_file(tmp_path / "mine.txt"), "mine")
     text = kept.path.read_text()
     kept.path.write_text(text.replace("e-13", "e-12", 1))
@@ -184,7 +184,7 @@ def test_a_calspec_star_by_its_newest_file(archive: str) -> None:
     assert star.magnitude("V") == pytest.approx(5.50, abs=0.06)
 
 
-def test_a_short_one_is_kept_with_what_extends_it(archive: str, tmp_path: Path) -> None:
+def test_short_spectrum_is_kept_with_its_extension(archive: str, tmp_path: Path) -> None:
     base = f"{archive}/calspec/"
     with pytest.raises(InputError, match=r"VB8 spans 290\.033-2497\.72 nm, expected at least 200-700 nm"):
         hst_collections.fetch("calspec:VB 8", base=base, show_progress=False)
@@ -210,7 +210,7 @@ def test_an_ngsl_star(archive: str) -> None:
     assert not kept.dereddened
 
 
-def test_a_star_freed_of_its_dust_is_marked_and_reddened_again(archive: str) -> None:
+def test_dereddened_star_is_marked_and_can_be_reddened(archive: str) -> None:
     kept = hst_collections.fetch("lowlib:HD146233", base=f"{archive}/lowlib/", show_progress=False)
     assert kept.dereddened
     star, mauve = Source.from_library("HD146233").at_magnitude(7.0), Instrument.load("mauve")
@@ -245,7 +245,7 @@ def test_any_collection_is_searched(archive: str, monkeypatch: pytest.MonkeyPatc
         ("calspec:x", "hang", r"cannot be reached \(.*timed out.*expected a network; without one bring the file"),
     ],
 )
-def test_what_goes_wrong_is_a_sentence(
+def test_failed_downloads_raise(
     archive: str, name: str, below: str, sentence: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(hst_collections, "TIMEOUT_S", 0.5)
@@ -266,7 +266,7 @@ def test_what_goes_wrong_is_a_sentence(
         ("ngsl:HD 1", "slow", r"_v2.fits takes more than 0 s to come, expected less: try again later"),
     ],
 )
-def test_what_never_ends_is_not_fetched(
+def test_endless_downloads_raise(
     archive: str, name: str, below: str, sentence: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MAUVECL_LARGEST_FILE_MIB", "1")
@@ -277,7 +277,7 @@ def test_what_never_ends_is_not_fetched(
     assert own_stars.kept() == []
 
 
-def test_without_a_network() -> None:
+def test_download_without_a_network_raises() -> None:
     with pytest.raises(InputError, match=r"cannot be reached \(.*refused.*mauvecl library add"):
         hst_collections.fetch("ngsl:HD 37202", base="http://127.0.0.1:9/", show_progress=False)
     with pytest.raises(InputError, match="collection 'mast' is unknown, expected one of calspec, ngsl, lowlib"):
@@ -286,7 +286,7 @@ def test_without_a_network() -> None:
         hst_collections.fetch("HD 37202", base="http://127.0.0.1:9/")
 
 
-def test_the_verbs(tmp_path: Path, archive: str) -> None:
+def test_library_verbs(tmp_path: Path, archive: str) -> None:
     run = CliRunner().invoke
     files = [str(text_file(tmp_path / f"{name}.txt")) for name in ("one", "two")]
     added = run(app, ["library", "add", *files])
@@ -307,7 +307,7 @@ def test_the_verbs(tmp_path: Path, archive: str) -> None:
     assert "Your own" not in run(app, ["library"]).output
 
 
-def test_documentation_and_help_name_the_collections_that_there_are() -> None:
+def test_documentation_and_help_list_all_collections() -> None:
     page = (Path(__file__).parents[2] / "docs/my-star.md").read_text(encoding="utf-8")
     named = {*re.findall(r'fetch "(\w+):', page), *re.findall(r"\b(\w+):\.\.\.", page)}
     assert named == {one.name for one in hst_collections.COLLECTIONS}

@@ -38,7 +38,7 @@ def test_each_column_changes_its_own_quantity() -> None:
     assert mauve.with_(pixel_map=given).digest != mauve.digest
 
 
-def test_files_there_and_back(tmp_path: Path) -> None:
+def test_written_maps_are_read_back(tmp_path: Path) -> None:
     made = PixelMap.made_up(2048, seed=3, hot_share=0.01, hot_dark=50.0)
     assert 5 < np.sum(made.dark > 10) < 50
     made.write(tmp_path / "map.ecsv")
@@ -63,12 +63,12 @@ def test_files_there_and_back(tmp_path: Path) -> None:
         ({"dark": [[1.0]]}, "one value per pixel"),
     ],
 )
-def test_impossible_maps_are_refused(columns: dict, sentence: str) -> None:
+def test_invalid_maps_raise(columns: dict, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         PixelMap(**{name: np.array(values) for name, values in columns.items()})
 
 
-def test_files_that_are_no_maps(tmp_path: Path) -> None:
+def test_files_that_are_not_maps_raise(tmp_path: Path) -> None:
     path = tmp_path / "map.ecsv"
     for text, sentence in (
         (None, "does not exist"),

@@ -99,7 +99,7 @@ def test_line_function_is_the_convolution(mauve: Instrument) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("order", ["paper", "physical"])
 @pytest.mark.parametrize(("top_hat", "fwhm"), KERNELS)
-def test_random_spectra_against_quadrature(mauve: Instrument, top_hat: float, fwhm: float, order: Order) -> None:
+def test_random_spectra_agree_with_quadrature(mauve: Instrument, top_hat: float, fwhm: float, order: Order) -> None:
     instrument = mauve.with_(top_hat_width_nm=top_hat, gaussian_fwhm_nm=fwhm)
     rng = np.random.default_rng(20250101)
     wavelength = np.sort(np.append(rng.uniform(180, 750, 400), [180, 750]))
@@ -118,14 +118,14 @@ def per_efficiency(instrument: Instrument, rate: Float) -> Float:
     return rate / (1e-6 * instrument.collecting_area_cm2 * own / CHARGE_C)
 
 
-def test_a_flat_spectrum_stays_flat(mauve: Instrument) -> None:
+def test_flat_spectrum_stays_flat(mauve: Instrument) -> None:
     rate = electrons_per_second(mauve, [100.0, 800.0], [2e-13, 2e-13])
     np.testing.assert_allclose(per_efficiency(mauve, rate), 2e-13 * 0.3043, rtol=1e-12)
 
 
 @pytest.mark.parametrize(("top_hat", "fwhm"), KERNELS)
 @pytest.mark.parametrize("half_width", [1e-4, 0.3])
-def test_a_line_keeps_its_flux_and_place(mauve: Instrument, top_hat: float, fwhm: float, half_width: float) -> None:
+def test_line_keeps_its_flux_and_position(mauve: Instrument, top_hat: float, fwhm: float, half_width: float) -> None:
     instrument = mauve.with_(top_hat_width_nm=top_hat, gaussian_fwhm_nm=fwhm)
     nodes = np.array([180, 437.1 - half_width, 437.1, 437.1 + half_width, 750])
     landed = per_efficiency(instrument, electrons_per_second(instrument, nodes, [0, 0, 1.0, 0, 0]))
@@ -169,7 +169,9 @@ def test_many_nodes_lose_no_flux(mauve: Instrument, order: Order) -> None:
 
 
 @pytest.mark.parametrize("order", ["paper", "physical"])
-def test_with_or_without_a_matrix(mauve: Instrument, order: Order, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_results_with_and_without_a_matrix_agree(
+    mauve: Instrument, order: Order, monkeypatch: pytest.MonkeyPatch
+) -> None:
     wavelength = np.linspace(180, 750, 3001)
     flux = 1 + np.sin(wavelength)
     by_matrix = electrons_per_second(mauve, wavelength, flux, order)
@@ -178,7 +180,7 @@ def test_with_or_without_a_matrix(mauve: Instrument, order: Order, monkeypatch: 
     np.testing.assert_allclose(electrons_per_second(mauve, wavelength, flux, order), by_matrix, rtol=1e-12)
 
 
-def test_nodes_more_than_needed_change_nothing(mauve: Instrument) -> None:
+def test_redundant_nodes_change_nothing(mauve: Instrument) -> None:
     wavelength = np.array([150.0, 230.0, 390.0, 400.0, 800.0])
     flux = np.array([0.0, 1.0, 3.0, 1.0, 2.0])
     more = np.union1d(wavelength, np.linspace(150, 800, 5000))
@@ -189,14 +191,14 @@ def test_nodes_more_than_needed_change_nothing(mauve: Instrument) -> None:
     )
 
 
-def test_physical_order_carries_the_lights_own_efficiency(mauve: Instrument) -> None:
+def test_physical_order_applies_the_efficiency_of_the_light(mauve: Instrument) -> None:
     nodes = np.array([180, 302.999, 303.0, 303.001, 750])
     rate = electrons_per_second(mauve, nodes, [0, 0, 1.0, 0, 0], "physical")
     own = mauve.efficiency(303.0) * mauve.quantum_efficiency_a_per_w.at(303.0)
     assert rate.sum() == pytest.approx(1e-6 * 0.001 * 122 * own / CHARGE_C, rel=1e-6)
 
 
-def test_the_order_matters_where_the_efficiency_is_steep(mauve: Instrument) -> None:
+def test_order_matters_where_the_efficiency_is_steep(mauve: Instrument) -> None:
     # For a flat flux it is the efficiency's curvature alone: some per cent at most, but at the ends of the range.
     nodes, flat = np.array([100.0, 900.0]), np.ones(2)
     ratio = electrons_per_second(mauve, nodes, flat, "physical") / electrons_per_second(mauve, nodes, flat)
@@ -204,13 +206,13 @@ def test_the_order_matters_where_the_efficiency_is_steep(mauve: Instrument) -> N
     assert np.abs(ratio - 1).max() > 0.005
 
 
-def test_light_out_of_reach_leaves_nothing(mauve: Instrument) -> None:
+def test_light_out_of_reach_is_not_detected(mauve: Instrument) -> None:
     assert not electrons_per_second(mauve, [900.0, 1000.0], [1.0, 1.0]).any()
     beyond = Line.of(mauve).reach + 1
     assert electrons_per_second(mauve, [500.0, 501.0], [1.0, 1.0])[mauve.wavelength_nm > 501 + beyond].max() == 0
 
 
-def test_the_matrix_is_built_once(mauve: Instrument) -> None:
+def test_matrix_is_cached(mauve: Instrument) -> None:
     wavelength = np.linspace(180, 750, 500)
     first = response_matrix(mauve, wavelength)
     assert response_matrix(Instrument.load("mauve"), wavelength.copy()) is first
@@ -220,12 +222,12 @@ def test_the_matrix_is_built_once(mauve: Instrument) -> None:
 
 
 @pytest.mark.parametrize("nodes", [[300.0], [300.0, 300.0], [400.0, 300.0], [300.0, np.nan], [[300.0, 400.0]]])
-def test_bad_nodes(mauve: Instrument, nodes: list[float]) -> None:
+def test_invalid_nodes_raise(mauve: Instrument, nodes: list[float]) -> None:
     with pytest.raises(InputError, match="strictly increasing"):
         response_matrix(mauve, nodes)
 
 
-def test_bad_order_and_flux(mauve: Instrument) -> None:
+def test_unknown_order_and_wrong_flux_raise(mauve: Instrument) -> None:
     with pytest.raises(InputError, match="order = 'other', expected 'paper' or 'physical'"):
         response_matrix(mauve, [300.0, 400.0], "other")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="3 values for 2 wavelengths"):

@@ -61,7 +61,7 @@ def almanac(ra_deg: float, dec_deg: float, utc: str) -> tuple[float, float, floa
 
 @pytest.mark.parametrize("lookup", ["bilinear", "nearest"])
 @pytest.mark.parametrize("place", CELLS)
-def test_the_tables_own_cells(place: tuple[int, int], lookup: Lookup) -> None:
+def test_cells_of_the_table(place: tuple[int, int], lookup: Lookup) -> None:
     where = HelioEcliptic(float(place[0]), float(place[1]), 31.4)
     if CELLS[place] == "SA":
         with pytest.raises(InputError, match=r"the Sun is 31\.4 deg from the target"):
@@ -70,7 +70,7 @@ def test_the_tables_own_cells(place: tuple[int, int], lookup: Lookup) -> None:
         assert zodiacal_brightness(where, lookup) == pytest.approx(float(CELLS[place]), abs=1e-12)
 
 
-def test_the_tables_shape() -> None:
+def test_shape_of_the_table() -> None:
     assert zodiacal_table().brightness.shape == (13, 7)
     assert len(CELLS) == 91
     assert np.isnan(zodiacal_table().brightness).sum() == 13
@@ -97,7 +97,7 @@ def test_between_cells() -> None:
     ("ra", "dec"), [(290.0, -11.2), (0.0, 0.0), (53.2327, -9.4583), (243.9053, -8.3694), (180.0, 85.0), (84.4, 21.1)]
 )
 @pytest.mark.parametrize("utc", ["2026-03-01T12:00:00", "2026-06-21T00:00:00", "2027-11-05T05:06:07", "1999-12-31"])
-def test_position_against_the_almanac(ra: float, dec: float, utc: str) -> None:
+def test_position_agrees_with_the_almanac(ra: float, dec: float, utc: str) -> None:
     found = helioecliptic(SkyCoord(ra * u.deg, dec * u.deg), Time(utc, scale="utc"))
     folded, latitude, separation = almanac(ra, dec, utc)
     assert found.longitude_deg == pytest.approx(folded, abs=0.05 / np.cos(np.radians(latitude)))
@@ -107,7 +107,7 @@ def test_position_against_the_almanac(ra: float, dec: float, utc: str) -> None:
     assert 0 <= found.latitude_deg <= 90
 
 
-def test_ways_to_say_where_and_when() -> None:
+def test_equivalent_targets_and_times() -> None:
     target = SkyCoord("19h22m00s -11d12m00s")
     same = Sky.at(target, Time("2026-07-01T00:00:00", scale="utc"))
     assert Sky.at("19h22m00s -11d12m00s", "2026-07-01") == same
@@ -120,7 +120,7 @@ def test_ways_to_say_where_and_when() -> None:
     assert "deg from the Sun" in same.description
 
 
-def test_solar_avoidance_says_how_far_the_sun_is() -> None:
+def test_solar_avoidance_message_states_the_separation() -> None:
     _, _, separation = almanac(100.0, 10.0, "2026-06-21")
     with pytest.raises(InputError, match="deg from the target") as caught:
         Sky.at("100.0 10.0", "2026-06-21")
@@ -146,19 +146,19 @@ def test_solar_avoidance_says_how_far_the_sun_is() -> None:
         ("290 -11", 2026, "time = 2026, expected a UTC time"),
     ],
 )
-def test_bad_targets_and_times(target: Any, time: Any, message: str) -> None:
+def test_invalid_targets_and_times_raise(target: Any, time: Any, message: str) -> None:
     with pytest.raises(InputError, match=message) as caught:
         Sky.at(target, time)
     assert "\n" not in str(caught.value)
 
 
-def test_bad_lookup() -> None:
+def test_unknown_lookup_raises() -> None:
     with pytest.raises(InputError, match="lookup = 'cubic', expected 'bilinear' or 'nearest'"):
         Sky.at("290 -11", "2026-07-01", "cubic")  # type: ignore[arg-type]
 
 
 @pytest.mark.filterwarnings("error")
-def test_no_network_and_nothing_global(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_network_access_and_no_global_state(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_: object, **__: object) -> None:
         raise AssertionError("the network was asked")
 

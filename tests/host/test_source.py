@@ -34,14 +34,14 @@ def grid() -> np.ndarray:
     return np.arange(170.0, 1100.0, 1.0)
 
 
-def test_the_library_is_small_and_complete() -> None:
+def test_library_is_small_and_complete() -> None:
     assert 25 <= len(NAMES) <= 40
     assert {"B0V", "B2IV", "G2V", "K2.5V", "M3V", "Sun", "Vega"} <= set(NAMES)
     assert sum(path.stat().st_size for path in LIBRARY.rglob("*") if path.is_file()) < 2e6
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_each_spectrum_is_usable_and_says_where_it_is_from(name: str) -> None:
+def test_each_spectrum_is_usable_and_has_an_origin(name: str) -> None:
     entry = catalogue.find(name)
     assert all(entry[field] for field in ("origin", "citation", "licence", "treatment", "uv_quality"))
     source = Source.from_library(name)
@@ -69,7 +69,7 @@ def test_ultraviolet_quality_of_known_stars() -> None:
         assert mean(low, high) / mean(540, 560) == pytest.approx(ratio, rel=0.05)
 
 
-def test_unknown_names_get_the_nearest() -> None:
+def test_unknown_name_suggests_the_nearest() -> None:
     assert Source.from_library(" g2v ").name == "G2V"
     assert Source.from_library("hd 40307").name == "K2.5V"
     with pytest.raises(InputError, match=r"'G3V' is unknown, expected a name such as .*G[258]V"):
@@ -78,7 +78,7 @@ def test_unknown_names_get_the_nearest() -> None:
 
 @pytest.mark.parametrize("band", ALIASES)
 @pytest.mark.parametrize("name", ["B2IV", "G2V", "K3V"])
-def test_photometry_is_synphots(name: str, band: str) -> None:
+def test_photometry_equals_synphot(name: str, band: str) -> None:
     """Photons to the last bit and magnitudes to 1e-13 as of synphot's observation, for whole and for ending spectra."""
     from synphot import Empirical1D, Observation, SpectralElement, units
 
@@ -105,7 +105,7 @@ def test_photometry_is_synphots(name: str, band: str) -> None:
 
 
 @pytest.mark.parametrize("kelvin", [1000.0, 5772.0, 10_000.0, 200_000.0])
-def test_a_blackbody_is_astropys_to_the_last_bit(kelvin: float) -> None:
+def test_blackbody_equals_astropy_to_the_last_bit(kelvin: float) -> None:
     from astropy.modeling.physical_models import BlackBody
 
     unit = u.erg / (u.s * u.cm**2 * u.AA * u.sr)
@@ -126,7 +126,7 @@ def test_vega_has_its_catalogued_magnitude_and_ten_is_fainter(sun: Source) -> No
 
 
 @pytest.mark.parametrize("system", bands.SYSTEMS)
-def test_a_star_is_brought_to_a_magnitude_of_any_system(sun: Source, system: bands.System) -> None:
+def test_scaling_to_a_magnitude_in_any_system(sun: Source, system: bands.System) -> None:
     star = sun.at_magnitude(7.4, "Kepler", system)
     assert star.magnitude("Kepler", system) == pytest.approx(7.4, abs=1e-9)
     assert (
@@ -143,7 +143,7 @@ def test_a_star_is_brought_to_a_magnitude_of_any_system(sun: Source, system: ban
     )
 
 
-def test_unknown_systems_are_named(sun: Source) -> None:
+def test_unknown_magnitude_system_raises(sun: Source) -> None:
     with pytest.raises(InputError, match="magnitude system 'AB' is unknown, expected one of catalogue, vega, ab"):
         sun.at_magnitude(7.4, "V", "AB")  # type: ignore[arg-type]
 
@@ -207,12 +207,12 @@ def test_a_replacing_flare_hides_photosphere(sun: Source) -> None:
         ({"amplitude": 0.1, "geometry": "sideways"}, "geometry = 'sideways'"),
     ],
 )
-def test_impossible_flares_are_refused(sun: Source, options: dict, sentence: str) -> None:
+def test_invalid_flares_raise(sun: Source, options: dict, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         sun.flaring(**options)
 
 
-def test_a_flare_takes_the_place_of_each_stars_own_photosphere(sun: Source) -> None:
+def test_replacing_flare_uses_the_photosphere_of_the_star(sun: Source) -> None:
     """The library's temperature where none is given; a spectrum of one's own has none."""
     assert (sun.temperature_k, Source.from_library("K2.5V").temperature_k) == (5636.0, 4783.0)
     own = sun.flaring(0.1, geometry="replaces")
@@ -228,7 +228,7 @@ def test_a_flare_takes_the_place_of_each_stars_own_photosphere(sun: Source) -> N
         unknown.flaring(0.1, geometry="replaces")
 
 
-def test_bands_that_the_spectrum_does_not_cover_are_refused() -> None:
+def test_uncovered_band_raises() -> None:
     short = Source.from_arrays(np.arange(175.0, 751.0), np.ones(576))
     assert np.isfinite(short.magnitude("V"))
     with pytest.raises(InputError, match="covers 175-750 nm, expected 99% of the band TESS"):
@@ -248,7 +248,7 @@ def test_dust_dims_the_blue_most(sun: Source) -> None:
             sun.reddened(**options)
 
 
-def test_a_real_calspec_file_goes_through(sun: Source) -> None:
+def test_calspec_file_is_read(sun: Source) -> None:
     """18 Sco, the paper's G2V star: the whole file, unmodified, and close to the library's G2V."""
     star = Source.read(DATA / "spectra" / "18sco_stis_004.fits")
     assert star.name == "18SCO"
@@ -337,7 +337,7 @@ GOOD = grid() * 1e-15
         (rows(grid(), 0 * GOOD), "every flux is zero"),
     ],
 )
-def test_bad_text_is_one_sentence(tmp_path: Path, text: str, sentence: str) -> None:
+def test_invalid_text_raises(tmp_path: Path, text: str, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence) as caught:
         Source.read(write(tmp_path / "star.dat", text))
     assert "\n" not in str(caught.value)
@@ -355,7 +355,7 @@ def test_bad_text_is_one_sentence(tmp_path: Path, text: str, sentence: str) -> N
         (slice(535), r"ends at 704 nm, where it is bright: \d+.\d% of the brightest"),
     ],
 )
-def test_short_spectra_are_refused_for_the_nominal_range(kept: slice, sentence: str) -> None:
+def test_short_spectra_raise_for_the_nominal_range(kept: slice, sentence: str) -> None:
     """And used by an instrument whose pixels see what is there."""
     star = Source.from_arrays(grid()[kept], GOOD[kept])
     mauve = Instrument.load("mauve")
@@ -366,7 +366,7 @@ def test_short_spectra_are_refused_for_the_nominal_range(kept: slice, sentence: 
     np.testing.assert_array_equal(expect(star, narrow, exposure=5.0).source_electrons, whole.source_electrons)
 
 
-def test_bad_files_are_one_sentence(tmp_path: Path) -> None:
+def test_unreadable_spectrum_files_raise(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="does not exist"):
         Source.read(tmp_path / "no.txt")
     (tmp_path / "junk.txt").write_bytes(bytes(range(256)))
@@ -415,7 +415,7 @@ def test_other_numbers_of_the_span() -> None:
         cut.magnitude("GALEX NUV")
 
 
-def test_extended_by_another_star(sun: Source) -> None:
+def test_extension_by_another_star(sun: Source) -> None:
     """The library's Sun cut at both ends and extended by itself, at another brightness, is the library's Sun."""
     kept = (sun.wavelength_nm > 250) & (sun.wavelength_nm < 650)
     mauve = Instrument.load("mauve")
@@ -445,7 +445,7 @@ def noisy(level: float) -> tuple[np.ndarray, np.ndarray]:
     return nm, np.where(nm > 350, 1e-12, level) + 1e-14 * rng.standard_normal(nm.size)
 
 
-def test_measured_noise_is_kept_and_told_once() -> None:
+def test_measured_noise_is_kept_and_reported_once() -> None:
     nm, flux = noisy(0.0)
     star = Source.from_arrays(nm, flux, name="cool")
     np.testing.assert_array_equal(star.flux_flam, flux)
@@ -460,7 +460,7 @@ def test_measured_noise_is_kept_and_told_once() -> None:
     assert star.binned(5.0).magnitude("V") == pytest.approx(star.magnitude("V"), abs=2e-3)
 
 
-def test_a_mean_below_zero_beyond_its_error_is_refused() -> None:
+def test_mean_too_far_below_zero_raises() -> None:
     """A level of -1e-13 is ten errors of a point, and hundreds of a pixel's: no noise of the spectrum explains it."""
     star = Source.from_arrays(*noisy(-1e-13), name="wrong")
     with pytest.raises(
@@ -469,7 +469,7 @@ def test_a_mean_below_zero_beyond_its_error_is_refused() -> None:
         expect(star.at_magnitude(2.0), Instrument.load("mauve"), exposure=50.0)
 
 
-def test_a_pixels_error_is_the_scatter_of_its_means() -> None:
+def test_standard_error_equals_the_scatter_of_means() -> None:
     """Against the scatter over 200 spectra of white noise.
 
     200 draws tell a standard deviation to 5 %, and the error told, a mean over 20 of them, is right to 3 %: 0.75 to
@@ -490,7 +490,7 @@ def test_a_pixels_error_is_the_scatter_of_its_means() -> None:
     assert (np.abs(ratio - 1) < 0.25).all(), ratio
 
 
-def test_wavelengths_a_rounding_apart_are_no_two_points() -> None:
+def test_nearly_equal_wavelengths_count_as_one() -> None:
     nm = np.insert(grid(), 100, np.nextafter(grid()[100], 0))
     with pytest.raises(InputError, match="are the same to within rounding"):
         Source.from_arrays(nm, 1e-15 * nm)

@@ -104,7 +104,7 @@ NOT_FLUX = [
 
 
 @pytest.mark.parametrize("extra", NOT_FLUX)
-def test_no_other_column_is_taken_for_the_flux(tmp_path: Path, extra: str) -> None:
+def test_flux_column_is_never_confused_with_another(tmp_path: Path, extra: str) -> None:
     """Between wavelength and flux, where a reader that drops unknown names would take it."""
     assert is_right(read(tmp_path, text({"nm": NM, extra: ERRORS, "flux": FLUX})))
     units = {"wavelength": (NM, "nm"), extra: (ERRORS, None), "flux": (FLUX, "FLAM")}
@@ -250,7 +250,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("case", REFUSED)
-def test_refused_in_one_sentence(tmp_path: Path, case: str) -> None:
+def test_ambiguous_tables_raise(tmp_path: Path, case: str) -> None:
     content, sentence = REFUSED[case]
     with pytest.raises(InputError, match=sentence) as caught:
         read(tmp_path, content)
@@ -268,7 +268,7 @@ def test_a_column_is_chosen_by_its_name(tmp_path: Path) -> None:
         read(tmp_path, text({"nm": NM, "model": ONE, "flux": TWO}), "[banana]")
 
 
-def test_what_the_user_says_counts_more(tmp_path: Path) -> None:
+def test_arguments_override_the_file(tmp_path: Path) -> None:
     per_nm = FLUX / 100
     assert is_right(read(tmp_path, text({"nm": NM, "flux (W/m2)": per_nm}), flux_unit="W m-2 nm-1"))
     magnitudes = text({"nm": NM, "flux": (FLUX * FLAM).to_value(u.ABmag, PER_HZ)})
@@ -280,7 +280,7 @@ def test_what_the_user_says_counts_more(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("values", [np.ones(NM.size, bool), FLUX * (1 + 1j)], ids=["boolean", "complex"])
 @pytest.mark.parametrize("form", ["fits", "votable", "ascii.ecsv"])
-def test_numbers_that_are_not_real(tmp_path: Path, values: Any, form: str) -> None:
+def test_complex_and_boolean_columns_raise(tmp_path: Path, values: Any, form: str) -> None:
     made = Table({"wavelength": Column(NM, unit="nm"), "flux": Column(values, unit=FLAM)})
     made.write(tmp_path / "star.dat", format=form)
     with pytest.raises(InputError, match=r"holds (true and false|complex numbers), expected real|no plain numbers"):
@@ -306,7 +306,7 @@ UNITS = {
 
 @pytest.mark.parametrize("form", ["ecsv", "fits", "text", "name"])
 @pytest.mark.parametrize("case", UNITS)
-def test_one_normaliser_of_units_for_all_formats(tmp_path: Path, case: str, form: str) -> None:
+def test_units_are_normalised_alike_in_all_formats(tmp_path: Path, case: str, form: str) -> None:
     """astropy itself refuses ANGSTROMS, FLAM, microns and Angstroem, and reads A as ampere."""
     length, density, wavelength, flux = UNITS[case]
     if form == "ecsv":
@@ -385,7 +385,7 @@ FLUXES = {
 @settings(
     max_examples=150, deadline=None, derandomize=True, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
-def test_any_table_is_read_right_or_refused(
+def test_any_table_is_read_correctly_or_raises(
     tmp_path: Path,
     wave: str,
     flux: str,
@@ -444,7 +444,7 @@ def test_prose_in_a_header_changes_nothing(
         assert is_right(star), star.told
 
 
-def test_names_are_recognised_whatever_their_style() -> None:
+def test_column_names_are_recognised_in_any_style() -> None:
     for kind, names in {
         "wavelength": "wavelength WAVE lambda λ wl_nm Wavelength[um] log_wave loglam frequency awav energy_keV",
         "flux": "flux FLUX F_lambda fλ flam nuFnu Flux_Density spectralFluxDensity sflux irradiance logflux ABmag",

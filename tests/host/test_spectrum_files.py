@@ -101,7 +101,7 @@ def test_text_with_its_units(tmp_path: Path, text: str) -> None:
 @pytest.mark.parametrize("pack", [gzip.compress, bz2.compress, lzma.compress, bytes])
 @pytest.mark.parametrize("content", [PLAIN.encode(), table(), b"\xef\xbb\xbf" + PLAIN.encode(), PLAIN.encode("utf-16")])
 @pytest.mark.parametrize("name", ["star.txt", "star.fits", "star"])
-def test_content_counts_and_not_the_name(
+def test_format_follows_content_not_file_name(
     tmp_path: Path, pack: Callable[[bytes], bytes], content: bytes, name: str
 ) -> None:
     (tmp_path / name).write_bytes(pack(content))
@@ -217,7 +217,7 @@ def test_tables_that_name_their_units(tmp_path: Path) -> None:
     alike(tmp_path / "d.dat")
 
 
-def test_assumed_units_are_told(tmp_path: Path) -> None:
+def test_assumed_units_are_reported(tmp_path: Path) -> None:
     (tmp_path / "a.txt").write_text(lines(NM, FLUX))
     assert [text.split(",")[0] for text in alike(tmp_path / "a.txt").told] == [
         "ASSUMED: wavelength in nm",
@@ -263,7 +263,9 @@ def test_angstrom_that_spans_the_range_as_numbers_is_not_nm(tmp_path: Path) -> N
         (1700, 5000),
     ],
 )
-def test_angstrom_without_a_unit_gets_one_advice(tmp_path: Path, low: float, high: float, extend: str | None) -> None:
+def test_angstrom_without_a_unit_gets_a_single_hint(
+    tmp_path: Path, low: float, high: float, extend: str | None
+) -> None:
     """The range of the AD Leo great flare and others: taken as nm, nearly all light would be another star's."""
     angstrom = np.geomspace(low, high, 1500)
     (tmp_path / "flare.dat").write_text(lines(angstrom, 1e-13 + 1e-17 * angstrom))
@@ -322,7 +324,7 @@ BAD_TEXT = {
 
 
 @pytest.mark.parametrize("kind", BAD_TEXT)
-def test_bad_text_is_a_sentence(tmp_path: Path, kind: str) -> None:
+def test_unusable_text_raises(tmp_path: Path, kind: str) -> None:
     text, sentence = BAD_TEXT[kind]
     (tmp_path / "star.txt").write_text(text)
     with pytest.raises(InputError, match=sentence) as caught:
@@ -354,7 +356,7 @@ BAD_FITS = {
 
 
 @pytest.mark.parametrize("kind", BAD_FITS)
-def test_bad_fits_is_a_sentence(tmp_path: Path, kind: str) -> None:
+def test_unusable_fits_raises(tmp_path: Path, kind: str) -> None:
     content, sentence = BAD_FITS[kind]
     (tmp_path / "star.fits").write_bytes(content)
     with pytest.raises(InputError, match=sentence) as caught:
@@ -362,7 +364,7 @@ def test_bad_fits_is_a_sentence(tmp_path: Path, kind: str) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_damaged_bytes_end_in_a_sentence_or_a_spectrum(tmp_path: Path) -> None:
+def test_damaged_files_raise_or_are_read(tmp_path: Path) -> None:
     """Whole files with bytes changed at random, by a fixed seed: nothing but `InputError` may come out."""
     rng = np.random.default_rng(14)
     for content in (WHOLE, FITS["linear image"], FITS["start and step"], PLAIN.encode(), gzip.compress(WHOLE)):
@@ -422,14 +424,14 @@ def test_masks_and_integers_that_mark_nothing(tmp_path: Path) -> None:
         Source.read(tmp_path / "d.vot")
 
 
-def test_the_span_is_judged_before_ends_are_cut(tmp_path: Path) -> None:
+def test_coverage_is_checked_before_ends_are_dropped(tmp_path: Path) -> None:
     flux = np.where(NM < 230, np.nan, FLUX)
     (tmp_path / "a.txt").write_text(lines(NM, flux, head="# nm FLAM\n"))
     with pytest.raises(InputError, match=r"flux nan at point \d+, 200 nm"):
         Source.read(tmp_path / "a.txt")
 
 
-def test_a_bomb_of_aliases_is_refused(tmp_path: Path) -> None:
+def test_yaml_alias_bomb_raises(tmp_path: Path) -> None:
     """A header of 1 KiB that stands for 10**9 values, and one of astropy's own aliases, which is not."""
     levels = ["a0: &a0 [x,x,x,x,x,x,x,x,x,x]"]
     levels += [f"a{k}: &a{k} [{','.join([f'*a{k - 1}'] * 10)}]" for k in range(1, 9)]

@@ -89,7 +89,7 @@ def test_cos_segments_are_joined(tmp_path: Path) -> None:
         Source.read(path)
 
 
-def test_segments_within_one_another_are_asked_for(tmp_path: Path) -> None:
+def test_nested_segments_need_a_choice(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"lies within another.*FILE\[name\]"):
         read_spectrum(cos(tmp_path, [("NUVA", 2000.0, 3000.0), ("NUVB", 2400.0, 2600.0)]))
 

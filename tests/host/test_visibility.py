@@ -61,7 +61,7 @@ def test_continuous_viewing(margin: float) -> None:
     assert from_pole[seen].max(initial=-1.0) == pytest.approx(22.0 - margin, abs=0.1)
 
 
-def test_m4opts_definitions() -> None:
+def test_constraints_agree_with_m4opt() -> None:
     """The same angles as m4opt has them (its version 2.3.1, `m4opt.constraints`), by astropy's horizontal frame.
 
     The Earth's limb: altitude + arccos(R_earth / distance); its altitude is over the ellipsoid's horizon, up to 0.2 deg
@@ -100,7 +100,7 @@ def test_m4opts_definitions() -> None:
                 assert np.abs(seen - np.degrees(np.arccos(found @ star))).max() < 0.02
 
 
-def test_flags_are_the_angles(month: Visibility) -> None:
+def test_limits_apply_to_the_angles(month: Visibility) -> None:
     """Each limit, in float32 and by cosines, against angles in float64."""
     track, target = month.track, month.target
     part = slice(0, 3000)
@@ -119,7 +119,7 @@ def _agree(flags: NDArray[np.bool_], over_deg: NDArray[np.float64]) -> None:
     assert (flags == (over_deg >= 0))[sure].all()
 
 
-def test_windows_add_up(month: Visibility) -> None:
+def test_windows_sum_to_the_visible_time(month: Visibility) -> None:
     names, hours = month.by_month()
     assert names == ["2026-12", "2027-01"]
     for k in range(len(month.target)):
@@ -142,14 +142,14 @@ def test_windows_add_up(month: Visibility) -> None:
     assert len(month.by_orbit(0)) in (609, 610)
 
 
-def test_each_limit_leaves_its_share(month: Visibility) -> None:
+def test_fraction_allowed_by_each_limit(month: Visibility) -> None:
     """The limits together leave no more than each alone, and what none would take away is there."""
     assert (month.share <= np.min(list(month.kept_by.values()), axis=0) + 1e-12).all()
     free = Limits(earth_limb_deg=None, sun_deg=None, moon_deg=None, declination_deg=None, proton_flux=None)
     assert Visibility.of(month.track, month.target, free).share == pytest.approx(1.0)
 
 
-def test_eclipse_as_a_condition(month: Visibility) -> None:
+def test_eclipse_rule(month: Visibility) -> None:
     both, dark, light = (
         Visibility.of(month.track, month.target, Limits(eclipse=rule)).seen for rule in ("any", "only", "never")
     )
@@ -170,7 +170,7 @@ def test_declination_cone_and_duty_cycle(month: Visibility) -> None:
     assert half.hours == pytest.approx(month.hours / 2)
 
 
-def test_short_windows_are_left_out(month: Visibility) -> None:
+def test_short_windows_are_dropped(month: Visibility) -> None:
     long = Visibility.of(month.track, month.target, Limits(shortest_s=1200.0))
     for k in range(len(month.target)):
         every, kept = month.windows(k), long.windows(k)
@@ -187,14 +187,14 @@ def test_shadow_of_a_circular_orbit() -> None:
         assert found == pytest.approx(0.0 if cosine > 1 else np.arccos(cosine) / np.pi, abs=2e-4)
 
 
-def test_polygon_over_the_date_line() -> None:
+def test_polygon_across_the_date_line() -> None:
     corners = np.array([[170.0, -10.0], [-170.0, -10.0], [-170.0, 10.0], [170.0, 10.0]])
     longitude = np.array([175.0, -175.0, 185.0, 165.0, -165.0, 0.0])
     assert constraints.in_polygon(longitude, np.zeros(6), corners).tolist() == [True, True, True, False, False, False]
     assert not constraints.in_polygon(np.array([180.0]), np.array([11.0]), corners)[0]
 
 
-def test_map_between_cells() -> None:
+def test_flux_map_interpolates_between_cells() -> None:
     """At a cell its value, halfway the mean of two, over the date line and at the poles nothing odd."""
     flux = proton_map()
     grid = flux.flux[10]
@@ -248,12 +248,12 @@ def test_hits_along_the_orbit(month: Visibility) -> None:
 @pytest.mark.parametrize(
     ("text", "words"), [("epsilon Errr", "such as eps Eri"), ("700 10", "0 to 360"), ("zzz", "embedded list")]
 )
-def test_unknown_targets(text: str, words: str) -> None:
+def test_unknown_target_raises(text: str, words: str) -> None:
     with pytest.raises(InputError, match=words):
         Target.of(text)
 
 
-def test_names_in_any_writing() -> None:
+def test_names_in_any_spelling() -> None:
     same = {Target.of(name) for name in ("eps Eri", "epsilon Eri", "EPS ERI", "HD 22049", "hd22049", "HIP 16537")}
     assert len(same) == 1
     assert Target.of("19h22m00s -11d12m00s").ra_deg == pytest.approx(290.5)
@@ -299,7 +299,7 @@ def test_simbad(monkeypatch: pytest.MonkeyPatch) -> None:
         Target.of("HD 3", simbad=True)
 
 
-def test_no_network_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_network_failure_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     """With a network that fails, one that never answers, and without astroquery."""
     from mauvecl.host.orbit import targets
 
@@ -334,6 +334,6 @@ def test_no_network_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
         {"shortest_s": -1.0},
     ],
 )
-def test_impossible_limits(kwargs: dict[str, object]) -> None:
+def test_invalid_limits_raise(kwargs: dict[str, object]) -> None:
     with pytest.raises(InputError):
         Limits(**kwargs)  # type: ignore[arg-type]

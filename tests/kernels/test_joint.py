@@ -91,7 +91,7 @@ def span(x: Expectation) -> tuple[int, int]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", PIXELS)
-def test_no_number_of_draws_would_tell(name: str) -> None:
+def test_joint_draws_cannot_be_distinguished_from_exact_ones(name: str) -> None:
     """Pearson's test would need 1e12 draws to see the polynomial at five sigma; most cases far more."""
     x = PIXELS[name]
     assert joint_is_exact(Cumulants.of(x, 1)).all()
@@ -103,7 +103,7 @@ def test_no_number_of_draws_would_tell(name: str) -> None:
     assert needed > 1e14
 
 
-def test_what_is_not_smooth_is_drawn_apart() -> None:
+def test_noise_that_is_not_smooth_is_drawn_separately() -> None:
     for x in (
         one_pixel(2225.0, 0.0, 1.4),
         one_pixel(2.0, 0.0, 1.0),

@@ -76,7 +76,7 @@ BOUNDS = [(np.log10(1.5), 1.5), (-0.5, 0.5), (-2.5, 3.3), (-1.0, 1.0), (-4.5, 3.
 @pytest.mark.long
 @pytest.mark.parametrize("varying", [False, True], ids=["steady", "factors on light and dark"])
 @pytest.mark.parametrize("what", ["Pearson", "tails"])
-def test_the_worst_that_is_allowed(what: str, varying: bool) -> None:
+def test_worst_draws_that_the_region_allows(what: str, varying: bool) -> None:
     """A search for what Pearson's test sees soonest, and for the worst tail, among all that is drawn jointly."""
     tried = 0
 
@@ -98,7 +98,7 @@ def test_the_worst_that_is_allowed(what: str, varying: bool) -> None:
 
 
 @pytest.mark.parametrize("name", ["mauve", "mauve-electrons"])
-def test_the_payload_at_every_setting(name: str) -> None:
+def test_nominal_payload_at_all_settings(name: str) -> None:
     """Nine temperatures, 1 to 100 frames: jointly, and by the estimate never noticed before 5e13 draws."""
     below = 0
     for temperature in (-40, -30, -20, -9, 0, 9, 15, 21, 25):
@@ -113,7 +113,7 @@ def test_the_payload_at_every_setting(name: str) -> None:
     assert below == {"mauve": 2, "mauve-electrons": 3}[name]
 
 
-def test_the_smallest_poisson_means() -> None:
+def test_smallest_poisson_means() -> None:
     """1.5 DN of Gaussian noise and .14 counts: gamma_3 is .038, yet 2e9 draws tell; the tail is off by a fifth."""
     noise = Noise(1.5, 0.14, 1.0, 0.0, 1.0, 0.37)
     p, q = noise.both(varying=False)
@@ -129,7 +129,7 @@ def test_the_smallest_poisson_means() -> None:
         prepare([x], processes=Processes(qe_scale=Uniform(0.9, 1.1)))
 
 
-def test_priors_that_lead_out_of_the_region_are_refused() -> None:
+def test_priors_outside_the_tested_region_raise() -> None:
     """Where the expectation may be drawn jointly and its dark at the prior's other end may not."""
     x = toy(8, 1, dark=2225.0, read=2.0, light=0.0)
     prepare([x], processes=Processes(detector_temperature=Uniform(19.0, 23.0)))

@@ -44,7 +44,7 @@ def test_accuracy(probes: Probes) -> None:
     assert 6.75 < np.abs(z).max() < 6.77
 
 
-def test_the_twin_has_the_same_bits(probes: Probes) -> None:
+def test_reference_has_the_same_bits(probes: Probes) -> None:
     radius, angle = words(2**18)
     np.testing.assert_array_equal(
         probes.normal(radius, angle).view(np.uint32), np.stack(reference.normal_pair(radius, angle)).view(np.uint32)
@@ -108,7 +108,7 @@ def probes_fast(engine: Engine) -> Probes:
     return Probes(device=engine.opened)
 
 
-def test_the_fused_multiply_add_is_rounded_once() -> None:
+def test_fused_multiply_add_rounds_once() -> None:
     """The twin's float32 fma against exact rational arithmetic."""
     from fractions import Fraction
 

@@ -28,7 +28,7 @@ def random_counters(n: int) -> tuple[np.ndarray, np.ndarray]:
     return counters, generator.integers(0, 2**32, (n, 2), dtype=np.uint32)
 
 
-def test_the_loop_invariant_form_is_the_plain_one(probes: Probes) -> None:
+def test_loop_invariant_form_equals_the_plain_one(probes: Probes) -> None:
     out = probes.philox(*random_counters(5000))
     np.testing.assert_array_equal(out[:, :4], out[:, 4:])
 

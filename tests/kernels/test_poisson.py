@@ -108,7 +108,7 @@ def draws_to_tell(mean: float, offset: float, slope: float, cubic: float) -> flo
 
 
 @pytest.mark.parametrize("mean", [SMALLEST_EXPANDED, 2225.0, 22250.0, 1e6])
-def test_no_number_of_draws_would_tell_the_expansion(mean: float) -> None:
+def test_expansion_cannot_be_distinguished_from_exact_draws(mean: float) -> None:
     """By what the scene gives the device; without its last term 2e10 draws of a mean of 1000 would."""
     scene = prepare([selftest.toy(4, 1, dark=mean)], recipe="apart")
     (source,) = scene.dark_counts[:1]
@@ -120,7 +120,7 @@ def test_no_number_of_draws_would_tell_the_expansion(mean: float) -> None:
 
 
 @pytest.mark.parametrize("mean", [SMALLEST_EXPANDED, 2225.0, 22250.0])
-def test_a_rounded_normal_would_fail(mean: float) -> None:
+def test_rounded_normal_fails(mean: float) -> None:
     """The test above can fail: the same number of draws from a rounded normal, or without the last term."""
     half = int(10 * np.sqrt(mean))
     n = np.arange(-half, half)
@@ -128,7 +128,7 @@ def test_a_rounded_normal_would_fail(mean: float) -> None:
     assert pearson(np.rint(1e8 * rounded).astype(np.int64), round(mean) - half, mean) < 1e-6
 
 
-def test_the_expansion_is_the_twins(probes: Probes) -> None:
+def test_expansion_equals_the_reference(probes: Probes) -> None:
     mean = 2225.0
     w = np.array(reference.words_at(np.arange(4096), 0, "dark", 1, 5))
     z = reference.normal_pair(w[0], w[1])
@@ -168,6 +168,6 @@ def test_equal_means_share_a_table() -> None:
 
 
 @pytest.mark.parametrize("mean", [-1.0, np.nan, np.inf, 1e9])
-def test_impossible_means_are_refused(mean: float) -> None:
+def test_impossible_means_raise(mean: float) -> None:
     with pytest.raises(ValueError, match="Poisson mean"):
         alias_table(mean)

@@ -159,7 +159,7 @@ def outside(prior: Prior, value: float, upper: bool) -> float:
     return float(np.exp(log_integral(low, high) - log_integral(prior.low, prior.high)))
 
 
-def test_the_twin_has_the_same_bits(probes: Probes) -> None:
+def test_reference_has_the_same_bits(probes: Probes) -> None:
     """At the ends of words, octaves and cells, and at random words."""
     table = Processes(qe_scale=Normal(1.0, 0.01, 0.5, 1.5)).factors(CONDITIONS).tables[0]
     ends = np.concatenate([[2**k - 1, 2**k, 2**k + 1] for k in range(1, 32)]).astype(np.uint32)
@@ -174,6 +174,6 @@ def test_the_twin_has_the_same_bits(probes: Probes) -> None:
     assert (np.diff(found[low]) >= 0).all()
 
 
-def test_a_cut_too_far_is_refused() -> None:
+def test_prior_truncated_too_far_raises() -> None:
     with pytest.raises(InputError, match=r"9\.9e\+06 sd from its mean, expected at most 100000"):
         Normal(1.0, 1e-7, 1.99, 3.0)

@@ -51,7 +51,7 @@ def counted(kind: str, fap: float, probability: float, n: int, seeds: int) -> tu
     ("fap", "n", "seeds", "probabilities"),
     [(0.1, 1000, 2000, (0.3, 0.7, 0.97)), (0.01, 10_000, 1000, (0.05, 0.3, 0.97)), (1e-3, 100_000, 100, (0.3,))],
 )
-def test_it_covers_as_often_as_it_says(kind: str, fap: float, n: int, seeds: int, probabilities: tuple) -> None:
+def test_interval_has_nominal_coverage(kind: str, fap: float, n: int, seeds: int, probabilities: tuple) -> None:
     """94-97 %, beside 5 standard errors of the seeds: one of the 21 fails by chance in 8e4 runs.
 
     The interval that it takes the place of is wider in all of them, and up to twice as wide.
@@ -69,7 +69,7 @@ def test_it_covers_as_often_as_it_says(kind: str, fap: float, n: int, seeds: int
 
 
 @pytest.mark.parametrize("probability", [0.15, 0.5, 0.99, 0.998, 0.9995])
-def test_it_covers_at_least_as_often_near_the_ends(probability: float) -> None:
+def test_interval_covers_near_the_ends(probability: float) -> None:
     """Few flares missed of 1000, or hardly more than false alarms; 5 standard errors below 94 %: 3e-7 by chance."""
     for kind in ("matched", "chi2"):
         above, shared = counted(kind, 0.1, probability, 1000, 1000)
@@ -96,7 +96,7 @@ def test_ends_of_the_counts() -> None:
 
 
 @pytest.mark.parametrize("correlation", [0.0, 0.3, 0.96, 0.9999, 1.0])
-def test_two_normals_together(correlation: float) -> None:
+def test_orthant_probability_of_two_normals(correlation: float) -> None:
     """Against scipy's bivariate normal."""
     for h, k in ((2.33, -0.5), (3.09, 1.88), (1.28, 1.0)):
         exact = stats.multivariate_normal.cdf(

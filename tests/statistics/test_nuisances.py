@@ -44,7 +44,7 @@ def setting(quiet: Expectation, sd: dict[str, float]) -> Setting:
         (("M3V", 9.0, 0.24), 46.5, (1.25, 17.0), (44.8, 45.1), 13.6),
     ],
 )
-def test_the_table_of_the_methods(
+def test_table_of_the_methods(
     star: Any, known: float, dark: tuple[float, float], light: tuple[float, float], both: float
 ) -> None:
     """Numbers computed apart from this project, Vega at V = 0; to 1 %, or half a unit of the last digit of 0.23."""
@@ -65,7 +65,7 @@ def test_the_table_of_the_methods(
 @pytest.mark.long
 @pytest.mark.parametrize("sd", [{"dark": 0.1}, {"dark": FREE, "light": 0.02}, {"dark": 0.3, "sky": 1.0, "tilt": FREE}])
 @pytest.mark.parametrize("name", ["chi2", "chi2_element", "matched", "uv_excess", "own"])
-def test_distributions_against_draws_with_the_unknowns_drawn(name: str, sd: dict[str, float]) -> None:
+def test_distributions_agree_with_drawn_nuisances(name: str, sd: dict[str, float]) -> None:
     """4000 spectra with and without a flare. Means and standard deviations within 5 standard errors, 60 of them: by
     chance one run in 3e4 fails."""
     quiet, flare = pair(amplitude=0.081)
@@ -87,7 +87,7 @@ def test_distributions_against_draws_with_the_unknowns_drawn(name: str, sd: dict
 
 
 @pytest.mark.parametrize("name", ["chi2", "chi2_element"])
-def test_the_sums_subtracted_are_the_inverse_covariance(name: str) -> None:
+def test_subtracted_rows_give_the_inverse_covariance(name: str) -> None:
     """x^T C^-1 x with C written out in full."""
     quiet, _ = pair()
     s, one = setting(quiet, {"dark": 0.1, "light": 0.02, "tilt": 0.05}), STATISTICS[name]
@@ -103,7 +103,7 @@ def test_the_sums_subtracted_are_the_inverse_covariance(name: str) -> None:
     assert one.values(s, x, np.broadcast_to(one.variance(s), x.shape)) == pytest.approx(wanted, rel=1e-9)
 
 
-def test_what_is_projected_out_changes_nothing() -> None:
+def test_projected_out_spectra_do_not_change_the_statistic() -> None:
     quiet, flare = pair()
     s = setting(quiet, {"dark": FREE, "light": FREE})
     assert s.nuisances is not None
@@ -123,7 +123,7 @@ def test_degrees_of_freedom() -> None:
     assert STATISTICS["matched"].dof(s) == 1
 
 
-def test_what_cannot_be_is_refused_in_a_sentence() -> None:
+def test_invalid_nuisances_raise() -> None:
     quiet, flare = pair()
     n = quiet.wavelength_nm.size
     with pytest.raises(InputError, match="unknown 'dust' has no spectrum"):
@@ -150,7 +150,7 @@ def test_what_cannot_be_is_refused_in_a_sentence() -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("amplitude", [0.24, 3.0])
-def test_the_closed_form_in_the_span_of_few_vectors_is_that_of_all(amplitude: float) -> None:
+def test_closed_form_in_a_span_equals_the_full_one(amplitude: float) -> None:
     """Every fourth pixel, against the eigenvalues of the whole covariance."""
     quiet, flare = pair(amplitude=amplitude)
     used = np.arange(quiet.wavelength_nm.size) % 4 == 0

@@ -28,7 +28,7 @@ def whole(quiet: Expectation, flare: Expectation) -> tuple[np.ndarray, np.ndarra
 
 
 @pytest.mark.long
-def test_few_centres_say_what_all_pixels_say() -> None:
+def test_few_centres_represent_all_pixels() -> None:
     """Draw by draw to 1e-3, thresholds to 1e-4, false alarms to 1e-3 at 1e-2 and to 5e-3 at 1e-10."""
     quiet, flare = star(amplitudes=(0.081,))
     rows, factor, modes = whole(quiet, flare)
@@ -46,7 +46,7 @@ def test_few_centres_say_what_all_pixels_say() -> None:
         assert full.sf(form.isf(fap)) == pytest.approx(fap, rel=error)
 
 
-def test_where_few_centres_do_not_do_every_pixel_is_taken() -> None:
+def test_every_pixel_is_a_centre_if_few_do_not_suffice() -> None:
     """A star without any light below 400 nm, nor any sky: one over the smoothed flux jumps."""
     nm = np.arange(170.0, 1150.0, 0.5)
     dark = Source.from_arrays(nm, np.where(nm > 400.0, 1e-11, 0.0)).at_magnitude(7.4)
@@ -80,7 +80,7 @@ def test_bands_hold_the_rows(chunk: int, changes: dict) -> None:
     np.testing.assert_allclose(out, smoothing.rows @ x[:n], atol=1e-6)
 
 
-def test_the_sum_is_a_generalised_chi_squared() -> None:
+def test_sum_is_a_generalised_chi_squared() -> None:
     """Against NumPy's normals: Kolmogorov-Smirnov p > 1e-6 with and without a flare."""
     quiet, flare = star(amplitudes=(0.03,), payload=instrument(part=True))
     smoothing = Smoothing.of(quiet, np.ones(quiet.wavelength_nm.size, bool))
@@ -97,7 +97,7 @@ def test_the_sum_is_a_generalised_chi_squared() -> None:
 
 
 @pytest.mark.parametrize("words", [("stack",), ("stack:0",), ("mean",), ("exposure:2",), ("template", "guessed")])
-def test_words_that_are_none(words: tuple[str, ...]) -> None:
+def test_invalid_comparison_raises(words: tuple[str, ...]) -> None:
     with pytest.raises(InputError, match="expected"):
         Comparison.of(*words)
     assert Comparison.of("stack:5", "estimated") == Comparison(5, True)

@@ -26,7 +26,7 @@ def test_equal_weights_are_a_scaled_non_central_chi_squared(n: int, scale: float
         assert form.sf(float(exact.isf(p))) == pytest.approx(p, rel=1e-4, abs=1e-13)
 
 
-def test_unit_weights_are_handed_to_scipy() -> None:
+def test_unit_weights_use_scipy() -> None:
     assert QuadraticForm(np.ones(30), np.zeros(30)).isf(1e-3) == stats.chi2.isf(1e-3, 30)
     form = QuadraticForm(np.ones(30), np.full(30, 0.3))
     assert form.sf(40.0) == pytest.approx(stats.ncx2.sf(40.0, 30, 30 * 0.09), rel=1e-12)
@@ -76,7 +76,7 @@ def test_two_terms_of_any_kind_against_quadrature() -> None:
 
 @pytest.mark.parametrize("n", [1, 2, 5, 29, 400])
 @pytest.mark.parametrize("push", [0.0, 0.5, 1e4])
-def test_few_terms_and_far_tails_are_scipys(n: int, push: float) -> None:
+def test_few_terms_and_far_tails_agree_with_scipy(n: int, push: float) -> None:
     """Equal weights, whatever their number: 1e-100 too; below 1e-10 scipy's own digits end."""
     form = QuadraticForm(np.full(n, 2.5), np.sqrt(np.append(push, np.zeros(n - 1))))
     exact = stats.ncx2(n, push, scale=2.5) if push else stats.chi2(n, scale=2.5)
@@ -98,7 +98,7 @@ def test_several_weights_with_a_closed_form() -> None:
 
 
 @pytest.mark.parametrize("spread", [0.01, 0.5, 3.0])
-def test_both_integrals_say_the_same(spread: float) -> None:
+def test_both_integrals_agree(spread: float) -> None:
     """Of many terms: the characteristic function's, and the one along the bent path."""
     generator = np.random.default_rng(9)
     form = QuadraticForm(10 ** generator.uniform(-spread, 0, 300), generator.normal(0, 0.3, 300))
