@@ -38,7 +38,9 @@ class TimeGrid:
         if not 1 <= self.n <= MAX_STEPS:
             raise InputError(
                 f"{self.days:g} days in steps of {self.step_s:g} s are {self.days * DAY_S / self.step_s:.3g} steps, "
-                f"expected 1 to {MAX_STEPS}"
+                f"expected 1 to {MAX_STEPS}",
+                key="step_s",
+                value=self.step_s,
             )
         _ = self.first  # raises InputError for an invalid start
 

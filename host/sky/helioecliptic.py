@@ -96,7 +96,7 @@ def parse_time(time: Time | str) -> Time:
     else:
         raise InputError(f"time = {_line(time)}, {expected}")
     if not moment.isscalar:
-        raise InputError(f"time holds {moment.size} times, expected one")
+        raise InputError(f"time holds {moment.size} times, expected one", key="time", value=time)
     if np.ma.is_masked(moment.jd) or not np.isfinite(moment.jd):
         raise InputError(f"time = {_line(time)} is not finite, {expected}")
     year = float(moment.decimalyear)
@@ -123,7 +123,7 @@ def parse_position(target: SkyCoord | str) -> SkyCoord:
     else:
         raise InputError(f"target = {_line(target)}, {expected}")
     if not position.isscalar:
-        raise InputError(f"target holds {position.size} positions, expected one")
+        raise InputError(f"target holds {position.size} positions, expected one", key="target", value=target)
     angles = position.spherical
     if not np.isfinite([angles.lon.deg, angles.lat.deg]).all():
         raise InputError(f"target = {_line(target)} is not finite, {expected}")

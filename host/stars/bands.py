@@ -85,7 +85,11 @@ def scale(name: str, system: System = "catalogue") -> str:
 
 def _check_system(system: str) -> None:
     if system not in SYSTEMS:
-        raise InputError(f"magnitude system {shortened(str(system))} is unknown, expected one of {', '.join(SYSTEMS)}")
+        raise InputError(
+            f"magnitude system {shortened(str(system))} is unknown, expected one of {', '.join(SYSTEMS)}",
+            key="system",
+            value=system,
+        )
 
 
 @array_cache(256)

@@ -165,10 +165,19 @@ def test_elements_from_a_file(tmp_path: Path, orbit: Orbit) -> None:
     assert Orbit.load(tmp_path / "own.tle").elements.satellite.ndot == orbit.elements.satellite.ndot
 
 
-@pytest.mark.parametrize("kwargs", [{"days": 0.0}, {"days": float("nan")}, {"step_s": 1e-3}, {"start": "yesterday"}])
-def test_invalid_time_grid_raises(kwargs: dict[str, float | str]) -> None:
-    with pytest.raises(InputError):
+@pytest.mark.parametrize(
+    ("kwargs", "key"),
+    [
+        ({"days": 0.0}, "days"),
+        ({"days": float("nan")}, "days"),
+        ({"step_s": 1e-3}, "step_s"),
+        ({"start": "yesterday"}, "time"),
+    ],
+)
+def test_invalid_time_grid_raises(kwargs: dict[str, float | str], key: str) -> None:
+    with pytest.raises(InputError) as error:
         TimeGrid(**({"start": "2027-01-01", "days": 365.0} | kwargs))  # type: ignore[arg-type]
+    assert error.value.key == key
 
 
 @pytest.mark.parametrize("start", ["2027-01-01", "2027-01-01T11:59:59", "2027-01-01T12:00:01", "2027-01-01T23:59:59.5"])

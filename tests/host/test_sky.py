@@ -129,32 +129,36 @@ def test_solar_avoidance_message_states_the_separation() -> None:
 
 
 @pytest.mark.parametrize(
-    ("target", "time", "message"),
+    ("target", "time", "key", "expected"),
     [
-        ("18 Sco", "2026-01-01", "target = '18 Sco', expected right ascension and declination"),
-        ("290 -95", "2026-01-01", "target = '290 -95', expected"),
-        ("700 10", "2026-01-01", "has a right ascension of 700, expected 0 to 360"),
-        ("", "2026-01-01", "target = '', expected"),
-        ("nan nan", "2026-01-01", "target = 'nan nan', expected"),
-        (12.0, "2026-01-01", "target = 12.0, expected"),
-        (SkyCoord([1, 2] * u.deg, [3, 4] * u.deg), "2026-01-01", "target holds 2 positions, expected one"),
-        (SkyCoord(np.nan * u.deg, 4 * u.deg), "2026-01-01", "is not finite"),
-        ("290 -11", "yesterday", "time = 'yesterday', expected a UTC time"),
-        ("290 -11", "2026-13-01", "time = '2026-13-01', expected a UTC time"),
-        ("290 -11", "1850-01-01", "time = 1850-01-01T00:00:00.000, expected between 1990 and 2100"),
-        ("290 -11", Time(["2026-01-01", "2026-01-02"]), "time holds 2 times, expected one"),
-        ("290 -11", 2026, "time = 2026, expected a UTC time"),
+        ("18 Sco", "2026-01-01", "target", "right ascension and declination"),
+        ("290 -95", "2026-01-01", "target", "right ascension and declination"),
+        ("700 10", "2026-01-01", "target", "0 to 360 degrees"),
+        ("", "2026-01-01", "target", "right ascension and declination"),
+        ("nan nan", "2026-01-01", "target", "right ascension and declination"),
+        (12.0, "2026-01-01", "target", "right ascension and declination"),
+        (SkyCoord([1, 2] * u.deg, [3, 4] * u.deg), "2026-01-01", "target", "one"),
+        (SkyCoord(np.nan * u.deg, 4 * u.deg), "2026-01-01", "target", "right ascension and declination"),
+        ("290 -11", "yesterday", "time", "a UTC time"),
+        ("290 -11", "2026-13-01", "time", "a UTC time"),
+        ("290 -11", "1850-01-01", "time", "between 1990 and 2100"),
+        ("290 -11", Time(["2026-01-01", "2026-01-02"]), "time", "one"),
+        ("290 -11", 2026, "time", "a UTC time"),
     ],
 )
-def test_invalid_targets_and_times_raise(target: Any, time: Any, message: str) -> None:
-    with pytest.raises(InputError, match=message) as caught:
+def test_invalid_targets_and_times_raise(target: Any, time: Any, key: str, expected: str) -> None:
+    with pytest.raises(InputError) as error:
         Sky.at(target, time)
-    assert "\n" not in str(caught.value)
+    assert error.value.key == key
+    assert error.value.expected is not None
+    assert error.value.expected.startswith(expected)
+    assert "\n" not in str(error.value)
 
 
 def test_unknown_lookup_raises() -> None:
-    with pytest.raises(InputError, match="lookup = 'cubic', expected 'bilinear' or 'nearest'"):
+    with pytest.raises(InputError) as error:
         Sky.at("290 -11", "2026-07-01", "cubic")  # type: ignore[arg-type]
+    assert (error.value.key, error.value.expected) == ("lookup", "'bilinear' or 'nearest'")
 
 
 @pytest.mark.filterwarnings("error")
@@ -174,8 +178,9 @@ def test_fixed_brightness() -> None:
     assert Sky.of_brightness(22.1).surface_brightness == 22.1
     assert Sky.of_brightness(22.1 * u.mag / u.arcsec**2) == Sky.of_brightness(22.1)
     for bad in (float("nan"), 100.0, "bright", True, 22.1 * u.mag, 3 * u.m, None):
-        with pytest.raises(InputError, match="sky brightness"):
+        with pytest.raises(InputError) as error:
             Sky.of_brightness(bad)
+        assert error.value.key == "sky_brightness"
 
 
 def test_total_magnitude_and_spectrum() -> None:

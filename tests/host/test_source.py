@@ -144,8 +144,10 @@ def test_scaling_to_a_magnitude_in_any_system(sun: Source, system: bands.System)
 
 
 def test_unknown_magnitude_system_raises(sun: Source) -> None:
-    with pytest.raises(InputError, match="magnitude system 'AB' is unknown, expected one of catalogue, vega, ab"):
+    with pytest.raises(InputError) as error:
         sun.at_magnitude(7.4, "V", "AB")  # type: ignore[arg-type]
+    assert (error.value.key, error.value.value) == ("system", "AB")
+    assert error.value.expected == "one of catalogue, vega, ab"
 
 
 @pytest.mark.parametrize(
@@ -195,21 +197,22 @@ def test_a_replacing_flare_hides_photosphere(sun: Source) -> None:
 
 
 @pytest.mark.parametrize(
-    ("options", "sentence"),
+    ("options", "key"),
     [
-        ({"amplitude": -0.1}, "amplitude = -0.1"),
-        ({"amplitude": np.nan}, "amplitude = nan"),
-        ({"amplitude": 0.1, "temperature": 10.0}, "temperature = 10.0 K, expected 1000"),
-        ({"amplitude": 0.1, "temperature": 1 * u.m}, "expected kelvin"),
-        ({"amplitude": 0.1, "band": "Q"}, "band 'Q' is unknown, expected one of B, V"),
-        ({"amplitude": 0.1, "geometry": "replaces", "photosphere_temperature": 2e4}, "no hotter"),
-        ({"amplitude": 50.0, "geometry": "replaces", "photosphere_temperature": 5800}, "of the star's disc"),
-        ({"amplitude": 0.1, "geometry": "sideways"}, "geometry = 'sideways'"),
+        ({"amplitude": -0.1}, "flare_amplitude"),
+        ({"amplitude": np.nan}, "flare_amplitude"),
+        ({"amplitude": 0.1, "temperature": 10.0}, "flare_temperature"),
+        ({"amplitude": 0.1, "temperature": 1 * u.m}, "flare_temperature"),
+        ({"amplitude": 0.1, "band": "Q"}, "band"),
+        ({"amplitude": 0.1, "geometry": "replaces", "photosphere_temperature": 2e4}, "flare_temperature"),
+        ({"amplitude": 50.0, "geometry": "replaces", "photosphere_temperature": 5800}, "flare_amplitude"),
+        ({"amplitude": 0.1, "geometry": "sideways"}, "flare_geometry"),
     ],
 )
-def test_invalid_flares_raise(sun: Source, options: dict, sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence):
+def test_invalid_flares_raise(sun: Source, options: dict, key: str) -> None:
+    with pytest.raises(InputError) as error:
         sun.flaring(**options)
+    assert error.value.key == key
 
 
 def test_replacing_flare_uses_the_photosphere_of_the_star(sun: Source) -> None:

@@ -335,5 +335,6 @@ def test_network_failure_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     ],
 )
 def test_invalid_limits_raise(kwargs: dict[str, object]) -> None:
-    with pytest.raises(InputError):
+    with pytest.raises(InputError) as error:
         Limits(**kwargs)  # type: ignore[arg-type]
+    assert error.value.key == next(iter(kwargs))
