@@ -8,7 +8,6 @@ import threading
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
-from importlib import resources
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -18,7 +17,9 @@ from ..errors import InputError
 from ..files.bounded import shortened
 from ..files.ecsv import parse_ecsv
 from ..sky.helioecliptic import offline, parse_position
+from . import star_list
 from .earth import direction
+from .star_list import name_key
 
 if TYPE_CHECKING:
     from astropy.table import Table
@@ -52,14 +53,14 @@ class Target:
         simbad : bool
             Whether to query SIMBAD for a name that is not embedded (needs `mauvecl[names]` and a network).
         """
-        row = _names().get(_key(text))
+        row = _names().get(name_key(text))
         if row is not None:
             return cls(name or row.name, row.ra_deg, row.dec_deg, row.source, row.distance_pc, row.magnitude,
                        row.spectral_type)  # fmt: skip
         if not re.match(r"\s*[+-]?\d", text):
             if simbad:
                 return _from_simbad(text, name)
-            near = difflib.get_close_matches(_key(text), _names(), n=3, cutoff=0.5)
+            near = difflib.get_close_matches(name_key(text), _names(), n=3, cutoff=0.5)
             like = ", ".join(dict.fromkeys(_names()[one].name for one in near))
             like = f"a name such as {like}" if like else "a name of the embedded list"
             raise InputError(
@@ -78,27 +79,19 @@ class Target:
 
 @cache
 def _list() -> Table:
-    text = resources.files(__package__).joinpath("targets.ecsv").read_text(encoding="utf-8")
-    return parse_ecsv(text, "the embedded list of stars")
+    return parse_ecsv(star_list.text(), "the embedded list of stars")
 
 
 @cache
 def _names() -> dict[str, Target]:
     """Return the embedded stars by normalised name."""
-    stars = {}
-    for row in _list():
-        star = Target(
-            str(row["name"]), float(row["ra"]), float(row["dec"]), f"embedded list ({row['source']})",
-            float(row["distance"]), float(row["V"]), str(row["spectral_type"]),
-        )  # fmt: skip
-        for name in (star.name, *str(row["other_names"]).split(",")):
-            stars[_key(name)] = star
-    return stars
-
-
-def known_target(name: str) -> Target | None:
-    """Return the embedded star of that name, or None."""
-    return _names().get(_key(name))
+    return {
+        key: Target(
+            row["name"], float(row["ra"]), float(row["dec"]), f"embedded list ({row['source']})",
+            float(row["distance"]), float(row["V"]), row["spectral_type"],
+        )
+        for key, row in star_list.rows_by_name().items()
+    }  # fmt: skip
 
 
 def target_table() -> Table:
@@ -110,20 +103,6 @@ def target_table() -> Table:
         Columns name, ra, dec (deg, ICRS), distance (pc), V, spectral_type, other_names and source.
     """
     return _list().copy()
-
-
-#: Abbreviations of Greek letters in catalogues.
-_GREEK = {"alpha": "alp", "beta": "bet", "gamma": "gam", "delta": "del", "epsilon": "eps", "zeta": "zet", "iota": "iot",
-          "kappa": "kap", "sigma": "sig", "omicron": "omi"}  # fmt: skip
-
-
-def _key(name: str) -> str:
-    """Normalise a name: lower case, no separators, abbreviated Greek letters."""
-    key = re.sub(r"[\s_*.']+", "", name).casefold()
-    for long, short in _GREEK.items():
-        if key.startswith(long):
-            return short + key.removeprefix(long)
-    return key
 
 
 #: ADQL query of SIMBAD (tried with astroquery 0.4.11). The left join keeps stars without a V magnitude.

@@ -40,14 +40,28 @@ app = typer.Typer(
 
 
 def _help(verb: Callable[..., None]) -> str:
-    """What `--help` says, with each example on a line, as it is typed."""
-    return re.sub(r"(?m)^(?=Examples?: |mauvecl )", "\b\n", inspect.getdoc(verb) or "")
+    """Return what `--help` says, with each example on lines of its own that fit 80 columns and can be pasted."""
+    text = re.sub(r"(?m)^(Examples?:) (?=mauvecl )", r"\1\n\n", inspect.getdoc(verb) or "")
+    return re.sub(r"(?m)^mauvecl .*$", lambda found: "\b\n" + _broken(found[0]), text)
+
+
+def _broken(command: str, most: int = 72) -> str:
+    """Return a command on lines that end in a backslash before a flag, where it is long."""
+    lines = [""]
+    for part in re.split(r" (?=-)", command):
+        if lines[-1] and len(lines[-1]) + len(part) > most:
+            lines[-1] += " \\"
+            lines.append("   ")
+        lines[-1] += f" {part}" if lines[-1] else part
+    return "\n".join(lines)
 
 
 # In the order of `--help`: one star, flares, hours and campaigns, bulk, mauvecl itself.
 for verb in (simulate, snr, exposure, detect, limit, detection_map, gaussian, measure, stare, inject, visible, plan,
              realise, verify, export, serve, devices, selftest, schema):  # fmt: skip
     app.command("map" if verb is detection_map else None, help=_help(verb))(verb)
+for command in library.registered_commands:
+    command.help = _help(command.callback) if command.callback else None
 app.add_typer(library, name="library")
 
 

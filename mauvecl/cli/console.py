@@ -15,6 +15,8 @@ if TYPE_CHECKING:
 
 #: Work shorter than this shows no progress.
 PATIENCE_S = 2.0
+#: Heading of an interval, which stays next to the column before it.
+INTERVAL = "95 % interval"
 #: Columns of a table that goes into a pipe or a file, at most.
 WIDEST = 100_000
 #: Share of the work from which the time left is told: the first tile's rate says little.
@@ -170,14 +172,16 @@ def _width(columns: Sequence[str], cells: Sequence[Sequence[Any]], part: Sequenc
 
 
 def _parts(columns: Sequence[str], cells: Sequence[Sequence[Any]], filled: list[int], room: int) -> list[list[int]]:
-    """Columns that fit beside each other; the first ones, which say what a row is, begin each part."""
+    """Return the columns of each part: those that fit next to each other, after the first ones that tell rows apart."""
     if _width(columns, cells, filled) <= room:
         return [filled]
-    first = next((filled[:n] for n in (3, 2) if _width(columns, cells, filled[:n]) <= room / 2), filled[:1])
+    # No more than needed: of months, the first are not repeated in each part.
+    apart = next((n for n in (1, 2, 3) if len({tuple(row[i] for i in filled[:n]) for row in cells}) == len(cells)), 3)
+    fitting = (filled[:n] for n in range(apart, 1, -1) if _width(columns, cells, filled[:n]) <= room / 2)
+    first = next(fitting, filled[:1])
     together: list[list[int]] = []
     for i in filled[len(first) :]:
-        # A column without a name belongs to the one before it: an interval, say.
-        if together and not columns[i]:
+        if together and columns[i] == INTERVAL:
             together[-1].append(i)
         else:
             together.append([i])

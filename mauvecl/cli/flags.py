@@ -168,7 +168,8 @@ DETECTION = group(
     flag(
         str,
         "--tails",
-        "Thresholds beyond what is drawn: counted (refused), or sampled with importance [counted].",
+        "Thresholds with fewer than 100 draws beyond them: counted refuses them, sampled finds them by importance "
+        "sampling [counted].",
         "run.tails",
     ),
     flag(

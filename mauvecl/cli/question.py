@@ -44,8 +44,7 @@ def study_of(
 
 def is_star(given: Path) -> bool:
     """Return whether what stands in place of the study is a star: a name of the library or a spectrum file."""
-    from mauvecl.host.orbit.targets import known_target
-    from mauvecl.study.star_names import has_spectrum
+    from mauvecl.study.star_names import has_spectrum, well_known
 
     text = str(given)
     if given.suffix.lower() == ".toml" or given.is_dir():
@@ -53,7 +52,7 @@ def is_star(given: Path) -> bool:
     if not _is_there(text):
         # The first name decides: a wrong one among others has a sentence of its own.
         first = text.split(",")[0].strip()
-        return bool(first) and (has_spectrum(first) or known_target(first) is not None)
+        return bool(first) and (has_spectrum(first) or well_known(first) is not None)
     if given.suffix.lower() == ".ecsv":
         return not holds_study(given)
     return not given.is_file() or not _is_toml(given)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from mauvecl.host.errors import InputError
 
 
@@ -12,22 +14,29 @@ def has_spectrum(name: str) -> bool:
     return catalogue.embedded(name) is not None or own_stars.find(name) is not None
 
 
+def well_known(name: str) -> Mapping[str, str] | None:
+    """Return the row of a well-known star in the embedded list, or None."""
+    from mauvecl.host.orbit.star_list import name_key, rows_by_name
+
+    return rows_by_name().get(name_key(name))
+
+
 def check_spectrum(name: str) -> None:
     """Raise InputError if a name has no spectrum; for a well-known star the message says which one stands for it."""
     if has_spectrum(name):
         return
-    from mauvecl.host.orbit.targets import known_target
     from mauvecl.host.stars import catalogue
-    from mauvecl.study.spectral_types import nearest_spectrum
 
-    star = known_target(name)
-    if star is None or star.spectral_type is None:
+    row = well_known(name)
+    if row is None:
         catalogue.find(name)
         return
+    from mauvecl.study.spectral_types import nearest_spectrum
+
     raise InputError(
         f"star {name!r} has no spectrum of its own in the library, expected that of the nearest type and its V: "
-        f"`star={nearest_spectrum(star.spectral_type)!r}` with `magnitude={star.magnitude:g}` ({star.name} is of type "
-        f"{star.spectral_type}, {star.distance_pc:g} pc away; {star.source})",
+        f"`star={nearest_spectrum(row['spectral_type'])!r}` with `magnitude={float(row['V']):g}` ({row['name']} is of "
+        f"type {row['spectral_type']}, {float(row['distance']):g} pc away; {row['source']})",
         key="star",
         value=name,
     )

@@ -47,7 +47,7 @@ def test_the_limiting_magnitude_has_the_power_asked_for(engine: Engine, power: f
         p = limit.check.probability
         assert p.low - (p.high - p.low) < power < p.high + (p.high - p.low)
         assert limit.agrees == (p.low <= power <= p.high)
-        assert limit.verdict in ("agrees", "")
+        assert limit.verdict in ("confirms it", "")
         assert limit.check.seed != asked.run.seed
         # Far from the rails the closed form is right to the skew of the dark.
         assert abs(limit.value.value - limit.closed_form) < 0.03
@@ -157,7 +157,7 @@ def test_a_limit_tells_of_saturation(engine: Engine) -> None:
 def test_one_frame_is_the_shortest(engine: Engine) -> None:
     (limit,) = shortest_exposure(study(run=FEW, star=[{"library": "G2V", "magnitude": 5.0}]), engine).limits
     assert limit.value.value == 5.0
-    assert limit.verdict == "reaches"
+    assert limit.verdict == "exceeds it"
     assert not limit.agrees
 
 

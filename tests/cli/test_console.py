@@ -7,7 +7,7 @@ import re
 import pytest
 
 from mauvecl.cli import console
-from mauvecl.cli.console import Meter, show_table
+from mauvecl.cli.console import INTERVAL, Meter, show_table
 
 
 class Clock:
@@ -84,7 +84,7 @@ def test_a_narrow_terminal_cuts_nothing(
 ) -> None:
     monkeypatch.setenv("COLUMNS", str(width))
     monkeypatch.setenv("FORCE_COLOR", "1")
-    columns = ("star", "flare", "threshold", "", "closed form", "why")
+    columns = ("star", "flare", "threshold", INTERVAL, "closed form", "why")
     cells = [(f"star {n}", f"{n} %", f"{n}12.345", f"[{n}, 77]", f"0.{n}", "a reason of many words") for n in range(3)]
     show_table("title", columns, cells)
     told = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)

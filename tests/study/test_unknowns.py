@@ -70,7 +70,7 @@ def test_a_limit_over_the_unknown_has_the_power_on_average(engine: Engine) -> No
     (limit,) = result.limits
     question = MarginalLimitSearch(asked, asked.star[0], 0.24, "matched")
     assert question.theory(limit.closed_form) == pytest.approx(0.9, abs=1e-3)
-    assert limit.verdict in ("agrees", "")
+    assert limit.verdict in ("confirms it", "")
     found = limit.unknown
     assert found is not None
     low, high = found.range

@@ -90,16 +90,17 @@ class Limit:
 
     @property
     def verdict(self) -> str:
-        """What the fresh simulation says of the limit, in a word.
+        """What the fresh simulation says of the limit, in two words.
 
-        "agrees" where its interval holds the wanted power; of whole frames "reaches" where it lies above it; "DIFFERS"
-        where it passes it by more than its own width; nothing between, as chance makes of one in six.
+        "confirms it" where its interval holds the wanted power; of whole frames "exceeds it" where it lies above the
+        power; "DIFFERS" where it misses the power by more than its own width; nothing between, as chance makes of one
+        in six.
         """
         p = self.check.probability
         if self.agrees:
-            return "agrees"
+            return "confirms it"
         if self.of == "exposure" and p.low > self.power:
-            return "reaches"
+            return "exceeds it"
         away = max(p.low - self.power, self.power - p.high)
         return "DIFFERS" if away > p.high - p.low else ""
 

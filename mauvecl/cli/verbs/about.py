@@ -50,7 +50,7 @@ def devices(
         )
         for number, record in enumerate(records)
     ]
-    columns = ("number", "device", "driver", "kind", "units", "GiB", "promise", "rate", "")
+    columns = ("number", "device", "driver", "kind", "units", "GiB", "promise", "rate", "chosen")
     show_table("OpenCL devices; choose with --device NUMBER or part of a name", columns, cells)
 
 
@@ -84,7 +84,7 @@ def selftest(
         print(json.dumps(selftest.last(engine.device) or [asdict(check) for check in checks], indent=2))
     else:
         cells = [("PASS" if check.passed else "FAIL", check.name, check.result) for check in checks]
-        show_table(f"Self-test of {engine.device_name}, driver {engine.driver}", ("", "check", "found"), cells)
+        show_table(f"Self-test of {engine.device_name}, driver {engine.driver}", ("result", "check", "found"), cells)
         outcome = f"{failed} of {len(checks)} checks FAILED" if failed else f"All {len(checks)} checks passed"
         show([f"{outcome} in {seconds:.0f} s. Promise: {engine.device.promise}."])
     if folder is not None:
@@ -96,7 +96,9 @@ def selftest(
 def schema() -> None:
     """The JSON schema of study files, for editors that check TOML.
 
-    Example: mauvecl schema > study.schema.json, and a first line #:schema study.schema.json in the study
+    A study names it in its first line, as in #:schema study.schema.json.
+
+    Example: mauvecl schema > study.schema.json
     """
     from mauvecl.study.study import Study
 

@@ -155,7 +155,7 @@ def verify(
     else:
         if faults:
             cells = [(fault.key, fault.state, "repaired" if fault.mended else "") for fault in faults]
-            show_table(f"Not as it was written: {store}", ("file", "what", ""), cells)
+            show_table(f"Not as it was written: {store}", ("file", "what", "repaired"), cells)
         told = "with what was written" if not redraw else "with what the engine draws"
         show([f"{len(faults) - left} repaired, {left} left as found." if faults else f"Everything agrees {told}."])
     if left:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from mauvecl.cli.console import short
+from mauvecl.cli.console import INTERVAL, short
 from mauvecl.cli.flags import CAMPAIGN, COUNTED, DETECTION, DRAWS, FLARE, NUISANCES, SWEEP, TEMPLATE
 from mauvecl.cli.verb import takes_study
 
@@ -46,7 +46,17 @@ def _show_detections(answer: DetectAnswer) -> None:
         dict.fromkeys(f"{x.exposure_s:g} s ({x.n_frames} frames)" for x in (s.detection.quiet for s in answer.stars))
     )
     swept = [axis.quantity for axis in study.sweep.axes if axis.quantity != "amplitude"]
-    columns = ("flare", "statistic", "expected", "simulated", "reduced", "threshold", "detected", "", "closed form")
+    columns = (
+        "flare",
+        "statistic",
+        "expected",
+        "simulated",
+        "reduced",
+        "threshold",
+        "detected",
+        INTERVAL,
+        "closed form",
+    )
     cells = []
     for row in answer.table:
         amplitude, digits = f"{100 * row['amplitude']:g} %", (row["expected"], row["mean"])
@@ -61,7 +71,7 @@ def _show_detections(answer: DetectAnswer) -> None:
         )  # fmt: skip
     show_table(
         f"Detection at a false-alarm probability of {run.fap:g} per test, {exposures}, {run.realisations:,} "
-        "realisations; [95 % interval]",
+        "realisations",
         ("star", *swept, *columns),
         cells,
     )
@@ -83,7 +93,7 @@ def _show_departures(table: QTable, fap: float) -> None:
         show_table(
             f"Where the simulation differs from the closed form: false-alarm probability at the threshold that should "
             f"give {fap:g}",
-            ("star", "statistic", "flare", "simulated", "", "ratio", "why"),
+            ("star", "statistic", "flare", "simulated", INTERVAL, "ratio", "why"),
             [
                 (row["star"], row["statistic"], flare, f"{row['fap']:.3g}",
                  f"[{row['fap_low']:.3g}, {row['fap_high']:.3g}]", f"{row['ratio']:.3f}", row["why"])

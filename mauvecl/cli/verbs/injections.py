@@ -76,14 +76,15 @@ def inject(study: Study, session: Session) -> None:
 
 def _show(answer: InjectAnswer) -> None:
     from mauvecl.answers.stares.inject import SIZE_UNITS
-    from mauvecl.cli.console import short, show_table
+    from mauvecl.cli.console import INTERVAL, short, show_table
 
     choice = answer.study.search
     alarms = "false alarm" if choice.false_alarms == 1 else "false alarms"
     swept = tuple(axis.quantity for axis in answer.study.sweep.axes)
     show_table(
-        f"The search: {choice.false_alarms:g} {alarms} per star-{choice.per} of frames; [95 % interval]",
-        ("star", *swept, "threshold", "", "templates", "sums of a frame", "alarms a day above", "sampled", "drawn"),
+        f"The search: {choice.false_alarms:g} {alarms} per star-{choice.per} of frames",
+        ("star", *swept, "threshold", INTERVAL, "templates", "sums of a frame", "alarms a day above", "sampled",
+         "drawn"),
         [
             (one.label, *map(short, one.at.values()), f"{one.threshold.value:.3f}",
              f"[{one.threshold.low:.3f}, {one.threshold.high:.3f}]", str(one.surveyed.survey.search.n_filters),
@@ -99,8 +100,8 @@ def _show(answer: InjectAnswer) -> None:
             column = table[name]
             table = table[getattr(column, "value", column) == value]
         show_table(
-            f"{one.title}: {one.sizes.of}{unit} of which a half (E50) and nine tenths (E90) are found; [95 % interval]",
-            ("half-width (s)", "E50", "", "E90", "", "no template fits"),
+            f"{one.title}: {one.sizes.of}{unit} of which a half (E50) and nine tenths (E90) are found",
+            ("half-width (s)", "E50", INTERVAL, "E90", INTERVAL, "no template fits"),
             [
                 ("all" if row["half_width"].value != row["half_width"].value else f"{row['half_width'].value:.4g}",
                  *(text for name in ("e50", "e90") for text in _limit(row, name)), f"{100 * row['never']:.3g} %")

@@ -43,7 +43,16 @@ def library(context: typer.Context, as_json: JsonFlag = False) -> None:
     from mauvecl.cli.console import show_table
 
     ours = table[table["kept"] == "embedded"]
-    columns = ("name", "also", "type", "star", "K", "UV at 190-210, 240-260, 290-310 nm", "noise below", "licence")
+    columns = (
+        "name",
+        "also",
+        "type",
+        "star",
+        "K",
+        "UV at 190-210, 240-260, 290-310 nm",
+        "noisy below",
+        "licence",
+    )
     cells = []
     for row in ours:
         ratios = ", ".join(part.split()[0] for part in row["uv_quality"].split("; ")[0].split(": ")[1].split(", "))

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mauvecl.cli.console import short
+from mauvecl.cli.console import INTERVAL, short
 from mauvecl.cli.flags import DETECTION, DRAWS, FLARE, LIMIT, MAP, NUISANCES, SWEEP, UNKNOWN
 from mauvecl.cli.verb import takes_study
 
@@ -64,8 +64,19 @@ def _show_limits(answer: LimitResult) -> None:
         )  # fmt: skip
     show_table(
         f"Limit of {asked.of} at a detection probability of {asked.power:g}, false-alarm probability {run.fap:g} per "
-        f"test, {run.realisations:,} realisations; [95 % interval]",
-        ("star", *swept, "flare", "statistic", sought, "", "closed form", "simulated again there", "", ""),
+        f"test, {run.realisations:,} realisations",
+        (
+            "star",
+            *swept,
+            "flare",
+            "statistic",
+            sought,
+            INTERVAL,
+            "closed form",
+            "detected there, simulated again",
+            INTERVAL,
+            "which",
+        ),
         cells,
     )
     if study.unknowns.draws:

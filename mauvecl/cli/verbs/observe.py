@@ -143,7 +143,7 @@ def _show_exposures(answer: ExposureResult) -> None:
     show_table(
         f"Exposure for an S/N of {wanted.snr:g} per {wanted.per} at {wanted.wavelength_nm:g} nm "
         "(closed form, whole frames)",
-        ("star", "exposure (s)", "frames", "S/N", "a frame less", ""),
+        ("star", "exposure (s)", "frames", "S/N", "a frame less", "saturation"),
         [
             (e.star, f"{e.exposure_s:.10g}", str(e.frames), f"{e.snr:.3f}", f"{floored(e.snr_one_frame_less):.3f}",
              "SATURATED" if e.saturated else "")

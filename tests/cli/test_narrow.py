@@ -1,0 +1,89 @@
+"""A terminal of 80 columns: help, and the headings of tables."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shlex
+from pathlib import Path
+from typing import Any
+
+import pytest
+from commands import ended
+from typer.main import get_command
+
+import mauvecl
+from mauvecl.cli.app import app
+from mauvecl.cli.console import show_table
+
+VERBS = Path(mauvecl.__file__).parent / "cli" / "verbs"
+
+
+def commands() -> list[tuple[str, ...]]:
+    """Return every verb, and every verb of `library`."""
+    root: Any = get_command(app)
+    own = [(name,) for name, one in root.commands.items() if not hasattr(one, "commands")]
+    return [*own, *(("library", name) for name in root.commands["library"].commands)]
+
+
+@pytest.mark.parametrize("words", commands(), ids=" ".join)
+def test_help_fits_and_its_examples_can_be_pasted(
+    words: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    import typer.rich_utils
+
+    monkeypatch.setattr(typer.rich_utils, "MAX_WIDTH", 80, raising=False)
+    monkeypatch.setenv("TERMINAL_WIDTH", "80")
+    code, told, _ = ended(*words, "--help", folder=tmp_path)
+    assert code == 0
+    text = told.replace("\\\n", " ")
+    examples = re.findall(rf"^ +(mauvecl {' '.join(words)}.*)$", text, re.MULTILINE)
+    assert examples
+    lines = told.splitlines()
+    begun = [i for i, line in enumerate(lines) if line.strip().startswith("mauvecl ")]
+    for i in begun:
+        while lines[i].endswith("\\"):
+            assert len(lines[i]) <= 80
+            i += 1
+        assert len(lines[i]) <= 80, lines[i]
+    for example in examples:
+        assert shlex.split(example)[0] == "mauvecl"
+
+
+def test_every_column_has_a_heading() -> None:
+    """No literal tuple of headings holds an empty one."""
+    seen = 0
+    for file in VERBS.glob("*.py"):
+        for node in ast.walk(ast.parse(file.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and getattr(node.func, "id", "") == "show_table":
+                headings = [node.args[1]]
+            elif isinstance(node, ast.Assign) and getattr(node.targets[0], "id", "") == "columns":
+                headings = [node.value]
+            else:
+                continue
+            for one in headings:
+                elements = one.elts if isinstance(one, ast.Tuple) else []
+                assert not [e for e in elements if isinstance(e, ast.Constant) and e.value == ""], (
+                    file.name,
+                    one.lineno,
+                )
+                seen += len(elements)
+    assert seen > 60
+
+
+@pytest.mark.parametrize("labels", [1, 2, 3])
+def test_parts_repeat_no_more_than_tells_rows_apart(
+    labels: int, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Months of a year in 80 columns: each month once, and in each part what its rows are."""
+    monkeypatch.setenv("COLUMNS", "80")
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    months = [f"2027-{month:02d}" for month in range(1, 13)]
+    names = [f"label {n}" for n in range(labels)]
+    rows = [tuple(f"{r >> n & 1}abc" for n in reversed(range(labels))) for r in range(2**labels)]
+    show_table("title", (*names, *months), [(*row, *("300" for _ in months)) for row in rows])
+    told = re.sub(r"\x1b\[[0-9;]*m", "", capsys.readouterr().out)
+    assert all(told.count(month) == 1 for month in months)
+    assert told.count(names[0]) > 1
+    assert all(told.count(name) == told.count(names[0]) for name in names)
+    assert max(map(len, told.splitlines())) <= 80
