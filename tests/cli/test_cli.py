@@ -300,7 +300,7 @@ def test_limit(tmp_path: Path) -> None:
     words = ("--star", "G2V", "-a", "0.24", "-n", "20000", "--fap", "0.01", "--statistic", "matched")
     shown = run("limit", *words, folder=tmp_path).stdout
     assert "Limit of magnitude" in shown
-    assert "agrees" in shown
+    assert "confirms it" in shown
     assert "not a flight calibration" in shown
     first = tmp_path / "mauvecl-limit"
     assert {p.name for p in first.iterdir()} == {"limit.ecsv", "limit.png", "study.toml", "run.json"}

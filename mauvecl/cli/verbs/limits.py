@@ -75,7 +75,7 @@ def _show_limits(answer: LimitResult) -> None:
             "closed form",
             "detected there, simulated again",
             INTERVAL,
-            "which",
+            "verdict",
         ),
         cells,
     )
