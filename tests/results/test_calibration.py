@@ -21,7 +21,7 @@ STARS = ("B2IV", "A0V", "F5V", "G2V", "K3V", "K5V", "M0V")
 
 
 def scene(number: int) -> tuple:
-    """A star, magnitude, exposure, temperature, sky, instrument and 12 nm of spectrum, all at random."""
+    """Draw a star, magnitude, exposure, temperature, sky, instrument and 12 nm of spectrum at random."""
     generator = np.random.default_rng([2026, number])
     first = generator.uniform(200.0, 330.0)
     payload = Instrument.load(str(generator.choice(["mauve", "mauve-electrons"]))).with_(

@@ -30,7 +30,7 @@ SEED = 14
 
 
 def study(number: int) -> tuple[list[Expectation], dict]:
-    """A star with two flares, and how it is drawn and compared."""
+    """Return a star with two flares, and how it is drawn and compared."""
     rng = np.random.default_rng([14, number])
     low = float(rng.uniform(205.0, 600.0))
     payload = instrument(

@@ -162,7 +162,7 @@ COLUMNS = ("temperature", "amplitude", "flux 200-320 nm", "flux bolometric")
 
 
 def bounds(n: int, low: float = 0.94, high: float = 0.96, false: float = 1e-6) -> tuple[int, int]:
-    """Counts of covered truths that an honest coverage of `low` to `high` leaves with a probability of 2 x `false`."""
+    """Return the range of covered truths for a coverage of `low` to `high`, left with a probability of 2 x `false`."""
     return int(scipy.stats.binom.ppf(false, n, low)), int(scipy.stats.binom.isf(false, n, high))
 
 

@@ -22,7 +22,7 @@ PAYLOAD = instrument(part=True, output_min_nm=300.0, output_max_nm=310.0)
 
 
 def nearly_saturated(seed: int) -> tuple[Expectation, Expectation]:
-    """A star that leaves one pixel near saturation and saturates the others, and a weak flare."""
+    """Return a star that leaves one pixel near saturation and saturates the others, and a weak flare."""
     rng = np.random.default_rng(seed)
     quiet, _ = star("G2V", 5.0, amplitudes=(0.05,), exposure=5.0 * float(rng.integers(1, 3)), payload=PAYLOAD)
     room = (quiet.ceiling_dn - quiet.bias_dn - quiet.dark_dn) / quiet.gain_dn_per_electron
@@ -115,7 +115,7 @@ def study(magnitude: float, **sections: object) -> Study:
 
 
 def at_the_rail() -> float:
-    """The magnitude at which the faintest pixel of `study` reaches saturation on average."""
+    """Return the magnitude at which the faintest pixel of `study` reaches saturation on average."""
 
     def faintest(magnitude: float) -> float:
         one = study(magnitude)

@@ -100,7 +100,7 @@ GRIDS = {
 
 
 def bin_of(value: float, grid: Grid) -> float:
-    """The widest that a bin around a value may be: 1/512 of a standard deviation, or 2**-13 of the value."""
+    """Return the largest width of a bin around a value: 1/512 of a standard deviation, or 2**-13 of the value."""
     return max(4 / 2048 * grid.sigma if grid.sigma < 1e30 else 0.0, abs(value) * 2.0**-13, 1e-40)
 
 

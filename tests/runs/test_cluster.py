@@ -245,7 +245,7 @@ def test_an_interrupted_cluster_ends_in_order(stop: signal.Signals, tmp_path: Pa
 
 @contextmanager
 def by_hand(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], Path]]:
-    """A scheduler and a worker started by hand, as on a cluster; the scheduler and its file."""
+    """Start a scheduler and a worker as on a cluster; return the scheduler and its file."""
     file, dask = folder / "scheduler.json", Path(sys.executable).with_name("dask")
 
     def start(*words: str | Path) -> subprocess.Popen[bytes]:
@@ -266,7 +266,7 @@ def by_hand(folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], Path]]:
 
 @pytest.fixture(scope="module")
 def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[str, Path]]:
-    """What the documentation's example for batch systems starts; its address and its file."""
+    """Start the documentation's example for batch systems; return its address and its file."""
     pytest.importorskip("dask_jobqueue")
     folder = tmp_path_factory.mktemp("cluster")
     example, file = Path(__file__).parents[2] / "docs" / "examples" / "batch_cluster.py", folder / "scheduler.json"

@@ -14,7 +14,7 @@ DOF = 48
 
 
 def strength(kind: str, fap: float, probability: float) -> tuple[float, float]:
-    """The true threshold, and what a flare must add to be detected with a probability."""
+    """Return the true threshold, and what a flare must add to be detected with a probability."""
     if kind == "matched":
         cut = float(stats.norm.isf(fap))
         return cut, cut - float(stats.norm.isf(probability))

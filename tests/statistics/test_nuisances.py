@@ -66,8 +66,10 @@ def test_table_of_the_methods(
 @pytest.mark.parametrize("sd", [{"dark": 0.1}, {"dark": FREE, "light": 0.02}, {"dark": 0.3, "sky": 1.0, "tilt": FREE}])
 @pytest.mark.parametrize("name", ["chi2", "chi2_element", "matched", "uv_excess", "own"])
 def test_distributions_agree_with_drawn_nuisances(name: str, sd: dict[str, float]) -> None:
-    """4000 spectra with and without a flare. Means and standard deviations within 5 standard errors, 60 of them: by
-    chance one run in 3e4 fails."""
+    """Compare 4000 spectra with and without a flare.
+
+    60 means and standard deviations lie within 5 standard errors: by chance one run in 3e4 fails.
+    """
     quiet, flare = pair(amplitude=0.081)
     n = quiet.wavelength_nm.size
     one = Linear("own", 1.0 + np.arange(n) / n) if name == "own" else STATISTICS[name]

@@ -17,7 +17,7 @@ from mauvecl.statistics.smoothing import SMOOTHING_NM, Smoothing
 
 
 def whole(quiet: Expectation, flare: Expectation) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The paper's sum over every pixel: the filter's rows, the factors of their squares, the variances of the modes."""
+    """Return the rows, factors of squares and variances of modes of the paper's sum over every pixel."""
     n = quiet.wavelength_nm.size
     sigma = SMOOTHING_NM / np.sqrt(8 * np.log(2)) / np.median(np.diff(quiet.wavelength_nm))
     rows = gaussian_filter1d(np.eye(n), sigma, axis=0, mode="nearest")

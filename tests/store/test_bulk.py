@@ -209,7 +209,7 @@ def test_two_writers_on_one_store(tmp_path: Path, engine: Engine) -> None:
 
 @pytest.fixture(scope="module")
 def painted(tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """The store of a run that nobody killed."""
+    """Return the store of an uninterrupted run."""
     path = tmp_path_factory.mktemp("painted") / "frames.zarr"
     before, store.CHUNK_BYTES = store.CHUNK_BYTES, 64 * 197 * 2
     bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]

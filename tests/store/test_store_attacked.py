@@ -43,7 +43,7 @@ PAINTER: Any = Seeded()
 
 @pytest.fixture
 def made(tmp_path: Path) -> Path:
-    """A small store, whole."""
+    """Return a small intact store."""
     path = tmp_path / "frames.zarr"
     bulk.realise(study(), path, PAINTER)
     return path
