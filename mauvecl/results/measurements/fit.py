@@ -18,9 +18,9 @@ from mauvecl.results.measurements.reduction import Reduction
 from mauvecl.statistics.nuisances import Nuisances
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator
+    from collections.abc import Callable, Iterator
 
-    from astropy.table import QTable
+    from astropy.table import Table
 
     from mauvecl.host.expectation import Expectation
 
@@ -107,7 +107,7 @@ class Measurement:
             raise InputError(f"quantity {name!r} is not measured, expected one of {', '.join(self.names)}")
         return self.names.index(name)
 
-    def table(self, frame: int = 0) -> QTable:
+    def table(self, frame: int = 0) -> Table:
         """Return the estimates and intervals of one frame, one row per quantity."""
         from astropy.table import Table
 
@@ -116,6 +116,8 @@ class Measurement:
         for level, low, high in zip(self.levels, self.low, self.high, strict=True):
             percent = f"{100 * level:.4g}"
             table[f"low_{percent}"], table[f"high_{percent}"] = low[frame], high[frame]
+        for name in table.colnames[2:]:
+            table[name].format = ".4g"
         table.meta |= {"chi2": float(self.chi2[frame]), "dof": self.dof, "p_value": float(self.p_value[frame])}
         return table
 
@@ -128,6 +130,7 @@ def fit(
     nuisances: Nuisances | None = None,
     *,
     levels: Sequence[float] = LEVELS,
+    skipped_nm: Sequence[tuple[float, float]] = (),
 ) -> Measurement:
     """Fit one flare to each of some exposures.
 
@@ -145,6 +148,8 @@ def fit(
         Unknown amplitudes of known spectra, which are marginalised over.
     levels : sequence of float
         Nominal coverage of the intervals.
+    skipped_nm : sequence of tuple
+        Wavelengths between which pixels do not count, such as gaps of an observation.
 
     Raises
     ------
@@ -171,11 +176,19 @@ def fit(
     if not levels or not all(0.0 < level < 1.0 for level in levels):
         raise InputError(f"levels = {list(levels)}, expected probabilities between 0 and 1")
     excess = raw - expectation.recorded_dn
-    log_k, linear = _pilot(excess, expectation, model, nuisances)
+    nm = expectation.wavelength_nm
+    left_out = np.zeros(nm.size, np.bool_)
+    for low, high in skipped_nm:
+        left_out |= (nm >= low) & (nm <= high)
+
+    def reduction_of(added_dn: Float | None) -> Reduction:
+        return Reduction.of(model, expectation, added_dn, nuisances, left_out)
+
+    log_k, linear = _pilot(excess, model, reduction_of(None))
     parts: list[tuple[NDArray[np.intp], dict[str, Any]]] = []
     for step in range(REFITS):
         parts = []
-        for rows, reduction in _groups(expectation, model, nuisances, log_k, linear):
+        for rows, reduction in _groups(expectation, model, log_k, linear, reduction_of):
             for start in range(0, rows.size, BATCH):
                 some = rows[start : start + BATCH]
                 parts.append((some, _fitted(excess[some], model, reduction, levels if step == REFITS - 1 else ())))
@@ -193,9 +206,8 @@ def fit(
     return Measurement(model.names, units, levels=tuple(levels), dof=int(dof.min()), **joined)
 
 
-def _pilot(excess: Float, quiet: Expectation, model: FlareModel, nuisances: Nuisances | None) -> tuple[Float, Float]:
-    """Return fits with the variance of the quiescent star."""
-    reduction = Reduction.of(model, quiet, None, nuisances)
+def _pilot(excess: Float, model: FlareModel, reduction: Reduction) -> tuple[Float, Float]:
+    """Return fits with one variance for all frames, that of the quiescent star."""
     log_k, linear = np.empty(len(excess)), np.empty((len(excess), len(model.linear)))
     for start in range(0, len(excess), BATCH):
         some = slice(start, start + BATCH)
@@ -205,7 +217,11 @@ def _pilot(excess: Float, quiet: Expectation, model: FlareModel, nuisances: Nuis
 
 
 def _groups(
-    quiet: Expectation, model: FlareModel, nuisances: Nuisances | None, log_k: Float, linear: Float
+    quiet: Expectation,
+    model: FlareModel,
+    log_k: Float,
+    linear: Float,
+    reduction_of: Callable[[Float], Reduction],
 ) -> Iterator[tuple[NDArray[np.intp], Reduction]]:
     """Yield frames whose fitted flares have nearly the same variance, with their reduction."""
     n_pixel = quiet.wavelength_nm.size
@@ -222,7 +238,7 @@ def _groups(
     for rows in np.split(order, np.cumsum(counts)[:-1]):
         middle = np.mean(log_k[rows])
         mean = linear[rows, 0].mean() * model.hot_spline(middle) + linear[rows, 1:].mean(axis=0) @ model.fixed
-        yield rows, Reduction.of(model, quiet, mean, nuisances)
+        yield rows, reduction_of(mean)
 
 
 def _fitted(excess: Float, model: FlareModel, reduction: Reduction, levels: Sequence[float]) -> dict[str, Any]:

@@ -65,7 +65,12 @@ class Reduction:
 
     @classmethod
     def of(
-        cls, model: FlareModel, quiet: Expectation, added_dn: Float | None = None, nuisances: Nuisances | None = None
+        cls,
+        model: FlareModel,
+        quiet: Expectation,
+        added_dn: Float | None = None,
+        nuisances: Nuisances | None = None,
+        left_out: NDArray[np.bool_] | None = None,
     ) -> Self:
         """Return the reduction of exposures with the variance of a flare that adds some counts.
 
@@ -76,6 +81,8 @@ class Reduction:
         added_dn : ndarray, shape (n_pixel,), optional
             Mean DN of the flare; none by default.
         nuisances : Nuisances, optional
+        left_out : ndarray of bool, shape (n_pixel,), optional
+            Pixels that do not count, as saturated ones do not.
 
         Raises
         ------
@@ -83,8 +90,11 @@ class Reduction:
             If every pixel saturates, or a flare cannot be told from what is unknown.
         """
         variance, used = variance_of(quiet, added_dn)
+        if left_out is not None:
+            used = used & ~left_out
+            variance = np.where(used, variance, 0.0)
         if not used.any():
-            raise InputError(f"every pixel of {quiet.name} saturates, expected some that do not")
+            raise InputError(f"every pixel of {quiet.name} saturates or is left out, expected some that count")
         inverse = np.divide(1.0, variance, out=np.zeros_like(variance), where=used)
         rows = nuisances.rows(variance, nuisances.spectra * used) if nuisances else np.zeros((0, variance.size))
         spanning = np.vstack([model.hot[::EVERY], model.fixed]) * used
