@@ -264,6 +264,32 @@ def _fitted(excess: Float, model: FlareModel, reduction: Reduction, levels: Sequ
     }
 
 
+def fit_sums(sums: Float, model: FlareModel, reduction: Reduction) -> tuple[Float, Float]:
+    """Fit sums of exposures that one reduction made, without intervals: some 1e5 fits in a second of one processor.
+
+    Parameters
+    ----------
+    sums : ndarray, shape (n, n_sum)
+    model : FlareModel
+    reduction : Reduction
+        Its variance is taken for that of every exposure.
+
+    Returns
+    -------
+    estimates : ndarray, shape (n, n_derived)
+        The model's quantities.
+    covariance : ndarray, shape (n, n_derived, n_derived)
+        From the Fisher information at the fit.
+    """
+    estimates, spreads = [], []
+    for start in range(0, len(sums), BATCH):
+        profile = Profile(reduction, sums[start : start + BATCH])
+        best = profile.best()
+        estimates.append(derived_values(model, best.log_k, best.linear))
+        spreads.append(covariance(model, profile, best))
+    return np.concatenate(estimates), np.concatenate(spreads)
+
+
 @dataclass(frozen=True, eq=False)
 class Forecast:
     """Errors that a measurement will have, from the Fisher information.

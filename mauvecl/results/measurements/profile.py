@@ -27,6 +27,8 @@ Float = NDArray[np.float64]
 
 #: Parabolas through three temperatures that refine the best node, and the factor by which they get narrower.
 REFINEMENTS, NARROWER = 3, 8.0
+#: A search for the best temperature alone begins at one in so many of the model's nodes.
+COARSE = 4
 #: Steps of the search for the end of an interval.
 STEPS = 12
 #: Temperatures within an interval at which derived quantities are computed.
@@ -91,9 +93,9 @@ class Profile:
         base = np.einsum("nk,nk->n", self.along, self.along).reshape((-1,) + (1,) * (log_k.ndim - 1))
         return np.asarray(base + np.maximum(amplitude, 0.0) ** 2 / variance)
 
-    def gain_at_nodes(self) -> Float:
-        """Return `gain` at the model's temperatures, shape (n, n_node)."""
-        product = self.rest @ (self.hot_nodes / self._lengths[:, None]).T
+    def gain_at_nodes(self, every: int = 1) -> Float:
+        """Return `gain` at one in so many of the model's temperatures, shape (n, n_node)."""
+        product = self.rest @ (self.hot_nodes[::every] / self._lengths[::every, None]).T
         return np.asarray(np.maximum(product, 0.0) ** 2 + np.einsum("nk,nk->n", self.along, self.along)[:, None])
 
     def linear(self, log_k: Float, amplitude: Float, hot: Float) -> Float:
@@ -106,10 +108,11 @@ class Profile:
 
     def best(self, at_nodes: Float | None = None) -> Best:
         """Return the best fit of each frame."""
-        at_nodes = self.gain_at_nodes() if at_nodes is None else at_nodes
+        every = COARSE if at_nodes is None else 1
+        at_nodes = self.gain_at_nodes(every) if at_nodes is None else at_nodes
         low, high = self.nodes[0], self.nodes[-1]
-        step = float(self.nodes[1] - self.nodes[0])
-        x = self.nodes[np.argmax(at_nodes, axis=1)]
+        step = every * float(self.nodes[1] - self.nodes[0])
+        x = self.nodes[::every][np.argmax(at_nodes, axis=1)]
         for _ in range(REFINEMENTS):
             there = np.clip(x[:, None] + step * np.array([-1.0, 0.0, 1.0]), low, high)
             g = self.gain(there)

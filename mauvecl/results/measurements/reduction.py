@@ -16,6 +16,7 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
+from mauvecl.statistics.linear import Linear
 from mauvecl.statistics.nuisances import Nuisances, join_names
 
 if TYPE_CHECKING:
@@ -122,6 +123,11 @@ class Reduction:
         return sums, whole - np.einsum("nk,nk->n", unknown, unknown) - np.einsum("nk,nk->n", sums, sums)
 
     @property
+    def statistics(self) -> tuple[Linear, ...]:
+        """The sums as statistics, which the device draws pixel by pixel and sums; see `drawn_sums`."""
+        return tuple(Linear(f"sum {k}", weights) for k, weights in enumerate(self.weights))
+
+    @property
     def n_used(self) -> int:
         """Number of pixels that count."""
         return int((self.variance > 0.0).sum())
@@ -138,6 +144,11 @@ class Reduction:
     def spline(self) -> scipy.interpolate.CubicSpline:
         """Sums of the blackbody over log temperature."""
         return scipy.interpolate.CubicSpline(self.log_k, self.hot)
+
+
+def drawn_sums(values: NDArray[np.float32], reduction: Reduction) -> Float:
+    """Return sums of drawn exposures, (n, n_sum), from what `Engine.statistic_values` gives of one flare."""
+    return np.ascontiguousarray(values[-len(reduction.weights) :].T, np.float64)
 
 
 def variance_of(quiet: Expectation, added_dn: Float | None = None) -> tuple[Float, NDArray[np.bool_]]:
