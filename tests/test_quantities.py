@@ -68,6 +68,7 @@ REASONS = {
     "bulk.draw.start": "hands on to Engine.realise, once whole",
     "bulk.draw.count": "hands on to Engine.realise, once whole",
     "FlareModel.of.bands_nm": "pairs of plain numbers, as a study has them",
+    "fit.skipped_nm": "pairs of plain numbers, as FlareModel.of takes them",
     "ObservedFlare.wavelength_nm": "as ObservedFlare.from_arrays",
     "ObservedFlare.measured_nm": "made by ObservedFlare.from_arrays",
     "ObservedFlare.read.wavelength_unit": "a unit, no wavelength",

@@ -37,6 +37,7 @@ ASKED = {
     "plan": ("targets.csv --days 3 --completeness 'closed form' --report html",
              "instrument mauve, detector at 21 deg C; " + FLARE + "orbit of embedded elements; "
              "least angles: Earth's limb 25 deg, Sun 46 deg, Moon 25 deg; seed 1"),
+    "measure": ("--star G2V -m 7.4 --set measure.fits=100", USUAL + FLARE + REST),
     "realise": ("--star G2V -m 7.4 -n 10 --output r.zarr", USUAL + FLARE + REST),
 }  # fmt: skip
 

@@ -99,7 +99,7 @@ def test_one_sentence_where_no_level_works(act: str, tmp_path: Path) -> None:
     assert found.keys() == {"sentence"}
     lines, sentence = found["sentence"].split(" ", 1)
     assert lines == "0"
-    for word in ("processor", "driver", ACTS[act], "conda-forge", "--device"):
+    for word in ("processor", "driver", ACTS[act], "conda-forge", "`mauvecl devices`"):
         assert word in sentence
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mauvecl.cli.flags import DRAWS, FLARE, MEASURE, NUISANCES, SIZE, SWEEP, DeviceFlag, flag, group
+from mauvecl.cli.flags import DETECTION, DRAWS, FLARE, MEASURE, NUISANCES, SIZE, SWEEP, DeviceFlag
 from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
@@ -12,15 +12,15 @@ if TYPE_CHECKING:
     from mauvecl.cli.session import Session
     from mauvecl.study.study import Study
 
-SELECTED = group(flag(float, "--fap", "False-alarm probability at which flares count as detected [0.001].", "run.fap"))
+SELECTED = {"fap": DETECTION["fap"]}
 
 
 @takes_study(FLARE, MEASURE, NUISANCES, SIZE, SELECTED, {"seed": DRAWS["seed"]}, SWEEP, draws=False)
 def measure(study: Study, session: Session, device: DeviceFlag = None) -> None:
-    """What would be measured of a flare: temperature, area, energy, Balmer jump, lines.
+    """What would be measured of a flare's spectrum, and how well.
 
-    Errors in advance, simulated fits with the coverage of their intervals, the same for flares that a search detects,
-    and what a too simple model makes of the flare.
+    Temperature, area, energy, Balmer jump and lines: errors in advance, simulated fits with the coverage of their
+    intervals, the same for flares that a search detects, and what a too simple model makes of the flare.
 
     Examples: mauvecl measure --star M3V --magnitude 9 --amplitude 0.5 --balmer-jump 2 --nuisance dark=free --nuisance
     light=free
