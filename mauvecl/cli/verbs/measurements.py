@@ -22,8 +22,7 @@ def measure(study: Study, session: Session, device: DeviceFlag = None) -> None:
     Temperature, area, energy, Balmer jump and lines: errors in advance, simulated fits with the coverage of their
     intervals, the same for flares that a search detects, and what a too simple model makes of the flare.
 
-    Examples: mauvecl measure --star M3V --magnitude 9 --amplitude 0.5 --balmer-jump 2 --nuisance dark=free --nuisance
-    light=free
+    Examples: mauvecl measure --star M3V -m 9 -a 0.5 --balmer-jump 2 --nuisance dark=free --nuisance light=free
 
     mauvecl measure --star M3V --magnitude 9 --amplitude 0.5 --sweep exposure=50,300 --distance 5 --radius 0.4
     """
