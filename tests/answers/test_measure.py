@@ -11,6 +11,7 @@ from scipy import stats
 
 from mauvecl import Engine, InputError, Study, measure
 from mauvecl.answers.measurements.measure import MeasureAnswer
+from mauvecl.host.plotting import picture
 from mauvecl.host.stars.bands import photons
 
 
@@ -79,6 +80,17 @@ def test_detected_flares_near_the_threshold_are_too_bright(engine: Engine) -> No
     assert rows["flux 200-320 nm"]["bias_selected"] > 0
 
 
+@pytest.mark.parametrize("amplitude", [1e-4, 0.01, 30.0])
+def test_faint_and_bright_flares_have_tables_and_pictures(amplitude: float, engine: Engine, tmp_path: Path) -> None:
+    """Without limits on one side or both, or with pixels that saturate."""
+    study = study_of("measure.fits=20", f"flare.amplitudes=[{amplitude}]", spectrum={"balmer_jump": 2.0})
+    answer = measure(study, engine)
+    assert len(answer.table) == sum(len(one.truth) for one in answer.flares)
+    for name, (function, shown) in answer.pictures.items():
+        picture(function, shown, path=tmp_path / f"{name}.png")
+        assert (tmp_path / f"{name}.png").exists()
+
+
 def test_lines_and_absolute_fluxes(engine: Engine) -> None:
     spectrum = {"balmer_jump": 2.0, "lines": {"H alpha": 0.05}, "line_fluxes": {"Mg II": 2e-11}}
     answer = measure(study_of("measure.fits=50", "nuisances={}", spectrum=spectrum), engine)
@@ -120,6 +132,7 @@ def test_sweeps_seeds_and_files(engine: Engine, tmp_path: Path) -> None:
     ("settings", "text"),
     [
         (["flare.geometry=replaces"], "expected 'added'"),
+        (["flare.amplitudes=[0.5, 0.0]"], "flare amplitude = 0"),
         (["measure.bands_nm=[[300, 200]]"], "bands_nm"),
         (['measure.lines=["X"]'], "'X' is unknown"),
         (["measure.fits=0"], "measure.fits"),

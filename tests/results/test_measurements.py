@@ -286,6 +286,7 @@ def test_one_frame_is_fitted_alike_in_any_company() -> None:
     ("call", "text"),
     [
         (lambda: fit(np.zeros((2, 7)), quiet(), model()), r"shape \(2, 7\)"),
+        (lambda: fit(np.zeros((0, quiet().wavelength_nm.size)), quiet(), model()), r"shape \(0, "),
         (lambda: fit(np.full(quiet().wavelength_nm.size, np.nan), quiet(), model()), "undefined"),
         (lambda: fit(quiet().recorded_dn, quiet(), model(), levels=(95.0,)), "levels"),
         (lambda: FlareModel.of(star(), MAUVE, quiet(), lines=("X",)), "'X' is unknown"),

@@ -240,6 +240,8 @@ def measure(study: Study, engine: Engine, progress: Callable[[int, int], None] |
     """
     if study.flare.geometry != "added":
         raise InputError("flare.geometry = 'replaces' in a measurement, expected 'added': fits take light for added")
+    if any(not amplitude > 0.0 for _, cell in study.cells() for amplitude in cell.flare.amplitudes):
+        raise InputError("flare amplitude = 0 in a measurement, expected one above 0")
     prepared = [(at, cell, star, cell.expectations(star)) for at, cell in study.cells() for star in cell.star]
     flares: list[MeasuredFlare] = []
     n = sum(len(group) - 1 for *_, group in prepared)

@@ -169,8 +169,10 @@ def fit(
     [9000.0, 0.5]
     """
     raw = np.atleast_2d(np.asarray(frames, np.float64))
-    if raw.ndim != 2 or raw.shape[1] != expectation.wavelength_nm.size:
-        raise InputError(f"frames of the shape {raw.shape}, expected {expectation.wavelength_nm.size} pixels in each")
+    if raw.ndim != 2 or not len(raw) or raw.shape[1] != expectation.wavelength_nm.size:
+        raise InputError(
+            f"frames of the shape {raw.shape}, expected {expectation.wavelength_nm.size} pixels in each of some"
+        )
     if not np.isfinite(raw).all():
         raise InputError("frames hold undefined values, expected finite numbers")
     if not levels or not all(0.0 < level < 1.0 for level in levels):
