@@ -14,13 +14,13 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from ..drawable import Drawable
 from .arguments import public
 from .content import ContentEquality
 from .errors import InputError
 from .instrument.instrument import Instrument
 from .instrument.line import Line
 from .measured_noise import negative_means_message
-from .plotting import picture
 from .quantities import number
 from .ranges import EXPOSURES, check_exposure
 from .response import Order, electrons_per_second
@@ -47,7 +47,7 @@ SIGNALS: tuple[Signal, ...] = get_args(Signal)
 
 @public
 @dataclass(frozen=True, eq=False)
-class Expectation(ContentEquality):
+class Expectation(Drawable, ContentEquality):
     """Means and noise per pixel of an exposure; the arrays are read-only and refer to a single frame.
 
     Attributes
@@ -182,10 +182,6 @@ class Expectation(ContentEquality):
         table["noise"].info.description = "standard deviation, without the ADC's rounding"
         table.meta |= {"name": self.name, "instrument": self.instrument, "exposure_s": self.exposure_s}
         return table
-
-    def plot(self, path: str | Path | None = None, *, ax: Any = None) -> Any:
-        """Plot the mean signal and its noise against wavelength, to a file or in given axes; needs matplotlib."""
-        return picture("inputs.expectation", self, path=path, ax=ax)
 
     @property
     def exposure_s(self) -> float:

@@ -9,6 +9,7 @@ import sys
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from mauvecl import drawable
 from mauvecl.host.version import VERSION
 
 if sys.platform == "win32":
@@ -57,6 +58,8 @@ if TYPE_CHECKING:
     from mauvecl.statistics.nuisances import Nuisances
     from mauvecl.store import bulk
     from mauvecl.study.study import PAPER_BUDGETS, Study
+
+drawable.connect(lambda: import_module("mauvecl.pictures.registry"))
 
 __version__ = VERSION
 __all__ = [

@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ...drawable import Drawable
 from ..arguments import public
 from ..content import ContentEquality
 from ..errors import InputError
-from ..plotting import picture
 from ..quantities import number
 from ..ranges import check_magnitude
 from ..spectra.ends import (
@@ -45,7 +45,7 @@ BRIGHTEST_V, SUN_V = -2.0, (-27.3, -26.2)
 
 @public
 @dataclass(frozen=True, eq=False)
-class Source(ContentEquality):
+class Source(Drawable, ContentEquality):
     """A stellar spectrum at the telescope.
 
     Attributes
@@ -339,10 +339,6 @@ class Source(ContentEquality):
         table = QTable({"wavelength": self.wavelength_nm * u.nm, "flux": self.flux_flam * flam})
         table.meta |= {"name": self.name, "origin": self.origin, "history": list(self.history)}
         return table
-
-    def plot(self, path: str | Path | None = None, *, ax: Any = None) -> Any:
-        """Plot flux against wavelength, to a file or in given axes; needs matplotlib."""
-        return picture("inputs.source", self, path=path, ax=ax)
 
     def _line(self) -> str:
         span = f"{self.name!r}, {self.wavelength_nm[0]:.0f}-{self.wavelength_nm[-1]:.0f} nm"

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from mauvecl.drawable import Drawable, documents_of
 from mauvecl.host.content import ContentEquality
-from mauvecl.host.plotting import picture
 from mauvecl.study.labels import titled
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ class InCell:
         return titled(self.label, self.at)
 
 
-class Answer(ContentEquality, ABC):
+class Answer(Drawable, ContentEquality, ABC):
     """The answer to one question of a study."""
 
     #: Endings of the files of each table; the first table's alone in some answers.
@@ -64,11 +64,6 @@ class Answer(ContentEquality, ABC):
         """Expectations that it rests on, for the record of a run."""
 
     @property
-    @abstractmethod
-    def pictures(self) -> dict[str, tuple[Any, ...]]:
-        """Every picture by the name of its file: a function of `mauvecl.pictures`, and what it takes before a path."""
-
-    @property
     def assumed(self) -> str:
         """One line with what the study assumes of the parts that the answer uses."""
         from mauvecl.study.assumed import assumption_line
@@ -92,11 +87,6 @@ class Answer(ContentEquality, ABC):
 
         return {"messages": list(self.messages), "rows": rows(next(iter(self.tables.values())))}
 
-    def plot(self, path: str | Path | None = None, *, ax: Any = None) -> Any:
-        """The first of its pictures, saved where a path is given; needs matplotlib."""
-        name, *given = next(iter(self.pictures.values()))
-        return picture(name, *given, path=path, ax=ax)
-
     def write(self, folder: str | Path) -> list[Path]:
         """Every table, and the study that gives them again.
 
@@ -117,7 +107,7 @@ class Answer(ContentEquality, ABC):
     @property
     def documents(self) -> dict[str, Callable[[], bytes]]:
         """Files that are more than a table, by their full names: what makes their content."""
-        return {}
+        return documents_of(self)
 
     @property
     def files(self) -> dict[str, Table]:

@@ -147,10 +147,12 @@ class Session:
         """What tables and pictures are made with: three quarters of a second that would be waited for at the end."""
         from importlib import import_module
 
+        from mauvecl.pictures.registry import load
         from mauvecl.pictures.style import available, canvas
 
         for name in ("astropy.table", "astropy.io.misc.yaml", "rich.table"):
             import_module(name)
+        load()
         if self.pictures and available():
             canvas()
 
@@ -253,10 +255,8 @@ class Session:
         for name, content in answer.documents.items():
             self.leave(partial(self._document, name, content))
         if self.draws_pictures:
-            from mauvecl.host.plotting import picture
-
-            for name, (function, *given) in answer.pictures.items():
-                self.leave(partial(picture, function, *given, path=self.folder / f"{name}.png"))
+            for name, draw in answer.pictures.items():
+                self.leave(partial(draw, self.folder / f"{name}.png"))
         self.record(answer.study, answer.inputs, [*answer.messages, *answer.remarks])
 
     def _written(self) -> str:

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.pictures.registry import picture_of
 from mauvecl.pictures.style import (
     COLOURS,
     COLUMN,
@@ -26,6 +27,7 @@ from mauvecl.statistics.statistic import LinearStatistic
 if TYPE_CHECKING:
     from astropy.table import QTable
 
+    from mauvecl.answers.detection.detect import DetectAnswer
     from mauvecl.host.expectation import Expectation
     from mauvecl.results.detection.detection import Detection
     from mauvecl.results.detection.roc import Roc
@@ -33,10 +35,23 @@ if TYPE_CHECKING:
 
 #: A star: title, findings, and its flares' names.
 Shown = tuple[str, "Detection", Sequence[str]]
+#: Stars in one picture, at most.
+MOST_STARS = 6
 
 
+def _few(answer: DetectAnswer) -> list[Shown]:
+    """More stars would be too small to read."""
+    return [star.shown for star in answer.stars[:MOST_STARS]]
+
+
+def _alone(found: Detection) -> list[Shown]:
+    return [(found.quiet.name, found, [f"flare {k + 1}" for k in range(len(found.flares))])]
+
+
+@picture_of("DetectAnswer", "detection", given=lambda answer: (_few(answer), answer.study.run.fap))
+@picture_of("Detection", "detection", given=lambda found: (_alone(found),))
 @drawn
-def detection(plt: Any, stars: Sequence[Shown], fap: float) -> Any:
+def detection(plt: Any, stars: Sequence[Shown], fap: float = 1e-3) -> Any:
     """Null and flare distributions: a row per star, a column per statistic."""
     first = stars[0][1]
     statistics = first.statistics
@@ -109,6 +124,12 @@ def _distributions(axis: Any, outcome: Detection, flares: Sequence[str], statist
     axis.set_xlabel(label(statistic))
 
 
+@picture_of("Roc", "roc")
+def named_roc(curve: Roc, name: str = "", **how: Any) -> Any:
+    """One receiver operating characteristic with its area."""
+    return roc([(name, curve)], **how)
+
+
 @drawn
 def roc(plt: Any, curves: Sequence[tuple[str, Roc]]) -> Any:
     """Receiver operating characteristics with their areas."""
@@ -127,6 +148,7 @@ def roc(plt: Any, curves: Sequence[tuple[str, Roc]]) -> Any:
     return figure
 
 
+@picture_of("DetectAnswer", "spectra", given=lambda answer: (_few(answer),))
 @drawn
 def spectra(plt: Any, stars: Sequence[Shown]) -> Any:
     """Mean spectra per second with the noise of a pixel; beneath, what flares add, in sigma of an element's noise."""
@@ -170,6 +192,9 @@ def _whole(x: Expectation) -> NDArray[np.bool_]:
     return np.asarray(pixels >= np.median(pixels) - 1)
 
 
+@picture_of(
+    "SimulateAnswer", "observation", each=lambda answer: [(title, table) for title, _, table in answer.observations]
+)
 @drawn
 def observation(plt: Any, title: str, table: QTable) -> Any:
     """One raw spectrum and what it is made of, as the paper's figure of components."""
@@ -194,6 +219,13 @@ def observation(plt: Any, title: str, table: QTable) -> Any:
     return figure
 
 
+@picture_of(
+    "SnrAnswer",
+    "snr",
+    given=lambda answer: ([(star.title, star.result) for star in answer.stars],),
+    when=lambda answer: len(answer.stars) <= MOST_STARS,
+)
+@picture_of("SnrResult", "snr", given=lambda result: ([(result.expectation.name, result)],))
 @drawn
 def signal_to_noise(plt: Any, stars: Sequence[tuple[str, SnrResult | Expectation]]) -> Any:
     """S/N per pixel and per resolution element: closed form, and the spread of realisations where there are some."""

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.pictures.registry import picture_of
 from mauvecl.pictures.style import COLOURS, MOST_COLUMNS, STYLE, canvas, finished, headline, legend_below
 
 if TYPE_CHECKING:
@@ -21,13 +22,13 @@ SIZES = {
 }
 #: Half-widths with curves of their own, at most.
 MOST_CURVES = 6
+#: Maps in one picture, at most.
+MOST_MAPS = 6
 CONTOURS = (0.1, 0.5, 0.9)
 
 
 def _panels(answer: InjectAnswer) -> tuple[Any, list[Any], list[Any]]:
-    from mauvecl.answers.stares.inject import MOST_DRAWN
-
-    stars = answer.stars[:MOST_DRAWN]
+    stars = answer.stars[:MOST_MAPS]
     columns = min(len(stars), MOST_COLUMNS)
     rows = -(-len(stars) // columns)
     figure, axes = canvas().subplots(rows, columns, figsize=(3.6 * columns + 0.8, 3.2 * rows), squeeze=False)
@@ -46,6 +47,7 @@ def _titled(figure: Any, answer: InjectAnswer) -> None:
     )
 
 
+@picture_of("InjectAnswer", "completeness")
 def maps(answer: InjectAnswer, path: str | Path | None) -> Any:
     """Completeness over half-width and size, one panel per star; the figure where no path is given."""
     with canvas().rc_context(STYLE):
@@ -68,6 +70,30 @@ def maps(answer: InjectAnswer, path: str | Path | None) -> Any:
         return finished(figure, path)
 
 
+@picture_of("InjectAnswer", "curves")
+def curves(answer: InjectAnswer, path: str | Path | None) -> Any:
+    """Completeness over size at some half-widths, with 95 % intervals; the figure where no path is given."""
+    with canvas().rc_context(STYLE):
+        figure, stars, axes = _panels(answer)
+        for star, axis in zip(stars, axes, strict=False):
+            f = star.injected
+            picked = np.unique(np.linspace(0, len(f.half_widths_s) - 1, MOST_CURVES).round().astype(int))
+            for k, colour in zip(picked, COLOURS, strict=False):
+                axis.fill_between(
+                    f.sizes, f.completeness_low[k], f.completeness_high[k], color=colour, alpha=0.25, linewidth=0
+                )
+                axis.plot(f.sizes, f.completeness[k], color=colour, label=f"half-width {f.half_widths_s[k]:.0f} s")
+            for power in (0.5, 0.9):
+                axis.axhline(power, color="black", linewidth=0.6, linestyle="--")
+            axis.set(
+                xscale="log", xlabel=SIZES[star.sizes.of], ylabel="completeness", ylim=(-0.02, 1.02), title=star.title
+            )
+        legend_below(figure, *axes[0].get_legend_handles_labels())
+        _titled(figure, answer)
+        return finished(figure, path)
+
+
+@picture_of("InjectAnswer", "energies", when=lambda answer: all(star.fitted for star in answer.stars))
 def energies(answer: InjectAnswer, path: str | Path | None) -> Any:
     """Recovered over injected energy of found flares over half-width and size; the figure where no path is given."""
     with canvas().rc_context(STYLE):
@@ -89,25 +115,3 @@ def _edges(middles: Any) -> Any:
     """Edges of cells whose middles are evenly spaced in the logarithm, about."""
     steps = np.sqrt(middles[1:] / middles[:-1])
     return np.concatenate([[middles[0] / steps[0]], middles[:-1] * steps, [middles[-1] * steps[-1]]])
-
-
-def curves(answer: InjectAnswer, path: str | Path | None) -> Any:
-    """Completeness over size at some half-widths, with 95 % intervals; the figure where no path is given."""
-    with canvas().rc_context(STYLE):
-        figure, stars, axes = _panels(answer)
-        for star, axis in zip(stars, axes, strict=False):
-            f = star.injected
-            picked = np.unique(np.linspace(0, len(f.half_widths_s) - 1, MOST_CURVES).round().astype(int))
-            for k, colour in zip(picked, COLOURS, strict=False):
-                axis.fill_between(
-                    f.sizes, f.completeness_low[k], f.completeness_high[k], color=colour, alpha=0.25, linewidth=0
-                )
-                axis.plot(f.sizes, f.completeness[k], color=colour, label=f"half-width {f.half_widths_s[k]:.0f} s")
-            for power in (0.5, 0.9):
-                axis.axhline(power, color="black", linewidth=0.6, linestyle="--")
-            axis.set(
-                xscale="log", xlabel=SIZES[star.sizes.of], ylabel="completeness", ylim=(-0.02, 1.02), title=star.title
-            )
-        legend_below(figure, *axes[0].get_legend_handles_labels())
-        _titled(figure, answer)
-        return finished(figure, path)

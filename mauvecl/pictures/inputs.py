@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.pictures.registry import picture_of
 from mauvecl.pictures.style import COLOURS, NULL, drawn
 
 if TYPE_CHECKING:
@@ -28,6 +29,7 @@ OPTICS = {
 }
 
 
+@picture_of("Source", "source")
 @drawn
 def source(plt: Any, star: Source) -> Any:
     """A spectrum where Mauve sees it."""
@@ -38,6 +40,7 @@ def source(plt: Any, star: Source) -> Any:
     return figure
 
 
+@picture_of("Expectation", "expectation")
 @drawn
 def expectation(plt: Any, x: Expectation) -> Any:
     """Mean signal of an exposure, with its noise."""

@@ -7,20 +7,27 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.measurements.measure import contour
+from mauvecl.pictures.registry import picture_of
 from mauvecl.pictures.style import COLOURS, NULL, drawn
 from mauvecl.results.measurements.fit import forecast
 from mauvecl.results.measurements.reduction import variance_of
 
 if TYPE_CHECKING:
-    from mauvecl.answers.measurements.measure import MeasuredFlare
+    from mauvecl.answers.measurements.measure import MeasureAnswer, MeasuredFlare
 
 #: Rises of chi-squared that enclose 68.27 and 95 % in two dimensions.
 RISES = (2.30, 5.99)
 #: Factors of the amplitude over which errors are drawn.
 FACTORS = np.geomspace(0.1, 10.0, 25)
+#: Flares in one picture, at most.
+MOST_FLARES = 4
 
 
+def _few(answer: MeasureAnswer) -> tuple[Any, ...]:
+    return (answer.flares[:MOST_FLARES],)
+
+
+@picture_of("MeasureAnswer", "fit", given=_few)
 @drawn
 def fits(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
     """The first exposure per resolution element, less unknowns, with the fitted flare; residuals; a column per fit."""
@@ -43,9 +50,12 @@ def fits(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
     return figure
 
 
+@picture_of("MeasureAnswer", "contours", given=_few)
 @drawn
 def contours(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
     """Expected confidence regions of temperature and amplitude, unknowns marginalised over."""
+    from mauvecl.answers.measurements.measure import contour
+
     figure, axes = plt.subplots(1, len(flares), figsize=(3.4 * len(flares), 3.2), squeeze=False)
     for axis, one in zip(axes[0], flares, strict=True):
         kelvin, amplitude, rise = contour(one)
@@ -57,6 +67,7 @@ def contours(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
     return figure
 
 
+@picture_of("MeasureAnswer", "pulls", given=_few)
 @drawn
 def pulls(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
     """Estimates less the truth over their standard errors, beside the standard normal."""
@@ -78,6 +89,7 @@ def pulls(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
     return figure
 
 
+@picture_of("MeasureAnswer", "errors", given=_few)
 @drawn
 def errors(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
     """Errors of temperature and amplitude in advance against the amplitude: everything known, and unknowns not."""

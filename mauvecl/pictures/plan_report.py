@@ -12,7 +12,9 @@ import numpy as np
 
 from mauvecl.answers.campaigns.plan_text import LEGEND, SUMMARY, heading, summary_rows, target_lines
 from mauvecl.host.version import VERSION
+from mauvecl.pictures.registry import document_of, picture_of
 from mauvecl.pictures.style import COLOURS, NULL, STYLE, canvas, finished
+from mauvecl.pictures.visibility import calendar
 
 if TYPE_CHECKING:
     from mauvecl.answers.campaigns.plan import PlanAnswer
@@ -28,6 +30,7 @@ ASSUMED_AT = (0.0, 0.24, 0.5)
 PANELS = {"left": 0.085, "right": 0.905, "top": 0.955, "bottom": 0.09, "hspace": 0.5}
 
 
+@picture_of("PlanAnswer", "plan")
 def overview(answer: PlanAnswer, path: str | Path | None) -> Any:
     """Flares expected of each target with 95 % of campaigns, and E50 to E90."""
     plt = canvas()
@@ -35,6 +38,12 @@ def overview(answer: PlanAnswer, path: str | Path | None) -> Any:
         figure, axes = plt.subplots(1, 2, figsize=(7.4, 0.24 * len(answer.planned) + 1.5), sharey=True)
         _overview(axes, answer)
         return finished(figure, path)
+
+
+@picture_of("PlanAnswer", "visible")
+def visible(answer: PlanAnswer, path: str | Path | None = None) -> Any:
+    """Hours of exposure a day of all targets."""
+    return calendar(answer.seen, path)
 
 
 def overview_png(answer: PlanAnswer) -> bytes:
@@ -71,6 +80,7 @@ def _overview(axes: Any, answer: PlanAnswer) -> None:
     left.set_ylim(n - 0.5, -0.5)
 
 
+@document_of("PlanAnswer", "plan.pdf", when=lambda answer: answer.study.plan.report == "pdf")
 def pdf_bytes(answer: PlanAnswer) -> bytes:
     """The report as PDF: the summary, a page for each target, every assumption."""
     from matplotlib.backends.backend_pdf import PdfPages

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.pictures.registry import picture_of
 from mauvecl.pictures.style import (
     COLOURS,
     COLUMN,
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 STROKES = (":", "--", "-", "-.")
 
 
+@picture_of("MapResult", "map")
 @drawn
 def detection_map(plt: Any, answer: MapResult) -> Any:
     """Detection probability over two quantities, one panel per statistic."""
@@ -81,6 +83,7 @@ def detection_map(plt: Any, answer: MapResult) -> Any:
     return figure
 
 
+@picture_of("LimitResult", "limit")
 @drawn
 def limits(plt: Any, answer: LimitResult) -> Any:
     """Detection probability at every simulated value, and the limits."""
@@ -129,6 +132,7 @@ ORIGINS = {
 }
 
 
+@picture_of("SnrAnswer", "noise-budget")
 def noise_budgets(answer: SnrAnswer, path: str | Path | None = None) -> Any:
     """Noise of a pixel by origin against wavelength, one panel per star and cell, as the paper's figure has it."""
     each = len(answer.study.cells())
@@ -164,6 +168,7 @@ def noise_budget(plt: Any, observed: Sequence[tuple[str, Expectation]], *, each:
     return figure
 
 
+@picture_of("SnrAnswer", "snr-sweep", when=lambda answer: answer.study.sweep.axes)
 @drawn
 def snr_sweep(plt: Any, answer: SnrAnswer) -> Any:
     """S/N of some elements against what is swept first, a line for each value of the rest."""
@@ -204,6 +209,7 @@ def snr_sweep(plt: Any, answer: SnrAnswer) -> Any:
     return figure
 
 
+@picture_of("GaussianReport", "gaussian")
 @drawn
 def gaussian(plt: Any, answer: GaussianReport) -> Any:
     """How far each promise of the usual formula holds in every cell."""
@@ -236,6 +242,7 @@ def gaussian(plt: Any, answer: GaussianReport) -> Any:
     return figure
 
 
+@picture_of("ExposureResult", "exposure")
 @drawn
 def exposures(plt: Any, answer: ExposureResult) -> Any:
     """S/N against exposure for each star, which grows with the root of it."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.answers.stares.stare import Searched
+from mauvecl.pictures.registry import picture_of
 from mauvecl.pictures.style import COLOURS, NULL, drawn, headline
 
 if TYPE_CHECKING:
@@ -21,9 +21,12 @@ MOST_POINTS, MOST_ROWS = 4000, 600
 IN_SECONDS_S, IN_MINUTES_S = 600.0, 4 * 3600.0
 
 
+@picture_of("StareAnswer", "light-curve", each=lambda answer: [(one,) for one in answer.stares])
 @drawn
 def light_curves(plt: Any, one: StarStare) -> Any:
     """Light curves in all bands, relative to the quiescent star; dotted: flares put in, triangles: found."""
+    from mauvecl.answers.stares.stare import Searched
+
     stare, light = one.staring.stare, one.light
     scale, unit = _time(stare.duration_s)
     level = np.median(light.mean, axis=0)
@@ -82,6 +85,7 @@ def beside(plt: Any, answers: Sequence[tuple[str, StareAnswer]], band: int = 0) 
     return figure
 
 
+@picture_of("StareAnswer", "dynamic-spectrum", each=lambda answer: [(one,) for one in answer.stares])
 @drawn
 def dynamic_spectrum(plt: Any, one: StarStare) -> Any:
     """Light in every resolution element and frame, as standard deviations from the median over the stare."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Callable, Sequence
+from contextvars import ContextVar
 from functools import wraps
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec
@@ -12,9 +13,10 @@ import numpy as np
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.whole import write_whole
-from mauvecl.host.plotting import AXES
 
 P = ParamSpec("P")
+#: The caller's axes to draw in; None if the picture makes its own figure.
+AXES: ContextVar[Any] = ContextVar("axes", default=None)
 #: Okabe and Ito's colours, which colour-blind readers can tell apart (jfly.uni-koeln.de/color).
 COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7", "#000000")
 NULL = "#777777"

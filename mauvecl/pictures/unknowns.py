@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.detection.unknown_table import power
+from mauvecl.pictures.registry import picture_of
 from mauvecl.pictures.style import COLOURS, drawn
 from mauvecl.study.quantities import QUANTITIES
 
@@ -14,9 +14,12 @@ if TYPE_CHECKING:
     from mauvecl.answers.detection.unknown_table import UnknownTable
 
 
+@picture_of("UnknownTable", "unknowns")
 @drawn
 def unknowns(plt: Any, answer: UnknownTable) -> Any:
     """One panel per star, plain dashed and marginalised solid, and the smallest amplitude of each; closed forms."""
+    from mauvecl.answers.detection.unknown_table import power
+
     stars = list(dict.fromkeys(star for star, _ in answer.costs))
     names = list(next(iter(answer.costs.values())))
     fap = answer.study.run.fap

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.pictures.registry import picture_of
 from mauvecl.pictures.style import STYLE, canvas, finished, headline
 
 if TYPE_CHECKING:
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
 MOST_CALENDARS = 6
 
 
+@picture_of("VisibleAnswer", "visible")
 def calendar(answer: VisibleAnswer, path: str | Path | None) -> Any:
     """Hours of exposure a day: a calendar for each target, or a row where there are many."""
     plt = canvas()

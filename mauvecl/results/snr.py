@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.drawable import Drawable
 from mauvecl.host.content import ContentEquality
 from mauvecl.host.errors import InputError
-from mauvecl.host.plotting import picture
 from mauvecl.host.tables import make_table, set_descriptions
 from mauvecl.noise import layout
 from mauvecl.noise.scene import Scene
@@ -157,7 +156,7 @@ def signal_to_noise(dn: NDArray[np.integer], observers: NDArray[np.void], sky: n
 
 
 @dataclass(frozen=True, eq=False)
-class SnrResult(ContentEquality):
+class SnrResult(Drawable, ContentEquality):
     """Distributions of the S/N over realisations."""
 
     expectation: Expectation
@@ -204,10 +203,6 @@ class SnrResult(ContentEquality):
             return np.asarray(self.elements["centre"][which] + step[which] * (place - 0.5))
 
         return self._table("element", x.element_wavelength_nm, x.snr_per_element(), snr)
-
-    def plot(self, path: str | Path | None = None, *, ax: Any = None) -> object:
-        """Plot the S/N per pixel and element, in closed form and simulated; needs matplotlib."""
-        return picture("answers.signal_to_noise", [(self.expectation.name, self)], path=path, ax=ax)
 
     def _line(self) -> str:
         return f"of {self.expectation.name!r}, {self.counts.n} realisations"

@@ -24,7 +24,6 @@ from mauvecl.answers.signal.exposures import exposure_for
 from mauvecl.answers.signal.simulate import simulate
 from mauvecl.answers.signal.snr import snr
 from mauvecl.device.engine import Engine
-from mauvecl.host.plotting import picture
 from mauvecl.pictures.style import COLUMN, STYLE, canvas, finished, headline, legend_below
 from mauvecl.study.study import Study
 
@@ -63,8 +62,8 @@ CASES: dict[str, tuple[Any, tuple[str, ...], bool]] = {
 def drawn(answer: Answer) -> Iterator[tuple[str, Any, Any]]:
     """Name, figure and renderer of each picture."""
     with mpl.rc_context():
-        for name, (function, *given) in answer.pictures.items():
-            figure = picture(function, *given, path=None)
+        for name, draw in answer.pictures.items():
+            figure = draw()
             canvas = FigureCanvasAgg(figure)
             canvas.draw()
             yield name, figure, canvas.get_renderer()  # type: ignore[no-untyped-call]
@@ -118,14 +117,14 @@ def test_everything_is_inside_and_apart(case: str, engine: Engine) -> None:
         if place == 0 and column:
             assert figure.get_figwidth() <= COLUMN, name
         words = " ".join(text.get_text() for text in texts).replace("\N{NO-BREAK SPACE}", " ")
-        if exposures and not case.startswith("limit of") and answer.pictures[name][0] != "plans.exposures":
+        if exposures and not case.startswith("limit of") and name != "exposure":
             assert any(f"{value} s" in words or "exposure (s)" in words for value in exposures), (name, words)
 
 
 def test_a_flare_that_is_detected_is_seen(engine: Engine) -> None:
     """The 5 % flare, hidden in the noise of a pixel, rises to four sigma of an element beneath."""
     answer = detect(Study().with_settings([*FEW, ONE, "flare.amplitudes=[0.05]", ONLY]), engine)
-    figure = picture(*answer.pictures["spectra"], path=None)
+    figure = answer.pictures["spectra"]()
     (line,) = [line for line in figure.axes[1].lines if len(line.get_ydata()) > 2]
     assert 3.0 < max(line.get_ydata()) < 6.0
     # The last element of the spectrum is a part of one, and is left out.

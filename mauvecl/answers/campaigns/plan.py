@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 
@@ -229,16 +229,6 @@ class PlanAnswer(Answer):
             "assumptions": self.assumptions,
         }
 
-    @property
-    def documents(self) -> dict[str, Callable[[], bytes]]:
-        """The report: a table, a page for each target, every assumption."""
-        from mauvecl.answers.campaigns.plan_page import report_html
-        from mauvecl.host.plotting import picture
-
-        if self.study.plan.report == "html":
-            return {"plan.html": lambda: report_html(self)}
-        return {"plan.pdf": lambda: bytes(picture("plan_report.pdf_bytes", self))}
-
     @cached_property
     def inputs(self) -> list[Expectation]:
         """One frame of each star."""
@@ -271,11 +261,6 @@ class PlanAnswer(Answer):
             )
         lines += self.seen.messages
         return list(dict.fromkeys(lines))
-
-    @property
-    def pictures(self) -> dict[str, tuple[Any, ...]]:
-        """Expected flares and energies of all targets."""
-        return {"plan": ("plan_report.overview", self), "visible": ("visibility.calendar", self.seen)}
 
 
 #: Of E50 and E90.

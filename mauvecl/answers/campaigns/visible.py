@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -257,11 +257,6 @@ class VisibleAnswer(Answer):
         k = [one.name for one in self.targets].index(name)
         alone = [limit for limit, kept in self.visibility.kept_by.items() if kept[k] == 0]
         return f"the limit of {alone[0]} alone leaves nothing" if alone else "its limits together leave nothing"
-
-    @property
-    def pictures(self) -> dict[str, tuple[Any, ...]]:
-        """A calendar of hours a day."""
-        return {"visible": ("visibility.calendar", self)}
 
 
 #: Columns of the table of targets.

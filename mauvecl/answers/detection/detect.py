@@ -36,10 +36,6 @@ if TYPE_CHECKING:
     from mauvecl.study.questions import CampaignQuestion
 
 
-#: Stars, or cells of a sweep, in one picture.
-MOST_DRAWN = 6
-
-
 @dataclass(frozen=True, eq=False)
 class StarDetection(InCell):
     """One star in one cell of the sweep."""
@@ -106,12 +102,6 @@ class DetectAnswer(Answer):
     @property
     def inputs(self) -> list[Expectation]:
         return [x for star in self.stars for x in (star.detection.quiet, *star.detection.flares)]
-
-    @property
-    def pictures(self) -> dict[str, tuple[Any, ...]]:
-        """Null and flare distributions of every statistic, and spectra; more stars would be too small to read."""
-        shown = [star.shown for star in self.stars[:MOST_DRAWN]]
-        return {"detection": ("answers.detection", shown, self.study.run.fap), "spectra": ("answers.spectra", shown)}
 
     @property
     def remarks(self) -> list[str]:

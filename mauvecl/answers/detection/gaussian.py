@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -173,11 +173,6 @@ class GaussianReport(Answer):
     @property
     def inputs(self) -> list[Expectation]:
         return self.signal.inputs
-
-    @property
-    def pictures(self) -> dict[str, tuple[Any, ...]]:
-        """The promises over what is swept."""
-        return {"gaussian": ("plans.gaussian", self)}
 
     @cached_property
     def elements(self) -> QTable:

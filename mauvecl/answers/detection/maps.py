@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,11 +108,6 @@ class MapResult(Answer):
     def inputs(self) -> list[Expectation]:
         """The star without a flare in the first cell."""
         return [] if self.quiet is None else [self.quiet]
-
-    @property
-    def pictures(self) -> dict[str, tuple[Any, ...]]:
-        """One panel per statistic, with contours at the study's powers."""
-        return {"map": ("plans.detection_map", self)}
 
 
 @public

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,11 +108,6 @@ class UnknownTable(Answer):
     @property
     def inputs(self) -> list[Expectation]:
         return list(self.quiets)
-
-    @property
-    def pictures(self) -> dict[str, tuple[Any, ...]]:
-        """Detection probability against amplitude, and the smallest amplitude of each star."""
-        return {"unknowns": ("unknowns.unknowns", self)}
 
 
 def unknown_table(study: Study, unknowns: Mapping[str, NuisanceChoice] = SHOWN) -> UnknownTable:

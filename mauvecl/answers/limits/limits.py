@@ -196,11 +196,6 @@ class LimitResult(Answer):
         failed = [f"NO LIMIT: {text}." for text in self.failed]
         return [*failed, *stars, *marginal_lines(self.study), *cost_lines(costs, self.study)]
 
-    @property
-    def pictures(self) -> dict[str, tuple[Any, ...]]:
-        """Detection probability against the quantity: every simulated point and the limits."""
-        return {"limit": ("plans.limits", self)}
-
     def as_json(self) -> dict[str, Any]:
         from mauvecl.answers.report import rows
 

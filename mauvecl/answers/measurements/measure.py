@@ -39,8 +39,6 @@ Float = NDArray[np.float64]
 BATCH = 4096
 #: A good fit is rejected where one of its p-value is less probable.
 REJECTED = 0.01
-#: Flares in one picture, at most.
-MOST_DRAWN = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,17 +193,6 @@ class MeasureAnswer(Answer):
     @property
     def inputs(self) -> list[Expectation]:
         return list({id(one.quiet): one.quiet for one in self.flares}.values())
-
-    @property
-    def pictures(self) -> dict[str, tuple[Any, ...]]:
-        """One exposure with its fits; temperature against amplitude; pulls; errors against amplitude."""
-        shown = self.flares[:MOST_DRAWN]
-        return {
-            "fit": ("measurements.fits", shown),
-            "contours": ("measurements.contours", shown),
-            "pulls": ("measurements.pulls", shown),
-            "errors": ("measurements.errors", shown),
-        }
 
     def as_json(self) -> dict[str, Any]:
         from mauvecl.answers.report import rows

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, ClassVar, Literal
+from typing import TYPE_CHECKING, ClassVar, Literal
 
 import numpy as np
 
@@ -88,11 +88,6 @@ class ExposureResult(Answer):
     @property
     def inputs(self) -> list[Expectation]:
         return list(self.expectations)
-
-    @property
-    def pictures(self) -> dict[str, tuple[Any, ...]]:
-        """S/N against exposure, and the answers on it."""
-        return {"exposure": ("plans.exposures", self)}
 
 
 def snr_at(x: Expectation, wavelength_nm: float, per: Per = "element") -> float:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from mauvecl.answers.answer import Answer
 from mauvecl.host.arguments import public
-from mauvecl.host.plotting import picture
 from mauvecl.host.quantities import count
 from mauvecl.noise.components import components
 from mauvecl.study.labels import described, label, told
@@ -51,14 +50,6 @@ class SimulateAnswer(Answer):
         return [x for _, x, _ in self.observations]
 
     @property
-    def pictures(self) -> dict[str, tuple[Any, ...]]:
-        """One per observation."""
-        return {
-            f"observation-{n}": ("answers.observation", title, table)
-            for n, (title, _, table) in enumerate(self.observations, 1)
-        }
-
-    @property
     def summary(self) -> list[dict[str, Any]]:
         """Peak, best closed-form S/N and saturated pixels of each observation."""
         rows = []
@@ -82,8 +73,7 @@ class SimulateAnswer(Answer):
 
     def plot(self, path: str | Path | None = None, *, number: int = 0, ax: Any = None) -> Any:
         """One of the observations and what it is made of; needs matplotlib."""
-        title, _, table = self.observations[number]
-        return picture("answers.observation", title, table, path=path, ax=ax)
+        return list(self.pictures.values())[number](path, ax=ax)
 
 
 @public

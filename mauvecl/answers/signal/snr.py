@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 
 #: Wavelengths of the elements that terminal and pictures show, nm; the tables hold all of them.
 SHOWN_NM = (250.0, 300.0, 400.0, 550.0)
-#: Stars, or cells of a sweep, in one picture.
-MOST_DRAWN = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,17 +83,6 @@ class SnrAnswer(Answer):
     @property
     def inputs(self) -> list[Expectation]:
         return [star.result.expectation for star in self.stars]
-
-    @property
-    def pictures(self) -> dict[str, tuple[Any, ...]]:
-        """S/N per pixel and element, closed form and realisations; noise by origin; S/N over what is swept."""
-        drawn: dict[str, tuple[Any, ...]] = {}
-        if len(self.stars) <= MOST_DRAWN:
-            drawn["snr"] = ("answers.signal_to_noise", [(s.title, s.result) for s in self.stars])
-        drawn["noise-budget"] = ("plans.noise_budgets", self)
-        if self.study.sweep.axes:
-            drawn["snr-sweep"] = ("plans.snr_sweep", self)
-        return drawn
 
     def as_json(self) -> dict[str, Any]:
         from mauvecl.answers.report import rows

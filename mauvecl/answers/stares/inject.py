@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
 import scipy
@@ -46,8 +46,6 @@ SIZE_UNITS = {"amplitude": "", "duration": "s", "energy": "erg", "band_energy": 
 DIFFERS = 4.0
 #: Chance of as many alarms at the threshold below which they are too many.
 LEAST_CHANCE = 1e-5
-#: Maps in one picture.
-MOST_DRAWN = 6
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,12 +168,6 @@ class InjectAnswer(Answer):
     @property
     def inputs(self) -> list[Expectation]:
         return [star.surveyed.quiet for star in self.stars]
-
-    @property
-    def pictures(self) -> dict[str, tuple[Any, ...]]:
-        """Maps of completeness, curves over size, and where flares are fitted a map of the energies recovered."""
-        fitted = {"energies": ("injections.energies", self)} if all(star.fitted for star in self.stars) else {}
-        return {"completeness": ("injections.maps", self), "curves": ("injections.curves", self), **fitted}
 
 
 def _limits(star: StarCompleteness) -> QTable:

@@ -266,15 +266,6 @@ class StareAnswer(Answer):
         return [one.staring.quiet for one in self.stares]
 
     @property
-    def pictures(self) -> dict[str, tuple[Any, ...]]:
-        """Light curves and dynamic spectrum of each star and cell."""
-        drawn: dict[str, tuple[Any, ...]] = {}
-        for n, one in enumerate(self.stares, 1):
-            drawn[f"light-curve-{n}"] = ("stares.light_curves", one)
-            drawn[f"dynamic-spectrum-{n}"] = ("stares.dynamic_spectrum", one)
-        return drawn
-
-    @property
     def remarks(self) -> list[str]:
         long = [one.title for one in self.stares if one.staring.stare.n_frames > MOST_ROWS]
         return (

@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.drawable import Drawable
 from mauvecl.host.arguments import public
 from mauvecl.host.content import ContentEquality
-from mauvecl.host.plotting import picture
 from mauvecl.host.quantities import count
 from mauvecl.host.tables import make_table, set_descriptions
 from mauvecl.results.counts.tally import Distribution, TailSamples, Tally
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
 
 @public
 @dataclass(eq=False)
-class Detection(ContentEquality, Hypotheses):
+class Detection(Drawable, ContentEquality, Hypotheses):
     """Simulated null and flare distributions, as returned by `Engine.detect`.
 
     Attributes are those of `Hypotheses` and the following.
@@ -227,10 +227,9 @@ class Detection(ContentEquality, Hypotheses):
         null = self._at(self._null_key(statistic, flare))
         return Roc.of(null, self._at((statistic, "flare_on_null_grid", flare)))
 
-    def plot(self, path: str | Path | None = None, *, fap: float = 1e-3, ax: Any = None) -> object:
+    def plot(self, path: str | Path | None = None, *, fap: float = 1e-3, ax: Any = None) -> Any:
         """Plot the null and flare distributions of all statistics with their thresholds; needs matplotlib."""
-        flares = [f"flare {k + 1}" for k in range(len(self.flares))]
-        return picture("answers.detection", [(self.quiet.name, self, flares)], fap, path=path, ax=ax)
+        return self._draw(path, ax, fap=fap)
 
     def table(self, fap: float = 1e-3) -> QTable:
         """Return expected and simulated values, thresholds and probabilities, one row per flare and statistic.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.host.plotting import picture
+from mauvecl.drawable import Drawable
 from mauvecl.host.tables import make_table
 from mauvecl.statistics.intervals import CONFIDENCE, Interval, clopper_pearson
 
@@ -23,7 +23,7 @@ Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Roc:
+class Roc(Drawable):
     """ROC curve from the lowest threshold to the highest, at edges of filled bins."""
 
     threshold: Float  # shape (n,)
@@ -62,9 +62,9 @@ class Roc:
             low, high = sure.low, sure.high
         return cls(np.append(lower[0], upper), above[0], above[1], null.n, Interval(area, low, high))
 
-    def plot(self, path: str | Path | None = None, *, name: str = "", ax: Any = None) -> object:
+    def plot(self, path: str | Path | None = None, *, name: str = "", ax: Any = None) -> Any:
         """Plot detection probability against false-alarm probability; needs matplotlib."""
-        return picture("answers.roc", [(name, self)], path=path, ax=ax)
+        return self._draw(path, ax, name=name)
 
     def table(self, rows: int = 200) -> QTable:
         """Return at most `rows` rows of the curve, evenly spaced in the logarithm of the false-alarm probability.

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from html import escape
 from typing import TYPE_CHECKING
 
 from mauvecl.answers.campaigns.plan_text import LEGEND, SUMMARY, heading, summary_rows, target_lines
-from mauvecl.host.plotting import picture
 from mauvecl.host.version import VERSION
+from mauvecl.pictures.plan_report import overview_png, target_png
+from mauvecl.pictures.registry import document_of
+from mauvecl.pictures.style import available
 
 if TYPE_CHECKING:
     from mauvecl.answers.campaigns.plan import PlanAnswer
@@ -23,6 +25,7 @@ STYLE = (
 )
 
 
+@document_of("PlanAnswer", "plan.html", when=lambda answer: answer.study.plan.report == "html")
 def report_html(answer: PlanAnswer) -> bytes:
     """The report: summary, a section for each target with its pictures where matplotlib is there, assumptions."""
     parts = [
@@ -31,14 +34,14 @@ def report_html(answer: PlanAnswer) -> bytes:
         f"<p>{escape(heading(answer))}; mauvecl {VERSION}.</p>",
         _table(SUMMARY, summary_rows(answer), "numbers", link=True),
         f"<p class=from>{escape(LEGEND)}</p>",
-        _image("plan_report.overview_png", answer, text="flares expected and energies of all targets"),
+        _image(overview_png, answer, text="flares expected and energies of all targets"),
         *(f"<p>{escape(message)}</p>" for message in answer.messages),
     ]
     for k, one in enumerate(answer.planned):
         lines = _table(("", "", "table: column"), target_lines(answer, k))
         parts.append(f"<section id=target-{k}><h2>{escape(one.name)}</h2>{lines}")
         if one.seen_h > 0:
-            parts.append(_image("plan_report.target_png", answer, k, text=f"hours and energies of {one.name}"))
+            parts.append(_image(target_png, answer, k, text=f"hours and energies of {one.name}"))
         parts.append("</section>")
     table = answer.assumptions
     rows = [tuple(str(cell) for cell in row) for row in table]
@@ -61,10 +64,8 @@ def _table(names: Sequence[str], rows: Iterable[Sequence[str]], kind: str = "", 
     return f"<table class='{kind}'><tr>{head}</tr>{body}</table>"
 
 
-def _image(name: str, *what: object, text: str) -> str:
-    from importlib.util import find_spec
-
-    if find_spec("matplotlib") is None:
+def _image(draw: Callable[..., bytes], *what: object, text: str) -> str:
+    if not available():
         return ""
-    content = base64.b64encode(picture(name, *what)).decode()
+    content = base64.b64encode(draw(*what)).decode()
     return f"<img alt='{escape(text, quote=True)}' src='data:image/png;base64,{content}'>"

@@ -1,0 +1,49 @@
+"""The base class of everything with a `plot` method; it imports neither matplotlib nor the functions that draw."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, Protocol
+
+if TYPE_CHECKING:
+    from pathlib import Path
+
+
+class Registry(Protocol):
+    """The registry of pictures, as this module needs it."""
+
+    def pictures_of(self, thing: Any) -> dict[str, Callable[..., Any]]:
+        """Return every picture of a thing by the name of its file."""
+
+    def documents_of(self, thing: Any) -> dict[str, Callable[[], bytes]]:
+        """Return what makes each document of a thing, by the full name of its file."""
+
+
+class Drawable:
+    """A thing with pictures."""
+
+    @property
+    def pictures(self) -> dict[str, Callable[..., Any]]:
+        """Every picture by the name of its file; each is called with a `path`, with axes `ax`, or with neither."""
+        return _registry().pictures_of(self)
+
+    def plot(self, path: str | Path | None = None, *, ax: Any = None) -> Any:
+        """Draw the first picture and return the figure, the path of the saved file, or `ax`; needs matplotlib."""
+        return self._draw(path, ax)
+
+    def _draw(self, path: str | Path | None, ax: Any, **options: Any) -> Any:
+        return next(iter(self.pictures.values()))(path, ax=ax, **options)
+
+
+def documents_of(thing: Drawable) -> dict[str, Callable[[], bytes]]:
+    """Return what makes each registered document of a thing, by the full name of its file."""
+    return _registry().documents_of(thing)
+
+
+def connect(find: Callable[[], Registry]) -> None:
+    """Name the function that imports the registry; the package itself calls this when it is imported."""
+    global _registry
+    _registry = find
+
+
+_registry: Callable[[], Registry]

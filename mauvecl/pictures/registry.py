@@ -1,0 +1,124 @@
+"""The registry of pictures: the decorators with which each function says what it draws, and under which name."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from functools import cache, partial
+from importlib import import_module
+from pathlib import Path
+from pkgutil import iter_modules
+from typing import Any, TypeVar
+
+from mauvecl.host.errors import InputError
+from mauvecl.host.quantities import shown
+from mauvecl.pictures.style import AXES
+
+F = TypeVar("F", bound=Callable[..., Any])
+#: Modules that a search for pictures must not import: matplotlib is loaded only when a picture is drawn.
+WITHOUT_PICTURES = ("figure",)
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A function that draws, or writes a document, with the class that it is for.
+
+    Attributes
+    ----------
+    name : str
+        Name of the file.
+    make : callable
+    given : callable, optional
+        Arguments of `make` for a thing; the thing itself without it.
+    each : callable, optional
+        Arguments of `make` for each of several numbered pictures of a thing.
+    when : callable, optional
+        Whether a thing has the picture.
+    """
+
+    name: str
+    make: Callable[..., Any]
+    given: Callable[[Any], tuple[Any, ...]] | None = None
+    each: Callable[[Any], Iterable[tuple[Any, ...]]] | None = None
+    when: Callable[[Any], bool] | None = None
+
+    def of(self, thing: Any) -> list[tuple[int, str, Callable[..., Any]]]:
+        """Return number, name and bound function of each picture of a thing."""
+        if self.when is not None and not self.when(thing):
+            return []
+        if self.each is not None:
+            return [(n, f"{self.name}-{n}", partial(self.make, *given)) for n, given in enumerate(self.each(thing), 1)]
+        given = (thing,) if self.given is None else self.given(thing)
+        return [(0, self.name, partial(self.make, *given))]
+
+
+#: By the name of the class: importing the classes themselves would import every answer to draw one.
+PICTURES: defaultdict[str, list[Entry]] = defaultdict(list)
+DOCUMENTS: defaultdict[str, list[Entry]] = defaultdict(list)
+
+
+def picture_of(kind: str, name: str, **how: Any) -> Callable[[F], F]:
+    """Register a function as a picture of a class; the first one registered is what `plot` draws.
+
+    Parameters
+    ----------
+    kind : str
+        Name of the class, as in ``"LimitResult"``.
+    name : str
+        Name of the picture's file without its ending.
+    **how
+        `given`, `each` and `when` as `Entry` has them.
+    """
+    return _registers(PICTURES, kind, name, how)
+
+
+def document_of(kind: str, name: str, **how: Any) -> Callable[[F], F]:
+    """Register a function that returns the bytes of a document, such as a report; `name` has its ending."""
+    return _registers(DOCUMENTS, kind, name, how)
+
+
+def _registers(entries: defaultdict[str, list[Entry]], kind: str, name: str, how: dict[str, Any]) -> Callable[[F], F]:
+    def register(make: F) -> F:
+        entries[kind].append(Entry(name, make, **how))
+        return make
+
+    return register
+
+
+def pictures_of(thing: Any) -> dict[str, Callable[..., Any]]:
+    """Return every picture of a thing by the name of its file: a function of `path` and `ax`."""
+    return {name: partial(_draw, draw) for name, draw in _found(PICTURES, thing)}
+
+
+def documents_of(thing: Any) -> dict[str, Callable[[], bytes]]:
+    """Return what makes each document of a thing, by the full name of its file."""
+    return dict(_found(DOCUMENTS, thing))
+
+
+def _found(entries: defaultdict[str, list[Entry]], thing: Any) -> list[tuple[str, Callable[..., Any]]]:
+    """Return the entries for a thing's class, numbered ones in the order of their numbers."""
+    load()
+    own = next((entries[kind.__name__] for kind in type(thing).__mro__ if kind.__name__ in entries), [])
+    made = sorted((one for entry in own for one in entry.of(thing)), key=lambda one: one[0])
+    return [(name, make) for _, name, make in made]
+
+
+@cache
+def load() -> None:
+    """Import every module of pictures, so that each registers what it draws."""
+    for module in iter_modules([str(Path(__file__).parent)]):
+        if module.name not in WITHOUT_PICTURES:
+            import_module(f"{__package__}.{module.name}")
+
+
+def _draw(draw: Callable[..., Any], path: str | Path | None = None, *, ax: Any = None, **options: Any) -> Any:
+    """Draw a picture and return the figure, the path of the saved file, or `ax`."""
+    if ax is not None and not (hasattr(ax, "plot") and hasattr(ax, "figure")):
+        raise InputError(f"ax = {shown(ax)}, expected axes, as plt.subplots makes")
+    before = AXES.set(ax)
+    try:
+        drawn = draw(path=path, **options)
+    finally:
+        AXES.reset(before)
+    return drawn if ax is None else ax
