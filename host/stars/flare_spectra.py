@@ -29,6 +29,8 @@ Float = NDArray[np.float64]
 
 #: h c / k, nm K, and the Stefan-Boltzmann constant, erg s-1 cm-2 K-4 (CODATA 2018).
 HC_OVER_K_NM_K, STEFAN_BOLTZMANN = 1.438776877e7, 5.670374419e-5
+#: Nominal solar radius (IAU 2015, resolution B3) and parsec, cm.
+SUN_CM, PARSEC_CM = 6.957e10, 3.0856775814913674e18
 #: Balmer edge, nm, and electron temperature of the recombination below it, K (assumed: optically thin hydrogen).
 BALMER_EDGE_NM, ELECTRON_TEMPERATURE_K = 364.6, 10_000.0
 #: Largest Balmer jump ratio; observed ones are 1 to 4 (Kowalski 2024).

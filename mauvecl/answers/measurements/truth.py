@@ -7,8 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mauvecl.host.stars.bands import photons
-from mauvecl.host.stars.flare_spectra import BalmerFlare, EmissionLine, FlareWithLines
-from mauvecl.results.measurements.model import PARSEC_CM, SUN_CM
+from mauvecl.host.stars.flare_spectra import PARSEC_CM, SUN_CM, BalmerFlare, EmissionLine, FlareWithLines
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

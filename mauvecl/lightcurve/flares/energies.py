@@ -29,15 +29,13 @@ from mauvecl.host.ranges import FLARE_TEMPERATURES_K
 from mauvecl.host.stars.bands import band as find_band
 from mauvecl.host.stars.bands import photons
 from mauvecl.host.stars.flare import Geometry, added_light, blackbody
-from mauvecl.host.stars.flare_spectra import STEFAN_BOLTZMANN, Blackbody, FlareSpectrum
+from mauvecl.host.stars.flare_spectra import PARSEC_CM, STEFAN_BOLTZMANN, SUN_CM, Blackbody, FlareSpectrum
 from mauvecl.lightcurve.flares.shapes import Shape, shape_of
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
 
 Float = NDArray[np.float64]
-#: IAU 2015 (resolution B3) nominal solar radius, and parsec, cm.
-SUN_CM, PARSEC_CM = 6.957e10, 3.0856775814913674e18
 #: What an integral over a band weights the response with.
 Weighted = Literal["energy", "photons"]
 #: Which light of a flare: that in the band of its amplitude, or all of it.

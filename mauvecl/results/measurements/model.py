@@ -24,7 +24,9 @@ from mauvecl.host.stars.flare import blackbody
 from mauvecl.host.stars.flare_spectra import (
     BALMER_EDGE_NM,
     ELECTRON_TEMPERATURE_K,
+    PARSEC_CM,
     STEFAN_BOLTZMANN,
+    SUN_CM,
     BalmerFlare,
     EmissionLine,
     balmer_continuum,
@@ -45,8 +47,6 @@ NODES = 225
 GRID_NM = np.linspace(170.0, 760.0, 2361)
 #: Bands in which light is reported unless others are named, nm.
 BANDS_NM = ((200.0, 320.0), (200.0, 700.0))
-#: Nominal solar radius (IAU 2015, resolution B3) and parsec, cm.
-SUN_CM, PARSEC_CM = 6.957e10, 3.0856775814913674e18
 
 
 @dataclass(frozen=True, eq=False)
