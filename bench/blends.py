@@ -15,13 +15,13 @@ import numpy as np
 from mauvecl.lightcurve.flares.events import Event, coefficients
 from mauvecl.lightcurve.search.alarms import Alarm, alarms
 from mauvecl.study.study import Study
-from mauvecl.study.surveys import Surveyed, surveyed
+from mauvecl.study.surveys import StarSurvey, survey_star
 
 THRESHOLD = 4.92
 SQUARE = 0.72148
 
 
-def found(known: Surveyed, events: list[Event], seed: int) -> list[Alarm]:
+def found(known: StarSurvey, events: list[Event], seed: int) -> list[Alarm]:
     """Return the alarms of one stare with normal noise."""
     stare, components = known.survey.stare, known.survey.components
     coefs = components.coefficients(stare, coefficients(events, stare.start_s, stare.frame_s, np.array([10_000.0])))
@@ -31,7 +31,7 @@ def found(known: Surveyed, events: list[Event], seed: int) -> list[Alarm]:
     return alarms(known.survey, known.templates, sums, THRESHOLD)
 
 
-def coverage(known: Surveyed, count: int, snrs: tuple[float, ...] = (6.0, 8.0, 15.0, 30.0)) -> None:
+def coverage(known: StarSurvey, count: int, snrs: tuple[float, ...] = (6.0, 8.0, 15.0, 30.0)) -> None:
     """Print the share of 68 % intervals that hold the truth, of flares that are found, by S/N."""
     names = ("peak_s", "amplitude", "half_width_s", "temperature_k", "equivalent_duration_s")
     for snr in snrs:
@@ -58,7 +58,7 @@ def coverage(known: Surveyed, count: int, snrs: tuple[float, ...] = (6.0, 8.0, 1
         )  # fmt: skip
 
 
-def pairs(known: Surveyed, count: int) -> None:
+def pairs(known: StarSurvey, count: int) -> None:
     """Print how two equal flares come back, by separation in half-widths (60 s) and S/N."""
     for snr in (15.0, 40.0, 100.0):
         amplitude = snr / known.unit_snr / np.sqrt(SQUARE * 60.0 / 5.0)
@@ -88,4 +88,4 @@ def _peak(alarm: Alarm) -> float:
 if __name__ == "__main__":
     study = Study().with_settings(['star=[{library="M3V", magnitude=9}]'])
     what, number = sys.argv[1], int(sys.argv[2])
-    {"coverage": coverage, "pairs": pairs}[what](surveyed(study, study.star[0]), number)
+    {"coverage": coverage, "pairs": pairs}[what](survey_star(study, study.star[0]), number)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from mauvecl.drawable import Drawable, documents_of
 from mauvecl.host.content import ContentEquality
-from mauvecl.study.labels import titled
+from mauvecl.study.labels import full_label
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from astropy.table import Table
 
     from mauvecl.host.expectation import Expectation
-    from mauvecl.study.assumed import Use
+    from mauvecl.study.assumptions import Use
     from mauvecl.study.study import Study
 
 
@@ -32,7 +32,7 @@ class InCell:
     @property
     def title(self) -> str:
         """The star and what is swept, for pictures."""
-        return titled(self.label, self.at)
+        return full_label(self.label, self.at)
 
 
 class Answer(Drawable, ContentEquality, ABC):
@@ -66,7 +66,7 @@ class Answer(Drawable, ContentEquality, ABC):
     @property
     def assumed(self) -> str:
         """One line with what the study assumes of the parts that the answer uses."""
-        from mauvecl.study.assumed import assumption_line
+        from mauvecl.study.assumptions import assumption_line
 
         return assumption_line(self.study, self.USES)
 

@@ -20,7 +20,7 @@ from mauvecl.pictures.style import (
     plain_numbers,
 )
 from mauvecl.statistics.registry import label
-from mauvecl.study.labels import titled
+from mauvecl.study.labels import full_label
 from mauvecl.study.quantities import QUANTITIES
 
 if TYPE_CHECKING:
@@ -184,7 +184,7 @@ def snr_sweep(plt: Any, answer: SnrAnswer) -> Any:
         lines: dict[str, list[tuple[Any, Any]]] = {}
         for star, table in zip(answer.stars, tables, strict=True):
             name = star.label if first != "magnitude" else star.label.split(" V = ")[0]
-            rest = titled(name, {k: v for k, v in star.at.items() if k != first})
+            rest = full_label(name, {k: v for k, v in star.at.items() if k != first})
             row = table[place_of(star.result.expectation, wavelength, "element")]
             lines.setdefault(rest, []).append((star.at[first], row))
         for k, (name, points) in enumerate(lines.items()):
@@ -236,7 +236,7 @@ def gaussian(plt: Any, answer: GaussianReport) -> Any:
         axis.set_xlabel(text)
         axis.xaxis.set_major_locator(MaxNLocator(3, prune="both"))
         axis.grid(axis="y", linewidth=0.3)
-    axes[0].set_yticks(rows, [titled(s.label, s.at) for s in answer.signal.stars])
+    axes[0].set_yticks(rows, [full_label(s.label, s.at) for s in answer.signal.stars])
     axes[0].invert_yaxis()
     headline(figure, "The root-of-N formula beside the simulation; grey: as promised; nominal throughput")
     return figure

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import read_bytes
 from mauvecl.host.version import VERSION
-from mauvecl.study.labels import told as messages_of
+from mauvecl.study.messages import collect_messages as messages_of
 
 if TYPE_CHECKING:
     from mauvecl.store.form import Store

@@ -26,7 +26,7 @@ from mauvecl.host.files.parsed import toml
 from mauvecl.host.files.whole import UNFINISHED, write_whole
 from mauvecl.runs.durable import differing_keys
 from mauvecl.store.description import describe, study_in
-from mauvecl.study.labels import label, titled
+from mauvecl.study.labels import full_label, label
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def scenes(study: Study) -> list[StoredScene]:
             chosen = cell.bulk.chosen(quiet.n_frames)
             # The amplitude is an attribute of the flare's array.
             swept = {name: value for name, value in at.items() if name != "amplitude"}
-            name = titled(label(star, quiet), swept)
+            name = full_label(label(star, quiet), swept)
             stored.append(StoredScene(f"star-{number}", "quiescent", name, 0.0, quiet, chosen, swept))
             for k, (amplitude, x) in enumerate(zip(cell.flare.amplitudes, flares, strict=True), 1):
                 stored.append(StoredScene(f"star-{number}", f"flare-{k}", name, amplitude, x, chosen, swept))

@@ -1,1 +1,1 @@
-"""A question as data: read from TOML, changed by flags, turned into expectations."""
+"""Studies: questions as data, read from TOML, changed by flags and converted to expectations."""

@@ -1,4 +1,4 @@
-"""What a study says is unknown from exposure to exposure: drawn, and marginalised over."""
+"""Study section for nuisance parameters, which vary between exposures and are drawn and marginalised over."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pydantic import BeforeValidator, Field, model_validator
 
 from mauvecl.host.files.bounded import shortened
 from mauvecl.noise.usual import USUAL
-from mauvecl.study.sections import Part
+from mauvecl.study.sections import Section
 
 if TYPE_CHECKING:
     import numpy as np
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 def _spread(given: Any) -> Any:
-    """A standard deviation, or "free"."""
+    """Validate a standard deviation or "free"."""
     if given == "free":
         return given
     try:
@@ -31,7 +31,7 @@ def _spread(given: Any) -> Any:
         value = float("nan")
     if not 0 < value < float("inf"):
         raise ValueError(
-            f"an unknown has the standard deviation {shortened(str(given))}, expected a number above 0, or 'free'"
+            f"the standard deviation of an unknown is {shortened(str(given))}, expected a number above 0, or 'free'"
         )
     return value
 
@@ -39,8 +39,8 @@ def _spread(given: Any) -> Any:
 Spread = Annotated[float | Literal["free"], BeforeValidator(_spread)]
 
 
-class OwnNuisance(Part):
-    """A spectrum of one's own: nm and DN of the exposure for an amplitude of one, as a file's two columns or points."""
+class OwnNuisance(Section):
+    """User-defined nuisance spectrum: wavelength in nm and DN per exposure at unit amplitude, as a file or points."""
 
     file: Path | None = None
     points: tuple[tuple[float, float], ...] | None = None
@@ -49,17 +49,11 @@ class OwnNuisance(Part):
     @model_validator(mode="after")
     def _one_spectrum(self) -> Self:
         if (self.file is None) == (self.points is None):
-            raise ValueError("an unknown of one's own has neither or both of file and points, expected one of them")
+            raise ValueError("a nuisance spectrum has neither or both of file and points, expected one of them")
         return self
 
     def spectrum(self, name: str, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
-        """DN of the exposure for an amplitude of one, shape (n_pixel,).
-
-        Raises
-        ------
-        InputError
-            For a file or points that hold no spectrum.
-        """
+        """Return the DN per exposure at unit amplitude, shape (n_pixel,)."""
         import numpy as np
 
         from mauvecl.study.weights import at_pixels, read_spectrum
@@ -69,10 +63,10 @@ class OwnNuisance(Part):
         return at_pixels(f"points of {shortened(name)}", "DN", np.array(self.points), wavelength_nm)
 
 
-class NuisanceChoice(Part):
-    """Amplitudes that statistics are marginalised over: prior standard deviations, or "free" (projected out).
+class NuisanceChoice(Section):
+    """Prior standard deviations of the amplitudes that statistics are marginalised over, or "free" (projected out).
 
-    With `usual` the documented set is drawn and marginalised over; what is named beside it takes its place.
+    With `usual` the documented set is drawn and marginalised over; values given here replace those of the set.
     """
 
     usual: bool = False
@@ -83,13 +77,7 @@ class NuisanceChoice(Part):
     own: dict[str, OwnNuisance] = Field(default_factory=dict)
 
     def marginalised(self, quiet: Expectation) -> Nuisances | None:
-        """As the engine takes them; None where nothing is unknown.
-
-        Raises
-        ------
-        InputError
-            For a file that cannot be read, or a spectrum that changes no pixel.
-        """
+        """Return the nuisance parameters for the engine, or None if there are none."""
         from mauvecl.statistics.nuisances import Nuisances
 
         sd: dict[str, float] = {}
@@ -106,7 +94,7 @@ class NuisanceChoice(Part):
         return Nuisances.of(quiet, sd, own) if sd else None
 
     def processes(self, named: Processes, temperature_c: float) -> Processes:
-        """What is drawn: the processes that a study names, and with `usual` the documented ones beside them."""
+        """Return the processes to draw: those given and, with `usual`, those of the documented set."""
         if not self.usual:
             return named
         added: dict[str, Any] = {u.process: u.prior(temperature_c) for u in USUAL if getattr(named, u.process) is None}
@@ -114,7 +102,7 @@ class NuisanceChoice(Part):
 
 
 def usual_spreads(quiet: Expectation) -> dict[str, float]:
-    """Standard deviations of the documented set; without a sky, that of the sky is left out."""
+    """Return the standard deviations of the documented set, omitting parameters without effect, such as no sky."""
     from mauvecl.statistics.nuisances import spectrum_of
 
     return {u.nuisance: u.sd for u in USUAL if spectrum_of(u.nuisance, quiet).any()}

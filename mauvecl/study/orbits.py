@@ -1,4 +1,4 @@
-"""A study's plan: from which orbit and when, what must hold for a target to be seen, targets and how they flare."""
+"""Study sections for orbit, visibility limits, targets and their flare rates, and campaign plans."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import shown
 from mauvecl.host.files.text_table import read_text_table
 from mauvecl.host.records import holds_truth, input_error
-from mauvecl.study.sections import Part
+from mauvecl.study.sections import Section
 
 if TYPE_CHECKING:
     from mauvecl.host.orbit.limits import Limits
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
     from mauvecl.lightcurve.search.completeness import DurationLaw
     from mauvecl.study.study import Study
 
-#: A number, or the word for no limit.
+#: A number, or "none" for no limit.
 Limit = float | Literal["none"]
-#: Rows of a table of targets, at most: a page each.
-MOST_TARGETS = 500
+#: Largest number of rows of a table of targets; a plan has a page for each.
+MAX_TARGETS = 500
 
 
-class LimitsText(Part):
-    """What must hold for a target to be seen; "none" is no limit. See `host.orbit.limits.Limits`."""
+class LimitsText(Section):
+    """Conditions for a target to be visible; see `host.orbit.limits.Limits`."""
 
     earth_limb_deg: Limit = 25.0
     sun_deg: Limit = 46.0
@@ -50,7 +50,7 @@ class LimitsText(Part):
         if isinstance(given, str) and given.strip().lower() == "none":
             return "none"
         if holds_truth(given):
-            # Refused by `Record`.
+            # `Record` rejects it.
             return given
         try:
             return float(given)
@@ -63,7 +63,7 @@ class LimitsText(Part):
         return self
 
     def limits(self) -> Limits:
-        """As the host takes them."""
+        """Return the limits for the host, with None for no limit."""
         from mauvecl.host.orbit.limits import Limits
 
         given = {name: getattr(self, name) for name in type(self).model_fields}
@@ -71,93 +71,57 @@ class LimitsText(Part):
         return Limits(**values)
 
 
-class OrbitQuestion(Part):
-    """Which orbit, when, which targets.
+class OrbitQuestion(Section):
+    """Orbit, time grid, targets and visibility limits."""
 
-    Attributes
-    ----------
-    tle : Path, optional
-        Two-line elements in place of the embedded ones.
-    kind : {"auto", "tle", "mean"}
-        See `host.orbit.orbit.Orbit`.
-    start : str
-        UTC.
-    days, step_s : float
-    targets : tuple of str
-        Names or coordinates; those of `plan` where there are none.
-    simbad : bool
-        Ask SIMBAD for names that are not embedded.
-    limits : LimitsText
-    """
-
-    tle: Path | None = None
-    kind: Literal["auto", "tle", "mean"] = "auto"
-    start: str = "2027-01-01"
+    tle: Path | None = None  # two-line elements that replace the embedded ones
+    kind: Literal["auto", "tle", "mean"] = "auto"  # see `host.orbit.orbit.Orbit`
+    start: str = "2027-01-01"  # UTC
     days: Annotated[float, Field(gt=0)] = 365.0
     step_s: Annotated[float, Field(gt=0)] = 60.0
-    targets: tuple[str, ...] = ()
-    simbad: bool = False
+    targets: tuple[str, ...] = ()  # names or coordinates; those of `plan` if empty
+    simbad: bool = False  # query SIMBAD for names that are not embedded
     limits: LimitsText = LimitsText()
 
     @field_validator("start", mode="before")
     @classmethod
     def _as_text(cls, given: Any) -> Any:
-        """TOML has dates of its own."""
+        """Convert TOML's date and time types to text."""
         if isinstance(given, datetime.datetime) and given.tzinfo is not None:
             given = given.astimezone(datetime.UTC).replace(tzinfo=None)
         return given.isoformat() if isinstance(given, datetime.date) else given
 
     def orbit(self) -> Orbit:
-        """As the host takes it."""
+        """Load the orbit."""
         from mauvecl.host.orbit.orbit import Orbit
 
         return Orbit.load(self.tle, self.kind)
 
     def times(self) -> TimeGrid:
-        """The times that are looked at."""
+        """Return the time grid."""
         from mauvecl.host.orbit.time_grid import TimeGrid
 
         return TimeGrid(self.start, self.days, self.step_s)
 
 
-class PlanTarget(Part):
-    """A star of a plan: where it is, what it shines like, how often it flares.
+class PlanTarget(Section):
+    """Position, spectrum and flare rates of a star in a plan.
 
-    What is not given is looked up by its name in the embedded list, and follows from its type.
-
-    Attributes
-    ----------
-    name : str
-    coordinates : str, optional
-        In place of the name's.
-    spectral_type : str, optional
-        Such as "M3V": the nearest spectrum of the library stands for it.
-    magnitude : float, optional
-        V.
-    distance_pc : float, optional
-    rates : str, optional
-        "G", "K", "M" or "sunlike"; by type unless given.
-    mass_msun, age_myr : float, optional
-        Both: rates by Davenport et al. 2019.
-    alpha, rate_per_day, at_erg : float, optional
-        All three: a power law of bolometric energies, through so many flares a day of `at_erg` or more.
-    rates_file : Path, optional
-        A cumulative distribution of one's own, in `rates_band`.
-    rates_band : str
+    Missing values are looked up by name in the embedded list of stars, or follow from the spectral type.
     """
 
     name: str
-    coordinates: str | None = None
-    spectral_type: str | None = None
-    magnitude: float | None = None
+    coordinates: str | None = None  # replace those of the name
+    spectral_type: str | None = None  # such as "M3V"; the nearest spectrum of the library is used
+    magnitude: float | None = None  # V
     distance_pc: Annotated[float, Field(gt=0)] | None = None
-    rates: Literal["G", "K", "M", "sunlike"] | None = None
-    mass_msun: Annotated[float, Field(gt=0)] | None = None
+    rates: Literal["G", "K", "M", "sunlike"] | None = None  # published rates; those of the spectral type by default
+    mass_msun: Annotated[float, Field(gt=0)] | None = None  # with `age_myr`: rates of Davenport et al. 2019
     age_myr: Annotated[float, Field(gt=0)] | None = None
-    alpha: Annotated[float, Field(gt=1)] | None = None
-    rate_per_day: Annotated[float, Field(gt=0)] | None = None
-    at_erg: Annotated[float, Field(gt=0)] | None = None
-    rates_file: Path | None = None
+    alpha: Annotated[float, Field(gt=1)] | None = None  # exponent of a power law of bolometric energies, for which
+    rate_per_day: Annotated[float, Field(gt=0)] | None = None  # is the rate of flares
+    at_erg: Annotated[float, Field(gt=0)] | None = None  # above this energy
+    rates_file: Path | None = None  # cumulative distribution of energies in `rates_band`
     rates_band: str = "bolometric"
 
     @model_validator(mode="after")
@@ -177,7 +141,7 @@ class PlanTarget(Part):
         return self
 
     def target(self, simbad: bool) -> Target:
-        """Its place and what is known of it."""
+        """Look up the target; given coordinates replace those of its name."""
         from dataclasses import replace
 
         from mauvecl.host.orbit.targets import Target
@@ -192,13 +156,7 @@ class PlanTarget(Part):
         return replace(known, name=self.name, ra_deg=place.ra_deg, dec_deg=place.dec_deg, source="given")
 
     def distribution(self, spectral_type: str) -> Rates:
-        """How often it flares.
-
-        Raises
-        ------
-        InputError
-            For a type that no preset stands for.
-        """
+        """Return the flare rates; raises InputError if none are given and the spectral type has no preset."""
         from mauvecl.lightcurve.flares.rates import BOLOMETRIC, EXPONENTS, PowerLaw, RateTable, davenport2019, preset
 
         if self.mass_msun is not None and self.age_myr is not None:
@@ -210,49 +168,34 @@ class PlanTarget(Part):
         kind = self.rates or spectral_type.strip()[:1].upper()
         if kind not in ("G", "K", "M", "sunlike"):
             alpha = EXPONENTS.get(kind)
-            told = "" if alpha is None else f" beside an exponent of {alpha} (Althukair & Tsiklauri 2023)"
+            known = "" if alpha is None else f" except for an exponent of {alpha} (Althukair & Tsiklauri 2023)"
             raise InputError(
-                f"flare rates of {self.name}, of the type {shortened(spectral_type)}, are not known{told}, expected "
+                f"flare rates of {self.name}, of the type {shortened(spectral_type)}, are unknown{known}, expected "
                 "alpha with rate_per_day and at_erg, rates, mass_msun and age_myr, or rates_file"
             )
         return preset(kind)
 
 
-class PlanQuestion(Part):
-    """A campaign: targets, how long each is observed at most, how long flares last; `search` says how they are found.
-
-    Attributes
-    ----------
-    targets : tuple of PlanTarget
-    hours : float, optional
-        Of exposure for each target; all that it is seen unless given.
-    half_width_s, at_erg, exponent, scatter_dex : float
-        See `lightcurve.completeness.DurationLaw`.
-    completeness : {"injections", "closed form"}
-        By flares put into drawn noise and searched for, or at once, for white noise.
-    along_orbit : bool
-        Whether each target's frames have the temperature and the hits by particles that the orbit gives them; those of
-        the study otherwise.
-    injections : int
-        Of each half-width.
-    best_months : int
-    report : {"pdf", "html"}
-    """
+class PlanQuestion(Section):
+    """Campaign: targets, exposure time per target, durations of flares, and how completeness is computed."""
 
     targets: tuple[PlanTarget, ...] = ()
-    hours: Annotated[float, Field(gt=0)] | None = None
+    hours: Annotated[float, Field(gt=0)] | None = None  # exposure per target; all visible time by default
+    # Durations; see `lightcurve.search.completeness.DurationLaw`.
     half_width_s: Annotated[float, Field(gt=0)] = 100.0
     at_erg: Annotated[float, Field(gt=0)] = 1e33
     exponent: Annotated[float, Field(ge=0, lt=1)] = 0.39
     scatter_dex: Annotated[float, Field(ge=0, le=2)] = 0.3
+    # Completeness from flares injected into simulated noise, or from the closed form for white noise.
     completeness: Literal["injections", "closed form"] = "injections"
+    # Frames have the detector temperature and particle flux along the orbit, instead of the study's constant ones.
     along_orbit: bool = True
-    injections: Annotated[int, Field(ge=20, le=1_000_000)] = 100
+    injections: Annotated[int, Field(ge=20, le=1_000_000)] = 100  # per half-width
     best_months: Annotated[int, Field(ge=1, le=12)] = 3
     report: Literal["pdf", "html"] = "pdf"
 
     @model_validator(mode="after")
-    def _some(self) -> Self:
+    def _different_targets(self) -> Self:
         names = [target.name for target in self.targets]
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
@@ -260,20 +203,14 @@ class PlanQuestion(Part):
         return self
 
     def law(self) -> DurationLaw:
-        """How long flares last."""
+        """Return the relation between energy and duration of flares."""
         from mauvecl.lightcurve.search.completeness import DurationLaw
 
         return DurationLaw(self.half_width_s, self.at_erg, self.exponent, self.scatter_dex)
 
 
 def targets_of(study: Study) -> list[Target]:
-    """Where a study's targets are: those of `orbit`, or those of `plan`.
-
-    Raises
-    ------
-    InputError
-        If there are none, or one is unknown.
-    """
+    """Look up the targets of a study: those of `orbit`, or else those of `plan`."""
     from mauvecl.host.orbit.targets import Target
 
     o = study.orbit
@@ -290,14 +227,9 @@ def targets_of(study: Study) -> list[Target]:
 
 
 def read_targets(path: Path) -> list[dict[str, Any]]:
-    """Targets of a table, CSV or ECSV: a column ``name``, and any other key of `PlanTarget`.
+    """Read targets from a CSV or ECSV table with a column ``name`` and any other keys of `PlanTarget`.
 
-    ``ra`` and ``dec`` in degrees stand for coordinates, ``V`` for the magnitude. Empty cells are not given.
-
-    Raises
-    ------
-    InputError
-        If it cannot be read, has no names, or other columns.
+    ``ra`` and ``dec`` in degrees replace ``coordinates``, and ``V`` replaces ``magnitude``. Empty cells are ignored.
     """
     import numpy as np
 
@@ -312,8 +244,8 @@ def read_targets(path: Path) -> list[dict[str, Any]]:
     other = next((name for name in columns if name not in keys), None)
     if other is not None:
         raise InputError(f"{named} has the column {shortened(other)}, expected some of {', '.join(sorted(keys))}")
-    if not 1 <= len(table) <= MOST_TARGETS:
-        raise InputError(f"{named} holds {len(table)} targets, expected 1 to {MOST_TARGETS}")
+    if not 1 <= len(table) <= MAX_TARGETS:
+        raise InputError(f"{named} holds {len(table)} targets, expected 1 to {MAX_TARGETS}")
     targets = []
     for number, row in enumerate(table, 1):
         one: dict[str, Any] = {}
@@ -323,13 +255,13 @@ def read_targets(path: Path) -> list[dict[str, Any]]:
                 one[key] = value.item() if hasattr(value, "item") else value
         if ("ra" in one) != ("dec" in one) or ("ra" in one and "coordinates" in one):
             raise InputError(
-                f"{named}: row {number} has only one of ra and dec, or coordinates too, expected both or none"
+                f"{named}: row {number} has only one of ra and dec, or coordinates as well, expected both or neither"
             )
         odd = next((key for key in ("ra", "dec") if key in one and not _is_number(one[key])), None)
         if odd is not None:
             raise InputError(
-                f"{named}: row {number} has {odd} = {shortened(str(one[odd]))}, expected degrees; sexagesimal ones go "
-                "into a column coordinates"
+                f"{named}: row {number} has {odd} = {shortened(str(one[odd]))}, expected degrees; sexagesimal "
+                "values belong in a column coordinates"
             )
         if "ra" in one:
             one["coordinates"] = f"{one.pop('ra')} {one.pop('dec')}"
@@ -354,8 +286,8 @@ def _is_number(cell: Any) -> bool:
     return True
 
 
-def find_plan_files(data: dict[str, Any], folder: Path) -> None:
-    """Put the folder of a study before the names of its orbit's and rates' files."""
+def resolve_plan_paths(data: dict[str, Any], folder: Path) -> None:
+    """Resolve the paths of elements and flare rates against a folder, in place."""
     orbit, plan = data.get("orbit"), data.get("plan")
     if isinstance(orbit, dict) and isinstance(orbit.get("tle"), str):
         orbit["tle"] = str(folder / orbit["tle"])
@@ -365,11 +297,11 @@ def find_plan_files(data: dict[str, Any], folder: Path) -> None:
             one["rates_file"] = str(folder / one["rates_file"])
 
 
-def without_usual_plan(data: dict[str, Any], study: Study) -> None:
-    """Leave out of a study's text what it does not say of orbit and plan; files by their full names."""
-    for name, usual in (("orbit", OrbitQuestion()), ("plan", PlanQuestion())):
-        if getattr(study, name) == usual:
+def drop_default_plan(data: dict[str, Any], study: Study) -> None:
+    """Remove default values of orbit and plan from a study's data and make its paths absolute, in place."""
+    for name, default in (("orbit", OrbitQuestion()), ("plan", PlanQuestion())):
+        if getattr(study, name) == default:
             del data[name]
     if "orbit" in data and study.orbit.limits == LimitsText():
         del data["orbit"]["limits"]
-    find_plan_files(data, Path.cwd())
+    resolve_plan_paths(data, Path.cwd())

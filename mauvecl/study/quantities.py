@@ -1,4 +1,4 @@
-"""What a study sweeps over, a map's axes run over, or a limit is asked for: one record each."""
+"""Quantities that sweeps, maps and limits vary."""
 
 from __future__ import annotations
 
@@ -7,28 +7,14 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Quantity:
-    """One quantity.
+    """Description and range of a quantity."""
 
-    Attributes
-    ----------
-    description : str
-        For the columns of tables.
-    axis : str
-        For the axes of pictures, with the unit.
-    low, high : float
-        Where it may lie; NaN for names.
-    unit : str
-        As astropy reads it; empty where it has none.
-    suffix : str
-        What follows a value in a title.
-    """
-
-    description: str
-    axis: str
-    low: float = float("nan")
+    description: str  # for table columns
+    axis: str  # axis label, with the unit
+    low: float = float("nan")  # range of numbers; NaN for names
     high: float = float("nan")
-    unit: str = ""
-    suffix: str = ""
+    unit: str = ""  # in astropy's notation; empty if dimensionless
+    suffix: str = ""  # follows a value in a title
 
 
 QUANTITIES: dict[str, Quantity] = {
@@ -57,12 +43,12 @@ QUANTITIES: dict[str, Quantity] = {
     ),
     "star": Quantity("library name or file, with its magnitude", "star"),
 }  # fmt: skip
-#: Those of the flare's spectrum, as [flare.spectrum] calls them.
+#: Quantities of the flare's spectrum, with their keys in [flare.spectrum].
 OF_SPECTRUM = {
     "balmer_jump": "balmer_jump",
     "second_temperature": "second_temperature_k",
     "second_area": "second_area",
     "line_scale": "line_scale",
 }
-#: Units of those that have any.
+#: Units of the quantities that have one.
 UNITS = {name: quantity.unit for name, quantity in QUANTITIES.items() if quantity.unit}

@@ -1,4 +1,4 @@
-"""What a study may ask beyond detection: quantities and their axes, limits, maps, sweeps, campaigns, bulk frames."""
+"""Study sections for campaigns, S/N, raw frames, limits, maps and sweeps."""
 
 from __future__ import annotations
 
@@ -10,41 +10,40 @@ from pydantic import Field, model_validator
 
 from mauvecl.host.errors import InputError
 from mauvecl.study.quantities import QUANTITIES
-from mauvecl.study.sections import Part
+from mauvecl.study.sections import Section
 
-#: Combinations of a sweep, at most: each has expectations of its own.
-MOST_CELLS = 100_000
+#: Largest number of combinations of a sweep; each has its own expectations.
+MAX_CELLS = 100_000
 
 
-class CampaignQuestion(Part):
-    """How many tests a search makes: frames in all, and from one stack to the next; and what is wanted of all of them.
+class CampaignQuestion(Section):
+    """Number of tests of a search, and the false alarms that the whole search may have."""
 
-    Wanted are the probability of any false alarm, or a number of false alarms to be expected.
-    """
-
-    frames: Annotated[int, Field(ge=1)] | None = None
-    step: Annotated[int, Field(ge=1)] | None = None
-    fap: Annotated[float, Field(gt=0, lt=1)] | None = None
-    alarms: Annotated[float, Field(gt=0)] | None = None
+    frames: Annotated[int, Field(ge=1)] | None = None  # in total
+    step: Annotated[int, Field(ge=1)] | None = None  # frames between the starts of consecutive stacks
+    fap: Annotated[float, Field(gt=0, lt=1)] | None = None  # probability of at least one false alarm
+    alarms: Annotated[float, Field(gt=0)] | None = None  # expected number of false alarms
 
     @model_validator(mode="after")
-    def _of_some_frames(self) -> Self:
+    def _requires_frames(self) -> Self:
         given = next((name for name in ("step", "fap", "alarms") if getattr(self, name) is not None), None)
         if given is not None and self.frames is None:
-            raise ValueError(f"campaign.{given} stands without campaign.frames, expected how many frames are searched")
+            raise ValueError(
+                f"campaign.{given} is given without campaign.frames, expected the number of frames that are searched"
+            )
         return self
 
 
-class SignalQuestion(Part):
-    """The S/N that an exposure is wanted for."""
+class SignalQuestion(Section):
+    """S/N that an exposure must reach."""
 
     snr: Annotated[float, Field(gt=0)] | None = None
     wavelength_nm: float | None = None
     per: Literal["element", "pixel"] = "element"
 
 
-class BulkQuestion(Part):
-    """What is kept of each realisation: the exposure's sum, or its frames; and the mean components beside it."""
+class BulkQuestion(Section):
+    """Data stored per realisation: the summed exposure or single frames, and optionally the mean components."""
 
     frames: Literal["stack", "all"] | Annotated[tuple[Annotated[int, Field(ge=0)], ...], Field(min_length=1)] = "stack"
     components: bool = False
@@ -52,17 +51,11 @@ class BulkQuestion(Part):
     @model_validator(mode="after")
     def _ascending(self) -> Self:
         if not isinstance(self.frames, str) and list(self.frames) != sorted(set(self.frames)):
-            raise ValueError(f"bulk.frames = {list(self.frames)}, expected ascending numbers")
+            raise ValueError(f"bulk.frames = {list(self.frames)} is not ascending, expected ascending numbers")
         return self
 
     def chosen(self, n_frames: int) -> tuple[int, ...] | None:
-        """Frames kept apart, of so many; None where they are summed.
-
-        Raises
-        ------
-        InputError
-            If one of them is not there.
-        """
+        """Return the indices of the frames to store, or None to store their sum."""
         if self.frames == "stack":
             return None
         if isinstance(self.frames, str):
@@ -72,15 +65,15 @@ class BulkQuestion(Part):
         return self.frames
 
 
-class LimitQuestion(Part):
-    """The value of one quantity at which a flare is detected with a wanted probability."""
+class LimitQuestion(Section):
+    """Quantity whose limit is computed, and the detection probability at the limit."""
 
     of: Literal["magnitude", "amplitude", "exposure"] = "magnitude"
     power: Annotated[float, Field(gt=0, lt=1)] = 0.9
 
 
-class Axis(Part):
-    """One axis of a map: values, or so many steps from start to stop."""
+class Axis(Section):
+    """Axis of a map or sweep: explicit values, or `steps` values from `start` to `stop`."""
 
     quantity: Literal[
         "magnitude", "amplitude", "flare_temperature", "balmer_jump", "second_temperature", "second_area", "line_scale",
@@ -114,7 +107,7 @@ class Axis(Part):
         return "names of the library" if self.quantity == "star" else "numbers"
 
     def points(self) -> tuple[float | str, ...]:
-        """Its values."""
+        """Return the values along the axis."""
         if self.values is not None:
             return self.values
         assert self.start is not None
@@ -122,7 +115,8 @@ class Axis(Part):
         assert self.steps is not None
         if self.log and min(self.start, self.stop) <= 0:
             raise ValueError(
-                f"the axis {self.quantity!r} is logarithmic from {self.start:g} to {self.stop:g}, expected > 0"
+                f"the logarithmic axis {self.quantity!r} runs from {self.start:g} to {self.stop:g}, expected values "
+                "above 0"
             )
         share = [i / (self.steps - 1) for i in range(self.steps)]
         if self.log:
@@ -130,48 +124,48 @@ class Axis(Part):
         return tuple(self.start + (self.stop - self.start) * s for s in share)
 
 
-class MapQuestion(Part):
-    """Detection probability over two quantities."""
+class MapQuestion(Section):
+    """Axes and contour levels of a map of the detection probability."""
 
     x: Axis = Axis(quantity="magnitude", start=4.0, stop=10.0, steps=16)
     y: Axis = Axis(quantity="amplitude", start=0.01, stop=1.0, steps=16, log=True)
     contours: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = (0.1, 0.5, 0.9)
 
     @model_validator(mode="after")
-    def _two(self) -> Self:
+    def _different_axes(self) -> Self:
         if self.x.quantity == self.y.quantity:
             raise ValueError(f"both axes of the map are {self.x.quantity!r}, expected two quantities")
         return self
 
 
-class Sweep(Part):
-    """Quantities that take several values: in every combination, or side by side as a list."""
+class Sweep(Section):
+    """Quantities that take several values, in all combinations ("product") or in parallel ("list")."""
 
     how: Literal["product", "list"] = "product"
     axes: tuple[Axis, ...] = ()
 
     @model_validator(mode="after")
-    def _fits(self) -> Self:
+    def _possible(self) -> Self:
         names = [axis.quantity for axis in self.axes]
         twice = next((name for name in names if names.count(name) > 1), None)
         if twice is not None:
             raise ValueError(f"the sweep has the quantity {twice!r} twice, expected different ones")
         lengths = {axis.quantity: len(axis.points()) for axis in self.axes}
         if self.how == "list" and len(set(lengths.values())) > 1:
-            told = ", ".join(f"{n} of {name}" for name, n in lengths.items())
-            raise ValueError(f"the sweep is a list of {told}, expected as many of each")
-        if self.size > MOST_CELLS:
-            raise ValueError(f"the sweep has {self.size} combinations, expected at most {MOST_CELLS}")
+            counts = ", ".join(f"{n} of {name}" for name, n in lengths.items())
+            raise ValueError(f"the sweep is a list of {counts}, expected equal numbers of values")
+        if self.size > MAX_CELLS:
+            raise ValueError(f"the sweep has {self.size} combinations, expected at most {MAX_CELLS}")
         return self
 
     @property
     def size(self) -> int:
-        """Cells."""
+        """Number of cells."""
         lengths = [len(axis.points()) for axis in self.axes]
         return max(lengths, default=1) if self.how == "list" else math.prod(lengths)
 
     def cells(self) -> list[dict[str, float | str]]:
-        """The values of each cell; one cell without any where nothing is swept."""
+        """Return the values of each cell; without axes, a single empty cell."""
         values = [axis.points() for axis in self.axes]
         together = zip(*values, strict=True) if self.how == "list" and values else itertools.product(*values)
         return [{a.quantity: v for a, v in zip(self.axes, cell, strict=True)} for cell in together]

@@ -1,4 +1,4 @@
-"""A study's search for flares, and the flares that are injected, as data; `surveys` makes of them what is done."""
+"""Study sections for the search for flares and for injected flares; `surveys` converts them."""
 
 from __future__ import annotations
 
@@ -8,60 +8,37 @@ from pydantic import Field, model_validator
 
 from mauvecl.lightcurve.usual import HALF_WIDTHS_S, RANK, WINDOW_S, Per, check_shape, per_day
 from mauvecl.study.nuisances import Spread
-from mauvecl.study.sections import Part
+from mauvecl.study.sections import Section
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.search.bank import Bank, Level
     from mauvecl.lightcurve.stares.stare import Stare
     from mauvecl.study.study import Study
 
-#: Orbits over which a level with the orbit's cycle is fitted: fewer cannot tell the cycle from a flare of minutes.
+#: Window, in orbits, of a baseline with the orbital cycle. Shorter ones cannot separate the cycle from a flare.
 CYCLE_ORBITS = 3.0
 
 Positive = Annotated[float, Field(gt=0)]
 
 
-class SearchChoice(Part):
-    """How a stare is searched for flares, and how many false alarms there may be.
-
-    Attributes
-    ----------
-    shape : str
-    half_widths_s : tuple of float
-        Of the bank.
-    sums : int
-        Of each frame, at most.
-    offset, slope : bool
-        Whether they are unknown of the level under a flare.
-    cycle : bool, optional
-        Whether the curves of the stare's unknowns are; where the stare has an unknown cycle by default.
-    window_s : float, optional
-        Time over which the level is taken for what it is; 1800 s by default, with a cycle three orbits.
-    frame : dict of str to float or "free"
-        What is unknown of each frame apart from all others, beside the stare's jitters: dark, light, sky, tilt.
-    false_alarms : float
-    per : {"day", "month", "year"}
-        Of star-days of frames.
-    null : {"sampled", "counted"}
-        Whether the threshold comes from normal noise by importance sampling, or from the stares that are drawn.
-    nulls : int
-        Stares drawn without a flare.
-    points, sigma
-        The common rule beside it: so many consecutive points above so many standard deviations.
-    """
+class SearchChoice(Section):
+    """Search of a stare for flares, and its rate of false alarms."""
 
     shape: str = "davenport2014"
-    half_widths_s: Annotated[tuple[Positive, ...], Field(min_length=1)] = HALF_WIDTHS_S
-    sums: Annotated[int, Field(ge=1, le=8)] = RANK
-    offset: bool = True
-    slope: bool = True
-    cycle: bool | None = None
-    window_s: Annotated[float, Field(ge=0)] | None = None
+    half_widths_s: Annotated[tuple[Positive, ...], Field(min_length=1)] = HALF_WIDTHS_S  # of the template bank
+    sums: Annotated[int, Field(ge=1, le=8)] = RANK  # largest number of weighted sums per frame
+    offset: bool = True  # marginalise over the offset of the baseline
+    slope: bool = True  # marginalise over the slope of the baseline
+    cycle: bool | None = None  # marginalise over the orbital cycle; by default if the stare has an unknown cycle
+    window_s: Annotated[float, Field(ge=0)] | None = None  # baseline window; 1800 s, or three orbits with a cycle
+    # Nuisance parameters that are independent in each frame, in addition to the stare's jitters.
     frame: dict[Literal["dark", "light", "sky", "tilt"], Spread] = Field(default_factory=dict)
     false_alarms: Positive = 1.0
-    per: Per = "month"
+    per: Per = "month"  # star-time of frames
+    # Threshold from importance sampling of normal noise, or counted in simulated stares.
     null: Literal["sampled", "counted"] = "sampled"
-    nulls: Annotated[int, Field(ge=0, le=1_000_000)] = 100
+    nulls: Annotated[int, Field(ge=0, le=1_000_000)] = 100  # simulated stares without a flare
+    # Conventional rule for comparison: `points` consecutive frames above `sigma` standard deviations.
     points: Annotated[int, Field(ge=1, le=100)] = 3
     sigma: Positive = 3.0
 
@@ -71,7 +48,7 @@ class SearchChoice(Part):
         if list(self.half_widths_s) != sorted(set(self.half_widths_s)):
             raise ValueError(f"search.half_widths_s = {list(self.half_widths_s)}, expected ascending times")
         if self.slope and not self.offset:
-            raise ValueError("search.slope without search.offset, expected both or the offset alone")
+            raise ValueError("search.slope is true without search.offset, expected both or the offset alone")
         return self
 
     @property
@@ -80,7 +57,7 @@ class SearchChoice(Part):
         return per_day(self.false_alarms, self.per)
 
     def white_bank(self, frame_s: float) -> Bank:
-        """For one sum of each frame and no curves, as closed forms take it."""
+        """Return the template bank of the closed form: one sum per frame and no cycle."""
         import numpy as np
 
         from mauvecl.lightcurve.flares.shapes import shape_of
@@ -90,7 +67,7 @@ class SearchChoice(Part):
         return Bank(self.half_widths_s, np.ones((1, 1)), shape_of(self.shape), frame_s, level)
 
     def level(self, stare: Stare, orbit_s: float) -> Level:
-        """What is unknown of the level in a stare."""
+        """Return the baseline model for a stare."""
         from mauvecl.lightcurve.search.bank import Level
 
         cycle = self.cycle if self.cycle is not None else any("cosine" in u.name for u in stare.unknowns)
@@ -98,47 +75,29 @@ class SearchChoice(Part):
         return Level(self.offset, self.slope, cycle, window)
 
     def spreads(self) -> dict[str, float]:
-        """Of what is unknown in each frame; infinite for what is projected out."""
+        """Return the standard deviations of the parameters of `frame`; infinite for "free"."""
         return {name: float("inf") if sd == "free" else float(sd) for name, sd in self.frame.items()}
 
 
-#: What the sizes of injected flares may be.
+#: Measures of the size of injected flares.
 Size = Literal["amplitude", "duration", "energy", "band_energy"]
 
 
-class InjectionQuestion(Part):
-    """Which flares are injected: sizes x half-widths, of the study's flare temperature and band.
+class InjectionQuestion(Section):
+    """Grid of sizes and half-widths of injected flares, which have the study's flare temperature and band."""
 
-    Attributes
-    ----------
-    of : {"amplitude", "duration", "energy", "band_energy"}, optional
-        Sizes: amplitudes, equivalent durations (s), bolometric energies or those in the flare's band (erg); energies
-        where the star's distance or radius is known, amplitudes elsewhere, by default.
-    low, high : float, optional
-        Smallest and largest size; from what the search should find, by default.
-    sizes, widths : int
-        How many, evenly in the logarithm.
-    half_width_low_s, half_width_high_s : float
-    shape : str, optional
-        The search's by default.
-    count : int
-        Injections of each cell.
-    positions : int
-        Places in the stare at which they peak.
-    fitted : int
-        Injections of each cell whose flares are fitted, where they are found.
-    """
-
+    # Amplitudes, equivalent durations (s), bolometric energies, or energies in the flare's band (erg). By default
+    # energies if the star's distance or radius is known, and amplitudes otherwise.
     of: Size | None = None
-    low: Positive | None = None
-    high: Positive | None = None
-    sizes: Annotated[int, Field(ge=2, le=256)] = 16
-    widths: Annotated[int, Field(ge=1, le=256)] = 16
+    low: Positive | None = None  # smallest size; by default from the sensitivity of the search
+    high: Positive | None = None  # largest size, likewise
+    sizes: Annotated[int, Field(ge=2, le=256)] = 16  # evenly spaced in the logarithm
+    widths: Annotated[int, Field(ge=1, le=256)] = 16  # evenly spaced in the logarithm
     half_width_low_s: Positive = 10.0
     half_width_high_s: Positive = 1800.0
-    count: Annotated[int, Field(ge=10, le=10**8)] = 2_000
-    positions: Annotated[int, Field(ge=2, le=100_000)] = 40
-    fitted: Annotated[int, Field(ge=0, le=100_000)] = 40
+    count: Annotated[int, Field(ge=10, le=10**8)] = 2_000  # injections per cell
+    positions: Annotated[int, Field(ge=2, le=100_000)] = 40  # peak times in the stare
+    fitted: Annotated[int, Field(ge=0, le=100_000)] = 40  # injections per cell that are fitted if detected
 
     @model_validator(mode="after")
     def _ordered(self) -> Self:
@@ -153,7 +112,7 @@ class InjectionQuestion(Part):
 
     @property
     def half_widths_s(self) -> tuple[float, ...]:
-        """Half-widths injected."""
+        """Half-widths of injected flares, evenly spaced in the logarithm."""
         import numpy as np
 
         if self.widths == 1:
@@ -161,10 +120,10 @@ class InjectionQuestion(Part):
         return tuple(float(w) for w in np.geomspace(self.half_width_low_s, self.half_width_high_s, self.widths))
 
 
-def without_usual_search(data: dict[str, Any], study: Study) -> None:
-    """Leave out of a study's text what it does not say of searches."""
-    for name, usual in (("search", SearchChoice()), ("injections", InjectionQuestion())):
-        if getattr(study, name) == usual:
+def drop_default_search(data: dict[str, Any], study: Study) -> None:
+    """Remove default values of search and injections from a study's data, in place."""
+    for name, default in (("search", SearchChoice()), ("injections", InjectionQuestion())):
+        if getattr(study, name) == default:
             del data[name]
     if "search" in data and not data["search"]["frame"]:
         del data["search"]["frame"]

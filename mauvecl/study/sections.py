@@ -1,4 +1,4 @@
-"""The sections of a study: star, flare, observation, sky, noise processes, run, and what is unknown."""
+"""Study sections for star, flare, observation, sky, noise processes, run and unknown instrument values."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ from pydantic import Field, create_model, field_validator, model_validator
 from mauvecl.host.sky import DEFAULT_SKY
 from mauvecl.noise.varied import VARIED
 from mauvecl.statistics.names import DEFAULT_STATISTICS, STATISTIC_NAMES
-from mauvecl.study.flare_text import FlareLight
-from mauvecl.study.part import Part as Part
+from mauvecl.study.flare_light import FlareLight
+from mauvecl.study.section import Section as Section
 
 if TYPE_CHECKING:
     from mauvecl.host.sky.zodiacal import Sky
@@ -22,14 +22,14 @@ if TYPE_CHECKING:
     from mauvecl.noise.processes import CosmicRays, Processes
 
 
-#: What a star from a file has and one of the library has not.
+#: Keys that only apply to a star from a file.
 FILE_KEYS = ("file", "wavelength_unit", "flux_unit", "extend")
-#: What belongs to one star, and not to another in its place.
+#: Keys that describe one star and are dropped when another star replaces it.
 STAR_KEYS = (*FILE_KEYS, "distance_pc", "radius_rsun", "effective_temperature_k")
 
 
-class Star(Part):
-    """Which spectrum, behind how much dust, how bright then; how far or large, for energies of flares."""
+class Star(Section):
+    """Spectrum, extinction and magnitude of a star; distance or radius for flare energies."""
 
     library: str | None = None
     file: Path | None = None
@@ -51,11 +51,11 @@ class Star(Part):
             raise ValueError("a star has neither or both of library and file, expected one of them")
         given = [key for key in FILE_KEYS if getattr(self, key) is not None]
         if self.file is None and given:
-            raise ValueError(f"a star of the library has {' and '.join(given)}, expected them of a file only")
+            raise ValueError(f"a star of the library has {' and '.join(given)}, expected a star from a file")
         return self
 
     def source(self) -> Source:
-        """The star's spectrum at its magnitude; as stored where none is given."""
+        """Load the spectrum and scale it to the magnitude, if one is given."""
         from dataclasses import replace
 
         from mauvecl.host.stars.source import Source
@@ -79,8 +79,8 @@ class Star(Part):
         return source.at_magnitude(self.magnitude, self.band, self.magnitude_system)
 
 
-class Flare(Part):
-    """Which flares."""
+class Flare(Section):
+    """Amplitudes, spectrum and geometry of flares."""
 
     amplitudes: Annotated[tuple[float, ...], Field(min_length=1)] = (0.0076, 0.02, 0.081, 0.24)
     temperature_k: float = 10_000.0
@@ -90,27 +90,21 @@ class Flare(Part):
     spectrum: FlareLight = FlareLight()
 
     def light(self, temperature_k: float | None = None) -> FlareSpectrum:
-        """Return the spectrum of a flare, of the study's temperature by default."""
-        return self.spectrum.form(self.temperature_k if temperature_k is None else temperature_k)
+        """Return the spectrum of a flare, by default at the study's temperature."""
+        return self.spectrum.at_temperature(self.temperature_k if temperature_k is None else temperature_k)
 
     @property
     def is_blackbody(self) -> bool:
-        """Whether the flare shines as one blackbody and nothing else."""
+        """True if the spectrum is a single blackbody."""
         return self.spectrum == FlareLight()
 
     def with_spectrum(self, key: str, value: Any) -> Self:
-        """Return the flare with one key of its spectrum changed.
-
-        Raises
-        ------
-        InputError
-            For a value that cannot be with the others.
-        """
+        """Return a copy with one key of the spectrum changed."""
         return self.model_copy(update={"spectrum": self.spectrum.with_value(key, value)})
 
 
-class Observation(Part):
-    """How it is observed."""
+class Observation(Section):
+    """Instrument, exposure, and how the detector is modelled."""
 
     exposure_s: float = 50.0
     instrument: str = "mauve"
@@ -122,8 +116,8 @@ class Observation(Part):
     changes: dict[str, float | int | str] = Field(default_factory=dict)
 
 
-class SkyLight(Part):
-    """What is behind the star: a surface brightness, a target and a time, or nothing."""
+class SkyLight(Section):
+    """Sky background: a surface brightness, that of a target at a time, or none."""
 
     surface_brightness: float | None = None
     target: str | None = None
@@ -132,7 +126,7 @@ class SkyLight(Part):
 
     @model_validator(mode="before")
     @classmethod
-    def _something(cls, given: Any) -> Any:
+    def _default_brightness(cls, given: Any) -> Any:
         return given or {"surface_brightness": DEFAULT_SKY}
 
     @model_validator(mode="after")
@@ -144,7 +138,7 @@ class SkyLight(Part):
         return self
 
     def sky(self) -> Sky:
-        """What the host needs of it."""
+        """Return the sky for the host."""
         from mauvecl.host.sky.zodiacal import Sky
 
         if self.none:
@@ -154,8 +148,8 @@ class SkyLight(Part):
         return Sky.none() if self.surface_brightness is None else Sky.of_brightness(self.surface_brightness)
 
 
-class PriorText(Part):
-    """What is known of a value that differs from realisation to realisation: flat, or normal and cut."""
+class PriorText(Section):
+    """Prior of a value that varies between realisations: uniform or truncated normal."""
 
     uniform: tuple[float, float] | None = None
     normal: tuple[float, float] | None = None
@@ -172,16 +166,16 @@ class PriorText(Part):
         return self
 
     def prior(self) -> Prior:
-        """As the engine takes it."""
+        """Return the prior for the engine."""
         from mauvecl.noise.priors import Normal, Uniform
 
         if self.normal is not None and self.between is not None:
             return Normal(*self.normal, *self.between)
-        return Uniform(*(self.uniform or (0.0, 0.0)))  # one of the two is there
+        return Uniform(*(self.uniform or (0.0, 0.0)))  # the validator ensures that one of them is given
 
 
-class Rays(Part):
-    """Cosmic-ray hits; see `processes.CosmicRays`."""
+class Rays(Section):
+    """Cosmic-ray hits; see `noise.processes.CosmicRays`."""
 
     rate_per_cm2_s: float = 1.0
     area_cm2: float = 0.057
@@ -194,21 +188,21 @@ class Rays(Part):
         return self
 
     def rays(self) -> CosmicRays:
-        """As the engine takes them."""
+        """Return the process for the engine."""
         from mauvecl.noise.processes import CosmicRays
 
         return CosmicRays(**self.model_dump())
 
 
-#: The rays, and one key for each thing that a prior may be put on.
+#: Cosmic rays, and a prior for each quantity that may vary.
 _keys: Any = {"cosmic_rays": (Rays | None, None)} | dict.fromkeys(VARIED, (PriorText | None, None))
 
 
-class NoiseProcesses(create_model("_Priors", __base__=Part, **_keys)):  # type: ignore[misc]
-    """Optional noise processes, all off unless named; see `processes.VARIED` and `processes.CosmicRays`."""
+class NoiseProcesses(create_model("_Priors", __base__=Section, **_keys)):  # type: ignore[misc]
+    """Optional noise processes, all disabled by default; see `noise.varied.VARIED` and `noise.processes.CosmicRays`."""
 
     def processes(self) -> Processes:
-        """As the engine takes them."""
+        """Return the processes for the engine."""
         from mauvecl.noise.processes import Processes
 
         rays = None if self.cosmic_rays is None else self.cosmic_rays.rays()
@@ -216,8 +210,8 @@ class NoiseProcesses(create_model("_Priors", __base__=Part, **_keys)):  # type: 
         return Processes(rays, **{name: None if text is None else text.prior() for name, text in given.items()})
 
 
-class Run(Part):
-    """How much is drawn, and what is asked of it."""
+class Run(Section):
+    """Number of realisations, seed, statistics and false-alarm probability."""
 
     realisations: Annotated[int, Field(ge=1)] = 1_000_000
     seed: Annotated[int, Field(ge=0, lt=2**64)] = 1
@@ -231,7 +225,7 @@ class Run(Part):
 
     @field_validator("statistics")
     @classmethod
-    def _all(cls, given: tuple[str, ...]) -> tuple[str, ...]:
+    def _expand_all(cls, given: tuple[str, ...]) -> tuple[str, ...]:
         return STATISTIC_NAMES if "all" in given else given
 
     @model_validator(mode="after")
@@ -240,16 +234,16 @@ class Run(Part):
         return self
 
     def comparison(self) -> Comparison:
-        """What an observed spectrum is compared with, as the engine takes it."""
+        """Return the reference of the comparison for the engine."""
         from mauvecl.noise.comparison import Comparison
 
         return Comparison.of(self.reference, self.variances)
 
 
-class Unknowns(Part):
-    """What is unknown of the instrument and the same in every exposure; nothing unless draws are asked for.
+class Unknowns(Section):
+    """Priors of instrument values that are unknown but constant; ignored unless `draws` is positive.
 
-    The priors are those of the documentation's page on what is nominal.
+    The documentation page on nominal values explains the default priors.
     """
 
     draws: Annotated[int, Field(ge=0, le=4096)] = 0
@@ -262,7 +256,7 @@ class Unknowns(Part):
     known: tuple[str, ...] = ()
 
     @model_validator(mode="after")
-    def _enough(self) -> Self:
+    def _possible(self) -> Self:
         if self.draws == 1:
             raise ValueError("unknowns.draws = 1, expected 0 or at least 2")
         other = next((name for name in self.known if name not in self._names()), None)
@@ -276,6 +270,6 @@ class Unknowns(Part):
         return [name for name in cls.model_fields if name not in ("draws", "known")]
 
     def priors(self) -> dict[str, Prior]:
-        """The priors of what is not known, by the instrument's names, and `qe_scale`."""
+        """Return the priors of unknown values by the instrument's names, and of `qe_scale`."""
         given = {name: getattr(self, name) for name in self._names() if name not in self.known}
         return {name: text.prior() for name, text in given.items() if text is not None}

@@ -1,4 +1,4 @@
-"""Names of stars in studies: spectra of the library, and what stands for well-known stars that have none there."""
+"""Names of stars in studies, and suggestions for well-known stars without a library spectrum."""
 
 from __future__ import annotations
 
@@ -8,21 +8,21 @@ from mauvecl.host.errors import InputError
 
 
 def has_spectrum(name: str) -> bool:
-    """Return whether the library, or a star that the user keeps, has that name."""
+    """Return whether a spectrum of the library or of the user has this name."""
     from mauvecl.host.stars import catalogue, own_stars
 
     return catalogue.embedded(name) is not None or own_stars.find(name) is not None
 
 
 def well_known(name: str) -> Mapping[str, str] | None:
-    """Return the row of a well-known star in the embedded list, or None."""
+    """Return the row of a star in the embedded list of well-known stars, or None."""
     from mauvecl.host.orbit.star_list import name_key, rows_by_name
 
     return rows_by_name().get(name_key(name))
 
 
 def check_spectrum(name: str) -> None:
-    """Raise InputError if a name has no spectrum; for a well-known star the message says which one stands for it."""
+    """Raise InputError if a name has no spectrum; for well-known stars, the message suggests one."""
     if has_spectrum(name):
         return
     from mauvecl.host.stars import catalogue

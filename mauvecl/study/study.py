@@ -1,4 +1,4 @@
-"""A question as data: read from TOML, changed by flags, turned into expectations."""
+"""The study: a question as data, read from TOML, changed by flags and converted to expectations."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import possible, read_text, toml
 from mauvecl.host.quantities import number
 from mauvecl.host.records import input_error
-from mauvecl.study.flare_text import find_spectrum_files, without_usual_spectrum
-from mauvecl.study.measuring import MeasureQuestion, without_usual_measure
+from mauvecl.study.flare_light import drop_default_spectrum, resolve_spectrum_paths
+from mauvecl.study.measurements import MeasureQuestion, drop_default_measure
 from mauvecl.study.nuisances import NuisanceChoice
-from mauvecl.study.orbits import OrbitQuestion, PlanQuestion, find_plan_files, without_usual_plan
+from mauvecl.study.orbits import OrbitQuestion, PlanQuestion, drop_default_plan, resolve_plan_paths
 from mauvecl.study.quantities import OF_SPECTRUM, QUANTITIES
 from mauvecl.study.questions import (
     Axis,
@@ -28,10 +28,10 @@ from mauvecl.study.questions import (
     SignalQuestion,
     Sweep,
 )
-from mauvecl.study.searches import InjectionQuestion, SearchChoice, without_usual_search
-from mauvecl.study.sections import STAR_KEYS, Flare, NoiseProcesses, Observation, Part, Run, SkyLight, Star, Unknowns
-from mauvecl.study.stares import EventText, StareQuestion, find_curves, without_usual
-from mauvecl.study.study_text import find_files, in_table, put, study_of, toml_value
+from mauvecl.study.searches import InjectionQuestion, SearchChoice, drop_default_search
+from mauvecl.study.sections import STAR_KEYS, Flare, NoiseProcesses, Observation, Run, Section, SkyLight, Star, Unknowns
+from mauvecl.study.stare_section import EventText, StareQuestion, drop_default_stare, resolve_stare_paths
+from mauvecl.study.study_text import locate_files, parse_toml_value, read_embedded_study, set_key, with_file_digests
 
 if TYPE_CHECKING:
     import astropy.units as u
@@ -47,7 +47,7 @@ PAPER_STARS = (Star(library="K3V", magnitude=3.7), Star(library="G2V", magnitude
 
 
 @public
-class Study(Part):
+class Study(Section):
     """Everything that an answer depends on; the default is the paper's question.
 
     Examples
@@ -88,22 +88,16 @@ class Study(Part):
         own = [number for number, star in enumerate(self.star) if star.effective_temperature_k is not None]
         if own and self.flare.geometry == "replaces" and self.flare.photosphere_temperature_k is not None:
             raise ValueError(
-                f"flare.photosphere_temperature_k is that of every star, and star.{own[0]} has its own beside it, "
-                "expected one of them"
+                f"flare.photosphere_temperature_k and star.{own[0]}.effective_temperature_k are both given, expected "
+                "one of them"
             )
         return self
 
     @classmethod
     def read(cls, path: str | Path) -> Self:
-        """A study file, or the study that an answer's ECSV table was made by.
-
-        Raises
-        ------
-        InputError
-            If it is missing, not TOML (naming the line), or holds an unknown key or an impossible value.
-        """
+        """Read a study file, or the study in an answer's ECSV table."""
         path = Path(path)
-        text = study_of(path) if path.suffix == ".ecsv" else read_text(path, "study file")
+        text = read_embedded_study(path) if path.suffix == ".ecsv" else read_text(path, "study file")
         data = toml(text, f"study file {shortened(path.name)}")
         if not _has_values(data):
             raise InputError(
@@ -111,9 +105,9 @@ class Study(Part):
                 "[[star]]; a verb without a study file answers the paper's question"
             )
         if path.suffix == ".ecsv":
-            find_files(data, path)
+            locate_files(data, path)
         for star in data.get("star", []) if isinstance(data.get("star"), list) else []:
-            # Files are named as seen from the study.
+            # Paths are relative to the study file.
             if isinstance(star, dict) and isinstance(star.get("file"), str):
                 star["file"] = str(path.parent / star["file"])
         run = data.get("run")
@@ -124,14 +118,14 @@ class Study(Part):
         for one in own.values() if isinstance(own, dict) else ():
             if isinstance(one, dict) and isinstance(one.get("file"), str):
                 one["file"] = str(path.parent / one["file"])
-        find_curves(data, path.parent)
-        find_plan_files(data, path.parent)
-        find_spectrum_files(data, path.parent)
+        resolve_stare_paths(data, path.parent)
+        resolve_plan_paths(data, path.parent)
+        resolve_spectrum_paths(data, path.parent)
         return cls.build(data, path.name)
 
     @classmethod
     def build(cls, data: dict[str, Any], where: str) -> Self:
-        """Validate nested data; raises InputError that describes the first fault."""
+        """Validate nested data; raises InputError for the first invalid value."""
         possible(data, where)
         try:
             return cls.model_validate(data)
@@ -141,12 +135,12 @@ class Study(Part):
     def with_changes(
         self, changes: dict[str, dict[str, Any]], stars: list[dict[str, Any]] | None, where: str = "changes"
     ) -> Self:
-        """The study with values replaced where they are not None, by sections such as "orbit.limits"; other stars."""
+        """Return a copy with other values, by sections such as "orbit.limits"; None leaves a value unchanged."""
         data = self.model_dump()
         for section, values in changes.items():
             given = {key: value for key, value in values.items() if value is not None}
             if section == "sky" and given:
-                # A new sky takes the place of the old one whole.
+                # A new sky replaces all keys of the old one.
                 data[section] = {}
             place = data
             for part in section.split("."):
@@ -157,23 +151,17 @@ class Study(Part):
         return self.build(data, where)
 
     def with_settings(self, settings: Sequence[str], where: str = "settings") -> Self:
-        """The study with keys set as text, such as ``run.fap=0.01`` or ``star.0.magnitude=6``.
-
-        Raises
-        ------
-        InputError
-            For text without "=", or a key or value that cannot be.
-        """
+        """Return a copy with keys set from text, such as ``run.fap=0.01`` or ``star.0.magnitude=6``."""
         data = self.model_dump(exclude_none=True)
         for text in settings:
             path, equals, value = (part.strip() for part in text.partition("="))
             if not (path and equals):
                 raise InputError(f"setting = {text!r}, expected key=value, such as run.fap=0.01")
-            put(data, path.split("."), toml_value(value), text)
+            set_key(data, path.split("."), parse_toml_value(value), text)
         return self.build(data, where)
 
     def toml(self) -> str:
-        """The study as TOML that `read` reads back."""
+        """Return the study as TOML, without sections that have their default values."""
         import tomli_w
 
         data = self.model_dump(mode="json", exclude_none=True)
@@ -195,11 +183,11 @@ class Study(Part):
             for one in data["nuisances"]["own"].values():
                 if "file" in one:
                     one["file"] = str(Path(one["file"]).resolve())
-        without_usual(data, self)
-        without_usual_search(data, self)
-        without_usual_plan(data, self)
-        without_usual_measure(data, self)
-        without_usual_spectrum(data, self.flare.spectrum)
+        drop_default_stare(data, self)
+        drop_default_search(data, self)
+        drop_default_plan(data, self)
+        drop_default_measure(data, self)
+        drop_default_spectrum(data, self.flare.spectrum)
         for section in ("processes", "campaign"):
             if not data[section]:
                 del data[section]
@@ -224,11 +212,11 @@ class Study(Part):
     __str__ = __repr__
 
     def text(self) -> str:
-        """Return the study as answers' tables hold it: files of spectra by name and digest, wherever they are."""
-        return in_table(self.toml())
+        """Return the study as TOML for an answer's table, with spectrum files by name and digest."""
+        return with_file_digests(self.toml())
 
     def load_instrument(self) -> Instrument:
-        """The instrument with what the study changes of it: its ``changes``, and the detector's temperature."""
+        """Load the instrument and apply the study's ``changes`` and detector temperature."""
         from mauvecl.host.instrument.instrument import Instrument
 
         instrument, o = Instrument.load(self.observation.instrument), self.observation
@@ -236,7 +224,7 @@ class Study(Part):
         return instrument.with_(**changes) if changes else instrument
 
     def with_instrument(self, changes: Mapping[str, Any]) -> Self:
-        """The study with some values of the instrument changed; see `Instrument.with_`."""
+        """Return a copy with other values of the instrument; see `Instrument.with_`."""
         o = self.observation
         update: dict[str, Any] = {"changes": o.changes | dict(changes)}
         if "temperature_c" in changes:
@@ -244,18 +232,14 @@ class Study(Part):
         return self.model_copy(update={"observation": o.model_copy(update=update)})
 
     def at(self, quantity: str, value: u.Quantity | float | str) -> Self:
-        """The study with one quantity at another value, for all its stars.
+        """Return a copy with another value of one quantity, for all stars.
 
         Parameters
         ----------
         quantity : str
-            A key of `QUANTITIES`, or "star" with a library name.
+            A key of `QUANTITIES`.
         value : float, Quantity or str
-
-        Raises
-        ------
-        InputError
-            For another quantity, or what is no value of it.
+            For "star", a name of the library.
         """
         if quantity not in QUANTITIES:
             raise InputError(
@@ -279,21 +263,15 @@ class Study(Part):
         return self.model_copy(update={"observation": self.observation.model_copy(update=change)})
 
     def unknown_priors(self) -> dict[str, Prior]:
-        """Priors of what is unknown of the instrument; what the study states of it is known.
-
-        Raises
-        ------
-        InputError
-            If nothing is left unknown, and draws are asked for.
-        """
+        """Return the priors of unknown instrument values; values that the study sets are known."""
         stated = {*self.observation.changes, *(() if self.observation.temperature_c is None else ("temperature_c",))}
         priors = {name: prior for name, prior in self.unknowns.priors().items() if name not in stated}
         if self.unknowns.draws and not priors:
-            raise InputError("everything is known of the instrument, expected a prior, or unknowns.draws = 0")
+            raise InputError("no instrument value is unknown, expected a prior, or unknowns.draws = 0")
         return priors
 
     def cells(self) -> list[tuple[dict[str, float | str], Self]]:
-        """The values that the study sweeps over, and the study at each; itself where it sweeps over nothing."""
+        """Return the values of each cell of the sweep, and the study at these values."""
         cells = []
         for values in self.sweep.cells():
             study = self.model_copy(update={"sweep": Sweep()})
@@ -304,7 +282,7 @@ class Study(Part):
 
     @property
     def drawing(self) -> dict[str, Any]:
-        """How the engine is to draw: mode, recipe, processes."""
+        """Arguments of the engine's methods: mode, recipe and processes."""
         o = self.observation
         processes = self.processes.processes()
         if self.nuisances.usual:
@@ -312,12 +290,12 @@ class Study(Part):
         return {"mode": o.mode, "recipe": o.recipe, "processes": processes}
 
     def detecting(self, quiet: Expectation) -> dict[str, Any]:
-        """How the engine is to draw and compare: everything that `Engine.detect` takes but stars and seed.
+        """Return all arguments of `Engine.detect` except expectations and seed.
 
         Parameters
         ----------
         quiet : Expectation
-            The star without a flare, whose pixels the unknowns' spectra change.
+            The star without a flare, for which nuisance spectra are computed.
         """
         run = self.run
         how = {"realisations": run.realisations, "statistics": run.statistics, "tails": run.tails}
@@ -325,7 +303,7 @@ class Study(Part):
         return self.drawing | how | marginal | {"comparison": run.comparison()}
 
     def setting(self, quiet: Expectation, *flares: Expectation) -> Setting:
-        """What statistics look at, for closed forms: nothing is laid out for a draw."""
+        """Return the input of statistics for closed forms."""
         from mauvecl.noise.drawn import Drawn
         from mauvecl.statistics.statistic import Setting
 
@@ -334,13 +312,13 @@ class Study(Part):
         return Setting(quiet, ~quiet.saturated, self.run.comparison(), flares, unknown, drawn)
 
     def expectations(self, star: Star) -> list[Expectation]:
-        """A star without a flare, then with each of the flares."""
+        """Return the expectations of a star without a flare and with each flare."""
         source = star.source()
         flares = [self.flaring(source, amplitude) for amplitude in self.flare.amplitudes]
         return self.expect([source, *flares])
 
     def flaring(self, source: Source, amplitude: float) -> Source:
-        """The star with one of the study's flares."""
+        """Return a star with a flare of the study's spectrum and geometry."""
         f = self.flare
         return source.flaring(
             amplitude,
@@ -351,7 +329,7 @@ class Study(Part):
         )
 
     def expect(self, sources: list[Source]) -> list[Expectation]:
-        """Expectations of sources on the study's instrument, sky and exposure."""
+        """Compute the expectations of sources for the study's instrument, sky and exposure."""
         from mauvecl.host.expectation import expect
 
         instrument, sky, o = self.load_instrument(), self.sky.sky(), self.observation
@@ -360,7 +338,7 @@ class Study(Part):
 
 
 def _has_values(data: Any) -> bool:
-    """Return whether nested tables hold any key."""
+    """Return whether nested tables contain any key."""
     return any(map(_has_values, data.values())) if isinstance(data, dict) else True
 
 

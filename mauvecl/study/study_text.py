@@ -1,4 +1,4 @@
-"""A study's text: keys set one by one, the study inside an answer's table, and a sentence for the first fault."""
+"""Text of a study: settings of single keys, and the study that an answer's table contains."""
 
 from __future__ import annotations
 
@@ -15,16 +15,16 @@ from mauvecl.host.files.parsed import parsing, read_text, toml
 from mauvecl.host.spectra.formats import without_columns
 
 
-def study_of(path: Path) -> str:
-    """The study in an answer's meta data."""
+def read_embedded_study(path: Path) -> str:
+    """Return the text of the study in an answer's metadata."""
     study = read_ecsv(path, "study", "an answer's ECSV table").meta.get("study")
     if not isinstance(study, str):
-        raise InputError(f"{path.name} holds no study, expected an answer's ECSV table")
+        raise InputError(f"{path.name} contains no study, expected an answer's ECSV table")
     return study
 
 
-def in_table(text: str) -> str:
-    """Return a study's text with files of spectra by name and digest: where they are is no part of an answer."""
+def with_file_digests(text: str) -> str:
+    """Replace the paths of spectra in a study's text by names and digests, since answers do not depend on paths."""
     import tomli_w
 
     data = tomllib.loads(text)
@@ -34,14 +34,14 @@ def in_table(text: str) -> str:
     for section, key in named:
         place, _ = without_columns(Path(section[key]))
         section[key] = Path(section[key]).name
-        # An answer is not lost for a file that is gone by now.
+        # Keep the answer even if the file no longer exists.
         with contextlib.suppress(InputError):
             section[f"{key}_sha256"] = _digest(place)
     return tomli_w.dumps(data)
 
 
 def _named_files(data: dict[str, Any]) -> list[tuple[dict[str, Any], str]]:
-    """List sections of a study that name a file of a spectrum, stars' and the flare's, with their keys."""
+    """List the sections of stars and flare that name a spectrum file, with the key."""
     stars, flare = data.get("star"), data.get("flare")
     sections = [(star, "file") for star in (stars if isinstance(stars, list) else [])]
     light = flare.get("spectrum") if isinstance(flare, dict) else None
@@ -49,16 +49,11 @@ def _named_files(data: dict[str, Any]) -> list[tuple[dict[str, Any], str]]:
     return [(one, key) for one, key in sections if isinstance(one, dict) and isinstance(one.get(key), str)]
 
 
-def find_files(data: dict[str, Any], table: Path) -> None:
-    """Put the places of spectra's files into the study of an answer's table, which names them by name and digest.
+def locate_files(data: dict[str, Any], table: Path) -> None:
+    """Locate the spectrum files that the study of an answer's table gives by name and digest, in place.
 
-    They are looked for beside the table, above it, in the current folder, and where the ``study.toml`` beside the table
-    has them.
-
-    Raises
-    ------
-    InputError
-        If none of that name is there as it was.
+    Searches the table's folder, its parent, the current folder, and the paths in a ``study.toml`` next to the table.
+    Raises InputError if no file with the name and digest is found.
     """
     for section, key in _named_files(data):
         if f"{key}_sha256" not in section:
@@ -71,13 +66,15 @@ def find_files(data: dict[str, Any], table: Path) -> None:
                 break
         else:
             raise InputError(
-                f"{shortened(table.name)}: its file {shortened(name)} is not there as it was (sha256 "
-                f"{shortened(str(digest))}), expected it beside the table"
+                f"{shortened(table.name)}: its file {shortened(name)} with sha256 {shortened(str(digest))} is missing "
+                "or has changed, expected it next to the table",
+                key=key,
+                value=name,
             )
 
 
 def _beside(table: Path, name: str) -> list[Path]:
-    """Files of that name in the study that was written with a table."""
+    """Return the files of this name in the ``study.toml`` next to a table."""
     study = table.parent / "study.toml"
     if not study.is_file():
         return []
@@ -90,18 +87,19 @@ def _digest(file: Path) -> str:
     return hashlib.sha256(read_bytes(file, "spectrum file")).hexdigest()
 
 
-def toml_value(text: str) -> Any:
-    """A value as TOML has it; a bare word is text."""
-    with parsing(f"value {shortened(text)}", "a value as TOML has it"):
+def parse_toml_value(text: str) -> Any:
+    """Parse a TOML value; a bare word is text."""
+    with parsing(f"value {shortened(text)}", "a TOML value"):
         try:
             parsed = tomllib.loads(f"value = {text}")
         except tomllib.TOMLDecodeError:
             return text
-    # Several lines would be several keys.
+    # Text of several lines would define several keys.
     return parsed["value"] if len(parsed) == 1 else text
 
 
-def put(data: Any, path: list[str], value: Any, text: str) -> None:
+def set_key(data: Any, path: list[str], value: Any, text: str) -> None:
+    """Set a nested key in place; `text` is the setting, for messages."""
     *parents, last = path
     for part in parents:
         if isinstance(data, list | tuple):
@@ -114,6 +112,6 @@ def put(data: Any, path: list[str], value: Any, text: str) -> None:
             data = data.setdefault(part, {})
     if not isinstance(data, dict):
         raise InputError(
-            f"setting = {shortened(text)}: {shortened('.'.join(parents))} holds no keys, expected one that does"
+            f"setting = {shortened(text)}: {shortened('.'.join(parents))} is a value, expected a section with keys"
         )
     data[last] = value

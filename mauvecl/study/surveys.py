@@ -1,4 +1,4 @@
-"""What a study's search and injections come to for a star: its survey, and the sizes of flares."""
+"""Survey of a study's star: template bank, search, and sizes of injected flares."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from mauvecl.lightcurve.search.recovery import Fit
 from mauvecl.lightcurve.search.survey import Survey
 from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates, frame_nuisances
 from mauvecl.lightcurve.stares.components import Components
-from mauvecl.study.flare_text import FlareLight
-from mauvecl.study.staring import energy_scale, stare_of
+from mauvecl.study.flare_light import FlareLight
+from mauvecl.study.stare_expectation import energy_scale, stare_of
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -26,58 +26,42 @@ if TYPE_CHECKING:
     from mauvecl.study.sections import Flare, Star
     from mauvecl.study.study import Study
 
-#: Smallest and largest flare of a map that is not told, in sizes that the search finds half of.
-AROUND = (0.3, 3.0)
+#: Default range of injected sizes, in units of the size with a completeness of one half.
+DEFAULT_RANGE = (0.3, 3.0)
 
 
 @dataclass(frozen=True, eq=False)
-class Surveyed:
-    """A star of a study, as it is stared at and searched.
-
-    Attributes
-    ----------
-    source : Source
-    quiet : Expectation
-        One frame.
-    templates : Templates
-    survey : Survey
-        With the study's flare as the only one of its components.
-    """
+class StarSurvey:
+    """A star of a study with its search."""
 
     source: Source
-    quiet: Expectation
+    quiet: Expectation  # of one frame
     templates: Templates
-    survey: Survey
+    survey: Survey  # its only flare component is the study's flare
 
     @property
     def fit(self) -> Fit:
-        """How what is found is fitted."""
+        """Fit of detected flares."""
         return Fit(self.survey.bank, self.templates)
 
     @property
     def unit_snr(self) -> float:
-        """S/N of one frame for the study's flare with an amplitude of one, shape and level aside."""
+        """S/N of one frame for the study's flare at constant unit amplitude and known baseline."""
         x = self.survey.components
         unit = np.zeros(3 + x.n_flares)
         unit[:3], unit[3] = 1.0, 1.0
         return float(np.linalg.norm(x.means(unit)))
 
 
-def surveyed(study: Study, star: Star) -> Surveyed:
-    """What a study's stare and search come to for one of its stars.
-
-    Raises
-    ------
-    InputError
-        For anything in the study that cannot be.
-    """
+def survey_star(study: Study, star: Star) -> StarSurvey:
+    """Build the search of a study for a star."""
     source, stare = star.source(), stare_of(study)
     choice = study.search
     frames = study.model_copy(
         update={"observation": study.observation.model_copy(update={"exposure_s": stare.frame_s})}
     )
     check_scales(study.flare.light())
-    # A search looks for blackbodies where the flare of the study has no temperature that can be varied.
+    # Templates are blackbodies if the study's flare has no temperature to vary.
     hot = frames if study.flare.spectrum.file is None else frames.model_copy(update={"flare": _blackbody(study.flare)})
     quiet, electrons = flare_electrons(hot, source, TEMPERATURES_K)
     _, own = flare_electrons(frames, source, (study.flare.temperature_k,))
@@ -95,8 +79,8 @@ def surveyed(study: Study, star: Star) -> Surveyed:
     )
     survey = Survey(Components(quiet, own, templates.weights), stare, bank)
     if level.cycle and not len(survey.curves if survey.curves is not None else ()):
-        raise InputError("search.cycle without a curve, expected unknown cycles in the stare")
-    return Surveyed(source, quiet, templates, survey)
+        raise InputError("search.cycle is true but the stare has no unknown cycle, expected stare.cycles")
+    return StarSurvey(source, quiet, templates, survey)
 
 
 def _blackbody(flare: Flare) -> Flare:
@@ -104,8 +88,8 @@ def _blackbody(flare: Flare) -> Flare:
 
 
 def flare_electrons(study: Study, source: Source, kelvin: tuple[float, ...]) -> tuple[Expectation, NDArray[np.float64]]:
-    """One frame of a star, and the electrons that flares of one amplitude add to it, (n_temperature, n_pixel)."""
-    # A flare that takes the place of photosphere is as linear in its amplitude, but not up to one.
+    """Return one frame and the electrons added by flares of unit amplitude, shape (n_temperature, n_pixel)."""
+    # A flare that replaces photosphere is linear in its amplitude, but an amplitude of 1 may exceed the whole disc.
     unit = 1.0 if study.flare.geometry == "added" else 0.01
     each = [study.model_copy(update={"flare": study.flare.model_copy(update={"temperature_k": k})}) for k in kelvin]
     quiet, *flaring = study.expect([source, *(one.flaring(source, unit) for one in each)])
@@ -114,29 +98,15 @@ def flare_electrons(study: Study, source: Source, kelvin: tuple[float, ...]) -> 
 
 @dataclass(frozen=True)
 class Sizes:
-    """What the sizes of flares are, for one star: amplitude x half-width^power x per_unit.
-
-    Attributes
-    ----------
-    of : str
-    power : int
-    per_unit : float
-        Size of a flare of one amplitude and a half-width of 1 s.
-    """
+    """Measure of flare size for a star: amplitude x half-width^power x per_unit."""
 
     of: Size
     power: int
-    per_unit: float
+    per_unit: float  # size of a flare of unit amplitude and a half-width of 1 s
 
     @classmethod
     def chosen(cls, study: Study, star: Star, source: Source) -> Sizes:
-        """By a study.
-
-        Raises
-        ------
-        InputError
-            For energies of a star of unknown size.
-        """
+        """Return the measure that a study chooses; raises InputError for energies of a star of unknown size."""
         asked = study.injections.of
         flare = study.flare
         bolometric = energy_scale(study, star, source, "bolometric", flare.temperature_k)
@@ -151,30 +121,32 @@ class Sizes:
         scale = energy_scale(study, star, source, kind, flare.temperature_k)
         if scale is None:
             raise InputError(
-                f"injections.of = {asked!r} at {source.name} of unknown size, expected the star's distance_pc or "
-                "radius_rsun and effective_temperature_k"
+                f"injections.of = {asked!r}, but the size of {source.name} is unknown, expected the star's "
+                "distance_pc, or radius_rsun and effective_temperature_k",
+                key="injections.of",
+                value=asked,
             )
         return cls(asked, 1, area * scale.erg_per_s)
 
     def of_amplitude(self, amplitude: Any, half_width_s: Any) -> Any:
-        """The size of amplitudes and half-widths, broadcast together."""
+        """Return the sizes of amplitudes and half-widths, broadcast together."""
         return amplitude * half_width_s**self.power * self.per_unit
 
     def amplitude(self, size: Any, half_width_s: Any) -> Any:
-        """The amplitude of sizes."""
+        """Return the amplitudes of sizes and half-widths, broadcast together."""
         return size / (half_width_s**self.power * self.per_unit)
 
 
-def sizes_of(study: Study, sizes: Sizes, unit_snr: float, threshold: float) -> NDArray[np.float64]:
-    """The sizes that a study injects, ascending; around what half are found of where the study does not tell."""
+def injected_sizes(study: Study, sizes: Sizes, unit_snr: float, threshold: float) -> NDArray[np.float64]:
+    """Return the sizes that a study injects, ascending; by default around a completeness of one half."""
     asked = study.injections
     widths = np.array([asked.half_width_low_s, asked.half_width_high_s])
     frames = widths / study.load_instrument().frame_s
-    # S/N of a known flare on a known level: (A / sigma) sqrt(square integral x half-width), of no more than its frames.
+    # S/N of a known flare on a known baseline: (A / sigma) sqrt(square integral x half-width in frames).
     amplitude = threshold / unit_snr / np.sqrt(shape_of(study.search.shape).square_integral * frames)
     half = sizes.of_amplitude(amplitude, widths)
-    low = AROUND[0] * half.min() if asked.low is None else asked.low
-    high = AROUND[1] * half.max() if asked.high is None else asked.high
+    low = DEFAULT_RANGE[0] * half.min() if asked.low is None else asked.low
+    high = DEFAULT_RANGE[1] * half.max() if asked.high is None else asked.high
     if not low < high:
-        raise InputError(f"injections from {low:.3g} to {high:.3g}, expected low below high")
+        raise InputError(f"injected sizes run from {low:.3g} to {high:.3g}, expected low below high")
     return np.geomspace(low, high, asked.sizes)

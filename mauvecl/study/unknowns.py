@@ -1,8 +1,8 @@
-"""What is unknown of the instrument, and the same with a flare and without: drawn from priors, and averaged over.
+"""Averages over unknown instrument values, which are constant and drawn from priors.
 
-An observer measures the instrument, and takes reference and threshold from it; while a proposal is written it is
-unknown. So each draw of the unknown values has its own reference and threshold, and a detection probability is the
-average.
+The instrument will be calibrated before observers choose reference and threshold, but is unknown when a proposal is
+written. Each draw of the unknown values therefore has its own reference and threshold, and detection probabilities are
+averaged over draws.
 """
 
 from __future__ import annotations
@@ -28,34 +28,26 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: What no unknown explains by a straight line.
+#: Name of the variance that no unknown explains linearly.
 REST = "the rest"
 
 
 @dataclass(frozen=True, eq=False)
 class DrawnStudies:
-    """Values of the unknown, one row a draw.
-
-    Attributes
-    ----------
-    names : tuple of str
-    values : ndarray, shape (n_draw, n_name)
-    studies : tuple of Study
-        The study on each draw's instrument, nothing unknown any more, with its part of the realisations.
-    """
+    """Draws of unknown instrument values."""
 
     names: tuple[str, ...]
-    values: Float
-    studies: tuple[Study, ...]
+    values: Float  # shape (n_draw, n_name)
+    studies: tuple[Study, ...]  # the study with each draw's instrument, without unknowns, and its share of realisations
 
 
 def drawn(study: Study) -> DrawnStudies:
-    """Draws from the study's priors, even in each of them (a Latin hypercube, seeded with the study's seed).
+    """Draw instrument values from a study's priors, as a Latin hypercube with the study's seed.
 
     Raises
     ------
     InputError
-        If a prior reaches where the instrument cannot be, or everything is known.
+        If a prior includes values that the instrument cannot have, or nothing is unknown.
     """
     from scipy.stats import qmc
 
@@ -70,28 +62,28 @@ def drawn(study: Study) -> DrawnStudies:
     for row in values:
         changes = dict(zip(priors, (float(v) for v in row), strict=True))
         if "qe_scale" in changes:
-            # It scales all light alike, as the area does.
+            # The collecting area has the same effect.
             changes["collecting_area_cm2"] = changes.pop("qe_scale") * area
         changed = certain.with_instrument(changes)
         try:
             changed.load_instrument()
         except InputError as error:
-            raise InputError(f"the priors of what is unknown reach too far: {error}") from error
+            raise InputError(f"the priors of unknown values include impossible ones: {error}") from error
         studies.append(changed)
     return DrawnStudies(tuple(priors), values, tuple(studies))
 
 
 def realisations_each(study: Study) -> int:
-    """Realisations for each draw: as many in all as asked for, but enough to count each draw's threshold."""
+    """Return the realisations per draw: an equal share, but enough to count the threshold of each draw."""
     run = study.run
     fewest = int(np.ceil(MIN_IN_TAIL / run.fap)) if run.tails == "counted" else 1000
     return max(run.realisations // study.unknowns.draws, fewest)
 
 
 def average(intervals: Sequence[Interval]) -> Interval:
-    """The mean of probabilities over draws of the unknown, with 95 % for their own errors and the number of draws.
+    """Return the mean of probabilities over draws, with a 95 % interval for their own errors and the number of draws.
 
-    Draws are even, so that the interval, made for independent ones, errs on the wide side.
+    The interval assumes independent draws and is therefore conservative for a Latin hypercube.
     """
     values = np.array([p.value for p in intervals])
     own = np.array([p.high - p.low for p in intervals]) / 2
@@ -103,11 +95,11 @@ def average(intervals: Sequence[Interval]) -> Interval:
 
 
 def shares(draws: DrawnStudies, outcome: Float) -> dict[str, float]:
-    """Share of an outcome's variance that each unknown explains, the largest first, and the rest; one in all.
+    """Return the share of an outcome's variance that each unknown explains, largest first, and the unexplained rest.
 
-    The shares are what each adds to a linear fit, averaged over all orders of adding them (Lindeman, Merenda & Gold
-    1980; Groemping 2007, doi 10.1198/000313007X188252): draws that are few are not quite independent, and single slopes
-    would count twice what two of them share. The rest, last, is what no straight line explains.
+    A share is the mean increase of the explained variance when the unknown is added to a linear fit, over all orders of
+    adding them (Lindeman, Merenda & Gold 1980; Groemping 2007, doi 10.1198/000313007X188252). Shares from single slopes
+    would count variance twice, since a few draws are correlated by chance.
 
     Parameters
     ----------
@@ -127,7 +119,7 @@ def shares(draws: DrawnStudies, outcome: Float) -> dict[str, float]:
     share = np.zeros(len(names))
     for some, value in explained.items():
         for k in set(range(len(names))) - set(some):
-            # So many orders have exactly these before it.
+            # Fraction of orders in which exactly these precede unknown k.
             weight = 1.0 / (len(names) * math.comb(len(names) - 1, len(some)))
             share[k] += weight * (explained[tuple(sorted((*some, k)))] - value)
     parts = {names[k]: float(share[k]) for k in np.argsort(-share)}
@@ -135,14 +127,14 @@ def shares(draws: DrawnStudies, outcome: Float) -> dict[str, float]:
 
 
 def _explained(x: Float, y: Float) -> float:
-    """Share of the variance that a linear fit explains."""
+    """Return the share of the variance that a linear fit explains."""
     straight = np.column_stack([x, np.ones(len(y))])
     left = y - straight @ np.linalg.lstsq(straight, y, rcond=None)[0]
     return float(1.0 - left.var() / y.var())
 
 
 def draws_table(draws: DrawnStudies, outcomes: dict[str, Float]) -> QTable:
-    """One row per draw: the unknown values, and what came of them."""
+    """Return a table with one row per draw: the drawn values and the outcomes."""
     from astropy.table import QTable
 
     table = QTable({name: draws.values[:, k] for k, name in enumerate(draws.names)})

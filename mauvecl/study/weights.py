@@ -1,4 +1,4 @@
-"""What a user brings in two columns: weights of a linear statistic, or the spectrum of something unknown."""
+"""Two-column files of users: weights of linear statistics, nuisance spectra, and curves."""
 
 from __future__ import annotations
 
@@ -17,20 +17,9 @@ if TYPE_CHECKING:
 
 
 def read_weights(name: str, path: Path, wavelength_nm: NDArray[np.float64]) -> Linear:
-    """A linear statistic from a file of wavelengths, nm, and weights per DN: straight between them, zero beyond.
+    """Read a linear statistic from a file of wavelengths, nm, and weights per DN.
 
-    Parameters
-    ----------
-    name : str
-        The statistic's.
-    path : Path
-    wavelength_nm : ndarray, shape (n_pixel,)
-        Of the pixels.
-
-    Raises
-    ------
-    InputError
-        If the file holds no such columns, a number that cannot be, or no weight for any pixel.
+    Weights are interpolated linearly and are 0 outside the file's range.
     """
     from mauvecl.statistics.linear import Linear
 
@@ -39,12 +28,7 @@ def read_weights(name: str, path: Path, wavelength_nm: NDArray[np.float64]) -> L
 
 
 def read_spectrum(name: str, path: Path, wavelength_nm: NDArray[np.float64]) -> NDArray[np.float64]:
-    """What an unknown amplitude of one adds to each pixel: wavelengths, nm, and DN of the exposure, as `read_weights`.
-
-    Returns
-    -------
-    ndarray, shape (n_pixel,)
-    """
+    """Read a nuisance spectrum from a file of wavelengths, nm, and DN per exposure, and interpolate it to pixels."""
     return _read_values(f"spectrum {shortened(path.name)} of {shortened(name)}", "DN", path, wavelength_nm)
 
 
@@ -53,18 +37,9 @@ def _read_values(what: str, kind: str, path: Path, wavelength_nm: NDArray[np.flo
 
 
 def read_columns(what: str, kind: str, path: Path) -> NDArray[np.float64]:
-    """Times and values from a file, shape (n, 2); # starts a comment.
+    """Read times and values from a file, shape (n, 2); # starts a comment.
 
-    Parameters
-    ----------
-    what, kind : str
-        What the file holds, and what its values are, for messages.
-    path : Path
-
-    Raises
-    ------
-    InputError
-        If it cannot be read or holds no two columns of numbers.
+    `what` names the content and `kind` the values in messages.
     """
     pairs = _columns(f"{what} {shortened(path.name)}", what, path)
     if pairs.ndim != 2 or pairs.shape[1] != 2:
@@ -78,13 +53,7 @@ def _columns(what: str, kind: str, path: Path) -> NDArray[np.float64]:
 
 
 def columns(what: str, text: str) -> NDArray[np.float64]:
-    """Numbers of a text's rows, shape (n, 2) where each has two.
-
-    Raises
-    ------
-    InputError
-        If there are no such rows.
-    """
+    """Parse rows of numbers, shape (n, 2) if each row has two."""
     with parsing(what, "two columns"):
         return np.array([[float(word) for word in row] for line in text.splitlines() if (row := _words(line))])
 
@@ -92,19 +61,15 @@ def columns(what: str, text: str) -> NDArray[np.float64]:
 def at_pixels(
     what: str, kind: str, rows: NDArray[np.float64], wavelength_nm: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Values between rows of wavelengths, nm, and values, straight between them, zero beyond; shape (n_pixel,).
+    """Interpolate values linearly to pixels, 0 outside their range, shape (n_pixel,).
 
     Parameters
     ----------
     what, kind : str
-        What holds them and what they are, for messages.
+        Names of the source and of its values, for messages.
     rows : ndarray, shape (n, 2)
+        Wavelengths, nm, and values.
     wavelength_nm : ndarray, shape (n_pixel,)
-
-    Raises
-    ------
-    InputError
-        If there are other columns, a number that cannot be, or nothing for any pixel.
     """
     if rows.ndim != 2 or rows.shape[1] != 2 or not np.all(np.diff(rows[:, 0]) > 0):
         raise InputError(

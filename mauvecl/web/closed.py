@@ -14,7 +14,7 @@ from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, u
 from mauvecl.host.errors import InputError
 from mauvecl.statistics.distributions import Gaussian, Mixture
 from mauvecl.statistics.registry import STATISTICS
-from mauvecl.study.labels import told
+from mauvecl.study.messages import collect_messages
 from mauvecl.web.fields import star_words
 from mauvecl.web.smooth import Smooth
 
@@ -95,7 +95,11 @@ class Closed:
     def messages(self) -> list[str]:
         """What the visitor must be told, worst first."""
         cost = unknown_cost("this flare", self.quiet, self.flare, self.study)
-        return [*told([self.quiet, self.flare]), *marginal_lines(self.study), *cost_lines([cost], self.study)]
+        return [
+            *collect_messages([self.quiet, self.flare]),
+            *marginal_lines(self.study),
+            *cost_lines([cost], self.study),
+        ]
 
     @property
     def words(self) -> str:

@@ -188,7 +188,7 @@ def test_refusals(stares):
         inject(study(star=[{"library": "G2V", "magnitude": 7.4}], injections={"of": "energy"}), stares)
     for section, key, value, match in (
         ("search", "half_widths_s", [20.0, 10.0], "ascending"),
-        ("search", "offset", False, "slope without"),
+        ("search", "offset", False, "without search.offset"),
         ("injections", "low", -1.0, "greater than 0"),
         ("injections", "half_width_low_s", 1e4, "above half_width_high_s"),
         ("search", "per", "week", "day"),
@@ -224,6 +224,7 @@ def test_sizes_may_be_energies():
 def test_a_size_that_a_star_has_not_is_told_before_any_is_searched(monkeypatch, stares):
     near = SMALL["star"][0]
     asked = study(star=[near, {**near, "distance_pc": None}], injections={"of": "energy"})
-    monkeypatch.setattr("mauvecl.answers.stares.inject.surveyed", lambda *_: pytest.fail("searched"))
-    with pytest.raises(InputError, match=r"injections\.of = 'energy' at G2V of unknown size"):
+    monkeypatch.setattr("mauvecl.answers.stares.inject.survey_star", lambda *_: pytest.fail("searched"))
+    with pytest.raises(InputError) as error:
         inject(asked, stares)
+    assert (error.value.key, error.value.value) == ("injections.of", "energy")

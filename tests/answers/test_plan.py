@@ -21,7 +21,7 @@ from mauvecl.lightcurve.search.completeness import Completeness
 from mauvecl.lightcurve.stares.along import stare_along
 from mauvecl.study.orbits import read_targets
 from mauvecl.study.spectral_types import nearest_spectrum, subtype
-from mauvecl.study.staring import stare_of
+from mauvecl.study.stare_expectation import stare_of
 
 #: Injections take ten seconds a target.
 QUICK = {"completeness": "closed form"}
@@ -143,7 +143,7 @@ def test_each_number_of_the_report_is_in_the_table_it_names(answer: PlanAnswer, 
 
 def test_what_is_missing_is_said(answer: PlanAnswer) -> None:
     told = " ".join(answer.messages)
-    assert "Flare rates of Denebola, of the type 'A3V', are not known beside an exponent of 1.3" in told
+    assert "Flare rates of Denebola, of the type 'A3V', are unknown except for an exponent of 1.3" in told
     assert "EK Dra is never seen" in told
     table = answer.table
     assert np.isnan(table["expected"][2])

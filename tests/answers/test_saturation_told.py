@@ -23,7 +23,7 @@ from mauvecl.device.engine import Engine
 from mauvecl.device.stares import Stares
 from mauvecl.host.errors import InputError
 from mauvecl.store.bulk import realise_file
-from mauvecl.study.labels import told
+from mauvecl.study.messages import collect_messages
 from mauvecl.study.study import Study
 
 Messages = Callable[[Study, Engine, Path], list[str]]
@@ -56,7 +56,7 @@ VERBS: dict[str, tuple[Messages, dict[str, Any]]] = {
     "stare": (lambda study, *_: list(stare(study, Stares()).messages), SHORT),
     "inject": (lambda study, *_: list(inject(study, Stares()).messages), SHORT),
     "realise": (
-        lambda study, engine, folder: told(
+        lambda study, engine, folder: collect_messages(
             [scene.expectation for scene in realise_file(study, folder / "frames.h5", engine).scenes]
         ),
         {},

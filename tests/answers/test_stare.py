@@ -18,7 +18,7 @@ from mauvecl.answers.stares.stare import StareAnswer, stare
 from mauvecl.device.engine import Engine
 from mauvecl.device.stares import Stares
 from mauvecl.host.errors import InputError
-from mauvecl.study.staring import stare_of
+from mauvecl.study.stare_expectation import stare_of
 from mauvecl.study.study import Study
 
 #: A G2V star for five minutes with a gap and a flare.
@@ -296,12 +296,15 @@ def test_unknowns_of_a_stare_are_drawn_where_asked_for():
         (["--gap", "20:10"], "a gap from 20 to 10 s, expected two times, ascending"),
         (["--duration", "-3"], "--duration -3.0, expected greater than 0"),
         (["--shape", "gauss"], "flare shape 'gauss' is unknown, expected one of davenport2014"),
-        (["--energy", "1e33"], "a flare of 1e+33 erg at K2.5V of unknown size, expected the star's distance_pc"),
+        (
+            ["--energy", "1e33"],
+            "amplitude of a flare of 1e+33 erg on K2.5V is unknown, expected the star's distance_pc",
+        ),
         (["--set", "stare.bands_nm=[[10,20]]"], "the band of 10 to 20 nm holds no pixel that is used"),
         (["--set", "stare.thermal.period_s=100"], "a curve has none or several of amplitude, points and file"),
         (["--set", "stare.jitters.star=0.1"], "a jitter of 'star', expected one of light, sky, temperature"),
         (["--set", "stare.variability.file='none.txt'"], "none.txt"),
-        (["--set", "processes.jitter.uniform=[0,0.05]"], "processes.jitter is of single exposures"),
+        (["--set", "processes.jitter.uniform=[0,0.05]"], "processes.jitter applies to single exposures only"),
         (
             ["--set", "events=[{peak_s=1, peak=1, amplitude=1}]"],
             "an event has amplitude and peak, expected one of them",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 from mauvecl.answers.report import json_text
-from mauvecl.study.labels import told
+from mauvecl.study.messages import collect_messages
 from mauvecl.study.study import Study
 
 
@@ -14,7 +14,7 @@ def test_closed_forms_that_rounding_spoils_are_told() -> None:
     asked = Study().with_changes({}, [{"library": "G2V", "magnitude": 12.0}])
     for settings, is_told in ((quiet, True), ((), False)):
         x, *_ = asked.with_settings(sorted(settings)).expectations(asked.star[0])
-        assert any("rounding to whole DN" in text for text in told([x])) == is_told
+        assert any("rounding to whole DN" in text for text in collect_messages([x])) == is_told
 
 
 def test_json_has_no_number_that_is_none() -> None:

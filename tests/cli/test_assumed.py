@@ -13,7 +13,7 @@ from marks import long_but
 from typer.main import get_command
 
 from mauvecl.cli.app import app
-from mauvecl.study.assumed import assumption_line
+from mauvecl.study.assumptions import assumption_line
 from mauvecl.study.study import Study
 
 USUAL = "instrument mauve, detector at 21 deg C; sky of V = 22.1 mag/arcsec2; "

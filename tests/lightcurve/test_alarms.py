@@ -8,19 +8,19 @@ import pytest
 from mauvecl.lightcurve.flares.events import Event, coefficients
 from mauvecl.lightcurve.search.alarms import LEFT_BEHIND, alarms
 from mauvecl.study.study import Study
-from mauvecl.study.surveys import Surveyed, surveyed
+from mauvecl.study.surveys import StarSurvey, survey_star
 
 #: One false alarm in a star-month at 4.91, by importance sampling, and so 5e-6 in an orbit at 6.
 THRESHOLD = 6.0
 
 
 @pytest.fixture(scope="module")
-def known() -> Surveyed:
+def known() -> StarSurvey:
     study = Study().with_settings(['star=[{library="G2V", magnitude=7.4}]', "search.half_widths_s=[22, 42, 77, 144]"])
-    return surveyed(study, study.star[0])
+    return survey_star(study, study.star[0])
 
 
-def drawn(known: Surveyed, events: list[Event], seed: int) -> np.ndarray:
+def drawn(known: StarSurvey, events: list[Event], seed: int) -> np.ndarray:
     """Sums of normal noise of covariance one, and of flares of the study's temperature."""
     stare = known.survey.stare
     flare = coefficients(events, stare.start_s, stare.frame_s, np.array([10_000.0]))
@@ -29,7 +29,7 @@ def drawn(known: Surveyed, events: list[Event], seed: int) -> np.ndarray:
     return known.survey.components.means(coefs) + noise
 
 
-def found(known: Surveyed, events: list[Event], seed: int = 1) -> list:
+def found(known: StarSurvey, events: list[Event], seed: int = 1) -> list:
     return alarms(known.survey, known.templates, drawn(known, events, seed), THRESHOLD)
 
 

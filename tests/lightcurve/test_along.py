@@ -74,7 +74,7 @@ def test_the_constructor_of_stares(orbit: Orbit, night: OrbitStare) -> None:
 
 def test_a_studys_stare(orbit: Orbit, night: OrbitStare) -> None:
     from mauvecl import Study
-    from mauvecl.study.staring import orbit_lines, stare_of
+    from mauvecl.study.stare_expectation import orbit_lines, stare_of
 
     study = Study().with_settings(
         ["stare.along_orbit=true", f"stare.duration_s={HOURS * 3600}", "orbit.targets=['eps Eri']",

@@ -8,23 +8,23 @@ import pytest
 from mauvecl.lightcurve.flares.events import Event, coefficients
 from mauvecl.lightcurve.search.alarms import Alarm, alarms
 from mauvecl.study.study import Study
-from mauvecl.study.surveys import Surveyed, surveyed
+from mauvecl.study.surveys import StarSurvey, survey_star
 
 #: One false alarm in a star-month.
 THRESHOLD = 4.92
 
 
-def survey_of(*settings: str) -> Surveyed:
+def survey_of(*settings: str) -> StarSurvey:
     study = Study().with_settings(['star=[{library="M3V", magnitude=9}]', *settings])
-    return surveyed(study, study.star[0])
+    return survey_star(study, study.star[0])
 
 
 @pytest.fixture(scope="module")
-def known() -> Surveyed:
+def known() -> StarSurvey:
     return survey_of()
 
 
-def found(known: Surveyed, events: list[Event], seed: int, threshold: float = THRESHOLD) -> list[Alarm]:
+def found(known: StarSurvey, events: list[Event], seed: int, threshold: float = THRESHOLD) -> list[Alarm]:
     """Alarms of one stare with normal noise, that of the flares' photons included."""
     stare, components = known.survey.stare, known.survey.components
     coefs = components.coefficients(stare, coefficients(events, stare.start_s, stare.frame_s, np.array([10_000.0])))

@@ -13,8 +13,8 @@ from mauvecl.host.stars.source import Source
 from mauvecl.lightcurve.flares.energies import EnergyScale, share_within
 from mauvecl.lightcurve.flares.events import Cooling, Event, coefficients, temperatures_of
 from mauvecl.study.sections import Flare, SkyLight, Star
-from mauvecl.study.stares import EventText
-from mauvecl.study.staring import energy_of, staring_of
+from mauvecl.study.stare_expectation import energy_of, expect_stare
+from mauvecl.study.stare_section import EventText
 from mauvecl.study.study import Study
 
 STARS = ("A0V", "A7V", "F5V", "G2V", "K1V", "K5V", "M0V", "M3V", "M5V", "Sun")
@@ -76,7 +76,7 @@ def test_drawn_light_carries_the_stated_energy(seed: int) -> None:
         ["stare.duration_s=120000"]
     )
     source = star.source()
-    staring, flares = staring_of(study, star)
+    staring, flares = expect_stare(study, star)
     kelvin = temperatures_of(flares)
     nm, sphere = source.wavelength_nm, 4 * np.pi * (star.distance_pc * u.pc).to_value(u.cm) ** 2
     spectra = [source.flaring(1.0, k, band=name).flux_flam - source.flux_flam for k in kelvin]

@@ -1,4 +1,4 @@
-"""Values that no study can mean: truth for a number, and a file that sets nothing."""
+"""Invalid values in studies: booleans as numbers, and files without keys."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mauvecl.study.study import Study
 
 
 def records(model: type[BaseModel]) -> Iterator[type[BaseModel]]:
-    """A model and all those that its fields hold."""
+    """Yield a model and all models of its fields."""
     yield model
     for field in model.model_fields.values():
         for inner in models_in(field.annotation):
@@ -34,7 +34,7 @@ def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
 
 
 def plain(annotation: Any) -> set[Any]:
-    """The types of single values in an annotation."""
+    """Return the types of single values in an annotation."""
     if get_origin(annotation) is Annotated:
         return plain(get_args(annotation)[0])
     parts = get_args(annotation)
@@ -53,7 +53,7 @@ NUMERIC = sorted(
 )
 
 
-def test_the_walk_finds_the_keys() -> None:
+def test_numeric_keys_are_found() -> None:
     names = {f"{model.__name__}.{name}" for model, name in NUMERIC}
     assert {"Star.bin_nm", "Flare.amplitudes", "Run.seed", "Instrument.read_noise_dn", "Axis.values"} <= names
     assert len(names) > 100
@@ -61,14 +61,14 @@ def test_the_walk_finds_the_keys() -> None:
 
 @pytest.mark.parametrize(("model", "name"), NUMERIC)
 @pytest.mark.parametrize("value", [True, False, np.True_, [True], [0.5, True], (False,)])
-def test_truth_is_no_number(model: type[Record], name: str, value: Any) -> None:
-    """Every numeric key of every section of studies and instruments; Python's and NumPy's truth, alone and in lists."""
+def test_booleans_as_numbers_raise(model: type[Record], name: str, value: Any) -> None:
+    """All numeric keys of studies and instruments reject booleans of Python and NumPy, alone and in lists."""
     with pytest.raises(ValidationError) as error:
         model.model_validate({name: value})
     assert any(fault["loc"][0] == name for fault in error.value.errors())
 
 
-def test_truth_is_no_number_wherever_it_is_given(tmp_path: Path) -> None:
+def test_booleans_in_settings_and_files_raise(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"star\.0\.bin_nm = True"):
         Study().with_settings(["star.0.bin_nm=true"])
     with pytest.raises(InputError, match=r"observation\.changes = "):
@@ -76,13 +76,13 @@ def test_truth_is_no_number_wherever_it_is_given(tmp_path: Path) -> None:
     study = tmp_path / "study.toml"
     study.write_text("[flare]\namplitudes = [true]\n", encoding="utf-8")
     assert "flare.amplitudes" in run("simulate", study, folder=tmp_path, code=2).stderr
-    # Truth itself stays.
+    # Boolean keys accept booleans.
     assert Study().with_settings(["orbit.simbad=true"]).orbit.simbad
 
 
 @pytest.mark.parametrize("text", ["", "\n\n", "# only a remark\n", "[flare]\n", "[run]\n[run.weights]\n"])
-def test_a_study_file_that_sets_nothing_is_refused(tmp_path: Path, text: str) -> None:
-    """The default study stays what verbs without a file, and `Study()`, have."""
+def test_study_file_without_keys_raises(tmp_path: Path, text: str) -> None:
+    """Only verbs without a study file and `Study()` use the default study."""
     study = tmp_path / "empty.toml"
     study.write_text(text, encoding="utf-8")
     with pytest.raises(InputError, match=r"empty\.toml.*sets nothing, expected at least one key"):

@@ -1,4 +1,4 @@
-"""What a study takes of each star: its photosphere, its magnitude; and that the sky is common to both hypotheses."""
+"""Photosphere and magnitude of each star of a study; the sky is the same under both hypotheses."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def flux(asked: Study, number: int) -> np.ndarray:
 
 
 def test_each_star_has_its_own_photosphere() -> None:
-    """The library's where nothing is said; a star's own before it; one of the flare's for all."""
+    """The default is the library's temperature; a star's own temperature overrides it, as does that of the flare."""
     both = study({"library": "G2V"}, {"library": "M3V"}, geometry="replaces")
     for number, (name, kelvin) in enumerate((("G2V", 5636.0), ("M3V", 3295.0))):
         star = Source.from_library(name).at_magnitude(8.0)
@@ -39,19 +39,19 @@ def test_each_star_has_its_own_photosphere() -> None:
     np.testing.assert_array_equal(flux(own, 0), flux(one, 0))
     assert not np.array_equal(flux(own, 0), flux(both, 0))
     assert Study.build(own.model_dump(), "again") == own
-    # Another star in its place brings its own.
+    # Another star has its own temperature.
     assert own.at("star", "M3V").star[0].effective_temperature_k is None
 
 
-def test_two_photospheres_of_one_star_are_refused() -> None:
-    with pytest.raises(InputError, match=r"star\.0 has its own beside it"):
+def test_two_photosphere_temperatures_raise() -> None:
+    with pytest.raises(InputError, match=r"photosphere_temperature_k and star\.0\.effective"):
         study(
             {"library": "G2V", "effective_temperature_k": 5000.0}, geometry="replaces", photosphere_temperature_k=5200.0
         )
 
 
 def test_the_sky_is_common_to_both_hypotheses(engine: Engine) -> None:
-    """What counts as signal changes no count of a detection; a sky 1000 times brighter makes it harder."""
+    """The definition of the signal does not affect detection; a sky 1000 times brighter makes it harder."""
     settings = [
         "run.realisations=20000",
         "run.fap=0.01",
@@ -70,22 +70,22 @@ def test_the_sky_is_common_to_both_hypotheses(engine: Engine) -> None:
     bright = detect(asked.with_settings(["sky.surface_brightness=14.6"]), engine).stars[0].detection
     seen, drowned = (found.detection_probability(0.01, "matched")[0].value for found in (net, bright))
     assert drowned < seen
-    # Without a flare nothing is seen of it: five standard errors of 200 alarms.
+    # The false-alarm probability is unchanged: within five standard errors of 200 alarms.
     assert bright.false_alarm_probability(net.threshold(0.01, "matched").value, "matched").value == pytest.approx(
         0.01, abs=5 * np.sqrt(2 * 0.01 / 20_000)
     )
 
 
 @pytest.mark.parametrize("verb", ["snr", "detect", "simulate", "exposure"])
-def test_a_star_without_a_magnitude_is_asked_for_it(verb: str, tmp_path: Any) -> None:
+def test_star_without_magnitude_raises(verb: str, tmp_path: Any) -> None:
     words = ["--snr", "10", "--at", "310"] if verb == "exposure" else []
     done = CliRunner().invoke(app, [verb, "--star", "G2V", *words, "--no-pictures", "-o", str(tmp_path / "out")])
-    told = done.stderr or str(done.exception)
+    message = done.stderr or str(done.exception)
     assert done.exit_code == 2 or isinstance(done.exception, InputError)
-    assert "the library keeps it at V = 0, expected a magnitude" in told
+    assert "the library keeps it at V = 0, expected a magnitude" in message
 
 
-def test_a_limiting_magnitude_needs_none(tmp_path: Any) -> None:
+def test_limiting_magnitude_needs_no_magnitude(tmp_path: Any) -> None:
     words = ["--star", "G2V", "-a", "0.3", "-n", "20000", "--fap", "0.01", "--statistic", "matched", "--no-pictures"]
     done = CliRunner().invoke(app, ["limit", *words, "-o", str(tmp_path / "out"), "--json"])
     assert done.exit_code == 0, done.output

@@ -1,4 +1,4 @@
-"""Studies that sweep: every combination or a list, in detections, limits and S/N; and the usual formula beside them."""
+"""Sweeps over products and lists in detection, limits and S/N, and comparison with the Gaussian formula."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from mauvecl.study.study import PAPER_BUDGETS, Study
 
 
 def study(axes: list[dict[str, Any]], how: str = "product", **changes: Any) -> Study:
-    """The paper's G2V star."""
+    """Return a study of the paper's G2V star."""
     data: dict[str, Any] = {
         "star": [{"library": "G2V", "magnitude": 7.4}],
         "flare": {"amplitudes": [0.1]},
@@ -71,7 +71,7 @@ def test_a_study_with_a_sweep_is_read_back(tmp_path: Any) -> None:
 
 
 def test_a_detection_of_each_cell_is_its_own(engine: Engine) -> None:
-    """Swept, or asked for alone: the same bits, with columns that say where."""
+    """A cell of a sweep has the same bits as the cell alone; columns give the swept values."""
     asked = study([MAGNITUDES, EXPOSURES])
     found = detect(asked, engine)
     assert list(found.table["magnitude"].value) == [6, 6, 9, 9]
@@ -86,7 +86,7 @@ def test_a_detection_of_each_cell_is_its_own(engine: Engine) -> None:
 
 
 def test_limits_over_a_sweep(engine: Engine) -> None:
-    """A colder detector and a longer exposure reach further."""
+    """A colder detector and a longer exposure have fainter limits."""
     axes = [{"quantity": "detector_temperature", "values": [13.0, 21.0]}, EXPOSURES]
     result = limiting_magnitude(study(axes), engine)
     table = result.table
@@ -100,7 +100,7 @@ def test_limits_over_a_sweep(engine: Engine) -> None:
 
 
 def test_the_papers_noise_budgets(engine: Engine) -> None:
-    """Three stars, 50 s and 600 s: the parts add up, photons rule the Be star, and the dark the G2V star."""
+    """For 50 s and 600 s, noise terms add up; photons dominate for the Be star and dark current for the G2V star."""
     found = snr(PAPER_BUDGETS.with_settings(["run.realisations=1000"]), engine)
     assert [s.result.expectation.exposure_s for s in found.stars] == [50.0] * 3 + [600.0] * 3
     table = found.noise_budget
@@ -110,7 +110,7 @@ def test_the_papers_noise_budgets(engine: Engine) -> None:
     for name, largest in (("B2IV V = 3.03", "source_photon"), ("G2V V = 7.4", "dark")):
         rows = table[blue & (table["star"] == name)]
         assert all(rows[largest].mean() >= rows[other].mean() for other in ("source_photon", "dark", "read"))
-    # Twelve times the frames, the root of twelve times the noise.
+    # Noise grows with the square root of the number of frames.
     short, long = (table[(table["exposure"].value == t) & (table["star"] == "G2V V = 7.4")] for t in (50, 600))
     np.testing.assert_allclose(long["total"] / short["total"], np.sqrt(12), rtol=1e-6)
 
@@ -127,7 +127,7 @@ def test_snr_grows_as_it_should(engine: Engine) -> None:
 
 
 def test_coverage_is_exact(engine: Engine) -> None:
-    """From the histograms as from the counts themselves; and as promised where the noise is normal."""
+    """Coverage from histograms equals that from the counts, and the nominal one for normal noise."""
     (quiet,) = star(exposure=5.0, payload=instrument(part=True))
     n = 20_000
     result = engine.snr(quiet, realisations=n, seed=4)
@@ -138,13 +138,13 @@ def test_coverage_is_exact(engine: Engine) -> None:
     direct = np.mean(np.abs(net - quiet.recorded_light_dn) <= sigma, axis=0)
     np.testing.assert_allclose(coverage(result), direct, atol=0.01)
     assert coverage(result).mean() == pytest.approx(direct.mean(), abs=5e-4)
-    # 198 pixels: the mean of so many is right to 2.4e-4, and a DN is 1/49 of sigma.
+    # The mean of 198 pixels has a standard error of 2.4e-4, and a DN is 1/49 of sigma.
     assert direct.mean() == pytest.approx(ONE_SIGMA, abs=5e-3)
 
 
 @pytest.mark.long
 def test_the_formula_holds_for_the_payload_and_fails_at_the_rail(engine: Engine) -> None:
-    """No false alarm or S/N is off for the nominal payload; a bias near zero clips, and everything is."""
+    """The formula holds for the nominal payload and fails with a bias near zero, which clips counts."""
     asked = study([MAGNITUDES, EXPOSURES])
     cells = gaussian_report(asked, engine).cells
     assert len(cells) == 4
@@ -161,11 +161,11 @@ def test_the_formula_holds_for_the_payload_and_fails_at_the_rail(engine: Engine)
 @pytest.mark.parametrize("temperature", [21.0, -30.0])
 @pytest.mark.parametrize("sigmas", [3.0, 5.0])
 def test_pixels_beyond_five_sigma(name: str, temperature: float, sigmas: float) -> None:
-    """The saddle point against the exact sum over dark counts, to 0.3 %: more above than a normal has, fewer below."""
+    """The saddle-point tail agrees with the exact sum over dark counts to 0.3 %; the distribution is skewed upward."""
     (quiet,) = star(exposure=5.0, payload=instrument(name, part=True, temperature_c=temperature))
     p, step = 90, float(quiet.dark_step_dn[90])
     poisson = quiet.photon_noise == "poisson"
-    # Photons and dark are then Poisson in electrons alike.
+    # Both photons and dark current are then Poisson in electrons.
     mean = quiet.dark_dn[p] / step + (quiet.source_electrons + quiet.sky_electrons)[p] * poisson
     goal = sigmas * np.sqrt(quiet.variance_dn2[p] - 1 / 12)
     photon = quiet.gain_dn_per_electron[p] * quiet.recorded_light_dn[p]
@@ -180,7 +180,7 @@ def test_pixels_beyond_five_sigma(name: str, temperature: float, sigmas: float) 
 
 @pytest.mark.long
 def test_every_column_is_described_and_every_answer_knows_its_study(engine: Engine) -> None:
-    """Tables of every kind of answer: a description for each column, and the study that is read back from each."""
+    """Every column of every answer has a description, and each table contains the study that made it."""
     asked = study([{"quantity": "sky", "values": [21.0, 22.0]}])
     plain = study([]).with_settings(
         ["map.x={quantity='magnitude',values=[7.0]}", "map.y={quantity='amplitude',values=[0.1]}"]

@@ -1,4 +1,4 @@
-"""What is unknown of the instrument: averages over it, and what matters most."""
+"""Averages over unknown instrument values, and their importance."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mauvecl.study.unknowns import REST, average, drawn, shares
 
 
 def study(unknowns: dict[str, Any], **changes: Any) -> Study:
-    """The paper's G2V star with a 24 % flare."""
+    """Return a study of the paper's G2V star with a 24 % flare."""
     data: dict[str, Any] = {
         "star": [{"library": "G2V", "magnitude": 7.4}],
         "flare": {"amplitudes": [0.24]},
@@ -51,8 +51,8 @@ def test_draws_follow_their_priors() -> None:
     np.testing.assert_array_equal(again.values, draws.values)
 
 
-def test_nothing_unknown_changes_nothing(engine: Engine) -> None:
-    """A prior without width gives the limit of the instrument as it is, draw for draw."""
+def test_prior_of_zero_width_changes_nothing(engine: Engine) -> None:
+    """A prior of zero width gives the limit of the nominal instrument."""
     averaged = limiting_magnitude(study(SURE | {"draws": 2}), engine)
     plain = limiting_magnitude(study({"draws": 0}), engine)
     (one,), (two,) = averaged.limits, plain.limits
@@ -63,8 +63,8 @@ def test_nothing_unknown_changes_nothing(engine: Engine) -> None:
 
 
 @pytest.mark.long
-def test_a_limit_over_the_unknown_has_the_power_on_average(engine: Engine) -> None:
-    """The closed form's mean is the power; harder instruments have brighter limits; one unknown explains most."""
+def test_limit_over_unknowns_has_the_power_on_average(engine: Engine) -> None:
+    """The mean of the closed form is the power; worse instruments have brighter limits; one unknown explains most."""
     asked = study({"draws": 24})
     result = limiting_magnitude(asked, engine)
     (limit,) = result.limits
@@ -75,7 +75,7 @@ def test_a_limit_over_the_unknown_has_the_power_on_average(engine: Engine) -> No
     assert found is not None
     low, high = found.range
     assert low < limit.value.value < high
-    # The average must be safe for most instruments, so that it lies on the bright side of their middle.
+    # The limit must hold for most instruments and is therefore brighter than the median.
     assert limit.closed_form < np.median(found.limits)
     by_name = dict(zip(found.draws.names, found.draws.values.T, strict=True))
     assert np.corrcoef(by_name["qe_scale"], found.limits)[0, 1] > 0.6
@@ -117,7 +117,7 @@ def test_a_map_is_the_mean_of_its_draws(engine: Engine) -> None:
     assert set(found.shares["matched"]) == {*drawn(asked).names, REST}
 
 
-def test_what_a_study_states_is_known() -> None:
+def test_values_of_the_study_are_known() -> None:
     stated = study({}, observation={"temperature_c": 15.0, "changes": {"light_loss": 0.3}})
     assert not {"temperature_c", "light_loss"} & set(drawn(stated).names)
     for unknowns, sentence in (
@@ -127,16 +127,16 @@ def test_what_a_study_states_is_known() -> None:
     ):
         with pytest.raises(InputError, match=sentence):
             study(unknowns)
-    with pytest.raises(InputError, match="everything is known"):
+    with pytest.raises(InputError, match="no instrument value is unknown"):
         drawn(study({"known": [*SURE["known"], "light_loss"]}))
-    with pytest.raises(InputError, match="the priors of what is unknown reach too far"):
+    with pytest.raises(InputError, match="the priors of unknown values include impossible ones"):
         drawn(study({"light_loss": {"uniform": [0.9, 1.2]}}))
 
 
 @pytest.mark.parametrize("of", ["magnitude", "amplitude", "exposure"])
 @pytest.mark.parametrize("geometry", ["added", "replaces"])
 def test_light_is_linear(of: str, geometry: str) -> None:
-    """What the closed form scales is what the host expects there."""
+    """The scaled expectation of the closed form equals the expectation of the host."""
     asked = study({"draws": 0}, limit={"of": of}).with_settings(
         [f"flare.geometry={geometry}", "flare.photosphere_temperature_k=5800"]
     )

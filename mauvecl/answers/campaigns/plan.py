@@ -27,7 +27,8 @@ from mauvecl.host.orbit.conditions import PARTICLES_SOURCE, THERMAL_SOURCE
 from mauvecl.host.tables import make_table
 from mauvecl.lightcurve.search.null import DAY_S
 from mauvecl.lightcurve.search.yields import Yield, recovered_per_day
-from mauvecl.study.labels import SATURATED, described, stacked, told
+from mauvecl.study.labels import describe_columns, stack_tables
+from mauvecl.study.messages import SATURATED, collect_messages
 from mauvecl.study.sections import Rays
 from mauvecl.study.study import Study
 
@@ -37,7 +38,7 @@ if TYPE_CHECKING:
     from mauvecl.device.stares import Stares
     from mauvecl.host.expectation import Expectation
     from mauvecl.runs.pool import Pool
-    from mauvecl.study.assumed import Use
+    from mauvecl.study.assumptions import Use
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +72,7 @@ class PlanAnswer(Answer):
             np.ma.MaskedArray(values, [value < 0 for value in values])
             for values in ([one.low for one in recovered], [one.high for one in recovered])
         )
-        return described(
+        return describe_columns(
             make_table(
                 [
                     ("target", [one.name for one in rows]),
@@ -152,7 +153,7 @@ class PlanAnswer(Answer):
             parts.append(({"target": one.name}, make_table(columns)))
         if not parts:
             return QTable({"target": np.array([], "U1"), "energy": np.array([]) * u.erg})
-        return stacked(parts, study=self.study.text())
+        return stack_tables(parts, study=self.study.text())
 
     @property
     def assumptions(self) -> Table:
@@ -237,7 +238,7 @@ class PlanAnswer(Answer):
     @property
     def messages(self) -> list[str]:
         """What saturates, which targets have no answer and why, what is extrapolated, what is said of visibility."""
-        lines = [text for text in told(self.inputs) if text.startswith(SATURATED)]
+        lines = [text for text in collect_messages(self.inputs) if text.startswith(SATURATED)]
         typical = [one.name for one in self.planned if one.rates is not None and "typical" in one.rates.source]
         if typical:
             lines.append(

@@ -18,7 +18,7 @@ from mauvecl.lightcurve.search.yields import Yield
 from mauvecl.study.orbits import PlanTarget
 from mauvecl.study.sections import SkyLight, Star
 from mauvecl.study.spectral_types import nearest_spectrum
-from mauvecl.study.staring import energy_scale
+from mauvecl.study.stare_expectation import energy_scale
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:

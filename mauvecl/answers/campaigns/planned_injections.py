@@ -14,7 +14,7 @@ from mauvecl.lightcurve.search.completeness import PER_DECADE, Completeness, Dur
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool
 from mauvecl.study.searches import InjectionQuestion
-from mauvecl.study.stares import CurveText
+from mauvecl.study.stare_section import CurveText
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:

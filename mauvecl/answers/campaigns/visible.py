@@ -19,7 +19,7 @@ from mauvecl.host.orbit.targets import Target
 from mauvecl.host.orbit.time_grid import DAY_S, TimeGrid
 from mauvecl.host.orbit.visibility import Visibility, Windows
 from mauvecl.host.tables import make_table
-from mauvecl.study.labels import described, stacked
+from mauvecl.study.labels import describe_columns, stack_tables
 from mauvecl.study.orbits import targets_of
 from mauvecl.study.study import Study
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
     from mauvecl.host.expectation import Expectation
-    from mauvecl.study.assumed import Use
+    from mauvecl.study.assumptions import Use
 
 Float = NDArray[np.float64]
 
@@ -126,7 +126,7 @@ class VisibleAnswer(Answer):
             ("faintest_sky", faintest, "zodiacal light at its faintest, V", sky),
         ]
         about = {"start": self.times.iso(0.0), "days": self.times.days}
-        return described(make_table(columns, **about, study=self.study.text()))
+        return describe_columns(make_table(columns, **about, study=self.study.text()))
 
     def _longest_gap_d(self, k: int) -> float:
         """Days without a window."""
@@ -162,7 +162,7 @@ class VisibleAnswer(Answer):
             )
             for k, one in enumerate(self.targets)
         )
-        return stacked(parts, study=self.study.text())
+        return stack_tables(parts, study=self.study.text())
 
     @property
     def window_table(self) -> QTable:
@@ -185,7 +185,7 @@ class VisibleAnswer(Answer):
             )
             for one, windows in zip(self.targets, self.windows, strict=True)
         )
-        return stacked(parts, study=self.study.text(), step_s=times.step_s)
+        return stack_tables(parts, study=self.study.text(), step_s=times.step_s)
 
     @property
     def assumptions(self) -> Table:

@@ -22,7 +22,8 @@ from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.statistics.distributions import QuadraticForm
 from mauvecl.statistics.linear import Linear, Matched
 from mauvecl.statistics.statistic import Setting
-from mauvecl.study.labels import label, put_first, stacked, told
+from mauvecl.study.labels import label, prepend_columns, stack_tables
+from mauvecl.study.messages import collect_messages
 from mauvecl.study.sections import Star
 from mauvecl.study.study import PAPER_STARS, Study
 from mauvecl.study.weights import read_weights
@@ -32,7 +33,7 @@ if TYPE_CHECKING:
 
     from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
-    from mauvecl.study.assumed import Use
+    from mauvecl.study.assumptions import Use
     from mauvecl.study.questions import CampaignQuestion
 
 
@@ -131,7 +132,7 @@ class DetectAnswer(Answer):
             # A flare's amplitude has its own column.
             swept = {name: value for name, value in star.at.items() if name != "amplitude"}
             parts.append(({"star": star.label, **swept}, table_of(star)))
-        return stacked(parts, study=self.study.text())
+        return stack_tables(parts, study=self.study.text())
 
 
 def _rocs(star: StarDetection) -> QTable:
@@ -144,7 +145,7 @@ def _rocs(star: StarDetection) -> QTable:
             for name in ("area", "area_low", "area_high"):
                 curve[name] = curve.meta.pop(name)
             curve["area"].info.description = "under the curve; 95 % interval by DeLong's method"
-            put_first(curve, {"statistic": statistic, "amplitude": amplitude})
+            prepend_columns(curve, {"statistic": statistic, "amplitude": amplitude})
             parts.append(curve)
     return vstack(parts)
 
@@ -159,7 +160,7 @@ def _tails(star: StarDetection) -> QTable:
             if star.detection.statistic(statistic).shaped or flare == 0:
                 kept.append((0.0, star.detection.tail_samples(statistic, template=flare)))
             for name, table in kept:
-                put_first(table, {"statistic": statistic, "amplitude": name, "template": amplitude})
+                prepend_columns(table, {"statistic": statistic, "amplitude": name, "template": amplitude})
                 parts.append(table)
     samples = vstack(parts)
     samples.meta["seed"] = star.detection.seed
@@ -203,7 +204,7 @@ def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
     blinding = [f"{text[:-1]} ({star.title})." for star in stars for text in star.detection.messages]
     blinding += [f"{t[:-1]} ({star.title})." for star in stars for t in star.detection.without_threshold(run.fap)]
     blinding += [f"{t[:-1]} ({star.title})." for star in stars for t in star.detection.lowered]
-    messages = [*blinding, *told([x for *_, group in prepared for x in group], study.processes.processes())]
+    messages = [*blinding, *collect_messages([x for *_, group in prepared for x in group], study.processes.processes())]
     errors = answer.table["fap_error"][np.isfinite(answer.table["fap_error"])]
     if not countable(run.fap, run.realisations) and errors.size:
         messages.append(

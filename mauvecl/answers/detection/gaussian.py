@@ -21,7 +21,7 @@ from mauvecl.host.arguments import public
 from mauvecl.host.tables import set_descriptions
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.results.snr import steps_of
-from mauvecl.study.labels import described
+from mauvecl.study.labels import describe_columns
 from mauvecl.study.quantities import UNITS
 from mauvecl.study.questions import Axis, Sweep
 from mauvecl.study.study import Study
@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
     from mauvecl.results.snr import SnrResult
     from mauvecl.runs.pool import Pool
-    from mauvecl.study.assumed import Use
+    from mauvecl.study.assumptions import Use
 
 #: Share of normal values within one standard deviation.
 ONE_SIGMA = float(special.ndtr(1.0) - special.ndtr(-1.0))
@@ -200,7 +200,7 @@ class GaussianReport(Answer):
             if axis.quantity in UNITS:
                 table[axis.quantity] = table[axis.quantity] * u.Unit(UNITS[axis.quantity])
         table.meta |= {"fap": self.study.run.fap, "study": self.study.text()}
-        return described(set_descriptions(table, WORST))
+        return describe_columns(set_descriptions(table, WORST))
 
 
 def _by_star(table: QTable, stars: int) -> list[QTable]:

@@ -15,7 +15,8 @@ from mauvecl.host.arguments import public
 from mauvecl.host.tables import make_table
 from mauvecl.results.requests.fap import check_fap
 from mauvecl.statistics.intervals import Interval
-from mauvecl.study.labels import SATURATED, described, label, told, worst_first
+from mauvecl.study.labels import describe_columns, label
+from mauvecl.study.messages import SATURATED, collect_messages, worst_first
 from mauvecl.study.quantities import OF_SPECTRUM, UNITS
 from mauvecl.study.study import Study
 from mauvecl.study.unknowns import average, drawn, shares
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
     from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
     from mauvecl.runs.pool import Pool
-    from mauvecl.study.assumed import Use
+    from mauvecl.study.assumptions import Use
 
 #: Quantities of the flare alone: cells that differ in them share their quiescent star, and one launch.
 OF_FLARE = ("amplitude", "flare_temperature", *OF_SPECTRUM)
@@ -88,14 +89,14 @@ class MapResult(Answer):
             realisations=self.study.run.realisations,
             study=self.study.text(),
         )
-        return described(table)
+        return describe_columns(table)
 
     ENDINGS = ("ecsv", "fits")
 
     @property
     def assumed(self) -> str:
         """One line with what the study assumes beside the two quantities of the map."""
-        from mauvecl.study.assumed import assumption_line
+        from mauvecl.study.assumptions import assumption_line
 
         return assumption_line(self.study, self.USES, (self.study.map.x.quantity, self.study.map.y.quantity))
 
@@ -169,7 +170,7 @@ def detection_map(
         messages=[
             *_blinded(values),
             *_without_threshold(study, values),
-            *worst_first([*told(seen, study.processes.processes()), *of_flares]),
+            *worst_first([*collect_messages(seen, study.processes.processes()), *of_flares]),
             *marginal_lines(study),
             *_cost(study, x, y),
         ],
@@ -235,7 +236,7 @@ def _map(
         quiet, flares = _expectations(study, [(x[i], y[j]) for i, j in cells])
         if not quiet.saturated.all():
             _fill(values, cells, study, quiet, flares, engine)
-        return quiet, len(cells), [text for text in told(flares) if text.startswith(SATURATED)]
+        return quiet, len(cells), [text for text in collect_messages(flares) if text.startswith(SATURATED)]
 
     done = 0
     for quiet, count, texts in map_in_order(engine, filled, _groups(study, x, y)):

@@ -13,14 +13,15 @@ from scipy import special
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import Cost, spoken, unknown_cost
 from mauvecl.host.tables import set_descriptions
-from mauvecl.study.labels import described, label, told
+from mauvecl.study.labels import describe_columns, label
+from mauvecl.study.messages import collect_messages
 from mauvecl.study.nuisances import NuisanceChoice
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
     from mauvecl.host.expectation import Expectation
-    from mauvecl.study.assumed import Use
+    from mauvecl.study.assumptions import Use
     from mauvecl.study.study import Study
 
 #: What is looked at where nothing else is named: METHODS' table, and more.
@@ -94,7 +95,7 @@ class UnknownTable(Answer):
         ]
         table = QTable(rows=rows, names=("star", "amplitude", "unknown", "known", "plain", "marginalised", "smallest"))
         table.meta |= {"fap": self.study.run.fap, "power": self.study.limit.power, "study": self.study.toml()}
-        return described(set_descriptions(table, DESCRIPTIONS))
+        return describe_columns(set_descriptions(table, DESCRIPTIONS))
 
     @property
     def tables(self) -> dict[str, Table]:
@@ -103,7 +104,7 @@ class UnknownTable(Answer):
 
     @property
     def messages(self) -> list[str]:
-        return told(list(self.quiets))
+        return collect_messages(list(self.quiets))
 
     @property
     def inputs(self) -> list[Expectation]:

@@ -9,7 +9,7 @@ from mauvecl.answers.limits.search import LimitSearch
 from mauvecl.host.arguments import public
 from mauvecl.host.tables import make_table
 from mauvecl.noise.processes import Uniform
-from mauvecl.study.labels import described
+from mauvecl.study.labels import describe_columns
 from mauvecl.study.sections import Star, Unknowns
 from mauvecl.study.study import Study
 
@@ -118,7 +118,7 @@ def what_matters(study: Study) -> QTable:
     )
     for name in (of, "at_low_end", "at_high_end", "span"):
         table[name].info.format = ".3f"
-    return described(table)
+    return describe_columns(table)
 
 
 def _moves(study: Study, star: Star, amplitude: float | None, statistic: str) -> list[Moved]:

@@ -17,7 +17,8 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.tables import make_table
 from mauvecl.results.requests.fap import check_fap
 from mauvecl.statistics.intervals import Interval
-from mauvecl.study.labels import SATURATED, described, label, stacked, told, worst_first
+from mauvecl.study.labels import describe_columns, label, stack_tables
+from mauvecl.study.messages import SATURATED, collect_messages, worst_first
 from mauvecl.study.quantities import UNITS
 from mauvecl.study.sections import Star
 from mauvecl.study.study import Study
@@ -29,7 +30,7 @@ if TYPE_CHECKING:
     from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
     from mauvecl.runs.pool import Pool
-    from mauvecl.study.assumed import Use
+    from mauvecl.study.assumptions import Use
 
 
 @dataclass(frozen=True)
@@ -158,7 +159,7 @@ class LimitResult(Answer):
                 ("its_share", [share for _, share in most], "share of the limits' variance that this unknown explains"),
             ]
         run = {"fap": self.study.run.fap, "realisations": self.study.run.realisations}
-        return described(make_table(columns, power=self.study.limit.power, **run, study=self.study.text()))
+        return describe_columns(make_table(columns, power=self.study.limit.power, **run, study=self.study.text()))
 
     @property
     def draws(self) -> QTable:
@@ -170,7 +171,7 @@ class LimitResult(Answer):
             amplitude = {} if np.isnan(one.amplitude) else {"amplitude": one.amplitude}
             swept = {k: v for k, v in one.at.items() if k != "amplitude"}
             parts.append(({"star": one.star, **swept, **amplitude, "statistic": one.statistic}, table))
-        return stacked(parts, study=self.study.text())
+        return stack_tables(parts, study=self.study.text())
 
     @property
     def tables(self) -> dict[str, Table]:
@@ -189,7 +190,7 @@ class LimitResult(Answer):
         stars = worst_first(
             [
                 *(text for one in self.limits for text in one.messages),
-                *told(self.inputs, self.study.processes.processes()),
+                *collect_messages(self.inputs, self.study.processes.processes()),
             ]
         )
         costs = [one.cost for one in self.limits if one.cost is not None]
@@ -250,7 +251,7 @@ def solve(
         curve=question.curve(value.value),
         at=at or {},
         unknown=question.unknown(theory) if isinstance(question, MarginalLimitSearch) else None,
-        messages=tuple(m for m in told([quiet, flare]) if m.startswith(SATURATED)),
+        messages=tuple(m for m in collect_messages([quiet, flare]) if m.startswith(SATURATED)),
         quiet=quiet,
         cost=unknown_cost(where, quiet, flare, question.study),
     )

@@ -20,8 +20,9 @@ from mauvecl.results.measurements.fit import LEVELS, Forecast, Measurement, fit,
 from mauvecl.results.measurements.model import FlareModel
 from mauvecl.results.measurements.reduction import Reduction, variance_of
 from mauvecl.statistics.intervals import clopper_pearson
-from mauvecl.study.labels import label, stacked, told
-from mauvecl.study.measuring import fitted_models
+from mauvecl.study.labels import label, stack_tables
+from mauvecl.study.measurements import fitted_models
+from mauvecl.study.messages import collect_messages
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -30,7 +31,7 @@ if TYPE_CHECKING:
     from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
     from mauvecl.statistics.nuisances import Nuisances
-    from mauvecl.study.assumed import Use
+    from mauvecl.study.assumptions import Use
     from mauvecl.study.sections import Star
 
 Float = NDArray[np.float64]
@@ -205,7 +206,7 @@ class MeasureAnswer(Answer):
             swept = {name: value for name, value in one.at.items() if name != "amplitude"}
             first: dict[str, Any] = {"star": one.label, **swept, "amplitude": one.amplitude, "model": one.model}
             parts.append((first, table_of(one)))
-        return stacked(parts, study=self.study.text())
+        return stack_tables(parts, study=self.study.text())
 
 
 @public
@@ -239,7 +240,7 @@ def measure(study: Study, engine: Engine, progress: Callable[[int, int], None] |
             done += 1
             if progress is not None:
                 progress(done, n)
-    messages = told([x for *_, group in prepared for x in group])
+    messages = collect_messages([x for *_, group in prepared for x in group])
     return MeasureAnswer(study, flares, [*messages, *_wrong(flares)])
 
 

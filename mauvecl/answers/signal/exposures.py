@@ -13,7 +13,8 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import number
 from mauvecl.host.ranges import DAY_S
 from mauvecl.host.tables import make_table
-from mauvecl.study.labels import described, label, told
+from mauvecl.study.labels import describe_columns, label
+from mauvecl.study.messages import collect_messages
 from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.sections import Star
 from mauvecl.study.study import Study
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
     from mauvecl.host.expectation import Expectation
-    from mauvecl.study.assumed import Use
+    from mauvecl.study.assumptions import Use
 
 Per = Literal["pixel", "element"]
 
@@ -78,7 +79,7 @@ class ExposureResult(Answer):
             ("saturated", "saturated", "whether the pixel, or one of the element, saturates in a single frame"),
         )
         made = ((name, [getattr(r, of) for r in self.exposures], *more) for name, of, *more in columns)
-        return described(make_table(made, study=self.study.text()))
+        return describe_columns(make_table(made, study=self.study.text()))
 
     @property
     def tables(self) -> dict[str, Table]:
@@ -159,7 +160,7 @@ def exposure_for(
     exposures, seen = zip(*answered, strict=True)
     long = [f"{e.star} needs more than a day: {np.ceil(e.exposure_s / DAY_S):.0f} exposures of a day at most, added up."
             for e in exposures if e.exposure_s > DAY_S]  # fmt: skip
-    messages = [*(f"NO ANSWER: {error}." for error in failed), *told(list(seen)), *long]
+    messages = [*(f"NO ANSWER: {error}." for error in failed), *collect_messages(list(seen)), *long]
     return ExposureResult(study, exposures, tuple(messages), seen)
 
 

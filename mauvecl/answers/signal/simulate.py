@@ -10,14 +10,15 @@ from mauvecl.answers.answer import Answer
 from mauvecl.host.arguments import public
 from mauvecl.host.quantities import count
 from mauvecl.noise.components import components
-from mauvecl.study.labels import described, label, told
+from mauvecl.study.labels import describe_columns, label
+from mauvecl.study.messages import collect_messages
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
     from mauvecl.host.expectation import Expectation
-    from mauvecl.study.assumed import Use
+    from mauvecl.study.assumptions import Use
 
 
 @dataclass(eq=False)
@@ -35,7 +36,7 @@ class SimulateAnswer(Answer):
     @property
     def assumed(self) -> str:
         """One line with what the study assumes, of flares too where the observations have any."""
-        from mauvecl.study.assumed import assumption_line
+        from mauvecl.study.assumptions import assumption_line
 
         flaring = len(self.observations) > len(self.study.star)
         return assumption_line(self.study, (*self.USES, "flare") if flaring else self.USES)
@@ -87,6 +88,6 @@ def simulate(study: Study, *, realisation: int = 0, flaring: bool = False) -> Si
             title = label(star, x) + (f", flare {100 * study.flare.amplitudes[i - 1]:g} %" if i else "")
             table = components(x, realisation=realisation, seed=study.run.seed, **study.drawing)
             table.meta["study"] = study.text()
-            observations.append((title, x, described(table)))
+            observations.append((title, x, describe_columns(table)))
         everything += xs
-    return SimulateAnswer(study, observations, told(everything, study.processes.processes()))
+    return SimulateAnswer(study, observations, collect_messages(everything, study.processes.processes()))

@@ -10,7 +10,8 @@ from mauvecl.answers.answer import Answer, InCell
 from mauvecl.answers.signal.exposures import place_of
 from mauvecl.host.arguments import public
 from mauvecl.runs.pool import Pool, map_in_order
-from mauvecl.study.labels import label, stacked, told
+from mauvecl.study.labels import label, stack_tables
+from mauvecl.study.messages import collect_messages
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
     from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
     from mauvecl.results.snr import SnrResult
-    from mauvecl.study.assumed import Use
+    from mauvecl.study.assumptions import Use
 
 
 #: Wavelengths of the elements that terminal and pictures show, nm; the tables hold all of them.
@@ -93,7 +94,7 @@ class SnrAnswer(Answer):
     def together(self, table_of: Callable[[SnrResult], QTable]) -> QTable:
         """A table of each star and cell as one, with the star and what is swept in front."""
         parts = (({"star": star.label, **star.at}, table_of(star.result)) for star in self.stars)
-        return stacked(parts, realisations=self.study.run.realisations, study=self.study.text())
+        return stack_tables(parts, realisations=self.study.run.realisations, study=self.study.text())
 
 
 @public
@@ -127,7 +128,10 @@ def snr(study: Study, engine: Engine | Pool) -> SnrAnswer:
     return SnrAnswer(
         study,
         stars,
-        [*told([x for _, _, x in prepared], study.processes.processes()), *filter(None, map(_cut_off, stars))],
+        [
+            *collect_messages([x for _, _, x in prepared], study.processes.processes()),
+            *filter(None, map(_cut_off, stars)),
+        ],
     )
 
 

@@ -22,10 +22,11 @@ from mauvecl.lightcurve.search.recoveries import Fitted, Refit
 from mauvecl.lightcurve.stares.requests import Arrays
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.statistics.intervals import Interval
-from mauvecl.study.labels import described, label, stacked, told
-from mauvecl.study.staring import orbit_lines, shifted_line
+from mauvecl.study.labels import describe_columns, label, stack_tables
+from mauvecl.study.messages import collect_messages
+from mauvecl.study.stare_expectation import orbit_lines, threshold_line
 from mauvecl.study.study import Study
-from mauvecl.study.surveys import Sizes, Surveyed, sizes_of, surveyed
+from mauvecl.study.surveys import Sizes, StarSurvey, injected_sizes, survey_star
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
@@ -33,7 +34,7 @@ if TYPE_CHECKING:
     from mauvecl.device.stares import Stares
     from mauvecl.host.expectation import Expectation
     from mauvecl.lightcurve.stares.requests import StaresRequest
-    from mauvecl.study.assumed import Use
+    from mauvecl.study.assumptions import Use
     from mauvecl.study.sections import Star
 
 Float = NDArray[np.float64]
@@ -54,7 +55,7 @@ class StarCompleteness(InCell):
 
     Attributes
     ----------
-    surveyed : Surveyed
+    surveyed : StarSurvey
     sizes : Sizes
     threshold : Interval
     simulated : Interval
@@ -77,7 +78,7 @@ class StarCompleteness(InCell):
     fitted : Fitted, optional
     """
 
-    surveyed: Surveyed
+    surveyed: StarSurvey
     sizes: Sizes
     threshold: Interval
     simulated: Interval
@@ -109,7 +110,7 @@ class StarCompleteness(InCell):
                 f"one at the threshold, {self.expected:.2g} should: set search.null = 'counted' with more search.nulls."
             )
         if self.shifted:
-            messages.append(shifted_line(self.title, self.threshold.value))
+            messages.append(threshold_line(self.title, self.threshold.value))
         if self.injected.amplitudes.max() > self.saturates:
             messages.append(
                 f"SATURATED: flares of {self.title} with an amplitude above {self.saturates:.3g} saturate a pixel, "
@@ -158,7 +159,7 @@ class InjectAnswer(Answer):
             "flare": f"{self.study.flare.light().describe()}, {choice.shape}, amplitudes in {self.study.flare.band}",
             "study": self.study.text(),
         }
-        return stacked(parts, **meta)
+        return stack_tables(parts, **meta)
 
     @property
     def tables(self) -> dict[str, Table]:
@@ -183,7 +184,7 @@ def _limits(star: StarCompleteness) -> QTable:
             (f"{name}_high", limits[2], "its 95 % interval, upper end", unit),
         ]
     text = "share of flares for which no template fits into what is observed"
-    return described(make_table([*columns, ("never", np.array([injected.never(k) for k in every]), text)]))
+    return describe_columns(make_table([*columns, ("never", np.array([injected.never(k) for k in every]), text)]))
 
 
 def _cells(star: StarCompleteness) -> QTable:
@@ -200,7 +201,7 @@ def _cells(star: StarCompleteness) -> QTable:
     ]
     if star.fitted is not None:
         columns += [(name, getattr(star.fitted, name)[d, s], text) for name, text in Fitted.COLUMNS.items()]
-    return described(make_table(columns))
+    return describe_columns(make_table(columns))
 
 
 def _search(star: StarCompleteness) -> QTable:
@@ -222,7 +223,7 @@ def _search(star: StarCompleteness) -> QTable:
         ("spectral_loss", float(star.surveyed.templates.loss.max()), "largest share of S/N lost to so few sums"),
         ("star_days", s.stare.observed_s / DAY_S, "star-days of a stare"),
     )
-    return described(make_table((name, [value], text) for name, value, text in rows))
+    return describe_columns(make_table((name, [value], text) for name, value, text in rows))
 
 
 @public
@@ -269,7 +270,7 @@ def inject(
     told_of(1.0)
     answer.messages = [
         *(text for star in answer.stars for text in star.messages),
-        *told(answer.inputs),
+        *collect_messages(answer.inputs),
         *orbit_lines(study),
     ]
     return answer
@@ -280,7 +281,7 @@ def _star(
 ) -> StarCompleteness:
     choice, asked, seed = study.search, study.injections, study.run.seed
     rays = study.processes.processes().cosmic_rays
-    known = surveyed(study, star)
+    known = survey_star(study, star)
     survey = known.survey
     drawn = None
     if choice.nulls:
@@ -291,7 +292,7 @@ def _star(
         tail.threshold(choice.rate) if choice.null == "sampled" or drawn is None else drawn.threshold(choice.rate)
     )
     sizes = Sizes.chosen(study, star, known.source)
-    values = sizes_of(study, sizes, known.unit_snr, threshold.value)
+    values = injected_sizes(study, sizes, known.unit_snr, threshold.value)
     positions = min(asked.positions, asked.count)
     injections = Injections(
         survey, 0, asked.half_widths_s, threshold.value, seed, positions, -(-asked.count // positions), rays

@@ -17,13 +17,14 @@ from mauvecl.host.tables import make_table
 from mauvecl.lightcurve.flares.energies import Kind
 from mauvecl.lightcurve.flares.events import Event, coefficients, temperatures_of
 from mauvecl.lightcurve.search.alarms import Alarm, alarms
-from mauvecl.lightcurve.stares.observed import Draw, Light, Staring, seen
+from mauvecl.lightcurve.stares.observed import Draw, Light, StareExpectation, seen
 from mauvecl.runs.checkpoint import kept
-from mauvecl.study.labels import described, label, stacked, told
-from mauvecl.study.stares import check_sweep
-from mauvecl.study.staring import energy_of, orbit_lines, shifted_line, stare_of, staring_of, unused_lines
+from mauvecl.study.labels import describe_columns, label, stack_tables
+from mauvecl.study.messages import collect_messages
+from mauvecl.study.stare_expectation import energy_of, expect_stare, orbit_lines, stare_of, threshold_line, unused_lines
+from mauvecl.study.stare_section import check_sweep
 from mauvecl.study.study import Study
-from mauvecl.study.surveys import surveyed
+from mauvecl.study.surveys import survey_star
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
@@ -35,9 +36,9 @@ if TYPE_CHECKING:
     from mauvecl.lightcurve.search.recovery import Recovered
     from mauvecl.results.sums import Arrays
     from mauvecl.runs.checkpoint import Checkpoint
-    from mauvecl.study.assumed import Use
+    from mauvecl.study.assumptions import Use
     from mauvecl.study.sections import Star
-    from mauvecl.study.surveys import Surveyed
+    from mauvecl.study.surveys import StarSurvey
 
 KINDS: tuple[Kind, ...] = ("band", "bolometric")
 #: Light curves in text, at most; longer ones are in their FITS files alone.
@@ -88,7 +89,7 @@ class Searched:
 class StarStare(InCell):
     """One star in one cell of the sweep; `searched` is a sentence where no search was possible."""
 
-    staring: Staring
+    staring: StareExpectation
     flares: tuple[Flaring, ...]
     light: Light
     searched: Searched | str | None = None
@@ -241,13 +242,13 @@ class StareAnswer(Answer):
 
     def _together(self, table_of: Callable[[StarStare], QTable]) -> QTable:
         parts = (({"star": one.label, **one.at}, table_of(one)) for one in self.stares)
-        return stacked(parts, study=self.study.text(), seed=self.study.run.seed)
+        return stack_tables(parts, study=self.study.text(), seed=self.study.run.seed)
 
     @property
     def tables(self) -> dict[str, Table]:
         """The stares, their flares, and a light curve of each."""
         curves = {
-            f"light-curve-{n}": described(self.light_curve(n - 1))
+            f"light-curve-{n}": describe_columns(self.light_curve(n - 1))
             for n, one in enumerate(self.stares, 1)
             if one.staring.stare.n_frames <= MOST_ROWS
         }
@@ -307,15 +308,15 @@ def stare(study: Study, stares: Stares, *, checkpoint: Checkpoint | None = None)
     if frames > MOST_SHOWN:
         raise InputError(f"a stare of {frames} frames, each with a spectrum, expected at most {MOST_SHOWN}")
     # Everything is looked at before anything is drawn: bad input shows at once.
-    prepared = [(star, at, cell, *staring_of(cell, star)) for at, cell in study.cells() for star in cell.star]
+    prepared = [(star, at, cell, *expect_stare(cell, star)) for at, cell in study.cells() for star in cell.star]
     drawn = [_drawn(study, stares, checkpoint, *one) for one in prepared]
-    messages = told([staring.quiet for _, _, _, staring, _ in prepared]) + orbit_lines(study)
+    messages = collect_messages([staring.quiet for _, _, _, staring, _ in prepared]) + orbit_lines(study)
     messages += dict.fromkeys(
         line for *_, cell, staring, events in prepared for line in unused_lines(cell, staring, events)
     )
     messages += [one.searched for one in drawn if isinstance(one.searched, str)]
     messages += [
-        shifted_line(one.title, one.searched.threshold)
+        threshold_line(one.title, one.searched.threshold)
         for one in drawn
         if isinstance(one.searched, Searched) and one.searched.shifted
     ]
@@ -333,7 +334,7 @@ def _drawn(
     star: Star,
     at: Mapping[str, float | str],
     cell: Study,
-    staring: Staring,
+    staring: StareExpectation,
     events: list[Event],
 ) -> StarStare:
     q, rays = study.stare, study.processes.processes().cosmic_rays
@@ -352,11 +353,11 @@ def _drawn(
 
 
 def _searched(
-    study: Study, star: Star, staring: Staring, events: list[Event], draw: Draw, checkpoint: Checkpoint | None
+    study: Study, star: Star, staring: StareExpectation, events: list[Event], draw: Draw, checkpoint: Checkpoint | None
 ) -> Searched | str:
     """What the study's search finds, or why it cannot be made."""
     try:
-        known = surveyed(study, star)
+        known = survey_star(study, star)
         survey = replace(known.survey, components=staring.components(known.templates.weights))
 
         def computed() -> Arrays:
@@ -391,7 +392,7 @@ def _event_of(study: Study, fit: Recovered) -> Event:
     return Event(float(fit.peak_s[0]), float(fit.half_width_s[0]), float(fit.amplitude[0]), kelvin, study.search.shape)
 
 
-def _log_energy(study: Study, star: Star, known: Surveyed) -> Factor | None:
+def _log_energy(study: Study, star: Star, known: StarSurvey) -> Factor | None:
     """Return the logarithm of the energy of a second of equivalent duration over that of the temperature, or None.
 
     None where the star's size is unknown, or a template's temperature gives no energy.
@@ -418,7 +419,7 @@ def _found_energy(study: Study, star: Star, source: Source, event: Event) -> flo
     return float("nan") if energy is None else energy
 
 
-def _flares(study: Study, star: Star, staring: Staring, events: list[Event]) -> tuple[Flaring, ...]:
+def _flares(study: Study, star: Star, staring: StareExpectation, events: list[Event]) -> tuple[Flaring, ...]:
     source, kelvin, frames = star.source(), temperatures_of(events), staring.stare
     flares = []
     for event in events:

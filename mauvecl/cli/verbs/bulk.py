@@ -73,10 +73,10 @@ def realise(study: Study, session: Session) -> None:
 
 def _tell(store: Store, place: Path, session: Session) -> None:
     from mauvecl.cli.console import show_table
-    from mauvecl.study.assumed import assumption_line
-    from mauvecl.study.labels import told
+    from mauvecl.study.assumptions import assumption_line
+    from mauvecl.study.messages import collect_messages
 
-    messages = told([scene.expectation for scene in store.scenes], store.study.processes.processes())
+    messages = collect_messages([scene.expectation for scene in store.scenes], store.study.processes.processes())
     assumed = assumption_line(store.study, ("instrument", "sky", "flare", "unknowns", "seed"))
     session.say([*messages, assumed])
     rows = [

@@ -38,7 +38,7 @@ LOOKED = {name: STARE[name] for name in ("gap", "orbit_gap", "thermal", "with_un
 
 
 def _day(_: dict[str, Any]) -> Study:
-    from mauvecl.study.stares import StareQuestion
+    from mauvecl.study.stare_section import StareQuestion
     from mauvecl.study.study import Study
 
     return Study(stare=StareQuestion(duration_s=DAY_S))

@@ -28,7 +28,7 @@ SATURATED = 1
 
 
 @dataclass(frozen=True, eq=False)
-class Staring:
+class StareExpectation:
     """A star, its flares and a stare, before anything is drawn.
 
     Attributes
@@ -155,12 +155,12 @@ class Light:
     element_nm: Float
 
 
-def seen(staring: Staring, bands_nm: Sequence[tuple[float, float]], draw: Draw) -> Light:
+def seen(staring: StareExpectation, bands_nm: Sequence[tuple[float, float]], draw: Draw) -> Light:
     """One stare in bands and resolution elements, all from the same draws of pixels.
 
     Parameters
     ----------
-    staring : Staring
+    staring : StareExpectation
     bands_nm : sequence of (float, float)
         From the first wavelength to before the last, nm; pixels that saturate count nowhere.
     draw : callable

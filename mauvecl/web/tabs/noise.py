@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.study.labels import label, stacked
+from mauvecl.study.labels import label, stack_tables
 from mauvecl.web.figures import Canvas
 from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
 
@@ -69,4 +69,4 @@ class Noise(Tab):
         """As `mauvecl snr` writes it; nothing of it is drawn."""
         study = closed.study
         parts = [({"star": label(study.star[0], closed.quiet)}, closed.quiet.noise_budget())]
-        return stacked(parts, realisations=study.run.realisations, study=study.text())
+        return stack_tables(parts, realisations=study.run.realisations, study=study.text())

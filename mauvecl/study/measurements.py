@@ -1,4 +1,4 @@
-"""What a study asks of a measurement."""
+"""Study section for measurements."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from mauvecl.study.part import Part
+from mauvecl.study.section import Section
 
 if TYPE_CHECKING:
     from mauvecl.study.study import Study
@@ -14,20 +14,20 @@ if TYPE_CHECKING:
 FittedModel = Literal["blackbody", "balmer", "lines"]
 
 
-class MeasureQuestion(Part):
-    """Which models are fitted to how many simulated exposures.
+class MeasureQuestion(Section):
+    """Models that are fitted to simulated exposures.
 
     Attributes
     ----------
     models : tuple of str
-        Fitted models, the simplest first: a blackbody, with a Balmer continuum, with lines too; by default those that
-        the flare's spectrum is made of, and each simpler one.
+        Fitted models, simplest first: a blackbody, with a Balmer continuum, and with lines; by default the model of the
+        flare's spectrum and all simpler ones.
     lines : tuple of str
-        Lines that are fitted; those of the flare's spectrum by default.
+        Fitted lines; by default those of the flare's spectrum.
     fits : int
-        Simulated exposures of each flare.
+        Number of simulated exposures per flare.
     bands_nm : tuple of tuple
-        Wavelengths between which the light is reported.
+        Wavelength ranges for which the flux is reported.
     """
 
     models: tuple[FittedModel, ...] = ()
@@ -49,7 +49,7 @@ class MeasureQuestion(Part):
 
 
 def fitted_models(study: Study) -> list[tuple[str, bool, tuple[str, ...]]]:
-    """Return each fitted model: its name, whether it has a Balmer continuum, and its lines."""
+    """Return the name of each fitted model, whether it has a Balmer continuum, and its lines."""
     asked, light = study.measure, study.flare.spectrum
     lines = asked.lines or tuple(dict.fromkeys((*light.lines, *light.line_fluxes)))
     models = list(asked.models)
@@ -59,7 +59,7 @@ def fitted_models(study: Study) -> list[tuple[str, bool, tuple[str, ...]]]:
     return [(name, name != "blackbody", lines if name == "lines" else ()) for name in dict.fromkeys(models)]
 
 
-def without_usual_measure(data: dict[str, Any], study: Study) -> None:
-    """Leave out of a study's text what it does not say of measurements."""
+def drop_default_measure(data: dict[str, Any], study: Study) -> None:
+    """Remove the section from a study's data if it has its default values, in place."""
     if study.measure == MeasureQuestion():
         del data["measure"]

@@ -1,4 +1,4 @@
-"""The line that says what an answer assumes, made from its study."""
+"""The line that states the assumptions of an answer."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ Use = Literal["instrument", "sky", "flare", "orbit", "unknowns", "seed"]
 
 
 def assumption_line(study: Study, uses: Collection[Use], varied: Collection[str] = ()) -> str:
-    """Return one line with what the study assumes of the parts that an answer uses.
+    """Return one line with the assumptions of a study about the parts that an answer uses.
 
     Parameters
     ----------
     study : Study
     uses : collection of str
-        Parts of the study, of `Use`.
+        Parts of the study; see `Use`.
     varied : collection of str
-        Quantities that the answer varies, next to those that the study sweeps.
+        Quantities that the answer varies in addition to those that the study sweeps.
     """
     swept = {axis.quantity for axis in study.sweep.axes} | set(varied)
     words: dict[Use, Callable[[], str]] = {
@@ -81,7 +81,7 @@ def _orbit(study: Study) -> str:
 
 
 def _unknowns(study: Study) -> str:
-    """Return what is unknown: what differs from draw to draw, what statistics marginalise over, and the instrument."""
+    """List the unknowns: those drawn, those marginalised over, and those of the instrument."""
     n, s = study.nuisances, study.stare
     named = [name for name in type(n).model_fields if name not in ("usual", "own") and getattr(n, name) is not None]
     drawn = [name.replace("_", " ") for name, value in study.processes if value is not None]

@@ -1,4 +1,4 @@
-"""What every section of a study is made of."""
+"""Base class of the sections of a study."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from mauvecl.host.records import Record
 
 
 def plain(key: str, given: Any) -> Any:
-    """What a study holds of a value: Quantities, times and places are kept as numbers and text."""
+    """Convert Quantities, times and coordinates to the numbers and text that a study stores."""
     if is_quantity(given):
         return numbers(key, given, unit_of(key)).tolist()
     if isinstance(given, list | tuple) and any(map(is_quantity, given)):
@@ -25,11 +25,11 @@ def plain(key: str, given: Any) -> Any:
     return given
 
 
-class Part(Record):
+class Section(Record):
     """A section of a study."""
 
     @field_validator("*", mode="before")
     @classmethod
     def _in_its_unit(cls, given: Any, info: ValidationInfo) -> Any:
-        """A Quantity as plain numbers in the unit of the key; other objects of astropy's as text."""
+        """Convert a Quantity to the unit of the key, and times and coordinates to text."""
         return plain(info.field_name or "", given)

@@ -1,4 +1,4 @@
-"""What a study's stare and flares come to for a star: frames, what is drawn of them, events with their sizes."""
+"""Expectation of a study's stare at a star: frames, unknown changes, and flares with their sizes."""
 
 from __future__ import annotations
 
@@ -12,10 +12,10 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.stars.flare import check_scales
 from mauvecl.lightcurve.flares.energies import EnergyScale, Kind, amplitude_of, amplitude_of_peak
 from mauvecl.lightcurve.flares.events import Cooling, Event, check_seen, coefficients, temperatures_of
-from mauvecl.lightcurve.stares.observed import Staring
+from mauvecl.lightcurve.stares.observed import StareExpectation
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.lightcurve.usual import CHANGING, Changing
-from mauvecl.study.stares import EventText
+from mauvecl.study.stare_section import EventText
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -23,13 +23,13 @@ if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
     from mauvecl.lightcurve.stares.curves import Curve
     from mauvecl.study.sections import Star
-    from mauvecl.study.stares import CurveText
+    from mauvecl.study.stare_section import CurveText
     from mauvecl.study.study import Study
 
 Float = NDArray[np.float64]
 
-#: What `nuisances.usual` draws of a stare, each with the reasons of `noise.usual.USUAL`: a thermal cycle of the orbit,
-#: light lost by pointing in each frame (uniform 0-5 %), the sky's level; and the star's own slow change, an assumption.
+#: Unknown changes of a stare under `nuisances.usual`, with the sources of `noise.usual.USUAL`: an orbital thermal
+#: cycle, pointing loss in each frame (uniform 0-5 %), the level of the sky, and slow variability of the star (assumed).
 USUAL_STARE: dict[str, dict[str, float]] = {
     "jitters": {"light": 0.05 / 12**0.5},
     "offsets": {"sky": 0.1},
@@ -39,18 +39,15 @@ USUAL_STARE: dict[str, dict[str, float]] = {
 
 
 def stare_of(study: Study) -> Stare:
-    """A study's stare: its frames, with everything that is known and unknown of them.
+    """Return the stare of a study.
 
-    Raises
-    ------
-    InputError
-        For a stare that cannot be, or processes that a stare has in a form of its own.
+    Raises InputError if the study has processes that only apply to single exposures.
     """
     processes = study.processes.processes()
     if processes.modulations:
         name, _ = processes.modulations[0]
         raise InputError(
-            f"processes.{name} is of single exposures, expected jitters, offsets, drifts or cycles of [stare]"
+            f"processes.{name} applies to single exposures only, expected jitters, offsets, drifts or cycles in [stare]"
         )
     q, instrument = study.stare, study.load_instrument()
     spreads: dict[str, dict[Changing, float]] = {
@@ -58,54 +55,47 @@ def stare_of(study: Study) -> Stare:
         for how in ("jitters", "offsets", "drifts", "cycles")
     }
     if study.nuisances.usual:
-        for how, usual in USUAL_STARE.items():
-            spreads[how] = {**usual, **spreads[how]}  # type: ignore[dict-item]
+        for how, documented in USUAL_STARE.items():
+            spreads[how] = {**documented, **spreads[how]}  # type: ignore[dict-item]
 
     def curve(name: str) -> Curve | None:
         text: CurveText | None = getattr(q, name)
         return None if text is None else text.curve(name, q.orbit_s)
 
-    what: dict[str, Any] = {name: curve(name) for name in ("variability", "throughput", "sky")} | spreads
-    what["orbit_s"] = q.orbit_s
+    changes: dict[str, Any] = {name: curve(name) for name in ("variability", "throughput", "sky")} | spreads
+    changes["orbit_s"] = q.orbit_s
     if q.along_orbit:
-        return _along(study, instrument.frame_s, what)
+        return _along_orbit(study, instrument.frame_s, changes)
     return Stare.of(
         q.duration_s,
         frame_s=instrument.frame_s,
         gaps=q.all_gaps(),
         temperature_c=instrument.temperature_c,
         thermal=curve("thermal"),
-        **what,
+        **changes,
     )
 
 
-def _along(study: Study, frame_s: float, what: dict[str, Any]) -> Stare:
-    """The stare as the orbit gives it, at the one target of the study's ``orbit`` from its start on.
-
-    Raises
-    ------
-    InputError
-        If there is not one target, or the study tells gaps or a thermal curve as well.
-    """
+def _along_orbit(study: Study, frame_s: float, changes: dict[str, Any]) -> Stare:
+    """Return the stare at the target of the study's ``orbit``, with gaps and temperatures along the orbit."""
     from mauvecl.study.orbits import targets_of
 
     q, o = study.stare, study.orbit
     if q.gaps or q.orbit_gap_s or q.thermal is not None:
-        raise InputError("stare.along_orbit beside gaps or a thermal curve, expected the orbit to give them")
+        raise InputError(
+            "stare.along_orbit is true and gaps or a thermal curve are given, expected neither, since both follow from "
+            "the orbit"
+        )
     targets = targets_of(study)
     if len(targets) != 1:
-        raise InputError(f"stare.along_orbit with {len(targets)} targets, expected one in orbit.targets")
-    return Stare.along(o.orbit(), targets[0], o.start, q.duration_s, frame_s=frame_s, limits=o.limits.limits(), **what)
+        raise InputError(f"stare.along_orbit is true with {len(targets)} targets, expected one in orbit.targets")
+    return Stare.along(
+        o.orbit(), targets[0], o.start, q.duration_s, frame_s=frame_s, limits=o.limits.limits(), **changes
+    )
 
 
-def staring_of(study: Study, star: Star) -> tuple[Staring, list[Event]]:
-    """A star of a study, its stare and its flares, and what frames are made of; the flares beside it.
-
-    Raises
-    ------
-    InputError
-        For anything of it that cannot be.
-    """
+def expect_stare(study: Study, star: Star) -> tuple[StareExpectation, list[Event]]:
+    """Compute the expectation of a study's stare at a star, and return it with its flares."""
     source, stare = star.source(), stare_of(study)
     events = events_of(study, star, source)
     check_seen(events, stare.start_s, stare.frame_s)
@@ -114,7 +104,7 @@ def staring_of(study: Study, star: Star) -> tuple[Staring, list[Event]]:
     frames = study.model_copy(
         update={"observation": study.observation.model_copy(update={"exposure_s": stare.frame_s})}
     )
-    # A flare that takes the place of photosphere is as linear in its amplitude, but not up to one.
+    # A flare that replaces photosphere is linear in its amplitude, but an amplitude of 1 may exceed the whole disc.
     unit = 1.0 if study.flare.geometry == "added" else 0.01
     flares = [
         frames.model_copy(update={"flare": study.flare.model_copy(update={"temperature_k": float(k)})}) for k in kelvin
@@ -122,11 +112,11 @@ def staring_of(study: Study, star: Star) -> tuple[Staring, list[Event]]:
     quiet, *flaring = frames.expect([source, *(one.flaring(source, unit) for one in flares)])
     electrons = [(x.source_electrons - quiet.source_electrons) / unit for x in flaring]
     spectra = np.reshape(electrons, (kelvin.size, quiet.wavelength_nm.size))
-    return Staring(quiet, stare, spectra, coefficients(events, stare.start_s, stare.frame_s, kelvin)), events
+    return StareExpectation(quiet, stare, spectra, coefficients(events, stare.start_s, stare.frame_s, kelvin)), events
 
 
-def unused_lines(study: Study, staring: Staring, events: Sequence[Event]) -> list[str]:
-    """Return what a study asks for that its stare does not show: an exposure, and flares that peak outside."""
+def unused_lines(study: Study, staring: StareExpectation, events: Sequence[Event]) -> list[str]:
+    """Return messages about settings without effect on the stare: the exposure, and flares that peak outside it."""
     exposure_s, frame_s = study.observation.exposure_s, staring.stare.frame_s
     lines = check_seen(events, staring.stare.start_s, frame_s)
     if exposure_s != frame_s:
@@ -137,7 +127,7 @@ def unused_lines(study: Study, staring: Staring, events: Sequence[Event]) -> lis
 
 
 def orbit_lines(study: Study) -> list[str]:
-    """What must be told of the orbit that a study's stare is along, if it is."""
+    """Return messages about the orbit of a stare with `along_orbit`."""
     from mauvecl.host.orbit.time_grid import DAY_S, TimeGrid
 
     if not study.stare.along_orbit:
@@ -150,8 +140,8 @@ def orbit_lines(study: Study) -> list[str]:
     return [*o.orbit().messages(times), assumed]
 
 
-def shifted_line(title: str, threshold: float) -> str:
-    """Return what must be told where a threshold allows for trends that the search leaves in."""
+def threshold_line(title: str, threshold: float) -> str:
+    """Return the message for a threshold that is raised because of trends that the search does not remove."""
     return (
         f"FALSE ALARMS of {title} come from what is unknown of the stare, too: the search does not marginalise over "
         "all of it (see search.cycle, slope, offset and window_s). The threshold of "
@@ -162,7 +152,7 @@ def shifted_line(title: str, threshold: float) -> str:
 def energy_scale(study: Study, star: Star, source: Source, kind: Kind, flare_k: float) -> EnergyScale | None:
     """Return the energy of flares of a temperature per second of equivalent duration.
 
-    By the star's distance where it is known, by its radius and temperature otherwise; None where neither is.
+    It follows from the star's distance or else from its radius and temperature; None if neither is known.
     """
     flare = study.flare
     how: dict[str, Any] = {
@@ -179,9 +169,9 @@ def energy_scale(study: Study, star: Star, source: Source, kind: Kind, flare_k: 
 def energy_of(
     study: Study, star: Star, source: Source, event: Event, kind: Kind, temperatures_k: Float | None = None
 ) -> float | None:
-    """Return the energy of a flare at a star, erg; None where the star's size and distance are unknown.
+    """Return the energy of a flare, erg, or None if the star's distance and radius are unknown.
 
-    `temperatures_k` are those from which the stare's flares are mixed, as `Event.total_energy` takes them.
+    `temperatures_k` are the temperatures between which flare spectra are interpolated; see `Event.total_energy`.
     """
     if energy_scale(study, star, source, kind, event.hottest_k) is None:
         return None
@@ -195,35 +185,34 @@ def energy_of(
 
 
 def events_of(study: Study, star: Star, source: Source) -> list[Event]:
-    """A study's flares at one of its stars: its `events`, or one of each energy or amplitude, evenly over the stare.
+    """Return the flares of a star: `events`, or one per energy or amplitude, evenly spaced over the stare.
 
-    Raises
-    ------
-    InputError
-        For an energy where neither the star's size nor its distance is known, or a flare that cannot be.
+    Raises InputError if an energy is given for a star of unknown distance and radius.
     """
-    texts = study.events or _spread(study)
+    texts = study.events or _evenly_spaced(study)
     events = [_event(study, text) for text in texts]
-    # What a flare that cools is mixed from depends on the temperatures of all flares.
+    # The spectrum of a cooling flare is interpolated between the temperatures of all flares.
     kelvin = temperatures_of(events)
     return [_of_energy(study, star, source, text, event, kelvin) for text, event in zip(texts, events, strict=True)]
 
 
-def _spread(study: Study) -> Sequence[EventText]:
+def _evenly_spaced(study: Study) -> Sequence[EventText]:
     q = study.stare
     sizes = [{"energy_erg": e} for e in q.energies_erg] or [{"amplitude": a} for a in study.flare.amplitudes]
-    # As much before the first as from one to the next.
+    # The time before the first flare equals the spacing.
     step = q.duration_s / (len(sizes) + 1)
     return [EventText(peak_s=step * (n + 1), **size) for n, size in enumerate(sizes)]
 
 
 def _event(study: Study, text: EventText) -> Event:
-    """Return a flare as it is given; of amplitude 1 where its energy is."""
-    shape, flare = text.form(study.stare.shape), study.flare
+    """Return a flare, with amplitude 1 if its energy is given."""
+    shape, flare = text.load_shape(study.stare.shape), study.flare
     half = study.stare.half_width_s if text.half_width_s is None else text.half_width_s
     kelvin = flare.temperature_k if text.temperature_k is None else text.temperature_k
     if text.cooling is not None and flare.spectrum.file is not None:
-        raise InputError("events.cooling with a flare's spectrum from a file, expected a flare that has a temperature")
+        raise InputError(
+            "events.cooling is given with a flare spectrum from a file, expected a flare that has a temperature"
+        )
     temperature = kelvin if text.cooling is None else Cooling(kelvin, text.cooling.end_k, text.cooling.fold_s)
     amplitude = flare.amplitudes[0] if text.amplitude is None else text.amplitude
     if text.peak is not None:
@@ -236,14 +225,14 @@ def _event(study: Study, text: EventText) -> Event:
 
 
 def _of_energy(study: Study, star: Star, source: Source, text: EventText, event: Event, temperatures_k: Float) -> Event:
-    """Return the flare with the amplitude for its energy, where that is given."""
+    """Return the flare with the amplitude that follows from its energy, if one is given."""
     if text.energy_erg is None:
         return event
-    # Any energy is linear in the amplitude.
+    # The energy is linear in the amplitude.
     one = energy_of(study, star, source, event, text.energy, temperatures_k)
     if one is None:
         raise InputError(
-            f"a flare of {text.energy_erg:g} erg at {source.name} of unknown size, expected the star's distance_pc "
-            "or radius_rsun and effective_temperature_k"
+            f"the amplitude of a flare of {text.energy_erg:g} erg on {source.name} is unknown, expected the star's "
+            "distance_pc, or radius_rsun and effective_temperature_k"
         )
     return replace(event, amplitude=text.energy_erg / one)

@@ -1,4 +1,4 @@
-"""The spectrum of a study's flare as data; `host.stars.flare_spectra` computes it."""
+"""Study section for the spectrum of a flare; `host.stars.flare_spectra` computes the spectrum."""
 
 from __future__ import annotations
 
@@ -8,41 +8,41 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 from pydantic import Field, model_validator
 
 from mauvecl.host.errors import InputError
-from mauvecl.study.part import Part
+from mauvecl.study.section import Section
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.flare_spectra import FlareSpectrum
 
-#: What only a spectrum from a file has, beside `file` itself.
-OF_FILE = ("quiescent", "wavelength_unit", "flux_unit", "continue_at_k")
-#: What only a blackbody has.
-OF_BLACKBODY = ("second_temperature_k", "second_area", "balmer_jump")
-#: Files that a study names; relative to its folder.
-FILES = ("file", "quiescent")
+#: Keys, other than `file`, that only apply to a spectrum from a file.
+FILE_KEYS = ("quiescent", "wavelength_unit", "flux_unit", "continue_at_k")
+#: Keys that do not apply to a spectrum from a file.
+BLACKBODY_KEYS = ("second_temperature_k", "second_area", "balmer_jump")
+#: Keys that hold paths, relative to the folder of the study file.
+PATH_KEYS = ("file", "quiescent")
 
 
-class FlareLight(Part):
-    """The light of a flare: one blackbody of `flare.temperature_k` unless something else is given.
+class FlareLight(Section):
+    """Spectrum of a flare; by default a blackbody of `flare.temperature_k`.
 
     Attributes
     ----------
     balmer_jump : float, optional
-        Flux just below the Balmer edge over that just above.
+        Ratio of the flux just below the Balmer edge to the flux just above it.
     electron_temperature_k : float
-        Of the Balmer continuum.
+        Electron temperature of the Balmer continuum.
     second_temperature_k, second_area : float, optional
-        A second blackbody, and its area over that of the first.
+        Temperature of a second blackbody, and the ratio of its area to that of the first.
     lines, line_fluxes : dict
-        Fluxes of lines by name or wavelength in nm: as a fraction of the continuum's flux in 200-700 nm, or at the
-        telescope in erg s-1 cm-2.
+        Line fluxes by name or wavelength in nm: as a fraction of the continuum flux in 200-700 nm, or at the telescope
+        in erg s-1 cm-2.
     line_scale : float
-        Factor of all lines.
+        Factor applied to all line fluxes.
     file, quiescent : Path, optional
-        Spectrum of a flare, and of its star without it, which is subtracted.
+        Spectrum of the star during a flare, and its quiescent spectrum, which is subtracted.
     wavelength_unit, flux_unit : str, optional
-        Override what these files state.
+        Units of these files; override the units that the files state.
     continue_at_k : float, optional
-        Temperature of a blackbody that continues the file's spectrum where it ends.
+        Temperature of a blackbody that extends the spectrum of the file.
     """
 
     balmer_jump: Annotated[float, Field(ge=1, le=100)] | None = None
@@ -60,10 +60,10 @@ class FlareLight(Part):
 
     @model_validator(mode="after")
     def _one_model(self) -> Self:
-        given = [key for key in OF_BLACKBODY if getattr(self, key) is not None]
+        given = [key for key in BLACKBODY_KEYS if getattr(self, key) is not None]
         if self.file is not None and given:
             raise ValueError(f"a flare's spectrum has file and {given[0]}, expected one of them")
-        own = [key for key in OF_FILE if getattr(self, key) is not None]
+        own = [key for key in FILE_KEYS if getattr(self, key) is not None]
         if self.file is None and own:
             raise ValueError(f"a flare's spectrum has {own[0]} without a file, expected both or neither")
         if (self.second_temperature_k is None) != (self.second_area is None):
@@ -73,17 +73,11 @@ class FlareLight(Part):
         if self.balmer_jump is not None and self.second_area is not None:
             raise ValueError("a flare's spectrum has balmer_jump and second_area, expected one of them")
         if self.file is None and self != FlareLight.model_construct():
-            self.form(10_000.0)
+            self.at_temperature(10_000.0)
         return self
 
-    def form(self, temperature_k: float) -> FlareSpectrum:
-        """Return the spectrum of a flare of a temperature, K, which that of a file has not.
-
-        Raises
-        ------
-        InputError
-            For a value that cannot be, or a file that holds no spectrum.
-        """
+    def at_temperature(self, temperature_k: float) -> FlareSpectrum:
+        """Return the spectrum at a temperature, which a spectrum from a file ignores."""
         from mauvecl.host.stars.flare_spectra import (
             BalmerFlare,
             Blackbody,
@@ -111,15 +105,11 @@ class FlareLight(Part):
         return FlareWithLines(light, *scaled)
 
     def with_value(self, key: str, value: Any) -> Self:
-        """Return the spectrum with one key changed.
-
-        Raises
-        ------
-        InputError
-            For a value that cannot be with the others, or one that changes nothing.
-        """
+        """Return a copy with one key changed; raises InputError if the key has no effect."""
         if key == "line_scale" and not (self.lines or self.line_fluxes):
-            raise InputError(f"line_scale = {value} of a flare without lines, expected some in flare.spectrum.lines")
+            raise InputError(
+                f"line_scale = {value} has no effect on a flare without lines, expected lines in flare.spectrum.lines"
+            )
         return type(self)(**(self.model_dump() | {key: value}))
 
     @property
@@ -127,18 +117,18 @@ class FlareLight(Part):
         return self.lines, self.line_fluxes
 
 
-def find_spectrum_files(data: dict[str, Any], folder: Path) -> None:
-    """Put the folder of a study before the names of its flare's files."""
+def resolve_spectrum_paths(data: dict[str, Any], folder: Path) -> None:
+    """Resolve the paths of the flare's files against a folder, in place."""
     flare = data.get("flare")
     spectrum = flare.get("spectrum") if isinstance(flare, dict) else None
     if isinstance(spectrum, dict):
-        for key in FILES:
+        for key in PATH_KEYS:
             if isinstance(spectrum.get(key), str):
                 spectrum[key] = str(folder / spectrum[key])
 
 
-def without_usual_spectrum(data: dict[str, Any], light: FlareLight) -> None:
-    """Leave out of a study's text what it does not say of the flare's spectrum; files by their full names."""
+def drop_default_spectrum(data: dict[str, Any], light: FlareLight) -> None:
+    """Remove default values of the flare's spectrum from a study's data and make its paths absolute, in place."""
     if light == FlareLight():
         del data["flare"]["spectrum"]
         return
@@ -146,6 +136,6 @@ def without_usual_spectrum(data: dict[str, Any], light: FlareLight) -> None:
     for key in ("lines", "line_fluxes"):
         if not spectrum[key]:
             del spectrum[key]
-    for key in FILES:
+    for key in PATH_KEYS:
         if key in spectrum:
             spectrum[key] = str(Path(spectrum[key]).resolve())

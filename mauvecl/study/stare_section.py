@@ -1,7 +1,4 @@
-"""A study's stare and the flares in it, as data: frames, gaps, what changes slowly, what is unknown; times and sizes.
-
-`staring` makes of it what is observed, and takes longer to load.
-"""
+"""Study sections for stares and the flares in them; `stare_expectation` converts them, and takes longer to import."""
 
 from __future__ import annotations
 
@@ -13,19 +10,19 @@ from pydantic import Field, model_validator
 
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.usual import ORBIT_S, check_shape
-from mauvecl.study.sections import Part
+from mauvecl.study.sections import Section
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.flares.shapes import Shape
     from mauvecl.lightcurve.stares.curves import Curve
     from mauvecl.study.study import Study
 
-#: One orbit in whole frames, s.
+#: Orbital period rounded down to a multiple of the frame time, s.
 ORBIT_FRAMES_S = 5680.0
 
 
-class CurveText(Part):
-    """What changes slowly: a sinusoid, points, or a file of two columns, time in s and value."""
+class CurveText(Section):
+    """Slow change with time: a sinusoid, points, or a file with two columns, time in s and value."""
 
     amplitude: float | None = None
     period_s: float | None = None
@@ -38,19 +35,13 @@ class CurveText(Part):
         if (self.amplitude is not None) + (self.points is not None) + (self.file is not None) != 1:
             raise ValueError("a curve has none or several of amplitude, points and file, expected one of them")
         if self.amplitude is None and (self.period_s is not None or self.phase):
-            raise ValueError("a curve of points has a period_s or phase, expected them beside an amplitude")
+            raise ValueError("a curve without amplitude has period_s or phase, expected them with an amplitude only")
         if self.file is None:
             self.curve("curve", ORBIT_S)
         return self
 
     def curve(self, name: str, orbit_s: float) -> Curve:
-        """As a stare takes it.
-
-        Raises
-        ------
-        InputError
-            For a file or points that are no curve.
-        """
+        """Return the curve for a stare."""
         import numpy as np
 
         from mauvecl.lightcurve.stares.curves import Sinusoid, Table
@@ -65,8 +56,8 @@ class CurveText(Part):
 Spreads = dict[Literal["star", "light", "sky", "temperature"], Annotated[float, Field(gt=0)]]
 
 
-class StareQuestion(Part):
-    """How long is looked, with which gaps; what changes and what is unknown; the flares where `events` names none."""
+class StareQuestion(Section):
+    """Duration and gaps of a stare, known and unknown changes during it, and its flares unless `events` are given."""
 
     duration_s: Annotated[float, Field(gt=0)] = ORBIT_FRAMES_S
     gaps: tuple[tuple[float, float], ...] = ()
@@ -102,11 +93,11 @@ class StareQuestion(Part):
 
     @property
     def has_unknowns(self) -> bool:
-        """Whether anything of the stare is unknown."""
+        """True if the stare has unknown changes."""
         return bool(self.jitters or self.offsets or self.drifts or self.cycles)
 
     def all_gaps(self) -> list[tuple[float, float]]:
-        """The gaps that are named, and the end of every orbit."""
+        """Return the given gaps and the gap at the end of every orbit."""
         every = [*self.gaps]
         if self.orbit_gap_s:
             orbits = math.ceil(self.duration_s / self.orbit_s)
@@ -114,41 +105,30 @@ class StareQuestion(Part):
         return every
 
 
-class CoolingText(Part):
-    """How a flare cools from its temperature on."""
+class CoolingText(Section):
+    """Exponential cooling of a flare from its initial temperature."""
 
     end_k: float
     fold_s: float
 
 
-class EventText(Part):
-    """One flare in time; sizes that are not given are the study's flare's.
+class EventText(Section):
+    """A flare at a given time; by default with the amplitude and temperature of the study's flare.
 
-    Attributes
-    ----------
-    peak_s, half_width_s : float
-    amplitude, peak, equivalent_duration_s, energy_erg : float, optional
-        The shape's amplitude, its highest value, or what both follow from; at most one of them.
-    energy : {"bolometric", "band"}
-        Which energy `energy_erg` is.
-    temperature_k : float, optional
-    cooling : CoolingText, optional
-    shape : str
-    shape_file : Path, optional
-        Two columns, time in half widths and value, in place of a published shape.
+    At most one of `amplitude`, `peak`, `equivalent_duration_s` and `energy_erg` is given.
     """
 
     peak_s: float
     half_width_s: Annotated[float, Field(gt=0)] | None = None
-    amplitude: Annotated[float, Field(ge=0)] | None = None
-    peak: Annotated[float, Field(ge=0)] | None = None
+    amplitude: Annotated[float, Field(ge=0)] | None = None  # amplitude of the shape
+    peak: Annotated[float, Field(ge=0)] | None = None  # maximum of the shape
     equivalent_duration_s: Annotated[float, Field(gt=0)] | None = None
     energy_erg: Annotated[float, Field(gt=0)] | None = None
-    energy: Literal["bolometric", "band"] = "bolometric"
+    energy: Literal["bolometric", "band"] = "bolometric"  # meaning of `energy_erg`
     temperature_k: float | None = None
     cooling: CoolingText | None = None
     shape: str | None = None
-    shape_file: Path | None = None
+    shape_file: Path | None = None  # two columns, time in half-widths and value, instead of a published shape
 
     @model_validator(mode="after")
     def _one_size(self) -> Self:
@@ -162,26 +142,20 @@ class EventText(Part):
             check_shape(self.shape)
         return self
 
-    def form(self, usual: str) -> Shape:
-        """Its shape."""
+    def load_shape(self, default: str) -> Shape:
+        """Return the shape, or the published shape named `default` if none is given."""
         from mauvecl.host.files.bounded import shortened
         from mauvecl.lightcurve.flares.shapes import TableShape, shape_of
         from mauvecl.study.weights import read_columns
 
         if self.shape_file is None:
-            return shape_of(self.shape or usual)
+            return shape_of(self.shape or default)
         columns = read_columns("flare shape", "values", self.shape_file)
         return TableShape(columns[:, 0], columns[:, 1], self.shape_file.stem, shortened(self.shape_file.name))
 
 
 def check_sweep(study: Study) -> None:
-    """See that what a study sweeps over changes its stares.
-
-    Raises
-    ------
-    InputError
-        For a quantity that does not.
-    """
+    """Raise InputError if a swept quantity has no effect on the stare."""
     sizes = ("amplitude", "peak", "equivalent_duration_s", "energy_erg")
     events = study.events
     fixed = {
@@ -195,12 +169,12 @@ def check_sweep(study: Study) -> None:
         if fixed.get(axis.quantity):
             raise InputError(
                 f"a sweep over {axis.quantity.replace('_', ' ')} changes no flare of this stare, expected a quantity "
-                "that its [stare] and events leave open"
+                "that [stare] and [[events]] do not fix"
             )
 
 
-def find_curves(data: dict[str, Any], folder: Path) -> None:
-    """Put the folder of a study before the names of its curves' and shapes' files."""
+def resolve_stare_paths(data: dict[str, Any], folder: Path) -> None:
+    """Resolve the paths of curves and shapes against a folder, in place."""
     stare, events = data.get("stare"), data.get("events")
     curves = [one for one in stare.values() if isinstance(one, dict)] if isinstance(stare, dict) else []
     shapes = [one for one in events if isinstance(one, dict)] if isinstance(events, list) else []
@@ -209,8 +183,8 @@ def find_curves(data: dict[str, Any], folder: Path) -> None:
             one[key] = str(folder / one[key])
 
 
-def without_usual(data: dict[str, Any], study: Study) -> None:
-    """Leave out of a study's text what it does not say of stares; files by their full names."""
+def drop_default_stare(data: dict[str, Any], study: Study) -> None:
+    """Remove default values of stare and events from a study's data and make its paths absolute, in place."""
     if study.stare == StareQuestion():
         del data["stare"]
     else:
@@ -219,4 +193,4 @@ def without_usual(data: dict[str, Any], study: Study) -> None:
                 del data["stare"][how]
     if not study.events:
         del data["events"]
-    find_curves(data, Path.cwd())
+    resolve_stare_paths(data, Path.cwd())
