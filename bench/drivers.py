@@ -27,13 +27,13 @@ import json, platform, sys
 import numpy
 from mauvecl.device import selftest
 from mauvecl.device.engine import Engine, devices
-from mauvecl.device.rate import chi2_rate
+from mauvecl.device.benchmark import chi2_rate
 for number, record in enumerate(devices()):
     if record.kind != "cpu" or record.platform == "Oclgrind":
         continue
     engine = Engine(str(number))
-    same = all(selftest.digests(engine, name) == selftest.twin_digests(name) for name in ("stack", "one frame"))
-    version = engine.opened.context.devices[0].platform.version
+    same = all(selftest.digests(engine, name) == selftest.reference_digests(name) for name in ("stack", "one frame"))
+    version = engine.open_device.context.devices[0].platform.version
     python = f"{platform.python_version()}, numpy {numpy.__version__}"
     rate = max(chi2_rate(engine) for _ in range(3))
     print(json.dumps([record.platform, record.driver, version, python, same, rate]), flush=True)

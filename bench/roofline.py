@@ -22,8 +22,8 @@ from rates import engine_lines
 from tables import write
 
 from mauvecl import Engine
+from mauvecl.device.device import VECTORS
 from mauvecl.device.kernel_cache import kernel_cache
-from mauvecl.device.opened import VECTORS
 
 PEAK = """
 typedef float float16_;
@@ -48,14 +48,14 @@ LOOPS = (("words", 8), ("normals", 8), ("statistic", 4 * VECTORS))
 
 def peak_rate(engine: Engine, turns: int = 3_000_000) -> float:
     """512-bit fused multiply-adds per second of the whole device."""
-    cl, items = engine.opened.cl, engine.device.compute_units
-    kernel = cl.Kernel(cl.Program(engine.opened.context, PEAK).build(), "peak")
-    out = cl.Buffer(engine.opened.context, cl.mem_flags.READ_WRITE, 4 * items)
+    cl, items = engine.open_device.cl, engine.device.compute_units
+    kernel = cl.Kernel(cl.Program(engine.open_device.context, PEAK).build(), "peak")
+    out = cl.Buffer(engine.open_device.context, cl.mem_flags.READ_WRITE, 4 * items)
     seconds = []
     for _ in range(7):
         start = time.perf_counter()
-        kernel(engine.opened.queue, (items,), (1,), np.uint32(turns), out)
-        engine.opened.queue.finish()
+        kernel(engine.open_device.queue, (items,), (1,), np.uint32(turns), out)
+        engine.open_device.queue.finish()
         seconds.append(time.perf_counter() - start)
     return items * turns * 24 / float(np.median(seconds))
 

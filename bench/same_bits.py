@@ -53,7 +53,7 @@ def main() -> int:
     output = parser.parse_args().output
     from mauvecl.device import selftest
 
-    twin = {name: selftest.twin_digests(name) for name in selftest.CASES}
+    twin = {name: selftest.reference_digests(name) for name in selftest.CASES}
     with tempfile.TemporaryDirectory() as folder:
         run = subprocess.run(
             [sys.executable, "-c", CHILD], env=vendors(Path(folder)), stdout=subprocess.PIPE, text=True, check=True

@@ -247,7 +247,7 @@ def main() -> None:
     for column, text in told.items():
         table[column].unit = "1 / s"
         table[column].info.format, table[column].info.description = ".3g", text
-    told: dict[str, Any] = {"device": stares.opened.record.label, "processor": processor()}
+    told: dict[str, Any] = {"device": stares.open_device.record.label, "processor": processor()}
     write(table, options.output, **told, pixels=payload(1).quiet.wavelength_nm.size, versions=versions())
 
 

@@ -13,9 +13,9 @@ from mauvecl import drawable
 from mauvecl.host.version import VERSION
 
 if sys.platform == "win32":
-    from mauvecl.device.drivers import sources
+    from mauvecl.device.drivers import driver_sources
 
-    raise ImportError(f"mauvecl does not run on Windows itself, expected {sources('Windows')}")
+    raise ImportError(f"mauvecl does not run on Windows itself, expected {driver_sources('Windows')}")
 
 if TYPE_CHECKING:
     from mauvecl.answers.campaigns.plan import plan

@@ -19,7 +19,7 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 
 PHILOX, NORMAL, POISSON = (f"kernels/{name}.cl.mako" for name in ("philox", "normal", "poisson"))
-TWIN = "mauvecl/noise/twin.py"
+TWIN = "mauvecl/noise/reference.py"
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ MUTATIONS = {
                 "nuisances.names[1:] if nuisances else ()))",
             ),
         ),
-        "tests/device/test_marginal.py::test_false_alarms_and_power_with_the_unknown_drawn[0.1]",
+        "tests/device/test_marginal.py::test_marginalised_statistics_keep_false_alarms_and_power[0.1]",
     ),
     "a sky that follows no level": Mutation(
         (("mauvecl/noise/pixels.py", "factors.light * factors.sky * share / light", "0.0 * share / light"),),
@@ -203,7 +203,7 @@ MUTATIONS = {
             ("kernels/histogram.cl.mako", "        signal -= (floatv)element.sky;\n", ""),
             ("mauvecl/results/numpy_kernels.py", '        signal = signal - element["sky"]\n', ""),
         ),
-        "tests/device/test_engine.py::test_snr_of_each_realisation_takes_the_sky_for_noise",
+        "tests/device/test_engine.py::test_snr_includes_photon_noise_of_sky",
     ),
     "carry of the index dropped between launches": Mutation(
         (("mauvecl/device/tiles.py", "np.uint32(self.first >> 32)", "np.uint32(0)"),),
@@ -242,7 +242,7 @@ MUTATIONS = {
     "priors' finer digits dropped": Mutation(
         (
             ("kernels/prior.cl.mako", "finer & (uintv)0x7fffffu", "finer & (uintv)0u"),
-            ("mauvecl/noise/twin.py", "finer & np.uint32(0x7FFFFF)", "finer & np.uint32(0)"),
+            ("mauvecl/noise/reference.py", "finer & np.uint32(0x7FFFFF)", "finer & np.uint32(0)"),
         ),
         "tests/kernels/test_prior.py::test_tails",
     ),
@@ -270,7 +270,7 @@ MUTATIONS = {
     ),
     "closed forms that follow a temperature by their means alone": Mutation(
         (("mauvecl/statistics/statistic.py", "seen.variance + more, scatter", "seen.variance, scatter"),),
-        "tests/device/test_marginal.py::test_closed_forms_integrate_over_what_is_drawn[half a degree]",
+        "tests/device/test_marginal.py::test_closed_forms_integrate_over_drawn_unknowns[half a degree]",
     ),
     "moved scores that count like others": Mutation(
         (("mauvecl/results/detection/tails.py", "np.log(2.0) - np.logaddexp(0.0, ratio)", "np.zeros(BLOCK)"),),

@@ -22,7 +22,7 @@ from mauvecl.host.version import VERSION
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from mauvecl.device.opened import Device
+    from mauvecl.device.device import Device
     from mauvecl.host.expectation import Expectation
     from mauvecl.runs.pool import Pool
     from mauvecl.study.study import Study
@@ -169,15 +169,16 @@ def write_record(
     }
     if pool is not None or opened is not None:
         # What the self-test found on these devices, if the user has run it.
-        from mauvecl.device.selftest import last
 
         devices = pool.devices if pool is not None else [opened.record] if opened is not None else []
         record["devices"] = [asdict(device) for device in devices]
         record["kernels"] = (pool or opened).kernel_digest  # type: ignore[union-attr]
         if pool is not None:
             record["shards"] = asdict(pool.standing)
+        from mauvecl.device.selftest import read_outcome
+
         told = "not run on this device and version: mauvecl selftest"
-        record["selftest"] = [last(device) or told for device in devices]
+        record["selftest"] = [read_outcome(device) or told for device in devices]
     stale: list[Path] = []
     if files is not None:
         record["files"] = {path.name: digest_of(path) for path in files}

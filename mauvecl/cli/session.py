@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from mauvecl.answers.answer import Answer
     from mauvecl.cli.console import Meter
-    from mauvecl.device.opened import Device
+    from mauvecl.device.device import Device
     from mauvecl.host.expectation import Expectation
     from mauvecl.runs.checkpoint import Checkpoint
     from mauvecl.runs.pool import Pool, Workers

@@ -1,4 +1,4 @@
-"""Where it is computed: devices, programs, kernel cache, launches, engine, self-test.
+"""OpenCL devices: programs, kernel cache, launches, engine and self-test.
 
-Only this room imports pyopencl.
+Only this package imports pyopencl.
 """

@@ -1,10 +1,10 @@
-"""Where OpenCL drivers come from, by operating system."""
+"""Sources of OpenCL drivers for each operating system."""
 
 from __future__ import annotations
 
 import platform
 
-#: By system and machine, as Python's `platform` spells them; "" stands for every other machine.
+#: Sources by system and machine, as Python's `platform` spells them; "" stands for every other machine.
 SOURCES = {
     ("Linux", "x86_64"): (
         "`pip install 'pyopencl[pocl]'` (PoCL, for processors)",
@@ -27,14 +27,8 @@ SOURCES = {
 }
 
 
-def sources(system: str | None = None, machine: str | None = None) -> str:
-    """Return where drivers for a machine come from, as the end of a sentence.
-
-    Parameters
-    ----------
-    system, machine : str, optional
-        As `platform.system` and `platform.machine` spell them; this machine's by default.
-    """
+def driver_sources(system: str | None = None, machine: str | None = None) -> str:
+    """Return the sources of drivers for a machine, by default this one, as the end of a sentence."""
     system = platform.system() if system is None else system
     machine = platform.machine() if machine is None else machine
     found = SOURCES.get((system, machine)) or SOURCES.get((system, "")) or SOURCES["", ""]

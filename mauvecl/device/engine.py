@@ -1,4 +1,4 @@
-"""Draw what is asked on an OpenCL device and bring back only what was reduced there."""
+"""Engine that draws realisations on an OpenCL device and returns what is reduced there."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Any, Unpack
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.device.device import Device
 from mauvecl.device.errors import DeviceError
-from mauvecl.device.forms import ELEMENT_CHUNK, detection_launches, scene_launches
-from mauvecl.device.opened import Device
 from mauvecl.device.program import DeviceRecord, devices
 from mauvecl.device.stares import Stares
 from mauvecl.device.tiles import Progress, Tile, Tiles
+from mauvecl.device.variants import ELEMENT_CHUNK, detection_launches, scene_launches
 from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.stares.requests import StaresRequest
@@ -48,23 +48,23 @@ __all__ = ["DeviceError", "DeviceRecord", "Engine", "devices"]
 
 @public
 class Engine:
-    """Draws realisations on an OpenCL device and reduces them there.
+    """Engine that draws realisations on an OpenCL device and reduces them there.
 
     Parameters
     ----------
     device : str, optional
-        Number, or part of a platform's or device's name, as `devices` lists them; PoCL on the CPU by default.
+        Number, or part of the platform's or device's name, as listed by `devices`; PoCL on the CPU by default.
     progress : callable, optional
         Called as ``progress(done, total)`` before and between tiles, in realisations. It may raise to stop the work.
     tile : int, optional
-        Realisations in one launch, for tests; chosen from the device and the work by default. Never changes a result.
+        Realisations per launch, for tests; by default chosen from the device and the work. Does not affect results.
     width : int, optional
-        Realisations in one work-item, for tests: 16 on CPUs, 1 elsewhere. Never changes a result.
+        Realisations per work-item, for tests; by default 16 on CPUs and 1 elsewhere. Does not affect results.
 
     Raises
     ------
     DeviceError
-        If there is no such device, or PoCL cannot work here.
+        If there is no such device, or its driver does not work.
 
     Examples
     --------
@@ -90,28 +90,28 @@ class Engine:
         tile: int | None = None,
         width: int | None = None,
     ) -> None:
-        self.opened = Device(device, width=width)
-        self._tiles = Tiles(self.opened, progress=progress, largest=tile)
+        self.open_device = Device(device, width=width)
+        self._tiles = Tiles(self.open_device, progress=progress, largest=tile)
 
     @property
     def device(self) -> DeviceRecord:
-        """What drew, for run records."""
-        return self.opened.record
+        """Record of the device, for run records."""
+        return self.open_device.record
 
     @property
     def device_name(self) -> str:
-        """Platform and device."""
+        """Platform and device name."""
         return self.device.label
 
     @property
     def driver(self) -> str:
-        """The driver's version."""
+        """Version of the driver."""
         return self.device.driver
 
     @property
     def kernel_digest(self) -> str:
         """Short sha256 of the kernels rendered so far, for run records."""
-        return self.opened.kernel_digest
+        return self.open_device.kernel_digest
 
     def realise(
         self,
@@ -123,29 +123,24 @@ class Engine:
         out: NDArray[Any] | None = None,
         **drawing: Unpack[DrawingWords],
     ) -> NDArray[Any]:
-        """Raw spectra, each addressed by its realisation index alone.
+        """Draw raw spectra, each of which depends only on the seed and its realisation index.
 
         Parameters
         ----------
         expectation : Expectation
         start, count : int
-            Realisations start to start + count - 1.
+            Range of realisations, `start` to `start + count - 1`.
         seed : int
             0 to 2**64 - 1.
         out : ndarray, shape (count, n_pixel), optional
-            Where to write, contiguous and of the type below.
+            Contiguous array to fill, of the type below.
         mode, recipe, processes, first_frame
             See `Drawing`.
 
         Returns
         -------
         ndarray of uint16 or int32, shape (count, n_pixel)
-            Raw DN, summed over the exposure's frames: 16 bits where it is one frame of a 16-bit ADC.
-
-        Raises
-        ------
-        InputError
-            For an impossible range, seed or mode.
+            Raw DN, summed over the exposure's frames: 16 bits for one frame of a 16-bit ADC.
         """
         return self.realise_and_count(expectation, start=start, count=count, seed=seed, out=out, **drawing)[0]
 
@@ -159,12 +154,14 @@ class Engine:
         out: NDArray[Any] | None = None,
         **drawing: Unpack[DrawingWords],
     ) -> tuple[NDArray[Any], NDArray[np.uint32]]:
-        """`realise`, with the number of clipped samples of each realisation: pixels times frames that met a rail.
+        """Draw raw spectra and count their clipped samples; parameters as for `realise`.
 
         Returns
         -------
         raw : ndarray of uint16 or int32, shape (count, n_pixel)
+            Raw DN.
         clipped : ndarray of uint32, shape (count,)
+            Number of samples (pixels times frames) clipped at zero or saturation.
         """
         start, count, seed = self._checked(start, count, seed)
         scene = prepare([expectation_of("what is drawn", expectation)], **drawing)
@@ -183,13 +180,13 @@ class Engine:
             )
         clipped = np.empty(count, np.uint32)
         rows = out
-        with scene_launches(self.opened, scene, seed, row_type="ushort" if narrow else "int") as launches:
+        with scene_launches(self.open_device, scene, seed, row_type="ushort" if narrow else "int") as launches:
 
             def work(tile: Tile, done: int) -> None:
                 there = slice(done, done + tile.wanted)
                 clipped[there] = launches.realise(tile, rows[there])
 
-            self._tiles.over(start, count, scene.n_pixel * dtype.itemsize, work)
+            self._tiles.for_each(start, count, scene.n_pixel * dtype.itemsize, work)
         return out, clipped
 
     def snr(
@@ -201,7 +198,7 @@ class Engine:
         start: int = 0,
         **drawing: Unpack[DrawingWords],
     ) -> SnrResult:
-        """Distributions of the S/N per pixel and per resolution element (METHODS section 5).
+        """Simulate the distributions of S/N per pixel and per resolution element (METHODS section 5).
 
         Parameters
         ----------
@@ -213,11 +210,6 @@ class Engine:
             First realisation.
         mode, recipe, processes, first_frame
             See `Drawing`.
-
-        Raises
-        ------
-        InputError
-            For an impossible number, seed or mode.
         """
         request = SnrRequest(expectation, realisations, seed, start, Drawing(**drawing))
         sums = SnrSums(request)
@@ -225,20 +217,20 @@ class Engine:
         return sums.answer()
 
     def count(self, request: Countable, shard: Shard, *, out: NDArray[Any] | None = None) -> Arrays:
-        """What a shard of a request comes to, as `sums` adds it up.
+        """Compute the sums of one shard of a request, as accumulated by `results.sums`.
 
         Parameters
         ----------
         request : DetectRequest, SnrRequest, RealiseRequest or StaresRequest
         shard : Shard
-            `shards.shards` cuts requests into them.
+            One of the shards into which `shards.shards` divides the request.
         out : ndarray, optional
             As for `realise`.
 
         Returns
         -------
         dict of str to ndarray
-            Raw spectra as ``rows``.
+            Raw spectra are ``rows``.
         """
         match request:
             case DetectRequest():
@@ -251,16 +243,16 @@ class Engine:
                 rows = self.realise(x, start=shard.start, count=shard.count, seed=seed, out=out, **how)
                 return {"rows": rows}
             case StaresRequest():
-                return Stares(self.opened, tiles=self._tiles).reduced(request, shard)
+                return Stares(self.open_device, tiles=self._tiles).reduced(request, shard)
         raise TypeError(f"{type(request).__name__}, expected a request")
 
     def _snr(self, request: SnrRequest, shard: Shard) -> Counts:
-        self.opened.check_process()
+        self.open_device.check_process()
         scene, observed = request.scene, elements(request.expectation)
         counts = Counts(scene.n_pixel, len(observed))
-        with scene_launches(self.opened, scene, request.seed, chunk=ELEMENT_CHUNK) as launches:
+        with scene_launches(self.open_device, scene, request.seed, chunk=ELEMENT_CHUNK) as launches:
             launches.observe(observers(request.expectation, scene), observed)
-            self._tiles.over(shard.start, shard.count, 0, lambda tile, done: launches.histogram(tile, counts))
+            self._tiles.for_each(shard.start, shard.count, 0, lambda tile, done: launches.histogram(tile, counts))
             launches.flush_counts(counts)
         return counts
 
@@ -278,36 +270,31 @@ class Engine:
         nuisances: Nuisances | Mapping[str, float] | None = None,
         **drawing: Unpack[DrawingWords],
     ) -> Detection:
-        """Null and flare distributions of detection statistics, all on common draws (METHODS section 6).
+        """Simulate null and flare distributions of detection statistics on common draws (METHODS section 6).
 
         Parameters
         ----------
         quiet : Expectation
-            The star without a flare; its mean is the reference.
+            The quiescent star, whose mean is the reference.
         flares : sequence of Expectation, or one
-            The same star, instrument and exposure with flares; without any only the null is drawn.
+            The same star, instrument and exposure with flares. If empty, only the null is drawn.
         realisations : int
-            Of each scenario.
+            Number of realisations per scenario.
         seed : int
             0 to 2**64 - 1.
         statistics : sequence of str or Linear, or one
-            Names of `statistics.STATISTICS`, and statistics of one's own.
+            Names of `statistics.STATISTICS`, and user-defined linear statistics.
         start : int
             First realisation.
         mode, recipe, processes, first_frame
             See `Drawing`.
         comparison : Comparison
-            What is subtracted, and by whose variances; its expectation and the model's variances by default.
+            Subtracted reference and variances that weight residuals; by default the expectation and the model's.
         tails : {"counted", "sampled"}
-            Thresholds beyond what is drawn: refused, or by importance sampling (`tails.tail`).
+            Thresholds beyond the drawn realisations raise InputError, or come from importance sampling (`tails.tail`).
         nuisances : Nuisances or mapping of str to float, optional
-            What the statistics are marginalised over: standard deviations by name (`nuisances.NUISANCES`), infinite for
-            what is projected out.
-
-        Raises
-        ------
-        InputError
-            For an unknown statistic, scenarios that do not belong together, or an impossible number, seed or mode.
+            Nuisance parameters to marginalise: standard deviations by name (`nuisances.NUISANCES`), infinite for those
+            that are projected out.
         """
         how = (start, Drawing(**drawing), comparison, tails, nuisances)
         request = DetectRequest(quiet, flares, realisations, seed, statistics, *how)  # type: ignore[arg-type]
@@ -321,10 +308,10 @@ class Engine:
     def _detection(
         self, request: DetectRequest, shard: Shard, *, before: int = 0, total: int | None = None
     ) -> tuple[Tally, list[TailSamples | None]]:
-        self.opened.check_process()
+        self.open_device.check_process()
         plan, scene = request.plans[shard.part]
         tally, samples = Tally(plan.grids), plan.tails()
-        with detection_launches(self.opened, scene, request.seed, plan, request.hypotheses) as launches:
+        with detection_launches(self.open_device, scene, request.seed, plan, request.hypotheses) as launches:
 
             def work(tile: Tile, done: int) -> None:
                 launches.statistics(tile)
@@ -333,7 +320,7 @@ class Engine:
                     if kept is not None:
                         kept.add(launches.channel(tile, grid.channel), shard.start + done)
 
-            self._tiles.over(shard.start, shard.count, 4 * plan.n_rows, work, before=before, total=total)
+            self._tiles.for_each(shard.start, shard.count, 4 * plan.n_rows, work, before=before, total=total)
             launches.flush(tally)
         return tally, samples
 
@@ -350,49 +337,44 @@ class Engine:
         nuisances: Nuisances | Mapping[str, float] | None = None,
         **drawing: Unpack[DrawingWords],
     ) -> NDArray[np.float32]:
-        """What `detect` counts, realisation by realisation, for up to 15 flares (7 drawn frame by frame).
+        """Compute the statistics of each realisation, for up to 15 flares (7 if drawn frame by frame).
 
         Parameters
         ----------
         quiet, flares, seed, statistics, comparison, nuisances, mode, recipe, processes, first_frame
             As for `detect`.
         start, count : int
-            Realisations start to start + count - 1.
+            Range of realisations, `start` to `start + count - 1`.
 
         Returns
         -------
         ndarray of float32, shape (n_channel, count)
-            For each scenario chi2, chi2_element and chi2_pair, zero where not asked for; then the linear ones, scenario
-            by scenario: ``matched`` (without a flare for each flare's template) and the others in the order asked for,
-            among them the sums that a marginalised chi2 takes away; then ``paper``, as ``matched``.
-
-        Raises
-        ------
-        InputError
-            As `detect`, and for more flares than one launch holds.
+            First chi2, chi2_element and chi2_pair of each scenario, zero if not requested. Then the linear statistics
+            of each scenario: ``matched`` (the null's for each flare's template) and the others in the requested order,
+            including the sums that a marginalised chi2 subtracts. Finally ``paper``, in the order of ``matched``.
         """
         start, count, seed = self._checked(start, count, seed)
-        # As a request takes it, flares or one flare.
-        asked_for = DetectRequest(quiet, flares, count, seed, statistics)  # type: ignore[arg-type]
-        flares, statistics = asked_for.flares, asked_for.statistics
+        # The request validates the arguments and turns a single flare into a sequence.
+        request = DetectRequest(quiet, flares, count, seed, statistics)  # type: ignore[arg-type]
+        flares, statistics = request.flares, request.statistics
         scene = prepare([quiet, *flares], comparison=comparison, **drawing)
         if len(flares) >= BATCH[scene.frames]:
             raise InputError(f"{len(flares)} flares, expected at most {BATCH[scene.frames] - 1} in one launch")
-        asked = Hypotheses(quiet, flares, statistics, scene, nuisances=as_nuisances(nuisances, quiet))
-        plan = plan_channels(asked, range(len(flares)), first=True)
+        hypotheses = Hypotheses(quiet, flares, statistics, scene, nuisances=as_nuisances(nuisances, quiet))
+        plan = plan_channels(hypotheses, range(len(flares)), first=True)
         out = np.empty((plan.n_rows, count), np.float32)
 
-        with detection_launches(self.opened, scene, seed, plan, asked) as launches:
+        with detection_launches(self.open_device, scene, seed, plan, hypotheses) as launches:
 
             def work(tile: Tile, done: int) -> None:
                 launches.statistics(tile)
                 out[:, done : done + tile.wanted] = launches.values(tile)
 
-            self._tiles.over(start, count, 4 * plan.n_rows, work)
+            self._tiles.for_each(start, count, 4 * plan.n_rows, work)
         return out
 
     def _checked(self, start: int, count: int, seed: int) -> tuple[int, int, int]:
-        """Whole numbers, in a process that may draw."""
-        self.opened.check_process()
+        """Check the process and return validated integers."""
+        self.open_device.check_process()
         whole = check_numbers(count, seed, start)
         return whole["start"], whole["realisations"], whole["seed"]

@@ -1,9 +1,9 @@
-"""What a device or its driver cannot do."""
+"""Errors of devices and their drivers."""
 
 
 class DeviceError(RuntimeError):
-    """The device or its driver cannot do what is asked; the message is one sentence."""
+    """Failure of a device or driver, with a one-sentence message."""
 
 
 class BuildError(DeviceError):
-    """A kernel did not compile; the message holds the numbered source and the device's log."""
+    """Failure to compile a kernel; the message contains the numbered source and the device's log."""

@@ -1,9 +1,9 @@
-"""The first build for a device and a driver, in a process of its own.
+"""First build of kernels for a device and driver, in a child process.
 
-A driver's compiler may crash, hang or fill the memory, which would end the user's process without a word. The first
-build for a device, driver and version of mauvecl therefore runs in a child process with limits of time and memory,
-which draws a small scene and compares the counts with NumPy's. If that fails, the next lower level of the processor is
-tried. The outcome is kept in the store of compiled kernels, so that later processes read one small file.
+A driver's compiler may crash, hang or exhaust the memory, which would end the user's process without a message. The
+first build for a device, driver and version of mauvecl therefore runs in a child process with limits of time and
+memory, which draws a small scene and compares the counts with NumPy's. If it fails, the next lower level of the
+processor is tried. The outcome is saved with the compiled kernels, so that later processes read one small file.
 """
 
 from __future__ import annotations
@@ -24,42 +24,43 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from mauvecl.device import processor
-from mauvecl.device.drivers import sources
+from mauvecl.device.drivers import driver_sources
 from mauvecl.device.errors import DeviceError
 from mauvecl.device.kernel_cache import kernel_cache
 from mauvecl.host.errors import InputError
 from mauvecl.host.version import VERSION
 
-#: Seconds of processor time that the child may use, unless this variable says otherwise; 0 builds without a child. On
-#: a processor of 2024 it uses 3.
+#: Variable that sets the child's limit of processor time, and its default in seconds; 0 builds without a child. The
+#: child needs 3 s on a processor of 2024.
 LIMIT, LIMIT_S = "MAUVECL_BUILD_LIMIT_S", 60.0
-#: Seconds by the clock for each second of processor time, since other programs may run.
+#: Wall-clock limit per second of the processor-time limit, since other programs may run.
 CLOCK = 10.0
-#: Bytes of memory that a child on a processor may write to; it uses 300 MiB. GPU drivers reserve more than they use.
+#: Limit of writable memory for a child on a CPU, which uses 300 MiB. GPU drivers reserve more than they use.
 MEMORY = 4 * 2**30
-#: Variables that tell PoCL, old and new, how many threads it may use.
+#: Variables that limit the number of threads of old and new versions of PoCL.
 THREADS = ("POCL_MAX_PTHREAD_COUNT", "POCL_CPU_MAX_CU_COUNT")
-#: An outcome with a failure in it may have had another cause, such as a full machine, and is forgotten after a week.
-KEPT_S = 7 * 86400.0
-#: The child: it finds what its parent can import, wherever the parent was started.
+#: A failure may have a temporary cause, such as too little free memory, and is discarded after a week.
+OUTCOME_LIFETIME_S = 7 * 86400.0
+#: Code of the child, which searches the same import path as its parent.
 CHILD = (
-    "import json, sys; asked = json.loads(sys.argv[1]); sys.path[:] = asked['path']; "
-    "from mauvecl.device import first_build; first_build.child(asked)"
+    "import json, sys; request = json.loads(sys.argv[1]); sys.path[:] = request['path']; "
+    "from mauvecl.device import first_build; first_build.child(request)"
 )
 #: CL_DEVICE_TYPE_CPU of the OpenCL specification.
 CPU = 2
-#: Signals by which a person or a scheduler stops a process.
-STOPPED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+#: Signals with which users and schedulers stop processes.
+STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
-#: Names by which devices of this process are compiled for.
+#: Processor name chosen for each device of this process.
 _settled: dict[int, str | None] = {}
 _one_at_a_time = threading.Lock()
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """Names tried in turn, each with why it failed; the last one's reason is empty if it succeeded."""
+    """Outcome of the first build for a device."""
 
+    #: Processor names in the order of trial and why each failed; the last reason is empty after a success.
     tried: tuple[tuple[str | None, str], ...]
     time_s: float
 
@@ -69,23 +70,23 @@ class Outcome:
 
     @property
     def current(self) -> bool:
-        """Whether it can still be relied on."""
-        return not any(why for _, why in self.tried) or 0 <= time.time() - self.time_s < KEPT_S
+        """Whether the outcome is still valid."""
+        return not any(why for _, why in self.tried) or 0 <= time.time() - self.time_s < OUTCOME_LIFETIME_S
 
 
 def settle(device: Any, others: Callable[[], Sequence[Any]]) -> str | None:
-    """Let the driver compile for the highest level at which it works, and return that level's name.
+    """Set the highest processor level at which the driver works, and return its name.
 
     Parameters
     ----------
     device : pyopencl.Device
     others : callable
-        Returns the devices of this machine, among them `device`, in the order in which another process finds them.
+        Function that returns all devices, including `device`, in the order in which another process finds them.
 
     Returns
     -------
     str or None
-        None if the driver chooses by itself.
+        None if the driver makes the choice.
 
     Raises
     ------
@@ -99,7 +100,7 @@ def settle(device: Any, others: Callable[[], Sequence[Any]]) -> str | None:
                 names = processor.names(device)
                 outcome = _outcome(device, names, others)
                 if not outcome.succeeded:
-                    raise DeviceError(_sentence(device, outcome))
+                    raise DeviceError(_failure_message(device, outcome))
                 name = outcome.tried[-1][0]
                 if name is not None:
                     processor.give_name(device, name)
@@ -108,23 +109,23 @@ def settle(device: Any, others: Callable[[], Sequence[Any]]) -> str | None:
 
 
 def _outcome(device: Any, names: tuple[str | None, ...], others: Callable[[], Sequence[Any]]) -> Outcome:
-    """Recall what came of the first build, or try it."""
+    """Read the outcome of the first build, or run the build."""
     untried = Outcome(((names[0], ""),), time.time())
     limit_s = _limit_s()
     if limit_s == 0:
         return untried
     kept, key = kernel_cache(), _key(device, names)
-    recalled = _recalled(key)
-    if recalled is not None:
-        return recalled
+    known = _read_outcome(key)
+    if known is not None:
+        return known
     number = next((i for i, other in enumerate(others()) if other.int_ptr == device.int_ptr), None)
     if number is None or not sys.executable:
         return untried
-    with _alone():
+    with _locked():
         # Another process may have tried in the meantime.
-        recalled = _recalled(key)
-        if recalled is not None:
-            return recalled
+        known = _read_outcome(key)
+        if known is not None:
+            return known
         tried: list[tuple[str | None, str]] = []
         for name in names:
             try:
@@ -135,7 +136,7 @@ def _outcome(device: Any, names: tuple[str | None, ...], others: Callable[[], Se
             if not why:
                 break
         outcome = Outcome(tuple(tried), time.time())
-        kept.remember(key, json.dumps(asdict(outcome)))
+        kept.write_text(key, json.dumps(asdict(outcome)))
     return outcome
 
 
@@ -148,14 +149,14 @@ def _limit_s() -> float:
 
 
 def _key(device: Any, names: tuple[str | None, ...]) -> str:
-    """Name of the outcome in the store: another driver, processor or version is tried again."""
+    """Return the outcome's name in the cache, unique for version, driver, processor and installation."""
     about = (VERSION, device.platform.version, device.name, device.version, device.driver_version, sys.prefix)
     said = "\0".join(("first build", *map(str, about), *map(str, names), *sorted(processor.flags())))
     return hashlib.sha256(said.encode()).hexdigest()[:32]
 
 
-def _recalled(key: str) -> Outcome | None:
-    text = kernel_cache().recall(key)
+def _read_outcome(key: str) -> Outcome | None:
+    text = kernel_cache().read_text(key)
     if text is None:
         return None
     found = json.loads(text)
@@ -164,8 +165,8 @@ def _recalled(key: str) -> Outcome | None:
 
 
 @contextlib.contextmanager
-def _alone() -> Iterator[None]:
-    """Hold a lock next to the store, so that processes started together do not all try."""
+def _locked() -> Iterator[None]:
+    """Hold a lock next to the cache, so that of processes started together only one builds."""
     handle = None
     with contextlib.suppress(OSError):
         handle = os.open(kernel_cache().store.parent / "first-build.lock", os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
@@ -178,14 +179,11 @@ def _alone() -> Iterator[None]:
 
 
 def _try(name: str | None, number: int, device: Any, limit_s: float) -> str:
-    """Build in a child process and return why that failed, or an empty text.
+    """Build in a child process and return why it failed, or an empty string.
 
-    Raises
-    ------
-    InterruptedError
-        If no child could be started, or it was stopped from outside.
+    Raises InterruptedError if the child could not be started or was stopped by a signal.
     """
-    asked = {
+    request = {
         "path": sys.path,
         "name": name,
         "number": number,
@@ -196,12 +194,12 @@ def _try(name: str | None, number: int, device: Any, limit_s: float) -> str:
     threads = {variable: os.environ.get(variable, "2") for variable in THREADS}
     try:
         run = subprocess.run(
-            [sys.executable, "-c", CHILD, json.dumps(asked)],
+            [sys.executable, "-c", CHILD, json.dumps(request)],
             env=os.environ | threads,
             stdin=subprocess.DEVNULL,
             capture_output=True,
             timeout=CLOCK * limit_s,
-            # Ctrl-C is for the parent, which then ends the child.
+            # Ctrl-C must reach only the parent, which then ends the child.
             start_new_session=True,
         )
     except subprocess.TimeoutExpired:
@@ -210,7 +208,7 @@ def _try(name: str | None, number: int, device: Any, limit_s: float) -> str:
         raise InterruptedError from error
     if run.returncode == 0:
         return ""
-    if -run.returncode in STOPPED:
+    if -run.returncode in STOP_SIGNALS:
         raise InterruptedError
     if -run.returncode == signal.SIGXCPU:
         return f"not built after {limit_s:g} s of processor time"
@@ -220,24 +218,25 @@ def _try(name: str | None, number: int, device: Any, limit_s: float) -> str:
     return lines[-1] if lines else "failed"
 
 
-def _sentence(device: Any, outcome: Outcome) -> str:
-    """Say which processor and driver fail, what was tried, and what a user can do."""
+def _failure_message(device: Any, outcome: Outcome) -> str:
+    """Return a message that names the processor, the driver, the attempts and the remedies."""
     tried = "; ".join(f"{name or 'its own choice'} {why}" for name, why in outcome.tried)
     return (
         f"{device.platform.version.strip()}, driver {device.driver_version.strip()}, cannot build kernels for the "
         f"processor {device.name.strip()} (compiled for {tried}), expected another device (`mauvecl "
-        f"devices` lists them) or driver: {sources()}; {LIMIT} sets the limit, and mauvecl tries again after a week"
+        f"devices` lists them) or driver: {driver_sources()}; {LIMIT} sets the limit, and mauvecl tries again after "
+        "a week"
     )
 
 
-# In the child.
+# Functions of the child process.
 
 
-def child(asked: dict[str, Any]) -> None:
-    """Build and run kernels within limits; end the process with 0, or print one sentence and end it with 1."""
-    limit(asked)
+def child(request: dict[str, Any]) -> None:
+    """Build and run kernels within the limits and exit with 0, or print the reason of a failure and exit with 1."""
+    limit(request)
     try:
-        why = _build(asked)
+        why = _build(request)
     except Exception as error:
         why = str(error).splitlines()[0] if str(error) else type(error).__name__
     if why:
@@ -245,46 +244,46 @@ def child(asked: dict[str, Any]) -> None:
     sys.exit(1 if why else 0)
 
 
-def limit(asked: dict[str, Any]) -> None:
+def limit(request: dict[str, Any]) -> None:
     """Set the limits of this process."""
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    seconds = max(1, round(asked["limit_s"]))
-    # The hard limit kills where a handler of the compiler survives the soft one.
+    seconds = max(1, round(request["limit_s"]))
+    # The hard limit ends the process even if the compiler handles the signal of the soft one.
     _lower(resource.RLIMIT_CPU, seconds, seconds + 5)
-    # Should the parent be killed, nobody waits for this process.
-    signal.alarm(max(1, round(CLOCK * asked["limit_s"])))
-    if asked["memory"] is not None:
-        _lower(resource.RLIMIT_DATA, asked["memory"], asked["memory"])
+    # The alarm ends this process if the parent is killed.
+    signal.alarm(max(1, round(CLOCK * request["limit_s"])))
+    if request["memory"] is not None:
+        _lower(resource.RLIMIT_DATA, request["memory"], request["memory"])
 
 
 def _lower(what: int, soft: int, hard: int) -> None:
-    """Lower a limit; one that is lower already stays."""
+    """Lower a resource limit, unless it is lower already."""
     now = resource.getrlimit(what)[1]
     most = hard if now == resource.RLIM_INFINITY else min(hard, now)
-    # macOS knows some limits by name only.
+    # macOS defines some limits without enforcing them.
     with contextlib.suppress(OSError, ValueError):
         resource.setrlimit(what, (min(soft, most), most))
 
 
-def _build(asked: dict[str, Any]) -> str:
-    """Draw a small scene and return what is wrong with it, or an empty text."""
+def _build(request: dict[str, Any]) -> str:
+    """Draw a small scene and return what is wrong with it, or an empty string."""
     import numpy as np
 
     from mauvecl.device.engine import Engine
     from mauvecl.device.program import SAME_BITS, choose_device
     from mauvecl.device.selftest import toy
-    from mauvecl.noise import twin
+    from mauvecl.noise import reference
     from mauvecl.noise.scene import prepare
 
-    handle, record = choose_device(str(asked["number"]))
-    if record.label != asked["label"]:
-        return f"device {asked['number']} is {record.label} in a new process, expected {asked['label']}"
-    name = asked["name"]
+    handle, record = choose_device(str(request["number"]))
+    if record.label != request["label"]:
+        return f"device {request['number']} is {record.label} in a new process, expected {request['label']}"
+    name = request["name"]
     if name is not None and not processor.give_name(handle, name):
         return "PoCL's record of the device is not understood"
     _settled[int(handle.int_ptr)] = name
-    engine, quiet, flare = Engine(str(asked["number"])), toy(), toy(flare=0.3)
+    engine, quiet, flare = Engine(str(request["number"])), toy(), toy(flare=0.3)
     raw = engine.realise(quiet, count=64, seed=1)
     engine.detect(quiet, [flare], realisations=64, seed=1)
-    same = np.array_equal(raw, twin.realise(prepare([quiet]), np.arange(64, dtype=np.uint64), 1))
+    same = np.array_equal(raw, reference.realise(prepare([quiet]), np.arange(64, dtype=np.uint64), 1))
     return "" if same or record.promise != SAME_BITS else "draws other counts than NumPy"

@@ -1,8 +1,8 @@
-"""Compiled kernels kept from run to run, checked before PoCL sees them.
+"""Cache of compiled kernels, verified before PoCL reads them.
 
-PoCL ends the whole process on a damaged cache entry and finds no device where its folder cannot be made. So it works
-in a folder of this process alone; a store beside it keeps each program's files with their digests, and gives back only
-what still has them. A store that is damaged, full or unwritable costs a build, never a run.
+PoCL aborts the process on a damaged cache entry and finds no device if its cache folder cannot be created. It is
+therefore given a working folder of this process alone. A store next to it keeps each program's files with their
+digests and restores only files that match. If the store is damaged, full or read-only, kernels are built again.
 """
 
 from __future__ import annotations
@@ -26,35 +26,35 @@ from pathlib import Path
 from mauvecl.host.files.bounded import read_bytes
 from mauvecl.host.version import VERSION
 
-#: What PoCL needs to build the kernels of a session, bytes.
-ROOM = 64 * 2**20
-#: The store's size; the programs used longest ago make room.
-MOST_STORED = 128 * 2**20
-#: Working folders, the lock in each, and folders that are becoming one.
+#: Free space that PoCL needs to build the kernels of a session, bytes.
+MIN_FREE_BYTES = 64 * 2**20
+#: Largest size of the store in bytes; the least recently used programs are removed.
+MAX_STORED = 128 * 2**20
+#: Name prefix of working folders, name of the lock in each, and prefix of folders that are being created.
 WORK, LOCK, MAKING = "mauvecl-work-", "lock", ".mauvecl-making-"
-#: Random for each boot, the same in every container of a host (Linux, Documentation/admin-guide/sysctl/kernel.rst).
+#: Random identifier of each boot, shared by all containers of a host (Linux, admin-guide/sysctl/kernel.rst).
 BOOT = Path("/proc/sys/kernel/random/boot_id")
-#: A folder of another host, whose locks may not be seen here, is left over when nothing was built in it for so long.
+#: Age after which a folder of another host, whose locks may be invisible here, counts as abandoned.
 ABANDONED_S = 30 * 86400.0
 
 
 class KernelCache:
-    """One process's working folder and the store behind it.
+    """Working folder of a process and the store that outlives it.
 
     Attributes
     ----------
     work : Path
         PoCL's cache folder.
     pid : int
-        The process that it belongs to.
+        Process that owns the working folder.
     store : Path
-        One folder per program, named by its key, with a manifest of digests; need not exist.
+        Folder with one subfolder per program, named by its key, with a manifest of digests; need not exist.
     """
 
     def __init__(self, base: Path | None, work: Path) -> None:
         self.work = work
         self.pid = os.getpid()
-        # Age tells other hosts whether the folder is in use.
+        # The age of this file shows other hosts whether the folder is in use.
         self._lock = work / LOCK
         self.store = (base or work) / "store"
         self._folders: dict[str, str] = {}
@@ -62,9 +62,9 @@ class KernelCache:
         self._grown = False
 
     def restore(self, key: str) -> bool:
-        """Bring a program's files back from the store, if all of them are as they were put there."""
+        """Copy a program's files to the working folder if all match their digests; return whether they do."""
         if key in self._folders:
-            # Already in the working folder, and perhaps in use: a loaded kernel's file must not be written again.
+            # The file of a loaded kernel must not be written again.
             return True
         folder = self.store / key
         if not (folder / "manifest.json").exists():
@@ -90,10 +90,10 @@ class KernelCache:
 
     @contextlib.contextmanager
     def building(self, key: str) -> Iterator[None]:
-        """Learn which of PoCL's folders belongs to the program built inside the block.
+        """Record which of PoCL's folders belongs to the program built inside the block.
 
-        Those built before go into the store then, not only at the end, so that processes that run beside this one need
-        not build them: PoCL finishes a kernel at its first launch, beside its folder, and moves it there when whole.
+        Earlier programs are stored then instead of at exit, so that concurrent processes need not build them. PoCL
+        completes a kernel only at its first launch: it links the kernel outside the folder and moves the result there.
         """
         with contextlib.suppress(OSError):
             os.utime(self._lock)
@@ -102,30 +102,30 @@ class KernelCache:
         new = [folder for folder in self._programs() if folder not in before]
         if len(new) == 1:
             self._folders[key] = new[0]
-        self._keep()
+        self._store_new()
 
     def _programs(self) -> Iterator[str]:
         for path in self.work.glob("*/*/program.bc"):
             yield path.parent.relative_to(self.work).as_posix()
 
-    def remembered(self, key: str, make: Callable[[], str]) -> str:
-        """A text kept under its own digest, or made and kept."""
-        text = self.recall(key)
+    def get_or_write(self, key: str, make: Callable[[], str]) -> str:
+        """Return a stored text, or make and store it."""
+        text = self.read_text(key)
         if text is None:
             text = make()
-            self.remember(key, text)
+            self.write_text(key, text)
         return text
 
-    def recall(self, key: str) -> str | None:
-        """A text kept, or None where there is none or it is not what was put there."""
+    def read_text(self, key: str) -> str | None:
+        """Return a stored text, or None if it is missing or damaged."""
         with contextlib.suppress(OSError, ValueError):
             digest, text = (self.store / f"{key}.txt").read_text(encoding="utf-8").split("\n", 1)
             if hashlib.sha256(text.encode()).hexdigest() == digest:
                 return text
         return None
 
-    def remember(self, key: str, text: str) -> None:
-        """Keep a text under its own digest; whatever prevents it is no fault of the run."""
+    def write_text(self, key: str, text: str) -> None:
+        """Store a text with its digest; failures to write are ignored."""
         path = self.store / f"{key}.txt"
         self._grown = True
         with contextlib.suppress(OSError):
@@ -135,16 +135,16 @@ class KernelCache:
             new.replace(path)
 
     def publish(self) -> None:
-        """Put what was built since into the store, and keep that to its size."""
-        self._keep()
+        """Store programs built since the last call, and limit the size of the store."""
+        self._store_new()
         with contextlib.suppress(OSError):
-            # Looking through the store takes a tenth of a second, at the end of each run.
+            # Listing the store takes 0.1 s at the end of each run.
             if self._grown:
                 self._prune()
                 self._grown = False
 
-    def _keep(self) -> None:
-        """Put what was built since into the store; whatever prevents it is no fault of the run."""
+    def _store_new(self) -> None:
+        """Store programs built since the last call; failures to write are ignored."""
         for key, folder in self._folders.items():
             with contextlib.suppress(OSError):
                 files = [
@@ -167,7 +167,7 @@ class KernelCache:
                 (new / name).write_bytes(content)
                 digests[name] = hashlib.sha256(content).hexdigest()
             (new / "manifest.json").write_text(json.dumps({"folder": folder, "files": digests}), encoding="utf-8")
-            # A reader sees the old folder, none, or the new one.
+            # A reader finds the old folder, none, or the new one.
             shutil.rmtree(self.store / key, ignore_errors=True)
             new.rename(self.store / key)
         finally:
@@ -179,11 +179,11 @@ class KernelCache:
         for entry in kept:
             files = entry.rglob("*") if entry.is_dir() else [entry]
             total += sum(path.stat().st_size for path in files if path.is_file())
-            if total > MOST_STORED:
+            if total > MAX_STORED:
                 shutil.rmtree(entry) if entry.is_dir() else entry.unlink()
 
     def close(self) -> None:
-        """Publish, and remove the working folder; a forked child leaves it to its parent."""
+        """Publish and remove the working folder, except in a forked child."""
         if os.getpid() != self.pid:
             return
         self.publish()
@@ -192,12 +192,10 @@ class KernelCache:
 
 @cache
 def kernel_cache() -> KernelCache:
-    """The process's cache, in ``MAUVECL_CACHE_DIR``, the user's cache folder, or a temporary one: the first with room.
+    """Return the cache of this process.
 
-    Raises
-    ------
-    OSError
-        If none can be written to.
+    It is in ``MAUVECL_CACHE_DIR`` or the user's cache folder, or in a temporary folder if that has too little space.
+    Raises OSError if none of them is usable.
     """
     import platformdirs
 
@@ -208,9 +206,9 @@ def kernel_cache() -> KernelCache:
         if work is not None:
             break
     else:
-        raise OSError(f"no folder for compiled kernels can be written to with {ROOM >> 20} MiB to spare")
+        raise OSError(f"no folder for compiled kernels can be written to with {MIN_FREE_BYTES >> 20} MiB to spare")
     store = KernelCache(base if _writable(base) else None, work)
-    # PoCL's own threads may still write when Python ends; what they leave is swept up by a later process.
+    # PoCL's threads may still write when Python exits; a later process removes these files.
     atexit.register(store.close)
     return store
 
@@ -220,32 +218,32 @@ def _writable(folder: Path) -> bool:
 
 
 def _working_folder(parent: Path) -> Path | None:
-    """A new folder of this process under `parent`, or None where it cannot be made or would not suffice.
+    """Create a working folder under `parent`, or return None if that fails or the free space is too small.
 
-    It is named by host and boot, since a home may be shared, and locked while the process lives: process numbers mean
-    nothing on another host, nor in another container of this one.
+    The name contains host and boot, since hosts may share a home. A lock marks the folder as in use, since process
+    numbers are not unique across hosts and containers.
     """
     try:
         parent.mkdir(parents=True, exist_ok=True)
         _sweep(parent)
-        if shutil.disk_usage(parent).free < ROOM:
+        if shutil.disk_usage(parent).free < MIN_FREE_BYTES:
             return None
-        # Under another name until it is locked, so that nobody finds it without a lock.
+        # The folder has a temporary name until it is locked, so that no other process finds it without a lock.
         making = Path(tempfile.mkdtemp(prefix=MAKING, dir=parent))
         (making / "probe").write_bytes(b"\0" * 4096)
         (making / "probe").unlink()
         handle = os.open(making / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         with contextlib.suppress(OSError):
-            # A file system without locks leaves age alone to tell.
+            # On a file system without locks, age alone shows whether the folder is in use.
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        # The handle is never closed: the operating system lets go of the lock when the process has ended.
+        # The handle is never closed: the operating system releases the lock when the process ends.
         return making.rename(parent / f"{WORK}{_here()}-{secrets.token_hex(8)}")
     except OSError:
         return None
 
 
 def _here() -> str:
-    """This host since its last boot."""
+    """Return an identifier of this host and its last boot."""
     host = re.sub(r"[^A-Za-z0-9]", "", socket.gethostname())[:32]
     with contextlib.suppress(OSError):
         return f"{host}-{BOOT.read_text().strip().replace('-', '')}"
@@ -253,11 +251,11 @@ def _here() -> str:
 
 
 def _sweep(parent: Path) -> None:
-    """Remove what processes that were killed have left: here by its lock, elsewhere by its age too."""
+    """Remove folders of killed processes: those of this host if unlocked, those of other hosts if also old."""
     here = _here()
     for folder in [*parent.glob(f"{WORK}*"), *parent.glob(f"{MAKING}*")]:
         try:
-            # Containers of one host have one kernel, which knows all locks, whatever they are called.
+            # Containers of a host share a kernel, which knows all locks, but may differ in host name.
             same = not here.endswith("unknown") and here.rpartition("-")[2] == folder.name.split("-")[-2]
             lock = folder / LOCK
             age = time.time() - (lock if lock.exists() else folder).stat().st_mtime
@@ -268,7 +266,7 @@ def _sweep(parent: Path) -> None:
 
 
 def _is_free(lock: Path) -> bool:
-    """Whether no living process holds a lock; without a lock there is no holder."""
+    """Return whether no running process holds the lock, which need not exist."""
     try:
         handle = os.open(lock, os.O_RDWR | os.O_CLOEXEC)
     except FileNotFoundError:

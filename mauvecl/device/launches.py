@@ -1,4 +1,4 @@
-"""One scene on a device: its buffers and launches."""
+"""Buffers and kernel launches of a scene."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.device.device import Device
 from mauvecl.device.errors import DeviceError
-from mauvecl.device.opened import Device
 from mauvecl.device.program import out_of_memory
 from mauvecl.device.tiles import Tile
 from mauvecl.noise import layout
@@ -22,18 +22,18 @@ from mauvecl.results.snr import Counts
 if TYPE_CHECKING:
     from mauvecl.device.program import Variant
 
-#: Realisations, times frames, counted on the device before its 32-bit bins and 64-bit sums are emptied.
-MOST_COUNTED = 2**25
-#: Raw spectra looked at together on the host.
-PIECE = 4096
-#: Kernels of a detection, the first where more is compared than the expectation.
+#: Realisations times frames counted on the device before its 32-bit bins and 64-bit sums are moved to the host.
+MAX_COUNTED = 2**25
+#: Raw spectra processed at once on the host.
+RAW_BATCH = 4096
+#: Kernel files of a detection: for comparisons with more than the expectation, and for the expectation alone.
 COMPARED, DETECTION = ("sums", "comparison", "tally", "marginal"), ("sums", "statistics", "tally", "marginal")
-#: Work-items to an element or channel of a histogram, on a device of many.
+#: Work-items per element or channel of a histogram on a GPU.
 ITEMS = 1024
 
 
 class Launches:
-    """One scene on the device; its buffers are released at the end of the `with` block."""
+    """Buffers and launches of a scene; the buffers are released at the end of the `with` block."""
 
     def __init__(self, device: Device, scene: Scene, variant: Variant, seed: int) -> None:
         self._device, self._scene, self.variant = device, scene, variant
@@ -48,7 +48,7 @@ class Launches:
         self._arguments = [
             self.upload(job.reshape(1)),
             *(
-                self.upload(beyond(array))
+                self.upload(padded(array))
                 for array in (
                     scene.pixels,
                     scene.levels,
@@ -71,7 +71,7 @@ class Launches:
             buffer.release()
 
     def upload(self, array: NDArray[Any]) -> Any:
-        """A device buffer with the contents of an array; DeviceError where there is no room."""
+        """Copy an array to a new device buffer. Raises DeviceError if the memory does not suffice."""
         flags = self._cl.mem_flags
         data = np.ascontiguousarray(array if array.size else np.zeros(1, array.dtype))
         try:
@@ -85,8 +85,8 @@ class Launches:
         self._buffers.append(buffer)
         return buffer
 
-    def _room(self, name: str, size: int) -> Any:
-        """A buffer of at least so many bytes, kept from launch to launch."""
+    def _scratch(self, name: str, size: int) -> Any:
+        """Return a buffer of at least `size` bytes that is reused from launch to launch."""
         buffer = self._named.get(name)
         if buffer is None or buffer.size < size:
             if buffer is not None:
@@ -98,10 +98,10 @@ class Launches:
         return buffer
 
     @contextlib.contextmanager
-    def _into(self, name: str, out: NDArray[Any]) -> Iterator[Any]:
-        """A buffer of which `out` holds the content at the end; a processor's own memory needs no copy."""
+    def _output(self, name: str, out: NDArray[Any]) -> Iterator[Any]:
+        """Yield a buffer whose contents are in `out` at the end of the block; CPUs write to `out` without a copy."""
         if self._device.record.kind != "cpu":
-            buffer = self._room(name, out.nbytes)
+            buffer = self._scratch(name, out.nbytes)
             yield buffer
             self._cl.enqueue_copy(self._queue, out, buffer)
             return
@@ -119,15 +119,15 @@ class Launches:
 
     def _launch(self, name: str, items: tuple[int, ...], *arguments: Any) -> None:
         if name not in self._kernels:
-            # One build for those that are always used together.
+            # Kernels that are always used together are built together.
             detection = COMPARED if self.variant.compared else DETECTION
-            rooms = detection if name in (detection[1], "tally", "marginalise") else (name,)
-            self._kernels[name] = self._device.kernel(rooms, self.variant, name)
+            kernel_files = detection if name in (detection[1], "tally", "marginalise") else (name,)
+            self._kernels[name] = self._device.kernel(kernel_files, self.variant, name)
         local = (1,) * len(items) if self.variant.width > 1 else None
         self._kernels[name](self._queue, items, local, *arguments)
 
     def realise(self, tile: Tile, out: NDArray[Any]) -> NDArray[np.uint32]:
-        """Raw spectra of a tile into the rows of `out`.
+        """Draw the raw spectra of a tile into `out`.
 
         Parameters
         ----------
@@ -137,19 +137,19 @@ class Launches:
         Returns
         -------
         ndarray of uint32, shape (tile.wanted,)
-            Frames of any pixel cut off at zero or saturation.
+            Number of samples (pixels times frames) clipped at zero or saturation.
         """
         clipped = np.empty(tile.wanted, np.uint32)
-        counts, items = self._room("clipped", clipped.nbytes), (tile.size // self.variant.width,)
-        with self._into("rows", out) as rows:
+        counts, items = self._scratch("clipped", clipped.nbytes), (tile.size // self.variant.width,)
+        with self._output("rows", out) as rows:
             self._launch("realise", items, *self._arguments, *tile.address(), *tile.rows(), counts, rows)
         self._cl.enqueue_copy(self._queue, clipped, counts)
         return clipped
 
     def observe(self, observers: NDArray[np.void], elements: NDArray[np.void]) -> None:
-        """Upload what the observer subtracts and assumes, and the resolution elements."""
+        """Upload the observer's subtraction and variances, and the resolution elements."""
         self._n_element = len(elements)
-        self._observers, self._elements = self.upload(beyond(observers)), self.upload(elements)
+        self._observers, self._elements = self.upload(padded(observers)), self.upload(elements)
         shape = (self._scene.n_pixel + PIXEL_BLOCK, layout.OBSERVER_BINS)
         self._pixel_counts = self.upload(np.zeros(shape, np.uint32))
         self._element_counts = self.upload(np.zeros((len(elements), layout.OBSERVER_BINS), np.uint32))
@@ -158,7 +158,7 @@ class Launches:
         self._observed = observers, elements
 
     def histogram(self, tile: Tile, counts: Counts) -> None:
-        """Count each pixel's DN and each element's S/N of a tile on the device."""
+        """Add each pixel's DN and each element's S/N of a tile to the device's histograms."""
         width = self.variant.width
         items = (self._n_element,) if width > 1 else (self._n_element, min(tile.wanted, ITEMS))
         self._launch(
@@ -181,12 +181,12 @@ class Launches:
         if outside.any():
             self._cl.enqueue_copy(self._queue, self._outside, np.zeros_like(outside))
             self._add_far_snr(tile, counts, np.flatnonzero(outside))
-        if self._counted * self._scene.n_draws > MOST_COUNTED:
+        if self._counted * self._scene.n_draws > MAX_COUNTED:
             self.flush_counts(counts)
 
     def _add_far_snr(self, tile: Tile, counts: Counts, elements: NDArray[np.intp]) -> None:
-        """Count what lies outside the device's bins on the host, from the raw spectra of the same realisations."""
-        for piece in tile.pieces(PIECE):
+        """Count values outside the device's bins on the host, from the raw spectra of the same realisations."""
+        for piece in tile.pieces(RAW_BATCH):
             raw = np.empty((piece.wanted, self._scene.n_pixel), np.int32)
             self.realise(piece, raw)
             base = self._scene.n_draws * self._scene.base_dn[0]
@@ -196,7 +196,7 @@ class Launches:
         """Move the device's histograms to the host."""
         n = self._scene.n_pixel
         pixels, elements, clipped = (
-            self._emptied(buffer, shape)
+            self._take(buffer, shape)
             for buffer, shape in (
                 (self._pixel_counts, (n, layout.OBSERVER_BINS)),
                 (self._element_counts, (self._n_element, layout.OBSERVER_BINS)),
@@ -206,7 +206,8 @@ class Launches:
         counts.add(pixels, elements, clipped, self._counted)
         self._counted = 0
 
-    def _emptied(self, buffer: Any, shape: tuple[int, ...], dtype: type = np.uint32) -> NDArray[Any]:
+    def _take(self, buffer: Any, shape: tuple[int, ...], dtype: type = np.uint32) -> NDArray[Any]:
+        """Copy a buffer to the host and fill it with zeros."""
         host: NDArray[Any] = np.empty(shape, dtype)
         self._cl.enqueue_copy(self._queue, host, buffer)
         self._cl.enqueue_copy(self._queue, buffer, np.zeros(shape, dtype))
@@ -215,16 +216,16 @@ class Launches:
     def weigh(
         self, weights: NDArray[np.float32], linear_end: NDArray[np.uint32], pixels_end: NDArray[np.uint32]
     ) -> None:
-        """Upload the linear statistics' weights, and where each scenario's end; see `ChannelPlan`."""
+        """Upload the linear statistics' weights and the end of each scenario's; see `ChannelPlan`."""
         scene = self._scene
-        # A row of zeros behind them, for scenarios without any.
-        padded = np.concatenate([weights, np.zeros((1, len(scene.pixels)), np.float32)])
+        # A final row of zeros serves scenarios without linear statistics.
+        behind = np.concatenate([weights, np.zeros((1, len(scene.pixels)), np.float32)])
         constants = scene.constants(weights, linear_end, pixels_end)
-        self._weighing = [*map(self.upload, (constants, padded, linear_end, pixels_end))]
+        self._weighing = [*map(self.upload, (constants, behind, linear_end, pixels_end))]
         self._rows = len(layout.FIXED_STATISTICS) * len(scene.levels) + len(weights)
 
     def marginalise(self, subtractions: NDArray[np.uint32]) -> None:
-        """Upload which squares are taken away from which rows; see `ChannelPlan`."""
+        """Upload which squares are subtracted from which rows; see `ChannelPlan`."""
         self._subtractions = [np.uint32(subtractions.shape[1]), *map(self.upload, subtractions)]
 
     def compare(
@@ -234,7 +235,7 @@ class Launches:
         scales: NDArray[np.float32],
         scale_end: NDArray[np.uint32],
     ) -> None:
-        """Upload what only the kernel `comparison` reads, after `weigh`.
+        """Upload the additional arguments of the kernel `comparison`; call after `weigh`.
 
         Parameters
         ----------
@@ -246,13 +247,13 @@ class Launches:
             One past the last smoothed statistic of each scenario.
         """
         scene = self._scene
-        more = map(self.upload, (beyond(scene.estimates), bands, finished, scales, scale_end))
+        more = map(self.upload, (padded(scene.estimates), bands, finished, scales, scale_end))
         self._weighing = [self.upload(scene.references), *self._weighing, *more, np.uint32(scales.shape[1])]
         self._rows += len(scales)
 
     def statistics(self, tile: Tile) -> None:
-        """Compute every channel of a tile into values[channel][realisation]."""
-        values = self._room("values", 4 * self._rows * tile.size)
+        """Compute every channel of a tile on the device."""
+        values = self._scratch("values", 4 * self._rows * tile.size)
         kernel = (COMPARED if self.variant.compared else DETECTION)[1]
         items = (tile.size // (self.variant.width * self.variant.vectors),)
         self._launch(kernel, items, *self._arguments, *tile.address(), *self._weighing, np.uint32(tile.size), values)
@@ -261,20 +262,20 @@ class Launches:
             self._launch("marginalise", items, *self._subtractions, np.uint32(tile.size), values)
 
     def values(self, tile: Tile) -> NDArray[np.float32]:
-        """The channels of the tile computed last, shape (n_channel, tile.wanted)."""
+        """Return the channels of the last computed tile, shape (n_channel, tile.wanted)."""
         host = np.empty((self._rows, tile.size), np.float32)
         self._cl.enqueue_copy(self._queue, host, self._named["values"])
         return host[:, tile.start : tile.stop]
 
     def channel(self, tile: Tile, number: int) -> NDArray[np.float32]:
-        """One channel of the tile computed last, shape (tile.wanted,)."""
+        """Return one channel of the last computed tile, shape (tile.wanted,)."""
         host = np.empty(tile.wanted, np.float32)
         offset = 4 * (number * tile.size + tile.start)
         self._cl.enqueue_copy(self._queue, host, self._named["values"], src_offset=offset)
         return host
 
     def tally(self, tile: Tile, tally: Tally) -> None:
-        """Add a tile's channels to the histograms and integer sums on the device."""
+        """Add the channels of a tile to the histograms and integer sums on the device."""
         count = len(tally.grids)
         items = 1 if self.variant.width > 1 else ITEMS
         if "grids" not in self._named:
@@ -297,11 +298,11 @@ class Launches:
         self._queue.finish()
         self._counted += tile.wanted
         self._add_far(tile, tally)
-        if self._counted > MOST_COUNTED:
+        if self._counted > MAX_COUNTED:
             self.flush(tally)
 
     def _add_far(self, tile: Tile, tally: Tally) -> None:
-        """Count on the host what the device found outside its bins."""
+        """Count values outside the device's bins on the host."""
         outside = np.empty(len(tally.grids), np.uint32)
         self._cl.enqueue_copy(self._queue, outside, self._named["outside"])
         if not outside.any():
@@ -318,12 +319,12 @@ class Launches:
     def flush(self, tally: Tally) -> None:
         """Move the device's histograms and sums to the host."""
         count = len(tally.grids)
-        histogram = self._emptied(self._named["histogram"], (count, layout.BINS))
-        sums = self._emptied(self._named["sums"], (count, self._named["sums"].size // (16 * count), 2), np.int64)
+        histogram = self._take(self._named["histogram"], (count, layout.BINS))
+        sums = self._take(self._named["sums"], (count, self._named["sums"].size // (16 * count), 2), np.int64)
         tally.add(histogram, sums.sum(axis=1), self._counted)
         self._counted = 0
 
 
-def beyond(array: NDArray[np.void]) -> NDArray[np.void]:
-    """Per-pixel structs, end to end, and a block more: a launch may look past the last pixel, never use it."""
+def padded(array: NDArray[np.void]) -> NDArray[np.void]:
+    """Flatten per-pixel structs and append a block, since kernels may read, but not use, pixels past the last one."""
     return np.concatenate([array.ravel(), np.zeros(PIXEL_BLOCK, array.dtype)])

@@ -1,4 +1,4 @@
-"""Push chosen words through the production code on the device, for tests and the self-test."""
+"""Probes that run the production code on the device with chosen words, for tests and the self-test."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from mauvecl.device import program
 from mauvecl.device.program import Variant
 
 if TYPE_CHECKING:
-    from mauvecl.device.opened import Device
+    from mauvecl.device.device import Device
 
 
 class Probes:
-    """The probe kernels of a device, in its own form or another.
+    """Probe kernels of a device.
 
     Parameters
     ----------
     width : int, optional
-        Realisations in a vector.
+        Realisations per vector; by default the device's.
     vector_forms : bool, optional
-        Whether PoCL's fast forms are used, or built-ins.
+        Whether to use the fast forms for PoCL instead of built-in functions; by default the device's choice.
     device : Device
     """
 
@@ -43,9 +43,9 @@ class Probes:
         out_first: NDArray[Any] | None = None,
         start: NDArray[Any] | None = None,
     ) -> NDArray[Any]:
-        """Launch a probe; arrays are uploaded, the last argument of the kernel is `out`, which may begin with `start`.
+        """Launch a probe kernel and return `out`, its last argument.
 
-        `out_first` is written before it.
+        Input arrays are uploaded. `out_first` is an output before `out`, and `start` the initial contents of `out`.
         """
         flags = self.cl.mem_flags
         arguments = [
@@ -65,29 +65,29 @@ class Probes:
         return out
 
     def philox(self, counters: NDArray[np.uint32], keys: NDArray[np.uint32]) -> NDArray[np.uint32]:
-        """Eight words per counter: the plain generator's four, then those of the loop-invariant form."""
+        """Return eight words per counter: four of the plain generator, four of its loop-invariant form."""
         out = np.empty((len(counters), 8), np.uint32)
         return self.run("probe_philox", len(counters), out, np.uint32(len(counters)), counters, keys)
 
     def normal(self, radius: NDArray[np.uint32], angle: NDArray[np.uint32]) -> NDArray[np.float32]:
-        """Two rows of normals from two words each; sizes are multiples of the width."""
+        """Return two rows of normal deviates from two words each; sizes are multiples of the width."""
         words = np.stack([radius, angle])
         return self.run("probe_normal", radius.size // self.width, np.empty(words.shape, np.float32), words)
 
     def alias(self, words: NDArray[np.uint32], table: NDArray[np.uint32], bits: int) -> NDArray[np.uint32]:
-        """The column each word chooses."""
+        """Return the column that each word selects."""
         items = words.size // self.width
         return self.run("probe_alias", items, np.empty(words.size, np.uint32), words, table, np.uint32(bits))
 
     def prior(
         self, word: NDArray[np.uint32], finer: NDArray[np.uint32], table: NDArray[np.float32]
     ) -> NDArray[np.float32]:
-        """A prior's factors, less one, at the probabilities that two words each stand for."""
+        """Return a prior's factors minus one at the probabilities given by two words each."""
         words = np.stack([word, finer])
         return self.run("probe_prior", word.size // self.width, np.empty(word.size, np.float32), words, table)
 
     def expansion(self, radius: NDArray[np.uint32], angle: NDArray[np.uint32], mean: float) -> NDArray[np.int64]:
-        """Two rows of counts relative to the whole number nearest to the mean."""
+        """Return two rows of counts relative to the mean rounded to an integer."""
         words, root = np.stack([radius, angle]), np.sqrt(mean)
         offset, slope, cubic = mean - np.rint(mean) - 1 / 6, root - 1 / (36 * root), -1 / (72 * root)
         coefficients = [np.float32(c) for c in (offset, slope, cubic)]

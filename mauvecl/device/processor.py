@@ -1,14 +1,14 @@
-"""Names of x86-64 processors that PoCL's compiler can build for.
+"""Processor names for which PoCL compiles on x86-64.
 
-A PoCL made for many processors, as wheels and distributions ship it, loads the library of built-in functions that suits
-the instructions of the processor, but until version 5 it compiles kernels for the name by which LLVM knows the
-processor. The two need not fit. LLVM 14 calls AMD's Zen 4 "znver3", which has no AVX-512, while PoCL loads the AVX-512
-library because the processor has it: a build then takes minutes and gigabytes and ends in a segmentation fault. LLVM
-calls a processor that it does not know "generic", which its own compiler refuses for x86-64 (PoCL issue 1049).
+The PoCL of wheels and distributions supports many processors. It loads the library of built-in functions that suits the
+instructions of the processor, but before version 5 it compiles kernels for LLVM's name of the processor, which need not
+match the library. LLVM 14 calls AMD's Zen 4 "znver3", which has no AVX-512, while PoCL loads the AVX-512 library: a
+build then takes minutes and gigabytes and ends in a segmentation fault. LLVM calls an unknown processor "generic",
+which its compiler rejects for x86-64 (PoCL issue 1049).
 
-No setting gives another name. This module writes the highest level of the x86-64 psABI that fits both the processor and
-the library into PoCL's record of the device in memory. From version 5 on, and in Debian's 3.1, PoCL names the processor
-after the library, and its record is left alone.
+No setting changes the name. This module therefore writes the highest level of the x86-64 psABI that fits processor and
+library into PoCL's record of the device in memory. PoCL 5 and later, and Debian's 3.1, name the processor after the
+library; their record is not changed.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-#: Names to compile for, lowest first, and the instructions that each needs beyond the one before, as /proc/cpuinfo
-#: spells them. The psABI has no level for processors with AVX but without AVX2, which have a library of their own.
+#: Processor names, lowest first, and the instructions that each adds, as /proc/cpuinfo spells them. "sandybridge"
+#: stands for processors with AVX but without AVX2: PoCL has a library for them, the psABI has no level.
 LEVELS = {
     "x86-64": (),
     "x86-64-v2": ("cx16", "lahf_lm", "popcnt", "sse4_1", "sse4_2", "ssse3"),
@@ -31,16 +31,16 @@ LEVELS = {
     "x86-64-v3": ("avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe"),
     "x86-64-v4": ("avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"),
 }
-#: The name of a processor that LLVM does not know.
+#: LLVM's name of an unknown processor.
 UNKNOWN = "generic"
-#: A PoCL that chooses among libraries says so in its version.
-CHOOSES = "DISTRO"
-#: The end of a device's version: driver, target triple, processor.
+#: Part of the version of a PoCL that chooses among libraries.
+CHOOSES_LIBRARY = "DISTRO"
+#: End of a device's version: driver, target triple, processor.
 TARGET = re.compile(r"HSTR: \w+-(x86_64-\w+-\w+-\w+)-([\w-]+)$")
-#: Bytes of a device's record that are searched; it is some 2500 long.
+#: Bytes of a device's record that are searched, out of about 2500.
 RECORD_BYTES = 2048
 
-#: Names in memory: PoCL keeps pointers to them.
+#: Names that must stay in memory, since PoCL has pointers to them.
 _names: dict[str, Any] = {}
 
 
@@ -52,7 +52,7 @@ def levels(flags: frozenset[str]) -> tuple[str, ...]:
 
 @cache
 def flags() -> frozenset[str]:
-    """Return what the first processor of this machine can do; nothing if the kernel does not say."""
+    """Return the instruction sets of this machine's first processor; empty if unknown."""
     with contextlib.suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text(encoding="ascii", errors="replace").splitlines():
             name, _, words = line.partition(":")
@@ -62,37 +62,20 @@ def flags() -> frozenset[str]:
 
 
 def target(device: Any) -> tuple[str, str] | None:
-    """Return the triple and the processor's name for which PoCL compiles, or None if it can be left alone.
-
-    Parameters
-    ----------
-    device : pyopencl.Device
-    """
+    """Return the triple and processor name for which PoCL compiles, or None if they need no change."""
     found = TARGET.search(str(device.version))
-    if found is None or not (CHOOSES in str(device.platform.version) or found[2] == UNKNOWN):
+    if found is None or not (CHOOSES_LIBRARY in str(device.platform.version) or found[2] == UNKNOWN):
         return None
     return found[1], found[2]
 
 
 def names(device: Any) -> tuple[str | None, ...]:
-    """Return the names to compile for, best first; None alone if PoCL had better choose.
-
-    Parameters
-    ----------
-    device : pyopencl.Device
-    """
+    """Return the names to compile for, best first; ``(None,)`` leaves the choice to PoCL."""
     return levels(flags()) if flags() and _place(device) is not None else (None,)
 
 
 def give_name(device: Any, name: str) -> bool:
-    """Let PoCL compile for a processor of this name; return whether its record of the device was understood.
-
-    Parameters
-    ----------
-    device : pyopencl.Device
-    name : str
-        A name that LLVM knows, such as one of `LEVELS`.
-    """
+    """Make PoCL compile for a processor name known to LLVM; return False if the record's layout is unknown."""
     place = _place(device)
     if place is None:
         return False
@@ -102,7 +85,7 @@ def give_name(device: Any, name: str) -> bool:
 
 
 def _place(device: Any) -> int | None:
-    """Return the address of the pointer to the processor's name in PoCL's record, or None if it is not where it was."""
+    """Return the address of the pointer to the processor's name in PoCL's record, or None if it is not found."""
     found = target(device)
     if found is None:
         return None
@@ -113,8 +96,8 @@ def _place(device: Any) -> int | None:
     except OSError:
         return None
     try:
-        # The pointer to the triple stands before that to the name, unless PoCL names the processor after the library:
-        # that of version 5, and Debian's of 3.1.
+        # The pointer to the triple precedes that to the name, except in versions that name the processor after the
+        # library.
         pointers = [int.from_bytes(_bytes(memory, record + at, 8), "little") for at in range(0, RECORD_BYTES, 8)]
         for place, (first, second) in enumerate(itertools.pairwise(pointers), 1):
             if _text(memory, first) == triple and _text(memory, second) in (own, *_names):
@@ -125,7 +108,7 @@ def _place(device: Any) -> int | None:
 
 
 def _bytes(memory: int, address: int, size: int) -> bytes:
-    """Read memory of this process as a file, so that a wrong address gives nothing instead of a crash."""
+    """Read memory of this process as a file, since a wrong address then returns nothing instead of a crash."""
     try:
         return os.pread(memory, size, address)
     except (OSError, OverflowError):

@@ -1,7 +1,4 @@
-"""Find a device, render the kernels, build them, keep them in a private cache.
-
-Only this room touches pyopencl.
-"""
+"""Choice of a device, and rendering and building of kernels."""
 
 from __future__ import annotations
 
@@ -17,7 +14,7 @@ from importlib.resources import files
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.device import vendors
-from mauvecl.device.drivers import sources
+from mauvecl.device.drivers import driver_sources
 from mauvecl.device.errors import BuildError, DeviceError
 from mauvecl.device.first_build import settle
 from mauvecl.device.kernel_cache import kernel_cache
@@ -27,17 +24,15 @@ from mauvecl.noise import layout
 if TYPE_CHECKING:
     import pyopencl
 
-ROOMS = ("portable", "philox", "normal", "poisson", "prior", "detector")
+SHARED_FILES = ("portable", "philox", "normal", "poisson", "prior", "detector")
 POCL = "Portable Computing Language"
-
-
-#: What a device with strict arithmetic promises: every draw, statistic and table as on any other such device.
+#: Promise of devices with strict arithmetic: draws, statistics and tables are equal on all of them.
 SAME_BITS = "same bits"
 
 
 @dataclass(frozen=True)
 class DeviceRecord:
-    """One OpenCL device, as `mauvecl devices` lists it."""
+    """OpenCL device, as listed by `mauvecl devices`."""
 
     platform: str
     name: str
@@ -55,7 +50,7 @@ class DeviceRecord:
 
 @dataclass(frozen=True)
 class Variant:
-    """What kernels are rendered for; no value of a study is among it."""
+    """Options for which kernels are rendered; values of a study are not among them."""
 
     width: int
     vector_forms: bool
@@ -87,20 +82,15 @@ class Variant:
 
     @property
     def compared(self) -> bool:
-        """Whether more is compared than the expectation by the model's variances."""
+        """Whether statistics use more than the expectation and the model's variances."""
         return self.pair or self.noisy or self.estimated or self.slots > 0
 
 
 def load_opencl() -> Any:
-    """Import pyopencl with a cache folder of our own, after checking what would abort the process.
+    """Import pyopencl with a private cache folder.
 
-    PoCL ends the whole process when its cache is unusable or the linker it calls is missing, so both
-    are looked at before it is loaded.
-
-    Raises
-    ------
-    DeviceError
-        If the linker ``ld`` is not on the path, pyopencl cannot be loaded, or it was loaded before a fork.
+    PoCL aborts the process if its cache is unusable or the linker is missing, so both are checked first. Raises
+    DeviceError if the linker ``ld`` is not on the path, or pyopencl cannot be loaded or was loaded before a fork.
     """
     linker = shutil.which("ld", path=os.environ.get("PATH") or os.defpath)
     if linker is None:
@@ -109,28 +99,28 @@ def load_opencl() -> Any:
             "(Debian, Ubuntu: `apt-get install binutils`; Fedora: `dnf install binutils`)"
         )
     if not os.environ.get("PATH"):
-        # Python looks in the usual folders then, PoCL in none, and ends the process.
+        # Without PATH, Python searches the default folders, but PoCL finds no linker and aborts the process.
         os.environ["PATH"] = os.path.dirname(linker)
     try:
         os.environ["POCL_CACHE_DIR"] = str(kernel_cache().work)
     except OSError as error:
         raise DeviceError(f"{error}: set MAUVECL_CACHE_DIR to a folder that can") from error
     if kernel_cache().pid != os.getpid():
-        # PoCL's threads do not survive a fork; its next call would wait for them for ever.
+        # PoCL's threads do not survive a fork; its next call would wait forever.
         raise DeviceError("OpenCL was loaded before a fork, expected a process of its own start (use spawn)")
-    # pyopencl's own cache would be a second one beside PoCL's.
+    # pyopencl's own cache would duplicate PoCL's.
     os.environ.setdefault("PYOPENCL_NO_CACHE", "1")
     try:
         import pyopencl
     except ImportError as error:
-        raise DeviceError(f"pyopencl cannot be loaded ({error}): install {sources()}") from error
+        raise DeviceError(f"pyopencl cannot be loaded ({error}): install {driver_sources()}") from error
     return pyopencl
 
 
 def _devices() -> list[Any]:
     cl = load_opencl()
     try:
-        with vendors.shown():
+        with vendors.show_intel_runtime():
             platforms = cl.get_platforms()
     except cl.Error:
         platforms = []
@@ -141,11 +131,11 @@ def _devices() -> list[Any]:
         except cl.Error:
             continue
     if not handles:
-        # Loaders look in the folder that a variable names, and then nowhere else.
-        places = ", ".join(f"{name}={os.environ[name]}" for name in vendors.FOLDERS if os.environ.get(name))
+        # If a variable names a folder, loaders search only that.
+        places = ", ".join(f"{name}={os.environ[name]}" for name in vendors.FOLDER_VARIABLES if os.environ.get(name))
         searched = f" ({places})" if places else ""
-        raise DeviceError(f"no OpenCL device found{searched}: install {sources()}")
-    # PoCL on the CPU first: it is the default.
+        raise DeviceError(f"no OpenCL device found{searched}: install {driver_sources()}")
+    # PoCL on the CPU comes first, because the first device is the default.
     return sorted(handles, key=lambda d: (d.platform.name != POCL, "cpu" not in _kind(d)))
 
 
@@ -161,7 +151,7 @@ def _promise(device: Any) -> str:
 
 
 def weaknesses(device: Any) -> list[str]:
-    """What a device lacks of the arithmetic that gives the same bits everywhere."""
+    """Return the properties of strict arithmetic that a device lacks."""
     cl = load_opencl()
     bits = cl.device_fp_config
     needed = {
@@ -173,13 +163,7 @@ def weaknesses(device: Any) -> list[str]:
 
 
 def devices() -> list[DeviceRecord]:
-    """Every OpenCL device here, the default one first.
-
-    Raises
-    ------
-    DeviceError
-        If there is none, or no linker.
-    """
+    """List all OpenCL devices, the default one first. Raises DeviceError if there is none, or no linker."""
     return [
         DeviceRecord(
             platform=device.platform.name.strip(),
@@ -196,12 +180,9 @@ def devices() -> list[DeviceRecord]:
 
 
 def choose_device(wanted: str | None) -> tuple[Any, DeviceRecord]:
-    """The pyopencl device whose number, platform or name matches `wanted`; the default one for None.
+    """Return the pyopencl device whose number, platform or name matches `wanted`, or the default one for None.
 
-    Raises
-    ------
-    DeviceError
-        If nothing matches; the message lists the devices present.
+    Raises DeviceError, with a list of all devices, if none matches.
     """
     handles, records = _devices(), devices()
     if wanted is None:
@@ -214,16 +195,8 @@ def choose_device(wanted: str | None) -> tuple[Any, DeviceRecord]:
 
 
 @cache
-def render(rooms: tuple[str, ...], variant: Variant) -> str:
-    """The OpenCL C source of these files, after the shared ones.
-
-    Parameters
-    ----------
-    rooms : tuple of str
-        Names of kernel sources without their ending, such as ``("statistics",)``.
-    variant : Variant
-        Widths and switches.
-    """
+def render(kernel_files: tuple[str, ...], variant: Variant) -> str:
+    """Render the OpenCL C source of the shared files and `kernel_files`, given without their extension."""
     local = "" if variant.width == 1 else "__attribute__((reqd_work_group_size(1, 1, 1)))"
     values = asdict(variant) | {
         "attributes": local,
@@ -247,7 +220,7 @@ def render(rooms: tuple[str, ...], variant: Variant) -> str:
         "fine_bits": layout.FINE_BITS,
         "structs": {name: dtype.names for name, dtype in layout.STRUCTS.items()},
     }
-    names = (*ROOMS, *rooms)
+    names = (*SHARED_FILES, *kernel_files)
     folder = files("mauvecl.kernels")
     texts = [folder.joinpath(f"{name}.cl.mako").read_text(encoding="utf-8") for name in names]
     structs = layout.c_structs()
@@ -256,53 +229,46 @@ def render(rooms: tuple[str, ...], variant: Variant) -> str:
         parts = (str(_parsed(text).render(**values)) for text in texts)
         return "\n".join((f"/* mauvecl {VERSION} */", structs, *parts))
 
-    # Rendering takes longer than starting a kernel that is built already.
-    return kernel_cache().remembered(hashlib.sha256(repr((structs, values, texts)).encode()).hexdigest()[:32], make)
+    # Rendering takes longer than loading a compiled kernel.
+    return kernel_cache().get_or_write(hashlib.sha256(repr((structs, values, texts)).encode()).hexdigest()[:32], make)
 
 
 @cache
 def _parsed(text: str) -> Any:
-    # Heavy to import.
+    # The import is slow.
     from mako.template import Template
 
     return Template(text, strict_undefined=True)
 
 
 def out_of_memory(error: Exception) -> bool:
-    """Whether an OpenCL error says that the device's memory did not suffice."""
-    told = ("MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_RESOURCES", "OUT_OF_HOST_MEMORY", "INVALID_BUFFER_SIZE")
-    return any(word in str(error) for word in told)
+    """Return whether an OpenCL error means that the device's memory does not suffice."""
+    codes = ("MEM_OBJECT_ALLOCATION_FAILURE", "OUT_OF_RESOURCES", "OUT_OF_HOST_MEMORY", "INVALID_BUFFER_SIZE")
+    return any(code in str(error) for code in codes)
 
 
 def digest(source: str) -> str:
-    """Short sha256 of a rendered source, as run records carry it."""
+    """Return the short sha256 of a rendered source, for run records."""
     return hashlib.sha256(source.encode()).hexdigest()[:16]
 
 
 def build(context: pyopencl.Context, source: str) -> pyopencl.Program:
-    """Compile a rendered source with strict arithmetic, or take it from the cache.
-
-    Raises
-    ------
-    BuildError
-        With the numbered source and the device's log.
-    """
+    """Compile a rendered source with strict arithmetic, or load it from the cache."""
     cl = load_opencl()
     device = context.devices[0]
-    # Without -w PoCL's compiler prints how many warnings it kept to itself.
+    # Without -w, PoCL's compiler prints the number of suppressed warnings.
     options = ["-cl-std=CL1.2", "-w"]
     if not weaknesses(device):
         options.append("-cl-fp32-correctly-rounded-divide-sqrt")
     kept = kernel_cache()
-    # A store shared by several machines holds what each processor can run; names such as "AMD EPYC" do not tell.
-    # PoCL tells its programs apart by the place of its own libraries too: what another installation has compiled would
-    # be brought back and compiled again at every start.
+    # The key contains the processor level, since machines with the same device name, such as "AMD EPYC", may share the
+    # store, and the installation, since PoCL compiles a program of another installation again at every start.
     target = (device.name, device.version, device.driver_version, str(settle(device, _devices)), sys.prefix)
     key = hashlib.sha256("\0".join((source, *options, *target)).encode()).hexdigest()[:32]
     restored = kept.restore(key)
     try:
         with warnings.catch_warnings(), contextlib.nullcontext() if restored else kept.building(key):
-            # Some compilers greet.
+            # Some compilers print a greeting.
             warnings.simplefilter("ignore", cl.CompilerWarning)
             program: pyopencl.Program = cl.Program(context, source).build(options, cache_dir=False)
     except cl.Error as error:

@@ -1,4 +1,4 @@
-"""Whether a device gives what the answers rest on: known answers, twins, chance, closed forms, in under a minute."""
+"""Self-test of a device against known answers, the NumPy reference, probabilities and closed forms."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from mauvecl.device.probes import Probes
 from mauvecl.device.program import SAME_BITS
 from mauvecl.host.expectation import Expectation
 from mauvecl.host.version import VERSION
-from mauvecl.noise import layout, twin
+from mauvecl.noise import layout, reference
 from mauvecl.noise.comparison import Comparison
 from mauvecl.noise.processes import CosmicRays, Processes, Uniform
 from mauvecl.noise.scene import Scene, prepare
@@ -34,11 +34,11 @@ from mauvecl.statistics.registry import STATISTICS
 if TYPE_CHECKING:
     from mauvecl.device.program import DeviceRecord
 
-#: A test of chance fails by chance once in so many devices.
-LUCK = 1e-6
+#: Probability that a statistical check fails on a correct device.
+FALSE_FAILURE_PROBABILITY = 1e-6
 
-#: Random123's known answers: counter, key, output.
-KNOWN = (
+#: Known answers of Random123: counter, key, output.
+PHILOX_VECTORS = (
     ((0, 0, 0, 0), (0, 0), (0x6627E8D5, 0xE169C58D, 0xBC57AC4C, 0x9B00DBD8)),
     ((0xFFFFFFFF,) * 4, (0xFFFFFFFF,) * 2, (0x408F276D, 0x41C83B0E, 0xA20BC7C6, 0x6D5451FD)),
     (
@@ -51,7 +51,7 @@ KNOWN = (
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the table."""
+    """Outcome of one check, a line of the table."""
 
     name: str
     passed: bool
@@ -69,7 +69,7 @@ def toy(
     unit: Any = "DN",
     photon_noise: Any = "gaussian",
 ) -> Expectation:
-    """A small exposure without a star: a smooth spectrum on a plain detector, DN and electrons per frame."""
+    """Return a small exposure of a smooth spectrum on a uniform detector; dark in DN, light in electrons per frame."""
     shape = light * (1.0 + 0.5 * np.sin(np.arange(pixels) / 9.0))
     ones = np.ones(pixels)
     element = np.arange(pixels, dtype=np.int32) // 10
@@ -97,7 +97,7 @@ def toy(
 
 
 _RAYS = CosmicRays(rate_per_cm2_s=300.0)
-#: Small scenes that run every branch of every kernel: what is seen, and how it is drawn.
+#: Small scenes that run every branch of every kernel: options of `toy`, and of the draw and comparison.
 CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
     "stack": ({}, {}),
     "one frame": ({"frames": 1, "unit": "electrons", "photon_noise": "poisson"}, {}),
@@ -126,14 +126,14 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
         },
     ),
 }
-#: Statistics that the fast kernel knows, where nothing but the expectation is compared.
+#: Statistics of the fast kernel, which compares with the expectation only.
 FAST = tuple(name for name, one in STATISTICS.items() if not one.paired)
-#: Across the boundary of the counter's first word.
+#: Realisations that cross the boundary of the counter's first word.
 START, COUNT, SEED = 2**40 - 13, 40, 2**63 + 20_261_121
 
 
 def digests(engine: Engine, name: str) -> dict[str, str]:
-    """Short digests of what a device makes of a case: raw counts, statistics, histograms."""
+    """Return short digests of a device's raw counts, statistics and histograms for a case."""
     options, how = CASES[name]
     quiet, flare = toy(**options), toy(flare=0.3, **options)
     place: dict[str, Any] = {"start": START, "seed": SEED}
@@ -154,14 +154,14 @@ def digests(engine: Engine, name: str) -> dict[str, str]:
     }
 
 
-def twin_digests(name: str) -> dict[str, str]:
-    """The same by the NumPy twin."""
+def reference_digests(name: str) -> dict[str, str]:
+    """Return the digests that the NumPy reference gives for a case."""
     options, how = CASES[name]
     quiet, flare = toy(**options), toy(flare=0.3, **options)
     scene, index = prepare([quiet], **_laid_out(how)), np.arange(START, START + COUNT, dtype=np.uint64)
     both = prepare([quiet, flare], **_laid_out(how))
-    raw = twin.realise(scene, index, SEED)
-    clipped = twin.clipped(scene, index, SEED)
+    raw = reference.realise(scene, index, SEED)
+    clipped = reference.clipped(scene, index, SEED)
     seen = numpy_kernels.histograms(scene, observers(quiet, scene), elements(quiet), index, SEED)
     values, plan = _statistics(name, both)
     tally = Tally(plan.grids[plan.keys.index(("chi2", "null", 0)) :][:1])
@@ -179,7 +179,7 @@ def twin_digests(name: str) -> dict[str, str]:
 
 
 def _statistics(name: str, scene: Scene) -> tuple[NDArray[np.float32], ChannelPlan]:
-    """Every statistic of a case by the twin, and which is which."""
+    """Compute every statistic of a case with the NumPy reference; return values and the plan of their channels."""
     options, how = CASES[name]
     quiet, flare = toy(**options), toy(flare=0.3, **options)
     unknown = as_nuisances(how.get("nuisances"), quiet)
@@ -193,22 +193,22 @@ def _statistics(name: str, scene: Scene) -> tuple[NDArray[np.float32], ChannelPl
 
 
 def _drawing(how: dict[str, Any]) -> dict[str, Any]:
-    """How a case is drawn, whatever it is compared with."""
+    """Return the options of the draw, without those of the comparison."""
     return {key: value for key, value in how.items() if key not in ("comparison", "nuisances")}
 
 
 def _laid_out(how: dict[str, Any]) -> dict[str, Any]:
-    """What `prepare` takes of a case."""
+    """Return the options that `prepare` accepts."""
     return {key: value for key, value in how.items() if key != "nuisances"}
 
 
 def _asked(how: dict[str, Any], names: tuple[str, ...] = tuple(STATISTICS)) -> tuple[str, ...]:
-    """Statistics of a case: where it is marginalised, those that can be."""
+    """Return the statistics of a case; if it marginalises, only those that support this."""
     return tuple(n for n in names if STATISTICS[n].marginal) if "nuisances" in how else names
 
 
 def _fast(values: NDArray[np.float32], plan: ChannelPlan) -> NDArray[np.float32]:
-    """The channels of the fast kernel among all, those that it does not know left at zero."""
+    """Select the channels of the fast kernel, with zeros for statistics that it does not compute."""
     known = values[: plan.n_rows - len(plan.scales)].copy()
     known[[2, 5]] = 0.0
     return known
@@ -227,34 +227,38 @@ def _digest(*arrays: NDArray[Any]) -> str:
 
 
 def known_answers(engine: Engine) -> Check:
-    """Philox against Random123's vectors, on the device."""
-    counters, keys, answers = (np.array([row[i] for row in KNOWN], np.uint32) for i in range(3))
-    out = Probes(device=engine.opened).philox(counters, keys)
+    """Compare Philox on the device with Random123's vectors."""
+    counters, keys, answers = (np.array([row[i] for row in PHILOX_VECTORS], np.uint32) for i in range(3))
+    out = Probes(device=engine.open_device).philox(counters, keys)
     right = np.array_equal(out[:, :4], answers) and np.array_equal(out[:, 4:], answers)
-    return Check("Philox4x32-10, known answers", right, f"{len(KNOWN)} vectors of Random123")
+    return Check("Philox4x32-10, known answers", right, f"{len(PHILOX_VECTORS)} vectors of Random123")
 
 
-def twins(engine: Engine) -> Iterator[Check]:
-    """Every branch of every kernel against the twin."""
+def check_against_reference(engine: Engine) -> Iterator[Check]:
+    """Compare every branch of every kernel with the NumPy reference."""
     for name in CASES:
-        ours, slow = digests(engine, name), twin_digests(name)
+        ours, slow = digests(engine, name), reference_digests(name)
         differ = [part for part in ours if ours[part] != slow[part]]
         if not differ:
             passed, text = True, "digests " + " ".join(ours.values())
         elif engine.device.promise == SAME_BITS:
-            passed, text = False, f"{', '.join(differ)} differ from the twin's"
+            passed, text = False, f"{', '.join(differ)} differ from the reference's"
         else:
             passed, text = _nearly(engine, name)
-        yield Check(f"same bits as the NumPy twin: {name}", passed, text)
+        yield Check(f"same bits as the NumPy reference: {name}", passed, text)
 
 
 def _nearly(engine: Engine, name: str) -> tuple[bool, str]:
-    """The weaker promise: hardly a count off the twin's, and by one DN; statistics within a fifth of their spread."""
+    """Check the weaker promise of devices without strict arithmetic.
+
+    Fewer than 1 % of the counts differ from the reference's, by 1 DN, and statistics by less than 0.2 of their standard
+    deviation.
+    """
     options, how = CASES[name]
     quiet, flare = toy(**options), toy(flare=0.3, **options)
     index = np.arange(START, START + COUNT, dtype=np.uint64)
     raw = engine.realise(quiet, start=START, count=COUNT, seed=SEED, **_drawing(how)).astype(np.int64)
-    off = np.abs(raw - twin.realise(prepare([quiet], **_laid_out(how)), index, SEED))
+    off = np.abs(raw - reference.realise(prepare([quiet], **_laid_out(how)), index, SEED))
     share = float(np.mean(off > 0))
     ours = engine.statistic_values(quiet, [flare], start=START, count=COUNT, seed=SEED, statistics=_asked(how), **how)
     slow = _statistics(name, prepare([quiet, flare], **_laid_out(how)))[0]
@@ -266,7 +270,7 @@ def _nearly(engine: Engine, name: str) -> tuple[bool, str]:
 
 
 def pearson(counts: NDArray[np.int64], probability: NDArray[np.float64]) -> float:
-    """Both tails of Pearson's statistic; rare outcomes are put together."""
+    """Return the two-sided p-value of Pearson's statistic, with rare outcomes in one bin."""
     n = counts.sum()
     expected = n * probability
     common = expected > 20
@@ -280,14 +284,14 @@ def pearson(counts: NDArray[np.int64], probability: NDArray[np.float64]) -> floa
 
 
 def counts_of(engine: Engine, x: Expectation, realisations: int, recipe: Any) -> tuple[NDArray[np.int64], int]:
-    """Histogram of raw counts over all pixels, which are alike, and the count of its first bin."""
+    """Return the histogram of raw counts over all pixels, which are alike, and the count of its first bin."""
     signal = engine.snr(x, realisations=realisations, seed=SEED, recipe=recipe)
     first = int(signal.scene.base_dn[0, 0]) - layout.OBSERVER_BINS // 2
     return signal.counts.pixel.sum(axis=0), first
 
 
 def exact_counts(x: Expectation, first: int) -> NDArray[np.float64]:
-    """Probabilities of the same bins: Poisson dark with Gaussian noise, rounded; Gaussian photons."""
+    """Return the bins' probabilities for Poisson dark, Gaussian read and photon noise, and rounding."""
     mean, step = x.dark_dn[0], x.dark_step_dn[0]
     sd = float(np.sqrt(x.read_noise_dn[0] ** 2 + x.gain_dn_per_electron[0] * x.recorded_light_dn[0] / x.n_frames))
     expected = mean / step
@@ -302,7 +306,7 @@ def exact_counts(x: Expectation, first: int) -> NDArray[np.float64]:
 
 
 def chance(engine: Engine) -> Iterator[Check]:
-    """Pearson's test of raw counts, by every recipe."""
+    """Test raw counts of every recipe with Pearson's statistic."""
     for title, dark, read, recipe in (
         ("joint draw, dark of 2225", 2225.0, 12.0, "joint"),
         ("joint draw, dark of 30", 30.0, 12.0, "joint"),
@@ -312,16 +316,17 @@ def chance(engine: Engine) -> Iterator[Check]:
         x = toy(512, 1, dark=dark, read=read, light=0.0)
         counts, first = counts_of(engine, x, 100_000, recipe)
         p = pearson(counts, exact_counts(x, first))
-        yield Check(f"Pearson, {title}", bool(p > LUCK), f"p = {p:.3g} of {counts.sum():.2g} counts")
+        passed = bool(p > FALSE_FAILURE_PROBABILITY)
+        yield Check(f"Pearson, {title}", passed, f"p = {p:.3g} of {counts.sum():.2g} counts")
 
 
 def closed_forms(engine: Engine) -> Iterator[Check]:
-    """S/N and statistics against their closed forms, in standard errors."""
+    """Compare S/N and statistics with their closed forms, in standard errors."""
     n = 40_000
     quiet, flare = toy(256), toy(256, flare=0.4)
     table = engine.snr(quiet, realisations=n, seed=SEED).element
     z = (table["mean"] - table["expected"]) / table["std"]
-    # The root's curvature moves the mean by about noise over eight signals of an element, 2 % here.
+    # The curvature of the square root biases the mean by about noise / (8 signal) of an element, 2 % here.
     worst = float(np.abs(z).max())
     yield Check("S/N per element, closed form", bool(worst < 0.03 + 5 / np.sqrt(n)), f"means within {worst:.3f} sigma")
     detection = engine.detect(quiet, [flare], realisations=n, seed=SEED, statistics=tuple(STATISTICS))
@@ -334,33 +339,33 @@ def closed_forms(engine: Engine) -> Iterator[Check]:
 
 
 def tiles(engine: Engine) -> Check:
-    """The same realisations in one run and in pieces."""
+    """Compare realisations drawn at once with the same ones drawn in pieces."""
     quiet = toy()
     whole = engine.realise(quiet, start=0, count=500, seed=SEED)
     parts = [engine.realise(quiet, start=a, count=b - a, seed=SEED) for a, b in ((0, 1), (1, 77), (77, 500))]
     return Check("same bits in pieces", bool(np.array_equal(whole, np.concatenate(parts))), "500 realisations in 3")
 
 
-def run(engine: Engine, told: Callable[[Check], None] = lambda check: None) -> list[Check]:
-    """All checks; `told` hears of each as it ends."""
+def run(engine: Engine, report: Callable[[Check], None] = lambda check: None) -> list[Check]:
+    """Run all checks and call `report` with each outcome."""
     from mauvecl.device.selftest_stares import stares
 
     checks: list[Check] = []
 
     def note(check: Check) -> None:
         checks.append(check)
-        told(check)
+        report(check)
 
     note(known_answers(engine))
-    for group in (twins, stares, chance, closed_forms):
+    for group in (check_against_reference, stares, chance, closed_forms):
         for check in group(engine):
             note(check)
     note(tiles(engine))
     return checks
 
 
-def keep(engine: Engine, checks: list[Check], seconds: float) -> None:
-    """Remember the outcome for later run records on the same device, driver and version."""
+def write_outcome(engine: Engine, checks: list[Check], seconds: float) -> None:
+    """Write the outcome to the kernel cache, for run records of the same device, driver and version."""
     record = {
         "mauvecl": VERSION,
         "device": asdict(engine.device),
@@ -369,12 +374,12 @@ def keep(engine: Engine, checks: list[Check], seconds: float) -> None:
         "passed": all(check.passed for check in checks),
         "checks": [asdict(check) for check in checks],
     }
-    kernel_cache().remember(_key(engine.device), json.dumps(record))
+    kernel_cache().write_text(_key(engine.device), json.dumps(record))
 
 
-def last(device: DeviceRecord) -> dict[str, Any] | None:
-    """The outcome kept for a device, if any."""
-    text = kernel_cache().recall(_key(device))
+def read_outcome(device: DeviceRecord) -> dict[str, Any] | None:
+    """Return the latest outcome for a device, or None."""
+    text = kernel_cache().read_text(_key(device))
     return None if text is None else dict(json.loads(text))
 
 

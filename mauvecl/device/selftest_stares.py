@@ -1,4 +1,4 @@
-"""The self-test's checks of stares: both ways of drawing them against the NumPy twin."""
+"""Checks of stares in the self-test: both methods against the NumPy reference."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mauvecl.lightcurve.stares.scene import Flares, StareScene
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.noise.processes import CosmicRays
 
-#: Small stares that run every branch: the payload, what wobbles, how many sums.
+#: Small stares that run every branch: options of `toy`, unknowns of the stare, number of sums.
 CASES: dict[str, tuple[dict[str, Any], dict[str, Any], int]] = {
     "stares that wobble": (
         {"pixels": 8, "unit": "electrons"},
@@ -32,7 +32,7 @@ CASES: dict[str, tuple[dict[str, Any], dict[str, Any], int]] = {
 
 
 def stares(engine: Engine) -> Iterator[Check]:
-    """Every frame of a few stares with flares."""
+    """Compare every frame of a few stares with flares."""
     index = np.arange(START, START + COUNT, dtype=np.uint64)
     for name, (payload, wobble, n_sums) in CASES.items():
         quiet, flare = toy(frames=1, **payload), toy(frames=1, flare=1.0, **payload)
@@ -43,28 +43,28 @@ def stares(engine: Engine) -> Iterator[Check]:
         for method, slow in (("pixels", twin.pixels), ("cumulants", twin.sums)):
             rays = CosmicRays(rate_per_cm2_s=300.0) if method == "pixels" else None
             how: dict[str, Any] = {"seed": SEED, "method": method, "cosmic_rays": rays}
-            ours = Stares(engine.opened).frames(components, stare, given, first=START, count=COUNT, **how)
+            ours = Stares(engine.open_device).frames(components, stare, given, first=START, count=COUNT, **how)
             theirs = slow(StareScene.of(components, stare, rays), flares, index, frames, SEED)[0]
             apart = float(np.max(np.abs(ours - theirs).max(axis=(0, 1)) / theirs.std(axis=(0, 1))))
             if engine.device.promise == SAME_BITS:
                 passed, text = bool((ours == theirs).all()), f"{ours.size} sums, {apart:.2g} sigma apart"
             else:
                 passed, text = apart < 0.2, f"weaker promise: {apart:.2g} sigma apart"
-            yield Check(f"same bits as the NumPy twin: {name}, by {method}", passed, text)
-        asked = StaresRequest(components, stare, COUNT, SEED, start=START, reduction=Glow(), glow=True)
-        ours = Stares(engine.opened).reduced(asked)["glow"]
+            yield Check(f"same bits as the NumPy reference: {name}, by {method}", passed, text)
+        request = StaresRequest(components, stare, COUNT, SEED, start=START, reduction=Glow(), glow=True)
+        ours = Stares(engine.open_device).reduced(request)["glow"]
         theirs = twin.glow(StareScene.of(components, stare), index, frames, SEED)
         apart = float(np.abs(ours - theirs).max())
         passed = bool((ours == theirs).all()) if engine.device.promise == SAME_BITS else apart < 0.2
-        yield Check(f"same bits as the NumPy twin: {name}, what flares need", passed, f"{apart:.2g} apart")
+        yield Check(f"same bits as the NumPy reference: {name}, noise of flares", passed, f"{apart:.2g} apart")
 
 
 @dataclass(frozen=True)
 class Glow:
-    """What flares need beside frames, as it is."""
+    """Reduction that keeps the noise factors of flares."""
 
     adds: ClassVar[bool] = False
 
     def __call__(self, values: NDArray[np.float32], first: int, glow: NDArray[np.float32]) -> Arrays:
-        """As ``glow``."""
+        """Return the factors as ``glow``."""
         return {"glow": glow.copy()}

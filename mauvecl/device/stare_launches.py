@@ -1,4 +1,4 @@
-"""One stare on a device: its buffers and launches."""
+"""Buffers and kernel launches of stares."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.device.launches import Launches, beyond
-from mauvecl.device.opened import Device
+from mauvecl.device.device import Device
+from mauvecl.device.launches import Launches, padded
 from mauvecl.device.program import Variant
 from mauvecl.device.tiles import TILE_BYTES, Tile
 from mauvecl.lightcurve.stares.requests import Method
@@ -19,18 +19,18 @@ from mauvecl.lightcurve.stares.sums import SumTable
 
 Floats = NDArray[np.float32]
 
-#: Frames that one work-item follows where sums are drawn.
+#: Frames per work-item of the kernels whose lanes are frames.
 FRAMES_EACH = 1024
-#: Callers ask for a few stares at a time, with the same weights.
+#: Cached because callers draw a few stares at a time with the same weights.
 table_of = lru_cache(maxsize=4)(SumTable.of)
 
 
 class StareLaunches(Launches):
-    """One stare on a device, its buffers released at the end of the `with` block."""
+    """Buffers and launches of a stare; the buffers are released at the end of the `with` block."""
 
     def __init__(self, device: Device, stare: StareScene, seed: int, method: Method) -> None:
-        self._in_time = method == "cumulants"
-        table = table_of(stare.components) if self._in_time else None
+        self._by_sums = method == "cumulants"
+        table = table_of(stare.components) if self._by_sums else None
         scene = stare.scene
         variant = replace(
             device.variant,
@@ -42,14 +42,14 @@ class StareLaunches(Launches):
             counts=stare.counts,
             fourths=table is not None and table.fourths,
             jittered=any(stare.stare.jitters.values()),
-            in_time=self._in_time,
+            in_time=self._by_sums,
         )
         super().__init__(device, scene, variant, seed)
         self._held: Any = None
         self._stare, self._local = stare, (1, 1) if variant.width > 1 else None
         self._known = [*map(self.upload, (stare.numbers, stare.known, stare.curves, stare.kinds))]
         if table is None:
-            more = (beyond(stare.mixtures), stare.spectra, stare.weights, stare.constants)
+            more = (padded(stare.mixtures), stare.spectra, stare.weights, stare.constants)
             self._own = [*map(self.upload, more)]
         else:
             self._own = [self.upload(table.packed)]
@@ -59,8 +59,8 @@ class StareLaunches(Launches):
         if self._held is not None:
             self._held.release()
 
-    def give(self, flares: Flares) -> None:
-        """Upload the flares of the stares that are drawn next."""
+    def upload_flares(self, flares: Flares) -> None:
+        """Upload the flares of the next stares."""
         self._scenarios = len(flares.amplitudes)
         self._flares = [
             self._fill("staring", self._stare.staring_of(flares)),
@@ -70,7 +70,7 @@ class StareLaunches(Launches):
         ]
 
     def _shared(self, array: NDArray[Any]) -> Any:
-        """A processor's own memory, in use until the next flares are given."""
+        """Return a buffer that shares the host's memory, valid until the next flares are uploaded."""
         if self._held is not None:
             self._held.release()
         flags = self._cl.mem_flags
@@ -79,37 +79,38 @@ class StareLaunches(Launches):
         return self._held
 
     def _fill(self, name: str, array: NDArray[Any]) -> Any:
+        """Copy an array to a reused buffer."""
         data = np.ascontiguousarray(array if array.size else np.zeros(1, array.dtype))
-        buffer = self._room(name, data.nbytes)
+        buffer = self._scratch(name, data.nbytes)
         self._cl.enqueue_copy(self._queue, buffer, data)
         return buffer
 
     def draw(self, tile: Tile, out: Floats, row: int) -> None:
-        """Statistics of a tile's frames into rows of `out`.
+        """Draw the statistics of a tile's frames into `out`.
 
         Parameters
         ----------
         tile : Tile
         out : ndarray of float32, shape (n_scenario, n_stare, n_statistic, n_padded_frame)
         row : int
-            Where the tile's first stare goes.
+            Index in `out` of the tile's first stare.
         """
-        if self._in_time:
+        if self._by_sums:
             self._by_cumulants(tile, out, row)
         else:
             self._by_pixels(tile, out[:, row : row + tile.wanted])
 
     def _by_pixels(self, tile: Tile, out: Floats) -> None:
-        """A few frames of all stares at a time."""
+        """Draw pixels, a few frames of all stares at a time."""
         tile = tile.narrow(self.variant.width)
         n_frames, each = self._stare.stare.n_frames, self._scenarios * self.variant.sums * tile.size
         block = max(1, TILE_BYTES // (4 * each))
-        # As much room as the scenarios need: powers of two, so that few programs are built.
+        # The number of scenarios is rounded up to a power of two, so that few programs are built.
         variant = replace(self.variant, scenarios=1 << (self._scenarios - 1).bit_length())
         kernel = self._device.kernel(("stare", "stare_pixels"), variant, "stare_pixels")
         for begin in range(0, n_frames, block):
             size = min(block, n_frames - begin)
-            values = self._room("values", 4 * each * size)
+            values = self._scratch("values", 4 * each * size)
             kernel(
                 self._queue,
                 (tile.size // self.variant.width, size),
@@ -128,22 +129,25 @@ class StareLaunches(Launches):
             out[..., begin : begin + size] = host[..., tile.start : tile.stop].transpose(1, 3, 2, 0)
 
     def _by_cumulants(self, tile: Tile, out: Floats, row: int) -> None:
-        """All frames of each stare."""
+        """Draw sums from their cumulants, all frames of each stare at once."""
         self._in_frames("stare_sums", self.variant, self._own, tile, out, row)
 
     def glow(self, tile: Tile, out: Floats, row: int) -> None:
-        """What flares put into a tile's frames need, shape (1, n_stare, n_statistic + 1, n_padded_frame)."""
+        """Compute what `Injections` need to add flares to a tile's frames.
+
+        `out` has the shape (1, n_stare, n_statistic + 1, n_padded_frame).
+        """
         self._in_frames("stare_glow", replace(self.variant, in_time=True), [], tile, out, row)
 
     def _in_frames(self, name: str, variant: Variant, own: list[Any], tile: Tile, out: Floats, row: int) -> None:
-        """One kernel whose lanes are frames."""
+        """Launch a kernel whose lanes are frames."""
         first, each = tile.first + tile.start, FRAMES_EACH if variant.width > 1 else 1
         kernel = self._device.kernel(("stare", name), variant, name)
-        # Other memory holds this tile alone.
-        own_memory = self._device.record.kind == "cpu"
-        place = (out.shape[1], row) if own_memory else (tile.wanted, 0)
-        host = out if own_memory else np.empty((len(out), tile.wanted, *out.shape[2:]), np.float32)
-        with self._into("values", host) as values:
+        # A CPU writes to `out`; a buffer of another device contains only this tile.
+        shares_memory = self._device.record.kind == "cpu"
+        place = (out.shape[1], row) if shares_memory else (tile.wanted, 0)
+        host = out if shares_memory else np.empty((len(out), tile.wanted, *out.shape[2:]), np.float32)
+        with self._output("values", host) as values:
             kernel(
                 self._queue,
                 (tile.wanted, -(-out.shape[3] // each)),
@@ -157,5 +161,5 @@ class StareLaunches(Launches):
                 *map(np.uint32, place),
                 values,
             )
-        if not own_memory:
+        if not shares_memory:
             out[:, row : row + tile.wanted] = host

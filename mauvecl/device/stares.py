@@ -1,4 +1,4 @@
-"""Stares on a device: every frame drawn, and reduced there to a few weighted sums."""
+"""Drawing of stares on a device, where each frame is reduced to a few weighted sums."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.device.opened import Device
+from mauvecl.device.device import Device
 from mauvecl.device.stare_launches import StareLaunches
 from mauvecl.device.tiles import Progress, Tile, Tiles
 from mauvecl.host.arguments import public
@@ -23,31 +23,31 @@ from mauvecl.results.requests.requests import Shard
 
 Floats = NDArray[np.float32]
 
-#: Of stares that are drawn and reduced at once.
+#: Memory of stares that are drawn and reduced at once.
 REDUCED_BYTES = 4 * 2**20
 
 
 @public
 class Stares:
-    """Draws stares on an OpenCL device.
+    """Simulator of stares on an OpenCL device.
 
     Parameters
     ----------
     device : str or Device, optional
-        As `Engine` takes it, or a device that is open already.
+        Number or name, as for `Engine`, or an open device.
     progress : callable, optional
         Called as ``progress(done, total)`` before and between tiles, in stares. It may raise to stop the work.
     tile : int, optional
-        Stares in one launch, for tests; chosen from the device and the work by default. Never changes a result.
+        Stares per launch, for tests; by default chosen from the device and the work. Does not affect results.
     width : int, optional
-        Stares or frames in one work-item, for tests: 16 on CPUs, 1 elsewhere. Never changes a result.
+        Stares or frames per work-item, for tests; by default 16 on CPUs and 1 elsewhere. Does not affect results.
     tiles : Tiles, optional
-        How the work is cut, in place of `progress` and `tile`.
+        Division of the work, instead of `progress` and `tile`.
 
     Raises
     ------
     DeviceError
-        If there is no such device, or PoCL cannot work here.
+        If there is no such device, or its driver does not work.
 
     Examples
     --------
@@ -77,8 +77,8 @@ class Stares:
         width: int | None = None,
         tiles: Tiles | None = None,
     ) -> None:
-        self.opened = device if isinstance(device, Device) else Device(device, width=width)
-        self._tiles = tiles or Tiles(self.opened, progress=progress, largest=tile)
+        self.open_device = device if isinstance(device, Device) else Device(device, width=width)
+        self._tiles = tiles or Tiles(self.open_device, progress=progress, largest=tile)
 
     def frames(
         self,
@@ -93,35 +93,30 @@ class Stares:
         amplitudes: NDArray[Any] | None = None,
         cosmic_rays: CosmicRays | None = None,
     ) -> Floats:
-        """Statistics of each frame of stares `first` to `first + count - 1`.
+        """Draw the statistics of each frame of stares `first` to `first + count - 1`.
 
         Parameters
         ----------
         components : Components
         stare : Stare
         flare : ndarray, shape (n_frame, n_flare) or (count, n_frame, n_flare), optional
-            Amplitude of each flare spectrum in each frame, of all stares alike or of each.
+            Amplitude of each flare spectrum in each frame, common to all stares or per stare.
         first, count : int
-            Numbers of stares: what they hold follows from seed and number alone.
+            Range of stares; each stare depends only on the seed and its number.
         seed : int
             0 to 2**64 - 1.
         method : {"pixels", "cumulants"}
-            Every pixel drawn, or the sums at once from their cumulants. Conditions of frames are the same either way.
+            Draw every pixel, or the sums directly from their cumulants. The conditions of frames are equal for both.
         amplitudes : ndarray, shape (n_scenario, count) or (n_scenario, 1), optional
-            Factors on `flare`: as many scenarios on common draws.
+            Factors on `flare`, for several scenarios on common draws.
         cosmic_rays : CosmicRays, optional
-            By method "pixels".
+            Cosmic rays, supported by the method "pixels" only.
 
         Returns
         -------
         ndarray of float32, shape (count, n_frame, n_statistic)
-            Sums over pixels of weights times raw counts less the quiescent star's mean; frames of one statistic lie
-            side by side in memory. With `amplitudes` one axis more in front, (n_scenario, ...).
-
-        Raises
-        ------
-        InputError
-            For an impossible range, seed or method, or what cannot be drawn by it.
+            Weighted sums over pixels of raw counts minus the quiescent mean; frames of a statistic are contiguous in
+            memory. With `amplitudes`, the shape is (n_scenario, count, n_frame, n_statistic).
         """
         _check(first, count, seed, method)
         flares = Flares.of(components, stare, flare, amplitudes, count)
@@ -130,15 +125,15 @@ class Stares:
         with self._launches(components, stare, flares, seed, method, cosmic_rays) as launches:
 
             def work(tile: Tile, done: int) -> None:
-                launches.give(flares.part(done, tile.wanted))
+                launches.upload_flares(flares.part(done, tile.wanted))
                 launches.draw(tile, out, done)
 
-            self._tiles.over(first, count, out[:, 0].nbytes, work)
+            self._tiles.for_each(first, count, out[:, 0].nbytes, work)
         frames = np.moveaxis(out[..., : stare.n_frames], 2, 3)
         return frames[0] if amplitudes is None else frames
 
     def reduced(self, request: StaresRequest, shard: Shard | None = None) -> Arrays:
-        """What is kept of a request's stares, or of a shard of them, which are drawn and reduced a few at a time.
+        """Draw the stares of a request, or of a shard of it, and reduce them a few at a time.
 
         Parameters
         ----------
@@ -148,12 +143,7 @@ class Stares:
         Returns
         -------
         dict of str to ndarray
-            What the request's reduction gives, joined; of a shard with its ``start``, as `StareSums` takes it.
-
-        Raises
-        ------
-        InputError
-            As `frames`.
+            Joined results of the request's reduction; for a shard with its ``start``, as `StareSums` requires.
         """
         there = shard or Shard(0, request.start, request.realisations)
         _check(there.start, there.count, request.seed, request.method)
@@ -163,11 +153,11 @@ class Stares:
         parts = list[Arrays]()
         shape = (components.n_statistics, padded_frames(stare.n_frames))
         each = 4 * len(request.flares.amplitudes) * shape[0] * shape[1]
-        # Few enough to stay in a processor's cache while they are looked at, and never a vector's worth of months.
-        alone = 1 if request.method == "cumulants" else self.opened.width
-        piece = max(alone, REDUCED_BYTES // each // alone * alone)
+        # Pieces are small enough for a processor's cache; the cumulants need no full vector of long stares.
+        step = 1 if request.method == "cumulants" else self.open_device.width
+        piece = max(step, REDUCED_BYTES // each // step * step)
         room = np.empty(each * piece // 4, np.float32)
-        beside = np.empty((1, piece, shape[0] + 1, shape[1]) if request.glow else 0, np.float32)
+        glow = np.empty((1, piece, shape[0] + 1, shape[1]) if request.glow else 0, np.float32)
         with self._launches(components, stare, request.flares, *how) as launches:
 
             def work(tile: Tile, done: int) -> None:
@@ -175,18 +165,18 @@ class Stares:
                 for few in tile.pieces(piece):
                     out = room[: each * few.wanted // 4].reshape(-1, few.wanted, *shape)
                     first = few.first + few.start
-                    launches.give(request.flares.part(first - request.start, few.wanted))
+                    launches.upload_flares(request.flares.part(first - request.start, few.wanted))
                     launches.draw(few, out, 0)
                     values = np.moveaxis(out[..., : stare.n_frames], 2, 3)[scenarios]
                     more = []
                     if request.glow:
-                        launches.glow(few, beside, 0)
-                        more = [np.moveaxis(beside[0, : few.wanted, :, : stare.n_frames], 1, 2)]
+                        launches.glow(few, glow, 0)
+                        more = [np.moveaxis(glow[0, : few.wanted, :, : stare.n_frames], 1, 2)]
                     reduced.append(dict(reduction(values, first, *more)))
-                # A tile that fails half way is drawn again.
+                # Results are added last, since a tile that fails is drawn again.
                 parts.extend(reduced)
 
-            self._tiles.over(there.start, there.count, each, work)
+            self._tiles.for_each(there.start, there.count, each, work)
         kept = joined(parts, adds=reduction.adds)
         return kept | {"start": np.array(there.start)} if shard else kept
 
@@ -199,16 +189,16 @@ class Stares:
         method: Method,
         cosmic_rays: CosmicRays | None,
     ) -> StareLaunches:
-        self.opened.check_process()
-        scene = _laid_out(components, stare, cosmic_rays)
+        self.open_device.check_process()
+        scene = _scene_of(components, stare, cosmic_rays)
         scene.check(flares)
         if method == "cumulants":
             check_sums(scene, flares)
-        return StareLaunches(self.opened, scene, seed, method)
+        return StareLaunches(self.open_device, scene, seed, method)
 
 
-#: Callers ask for a few stares at a time, of the same star.
-_laid_out = lru_cache(maxsize=4)(StareScene.of)
+#: Cached because callers draw a few stares of the same star at a time.
+_scene_of = lru_cache(maxsize=4)(StareScene.of)
 
 
 def _check(first: int, count: int, seed: int, method: str) -> None:

@@ -1,4 +1,4 @@
-"""Realisations cut into launches, as the device's memory and the generator's counter allow."""
+"""Division of realisations into launches that fit the device's memory and the generator's counter."""
 
 from __future__ import annotations
 
@@ -7,46 +7,46 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from mauvecl.device.device import Device
 from mauvecl.device.errors import DeviceError
-from mauvecl.device.opened import Device
 from mauvecl.device.program import out_of_memory
 
 Progress = Callable[[int, int], None]
 
-#: Device memory for what one tile writes; tiles change no result.
+#: Device memory for the output of a tile. The size of tiles does not affect results.
 TILE_BYTES = 64 * 2**20
 LARGEST_TILE = 2**16
 
 
 @dataclass(frozen=True)
 class Tile:
-    """Realisations from `first` on, a multiple of the vector width; [start, stop) of these `size` are wanted."""
+    """Range of realisations computed in one launch."""
 
-    first: int
+    first: int  # a multiple of the vector width
     size: int
-    start: int
+    start: int  # the requested realisations are [start, stop), relative to first
     stop: int
 
     @property
     def wanted(self) -> int:
-        """How many are wanted."""
+        """Number of requested realisations."""
         return self.stop - self.start
 
     def address(self) -> tuple[np.uint32, np.uint32]:
-        """Both words of the first index."""
+        """Return both words of the first index."""
         return np.uint32(self.first & 0xFFFFFFFF), np.uint32(self.first >> 32)
 
     def rows(self) -> tuple[np.uint32, np.uint32]:
-        """Which of the tile are wanted."""
+        """Return the requested range, relative to the first realisation."""
         return np.uint32(self.start), np.uint32(self.stop)
 
     def narrow(self, width: int) -> Tile:
-        """The same realisations in as few vectors of a width as hold them."""
+        """Return the tile of the same requested realisations with the fewest vectors of this width."""
         skip = self.start - self.start % width
         return Tile(self.first + skip, -(-self.stop // width) * width - skip, self.start - skip, self.stop - skip)
 
     def pieces(self, size: int) -> Iterator[Tile]:
-        """The same realisations in tiles of at most so many, a multiple of what a work-item follows."""
+        """Yield tiles of at most `size` realisations, a multiple of those per work-item."""
         for begin in range(0, self.size, size):
             length = min(size, self.size - begin)
             start, stop = max(self.start - begin, 0), min(self.stop - begin, length)
@@ -55,7 +55,7 @@ class Tile:
 
 
 class Tiles:
-    """How one device's work is cut.
+    """Division of a device's work into tiles.
 
     Parameters
     ----------
@@ -63,13 +63,13 @@ class Tiles:
     progress : callable, optional
         Called as ``progress(done, total)`` before and between tiles, in realisations. It may raise to stop the work.
     largest : int, optional
-        Realisations in one tile, at most.
+        Largest number of realisations per tile.
     """
 
     def __init__(self, device: Device, *, progress: Progress | None = None, largest: int | None = None) -> None:
         self._device, self._progress, self._largest, self._step = device, progress, largest, device.step
 
-    def over(
+    def for_each(
         self,
         start: int,
         count: int,
@@ -79,7 +79,7 @@ class Tiles:
         before: int = 0,
         total: int | None = None,
     ) -> None:
-        """Work through realisations tile by tile, with smaller ones where the device's memory does not suffice."""
+        """Call `work(tile, done)` for each tile, with smaller tiles if the device's memory does not suffice."""
         size = self.size(bytes_each)
         done = 0
         if self._progress is not None and not before:
@@ -102,17 +102,17 @@ class Tiles:
                 self._progress(before + done, count if total is None else total)
 
     def size(self, bytes_each: int) -> int:
-        """Realisations in a tile: a power of two, from the device's memory and what each needs."""
+        """Return the number of realisations per tile, a power of two, from the memory of the device."""
         memory = min(TILE_BYTES, self._device.record.global_memory // 8)
         fit = memory // bytes_each if bytes_each else LARGEST_TILE
         size = min(self._largest or LARGEST_TILE, LARGEST_TILE, max(fit, 1))
         return int(max(1 << (size.bit_length() - 1), self._step))
 
     def at(self, index: int, left: int, size: int) -> Tile:
-        """The tile that `index` lies in, cut at multiples of its size, so that none crosses a multiple of 2**32."""
+        """Return the tile from `index` to a multiple of `size`, so that no tile crosses a multiple of 2**32."""
         first = index - index % size
         start, stop = index - first, min(index - first + left, size)
-        # A short tile computes only the vectors it needs.
+        # A short tile computes only the vectors that it needs.
         skip = start - start % self._step
         need = -(-stop // self._step) * self._step
         return Tile(first + skip, need - skip, start - skip, stop - skip)

@@ -1,8 +1,8 @@
-"""Intel's OpenCL runtime for processors as pip installs it.
+"""Support for Intel's OpenCL runtime for CPUs as installed by pip.
 
-The wheel brings the driver's library, but the .icd file that should name it holds a place of the machine on which the
-wheel was made, in a folder where no loader looks. So the loader is shown a folder with a file that names the library,
-next to what it would have found without; the PoCL that comes with pyopencl it finds in any case.
+The wheel contains the driver's library, but its .icd file names a path of the machine on which the wheel was built, and
+no loader searches the file's folder. The loader is therefore given a folder with a correct .icd file in addition to
+those that it would have found. It finds the PoCL of pyopencl's wheels in any case.
 """
 
 from __future__ import annotations
@@ -17,25 +17,25 @@ from pathlib import Path
 
 from mauvecl.device.kernel_cache import kernel_cache
 
-#: Name of the wheel, and of its driver.
+#: Name of the wheel and of its driver's library.
 WHEEL, DRIVER = "intel-opencl-rt", "libintelocl.so"
-#: Variables that name the loader's folder, the first that is set; and the folder without them.
-FOLDERS, USUAL = ("OCL_ICD_VENDORS", "OPENCL_VENDOR_PATH"), "/etc/OpenCL/vendors"
+#: Variables that name the loader's folder, in order of precedence, and the default folder.
+FOLDER_VARIABLES, DEFAULT_FOLDER = ("OCL_ICD_VENDORS", "OPENCL_VENDOR_PATH"), "/etc/OpenCL/vendors"
 
 
 @contextlib.contextmanager
-def shown() -> Iterator[None]:
-    """Let the OpenCL loader find Intel's runtime if it starts inside the block."""
-    folder = None if os.environ.get(FOLDERS[0]) else _folder()
+def show_intel_runtime() -> Iterator[None]:
+    """Make Intel's runtime visible to an OpenCL loader that starts inside the block."""
+    folder = None if os.environ.get(FOLDER_VARIABLES[0]) else _folder()
     if folder is None:
         yield
         return
-    os.environ[FOLDERS[0]] = str(folder)
+    os.environ[FOLDER_VARIABLES[0]] = str(folder)
     try:
         yield
     finally:
-        # Other programs started from here may outlive the folder.
-        del os.environ[FOLDERS[0]]
+        # Child processes may outlive the folder.
+        del os.environ[FOLDER_VARIABLES[0]]
 
 
 @cache
@@ -44,11 +44,12 @@ def _folder() -> Path | None:
     library = _library()
     if library is None:
         return None
-    places = [os.environ.get(FOLDERS[1]) or USUAL, os.path.join(sys.prefix, "etc", "OpenCL", "vendors")]
+    system = os.environ.get(FOLDER_VARIABLES[1]) or DEFAULT_FOLDER
+    places = [system, os.path.join(sys.prefix, "etc", "OpenCL", "vendors")]
     known = {path.name: _text(path) for place in reversed(places) for path in sorted(Path(place).glob("*.icd"))}
     drivers = {name: text for name, text in known.items() if DRIVER not in text or Path(text.strip()).exists()}
     if any(DRIVER in text for text in drivers.values()):
-        # The system knows Intel's runtime.
+        # The system lists Intel's runtime already.
         return None
     folder = kernel_cache().work / "vendors"
     with contextlib.suppress(OSError):
@@ -60,7 +61,7 @@ def _folder() -> Path | None:
 
 
 def _library() -> Path | None:
-    """Return the driver's library of the wheel, if that is installed here."""
+    """Return the path of the wheel's library, or None if the wheel is not installed."""
     with contextlib.suppress(metadata.PackageNotFoundError):
         for file in metadata.files(WHEEL) or ():
             if file.name == DRIVER:

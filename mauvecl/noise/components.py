@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.noise import twin
+from mauvecl.noise import reference
 from mauvecl.noise.drawing import DrawingWords
 from mauvecl.noise.scene import prepare
 
@@ -27,7 +27,7 @@ def components(
     seed: int,
     **drawing: Unpack[DrawingWords],
 ) -> QTable:
-    """The draws behind one raw spectrum, by the slow twin.
+    """The draws behind one raw spectrum, by the slow reference.
 
     Parameters
     ----------
@@ -61,18 +61,18 @@ def components(
     parts = {name: np.zeros(n) for name in ("source", "sky", "photon_noise", "dark", "read_noise", "cosmic_rays")}
     raw = np.zeros(n)
     for frame in range(scene.n_draws):
-        factors = twin.factors(scene, index, frame, seed)
+        factors = reference.factors(scene, index, frame, seed)
         light, warm, glow = ((1.0 + float(f[0])) * middle for f, middle in zip(factors, scene.medians, strict=True))
         dark_dn, photon_dn, cosmic, analogue, dn = np.zeros((5, len(scene.pixels)))
         u_dark, z_split = np.zeros((2, len(scene.pixels)))
         for group in range(len(scene.pixels) // 4):
-            drawn = twin.draws(scene, index, frame, group, seed)
-            chance = twin.words_at(index, frame, "split_dark", group, seed)
-            apart = twin.four_normals(twin.words_at(index, frame, "split", group, seed))
+            drawn = reference.draws(scene, index, frame, group, seed)
+            chance = reference.words_at(index, frame, "split_dark", group, seed)
+            apart = reference.four_normals(reference.words_at(index, frame, "split", group, seed))
             for i, p in enumerate(range(4 * group, 4 * group + 4)):
-                v = twin.analogue(scene, drawn, i, p, 0, *factors)
+                v = reference.analogue(scene, drawn, i, p, 0, *factors)
                 analogue[p] = v[0]
-                dn[p] = twin.digitise(v, scene.edges[0, p], clip=scene.clip)[0]
+                dn[p] = reference.digitise(v, scene.edges[0, p], clip=scene.clip)[0]
                 z_split[p] = apart[i][0]
                 u_dark[p] = (float(chance[i][0]) + 0.5) / 2**32
                 if scene.cosmic:
@@ -80,9 +80,10 @@ def components(
                 if not scene.joint:
                     dark_dn[p] = scene.dark_counts[p]["gain"] * drawn.dark[i][0]
                 if drawn.photon is not None:
-                    pairs = twin.four_normals(drawn.photon)
+                    pairs = reference.four_normals(drawn.photon)
                     source = scene.photon_counts[0, p]
-                    photon_dn[p] = source["gain"] * twin.poisson_draw(drawn.photon, i, source, scene.tables, pairs)[0]
+                    electrons = reference.poisson_draw(drawn.photon, i, source, scene.tables, pairs)[0]
+                    photon_dn[p] = source["gain"] * electrons
         source, sky = each * light * gain * x.source_electrons, each * light * glow * gain * x.sky_electrons
         photon_variance = gain * (source + sky)
         read_variance = each * x.read_noise_dn**2 + (each - 1) / 12

@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.noise import layout
+from mauvecl.noise.reference import MAGIC, Floats, clipped, fma, nearest, observed
 from mauvecl.noise.scene import Scene
-from mauvecl.noise.twin import MAGIC, Floats, clipped, fma, nearest, observed
 from mauvecl.results.snr import Counts
 from mauvecl.statistics.paper import Paper
 

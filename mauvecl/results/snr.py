@@ -14,8 +14,8 @@ from mauvecl.host.content import ContentEquality
 from mauvecl.host.errors import InputError
 from mauvecl.host.tables import make_table, set_descriptions
 from mauvecl.noise import layout
+from mauvecl.noise.reference import Floats, fma
 from mauvecl.noise.scene import Scene
-from mauvecl.noise.twin import Floats, fma
 from mauvecl.results.counts.far import SparseCounts
 
 if TYPE_CHECKING:

@@ -135,7 +135,7 @@ class LocalWorkers:
                     return self._engines[place].count(task.request, task.shard, out=task.out)
                 except Exception as error:
                     engine = self._engines[place]
-                    launch = isinstance(error, engine.opened.cl.Error)
+                    launch = isinstance(error, engine.open_device.cl.Error)
                     if not launch or self._stopping:
                         raise
                     if tried == MAX_TRIES:

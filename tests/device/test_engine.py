@@ -1,4 +1,4 @@
-"""The engine against its NumPy twin, its own splits, and the closed-form moments."""
+"""Comparison of the engine with the NumPy reference, with its own splits, and with closed-form moments."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from scenes import instrument, star
 from scipy import stats
 
 from mauvecl.device.engine import Engine
-from mauvecl.device.forms import scene_launches
 from mauvecl.device.selftest import toy
+from mauvecl.device.variants import scene_launches
 from mauvecl.host.errors import InputError
 from mauvecl.host.instrument.pixel_map import PixelMap
-from mauvecl.noise import twin as reference
+from mauvecl.noise import reference
 from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.processes import CosmicRays, Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare
@@ -40,8 +40,8 @@ PRIORS = Processes(
     pointing_loss=Uniform(0.0, 0.05),
     qe_scale=Normal(1.0, 0.3, 0.4, 1.6),
 )
-#: What the noise model can be asked for: paper and physical counts, one frame and stacks, a rail, every recipe (joint
-#: with and without the fourth power, apart by tables, expansion, or some of each), every process, uneven pixels.
+#: Options of the noise model: paper and physical counts, one frame and stacks, a rail, every recipe (joint with and
+#: without the fourth power, apart by tables, expansion, or both), every process, uneven pixels.
 CASES = {
     "stack": {},
     "one frame": {"exposure": 5.0},
@@ -78,8 +78,8 @@ CASES = {
 }
 
 
-#: Cases whose statistics a single realisation to a work-item is tried on: of every recipe, in stacks and frames, with
-#: every process. Raw spectra, by the same draws, are tried in all cases.
+#: Cases whose statistics are tested at width 1: every recipe, stacks and frames, every process. Raw spectra, which use
+#: the same draws, are tested in all cases.
 ONE_BY_ONE = (
     "stack",
     "one frame",
@@ -90,12 +90,12 @@ ONE_BY_ONE = (
     "priors, electrons, frames",
     "jitter, one frame, rays",
 )
-#: A joint draw, and one apart and frame by frame: what `make check` looks at.
+#: Cases of `make check`: a joint draw, and separate draws frame by frame.
 SHORT = ("stack", "apart, electrons, frames")
 
 
 def case(name: str) -> tuple[list, dict]:
-    """Expectations, and how to draw them."""
+    """Return the expectations of a case and the options of their draw."""
     options = dict(CASES[name])
     how = {key: options.pop(key) for key in ("mode", "recipe", "processes") if key in options}
     exposure, magnitude = options.pop("exposure", 50.0), options.pop("magnitude", 7.4)
@@ -105,34 +105,34 @@ def case(name: str) -> tuple[list, dict]:
 
 @pytest.fixture(scope="module")
 def one_by_one() -> Engine:
-    """With one realisation to a work-item."""
+    """Return an engine with one realisation per work-item."""
     return Engine(width=1)
 
 
 @pytest.fixture(scope="module", params=["vectors", pytest.param("scalar", marks=pytest.mark.long)])
 def any_width(request: pytest.FixtureRequest, engine: Engine, one_by_one: Engine) -> Engine:
-    """The engine as processors run it, and one realisation to a work-item, as a GPU does."""
+    """Return the engine as CPUs run it, and as GPUs do, with one realisation per work-item."""
     return engine if request.param == "vectors" else one_by_one
 
 
-#: Around the boundary of the counter's first word.
+#: Realisations that cross the boundary of the counter's first word.
 START = 2**32 - 24
 INDEX = np.arange(START, START + 40, dtype=np.uint64)
 SEED = 2**63 + 12345
 
 
 @pytest.mark.parametrize("name", long_but(CASES, *SHORT))
-def test_raw_spectra_are_the_twins(any_width: Engine, name: str) -> None:
+def test_raw_spectra_equal_reference(any_width: Engine, name: str) -> None:
     (quiet, *_), how = case(name)
     raw, clipped = any_width.realise_and_count(quiet, start=START, count=INDEX.size, seed=SEED, **how)
-    for ours, twin in zip((raw, clipped), _raw_twin(name), strict=True):
-        np.testing.assert_array_equal(ours, twin)
+    for ours, expected in zip((raw, clipped), _reference_raw(name), strict=True):
+        np.testing.assert_array_equal(ours, expected)
     assert (raw.dtype == np.uint16) == (quiet.n_frames == 1)
 
 
 @pytest.mark.long
-def test_raw_sums_beyond_what_float32_holds_are_whole(engine: Engine) -> None:
-    """400 frames that lose up to 48 000 DN each."""
+def test_raw_sums_above_float32_integers_are_exact(engine: Engine) -> None:
+    """Sum 400 frames that lose up to 48 000 DN each."""
     how = {"mode": "frames", "processes": Processes(light_loss=Uniform(0.0, 0.9))}
     quiet = toy(20, 400, light=90_000.0)
     raw, scene = engine.realise(quiet, count=40, seed=SEED, **how), prepare([quiet], **how)
@@ -142,7 +142,7 @@ def test_raw_sums_beyond_what_float32_holds_are_whole(engine: Engine) -> None:
 
 @cache
 def _twin(name: str, comparison: Comparison) -> tuple[ChannelPlan, np.ndarray]:
-    """Every channel of a detection by the twin, once for both widths."""
+    """Compute every channel of a detection with the reference, once for both widths."""
     (quiet, *flares), how = case(name)
     asked = DetectRequest.of(
         quiet, tuple(flares), INDEX.size, SEED, tuple(STATISTICS), START, comparison=comparison, **how
@@ -155,27 +155,27 @@ def _twin(name: str, comparison: Comparison) -> tuple[ChannelPlan, np.ndarray]:
 
 
 @cache
-def _raw_twin(name: str) -> tuple[np.ndarray, np.ndarray]:
-    """Raw counts, and how many of them are cut off in each realisation."""
+def _reference_raw(name: str) -> tuple[np.ndarray, np.ndarray]:
+    """Compute raw counts and each realisation's number of clipped samples with the reference."""
     (quiet, *_), how = case(name)
     scene = prepare([quiet], **how)
     return reference.realise(scene, INDEX, SEED), reference.clipped(scene, INDEX, SEED).sum(axis=(1, 2))
 
 
-# Without noise there is no statistic.
+# Statistics are undefined without noise.
 @pytest.mark.parametrize("name", long_but([name for name in CASES if name != "noiseless"], *SHORT))
-def test_every_statistic_is_the_twins(engine: Engine, name: str) -> None:
+def test_statistics_equal_reference(engine: Engine, name: str) -> None:
     check_statistics(engine, name)
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", ONE_BY_ONE)
-def test_every_statistic_is_the_twins_one_by_one(name: str, one_by_one: Engine) -> None:
+def test_statistics_equal_reference_at_width_one(name: str, one_by_one: Engine) -> None:
     check_statistics(one_by_one, name)
 
 
 def check_statistics(engine: Engine, name: str) -> None:
-    """Those of the fast kernel alone, and all of them, with their histograms."""
+    """Compare the statistics of the fast kernel, and all statistics with their histograms."""
     (quiet, *flares), how = case(name)
     kind = {"start": START, "seed": SEED, **how}
     found = engine.detect(quiet, flares, realisations=INDEX.size, statistics=tuple(STATISTICS), **kind)
@@ -192,10 +192,10 @@ def check_statistics(engine: Engine, name: str) -> None:
             continue
         ours = found.distribution(statistic, None if role == "null" else flare, template=flare)
         assert tally.add_far(i, values[plan.grids[i].channel]) == outside[i]
-        twin = tally.distribution(i)
-        np.testing.assert_array_equal(ours.counts, twin.counts)
-        assert (ours.first, ours.second) == (twin.first, twin.second)
-        assert ours.far.equals(twin.far)
+        expected = tally.distribution(i)
+        np.testing.assert_array_equal(ours.counts, expected.counts)
+        assert (ours.first, ours.second) == (expected.first, expected.second)
+        assert ours.far.equals(expected.far)
 
 
 @pytest.mark.parametrize(
@@ -210,34 +210,34 @@ def check_statistics(engine: Engine, name: str) -> None:
         ("stack", Comparison(1)),
     ),
 )
-def test_whatever_is_compared_is_the_twins(any_width: Engine, name: str, comparison: Comparison) -> None:
-    """Noisy quiescent exposures, one or several, and variances from the counts."""
+def test_comparisons_equal_reference(any_width: Engine, name: str, comparison: Comparison) -> None:
+    """Compare statistics with noisy quiescent exposures, one or several, and with estimated variances."""
     (quiet, *flares), how = case(name)
     kind = {"statistics": tuple(STATISTICS), "start": START, "seed": SEED, "comparison": comparison, **how}
     values = any_width.statistic_values(quiet, flares, count=INDEX.size, **kind)
     np.testing.assert_array_equal(values, _twin(name, comparison)[1])
     if comparison == Comparison(1):
-        # Against one exposure chi2 is chi2_pair, but for the order in which it is summed.
+        # Against one exposure, chi2 and chi2_pair differ only in the order of summation.
         np.testing.assert_allclose(values[0], values[2], rtol=1e-5)
 
 
 @pytest.mark.parametrize(
     "name", long_but(["stack", "at the rail", "apart, electrons, frames", "priors", "cosmic rays"], "stack")
 )
-def test_signal_to_noise_is_the_twins(any_width: Engine, name: str) -> None:
+def test_snr_equals_reference(any_width: Engine, name: str) -> None:
     (quiet, *_), how = case(name)
     scene = prepare([quiet], **how)
     found = any_width.snr(quiet, realisations=INDEX.size, start=START, seed=SEED, **how)
-    twin = numpy_kernels.histograms(scene, observers(quiet, scene), elements(quiet), INDEX, SEED)
-    same_counts(found.counts, twin)
+    expected = numpy_kernels.histograms(scene, observers(quiet, scene), elements(quiet), INDEX, SEED)
+    same_counts(found.counts, expected)
     assert all(
         each.sum() + found.counts.far[kind].counts.sum() == INDEX.size * len(each)
         for kind, each in (("pixel", found.counts.pixel), ("element", found.counts.element))
     )
 
 
-def test_modes_meet_the_rails(engine: Engine) -> None:
-    """A star that saturates is drawn frame by frame, cut off at saturation, unasked."""
+def test_saturating_star_is_drawn_frame_by_frame(engine: Engine) -> None:
+    """By default, a saturating star is drawn frame by frame and clipped."""
     (bright, *_), _ = case("at the rail")
     assert prepare([bright]).frames
     raw = engine.realise(bright, count=200, seed=1)
@@ -250,8 +250,8 @@ def test_modes_meet_the_rails(engine: Engine) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("payload", ["mauve", "mauve-electrons"])
-def test_moments_of_raw_spectra(engine: Engine, payload: str) -> None:
-    """Mean and variance of each pixel follow the model: |z| < 6 in 1643 pixels fails once in 3e5 seeds."""
+def test_moments_of_raw_spectra_follow_model(engine: Engine, payload: str) -> None:
+    """Compare mean and variance of each pixel with the model: |z| < 6 in 1643 pixels fails once in 3e5 seeds."""
     (quiet,) = star(payload=instrument(payload))
     n = 20_000
     raw = engine.realise(quiet, count=n, seed=4).astype(float)
@@ -265,7 +265,7 @@ def test_moments_of_raw_spectra(engine: Engine, payload: str) -> None:
 
 
 def test_frames_and_stacks_agree(engine: Engine) -> None:
-    """Two ways to draw the same exposure, far from the rails: means and variances, 5 standard errors."""
+    """Compare means and variances of both modes, far from the rails, within 5 standard errors."""
     (quiet, *_), _ = case("frames")
     n = 20_000
     frames, stacked = (engine.realise(quiet, count=n, seed=s, mode=m) for s, m in ((1, "frames"), (2, "stacked")))
@@ -295,7 +295,7 @@ def test_frames_are_uncorrelated(engine: Engine) -> None:
     z = []
     for frame in (0, 1, 2**32 - 1):
         scene, out = prepare([x], first_frame=frame), np.empty((20_000, x.wavelength_nm.size), np.int32)
-        with scene_launches(engine.opened, scene, 9) as run:
+        with scene_launches(engine.open_device, scene, 9) as run:
             engine._tiles.over(
                 0, 20_000, 4 * scene.n_pixel, lambda t, n, run=run, out=out: run.realise(t, out[n : n + t.wanted])
             )
@@ -305,7 +305,7 @@ def test_frames_are_uncorrelated(engine: Engine) -> None:
         assert abs(products.sum()) < 5 * np.sqrt(products.size)
 
 
-def test_any_realisation_by_its_index_alone(engine: Engine) -> None:
+def test_realisation_depends_only_on_its_index(engine: Engine) -> None:
     (quiet, *_), _ = case("stack")
     far = 734_221_008
     run = engine.realise(quiet, start=far - 100, count=300, seed=5)
@@ -313,12 +313,12 @@ def test_any_realisation_by_its_index_alone(engine: Engine) -> None:
         alone = engine.realise(quiet, start=far - 100 + offset, count=1, seed=5)
         np.testing.assert_array_equal(alone[0], run[offset])
     huge = engine.realise(quiet, start=2**62 + 3, count=2, seed=5)
-    twin = reference.realise(prepare([quiet]), np.array([2**62 + 3, 2**62 + 4], np.uint64), 5)
-    np.testing.assert_array_equal(huge, twin)
+    expected = reference.realise(prepare([quiet]), np.array([2**62 + 3, 2**62 + 4], np.uint64), 5)
+    np.testing.assert_array_equal(huge, expected)
 
 
 @pytest.mark.parametrize("tile", [16, 64, 4096])
-def test_tiles_change_no_bit(engine: Engine, tile: int) -> None:
+def test_tile_size_does_not_affect_results(engine: Engine, tile: int) -> None:
     (quiet, *flares), _ = case("stack")
     whole = engine.detect(quiet, flares, realisations=3001, start=77, seed=6, statistics=tuple(STATISTICS))
     parts = Engine(tile=tile).detect(quiet, flares, realisations=3001, start=77, seed=6, statistics=tuple(STATISTICS))
@@ -334,7 +334,7 @@ sys.path.insert(0, {tests!r})
 from answers import same_counts
 from marks import long_but
 from scenes import star
-from mauvecl.device.forms import scene_launches
+from mauvecl.device.variants import scene_launches
 from mauvecl.device.engine import Engine
 from mauvecl.device.selftest import toy
 quiet, *flares = star(amplitudes=(0.081, 0.24))
@@ -345,8 +345,8 @@ print(hashlib.sha256(repr([tuple(row) for row in table]).encode()).hexdigest())
 
 
 @pytest.mark.long
-def test_threads_change_no_bit() -> None:
-    """The same table from one thread and from two, to the last digit."""
+def test_number_of_threads_does_not_affect_results() -> None:
+    """Compare all digits of a table from one thread and from two."""
     code = THREADS.format(tests=os.path.dirname(os.path.dirname(__file__)))
     digests = {
         subprocess.run(
@@ -361,8 +361,8 @@ def test_threads_change_no_bit() -> None:
     assert len(digests) == 1
 
 
-def test_many_flares_are_done_in_batches(engine: Engine) -> None:
-    """More scenarios than one launch holds give each flare what it gets alone."""
+def test_flares_in_batches_equal_single_flares(engine: Engine) -> None:
+    """Compare flares of several launches with the same flares alone."""
     amplitudes = tuple(np.linspace(0.01, 0.3, 18))
     payload = instrument(part=True)
     quiet, *flares = star(amplitudes=amplitudes, payload=payload)
@@ -377,7 +377,7 @@ def test_many_flares_are_done_in_batches(engine: Engine) -> None:
 
 
 def test_snr_follows_the_closed_form(engine: Engine) -> None:
-    """Mean S/N against the closed form: the clipped root's bias is below 2 % of the spread for a star this bright."""
+    """Compare the mean S/N with the closed form, whose bias is below 2 % of the spread for a star this bright."""
     (quiet,) = star(magnitude=5.0)
     found = engine.snr(quiet, realisations=20_000, seed=2)
     for table in (found.pixel, found.element):
@@ -390,8 +390,8 @@ def test_snr_follows_the_closed_form(engine: Engine) -> None:
 
 
 @pytest.mark.parametrize("signal", ["net", "paper"])
-def test_snr_of_each_realisation_takes_the_sky_for_noise(engine: Engine, signal: Any) -> None:
-    """Against raw spectra: what is subtracted, whose photons are under the root; a sky as bright as the star."""
+def test_snr_includes_photon_noise_of_sky(engine: Engine, signal: Any) -> None:
+    """Compare with S/N computed from raw spectra, for a sky as bright as the star."""
     (x,) = star(magnitude=9.0, exposure=100.0, payload=instrument(part=True))
     x = replace(x, signal=signal, sky_electrons=x.source_electrons)
     n = 4000

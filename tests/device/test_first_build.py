@@ -1,4 +1,4 @@
-"""Whatever a driver's compiler does in the first build, the user's process goes on or ends with one sentence."""
+"""First builds with failing compilers: the user's process continues or ends with a one-sentence error."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 
 from mauvecl.device import processor
 
-#: Draws on the default device after `before` and prints the level and the digest of the counts, or the sentence.
+#: Script that draws on the default device and prints the level and the counts' digest, or the error.
 RUN = """
 import hashlib, sys
 from mauvecl.device import first_build, kernel_cache, processor, selftest
@@ -27,7 +27,7 @@ try:
 except (DeviceError, InputError) as error:
     print("sentence", str(error).count(chr(10)), error)
 """
-#: A child that misbehaves in its own way where it is asked to compile for the first name, and does nothing otherwise.
+#: Child that fails when it compiles for the first name, and does nothing otherwise.
 CHILD = """
 import json, sys, os, ctypes, time; asked = json.loads(sys.argv[1]); sys.path[:] = asked["path"]
 from mauvecl.device import first_build
@@ -35,7 +35,7 @@ first_build.limit(asked)
 if asked["name"] == "bad" or asked["name"] is None:
     {act}
 """
-#: What compilers of drivers do, and the words for it.
+#: Failures of compilers and the messages that report them.
 ACTS = {
     "os.abort()": "crashed: aborted",
     "ctypes.string_at(0)": "crashed: segmentation fault",
@@ -50,7 +50,7 @@ ACTS = {
 
 
 def run(cache: Path | str, before: str = "", *, code: str = RUN, **environment: str) -> dict[str, str]:
-    """What a process of its own prints."""
+    """Run a separate process and return what it prints."""
     child = subprocess.run(
         [sys.executable, "-c", code.format(before=before)],
         env=os.environ | {"MAUVECL_CACHE_DIR": str(cache)} | environment,
@@ -65,7 +65,7 @@ def run(cache: Path | str, before: str = "", *, code: str = RUN, **environment: 
 
 @pytest.fixture(scope="module")
 def chooses() -> None:
-    """Skip where mauvecl does not choose what PoCL compiles for."""
+    """Skip the test if mauvecl does not choose the processor name."""
     from mauvecl.device import program
 
     if processor.names(program.choose_device(None)[0]) == (None,):
@@ -74,27 +74,27 @@ def chooses() -> None:
 
 @pytest.fixture(scope="module")
 def plain(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, str]]:
-    """A cache after a first start, and what that printed."""
+    """Return the cache after a first start, and what this start printed."""
     cache = tmp_path_factory.mktemp("plain")
     return cache, run(cache)
 
 
 def misbehaving(act: str, names: str) -> str:
-    # Two seconds by the clock for each of processor time, so that sleeping ends soon.
+    # A wall-clock limit of two seconds per second of processor time ends sleeping children soon.
     clock = "first_build.CLOCK = 2.0; " if "sleep" in act else ""
     return f"{clock}first_build.CHILD = {CHILD.format(act=act)!r}; processor.names = lambda device: {names}"
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("act", [act for act in ACTS if any(word in act for word in ("string_at", "bytearray", "198"))])
-def test_next_level_is_tried_where_the_compiler_fails(act: str, tmp_path: Path, plain, chooses) -> None:
+def test_next_level_is_tried_after_compiler_failure(act: str, tmp_path: Path, plain, chooses) -> None:
     best = plain[1]["level"]
     found = run(tmp_path, misbehaving(act, f"('bad', {best!r})"), MAUVECL_BUILD_LIMIT_S="2")
     assert found == plain[1]
 
 
 @pytest.mark.parametrize("act", ACTS)
-def test_one_sentence_where_no_level_works(act: str, tmp_path: Path) -> None:
+def test_error_is_one_sentence_if_no_level_works(act: str, tmp_path: Path) -> None:
     found = run(tmp_path, misbehaving(act, "(None,)"), MAUVECL_BUILD_LIMIT_S="2")
     assert found.keys() == {"sentence"}
     lines, sentence = found["sentence"].split(" ", 1)
@@ -103,7 +103,7 @@ def test_one_sentence_where_no_level_works(act: str, tmp_path: Path) -> None:
         assert word in sentence
 
 
-def test_outcome_is_kept_until_driver_or_version_change(plain: tuple[Path, dict[str, str]]) -> None:
+def test_outcome_is_reused_until_driver_or_version_change(plain: tuple[Path, dict[str, str]]) -> None:
     cache, first = plain
     count = "first_build._try = lambda *a: print('tried', a[0]) or ''; "
     assert run(cache, count) == first
@@ -111,7 +111,7 @@ def test_outcome_is_kept_until_driver_or_version_change(plain: tuple[Path, dict[
     assert changed.keys() == first.keys() | {"tried"}
 
 
-def test_failure_is_kept_for_a_week(tmp_path: Path) -> None:
+def test_failure_is_reused_for_a_week(tmp_path: Path) -> None:
     fails = misbehaving("os.abort()", "(None,)")
     count = "processor.names = lambda device: (None,); first_build._try = lambda *a: print('tried', a[0]) or ''; "
     assert "sentence" in run(tmp_path, fails)
@@ -120,11 +120,11 @@ def test_failure_is_kept_for_a_week(tmp_path: Path) -> None:
     assert "tried" in run(tmp_path, count + later)
 
 
-def test_read_only_store_is_enough(plain: tuple[Path, dict[str, str]]) -> None:
+def test_read_only_store_suffices(plain: tuple[Path, dict[str, str]]) -> None:
     cache, first = plain
     folders = [cache, *(path for path in cache.rglob("*") if path.is_dir())]
     modes = {path: stat.S_IMODE(path.stat().st_mode) for path in folders}
-    # Root may write anywhere; the store is made unwritable for it too.
+    # Root ignores permissions, so the store is made read-only in another way.
     refuse = "kernel_cache._writable = lambda folder: False; " if os.getuid() == 0 else ""
     try:
         for path in folders:
@@ -137,7 +137,7 @@ def test_read_only_store_is_enough(plain: tuple[Path, dict[str, str]]) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("how", ["stdin", "thread", "no executable"])
-def test_first_build_works_however_python_was_started(how: str, tmp_path: Path, plain) -> None:
+def test_first_build_works_for_every_way_to_start_python(how: str, tmp_path: Path, plain) -> None:
     code = RUN.format(before="sys.executable = None" if how == "no executable" else "")
     if how == "thread":
         code = f"import threading\nt = threading.Thread(target=exec, args=({code!r}, {{}}))\nt.start(); t.join()"
@@ -155,7 +155,7 @@ def test_first_build_works_however_python_was_started(how: str, tmp_path: Path, 
 
 
 @pytest.mark.long
-def test_processes_started_together_try_once(tmp_path: Path, plain: tuple[Path, dict[str, str]]) -> None:
+def test_concurrent_processes_build_once(tmp_path: Path, plain: tuple[Path, dict[str, str]]) -> None:
     log = tmp_path / "log"
     count = f"real = first_build._try; first_build._try = lambda *a: (open({str(log)!r}, 'a').write('.'), real(*a))[1]"
     command = [sys.executable, "-c", RUN.format(before=count)]
@@ -167,8 +167,8 @@ def test_processes_started_together_try_once(tmp_path: Path, plain: tuple[Path, 
 
 
 @pytest.mark.long
-def test_zen_4_is_contained(tmp_path: Path, plain: tuple[Path, dict[str, str]], chooses) -> None:
-    """PoCL 3.0 with AVX-512 crashes for the name znver3 after minutes and gigabytes; its child is stopped before."""
+def test_first_build_stops_compiler_of_zen_4(tmp_path: Path, plain: tuple[Path, dict[str, str]], chooses) -> None:
+    """Stop the child of PoCL 3.0 with AVX-512, which crashes for the name znver3 after minutes and gigabytes."""
     if "avx512f" not in processor.flags():
         pytest.skip("this processor has no AVX-512")
     names = f"processor.names = lambda device: ('znver3', {plain[1]['level']!r})"
@@ -177,6 +177,6 @@ def test_zen_4_is_contained(tmp_path: Path, plain: tuple[Path, dict[str, str]], 
     assert time.monotonic() - start < 100
 
 
-def test_limits_that_cannot_be_are_refused(tmp_path: Path) -> None:
+def test_invalid_build_limit_raises(tmp_path: Path) -> None:
     for wrong in ("-1", "inf", "nan"):
         assert "MAUVECL_BUILD_LIMIT_S" in run(tmp_path, MAUVECL_BUILD_LIMIT_S=wrong)["sentence"]

@@ -1,4 +1,4 @@
-"""Compiled kernels kept from run to run: whatever is done to them costs a build, never a run or a bit."""
+"""Cache of compiled kernels: damage causes a new build, but never a failure or a different result."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from mauvecl.device.engine import Engine
 from mauvecl.device.kernel_cache import KernelCache
 from mauvecl.device.program import build
 
-#: Two kernels on the toy scene; tells whether they came from the store.
+#: Script that runs two kernels on the toy scene and prints whether they came from the store.
 RUN = """
 import hashlib, sys
 from mauvecl.device import kernel_cache, selftest
@@ -42,7 +42,7 @@ except DeviceError as error:
 
 
 def run(cache: Path | str, before: str = "") -> dict[str, str]:
-    """What a process of its own prints; PoCL ends processes, so each is watched from outside."""
+    """Run a separate process, which PoCL may abort, and return what it prints."""
     child = subprocess.run(
         [sys.executable, "-c", RUN.format(before=before)],
         env=os.environ | {"MAUVECL_CACHE_DIR": str(cache)},
@@ -56,7 +56,7 @@ def run(cache: Path | str, before: str = "") -> dict[str, str]:
 
 @pytest.fixture(scope="module")
 def filled(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
-    """A cache that one process has filled, and the digest it printed."""
+    """Return a cache that one process has filled, and the digest that it printed."""
     cache = tmp_path_factory.mktemp("filled")
     first = run(cache)
     assert first["restored"].startswith("0 of")
@@ -68,13 +68,13 @@ def files_of(cache: Path) -> list[Path]:
 
 
 @pytest.mark.long
-def test_the_second_process_builds_nothing(filled: tuple[Path, str]) -> None:
+def test_second_process_builds_nothing(filled: tuple[Path, str]) -> None:
     cache, digest = filled
     again = run(cache)
     restored, _, wanted = again["restored"].partition(" of ")
     assert again["digest"] == digest
     assert restored == wanted != "0"
-    # Each process leaves only the store behind.
+    # Only the store remains after a process ends.
     assert not Path(again["work"]).exists()
 
 
@@ -101,8 +101,8 @@ def store_of(cache: Path) -> Path:
 @pytest.mark.long
 @pytest.mark.parametrize("ending", [".so", ".bc", ".json"])
 @pytest.mark.parametrize("kind", DAMAGE)
-def test_a_damaged_program_is_never_restored(filled: tuple[Path, str], tmp_path: Path, kind: str, ending: str) -> None:
-    """Whatever happened to whichever file: nothing reaches the folder that PoCL reads."""
+def test_damaged_program_is_not_restored(filled: tuple[Path, str], tmp_path: Path, kind: str, ending: str) -> None:
+    """Keep damaged files of every kind out of the folder that PoCL reads."""
     shutil.copytree(store_of(filled[0]), tmp_path / "store")
     cache = KernelCache(tmp_path, tmp_path / "work")
     programs = [path for path in cache.store.iterdir() if path.is_dir()]
@@ -119,7 +119,7 @@ def test_a_damaged_program_is_never_restored(filled: tuple[Path, str], tmp_path:
 @pytest.mark.parametrize(
     ("kind", "ending"), [("a flipped bit", ".so"), ("garbage", ".json"), ("a flipped bit", ".txt")]
 )
-def test_a_damaged_store_is_built_again(filled: tuple[Path, str], tmp_path: Path, kind: str, ending: str) -> None:
+def test_damaged_store_is_rebuilt(filled: tuple[Path, str], tmp_path: Path, kind: str, ending: str) -> None:
     source, digest = filled
     cache = tmp_path / "cache"
     shutil.copytree(source, cache)
@@ -130,22 +130,22 @@ def test_a_damaged_store_is_built_again(filled: tuple[Path, str], tmp_path: Path
     after = run(cache)
     assert after["digest"] == digest
     if ending != ".txt":
-        # A text is a rendered source: made anew, it is the same, and its program is found.
+        # A text is a rendered source: rendering gives the same text again, and its program is found.
         assert after["restored"].startswith("0 of")
     healed = run(cache)
     restored, _, wanted = healed["restored"].partition(" of ")
     assert (healed["digest"], restored) == (digest, wanted)
 
 
-def test_processes_beside_each_other_share_what_they_build(tmp_path: Path) -> None:
-    """A program is in the store from the next build on, not only when the process ends."""
+def test_concurrent_processes_share_programs(tmp_path: Path) -> None:
+    """Store a program at the next build, not only at the end of the process."""
     one = KernelCache(tmp_path, tmp_path / "work-1")
     for number in range(2):
         with one.building(f"key{number}"):
             (one.work / "AA" / f"program{number}").mkdir(parents=True)
             (one.work / "AA" / f"program{number}" / "program.bc").write_bytes(bytes(100))
         if number == 0:
-            # Finished by its first launch.
+            # The first launch completes the program.
             (one.work / "AA" / "program0" / "kernel.so").write_bytes(bytes(100))
     other = KernelCache(tmp_path, tmp_path / "work-2")
     assert other.restore("key0")
@@ -156,7 +156,7 @@ MANIFESTS = ("", "[]", "3", '{"files": {}}', '{"files": 1}', '{"folder": "x"}', 
 
 
 @pytest.mark.parametrize("text", MANIFESTS)
-def test_any_manifest_is_read_without_trust(tmp_path: Path, text: str) -> None:
+def test_invalid_manifest_is_rejected(tmp_path: Path, text: str) -> None:
     cache = KernelCache(tmp_path, tmp_path / "work")
     entry = cache.store / "key"
     entry.mkdir(parents=True)
@@ -167,8 +167,8 @@ def test_any_manifest_is_read_without_trust(tmp_path: Path, text: str) -> None:
 
 
 @pytest.mark.long
-def test_a_full_store_is_no_obstacle(filled: tuple[Path, str], tmp_path: Path) -> None:
-    """The disk fills while the store is written to: the run is as ever, and nothing half-written is ever read."""
+def test_run_succeeds_on_full_disk(filled: tuple[Path, str], tmp_path: Path) -> None:
+    """Run while the disk fills: results are unchanged, and no incomplete file is read."""
     before = f"""
 from pathlib import Path
 write_bytes, write_text = Path.write_bytes, Path.write_text
@@ -182,8 +182,8 @@ Path.write_bytes = Path.write_text = full
     assert files_of(tmp_path) == []
 
 
-def test_without_any_room_one_sentence_says_what_to_do(tmp_path: Path) -> None:
-    said = run(tmp_path, "kernel_cache.ROOM = 2**60")["sentence"]
+def test_error_without_free_space_names_remedy(tmp_path: Path) -> None:
+    said = run(tmp_path, "kernel_cache.MIN_FREE_BYTES = 2**60")["sentence"]
     assert "no folder for compiled kernels" in said
     assert "MAUVECL_CACHE_DIR" in said
     assert "\n" not in said
@@ -191,14 +191,14 @@ def test_without_any_room_one_sentence_says_what_to_do(tmp_path: Path) -> None:
 
 @pytest.mark.long
 @pytest.mark.parametrize("folder", ["/proc/mauvecl", "/dev/null/mauvecl"])
-def test_a_folder_that_cannot_be_made_is_replaced(filled: tuple[Path, str], folder: str) -> None:
+def test_unusable_cache_folder_is_replaced(filled: tuple[Path, str], folder: str) -> None:
     found = run(folder)
     assert found["digest"] == filled[1]
     assert not found["work"].startswith(folder)
 
 
 @pytest.mark.long
-def test_what_a_killed_process_leaves_is_swept_up(filled: tuple[Path, str], tmp_path: Path) -> None:
+def test_folder_of_killed_process_is_removed(filled: tuple[Path, str], tmp_path: Path) -> None:
     code = "import time; from mauvecl.device.engine import Engine; Engine(); print('up', flush=True); time.sleep(60)"
     child = subprocess.Popen(
         [sys.executable, "-c", code],
@@ -218,7 +218,7 @@ def test_what_a_killed_process_leaves_is_swept_up(filled: tuple[Path, str], tmp_
 
 HOLDS = "from mauvecl.device.kernel_cache import kernel_cache; print(kernel_cache().work, flush=True); input()"
 SWEEPS = "import sys, pathlib; from mauvecl.device import kernel_cache; kernel_cache._sweep(pathlib.Path(sys.argv[1]))"
-#: Commands that run another as on a machine of its own: with its own processes, and its own name.
+#: Commands that run another one with its own process numbers and host name, as on another machine.
 ELSEWHERE = {
     "another container": ["unshare", "--pid", "--fork", "--mount-proc"],
     "another name": ["unshare", "--uts", "sh", "-c", 'hostname elsewhere && exec "$@"', "sh"],
@@ -229,8 +229,8 @@ ELSEWHERE = {
 @pytest.mark.long
 @pytest.mark.parametrize("place", ELSEWHERE)
 @pytest.mark.parametrize("holder", ["here", "there"])
-def test_containers_that_share_a_home_leave_each_other_alone(tmp_path: Path, place: str, holder: str) -> None:
-    """Whoever holds a working folder and whoever sweeps: while its process lives it stays, then it goes."""
+def test_containers_with_shared_home_keep_each_others_folders(tmp_path: Path, place: str, holder: str) -> None:
+    """Keep a working folder while its process runs, and remove it afterwards, in any container."""
     there = ELSEWHERE[place]
     if subprocess.run([*there, "true"], capture_output=True, check=False).returncode:
         pytest.skip("no namespaces can be made here")
@@ -258,8 +258,8 @@ def _holds(process: Path, file: Path) -> bool:
 
 @pytest.mark.parametrize("locked", [False, True])
 @pytest.mark.parametrize("days", [0, 29, 31])
-def test_another_hosts_folder_goes_by_age_and_lock(tmp_path: Path, days: int, locked: bool) -> None:
-    """Its processes cannot be seen from here, nor perhaps its locks."""
+def test_folder_of_other_host_is_removed_by_age_and_lock(tmp_path: Path, days: int, locked: bool) -> None:
+    """Remove a folder of another host, whose processes and locks may be invisible, by age and lock."""
     folder = tmp_path / "mauvecl-work-farhost-0123456789abcdef0123456789abcdef-00"
     folder.mkdir()
     then = time.time() - days * 86400
@@ -272,8 +272,8 @@ def test_another_hosts_folder_goes_by_age_and_lock(tmp_path: Path, days: int, lo
 
 
 @pytest.mark.long
-def test_a_second_engine_leaves_loaded_kernels_alone(filled: tuple[Path, str]) -> None:
-    """A loaded kernel whose file is written anew ends the process at its next use."""
+def test_second_engine_does_not_rewrite_loaded_kernels(filled: tuple[Path, str]) -> None:
+    """Keep the files of loaded kernels, since a process crashes if they are written again."""
     before = """
 from mauvecl.device.engine import Engine as E
 one = E()
@@ -284,9 +284,9 @@ assert first == digest(two) == digest(one)
     assert run(filled[0], before)["digest"] == filled[1]
 
 
-def test_the_store_keeps_to_its_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The programs used longest ago make room."""
-    monkeypatch.setattr(kernel_cache, "MOST_STORED", 25_000)
+def test_store_is_limited_in_size(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Remove the least recently used programs."""
+    monkeypatch.setattr(kernel_cache, "MAX_STORED", 25_000)
     for number in range(4):
         cache = KernelCache(tmp_path, tmp_path / f"work{number}")
         with cache.building(f"key{number}"):
@@ -296,7 +296,7 @@ def test_the_store_keeps_to_its_size(tmp_path: Path, monkeypatch: pytest.MonkeyP
         cache.publish()
         then = time.time() - 100 + number
         os.utime(cache.store / f"key{number}", (then, then))
-    # Nothing was put there since: the end of a run does not look all of it through.
+    # Without new programs, the end of a run does not list the store.
     monkeypatch.setattr(cache, "_prune", lambda: pytest.fail("the store was looked through"))
     cache.publish()
     assert sorted(path.name for path in cache.store.iterdir()) == ["key2", "key3"]
@@ -304,12 +304,12 @@ def test_the_store_keeps_to_its_size(tmp_path: Path, monkeypatch: pytest.MonkeyP
     assert manifest["folder"] == "AA/program3"
 
 
-def test_each_installation_has_kernels_of_its_own(monkeypatch: pytest.MonkeyPatch, engine: Engine) -> None:
-    """PoCL knows its programs by where its libraries are: another installation's would be compiled at every start."""
+def test_installations_do_not_share_programs(monkeypatch: pytest.MonkeyPatch, engine: Engine) -> None:
+    """Use different keys, since PoCL compiles a program of another installation again at every start."""
     keys: list[str] = []
     restore = KernelCache.restore
     monkeypatch.setattr(KernelCache, "restore", lambda cache, key: keys.append(key) or restore(cache, key))
     for place in ("one", "other", "one"):
         monkeypatch.setattr(sys, "prefix", place)
-        build(engine.opened.context, "kernel void f(global int *a) { a[0] = 1; }")
+        build(engine.open_device.context, "kernel void f(global int *a) { a[0] = 1; }")
     assert keys[0] == keys[2] != keys[1]

@@ -1,4 +1,4 @@
-"""Marginalised statistics on the device: the twin's bits, and the closed forms where the unknowns are drawn."""
+"""Marginalised statistics on the device, compared with the reference and with closed forms."""
 
 from __future__ import annotations
 
@@ -24,16 +24,16 @@ FREE = float("inf")
 
 @pytest.fixture(scope="module", params=["vectors", "scalar"])
 def any_width(request: pytest.FixtureRequest, engine: Engine) -> Engine:
-    """The engine as processors run it, and one realisation to a work-item, as a GPU does."""
+    """Return the engine as CPUs run it, and as GPUs do, with one realisation per work-item."""
     return engine if request.param == "vectors" else Engine(width=1)
 
 
 @pytest.mark.parametrize("exposure", [50.0, 5.0])
-def test_every_marginalised_statistic_is_the_twins(any_width: Engine, exposure: float) -> None:
+def test_marginalised_statistics_equal_reference(any_width: Engine, exposure: float) -> None:
     quiet, *flares = star(amplitudes=(0.081, 0.24), exposure=exposure, payload=instrument("mauve", part=True))
     names = ("chi2", "chi2_element", "matched", "uv_excess")
     own = Linear("own", np.linspace(0.0, 1.0, quiet.wavelength_nm.size))
-    # Part of the ultraviolet alone would leave `uv_excess` nothing beside a flat dark and the star's light.
+    # In part of the ultraviolet alone, `uv_excess` would be degenerate with a flat dark and the star's light.
     sd = {"dark": 0.1, "light": 0.02, "tilt": FREE}
     asked = [name for name in names if name != "uv_excess" or quiet.wavelength_nm[0] < 300] + [own]
     values = any_width.statistic_values(
@@ -44,14 +44,14 @@ def test_every_marginalised_statistic_is_the_twins(any_width: Engine, exposure: 
     plan = plan_channels(hypotheses, range(len(flares)), first=True)
     sums = numpy_kernels.statistics(scene, INDEX, SEED, plan, pair=False)
     np.testing.assert_array_equal(values, numpy_kernels.marginalise(sums, plan.subtractions))
-    # What is taken away matters.
+    # The subtraction changes the statistics.
     assert (values[0] < sums[0]).all()
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("sd", [0.1, FREE])
-def test_false_alarms_and_power_with_the_unknown_drawn(engine: Engine, sd: float) -> None:
-    """The marginalised statistics keep their false-alarm probability and power; the plain ones do not.
+def test_marginalised_statistics_keep_false_alarms_and_power(engine: Engine, sd: float) -> None:
+    """Check that marginalised statistics, unlike plain ones, keep their false-alarm probability and power.
 
     Twelve comparisons at 4.5 standard errors: by chance one run in 1e4 fails.
     """
@@ -77,7 +77,7 @@ def _prior(centre: float, sd: float) -> Normal:
     return Normal(centre, sd, centre - 5 * sd, centre + 5 * sd)
 
 
-#: Star, flares, what is marginalised over, what is drawn: Gaussian priors, and others.
+#: Star, flares, marginalised and drawn unknowns, with Gaussian and other priors.
 DRAWN = {
     "half a degree": (("G2V", 7.4, (0.1, 0.02)), {"dark": 0.5}, Processes(detector_temperature=_prior(21.0, 0.5))),
     "half a degree, projected out": (
@@ -95,8 +95,8 @@ DRAWN = {
 
 @pytest.mark.long
 @pytest.mark.parametrize("case", DRAWN)
-def test_closed_forms_integrate_over_what_is_drawn(engine: Engine, case: str) -> None:
-    """False alarms and detections at the closed forms' thresholds, within 4.5 standard errors and 1e-5.
+def test_closed_forms_integrate_over_drawn_unknowns(engine: Engine, case: str) -> None:
+    """Compare false alarms and detections at the closed forms' thresholds, within 4.5 standard errors and 1e-5.
 
     Some 20 values in each of five cases, many of them tied: by chance less than one run in 1500 fails.
     """
@@ -114,11 +114,11 @@ def test_closed_forms_integrate_over_what_is_drawn(engine: Engine, case: str) ->
             seen = found.distribution(statistic, flare).above(cut) / n
             assert abs(seen - power) < 4.5 * np.sqrt(power * (1 - power) / n) + 1e-5
             powers.append(power)
-    # Some of them say something.
+    # Some of the closed forms are defined.
     assert sum(0.05 < power < 0.99 for power in powers) >= 2
 
 
-def test_requests_carry_what_is_unknown(engine: Engine) -> None:
+def test_requests_carry_nuisances(engine: Engine) -> None:
     from mauvecl.results.requests.requests import DetectRequest
     from mauvecl.runs.shards import fingerprint
 

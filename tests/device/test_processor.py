@@ -1,4 +1,4 @@
-"""Names of processors that fit both the processor and the library that PoCL loads."""
+"""Processor names that fit both the processor and the library that PoCL loads."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_highest_level_has_all_its_instructions(flags: set[str], level: str) -> 
 
 
 def library(flags: set[str]) -> str:
-    """The built-in library that PoCL 3.0 to 4.0 loads (getX86KernelLibName in lib/CL/pocl_llvm_build.cc)."""
+    """Return the built-in library that PoCL 3.0 to 4.0 loads (getX86KernelLibName in lib/CL/pocl_llvm_build.cc)."""
     best = "sse2"
     for name, needed in {
         "ssse3": {"ssse3", "cx16"},
@@ -53,8 +53,8 @@ def library(flags: set[str]) -> str:
     return best
 
 
-def test_every_processor_is_compiled_for_as_wide_vectors_as_its_library() -> None:
-    """Vectors are passed in registers of one width by the library and by the kernels, whatever LLVM calls it."""
+def test_compiled_vectors_are_as_wide_as_those_of_library() -> None:
+    """Compare the register widths of the library and of the kernels, which must agree to pass vectors."""
     wide = {"x86-64": 128, "x86-64-v2": 128, "sandybridge": 256, "x86-64-v3": 256, "x86-64-v4": 512}
     passed = {"sse2": 128, "ssse3": 128, "sse41": 128, "avx": 256, "avx_f16c": 256, "avx2": 256, "avx512": 512}
     steps = [set(), {"ssse3", "cx16"}, V2, AVX, AVX | {"f16c"}, V3, V4]
@@ -63,7 +63,7 @@ def test_every_processor_is_compiled_for_as_wide_vectors_as_its_library() -> Non
 
 
 class Record:
-    """A device whose record in memory looks like PoCL's."""
+    """Device whose record in memory looks like PoCL's."""
 
     def __init__(
         self, cpu: str, triple: str = "x86_64-pc-linux-gnu", *, known_form: bool = True, chooses: bool = True
@@ -83,13 +83,13 @@ class Record:
 
 
 @pytest.mark.parametrize("own", ["generic", "znver3", "znver4", "skylake-avx512", "haswell", "x86-64"])
-def test_processor_is_named_by_level_whatever_llvm_calls_it(own: str) -> None:
+def test_processor_is_named_after_level(own: str) -> None:
     device = Record(own)
     before = device.words.copy()
     for name in ("x86-64-v4", "x86-64-v3", "x86-64-v3"):
         assert processor.give_name(device, name)
         assert device.cpu.decode() == name
-    # Nothing else in the record is touched.
+    # The rest of the record is unchanged.
     assert np.flatnonzero(device.words != before).tolist() == [5]
 
 
@@ -103,21 +103,21 @@ def test_processor_is_named_by_level_whatever_llvm_calls_it(own: str) -> None:
         Record("skylake-avx512", known_form=False),
     ],
 )
-def test_other_devices_are_left_alone(device: Record) -> None:
+def test_other_devices_are_unchanged(device: Record) -> None:
     before = device.words.copy()
     assert processor.names(device) == (None,)
     assert not processor.give_name(device, "x86-64-v3")
     assert (device.words == before).all()
 
 
-def test_a_record_outside_of_memory_is_no_crash() -> None:
+def test_record_at_invalid_address_is_ignored() -> None:
     device = Record("generic")
     device.int_ptr = 2**46
     assert not processor.give_name(device, "x86-64-v3")
 
 
 def test_compiler_prints_nothing(tmp_path: Path) -> None:
-    """PoCL's compiler writes the number of its warnings to file descriptor 2."""
+    """Check file descriptor 2, to which PoCL's compiler writes the number of its warnings."""
     code = (
         "from mauvecl.device import program\ncl = program.load_opencl()\n"
         "handle, _ = program.choose_device(None)\n"
@@ -134,7 +134,7 @@ def test_compiler_prints_nothing(tmp_path: Path) -> None:
     assert run.stderr == ""
 
 
-def test_a_compiler_that_refuses_the_processor_is_told_in_a_sentence(monkeypatch: Any) -> None:
+def test_error_names_processor_unknown_to_compiler(monkeypatch: Any) -> None:
     cl = program.load_opencl()
     handle, _ = program.choose_device(None)
 

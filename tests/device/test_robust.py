@@ -1,4 +1,4 @@
-"""What must end in a sentence or in the same bits: missing devices and tools, little memory, absurd numbers."""
+"""Missing devices and tools, little memory and invalid numbers: clear errors or unchanged results."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from mauvecl.device.selftest import toy
 from mauvecl.host.errors import InputError
 
 
-def test_devices_and_absent_ones() -> None:
+def test_device_is_chosen_by_name_or_number() -> None:
     present = devices()
     assert present[0].default
     assert "Portable" in present[0].platform
@@ -28,8 +28,8 @@ def test_devices_and_absent_ones() -> None:
     assert Engine(device="0").device == present[0]
 
 
-def test_a_missing_linker_is_named(tmp_path) -> None:
-    """PoCL would abort Python; here one sentence says what to install."""
+def test_error_names_missing_linker(tmp_path) -> None:
+    """Raise an error that names the remedy, where PoCL would abort Python."""
     code = "from mauvecl.device.engine import Engine, DeviceError\ntry: Engine()\nexcept DeviceError as e: print(e)"
     run = subprocess.run(
         [sys.executable, "-c", code],
@@ -42,7 +42,7 @@ def test_a_missing_linker_is_named(tmp_path) -> None:
     assert "binutils" in run.stdout
 
 
-def test_no_device_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_device_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     from mauvecl.device import program
 
     opencl = program.load_opencl()
@@ -57,8 +57,8 @@ def test_no_device_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("new", [False, True])
-def test_after_a_fork_there_is_a_sentence_and_no_hang(engine: Engine, new: bool) -> None:
-    """PoCL would wait for ever for threads that did not survive, for an old engine as for a new one."""
+def test_engine_after_fork_raises(engine: Engine, new: bool) -> None:
+    """Raise an error for old and new engines, where PoCL would wait forever for threads of the parent."""
     queue = multiprocessing.get_context("fork").Queue()
 
     def child() -> None:
@@ -73,7 +73,7 @@ def test_after_a_fork_there_is_a_sentence_and_no_hang(engine: Engine, new: bool)
     process.join(timeout=20)
 
 
-def test_a_forked_child_leaves_the_kernels_to_its_parent(engine: Engine) -> None:
+def test_forked_child_keeps_folder_of_parent(engine: Engine) -> None:
     work = kernel_cache().work
     process = multiprocessing.get_context("fork").Process(target=lambda: kernel_cache().close())
     process.start()
@@ -82,22 +82,22 @@ def test_a_forked_child_leaves_the_kernels_to_its_parent(engine: Engine) -> None
     assert work.is_dir()
 
 
-def test_a_failing_build_shows_the_numbered_source(engine: Engine) -> None:
+def test_build_error_contains_numbered_source(engine: Engine) -> None:
     from mauvecl.device.errors import BuildError
     from mauvecl.device.program import build
 
     with pytest.raises(BuildError, match=r"   2  nonsense here"):
-        build(engine.opened.context, "// a comment\nnonsense here\n")
+        build(engine.open_device.context, "// a comment\nnonsense here\n")
 
 
 def refuse_beyond(monkeypatch: pytest.MonkeyPatch, limit: int, *, scenes: bool = False) -> list[int]:
-    """Let the device refuse buffers of more than so many bytes, or what a scene is kept in; the sizes refused."""
+    """Make allocations above `limit` bytes fail, or all buffers of a scene; return the list of failed sizes."""
     refused: list[int] = []
 
     def buffer(context: cl.Context, flags: int, size: int = 0, hostbuf: np.ndarray | None = None) -> cl.Buffer:
         if size > limit or (scenes and hostbuf is not None):
             refused.append(size)
-            hostbuf, flags, size = None, cl.mem_flags.READ_WRITE, 2**60  # which no device has
+            hostbuf, flags, size = None, cl.mem_flags.READ_WRITE, 2**60  # larger than any device
         return real(context, flags, size, hostbuf)
 
     real = cl.Buffer
@@ -105,7 +105,7 @@ def refuse_beyond(monkeypatch: pytest.MonkeyPatch, limit: int, *, scenes: bool =
     return refused
 
 
-def test_little_memory_means_smaller_tiles_and_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_little_memory_shrinks_tiles_without_affecting_results(monkeypatch: pytest.MonkeyPatch) -> None:
     quiet, flare = toy(), toy(flare=0.3)
 
     def work() -> list[np.ndarray]:
@@ -115,14 +115,14 @@ def test_little_memory_means_smaller_tiles_and_the_same_bits(monkeypatch: pytest
         return [raw, clipped, *(found.distribution(s, k).counts for s in found.statistics for k in (None, 0))]
 
     plain = work()
-    # Statistics of 64 realisations take 64 * 4 * 8 bytes; a tile of 20 000 much more.
+    # Statistics of 64 realisations take 64 * 4 * 8 bytes, those of 20 000 exceed the limit.
     refused = refuse_beyond(monkeypatch, 5_000)
     for ours, wanted in zip(work(), plain, strict=True):
         np.testing.assert_array_equal(ours, wanted)
     assert len(refused) > 5
 
 
-def test_too_little_memory_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_too_little_memory_raises(monkeypatch: pytest.MonkeyPatch) -> None:
     refuse_beyond(monkeypatch, 100)
     with pytest.raises(DeviceError, match="too little memory for 64 realisations"):
         Engine().detect(toy(), [toy(flare=0.3)], realisations=20_000, seed=1)
@@ -131,7 +131,7 @@ def test_too_little_memory_is_a_sentence(monkeypatch: pytest.MonkeyPatch) -> Non
         Engine().realise(toy(), count=1, seed=1)
 
 
-def test_other_failures_of_a_device_are_not_taken_for_little_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_device_errors_are_not_retried(monkeypatch: pytest.MonkeyPatch) -> None:
     engine, real = Engine(), cl.Buffer
     both = cl.mem_flags.READ_ONLY | cl.mem_flags.WRITE_ONLY
     monkeypatch.setattr(cl, "Buffer", lambda context, flags, *rest, **more: real(context, both, 64))
@@ -144,7 +144,7 @@ def test_other_failures_of_a_device_are_not_taken_for_little_memory(monkeypatch:
     "name",
     ["source_electrons", "sky_electrons", "dark_dn", "bias_dn", "read_noise_dn", "gain_dn_per_electron"],
 )
-def test_absurd_means_and_noise_are_refused_by_pixel(name: str, value: float) -> None:
+def test_invalid_expectation_names_pixel(name: str, value: float) -> None:
     x = toy()
     wrong = getattr(x, name).copy()
     wrong[17] = value

@@ -1,4 +1,4 @@
-"""The self-test passes where all is well and fails where a kernel is wrong, by the strict promise and the weaker."""
+"""The self-test passes on correct kernels and fails on wrong ones, for the strict and the weaker promise."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ WEAKER = "same draws to float rounding: no fused multiply-add"
 
 
 def rendered_otherwise(monkeypatch: pytest.MonkeyPatch, change: Callable[[str], str]) -> None:
-    """Kernels built from a source changed after rendering."""
+    """Change the source of kernels after rendering."""
     render = program.render
 
     def changed(rooms: tuple[str, ...], variant: program.Variant) -> str:
@@ -35,12 +35,12 @@ def rendered_otherwise(monkeypatch: pytest.MonkeyPatch, change: Callable[[str], 
 
 
 def unfused(source: str) -> str:
-    """A device without fused multiply-add."""
+    """Return the source for a device without fused multiply-add."""
     return source.replace("#define FMA(a, b, c) fused((a), (b), (c))", "#define FMA(a, b, c) ((a) * (b) + (c))")
 
 
 def rough_roots(source: str) -> str:
-    """A device whose square roots are off by some units in the last place."""
+    """Return the source for a device whose square roots err by some units in the last place."""
     return source.replace("floatv root(floatv a) { return ", "floatv root(floatv a) { return 1.0000003f * ")
 
 
@@ -49,21 +49,21 @@ def another_key_schedule(source: str) -> str:
 
 
 @pytest.mark.long
-def test_all_is_well_here(engine: Engine) -> None:
-    """With LUCK 1e-6 and limits of five standard errors a sound device fails once in 1e5 seeds; this seed is fixed."""
-    told: list[selftest.Check] = []
-    checks = selftest.run(engine, told.append)
-    assert told == checks
+def test_self_test_passes(engine: Engine) -> None:
+    """Pass on a correct device; limits of p = 1e-6 and 5 standard errors fail for one in 1e5 seeds."""
+    reported: list[selftest.Check] = []
+    checks = selftest.run(engine, reported.append)
+    assert reported == checks
     assert len(checks) > 20
     assert [check.name for check in checks if not check.passed] == []
 
 
 def few_cases(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
-    """Kernels built anew are what these tests cost."""
+    """Restrict the self-test to a few cases, since building their kernels is slow."""
     monkeypatch.setattr(selftest, "CASES", {name: selftest.CASES[name] for name in names})
 
 
-#: One case of each way to draw for what real devices lack; of roots, whose errors go the same way, two.
+# One case per kind of draw; square roots, whose errors have one sign, need two.
 @pytest.mark.long
 @pytest.mark.parametrize(
     ("weakness", "cases"),
@@ -72,41 +72,43 @@ def few_cases(monkeypatch: pytest.MonkeyPatch, *names: str) -> None:
         (rough_roots, ("apart, tables", "marginalised, the sky unknown")),
     ],
 )
-def test_the_weaker_promise_is_kept_and_marked(
+def test_weaker_promise_is_checked_and_marked(
     monkeypatch: pytest.MonkeyPatch, weakness: Callable[[str], str], cases: tuple[str, ...]
 ) -> None:
     few_cases(monkeypatch, *cases)
     rendered_otherwise(monkeypatch, weakness)
     weak = Engine()
-    strict = list(selftest.twins(weak))
+    strict = list(selftest.check_against_reference(weak))
     assert not all(check.passed for check in strict), "a device that promises the same bits must give them"
-    weak.opened.record = replace(weak.device, promise=WEAKER)
-    checks = list(selftest.twins(weak))
+    weak.open_device.record = replace(weak.device, promise=WEAKER)
+    checks = list(selftest.check_against_reference(weak))
     assert [check.name for check in checks if not check.passed] == []
     marked = [check for check in checks if "weaker promise" in check.result]
     assert len(marked) == sum(not check.passed for check in strict) > 0
 
 
 @pytest.mark.long
-def test_a_wrong_kernel_keeps_no_promise(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another key schedule is other draws, not rounding."""
+def test_wrong_kernel_fails_both_promises(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Fail for another key schedule, which changes draws, not rounding."""
     few_cases(monkeypatch, "stack", "apart, tables")
     rendered_otherwise(monkeypatch, another_key_schedule)
     wrong = Engine()
     assert not selftest.known_answers(wrong).passed
-    wrong.opened.record = replace(wrong.device, promise=WEAKER)
-    assert not any(check.passed for check in selftest.twins(wrong))
+    wrong.open_device.record = replace(wrong.device, promise=WEAKER)
+    assert not any(check.passed for check in selftest.check_against_reference(wrong))
 
 
-def test_a_device_without_strict_arithmetic_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_device_without_strict_arithmetic_has_weaker_promise(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(program, "weaknesses", lambda device: ["fused multiply-add"])
     assert program.devices()[0].promise == WEAKER
     assert Engine().device.promise == WEAKER
 
 
-def test_the_command(tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A table, a file, exit code 0, or 1 where a check fails; later records carry the outcome."""
-    # A store of its own: the user's must not remember what is made up here.
+def test_selftest_command_reports_and_records_outcome(
+    tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Check table, file, exit codes 0 and 1 (failed check), and the outcome in later run records."""
+    # A separate store keeps these invented outcomes out of the user's.
     monkeypatch.setattr(selftest, "kernel_cache", lambda: KernelCache(tmp_path, tmp_path))
     checks = [selftest.Check("one thing", True, "as it should be")]
     monkeypatch.setattr(selftest, "run", lambda engine: checks)
@@ -117,7 +119,7 @@ def test_the_command(tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyP
     kept = json.loads((tmp_path / "selftest.json").read_text())
     assert kept["passed"] is True
     assert kept["checks"][0]["name"] == "one thing"
-    assert selftest.last(engine.device) == kept
+    assert selftest.read_outcome(engine.device) == kept
     pool = Pool(LocalWorkers([None], make=lambda device, progress: engine))
     record = report.write_record("detect", Study(), [], tmp_path, pool=pool, seconds=0.0, messages=[])
     assert json.loads(record.read_text())["selftest"] == [kept]
@@ -131,7 +133,7 @@ def test_the_command(tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyP
     assert json.loads(as_json.output)["passed"] is False
 
 
-def test_devices_tell_promise_and_rate() -> None:
+def test_devices_command_lists_promise_and_rate() -> None:
     run = CliRunner().invoke(app, ["devices", "--json"])
     (first, *_) = json.loads(run.output)
     assert first["promise"] == program.SAME_BITS

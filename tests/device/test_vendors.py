@@ -1,4 +1,4 @@
-"""Drivers: Intel's wheel is found and hides no other, and where there is none, a sentence says where they come from."""
+"""Drivers: Intel's wheel is found and hides no other; without drivers, an error names their sources."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ print([device.platform for device in devices()], os.environ.get("OCL_ICD_VENDORS
 
 @pytest.fixture
 def wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """The folder of a wheel like Intel's, whose driver is empty, importable in this process."""
+    """Return the folder of a wheel like Intel's with an empty driver, importable in this process."""
     info = tmp_path / "site" / "intel_opencl_rt-2026.2.0.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: intel-opencl-rt\nVersion: 2026.2.0\n")
@@ -38,21 +38,21 @@ def wheel(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (tmp_path / "usual" / "nvidia.icd").write_text("libnvidia-opencl.so.1\n")
     monkeypatch.syspath_prepend(str(info.parent))
     monkeypatch.setattr(sys, "prefix", str(tmp_path))
-    for name in vendors.FOLDERS:
+    for name in vendors.FOLDER_VARIABLES:
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setenv(vendors.FOLDERS[1], str(tmp_path / "usual"))
+    monkeypatch.setenv(vendors.FOLDER_VARIABLES[1], str(tmp_path / "usual"))
     vendors._folder.cache_clear()
     yield tmp_path
     vendors._folder.cache_clear()
 
 
 def listed() -> dict[str, str]:
-    with vendors.shown():
+    with vendors.show_intel_runtime():
         folder = Path(os.environ["OCL_ICD_VENDORS"])
         return {path.name: path.read_text().strip() for path in folder.iterdir()}
 
 
-def test_loader_is_shown_intels_driver_and_all_others(wheel: Path) -> None:
+def test_loader_finds_intels_driver_and_all_others(wheel: Path) -> None:
     assert listed() == {
         "nvidia.icd": "libnvidia-opencl.so.1",
         "mauvecl-intel.icd": str(wheel / "lib" / "libintelocl.so"),
@@ -60,27 +60,27 @@ def test_loader_is_shown_intels_driver_and_all_others(wheel: Path) -> None:
     assert "OCL_ICD_VENDORS" not in os.environ
 
 
-def test_users_folder_is_left_alone(wheel: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_users_folder_is_not_replaced(wheel: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("OCL_ICD_VENDORS", "/my/own")
-    with vendors.shown():
+    with vendors.show_intel_runtime():
         assert os.environ["OCL_ICD_VENDORS"] == "/my/own"
     assert os.environ["OCL_ICD_VENDORS"] == "/my/own"
 
 
 def test_driver_that_the_system_lists_is_not_listed_twice(wheel: Path) -> None:
     (wheel / "usual" / "intel.icd").write_text(f"{wheel}/lib/libintelocl.so\n")
-    with vendors.shown():
+    with vendors.show_intel_runtime():
         assert "OCL_ICD_VENDORS" not in os.environ
 
 
 def test_nothing_changes_without_the_wheel(wheel: Path) -> None:
     (wheel / "lib" / "libintelocl.so").unlink()
-    with vendors.shown():
+    with vendors.show_intel_runtime():
         assert "OCL_ICD_VENDORS" not in os.environ
 
 
-def test_pocl_is_found_beside_a_driver_that_cannot_be_loaded(wheel: Path) -> None:
-    environment = {name: text for name, text in os.environ.items() if name not in vendors.FOLDERS}
+def test_pocl_is_found_despite_broken_driver(wheel: Path) -> None:
+    environment = {name: text for name, text in os.environ.items() if name not in vendors.FOLDER_VARIABLES}
     run = subprocess.run(
         [sys.executable, "-c", CODE.format(place=str(wheel / "site"))],
         env=environment,
@@ -103,10 +103,10 @@ def test_pocl_is_found_beside_a_driver_that_cannot_be_loaded(wheel: Path) -> Non
         ("FreeBSD", "amd64", ["conda-forge"]),
     ],
 )
-def test_devices_says_where_drivers_come_from(
+def test_devices_command_names_sources_of_drivers(
     system: str, machine: str, words: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Also that no wheel is offered where none exists."""
+    """Name no wheel on platforms without one."""
     monkeypatch.setattr(platform, "system", lambda: system)
     monkeypatch.setattr(platform, "machine", lambda: machine)
     monkeypatch.setattr(program.load_opencl(), "get_platforms", list)
@@ -118,8 +118,8 @@ def test_devices_says_where_drivers_come_from(
     assert "\n" not in said
 
 
-def test_pip_asks_for_wheels_only_where_they_exist() -> None:
-    """PoCL's and Intel's wheels exist for Linux on x86-64; a requirement for them elsewhere fails to install."""
+def test_requirements_name_wheels_only_for_supported_platforms() -> None:
+    """Require PoCL's and Intel's wheels only on Linux on x86-64, since they exist for no other platform."""
     wheels = {"pyopencl": "pocl", "intel-opencl-rt": "", "intel-cmplr-lib-rt": "", "tbb": ""}
     project = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]
     wanted = [Requirement(line) for line in project["dependencies"] + project["optional-dependencies"]["intel"]]
@@ -131,7 +131,7 @@ def test_pip_asks_for_wheels_only_where_they_exist() -> None:
         assert "pyopencl" in {one.name for one in asked}
 
 
-def test_windows_is_told_what_to_use() -> None:
+def test_windows_error_names_alternative() -> None:
     code = "import sys; sys.platform = 'win32'; import mauvecl"
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert run.returncode == 1

@@ -12,4 +12,4 @@ from mauvecl.device.probes import Probes
 def probes(request: pytest.FixtureRequest, engine: Engine) -> Probes:
     """PoCL's fast forms, the plain OpenCL vectors that other compilers get, and what a GPU runs."""
     width = 1 if request.param == "scalar" else 16
-    return Probes(device=engine.opened, width=width, vector_forms=request.param == "vector forms")
+    return Probes(device=engine.open_device, width=width, vector_forms=request.param == "vector forms")

@@ -12,7 +12,7 @@ from scipy import optimize
 
 from mauvecl.device.selftest import toy
 from mauvecl.host.errors import InputError
-from mauvecl.noise import twin as reference
+from mauvecl.noise import reference
 from mauvecl.noise.cumulants import DRAWS_TO_NOTICE, Cumulants, joint_is_exact, left_out, needs_fourth_power, polynomial
 from mauvecl.noise.processes import Processes, Uniform
 from mauvecl.noise.scene import prepare

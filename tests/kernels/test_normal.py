@@ -8,7 +8,7 @@ from scipy import special, stats
 
 from mauvecl.device.engine import Engine
 from mauvecl.device.probes import Probes
-from mauvecl.noise import twin as reference
+from mauvecl.noise import reference
 
 #: Words at every end of every branch: zeros, ones, signs, quadrants, the split of the logarithm.
 EDGES = np.array(
@@ -105,7 +105,7 @@ def test_a_thousand_million_draws(probes_fast: Probes) -> None:
 
 @pytest.fixture(scope="module")
 def probes_fast(engine: Engine) -> Probes:
-    return Probes(device=engine.opened)
+    return Probes(device=engine.open_device)
 
 
 def test_fused_multiply_add_rounds_once() -> None:

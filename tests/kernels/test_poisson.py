@@ -9,7 +9,7 @@ from scipy import stats
 from mauvecl.device import selftest
 from mauvecl.device.engine import Engine
 from mauvecl.device.probes import Probes
-from mauvecl.noise import twin as reference
+from mauvecl.noise import reference
 from mauvecl.noise.poisson import SMALLEST_EXPANDED, alias_table, table_set
 from mauvecl.noise.scene import prepare
 
@@ -140,7 +140,7 @@ def test_expansion_equals_the_reference(probes: Probes) -> None:
 
 @pytest.fixture(scope="session")
 def probes_fast(engine: Engine) -> Probes:
-    return Probes(device=engine.opened)
+    return Probes(device=engine.open_device)
 
 
 def test_moments_of_the_table() -> None:

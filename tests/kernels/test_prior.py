@@ -10,7 +10,7 @@ import pytest
 
 from mauvecl.device.probes import Probes
 from mauvecl.host.errors import InputError
-from mauvecl.noise import twin as reference
+from mauvecl.noise import reference
 from mauvecl.noise.prior_tables import nodes
 from mauvecl.noise.priors import Normal, Prior, Uniform
 from mauvecl.noise.processes import Factors, Processes

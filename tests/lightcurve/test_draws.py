@@ -21,7 +21,7 @@ METHODS = ["pixels", "cumulants"]
 @pytest.fixture(scope="module")
 def stares(engine: Engine) -> Stares:
     """On the engine's device."""
-    return Stares(engine.opened)
+    return Stares(engine.open_device)
 
 
 @pytest.mark.parametrize("magnitude", [7.4, -0.7], ids=["plain", "at saturation"])

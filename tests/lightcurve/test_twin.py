@@ -63,7 +63,7 @@ def case(name: str) -> tuple[Components, Stare, Any, Any, dict[str, Any]]:
 @pytest.fixture(scope="module", params=["vectors", pytest.param("scalar", marks=pytest.mark.long)])
 def stares(request: pytest.FixtureRequest, engine: Engine) -> Stares:
     """As processors draw them, and one stare or frame to a work-item, as a GPU does."""
-    return Stares(engine.opened) if request.param == "vectors" else Stares(width=1)
+    return Stares(engine.open_device) if request.param == "vectors" else Stares(width=1)
 
 
 @pytest.mark.parametrize("name", long_but(CASES, "plain", "all that wobbles"))
@@ -92,18 +92,18 @@ def test_a_split_changes_no_bit(engine: Engine, method: Any) -> None:
     """Whatever the tile, the neighbours or the call: a stare follows from seed and number, a frame from its time."""
     components, stare, flare, amplitudes, _ = case("electrons")
     how: dict[str, Any] = {"seed": SEED, "method": method}
-    whole = Stares(engine.opened).frames(
+    whole = Stares(engine.open_device).frames(
         components, stare, flare, first=FIRST, count=COUNT, amplitudes=amplitudes, **how
     )
     for tile in (None, 16):
         parts = [
-            Stares(engine.opened, tile=tile).frames(
+            Stares(engine.open_device, tile=tile).frames(
                 components, stare, flare[a:b], first=FIRST + a, count=b - a, amplitudes=amplitudes[:, a:b], **how
             )
             for a, b in ((0, 1), (1, 23), (23, 40))
         ]
         np.testing.assert_array_equal(np.concatenate(parts, axis=1), whole)
-    alone = Stares(engine.opened).frames(
+    alone = Stares(engine.open_device).frames(
         components, stare, flare * amplitudes[1][:, None, None], first=FIRST, count=COUNT, **how
     )
     # The device multiplies in float32 what is multiplied in float64 here: whole DN may differ now and then.
@@ -111,7 +111,7 @@ def test_a_split_changes_no_bit(engine: Engine, method: Any) -> None:
     # The frames that a gap leaves are those of the stare without it.
     gapless = Stare.of(110.0, temperature_c=components.quiet.conditions["temperature_c"])
     gapped = Stare.of(110.0, temperature_c=components.quiet.conditions["temperature_c"], gaps=[(20.0, 60.0)])
-    both = [Stares(engine.opened).frames(components, s, None, count=2, **how) for s in (gapless, gapped)]
+    both = [Stares(engine.open_device).frames(components, s, None, count=2, **how) for s in (gapless, gapped)]
     np.testing.assert_array_equal(both[0][:, gapped.numbers], both[1])
 
 

@@ -9,8 +9,8 @@ import pytest
 from scenes import instrument, star
 
 from mauvecl.device.engine import Engine
-from mauvecl.device.forms import scene_launches
 from mauvecl.device.selftest import toy
+from mauvecl.device.variants import scene_launches
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.host.instrument.pixel_map import PixelMap
@@ -52,7 +52,7 @@ def test_no_two_draws_are_tied(engine: Engine, name: str) -> None:
     values = []
     for frame in (0, 1):
         scene, rows = prepare([x], first_frame=frame, **how), np.empty((ROWS, x.wavelength_nm.size), np.int32)
-        with scene_launches(engine.opened, scene, 17) as run:
+        with scene_launches(engine.open_device, scene, 17) as run:
             engine._tiles.over(0, ROWS, 256, lambda t, n, run=run, rows=rows: run.realise(t, rows[n : n + t.wanted]))
         values.append((rows - rows.mean(axis=0)) / rows.std(axis=0))
     # Single precision moves no z by 0.01, and takes half as long.

@@ -9,12 +9,11 @@ import pytest
 from scenes import instrument, star
 
 from mauvecl.device.engine import Engine
-from mauvecl.device.forms import scene_launches
 from mauvecl.device.tiles import Tile
+from mauvecl.device.variants import scene_launches
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
-from mauvecl.noise import layout
-from mauvecl.noise import twin as reference
+from mauvecl.noise import layout, reference
 from mauvecl.noise.processes import CosmicRays, Processes
 from mauvecl.noise.scene import Scene, prepare
 
@@ -48,7 +47,7 @@ def draw_one(engine: Engine, scene: Scene, index: int, seed: int) -> np.ndarray:
     out = np.empty((1, scene.n_pixel), np.int32)
     tile = engine._tiles.at(index, 1, 4096)
     assert isinstance(tile, Tile)
-    with scene_launches(engine.opened, scene, seed) as launches:
+    with scene_launches(engine.open_device, scene, seed) as launches:
         launches.realise(tile, out)
     return out
 

@@ -12,8 +12,7 @@ from scipy import stats
 
 from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError
-from mauvecl.noise import layout
-from mauvecl.noise import twin as reference
+from mauvecl.noise import layout, reference
 from mauvecl.noise.components import components
 from mauvecl.noise.processes import NONE, CosmicRays, Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare

@@ -10,7 +10,7 @@ from scenes import instrument, star
 
 from mauvecl.device.engine import Engine
 from mauvecl.host.expectation import Expectation
-from mauvecl.noise import twin as reference
+from mauvecl.noise import reference
 from mauvecl.noise.processes import Normal, Processes
 from mauvecl.noise.scene import prepare
 

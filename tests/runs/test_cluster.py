@@ -60,7 +60,7 @@ def test_two_processes_give_one_answer(workers: DaskWorkers, engine: Engine, sce
 def test_stares_by_two_processes(workers: DaskWorkers, engine: Engine) -> None:
     asked = flaring_stares()
     found = Pool(workers).stares(asked)
-    np.testing.assert_array_equal(found["values"], Stares(engine.opened).reduced(asked)["values"])
+    np.testing.assert_array_equal(found["values"], Stares(engine.open_device).reduced(asked)["values"])
 
 
 def test_a_worker_killed_in_mid_run(workers: DaskWorkers, engine: Engine, scene: list[Expectation]) -> None:

@@ -130,14 +130,14 @@ class Failing:
 
     def __init__(self, engine: Engine, fails: set[int], calls: list[int]) -> None:
         self._engine, self._fails, self._calls = engine, fails, calls
-        self.opened, self.device, self.device_name = engine.opened, engine.device, engine.device_name
+        self.open_device, self.device, self.device_name = engine.open_device, engine.device, engine.device_name
 
     def count(self, request: Any, shard: Shard, **more: Any) -> Arrays:
         self._calls.append(len(self._calls))
         if self._calls[-1] in self._fails:
             # Half of the shard is counted already when it fails.
             self._engine.count(request, replace(shard, count=shard.count // 2))
-            raise self.opened.cl.RuntimeError("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES", -5, "")
+            raise self.open_device.cl.RuntimeError("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES", -5, "")
         return self._engine.count(request, shard, **more)
 
 

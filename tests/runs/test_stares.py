@@ -63,7 +63,7 @@ def test_shards_join_to_the_same_bits(engine: Engine, method: Any, reduction: An
     found = pool.stares(pickle.loads(pickle.dumps(asked)))
     workers.close()
     assert pool.standing.shards == len(shards.shards(asked)) == 5, "cut at multiples of 64, and where the word ends"
-    whole = Stares(engine.opened).frames(
+    whole = Stares(engine.open_device).frames(
         asked.components,
         asked.stare,
         asked.flare,

@@ -28,9 +28,9 @@ def devices(
 
     Example: mauvecl devices
     """
-    from mauvecl.device.rate import measured
+    from mauvecl.device.benchmark import list_devices
 
-    records = measured() if rate else measured(measure=False)
+    records = list_devices() if rate else list_devices(measure=False)
     if as_json:
         print(json.dumps(records, indent=2))
         return
@@ -78,17 +78,17 @@ def selftest(
         engine = Engine(device, progress=meter)
         checks = selftest.run(engine)
     seconds = time.perf_counter() - started
-    selftest.keep(engine, checks, seconds)
+    selftest.write_outcome(engine, checks, seconds)
     failed = sum(not check.passed for check in checks)
     if as_json:
-        print(json.dumps(selftest.last(engine.device) or [asdict(check) for check in checks], indent=2))
+        print(json.dumps(selftest.read_outcome(engine.device) or [asdict(check) for check in checks], indent=2))
     else:
         cells = [("PASS" if check.passed else "FAIL", check.name, check.result) for check in checks]
         show_table(f"Self-test of {engine.device_name}, driver {engine.driver}", ("result", "check", "found"), cells)
         outcome = f"{failed} of {len(checks)} checks FAILED" if failed else f"All {len(checks)} checks passed"
         show([f"{outcome} in {seconds:.0f} s. Promise: {engine.device.promise}."])
     if folder is not None:
-        report.write_json(selftest.last(engine.device), folder / "selftest.json")
+        report.write_json(selftest.read_outcome(engine.device), folder / "selftest.json")
     if failed:
         raise typer.Exit(1)
 

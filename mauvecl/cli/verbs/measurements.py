@@ -30,7 +30,7 @@ def measure(study: Study, session: Session, device: DeviceFlag = None) -> None:
     from mauvecl.device.engine import Engine
 
     engine = Engine(device)
-    session.opened = engine.opened
+    session.opened = engine.open_device
     with session.metered("flares") as meter:
         answer = compute(study, engine, progress=meter)
     session.answer(answer, lambda: _show(answer))

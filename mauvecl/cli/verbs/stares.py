@@ -37,7 +37,7 @@ def stare(
         raise InputError("--energy is given beside --amplitude or --flares, expected one of them")
 
     stares = Stares(device)
-    session.opened = stares.opened
+    session.opened = stares.open_device
     with session.checkpoint() as checkpoint:
         answer = compute(study, stares, checkpoint=checkpoint)
     session.answer(answer, lambda: _show(answer))

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from mauvecl.lightcurve.stares.components import STEADY
 from mauvecl.lightcurve.stares.scene import Flares, StareScene, unique
 from mauvecl.lightcurve.stares.sums import SumTable
-from mauvecl.noise import layout, twin
-from mauvecl.noise.twin import MAGIC, fma, four_normals, together
+from mauvecl.noise import layout, reference
+from mauvecl.noise.reference import MAGIC, fma, four_normals, together
 
 Floats = NDArray[np.float32]
 Numbers = NDArray[np.uint64]
@@ -40,12 +40,12 @@ def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int) -> dic
     """
     moved = {name: np.zeros(len(numbers), np.float32) for name in layout.MOVED}
     if scene.staring["jittered"]:
-        drawn = four_normals(twin.words_at(numbers, int(scene.numbers[frame]), "stare_frame", 0, seed))
+        drawn = four_normals(reference.words_at(numbers, int(scene.numbers[frame]), "stare_frame", 0, seed))
         for name, z in zip(("light", "sky", "temperature"), drawn, strict=False):
             moved[name] = z * scene.staring[f"{name}_jitter"]
     for u, kind in enumerate(scene.kinds):
         name = layout.MOVED[kind]
-        z = four_normals(twin.words_at(numbers, 0, "stare_unknown", u // 4, seed))[u % 4]
+        z = four_normals(reference.words_at(numbers, 0, "stare_unknown", u // 4, seed))[u % 4]
         moved[name] = fma(z, scene.curves[u, frame], moved[name])
     star, star_less_one, sky, sky_less_one, dark, dark_less_one = scene.known[:6, frame]
     light = moved["light"]
@@ -68,7 +68,7 @@ def glow(scene: StareScene, numbers: Numbers, frames: Iterable[int], seed: int) 
     for frame in frames:
         z: list[Floats] = []
         for group in range(-(-len(scene.weights) // 4)):
-            z += four_normals(twin.words_at(numbers, int(scene.numbers[frame]), "stare_glow", group, seed))
+            z += four_normals(reference.words_at(numbers, int(scene.numbers[frame]), "stare_glow", group, seed))
         out.append([*z[: len(scene.weights)], strengths(scene, numbers, frame, seed)["light"]])
     return np.moveaxis(np.array(out), (0, 1, 2), (1, 2, 0))
 
@@ -91,14 +91,14 @@ def pixels(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable
         met = strengths(scene, numbers, frame, seed)
         sums = np.zeros((len(flares.amplitudes), 4, len(scene.weights), len(numbers)), np.float32)
         for group in range(len(scene.mixtures) // 4):
-            drawn = twin.draws(scene.scene, numbers, int(scene.numbers[frame]), group, seed)
+            drawn = reference.draws(scene.scene, numbers, int(scene.numbers[frame]), group, seed)
             for i, p in enumerate(range(4 * group, 4 * group + 4)):
                 for k in range(len(flares.amplitudes)):
                     flare = _coefficients(scene, flares, frame, k, met["light"])
                     v = _count(scene, p, drawn.z[i], met, flare)
                     if scene.scene.cosmic:
                         v = fma(drawn.cosmic[i], scene.scene.pixels[p]["cosmic_gain"], v)
-                    x = twin.digitise(v, scene.scene.edges[0, p], clip=scene.scene.clip)
+                    x = reference.digitise(v, scene.scene.edges[0, p], clip=scene.scene.clip)
                     for s, weight in enumerate(scene.weights[:, p]):
                         sums[k, i, s] = fma(x, weight, sums[k, i, s])
         a, b, c, d = np.moveaxis(sums, 1, 0)
@@ -147,7 +147,7 @@ def sums(scene: StareScene, flares: Flares, numbers: Numbers, frames: Iterable[i
         met = strengths(scene, numbers, frame, seed)
         z: list[Floats] = []
         for group in range(-(-len(scene.weights) // 4)):
-            z += four_normals(twin.words_at(numbers, int(scene.numbers[frame]), "stare_sums", group, seed))
+            z += four_normals(reference.words_at(numbers, int(scene.numbers[frame]), "stare_sums", group, seed))
         rows = []
         for k in range(len(flares.amplitudes)):
             flare = _coefficients(scene, flares, frame, k, met["light"])

@@ -1,4 +1,4 @@
-"""An OpenCL device in use: its context, its queue, and the kernels that were built for it."""
+"""An open OpenCL device: context, queue and compiled kernels."""
 
 from __future__ import annotations
 
@@ -10,29 +10,29 @@ from mauvecl.device.errors import DeviceError
 from mauvecl.device.program import Variant
 from mauvecl.noise.pixels import PIXEL_BLOCK
 
-#: Vectors of realisations that one work-item of the kernels of a detection follows on a processor, at most.
+#: Largest number of vectors of realisations per work-item of the detection kernels on a CPU.
 VECTORS = 4
 
 
 class Device:
-    """What engine, launches and probes work on.
+    """Open OpenCL device with its context, queue and compiled kernels.
 
     Parameters
     ----------
     wanted : str, optional
-        As `Engine` takes it.
+        Number or part of the name, as for `Engine`.
     width : int, optional
-        Realisations in one work-item: 16 on CPUs, 1 elsewhere.
+        Realisations per work-item; by default 16 on CPUs, 1 elsewhere.
 
     Attributes
     ----------
     record : DeviceRecord
     cl : module
-        pyopencl.
+        The imported pyopencl.
     context, queue : pyopencl.Context, pyopencl.CommandQueue
     width : int
     step : int
-        Launches are cut at multiples of what one work-item of any kernel follows.
+        Realisations per work-item of the widest kernel; launches are cut at its multiples.
     """
 
     def __init__(self, wanted: str | None = None, *, width: int | None = None) -> None:
@@ -49,17 +49,17 @@ class Device:
 
     @property
     def name(self) -> str:
-        """Platform and device."""
+        """Platform and device name."""
         return self.record.label
 
     @property
     def variant(self) -> Variant:
-        """How kernels are rendered for this device, whatever the scene."""
+        """Kernel variant of this device, before a scene sets its own options."""
         return Variant(width=self.width, vector_forms=self._vector_forms, chunk=PIXEL_BLOCK if self.width > 1 else 4)
 
     @property
     def programs(self) -> list[str]:
-        """The sources built so far."""
+        """Sources built so far."""
         return sorted(self._programs)
 
     @property
@@ -67,9 +67,9 @@ class Device:
         """Short sha256 of the kernels rendered so far, for run records."""
         return program.digest("\n".join(self.programs))
 
-    def kernel(self, rooms: tuple[str, ...], variant: Variant, name: str) -> Any:
-        """A kernel of the built program of some sources; both are made once."""
-        source = program.render(rooms, variant)
+    def kernel(self, kernel_files: tuple[str, ...], variant: Variant, name: str) -> Any:
+        """Return a kernel of the program of these files; both are built once."""
+        source = program.render(kernel_files, variant)
         if source not in self._programs:
             self._programs[source] = program.build(self.context, source)
         if (source, name) not in self._kernels:
@@ -77,12 +77,6 @@ class Device:
         return self._kernels[source, name]
 
     def check_process(self) -> None:
-        """Refuse to work where it cannot.
-
-        Raises
-        ------
-        DeviceError
-            After a fork: PoCL's threads do not survive it, and its next call would wait for them for ever.
-        """
+        """Raise DeviceError after a fork, which PoCL's threads do not survive: its next call would wait forever."""
         if os.getpid() != self._pid:
             raise DeviceError("this Engine was made before a fork, expected an Engine made in this process (use spawn)")

@@ -1,4 +1,4 @@
-"""How fast a device is, in a second of its own work."""
+"""Measurement of the speed of devices."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ PIXELS = 1600
 
 
 def chi2_rate(engine: Engine, seconds: float = 0.5) -> float:
-    """Pixel-realisations per second of chi2, a quiescent and a flaring scenario on common draws."""
+    """Measure chi2's pixel-realisations per second, for a quiescent and a flaring scenario on common draws."""
     quiet, flare = toy(PIXELS), toy(PIXELS, flare=0.1)
 
     def work(count: int) -> float:
@@ -22,30 +22,21 @@ def chi2_rate(engine: Engine, seconds: float = 0.5) -> float:
         engine.detect(quiet, [flare], realisations=count, seed=1, statistics=("chi2",))
         return time.perf_counter() - start
 
-    work(64)  # builds
+    # The first call builds the kernels.
+    work(64)
     count = 256
     while (spent := work(count)) < seconds / 4:
         count *= 4
     return count * PIXELS / min(spent, work(count))
 
 
-def measured(*, measure: bool = True) -> list[dict[str, Any]]:
-    """Every device, what it promises and how fast it is.
-
-    Parameters
-    ----------
-    measure : bool
-        Without, only what the drivers say.
+def list_devices(*, measure: bool = True) -> list[dict[str, Any]]:
+    """List all devices with their promise and, if `measure` is true, their speed.
 
     Returns
     -------
     list of dict
-        `DeviceRecord` with ``rate`` (None where not measured) and ``error``, why it failed, or "".
-
-    Raises
-    ------
-    DeviceError
-        If there is no device at all.
+        Fields of `DeviceRecord`, ``rate`` (None if not measured) and ``error`` (the reason of a failure, or "").
     """
     rates = []
     for number, record in enumerate(devices()):

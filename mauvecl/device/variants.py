@@ -1,4 +1,4 @@
-"""Which form of the kernels a scene, and what is asked of it, is launched with."""
+"""Choice of the kernel variant for a scene and its statistics."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from dataclasses import replace
 
 import numpy as np
 
+from mauvecl.device.device import VECTORS, Device
 from mauvecl.device.launches import Launches
-from mauvecl.device.opened import VECTORS, Device
 from mauvecl.noise.scene import BATCH, Scene
 from mauvecl.results.requests.channels import ChannelPlan
 from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.statistics.paper import Paper
 
-#: Vectors of realisations that one work-item follows where it sums more than chi-squared: registers hold no more sums.
+#: Vectors of realisations per work-item with sums other than chi-squared, limited by the number of registers.
 FEW_VECTORS = 2
-#: Pixels drawn at once for resolution elements, which have some 35 and begin anywhere.
+#: Pixels drawn at once for resolution elements, which have about 35 pixels and start at any pixel.
 ELEMENT_CHUNK = 8
 
 
@@ -32,17 +32,17 @@ def scene_launches(
     row_type: str = "int",
     chunk: int | None = None,
 ) -> Launches:
-    """A scene on a device, with kernels of the form that it needs and no more room than they need."""
+    """Return the launches of a scene, with the smallest kernel variant that suits it."""
     variant = replace(
         device.variant,
         scenarios=BATCH[scene.frames],
-        linears=_room_for(linears),
+        linears=_capacity(linears),
         frames=scene.frames,
         clip=scene.clip,
         pair=pair,
         noisy=scene.comparison.exposures > 0,
         estimated=scene.comparison.estimated,
-        smooths=_room_for(smooths),
+        smooths=_capacity(smooths),
         slots=slots,
         elements=elements,
         joint=scene.joint,
@@ -53,13 +53,13 @@ def scene_launches(
         row_type=row_type,
         chunk=min(chunk or device.variant.chunk, device.variant.chunk),
     )
-    alone = device.width == 1 or scene.frames or variant.compared
+    single = device.width == 1 or scene.frames or variant.compared
     many = VECTORS if not (variant.elements or variant.linears) else FEW_VECTORS
-    return Launches(device, scene, replace(variant, vectors=1 if alone else many), seed)
+    return Launches(device, scene, replace(variant, vectors=1 if single else many), seed)
 
 
 def detection_launches(device: Device, scene: Scene, seed: int, plan: ChannelPlan, hypotheses: Hypotheses) -> Launches:
-    """A scene on a device, with what every statistic of a detection needs."""
+    """Return the launches of a scene, with the weights and scales of all statistics of a detection."""
     bands, finished = np.zeros((1, 0, 1), np.float32), np.zeros(1, np.uint32)
     if len(plan.scales):
         bands, finished = Paper().smoothing(hypotheses.setting).bands(len(scene.pixels), device.variant.chunk)
@@ -82,6 +82,6 @@ def detection_launches(device: Device, scene: Scene, seed: int, plan: ChannelPla
     return launches
 
 
-def _room_for(count: int) -> int:
-    """Room in a kernel for so many statistics: a power of two, so that few programs are built."""
+def _capacity(count: int) -> int:
+    """Round a number of statistics up to a power of two, so that few programs are built."""
     return max(32, 1 << (count - 1).bit_length()) if count else 0
