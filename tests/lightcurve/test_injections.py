@@ -12,10 +12,11 @@ from scipy import special
 from searches import DAVENPORT, KNOWN, ONE, spectra, survey
 
 from mauvecl.device.stares import Stares
+from mauvecl.lightcurve.search import places
 from mauvecl.lightcurve.search.bank import Bank, Level
 from mauvecl.lightcurve.search.injections import Injections
 from mauvecl.lightcurve.search.null import in_a_row, in_a_row_rate
-from mauvecl.lightcurve.search.places import OVERLAP
+from mauvecl.lightcurve.search.places import OVERLAP, places_of
 from mauvecl.lightcurve.search.recovery import Fit
 from mauvecl.lightcurve.search.sampled import sampled
 from mauvecl.lightcurve.search.search import Search
@@ -180,6 +181,25 @@ def test_draws_are_common_and_addressed(injections, stares):
     np.testing.assert_array_equal(np.concatenate(parts), every)
     assert fingerprint(pickle.loads(pickle.dumps(asked))) == fingerprint(injections.request(4))
     assert fingerprint(asked) != fingerprint(replace(injections, threshold=5.3).request(4))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_places_are_those_of_each_flare_alone_and_of_part_of_the_stare(injections, seed, monkeypatch):
+    """Flares of random half-widths and times: filters of all at once are those of each in the frames around it."""
+    rng = np.random.default_rng([26, seed])
+    widths = tuple(np.sort(10 ** rng.uniform(0.8, 2.5, 4)))
+    peak = float(rng.uniform(-50.0, 950.0))
+    together = places_of(injections.survey, widths, peak, injections.response)
+    monkeypatch.setattr(places, "WHOLE", 0)
+    for width, place in zip(widths, together, strict=True):
+        (alone,) = places_of(injections.survey, (width,), peak, injections.response)
+        assert (place.half_width_s, place.peak_s, place.first) == (width, peak, alone.first)
+        np.testing.assert_array_equal(place.counts, alone.counts)
+        np.testing.assert_array_equal(place.widths_s, alone.widths_s)
+        np.testing.assert_array_equal(place.peaks_s, alone.peaks_s)
+        np.testing.assert_array_equal(place.mean, alone.mean)
+        # Filters are rounded to multiples of a step: sums in another order may round one to the next.
+        np.testing.assert_allclose(place.filters, alone.filters, rtol=0, atol=1.01 * places.STEP)
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.search.places import Place, place_of
+from mauvecl.lightcurve.search.places import Place, places_of
 from mauvecl.lightcurve.search.recoveries import KEPT, Refit
 from mauvecl.lightcurve.search.survey import net_of, part_of
 from mauvecl.lightcurve.stares.components import STEADY, Components
@@ -130,8 +130,7 @@ class Injections:
 
     def places(self, position: int) -> tuple[Place, ...]:
         """Every half-width at one of the peaks."""
-        peak_s = float(self.peaks_s[position])
-        return tuple(place_of(self.survey, width, peak_s, self.response) for width in self.half_widths_s)
+        return places_of(self.survey, self.half_widths_s, float(self.peaks_s[position]), self.response)
 
     def request(self, position: int, refit: Refit | None = None) -> StaresRequest:
         """The stares with flares at one of the peaks, what is found in them, and fits of the first ones.

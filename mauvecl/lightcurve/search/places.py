@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,9 @@ from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.search.survey import part_of
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from mauvecl.lightcurve.search.bank import Bank
     from mauvecl.lightcurve.search.survey import Survey
 
 Float = NDArray[np.float64]
@@ -24,6 +27,8 @@ OVERLAP = 0.3
 STEP = 2.0**-18
 #: Half-widths by which templates may differ from a flare's, and templates before and after its peak that are tried.
 WIDEST, BEFORE, AFTER = 10.0, 3.0, 5.0
+#: Frames up to which a stare is searched as a whole: its search is there, and no part of it is much smaller.
+WHOLE = 20_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,55 +74,122 @@ class Place:
         return replace(self, first=self.first - first)
 
 
-def place_of(survey: Survey, width_s: float, peak_s: float, response: Float) -> Place:
-    """A flare and what can find it.
+def places_of(survey: Survey, widths_s: Sequence[float], peak_s: float, response: Float) -> tuple[Place, ...]:
+    """Return flares of several half-widths that peak at one time, and the templates that can find each.
 
     Parameters
     ----------
     survey : Survey
-    width_s, peak_s : float
-        Of the flare.
+    widths_s : sequence of float
+        Half-widths of the flares.
+    peak_s : float
     response : ndarray, shape (n_sum,)
         Mean sums of a flare of one amplitude in a frame.
     """
     bank = survey.bank
-    stare, frame_s = survey.stare, bank.frame_s
-    near = [w for w in bank.half_widths_s if width_s / WIDEST <= w <= width_s * WIDEST]
-    if not near:
-        near = [min(bank.half_widths_s, key=lambda w: abs(np.log(w / width_s)))]
-    bank = replace(bank, half_widths_s=tuple(near))
-    widest = bank.templates[-1]
-    reach = (BEFORE * near[-1] + width_s, AFTER * max(width_s, near[-1]))
-    before = reach[0] - widest.first * frame_s
-    after = reach[1] + (widest.first + widest.time.size) * frame_s
-    first, last = (int(k) for k in np.searchsorted(stare.start_s, [peak_s - before, peak_s + after]))
-    part = slice(first, last)
+    reaches = [_Reach.of(bank, width, peak_s) for width in widths_s]
+    search, first = _near(survey, reaches)
+    stare = search.stare
+    edges = np.column_stack([stare.start_s, stare.start_s + bank.frame_s])
+    means = np.array([stare.light * bank.shape.mean_over(edges, peak_s, width) for width in widths_s])
+    # A flare's sums are its course in time the response, so that one correlation serves all temperatures.
+    along = (bank.directions @ response)[:, None]
+    seen: list[list[_Seen]] = [[] for _ in reaches]
+    for number, (row, correlated) in enumerate(search.correlations(means[:, :, None])):
+        times = (stare.numbers[0] + row.peaks + row.template.phases[row.phase]) * bank.frame_s
+        for found, reach, value in zip(seen, reaches, correlated[:, 0], strict=True):
+            if row.template.half_width_s in reach.half_widths_s:
+                inside = (times >= reach.first_s) & (times <= reach.last_s) & (row.per_amplitude > 0)
+                onsets = np.flatnonzero(inside)
+                onsets = onsets[(along * value[onsets]).max(axis=0, initial=0) > 0]
+                found.append(_Seen(number, onsets, times[onsets], along * value[onsets]))
+    for found in seen:
+        largest = max((float(one.values.max(initial=0)) for one in found), default=0.0)
+        found[:] = [one.above(OVERLAP * largest) for one in found]
+    filters = _filters(search, [one for found in seen for one in found])
+    return tuple(
+        _place(search, first, width, peak_s, mean, found, filters)
+        for width, mean, found in zip(widths_s, means, seen, strict=True)
+    )
+
+
+@dataclass(frozen=True)
+class _Reach:
+    """Templates that are tried for a flare, and the frames that they reach to, s."""
+
+    half_widths_s: tuple[float, ...]
+    first_s: float
+    last_s: float
+    begin_s: float
+    end_s: float
+
+    @classmethod
+    def of(cls, bank: Bank, width_s: float, peak_s: float) -> _Reach:
+        near = [w for w in bank.half_widths_s if width_s / WIDEST <= w <= width_s * WIDEST]
+        if not near:
+            near = [min(bank.half_widths_s, key=lambda w: abs(np.log(w / width_s)))]
+        first, last = peak_s - (BEFORE * near[-1] + width_s), peak_s + AFTER * max(width_s, near[-1])
+        lead, tail = (frames * bank.frame_s for frames in bank.window(near[-1]))
+        return cls(tuple(near), first, last, first - lead, last + tail + bank.frame_s)
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """Templates of one row of a search that see a flare, and their values, shape (n_temperature, n)."""
+
+    row: int
+    onsets: NDArray[np.int64]
+    times_s: Float
+    values: Float
+
+    def above(self, least: float) -> _Seen:
+        """Return those with a value of at least this at any temperature; values become whether each has it."""
+        counts = self.values >= least
+        kept = counts.any(axis=0)
+        return _Seen(self.row, self.onsets[kept], self.times_s[kept], counts[:, kept])
+
+
+def _near(survey: Survey, reaches: Sequence[_Reach]) -> tuple[Search, int]:
+    """Return a search of the frames that templates reach to, and the first of these frames."""
+    stare = survey.stare
+    if stare.n_frames <= WHOLE:
+        return survey.search, 0
+    ends = min(reach.begin_s for reach in reaches), max(reach.end_s for reach in reaches)
+    part = slice(*(int(k) for k in np.searchsorted(stare.start_s, ends)))
+    near = {width for reach in reaches for width in reach.half_widths_s}
+    bank = replace(survey.bank, half_widths_s=tuple(sorted(near)))
     curves = None if survey.curves is None else survey.curves[:, part]
-    search = Search(bank, part_of(stare, part), curves, survey.variance[part])
-    start = stare.start_s[part]
-    edges = np.column_stack([start, start + frame_s])
-    mean = stare.light[part] * bank.shape.mean_over(edges, peak_s, width_s)
-    chosen: list[tuple[Any, int, float, Float]] = []
-    sums = (mean[:, None] * response).astype(np.float32)
-    for row, rho in search.values(sums[None]):
-        times = (search.stare.numbers[0] + row.peaks + row.template.phases[row.phase]) * frame_s
-        inside = (times >= peak_s - reach[0]) & (times <= peak_s + reach[1])
-        values = np.where(inside, rho[0], -np.inf)
-        chosen += [(row, int(k), float(times[k]), values[:, k]) for k in np.flatnonzero(values.max(axis=0) > 0)]
-    values = np.array([v for *_, v in chosen]).reshape(len(chosen), len(bank.directions))
-    counts = values >= OVERLAP * values.max() if len(chosen) else values > 0
-    kept = np.flatnonzero(counts.any(axis=1))
-    filters = np.array([search.in_time(*chosen[k][:2]) for k in kept]).reshape(len(kept), start.size)
-    filters = (np.rint(filters / STEP) * STEP).astype(np.float32)
-    used = np.flatnonzero(filters.any(axis=0))
+    return Search(bank, part_of(stare, part), curves, survey.variance[part]), part.start
+
+
+def _filters(search: Search, seen: Sequence[_Seen]) -> dict[int, tuple[NDArray[np.int64], Single]]:
+    """Return the onsets that any flare needs of each row, ascending, and their filters."""
+    filters = {}
+    for number in sorted({one.row for one in seen}):
+        onsets = np.unique(np.concatenate([one.onsets for one in seen if one.row == number]))
+        in_time = search.in_time(search.grid[number], onsets)
+        filters[number] = onsets, (np.rint(in_time / STEP) * STEP).astype(np.float32)
+    return filters
+
+
+def _place(
+    search: Search, first: int, width_s: float, peak_s: float, mean: Float, seen: Sequence[_Seen],
+    filters: dict[int, tuple[NDArray[np.int64], Single]],
+) -> Place:  # fmt: skip
+    none = np.zeros((0, mean.size), np.float32)
+    own = [filters[one.row][1][np.searchsorted(filters[one.row][0], one.onsets)] for one in seen]
+    weights = np.concatenate([none, *own])
+    used = np.flatnonzero(weights.any(axis=0))
     ends = slice(int(used[0]), int(used[-1]) + 1) if used.size else slice(0, 0)
+    widths = [np.full(one.onsets.size, search.grid[one.row].template.half_width_s) for one in seen]
+    no_counts = np.zeros((len(search.bank.directions), 0), np.bool_)
     return Place(
         width_s,
         peak_s,
         first + ends.start,
-        np.ascontiguousarray(filters[:, ends]),
+        np.ascontiguousarray(weights[:, ends]),
         mean[ends].astype(np.float32),
-        np.array([chosen[k][0].template.half_width_s for k in kept]),
-        np.array([chosen[k][2] for k in kept]),
-        counts[kept].T,
+        np.concatenate([np.zeros(0), *widths]),
+        np.concatenate([np.zeros(0), *(one.times_s for one in seen)]),
+        np.concatenate([no_counts, *(one.values for one in seen)], axis=1),
     )

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from mauvecl.lightcurve.stares.stare import Stare
 
 Float = NDArray[np.float64]
-Single = NDArray[np.float32]
 
 #: Numbers that a batch of stares holds in one array, about.
 BATCH = 2**21
@@ -161,21 +160,57 @@ class Search:
         """
         yield from self._values(self._checked(sums))
 
+    def correlations(self, sums: NDArray[Any]) -> Iterator[tuple[Row, NDArray[Any]]]:
+        """Yield each row with the value of every sum for itself, shape (n_stare, n_sum, n_onset): zero where none is.
+
+        The values of rho are these, weighed with the bank's directions. There may be any number of sums.
+        """
+        spectra = self._spectra(sums)
+        real = _precision(sums)
+        window, level = (0, 0), []
+        for template in self.bank.templates:
+            onsets = self._onsets(template)
+            # Templates of one window share the level's part.
+            if window != (template.first, template.time.size):
+                window = template.first, template.time.size
+                level = [
+                    self._correlated(spectra[series], template.time**power, template.first)
+                    for power, series in self._terms
+                ]
+            for row in self.grid:
+                if row.template is not template:
+                    continue
+                correlated = self._correlated(spectra[0], template.shapes[row.phase], template.first)[..., onsets]
+                for projected, term in zip(row.project.astype(real), level, strict=True):
+                    correlated -= projected * term[..., onsets]
+                scale = np.divide(
+                    1.0, row.per_amplitude, out=np.zeros_like(row.per_amplitude), where=row.per_amplitude > 0
+                )
+                correlated *= scale.astype(real)
+                yield row, correlated
+
     def template(self, row: Row, onset: int, direction: int) -> Float:
         """What rho of one template weighs each sum with: rho = sum(template * sums), shape (n_frame, n_sum)."""
-        return np.asarray(self.in_time(row, onset)[:, None] * self.bank.directions[direction])
+        return np.asarray(self.in_time(row, np.array([onset]))[0][:, None] * self.bank.directions[direction])
 
-    def in_time(self, row: Row, onset: int) -> Float:
-        """The same without its direction, shape (n_frame,)."""
-        at = self._at - row.peaks[onset] - row.template.first
-        inside = (at >= 0) & (at < row.template.time.size)
-        at = at[inside]
+    def in_time(self, row: Row, onsets: NDArray[np.int64]) -> Float:
+        """Return what templates of a row weigh frames with, without their direction, shape (n_onset, n_frame)."""
+        size, first = row.template.time.size, row.peaks[onsets] + row.template.first
+        templates = np.zeros((onsets.size, self.stare.n_frames))
+        if not onsets.size:
+            return templates
+        reached = slice(*np.searchsorted(self._at, [first.min(), first.max() + size]))
+        grid = self._at[reached]
+        at = grid - first[:, None]
+        inside = (at >= 0) & (at < size)
+        at = np.where(inside, at, 0)
         shape = row.template.shapes[row.phase][at]
-        for (power, series), amplitude in zip(self._terms, row.project[:, onset], strict=True):
-            shape = shape - amplitude * row.template.time[at] ** power * self._series[series][self._at[inside]]
-        template = np.zeros(self.stare.n_frames)
-        template[inside] = shape * self._weight[self._at[inside]] / row.per_amplitude[onset]
-        return template
+        for (power, series), amplitude in zip(self._terms, row.project[:, onsets], strict=True):
+            shape -= amplitude[:, None] * (row.template.time**power)[at] * self._series[series][grid]
+        shape *= self._weight[grid]
+        shape /= row.per_amplitude[onsets][:, None]
+        templates[:, reached] = np.where(inside, shape, 0.0)
+        return templates
 
     @property
     def variance(self) -> Float:
@@ -211,24 +246,13 @@ class Search:
         return Found(best, peak, width, temperature, amplitude)
 
     def _values(self, sums: NDArray[Any]) -> Iterator[tuple[Row, NDArray[Any]]]:
-        spectra = self._spectra(sums)
-        real = _precision(sums)
-        directions = self.bank.directions.astype(real)
-        for template in self.bank.templates:
-            known = self._level(template, spectra)
-            for row in self.grid:
-                if row.template is not template:
-                    continue
-                correlated = self._correlated(spectra[0], template.shapes[row.phase], template)
-                for projected, term in zip(row.project.astype(real), known, strict=True):
-                    correlated -= projected * term
-                tried = row.per_amplitude > 0
-                scale = np.divide(1.0, row.per_amplitude, out=np.zeros_like(row.per_amplitude), where=tried)
-                correlated *= scale.astype(real)
-                rho = np.einsum("tk,skn->stn", directions, correlated, optimize=True)
-                if not tried.all():
-                    rho[:, :, ~tried] = -np.inf
-                yield row, rho
+        directions = self.bank.directions.astype(_precision(sums))
+        for row, correlated in self.correlations(sums):
+            tried = row.per_amplitude > 0
+            rho = np.einsum("tk,skn->stn", directions, correlated, optimize=True)
+            if not tried.all():
+                rho[:, :, ~tried] = -np.inf
+            yield row, rho
 
     def _spectra(self, sums: NDArray[Any]) -> list[NDArray[Any]]:
         """Fourier transforms of the weighted sums times each series, zero in gaps, (n_stare, n_sum, n_frequency)."""
@@ -254,18 +278,18 @@ class Search:
         span, size, _ = np.linalg.svd(columns.T, full_matrices=False)
         return np.asarray(span[:, size > 1e-12 * size[0]])
 
-    def _level(self, template: Template, spectra: list[NDArray[Any]]) -> list[Single]:
-        """The data's correlation with each term of the level, shape (n_stare, n_sum, n_onset)."""
-        return [self._correlated(spectra[series], template.time**power, template) for power, series in self._terms]
-
-    def _correlated(self, spectrum: NDArray[Any], kernel: Float, template: Template) -> NDArray[Any]:
-        """sum_t data(t) kernel(t - peak) at the template's onsets, in the precision of the spectrum."""
+    def _correlated(self, spectrum: NDArray[Any], kernel: Float, first: int) -> NDArray[Any]:
+        """Return sum_t data(t) kernel(t - first - onset) at every frame, in the precision of the spectrum."""
         real = np.float32 if spectrum.dtype == np.complex64 else np.float64
         held = np.zeros(self._size, real)
         held[: kernel.size] = kernel
-        other = np.conj(scipy.fft.rfft(np.roll(held, template.first)))
+        other = np.conj(scipy.fft.rfft(np.roll(held, first)))
         values: NDArray[Any] = scipy.fft.irfft(spectrum * other, self._size)
-        return values[..., self._start(template) : self.n_grid : template.stride]
+        return values[..., : self.n_grid]
+
+    def _onsets(self, template: Template) -> slice:
+        """Return the frames at which a template is tried."""
+        return slice(self._start(template), self.n_grid, template.stride)
 
     def _start(self, template: Template) -> int:
         return -self._first % template.stride
@@ -281,7 +305,7 @@ class Search:
             """The weighted correlation of two series' product with a kernel."""
             if (a, b) not in spectra:
                 spectra[a, b] = scipy.fft.rfft(self._weight * self._series[a] * self._series[b], self._size)
-            return np.asarray(self._correlated(spectra[a, b], kernel, template))
+            return np.asarray(self._correlated(spectra[a, b], kernel, template.first)[self._onsets(template)])
 
         gram = np.zeros((peaks.size, n, n))
         for i, (p, a) in enumerate(self._terms):
