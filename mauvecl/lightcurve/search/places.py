@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -140,7 +140,7 @@ class _Seen:
     row: int
     onsets: NDArray[np.int64]
     times_s: Float
-    values: Float
+    values: NDArray[Any]
 
     def above(self, least: float) -> _Seen:
         """Return those with a value of at least this at any temperature; values become whether each has it."""
