@@ -33,6 +33,8 @@ if TYPE_CHECKING:
     from mauvecl.results.detection.roc import Roc
     from mauvecl.results.snr import SnrResult
 
+#: Flares of a star in one picture.
+MOST_FLARES = 16
 #: A star: title, findings, and its flares' names.
 Shown = tuple[str, "Detection", Sequence[str]]
 #: Stars in one picture, at most.
@@ -74,29 +76,41 @@ def detection(plt: Any, stars: Sequence[Shown], fap: float = 1e-3) -> Any:
     headline(
         figure,
         f"Detection statistics without a flare and with one, {exposures}, "
-        f"{first.realisations:,} realisations each; nominal throughput",
+        f"{first.realisations:,} realisations each; nominal throughput{_left_out(stars)}",
     )
     return figure
+
+
+def _drawn_flares(names: Sequence[str]) -> list[int]:
+    """Return the indices of the flares that a picture shows: all, or evenly spread from the first to the last."""
+    return [round(k) for k in np.linspace(0, len(names) - 1, min(len(names), MOST_FLARES))]
+
+
+def _left_out(stars: Sequence[Shown]) -> str:
+    """Return the end of a title that states how many of the flares are drawn, or nothing if all are."""
+    most = max(len(names) for *_, names in stars)
+    return f"; {MOST_FLARES} of {most} flares" if most > MOST_FLARES else ""
 
 
 def _distributions(axis: Any, outcome: Detection, flares: Sequence[str], statistic: str, fap: float) -> None:
     one = outcome.statistic(statistic)
     linear = isinstance(one, LinearStatistic)
     shapes: list[tuple[int | None, str, str]] = [(None, NULL, "no flare")]
-    shapes += [(k, COLOURS[k % len(COLOURS)], name) for k, name in enumerate(flares)]
+    chosen = _drawn_flares(flares)
+    shapes += [(k, COLOURS[i % len(COLOURS)], flares[k]) for i, k in enumerate(chosen)]
     for flare, colour, name in shapes:
         edges, counts = outcome.histogram(statistic, flare, bins=120)
         middle, height = (edges[1:] + edges[:-1]) / 2, counts / counts.max()
         axis.fill_between(middle, height, step="mid", color=colour, alpha=0.3, linewidth=0)
         axis.step(middle, height, where="mid", color=colour, label=name)
     # Where a statistic is scaled by the flare, each has a threshold of its own.
-    own = range(len(flares)) if one.shaped and not linear else range(1)
-    for k in own:
+    own = chosen if one.shaped and not linear else [0]
+    for i, k in enumerate(own):
         try:
             cut = outcome.threshold(fap, statistic, template=k).value
         except NoThresholdError:
             continue
-        colour = COLOURS[k % len(COLOURS)] if len(own) > 1 else "black"
+        colour = COLOURS[i % len(COLOURS)] if len(own) > 1 else "black"
         name = f"threshold, fap {fap:g} per test"
         axis.axvline(cut, color=colour, linewidth=0.9, linestyle="--", label=None if len(own) > 1 else name)
     # Means lie decades apart.
@@ -159,8 +173,8 @@ def spectra(plt: Any, stars: Sequence[Shown]) -> Any:
         quiet, flares = outcome.quiet, outcome.flares
         element, whole = quiet.element_wavelength_nm, _whole(quiet)
         sigma = np.sqrt(quiet.per_element(quiet.variance_dn2))
-        for k in reversed(range(len(flares))):
-            x, colour = flares[k], COLOURS[k % len(COLOURS)]
+        for i, k in reversed(list(enumerate(_drawn_flares(names)))):
+            x, colour = flares[k], COLOURS[i % len(COLOURS)]
             above.plot(x.wavelength_nm, x.signal_dn / x.exposure_s, color=colour, label=names[k])
             risen = x.per_element(x.signal_dn - quiet.signal_dn) / sigma
             below.plot(element[whole], risen[whole], color=colour)
@@ -182,7 +196,10 @@ def spectra(plt: Any, stars: Sequence[Shown]) -> Any:
     axes[1][0].set_ylabel("flare less quiet\n(sigma per 10.5 nm)")
     handles, shown = axes[0][0].get_legend_handles_labels()
     legend_below(figure, handles, shown)
-    headline(figure, "Mean spectra as Mauve would see them; nominal throughput, not a flight calibration")
+    headline(
+        figure,
+        f"Mean spectra as Mauve would see them; nominal throughput, not a flight calibration{_left_out(stars)}",
+    )
     return figure
 
 

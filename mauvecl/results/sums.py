@@ -19,7 +19,7 @@ Arrays = dict[str, NDArray[Any]]
 
 def pack_detection(tally: Tally, samples: Sequence[TailSamples | None]) -> Arrays:
     """Pack a shard of a detection as arrays."""
-    shard = _pack_array("counts", tally.counts)
+    shard = _pack_counts("counts", tally.fine.keys, tally.fine.counts)
     shard["sums"] = np.array([[str(value) for value in row] for row in tally.sums])
     shard["n"] = np.array(tally.n)
     for number, far in enumerate(tally.far):
@@ -52,7 +52,7 @@ class DetectionSums:
         """Add a shard of one part."""
         tally, samples = self._sums[part]
         sums = np.array([[int(value) for value in row] for row in shard["sums"]], object)
-        tally.add(_unpack_array("counts", shard, tally.counts.shape), sums, int(shard["n"]))
+        tally.merge(*_unpack_counts("counts", shard), sums, int(shard["n"]))
         for number, far in enumerate(tally.far):
             if f"far-{number}" in shard:
                 first, second, undefined = (int(value) for value in shard[f"far-{number}-sums"])

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 CONFIDENCE = 0.95
 
@@ -24,10 +25,19 @@ def clopper_pearson(successes: int, trials: int, confidence: float = CONFIDENCE)
 
     The coverage is at least `confidence` for every true fraction.
     """
+    value, low, high = clopper_pearson_ends(np.array([successes]), trials, confidence)
+    return Interval(float(value[0]), float(low[0]), float(high[0]))
+
+
+def clopper_pearson_ends(
+    successes: NDArray[np.int64], trials: int, confidence: float = CONFIDENCE
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Return fractions and the lower and upper ends of their intervals; see `clopper_pearson`."""
     tail = (1.0 - confidence) / 2.0
-    low = 0.0 if successes == 0 else float(scipy.special.betaincinv(successes, trials - successes + 1, tail))
-    high = 1.0 if successes == trials else float(scipy.special.betainccinv(successes + 1, trials - successes, tail))
-    return Interval(successes / trials, low, high)
+    with np.errstate(all="ignore"):
+        low = np.where(successes == 0, 0.0, scipy.special.betaincinv(successes, trials - successes + 1, tail))
+        high = np.where(successes == trials, 1.0, scipy.special.betainccinv(successes + 1, trials - successes, tail))
+    return successes / trials, low, high
 
 
 def central_counts(trials: int, probability: float, confidence: float = CONFIDENCE) -> tuple[int, int]:

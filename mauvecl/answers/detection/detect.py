@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -17,6 +17,7 @@ from mauvecl.results.detection.campaign import campaign, per_test
 from mauvecl.results.detection.departures import departure_table
 from mauvecl.results.detection.detection import Detection
 from mauvecl.results.detection.paper import PAPER_G2V, WHY, reconstruct
+from mauvecl.results.detection.roc import ROC_ROWS
 from mauvecl.results.requests.fap import check_fap, countable
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.statistics.distributions import QuadraticForm
@@ -35,6 +36,10 @@ if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
     from mauvecl.study.assumptions import Use
     from mauvecl.study.questions import CampaignQuestion
+
+
+#: Rows of the tables of ROC and of extremes, which many flares share.
+MOST_ROWS = 100_000
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,13 +92,24 @@ class DetectAnswer(Answer):
 
     @property
     def roc(self) -> QTable:
-        """Every receiver operating characteristic, with its area; see `roc.Roc`."""
-        return self._together(_rocs)
+        """Every receiver operating characteristic, with its area; see `roc.Roc`.
+
+        Many flares share `MOST_ROWS` rows, so that each curve has fewer than its 200.
+        """
+        return self._together(partial(_rocs, share=self._share(1)))
 
     @property
     def tails(self) -> QTable:
-        """The extremes of every null (amplitude 0) and flare, with their realisations."""
-        return self._together(_tails)
+        """The extremes of every null (amplitude 0) and flare, with their realisations.
+
+        Many flares share `MOST_ROWS` rows, so that each distribution has fewer than its 1000.
+        """
+        return self._together(partial(_tails, share=self._share(2)))
+
+    def _share(self, each: int) -> int:
+        """Return the rows of each curve or distribution, of which every flare and statistic has at most `each`."""
+        number = sum(len(star.detection.statistics) * len(star.amplitudes) for star in self.stars)
+        return max(MOST_ROWS // (each * number), 2)
 
     @property
     def tables(self) -> dict[str, Table]:
@@ -135,13 +151,13 @@ class DetectAnswer(Answer):
         return stack_tables(parts, study=self.study.text())
 
 
-def _rocs(star: StarDetection) -> QTable:
+def _rocs(star: StarDetection, share: int) -> QTable:
     from astropy.table import vstack
 
     parts = []
     for statistic in star.detection.statistics:
         for flare, amplitude in enumerate(star.amplitudes):
-            curve = star.detection.roc(statistic, flare).table()
+            curve = star.detection.roc(statistic, flare).table(min(ROC_ROWS, share))
             for name in ("area", "area_low", "area_high"):
                 curve[name] = curve.meta.pop(name)
             curve["area"].info.description = "under the curve; 95 % interval by DeLong's method"
@@ -150,7 +166,7 @@ def _rocs(star: StarDetection) -> QTable:
     return vstack(parts)
 
 
-def _tails(star: StarDetection) -> QTable:
+def _tails(star: StarDetection, share: int) -> QTable:
     from astropy.table import vstack
 
     parts = []
@@ -159,7 +175,8 @@ def _tails(star: StarDetection) -> QTable:
             kept = [(amplitude, star.detection.tail_samples(statistic, flare))]
             if star.detection.statistic(statistic).shaped or flare == 0:
                 kept.append((0.0, star.detection.tail_samples(statistic, template=flare)))
-            for name, table in kept:
+            for name, every in kept:
+                table = every[:share]
                 prepend_columns(table, {"statistic": statistic, "amplitude": name, "template": amplitude})
                 parts.append(table)
     samples = vstack(parts)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
 from mauvecl.noise import layout
-from mauvecl.results.counts.far import UNIT_BITS, FarCounts, FarTally, is_above
+from mauvecl.results.counts.far import UNIT_BITS, FarCounts, FarTally, SparseCounts, is_above
 from mauvecl.statistics.intervals import Interval, central_counts
 
 
@@ -51,8 +51,8 @@ class Tally:
     def __init__(self, grids: Sequence[Grid]) -> None:
         self.grids = tuple(grids)
         self.packed = Grid.pack(self.grids)
-        # Fine bins; the first and the last stay empty.
-        self.counts = np.zeros((len(grids), layout.BINS), np.int64)
+        # Fine bins, by grid times BINS plus bin: few are filled. The first and the last of each grid stay empty.
+        self.fine = SparseCounts()
         # Sums of steps in fine bins and of their squares; Python integers, since squares may exceed 64 bits.
         self.sums = np.zeros((len(grids), 2), object)
         self.far = [FarTally() for _ in grids]
@@ -64,8 +64,13 @@ class Tally:
         `histogram` has the shape (n_grid, BINS). `sums`, shape (n_grid, 2), holds sums of fine steps and of their
         squares. `n` is the number of realisations, including those counted by `add_far`.
         """
-        inner = slice(FIRST_BIN, LAST_BIN + 1)
-        self.counts[:, inner] += histogram[:, inner]
+        grid, inner = np.nonzero(histogram[:, FIRST_BIN : LAST_BIN + 1])
+        counts = histogram[grid, FIRST_BIN + inner].astype(np.int64)
+        self.merge(grid * layout.BINS + FIRST_BIN + inner, counts, sums, n)
+
+    def merge(self, keys: NDArray[np.int64], counts: NDArray[np.int64], sums: NDArray[np.generic], n: int) -> None:
+        """Add counts of fine bins by their keys, as in `fine`; other parameters as for `add`."""
+        self.fine.add(keys, counts)
         self.sums += sums.astype(object)
         self.n += n
 
@@ -86,10 +91,12 @@ class Tally:
         """Return the distribution of a grid."""
         packed = self.packed[index]
         first, second = (int(value) for value in self.sums[index])
+        mine = slice(*np.searchsorted(self.fine.keys, (index * layout.BINS, (index + 1) * layout.BINS)))
         return Distribution(
             centre=float(packed["centre"]),
             step=1.0 / float(packed["steps_per_unit"]),
-            counts=self.counts[index].copy(),
+            filled=self.fine.keys[mine] - index * layout.BINS,
+            filled_counts=self.fine.counts[mine].copy(),
             first=first,
             second=second,
             n=self.n,
@@ -107,11 +114,19 @@ class Distribution:
 
     centre: float  # value of the statistic at step 0
     step: float  # size of a fine step
-    counts: NDArray[np.int64]  # of the fine bins, shape (bins,)
+    filled: NDArray[np.int64]  # fine bins with counts, ascending, shape (m,)
+    filled_counts: NDArray[np.int64]  # shape (m,)
     first: int  # sum of the fine steps
     second: int  # sum of their squares
     n: int  # number of realisations
     far: FarCounts  # values outside the fine bins
+
+    @property
+    def counts(self) -> NDArray[np.int64]:
+        """Counts of all fine bins, shape (BINS,)."""
+        counts = np.zeros(layout.BINS, np.int64)
+        counts[self.filled] = self.filled_counts
+        return counts
 
     @cached_property
     def _moments(self) -> tuple[Fraction, Fraction]:
@@ -153,16 +168,17 @@ class Distribution:
 
     def edge(self, index: int | NDArray[np.intp]) -> float | NDArray[np.float64]:
         """Return the lower edge of a fine bin."""
-        steps = (np.asarray(index) - self.counts.size // 2) * 2.0**layout.FINE_BITS - 0.5
+        steps = (np.asarray(index) - layout.BINS // 2) * 2.0**layout.FINE_BITS - 0.5
         edges: NDArray[np.float64] = self.centre + self.step * steps
         return edges if np.ndim(index) else float(edges)
 
-    @cached_property
+    # Computed when needed: a detection of hundreds of flares has thousands of distributions.
+    @property
     def bins(self) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
         """Lower edges, upper edges and counts of all filled bins, ascending; each shape (m,)."""
         self.refuse_undefined()
-        filled = np.flatnonzero(self.counts)
-        lower, upper, counts = np.asarray(self.edge(filled)), np.asarray(self.edge(filled + 1)), self.counts[filled]
+        filled, counts = self.filled, self.filled_counts
+        lower, upper = np.asarray(self.edge(filled)), np.asarray(self.edge(filled + 1))
         if not self.far.n:
             return lower, upper, counts
         ends = (
@@ -178,38 +194,38 @@ class Distribution:
             np.insert(self.far.counts, place, counts),
         )
 
-    @cached_property
-    def _below(self) -> NDArray[np.int64]:
-        """Number of realisations below each filled bin, and in total; shape (m + 1,)."""
-        return np.concatenate([[0], np.cumsum(self.bins[2])])
-
     def above(self, value: float) -> float:
         """Return the number of realisations at or above a value: exact at edges of bins, interpolated between."""
         lower, upper, counts = self.bins
+        below = _below(counts)
         # The first bin with an upper edge above the value.
         index = int(np.searchsorted(upper, value, side="right"))
         if index == counts.size:
             return 0.0
         if value <= lower[index]:
-            return float(self._below[-1] - self._below[index])
+            return float(below[-1] - below[index])
         share = (upper[index] - value) / (upper[index] - lower[index])
-        return float(self._below[-1] - self._below[index + 1] + share * counts[index])
+        return float(below[-1] - below[index + 1] + share * counts[index])
 
     def edge_with_at_most(self, n_above: int) -> float:
         """Return the lowest edge of a bin with at most `n_above` realisations at or above it, or minus infinity."""
-        more = np.flatnonzero(self._below[-1] - self._below[:-1] > n_above)
-        return float(self.bins[1][more[-1]]) if more.size else -math.inf
+        _, upper, counts = self.bins
+        below = _below(counts)
+        more = np.flatnonzero(below[-1] - below[:-1] > n_above)
+        return float(upper[more[-1]]) if more.size else -math.inf
 
     def around(self, edge: float) -> tuple[int, int]:
         """Return the counts at or above the lower edge of a bin, and in the filled bin below that edge."""
-        at = int(np.searchsorted(self.bins[1], edge, side="right"))
-        return int(self._below[-1] - self._below[at]), int(self.bins[2][at - 1]) if at else 0
+        _, upper, counts = self.bins
+        at = int(np.searchsorted(upper, edge, side="right"))
+        return int(counts[at:].sum()), int(counts[at - 1]) if at else 0
 
     def quantile(self, probability: float | NDArray[np.float64]) -> NDArray[np.float64]:
         """Return quantiles, interpolated linearly within bins."""
-        lower, upper, _ = self.bins
+        lower, upper, counts = self.bins
+        below = _below(counts)
         edges = np.column_stack([lower, upper]).ravel()
-        cumulative = np.column_stack([self._below[:-1], self._below[1:]]).ravel() / self.n
+        cumulative = np.column_stack([below[:-1], below[1:]]).ravel() / self.n
         return np.asarray(np.interp(probability, cumulative, edges))
 
     def quantile_interval(self, probability: float) -> Interval:
@@ -218,8 +234,8 @@ class Distribution:
             raise InputError(f"quantile at {probability!r}, expected a probability between 0 and 1")
         # The number of values below the quantile is binomial, so it lies between these ranks with 95 %.
         low, high = central_counts(self.n, probability)
-        lower, upper, _ = self.bins
-        first, last = (int(np.searchsorted(self._below[1:], rank)) for rank in (low, high + 1))
+        lower, upper, counts = self.bins
+        first, last = (int(np.searchsorted(counts.cumsum(), rank)) for rank in (low, high + 1))
         ends = float(lower[first]) if low else -np.inf, float(upper[last]) if high < self.n else np.inf
         return Interval(float(self.quantile(probability)), *ends)
 
@@ -231,12 +247,16 @@ class Distribution:
             span = upper[-1] - lower[0]
             edges = np.linspace(lower[0], upper[-1], max(min(bins, int(span / (upper - lower).max())), 1) + 1)
         else:
-            filled = np.flatnonzero(self.counts)
-            low, high = int(filled[0]), int(filled[-1]) + 1
+            low, high = int(self.filled[0]), int(self.filled[-1]) + 1
             group = -(-(high - low) // bins)
             edges = np.asarray(self.edge(np.arange(low, high + group, group)))
         above = [self.above(edge) for edge in edges]
         return edges, -np.diff(np.rint(above)).astype(np.int64)
+
+
+def _below(counts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Return the number of realisations below each filled bin, and in total; shape (m + 1,)."""
+    return np.concatenate([[0], np.cumsum(counts)])
 
 
 #: Number of extreme values of each tail that are kept with their realisations.

@@ -12,7 +12,7 @@ from scipy import special
 
 from mauvecl.drawable import Drawable
 from mauvecl.host.tables import make_table
-from mauvecl.statistics.intervals import CONFIDENCE, Interval, clopper_pearson
+from mauvecl.statistics.intervals import CONFIDENCE, Interval, clopper_pearson, clopper_pearson_ends
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
     from mauvecl.results.counts.tally import Distribution
 
 Float = NDArray[np.float64]
+#: Rows of a curve's table.
+ROC_ROWS = 200
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,12 +43,13 @@ class Roc(Drawable):
         Pearson for as many pairs as there are realisations.
         """
         # Union of the filled bins.
-        lower, first = np.unique(np.concatenate([null.bins[0], flare.bins[0]]), return_index=True)
-        upper = np.concatenate([null.bins[1], flare.bins[1]])[first]
+        bins = null.bins, flare.bins
+        lower, first = np.unique(np.concatenate([bins[0][0], bins[1][0]]), return_index=True)
+        upper = np.concatenate([bins[0][1], bins[1][1]])[first]
         share, above = np.zeros((2, lower.size)), np.zeros((2, lower.size + 1))
-        for i, d in enumerate((null, flare)):
+        for i, (d, (own, _, filled)) in enumerate(zip((null, flare), bins, strict=True)):
             counts = np.zeros(lower.size, np.int64)
-            counts[np.searchsorted(lower, d.bins[0])] = d.bins[2]
+            counts[np.searchsorted(lower, own)] = filled
             share[i] = counts / d.n
             # Integer counts above each edge make the ends of the curve exactly 1 and 0.
             above[i, :-1] = counts[::-1].cumsum()[::-1] / d.n
@@ -55,7 +58,7 @@ class Roc(Drawable):
         spread = [float(c @ (values - area) ** 2) for c, values in ((share[1], beaten), (share[0], beating))]
         reach = float(special.ndtri(0.5 + CONFIDENCE / 2)) * float(np.sqrt(spread[0] / flare.n + spread[1] / null.n))
         low, high = max(area - reach, 0.0), min(area + reach, 1.0)
-        if null.bins[0][-1] < flare.bins[0][0] or flare.bins[0][-1] < null.bins[0][0]:
+        if bins[0][0][-1] < bins[1][0][0] or bins[1][0][-1] < bins[0][0][0]:
             area = float(round(area))
             n = min(null.n, flare.n)
             sure = clopper_pearson(round(area) * n, n)
@@ -66,7 +69,7 @@ class Roc(Drawable):
         """Plot detection probability against false-alarm probability; needs matplotlib."""
         return self._draw(path, ax, name=name)
 
-    def table(self, rows: int = 200) -> QTable:
+    def table(self, rows: int = ROC_ROWS) -> QTable:
         """Return at most `rows` rows of the curve, evenly spaced in the logarithm of the false-alarm probability.
 
         Both ends are included. Probabilities have Clopper-Pearson intervals; the metadata contain the area.
@@ -76,7 +79,7 @@ class Roc(Drawable):
         chosen = np.unique(np.minimum(np.searchsorted(-self.fap, -wanted), self.fap.size - 1))
         columns: list[tuple[object, ...]] = [("threshold", self.threshold[chosen])]
         for name, what, chance in (("fap", "false-alarm", self.fap), ("probability", "detection", self.probability)):
-            values, low, high = np.array([astuple(clopper_pearson(round(p * n), n)) for p in chance[chosen]]).T
+            values, low, high = clopper_pearson_ends(np.rint(chance[chosen] * n).astype(np.int64), n)
             text = f"{what} probability{' per test' * (name == 'fap')}, with a 95 % Clopper-Pearson interval"
             columns += [(name, values, text), (f"{name}_low", low), (f"{name}_high", high)]
         area = dict(zip(("area", "area_low", "area_high"), astuple(self.area), strict=True))
