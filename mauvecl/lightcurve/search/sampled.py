@@ -217,25 +217,31 @@ def sampled(search: Search, *, seed: int, draws: int = DRAWS) -> Sampled:
     shares = np.cumsum(weights * sizes[:, None])
     variance = search.variance[:, None]
     estimates = np.empty((draws, len(LADDER)))
-    # Each draw is of two stares: the noise without its template's own value, and what moves that value by one. Few at
-    # once, so that they stay in the caches.
-    batch = max(1, BATCH // (16 * n_sum * search.n_grid))
+    # Each draw is of noise, and of what moves its template's own value by one: that in time the template's direction,
+    # so that it takes one more sum. Few at once, so that they stay in the caches.
+    directions = search.bank.directions
+    batch = max(1, BATCH // (8 * (n_sum + 1) * search.n_grid))
     for first in range(0, draws, batch):
-        held = []
-        for _ in range(first, min(first + batch, draws)):
+        count = min(batch, draws - first)
+        held = np.empty((count, search.stare.n_frames, n_sum + 1))
+        own, along = np.empty(count), np.empty((count, len(directions), 1))
+        for n in range(count):
             which, direction = divmod(
                 int(np.searchsorted(shares, rng.random() * shares[-1], "right")), weights.shape[1]
             )
             onset = int(rng.choice(tried[which]))
-            template = search.template(rows[which], onset, direction)
-            noise = np.sqrt(variance) * rng.standard_normal((search.stare.n_frames, n_sum))
-            move = template * variance
-            held += [noise - np.sum(template * noise) * move, move]
-        values: list[list[Float]] = [[] for _ in held[::2]]
-        for (row, rho), weight in zip(search.values(np.array(held)), weights, strict=True):
+            template = search.in_time(rows[which], np.array([onset]))[0]
+            held[n, :, :n_sum] = np.sqrt(variance) * rng.standard_normal((search.stare.n_frames, n_sum))
+            held[n, :, n_sum] = template * search.variance
+            own[n] = template @ held[n, :, :n_sum] @ directions[direction]
+            along[n, :, 0] = directions @ directions[direction]
+        values: list[list[Float]] = [[] for _ in range(count)]
+        for (row, correlated), weight in zip(search.correlations(held), weights, strict=True):
             at = row.per_amplitude > 0
             for n, kept in enumerate(values):
-                kept.append(_near(rho[2 * n : 2 * n + 2][:, :, at], weight, LADDER[0]))
+                c = along[n] * correlated[n, n_sum, at]
+                r = directions @ correlated[n, :n_sum, at].T - own[n] * c
+                kept.append(_near(np.array([r, c]), weight, LADDER[0]))
         for n, kept in enumerate(values):
             estimates[first + n] = _estimates(np.concatenate(kept, axis=1))
     estimates *= shares[-1]
