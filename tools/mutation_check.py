@@ -51,7 +51,7 @@ MUTATIONS = {
     ),
     "a sky that follows no level": Mutation(
         (("mauvecl/noise/pixels.py", "factors.light * factors.sky * share / light", "0.0 * share / light"),),
-        "tests/noise/test_processes.py::test_the_sky_follows_its_own_level[level0]",
+        "tests/noise/test_processes.py::test_sky_follows_its_level[level0]",
     ),
     "unknowns marginalised without their prior": Mutation(
         (("mauvecl/statistics/nuisances.py", "np.diag(self.sd**-2.0) + ", "np.diag(0.0 * self.sd**-2.0) + "),),
@@ -147,7 +147,7 @@ MUTATIONS = {
         "tests/kernels/test_philox.py::test_known_answers",
     ),
     "swapped words, production kernel alone": Mutation(
-        (SWAPPED,), "tests/noise/test_extremes.py::test_extreme_words_through_the_production_kernel"
+        (SWAPPED,), "tests/noise/test_extremes.py::test_extreme_words_in_production_kernel_equal_reference"
     ),
     "rounded normal for the dark": Mutation(
         (
@@ -165,7 +165,7 @@ MUTATIONS = {
         "tests/kernels/test_poisson.py::test_expansion_cannot_be_distinguished_from_exact_draws",
     ),
     "joint draw allowed by its skew alone": Mutation(
-        ((CUMULANTS, " & ~shows(left_out(c, fourth_power=True), c.variance))", ")"),),
+        ((CUMULANTS, " & ~is_noticeable(truncation_distance(c, fourth_power=True), c.variance)", ""),),
         "tests/kernels/test_joint_bound.py::test_worst_draws_that_the_region_allows",
     ),
     "fourth power left out too early": Mutation(
@@ -173,8 +173,8 @@ MUTATIONS = {
         "tests/kernels/test_joint_bound.py::test_worst_draws_that_the_region_allows",
     ),
     "rounding taken for noise everywhere": Mutation(
-        ((CUMULANTS, "return ~shows(loss, n * frame)", "return frame > 0"),),
-        "tests/noise/test_stacks.py::test_random_stacks_of_quiet_frames",
+        ((CUMULANTS, "return ~is_noticeable(loss, n * frame)", "return frame > 0"),),
+        "tests/noise/test_stacks.py::test_auto_mode_stacks_only_where_moments_agree",
     ),
     "fifth cumulants of varying dark forgotten": Mutation(
         (
@@ -185,7 +185,7 @@ MUTATIONS = {
     ),
     "pairs of two ways": Mutation(
         (("mauvecl/noise/pixels.py", "_both_of_a_pair(mean >= SMALLEST_EXPANDED)", "mean >= SMALLEST_EXPANDED"),),
-        "tests/noise/test_correlations.py::test_no_two_draws_are_tied",
+        "tests/noise/test_correlations.py::test_draws_are_uncorrelated",
     ),
     "skew-only expansion of the joint draw": Mutation(
         ((CUMULANTS, SHAPE, SHAPE.replace("    sd =", "    g2, g3 = 0 * g2, 0 * g3\n    sd =")),),
@@ -207,11 +207,11 @@ MUTATIONS = {
     ),
     "carry of the index dropped between launches": Mutation(
         (("mauvecl/device/tiles.py", "np.uint32(self.first >> 32)", "np.uint32(0)"),),
-        "tests/noise/test_extremes.py::test_counter_boundaries",
+        "tests/noise/test_extremes.py::test_draws_at_counter_boundaries_equal_reference",
     ),
     "carry of the index dropped within a launch": Mutation(
         (("mauvecl/device/tiles.py", "first = index - index % size", "first = index - index % self._step"),),
-        "tests/noise/test_extremes.py::test_counter_boundaries",
+        "tests/noise/test_extremes.py::test_draws_at_counter_boundaries_equal_reference",
     ),
     "carry of the product dropped in odd lanes": Mutation(
         (
@@ -248,7 +248,7 @@ MUTATIONS = {
     ),
     "saturation at the ADC's end alone": Mutation(
         (("host/expectation.py", "min(self.saturation_dn, float(self.adc_max_dn))", "float(self.adc_max_dn)"),),
-        "tests/noise/test_saturation.py::test_closed_forms_are_those_of_what_is_drawn",
+        "tests/noise/test_saturation.py::test_closed_forms_follow_simulation",
     ),
     "reference of what is not recorded": Mutation(
         (
@@ -258,7 +258,7 @@ MUTATIONS = {
                 "mean_sum = reference.n_frames * reference.mean_raw_dn",
             ),
         ),
-        "tests/noise/test_saturation.py::test_closed_forms_are_those_of_what_is_drawn",
+        "tests/noise/test_saturation.py::test_closed_forms_follow_simulation",
     ),
     "noise of what is subtracted forgotten": Mutation(
         (("mauvecl/noise/scene.py", "return 1.0 + comparison.added_variance", "return 1.0"),),

@@ -18,7 +18,7 @@ from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.stares.requests import StaresRequest
 from mauvecl.noise.comparison import NOISE_FREE, Comparison
-from mauvecl.noise.drawing import Drawing, DrawingWords
+from mauvecl.noise.drawing import Drawing, DrawingOptions
 from mauvecl.noise.scene import BATCH, prepare
 from mauvecl.results.counts.tally import TailSamples, Tally
 from mauvecl.results.detection.detection import Detection
@@ -121,7 +121,7 @@ class Engine:
         count: int,
         seed: int,
         out: NDArray[Any] | None = None,
-        **drawing: Unpack[DrawingWords],
+        **drawing: Unpack[DrawingOptions],
     ) -> NDArray[Any]:
         """Draw raw spectra, each of which depends only on the seed and its realisation index.
 
@@ -152,7 +152,7 @@ class Engine:
         count: int,
         seed: int,
         out: NDArray[Any] | None = None,
-        **drawing: Unpack[DrawingWords],
+        **drawing: Unpack[DrawingOptions],
     ) -> tuple[NDArray[Any], NDArray[np.uint32]]:
         """Draw raw spectra and count their clipped samples; parameters as for `realise`.
 
@@ -196,7 +196,7 @@ class Engine:
         realisations: int,
         seed: int,
         start: int = 0,
-        **drawing: Unpack[DrawingWords],
+        **drawing: Unpack[DrawingOptions],
     ) -> SnrResult:
         """Simulate the distributions of S/N per pixel and per resolution element (METHODS section 5).
 
@@ -239,7 +239,7 @@ class Engine:
                 return pack_snr(self._snr(request, shard))
             case RealiseRequest():
                 x, seed = request.expectation, request.seed
-                how = request.drawing.words
+                how = request.drawing.options
                 rows = self.realise(x, start=shard.start, count=shard.count, seed=seed, out=out, **how)
                 return {"rows": rows}
             case StaresRequest():
@@ -268,7 +268,7 @@ class Engine:
         comparison: Comparison = NOISE_FREE,
         tails: Tails = "counted",
         nuisances: Nuisances | Mapping[str, float] | None = None,
-        **drawing: Unpack[DrawingWords],
+        **drawing: Unpack[DrawingOptions],
     ) -> Detection:
         """Simulate null and flare distributions of detection statistics on common draws (METHODS section 6).
 
@@ -335,7 +335,7 @@ class Engine:
         statistics: Sequence[str | Linear] = DEFAULT_STATISTICS,
         comparison: Comparison = NOISE_FREE,
         nuisances: Nuisances | Mapping[str, float] | None = None,
-        **drawing: Unpack[DrawingWords],
+        **drawing: Unpack[DrawingOptions],
     ) -> NDArray[np.float32]:
         """Compute the statistics of each realisation, for up to 15 flares (7 if drawn frame by frame).
 

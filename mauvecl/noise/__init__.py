@@ -1,1 +1,1 @@
-"""What a draw is made of: shared structs, cumulants, Poisson tables, processes, scenes, the NumPy twin."""
+"""Noise model: processes, cumulants, tables, memory layout of scenes, and NumPy reference implementation."""

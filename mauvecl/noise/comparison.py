@@ -1,4 +1,4 @@
-"""What an observed spectrum is compared with, and by whose variances."""
+"""Reference and variances with which an observed spectrum is compared."""
 
 from __future__ import annotations
 
@@ -9,43 +9,38 @@ from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import count
 
-#: Quiescent exposures that one stack may hold.
-MOST_EXPOSURES = 1000
+#: Largest number of quiescent exposures in a stack.
+MAX_EXPOSURES = 1000
 
 
 @public
 @dataclass(frozen=True)
 class Comparison:
-    """The quiescent spectrum that is subtracted, and the variances that are divided by.
+    """Subtracted quiescent spectrum and the variances that weight the residuals.
 
     Attributes
     ----------
     exposures : int
-        Noisy quiescent exposures whose mean is subtracted; 0 for their expectation, which has no noise.
+        Number of noisy quiescent exposures whose mean is subtracted; 0 for the noise-free expectation.
     estimated : bool
-        Variances from the counts themselves, as an observer must, or from the model.
+        Whether variances are estimated from the counts, as an observer must, instead of taken from the model.
     """
 
     exposures: int = 0
     estimated: bool = False
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "exposures", count("exposures", self.exposures, high=MOST_EXPOSURES))
+        object.__setattr__(self, "exposures", count("exposures", self.exposures, high=MAX_EXPOSURES))
 
     @classmethod
     def of(cls, reference: str = "template", variances: str = "model") -> Self:
-        """From words.
+        """Create a comparison from its names in a study.
 
         Parameters
         ----------
         reference : str
-            ``"template"``, the expectation itself; ``"exposure"`` or ``"stack:n"`` with n of 1 and more exposures.
+            ``"template"`` for the expectation, ``"exposure"`` for one exposure, ``"stack:n"`` for n exposures.
         variances : {"model", "estimated"}
-
-        Raises
-        ------
-        InputError
-            For other words.
         """
         if variances not in ("model", "estimated"):
             raise InputError(f"variances = {variances!r}, expected 'model' or 'estimated'")
@@ -53,12 +48,12 @@ class Comparison:
 
     @property
     def added_variance(self) -> float:
-        """Variance of what is subtracted, in that of one exposure."""
+        """Variance of the subtracted spectrum, relative to that of one exposure."""
         return 1.0 / self.exposures if self.exposures else 0.0
 
     @property
     def plain(self) -> bool:
-        """Whether nothing but the expectation and the model's variances is needed."""
+        """Whether only the expectation and the model's variances are used."""
         return not (self.exposures or self.estimated)
 
 
@@ -66,12 +61,12 @@ def _exposures(reference: str) -> int:
     word, colon, number = reference.partition(":")
     if not colon and word in ("template", "exposure"):
         return int(word == "exposure")
-    if word == "stack" and number.isdecimal() and 1 <= int(number) <= MOST_EXPOSURES:
+    if word == "stack" and number.isdecimal() and 1 <= int(number) <= MAX_EXPOSURES:
         return int(number)
     raise InputError(
-        f"reference = {reference!r}, expected 'template', 'exposure' or 'stack:n' with n from 1 to {MOST_EXPOSURES}"
+        f"reference = {reference!r}, expected 'template', 'exposure' or 'stack:n' with n from 1 to {MAX_EXPOSURES}"
     )
 
 
-#: The expectation, and the model's variances.
+#: Comparison with the expectation by the model's variances.
 NOISE_FREE = Comparison()

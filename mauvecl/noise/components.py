@@ -1,4 +1,4 @@
-"""One realisation taken apart: what the star, the photons, the dark, the read noise and the ADC put into it."""
+"""Decomposition of a realisation into star, sky, photon noise, dark, read noise and digitisation."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.noise import reference
-from mauvecl.noise.drawing import DrawingWords
+from mauvecl.noise.drawing import DrawingOptions
 from mauvecl.noise.scene import prepare
 
 if TYPE_CHECKING:
@@ -25,9 +25,9 @@ def components(
     *,
     realisation: int,
     seed: int,
-    **drawing: Unpack[DrawingWords],
+    **drawing: Unpack[DrawingOptions],
 ) -> QTable:
-    """The draws behind one raw spectrum, by the slow reference.
+    """Decompose one raw spectrum into the draws of its components, with the NumPy reference.
 
     Parameters
     ----------
@@ -40,15 +40,15 @@ def components(
     Returns
     -------
     QTable
-        One row per pixel, DN summed over the exposure: ``raw``, what the engine gives for this realisation; ``source``
-        and ``sky``, the mean signals; ``photon_noise`` and ``read_noise``; ``dark``; ``cosmic_rays``, where asked for;
-        ``bias``; ``digitisation``, what rounding and clipping changed. Those after the first add up to it.
+        One row per pixel, in DN summed over the exposure: ``raw``, as drawn by the engine; the mean signals ``source``
+        and ``sky``; ``photon_noise`` and ``read_noise``; ``dark``; ``cosmic_rays``, if enabled; ``bias``; and
+        ``digitisation``, the effect of rounding and clipping. ``raw`` is the sum of the others.
 
     Notes
     -----
-    The kernels draw the noise as one sum. Its parts are drawn here from their distribution given that sum, from streams
-    of their own, so that taking a spectrum apart changes nothing in it. Given the rest the dark counts are Poisson
-    times a Gaussian; for this split, and only here, Poisson photons count as Gaussian.
+    The kernels draw the noise as one sum. Its components are drawn here from their conditional distribution given that
+    sum, from separate streams, so that the decomposition does not affect the spectrum. The conditional distribution of
+    the dark counts is Poisson times Gaussian. Only in this decomposition, Poisson photons are treated as Gaussian.
     """
     import astropy.units as u
     from astropy.table import QTable
@@ -88,7 +88,7 @@ def components(
         photon_variance = gain * (source + sky)
         read_variance = each * x.read_noise_dn**2 + (each - 1) / 12
         mean_dark = each * warm * x.dark_dn
-        # Everything random of this draw: photon noise + read noise + dark counts, DN.
+        # All random parts of this draw: photon noise + read noise + dark counts, DN.
         total = scene.base_dn[0] + analogue[:n] - cosmic[:n] - source - sky - each * x.bias_dn
         if scene.joint:
             dark = _dark_given_total(total, mean_dark, x.dark_step_dn, photon_variance + read_variance, u_dark[:n])
@@ -121,14 +121,14 @@ def components(
 
 
 def _dark_given_total(total: Float, mean: Float, step: Float, variance: Float, chance: Float) -> Float:
-    """Dark counts, DN, given their sum with a Gaussian of this variance, each by inversion at `chance`."""
+    """Draw dark counts, DN, given their sum with a Gaussian of this variance, by inversion at `chance`."""
     dark = np.zeros(total.size)
     for p in np.flatnonzero(mean > 0):
         if variance[p] == 0:
             dark[p] = total[p]
             continue
         expected = mean[p] / step[p]
-        # Around both the prior and what is left of the sum.
+        # This range covers both the prior and the likelihood.
         reach = 9.0 * np.sqrt(expected) + 9.0
         counts = np.arange(max(int(expected - reach), 0), int(expected + reach) + 1)
         log = special.xlogy(counts, expected) - special.gammaln(counts + 1.0)

@@ -1,4 +1,4 @@
-"""How realisations are drawn: what a user may say about it."""
+"""User's options for the drawing of realisations."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ Mode = Literal["auto", "frames", "stacked"]
 Recipe = Literal["auto", "joint", "apart"]
 
 
-class DrawingWords(TypedDict, total=False):
-    """The fields of a `Drawing`, as keyword arguments."""
+class DrawingOptions(TypedDict, total=False):
+    """Fields of a `Drawing` as keyword arguments."""
 
     mode: Mode
     recipe: Recipe
@@ -23,25 +23,21 @@ class DrawingWords(TypedDict, total=False):
 
 @dataclass(frozen=True)
 class Drawing:
-    """How realisations are drawn.
+    """Options for the drawing of realisations.
 
     Attributes
     ----------
     mode : {"auto", "frames", "stacked"}
-        Draw each frame, or all at once; by itself frames only near a rail, and where a frame has so little noise that
-        its rounding is none.
+        Whether to draw each frame, or their sum at once. "auto" draws frames only near zero or saturation, and if a
+        frame has too little noise to treat its rounding as noise.
     recipe : {"auto", "joint", "apart"}
-        Draw all noise of a pixel from one normal, or Poisson counts apart; by itself apart only where the joint draw
-        would not be exact.
+        Whether to draw all noise of a pixel from one normal, or Poisson counts separately. "auto" draws separately only
+        if the joint draw is not exact.
     processes : Processes
+        Optional noise processes.
     first_frame : int
-        Where frames are counted from: one frame k of an exposure is drawn with an expectation of one frame and
+        Number of the first frame. Frame k of an exposure is drawn with an expectation of one frame and
         ``first_frame=k``.
-
-    Raises
-    ------
-    InputError
-        For another mode or recipe.
     """
 
     mode: Mode = "auto"
@@ -56,8 +52,8 @@ class Drawing:
                 raise InputError(f"{name} = {value!r}, expected {a}, {b} or {c}")
 
     @property
-    def words(self) -> DrawingWords:
-        """Its fields."""
+    def options(self) -> DrawingOptions:
+        """Fields as keyword arguments."""
         return {
             "mode": self.mode,
             "recipe": self.recipe,
@@ -66,5 +62,5 @@ class Drawing:
         }
 
 
-#: As the noise itself asks for.
+#: Options that follow from the noise.
 AUTOMATIC = Drawing()

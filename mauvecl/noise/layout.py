@@ -1,6 +1,6 @@
-"""Declared once, used by Python and OpenCL alike: structs, stream numbers, polynomials, the tally's grid.
+"""Structs, stream numbers, polynomials and histogram grids shared by Python and OpenCL.
 
-The kernels get these as rendered C; a test compares every offset on the device.
+They are rendered into the kernels as C; a test compares every offset on the device.
 """
 
 from __future__ import annotations
@@ -9,10 +9,10 @@ import numpy as np
 
 WORD_BITS = 32
 
-#: Each random process draws from its own stream, the top byte of the counter's last word, so that adding one moves no
-#: other. `noise` is the joint Gaussian or what is Gaussian alone, `dark` and `photon` their Poisson counts where drawn
-#: apart; `split` takes a drawn spectrum apart. Of a stare `stare_unknown` holds what differs from stare to stare,
-#: `stare_frame` what does from frame to frame, and `stare_sums` the weighted sums where no pixel is drawn.
+#: Stream of each random process, the top byte of the counter's last word, so that a new process changes no other.
+#: `noise` is the joint draw or the Gaussian part, `dark` and `photon` are Poisson counts drawn separately, and `split`
+#: decomposes a drawn spectrum. In stares, `stare_unknown` varies from stare to stare, `stare_frame` from frame to
+#: frame, and `stare_sums` gives the weighted sums if no pixels are drawn.
 STREAMS = {
     "noise": 0,
     "dark": 1,
@@ -31,12 +31,12 @@ STREAMS = {
     "stare_sums": 18,
     "stare_glow": 19,
 }
-#: Added to the stream for the draws of a reference exposure.
+#: Offset of the stream for draws of a reference exposure.
 REFERENCE = 64
 
-#: What a launch needs to know: the seed, sizes, where frames and groups of four pixels begin to be counted, the alias
-#: table of the cosmic rays' charge, how many quiescent exposures are averaged, one over that, and by what half the
-#: inverse variance of one exposure exceeds the inverse variance used.
+#: Parameters of a launch: seed, sizes, numbers of the first frame and group of four pixels, alias table of the cosmic
+#: rays' charge, number of averaged quiescent exposures and its inverse, and half the ratio of the inverse variance of
+#: one exposure to the one used.
 JOB = np.dtype(
     [
         ("seed_low", "u4"),
@@ -57,12 +57,12 @@ JOB = np.dtype(
     ]
 )
 
-#: What all scenarios share in one pixel.
+#: Properties of a pixel shared by all scenarios.
 PIXEL = np.dtype([("used", "f4"), ("element_end", "u4"), ("four_uneven", "u4"), ("cosmic_gain", "f4")])
 
-#: One scenario in one pixel, read in every inner loop: coefficients of the draw as a polynomial of z, the whole DN
-#: that separate `nearest`'s result from the reference's, the reference's inverse variance, and twice that times the
-#: reference's fraction of a DN.
+#: A scenario in a pixel, read in every inner loop: coefficients of the draw as a polynomial of z, whole DN between
+#: `nearest`'s result and the reference, the reference's inverse variance, and twice its product with the reference's
+#: fraction of a DN.
 LEVEL = np.dtype(
     [
         ("c0", "f4"),
@@ -76,9 +76,9 @@ LEVEL = np.dtype(
     ]
 )
 
-#: One scenario in one pixel, read where needed: whole DN of one draw's mean that the kernels leave out, zero and
-#: saturation as `nearest` sees them, whole DN from the sum of draws to the reference, and, at an element's last pixel,
-#: the reference's fraction of a DN and inverse variance summed over the element.
+#: A scenario in a pixel, read when needed: whole DN of one draw's mean that the kernels omit, zero and saturation on
+#: the scale of `nearest`, whole DN from the sum of draws to the reference, and, at an element's last pixel, the
+#: reference's fraction of a DN and inverse variance summed over the element.
 EDGE = np.dtype(
     [
         ("base", "i4"),
@@ -90,8 +90,8 @@ EDGE = np.dtype(
     ]
 )
 
-#: A Poisson count relative to a whole number near its mean: column + low of an alias table, or, with bits = 0, from the
-#: expansion's coefficients; and DN per count.
+#: A Poisson count relative to an integer near its mean: column + low of an alias table or, with bits = 0, the
+#: coefficients of the expansion; and DN per count.
 POISSON = np.dtype(
     [
         ("table", "u4"),
@@ -104,8 +104,8 @@ POISSON = np.dtype(
     ]
 )
 
-#: How a joint draw follows factors on light and dark: their means, variances, third to fifth cumulants, DN; and the
-#: share of the light that is the sky's.
+#: Response of a joint draw to factors on light and dark: their means, variances and third to fifth cumulants, DN; and
+#: the sky's share of the light.
 RESPONSE = np.dtype(
     [
         ("light", "f4"),
@@ -123,23 +123,23 @@ RESPONSE = np.dtype(
     ]
 )
 
-#: What an observer subtracts and assumes in one pixel: net = value + net_offset, noise^2 = gain max(net, 0) + variance;
-#: and the base-2 logarithm of its histogram's bins in DN.
+#: An observer's subtraction and noise in a pixel: net = value + net_offset, noise^2 = gain max(net, 0) + variance; and
+#: the base-2 logarithm of the histogram's bin width in DN.
 OBSERVER = np.dtype([("net_offset", "f4"), ("gain", "f4"), ("variance", "f4"), ("bin_shift", "u4")])
 
-#: How an observer estimates a variance in one pixel of a scenario: net = x + net_offset, variance = gain max(net, 0) +
-#: variance; and the reference's fraction of a DN, zero where noisy exposures take its place.
+#: An observer's estimate of the variance in a pixel: net = x + net_offset, gain max(net, 0) + variance; and the
+#: reference's fraction of a DN, zero for noisy reference exposures.
 ESTIMATE = np.dtype([("net_offset", "f4"), ("gain", "f4"), ("variance", "f4"), ("fraction", "f4")])
 
-#: A resolution element: its pixels, the sky subtracted of their sum, DN, and the grid of its S/N's histogram.
+#: A resolution element: its pixels, the sky subtracted from their sum, DN, and the grid of its S/N histogram.
 ELEMENT = np.dtype([("first", "u4"), ("end", "u4"), ("sky", "f4"), ("centre", "f4"), ("bins_per_unit", "f4")])
 
-#: One histogram: which channel of values it reads, its centre, and fine steps per unit of the statistic.
+#: A histogram: channel of its values, centre, and fine steps per unit of the statistic.
 GRID = np.dtype([("channel", "u4"), ("centre", "f4"), ("steps_per_unit", "f4")])
 
-#: One pixel of a stare's frames: what is left of the mean at coefficients of one beside the whole DN that kernels leave
-#: out; star, sky and dark at a coefficient of one, DN; the photons' second to fifth cumulants over their mean; those of
-#: everything at coefficients of one; those of the dark alone.
+#: A pixel of a stare's frames: the mean at unit coefficients minus the whole DN that kernels omit; star, sky and dark
+#: at unit coefficients, DN; second to fifth cumulants of the photons divided by their mean, of the total at unit
+#: coefficients, and of the dark.
 MIXTURE = np.dtype(
     [
         ("rest", "f4"),
@@ -161,8 +161,8 @@ MIXTURE = np.dtype(
     ]
 )
 
-#: What holds for all frames of a stare: how many there are, and with padding; what is unknown of it; its jitters; how
-#: the dark follows the temperature; rows of flares, and of factors on them, one or one to a stare.
+#: Properties common to all frames of a stare: number of frames without and with padding, unknowns, jitters, slope of
+#: the dark with temperature, and numbers of rows of flares and of their amplitudes (one, or one per stare).
 STARING = np.dtype(
     [
         ("frame_count", "u4"),
@@ -179,14 +179,14 @@ STARING = np.dtype(
     ]
 )
 
-#: Rows of what is known of each frame: coefficients, and the same less one; the factor on all light.
+#: Rows of the known properties of frames: coefficients, the same minus one, and the factor on all light.
 KNOWN_OF_FRAMES = ("star", "star_less_one", "sky", "sky_less_one", "dark", "dark_less_one", "light")
-#: What an unknown of a stare is of: rows of what it moves.
+#: Parts of the signal that unknowns of a stare change, in the order of their numbers.
 MOVED = ("star", "light", "sky", "temperature")
 #: Frames are padded to a multiple of this.
 FRAME_BLOCK = 16
-#: exp(r) = 1 + r + r^2 q(r): Taylor's coefficients of q, off by less than 2e-8 for |r| <= ln(2) / 2; and ln(2) in two
-#: parts, of which the first has nine bits, so that its multiples are exact.
+#: Taylor coefficients of q in exp(r) = 1 + r + r^2 q(r), with an error below 2e-8 for |r| <= ln(2) / 2; and ln(2) in
+#: two parts, the first of which has nine bits, so that its multiples are exact.
 EXPONENTIAL = tuple(float(np.float32(1.0 / np.prod(np.arange(1.0, n + 3)))) for n in range(6))
 LN2_PARTS = (0.693359375, -2.1219444e-4)
 LOG2_E = 1.442695
@@ -209,26 +209,26 @@ STRUCTS = {
 #: Statistics with a channel in every scenario, in the kernel's order; linear statistics follow them.
 FIXED_STATISTICS = ("chi2", "chi2_element", "chi2_pair")
 
-#: Adding and subtracting this rounds a float32 below 2**22 to the nearest whole number.
+#: Adding and subtracting this rounds a float32 below 2**22 to the nearest integer.
 MAGIC = 12582912.0
 
-#: Priors' tables of quantiles run from each end to the median in octaves of probability, 2**-PRIOR_FINEST to 1/2, of
-#: 2**PRIOR_BITS cells each, between whose nodes the device interpolates.
+#: Quantile tables of priors run from each end to the median in octaves of probability, 2**-PRIOR_FINEST to 1/2, with
+#: 2**PRIOR_BITS cells each. The device interpolates between nodes.
 PRIOR_BITS = 7
 PRIOR_FINEST = 56
-#: Nodes from one end: 1/2 comes twice.
+#: Number of nodes from one end, with 1/2 repeated.
 PRIOR_NODES = (PRIOR_FINEST - 1) * 2**PRIOR_BITS + 2
 
-#: Histograms of S/N: one per pixel and element; the first and the last bin only mark what lies outside.
+#: Bins of the S/N histogram of each pixel and element; the first and last bins only mark values outside.
 OBSERVER_BINS = 2048
 
-#: A histogram has BINS bins of 2**FINE_BITS fine steps; a statistic's standard deviation is STEPS_PER_SIGMA steps. What
-#: falls into the first or the last, or further out, is only marked there: `far` counts it.
+#: A histogram has BINS bins of 2**FINE_BITS fine steps; a statistic's standard deviation is STEPS_PER_SIGMA steps. The
+#: first and last bins only mark values there and beyond, which `far` counts.
 BINS = 32768
 FINE_BITS = 2
 STEPS_PER_SIGMA = 2048
 
-#: Minimax fits in float32, made by tools/fit_normal.py: -2 ln(1 + f) / f for f in [sqrt(1/2) - 1, sqrt(2) - 1],
+#: Minimax fits in float32 from tools/fit_normal.py: -2 ln(1 + f) / f for f in [sqrt(1/2) - 1, sqrt(2) - 1],
 #: sin(pi s) / s and cos(pi s) in s^2 for s in [-1/2, 1/2].
 POLYNOMIALS = {
     "log": (
@@ -249,7 +249,7 @@ TWO_LN2 = "0x1.62e430p+0"
 
 
 def c_structs() -> str:
-    """The structs as OpenCL C typedefs, in the order of `STRUCTS`."""
+    """Render the structs as OpenCL C typedefs, in the order of `STRUCTS`."""
     scalars = {"u": "uint", "i": "int", "f": "float"}
     lines = []
     for name, dtype in STRUCTS.items():

@@ -1,4 +1,4 @@
-"""Poisson counts: exact integer alias tables, and from which mean on an expansion is as good."""
+"""Alias tables of Poisson counts, exact in integers."""
 
 from __future__ import annotations
 
@@ -11,34 +11,24 @@ from scipy import special
 
 from mauvecl.noise.layout import WORD_BITS
 
-#: Largest mean a table is made for; 17 index bits then still leave 15 for acceptance.
+#: Largest mean of a table, at which 17 index bits leave 15 bits for acceptance.
 LARGEST_MEAN = 1e8
 
-#: From this mean on counts come from the inverse's expansion (kernels/poisson.cl.mako): its distribution differs from
-#: the exact one by less than 1e13 draws would show.
+#: From this mean on, counts come from an expansion of the inverse distribution function (kernels/poisson.cl.mako). Its
+#: difference from the exact distribution is undetectable in 1e13 draws.
 SMALLEST_EXPANDED = 1000.0
 
 
 @dataclass(frozen=True)
 class AliasTable:
-    """A Poisson distribution as 2**bits columns of one packed word each.
+    """Distribution over integers as 2**bits columns of one packed word each."""
 
-    Attributes
-    ----------
-    low : int
-        The count that column 0 stands for.
-    bits : int
-        Base-2 logarithm of the number of columns.
-    entries : ndarray of uint32, shape (2**bits,)
-        ``alias << (32 - bits) | threshold``.
-    """
-
-    low: int
-    bits: int
-    entries: NDArray[np.uint32]
+    low: int  # count of column 0
+    bits: int  # base-2 logarithm of the number of columns
+    entries: NDArray[np.uint32]  # alias << (32 - bits) | threshold, shape (2**bits,)
 
     def words_per_column(self) -> NDArray[np.int64]:
-        """How many of the 2**32 words give each column: the realised probabilities, exactly."""
+        """Return how many of the 2**32 words give each column, which are its exact probabilities."""
         shift = WORD_BITS - self.bits
         threshold = self.entries.astype(np.int64) & ((1 << shift) - 1)
         alias = self.entries.astype(np.int64) >> shift
@@ -48,28 +38,16 @@ class AliasTable:
 
 
 def alias_table(mean: float) -> AliasTable:
-    """The alias table of a Poisson distribution; each probability is right to 2**-32.
+    """Compute the alias table of a Poisson distribution with a mean of 0 to 1e8, to 2**-32 in each probability.
 
-    Parameters
-    ----------
-    mean : float
-        Expected count, 0 to 1e8.
-
-    Raises
-    ------
-    ValueError
-        For a mean outside that range.
-
-    Notes
-    -----
-    Walker's method (1977, doi 10.1145/355744.355749) on whole numbers of words: the probabilities are first
-    rounded to multiples of 2**-32 that sum to one, so the table then holds them without any error.
+    Walker's method (1977, doi 10.1145/355744.355749) is applied to integers: the probabilities are rounded to multiples
+    of 2**-32 that sum to one, which the table then represents exactly.
     """
     if not 0.0 <= mean <= LARGEST_MEAN:
         raise ValueError(f"Poisson mean = {mean!r}, expected 0 to {LARGEST_MEAN:g}")
     if mean == 0.0:
         return AliasTable(0, 1, _pack(np.array([2**WORD_BITS, 0]), 1))
-    # Counts further out have less than half a word together.
+    # All counts beyond this range have together less than half a word.
     reach = 6.5 * np.sqrt(mean) + 16.0
     low = max(int(mean - reach), 0)
     high = int(mean + reach + 0.5 * reach**2 / (mean + 1.0))
@@ -80,12 +58,9 @@ def alias_table(mean: float) -> AliasTable:
 
 
 def table_of(probability: NDArray[np.float64], low: int = 0) -> AliasTable:
-    """The alias table of any distribution over whole numbers from `low` on.
+    """Compute the alias table of a distribution over the integers from `low` on.
 
-    Parameters
-    ----------
-    probability : ndarray, shape (n,)
-        Up to 2**24 values that need not sum to one.
+    `probability` has up to 2**24 values, which need not sum to one.
     """
     bits = max(int(probability.size - 1).bit_length(), 1)
     padded = np.zeros(1 << bits)
@@ -94,7 +69,7 @@ def table_of(probability: NDArray[np.float64], low: int = 0) -> AliasTable:
 
 
 def _whole_words(probability: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Probabilities as whole numbers of words that sum to 2**32, by largest remainder."""
+    """Convert probabilities to integers that sum to 2**32, by the method of largest remainders."""
     exact = probability / probability.sum() * 2.0**WORD_BITS
     words: NDArray[np.int64] = np.floor(exact).astype(np.int64)
     missing = int(2**WORD_BITS - words.sum())
@@ -107,7 +82,7 @@ def _pack(words: NDArray[np.int64], bits: int) -> NDArray[np.uint32]:
     shift = WORD_BITS - bits
     share = 1 << shift
     left: list[int] = words.tolist()
-    # A full column keeps itself: alias = itself, threshold 0.
+    # A full column is its own alias, with threshold 0.
     entries = [column << shift for column in range(1 << bits)]
     small = [c for c, n in enumerate(left) if n < share]
     large = [c for c, n in enumerate(left) if n > share]
@@ -123,20 +98,20 @@ def _pack(words: NDArray[np.int64], bits: int) -> NDArray[np.uint32]:
 
 
 def table_set(means: Iterable[float], tables: list[AliasTable]) -> tuple[list[AliasTable], list[int]]:
-    """One table per distinct mean, put behind those that are there.
+    """Append a table for each distinct mean.
 
     Parameters
     ----------
     means : iterable of float
     tables : list of AliasTable
-        Laid end to end on the device; new ones are appended.
+        Tables that are contiguous on the device; new ones are appended.
 
     Returns
     -------
     each : list of AliasTable
-        For each mean, its table; equal means share one.
+        Table of each mean.
     starts : list of int
-        Where each mean's table starts.
+        Start of each mean's table.
     """
     size = sum(table.entries.size for table in tables)
     distinct: dict[float, tuple[AliasTable, int]] = {}

@@ -1,4 +1,4 @@
-"""The tables by which the device draws from priors."""
+"""Quantile tables with which the device draws from priors."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ Float = NDArray[np.float64]
 
 
 def nodes() -> Float:
-    """Probabilities between an end of a prior and its median, those of the device's table.
+    """Return the probabilities of the table's nodes from an end of a prior to its median.
 
     Returns
     -------
     ndarray, shape (layout.PRIOR_NODES,)
-        Octaves from 2**-56 to 1/2, each cut into 2**PRIOR_BITS cells; the last once more, for a word that float32
+        Octaves from 2**-56 to 1/2 with 2**PRIOR_BITS cells each; the last node is repeated for words that float32
         rounds up.
     """
     cells = 2**layout.PRIOR_BITS
@@ -29,21 +29,21 @@ def nodes() -> Float:
 
 
 def table_of(prior: Prior, change: Callable[[Float], Float]) -> tuple[NDArray[np.float32], float]:
-    """What the device draws of a prior: its values from both ends to the median.
+    """Compute the quantile table of a prior.
 
     Parameters
     ----------
     prior : Prior
     change : callable
-        From the prior's values to a factor on light or dark, less one.
+        Function that converts the prior's values to a factor minus one.
 
     Returns
     -------
     table : ndarray of float32, shape (2 * PRIOR_NODES,)
-        Factors at `nodes` from the low end, then from the high end, over the factor at the median, less one: float32
-        resolves the spread of a prior however narrow, and however far from one.
+        Factors at `nodes` from the low end, then from the high end, divided by the factor at the median, minus one.
+        In this form float32 resolves priors of any width and location.
     centre : float
-        The factor at the median, less one.
+        Factor at the median, minus one.
     """
     tail = nodes()
     values = change(np.append(prior.quantile(tail, 1.0 - tail), prior.quantile(1.0 - tail, tail)))

@@ -1,6 +1,6 @@
-"""Distributions of what is not known exactly.
+"""Prior distributions of unknown values.
 
-A study holds them long before anything is asked of them: numpy is loaded where it is.
+Studies contain priors, so this module imports NumPy only when a quantile is computed, to keep start-up fast.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ if TYPE_CHECKING:
 
     Float = NDArray[np.float64]
 
-#: Standard deviations from a normal's mean beyond which logarithms of its tail lose the digits of its shape.
-FURTHEST = 1e5
+#: Largest distance of a cut from the mean in standard deviations; beyond it, the logarithm of the tail loses precision.
+MAX_CUT_SD = 1e5
 
 
 def _make_plain(prior: object, *names: str) -> None:
-    """Values of a prior as plain numbers, also those that came with a unit."""
+    """Convert values of a prior with units to plain numbers."""
     for name in names:
         value = getattr(prior, name)
         unit = getattr(value, "unit", None)
@@ -34,7 +34,7 @@ def _make_plain(prior: object, *names: str) -> None:
 
 @dataclass(frozen=True)
 class Uniform:
-    """A prior that is flat between two values: plain, or Quantities where they are temperatures (kept in deg C)."""
+    """Uniform prior between two values; temperatures may be Quantities and are stored in deg C."""
 
     low: float
     high: float
@@ -45,7 +45,7 @@ class Uniform:
             raise InputError(f"a uniform prior from {self.low:g} to {self.high:g}, expected low <= high")
 
     def quantile(self, below: Float, above: Float | None = None) -> Float:
-        """The values that the prior stays below with these probabilities; see `Normal.quantile`."""
+        """Return the quantiles at probabilities `below`; see `Normal.quantile`."""
         import numpy as np
 
         from_low = self.low + (self.high - self.low) * below
@@ -56,7 +56,7 @@ class Uniform:
 
 @dataclass(frozen=True)
 class Normal:
-    """A normal prior, cut at `low` and `high`; values as for `Uniform`, a plain `sd` in deg C."""
+    """Normal prior truncated at `low` and `high`; values as for `Uniform`, with a plain `sd` in deg C."""
 
     mean: float
     sd: float
@@ -71,20 +71,20 @@ class Normal:
                 "expected sd > 0 and low < high"
             )
         away = max(self.low - self.mean, self.mean - self.high) / self.sd
-        if away > FURTHEST:
+        if away > MAX_CUT_SD:
             raise InputError(
                 f"a normal prior of mean {self.mean:g} and sd {self.sd:g} is cut at {self.low:g} and {self.high:g}, "
-                f"{away:g} sd from its mean, expected at most {FURTHEST:g}"
+                f"{away:g} sd from its mean, expected at most {MAX_CUT_SD:g}"
             )
 
     def quantile(self, below: Float, above: Float | None = None) -> Float:
-        """The values that the prior stays below with these probabilities.
+        """Return the quantiles at probabilities `below`.
 
         Parameters
         ----------
         below : ndarray
         above : ndarray, same shape, optional
-            1 - below, where that would lose digits.
+            1 - below, if the subtraction would lose precision.
         """
         import numpy as np
         from scipy import special
@@ -93,7 +93,7 @@ class Normal:
         with np.errstate(divide="ignore", over="ignore"):
             low, high = np.log(below), np.log(above)
             a, b = ((np.array([self.low, self.high]) - self.mean) / self.sd).tolist()
-            # Each side of the mean by its own tail, in logarithms, so that no tail is too small.
+            # Each side of the mean uses the logarithm of its own tail, which does not underflow.
             left = special.ndtri_exp(np.logaddexp(special.log_ndtr(a) + high, special.log_ndtr(b) + low))
             right = -special.ndtri_exp(np.logaddexp(special.log_ndtr(-a) + high, special.log_ndtr(-b) + low))
         inside = np.where(left < 0.0, left, right)

@@ -1,6 +1,6 @@
-"""Optional noise processes, each with a stream of its own, all off unless asked for.
+"""Optional noise processes with separate random streams, disabled by default.
 
-What they draw is unknown to the observer: references and variances stay those of the expectation.
+Their values are unknown to the observer: references and variances remain those of the expectation.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import count, number
 from mauvecl.noise import layout
 from mauvecl.noise.prior_tables import table_of
+from mauvecl.noise.prior_targets import PRIOR_TARGETS, Conditions, SignalPart
 from mauvecl.noise.priors import Normal, Prior, Uniform
-from mauvecl.noise.varied import VARIED, Conditions, Modulated
 
 __all__ = ["NONE", "CosmicRays", "Factors", "Normal", "Prior", "Processes", "Uniform"]
 
 Float = NDArray[np.float64]
 
-#: More hits than have this probability in a pixel and draw are left out.
+#: Numbers of hits in a pixel and draw with a smaller probability are neglected.
 NEGLIGIBLE = 2.0**-40
 
 
@@ -37,13 +37,13 @@ class CosmicRays:
     rate_per_cm2_s : float
         Hits per area and time.
     area_cm2 : float
-        Of the whole detector: 2048 pixels of 14 x 200 um.
+        Area of the whole detector: 2048 pixels of 14 x 200 um.
     pixels : int
-        Over which the area is spread; a hit stays in one pixel.
+        Number of pixels that share the area; a hit affects one pixel.
     electrons : tuple of float, shape (2,)
-        A hit frees a number of electrons between these, all equally likely...
+        Smallest and largest number of electrons of a hit.
     weights : tuple of float, optional
-        ... or with these relative weights, one for each whole number from the first to the last.
+        Relative probabilities of the integers in this range; equal by default.
     """
 
     rate_per_cm2_s: float = 1.0
@@ -72,12 +72,12 @@ class CosmicRays:
                 )
 
     def charge(self, seconds: float) -> Float:
-        """Probabilities of the electrons that one pixel collects in a time: a compound Poisson distribution.
+        """Compute the distribution of the charge that a pixel collects in a time, a compound Poisson distribution.
 
         Returns
         -------
         ndarray, shape (n,)
-            Of 0, 1, 2, ... electrons; what is left out has less than `NEGLIGIBLE`.
+            Probabilities of 0, 1, 2, ... electrons; the omitted tail has a probability below `NEGLIGIBLE`.
         """
         seconds = number("time", seconds, "s", low=0.0)
         low, high = (int(e) for e in self.electrons)
@@ -90,12 +90,12 @@ class CosmicRays:
             )
         one = np.zeros(size)
         one[low : high + 1] = 1.0 if self.weights is None else self.weights
-        # The generating function of a sum of a Poisson number of hits; distances beyond `size` would fold back.
+        # This is the generating function of a Poisson number of hits; charges beyond `size` would alias.
         spectrum = np.exp(hits * (np.fft.rfft(one / one.sum()) - 1.0))
         return np.maximum(np.fft.irfft(spectrum, size)[: most + 1], 0.0)
 
     def most_electrons(self, seconds: float) -> int:
-        """Return the largest charge that one pixel collects in a time, but for a probability of `NEGLIGIBLE`."""
+        """Return the charge that a pixel exceeds in a time with a probability of at most `NEGLIGIBLE`."""
         from scipy import special
 
         hits = self._hits(number("time", seconds, "s", low=0.0))
@@ -112,22 +112,23 @@ class CosmicRays:
 @public
 @dataclass(frozen=True)
 class Processes:
-    """Which optional processes act.
+    """Optional noise processes; those that are None are disabled.
 
     Attributes
     ----------
     cosmic_rays : CosmicRays, optional
+        Hits by charged particles.
     jitter : Prior, optional
-        Share of the light that a frame loses by pointing jitter, on top of the expectation; drawn for every frame.
-        ``Uniform(0, 0.05)`` is the paper's expectation.
+        Fraction of the light that a frame loses by pointing jitter, in addition to the expectation's losses; drawn per
+        frame. The paper expects ``Uniform(0, 0.05)``.
     detector_temperature : Prior, optional
-        deg C, drawn for every realisation; the dark current follows by the instrument's law.
+        Temperature in deg C, drawn per realisation; the dark current follows the instrument's law.
     light_loss, pointing_loss : Prior, optional
-        In place of the instrument's value, drawn for every realisation.
+        Replacements of the instrument's values, drawn per realisation.
     qe_scale : Prior, optional
-        Factor on the quantum efficiency, drawn for every realisation.
+        Factor on the quantum efficiency, drawn per realisation.
     sky_level : Prior, optional
-        Factor on the sky's light, drawn for every realisation.
+        Factor on the sky's light, drawn per realisation.
     """
 
     cosmic_rays: CosmicRays | None = None
@@ -139,28 +140,23 @@ class Processes:
     sky_level: Prior | None = None
 
     @property
-    def modulations(self) -> tuple[tuple[str, Modulated], ...]:
-        """Names of the priors given, and what each changes."""
-        return tuple((name, varied.of) for name, varied in VARIED.items() if getattr(self, name) is not None)
+    def modulations(self) -> tuple[tuple[str, SignalPart], ...]:
+        """Names of the enabled priors and the part of the signal that each changes."""
+        return tuple((name, varied.of) for name, varied in PRIOR_TARGETS.items() if getattr(self, name) is not None)
 
     def factors(self, conditions: Conditions) -> Factors:
-        """What is drawn of each prior: factors on light, dark or sky, less one.
+        """Compute the quantile tables of the priors' factors on light, dark or sky.
 
         Parameters
         ----------
         conditions : mapping of float
-            The expectation's own values: ``temperature_c``, ``dark_slope_per_c``, ``light_loss``, ``pointing_loss``.
-
-        Raises
-        ------
-        InputError
-            For a prior that reaches where no value can be.
+            Values of the expectation: ``temperature_c``, ``dark_slope_per_c``, ``light_loss``, ``pointing_loss``.
         """
         tables = np.empty((len(self.modulations), 2 * layout.PRIOR_NODES), np.float32)
         ends = {"light": (1.0, 1.0), "dark": (1.0, 1.0), "sky": (1.0, 1.0)}
         centre = dict.fromkeys(ends, 1.0)
         for row, (name, factor) in enumerate(self.modulations):
-            prior, varied = getattr(self, name), VARIED[name]
+            prior, varied = getattr(self, name), PRIOR_TARGETS[name]
             change = partial(varied.change, conditions)
             first, last = prior.quantile(np.array([0.0, 1.0]))
             if not (varied.low <= first and last <= varied.high):
@@ -176,14 +172,14 @@ class Processes:
 
 @dataclass(frozen=True, eq=False)
 class Factors:
-    """What priors do to light, dark and sky; the sky's light follows the factors on light as well.
+    """Factors of priors on light, dark and sky; factors on light include the sky's light.
 
     Attributes
     ----------
     tables : ndarray of float32, shape (n_modulation, 2 * layout.PRIOR_NODES)
-        See `prior_tables.table_of`.
+        Quantile tables; see `prior_tables.table_of`.
     light, dark, sky : float
-        Factors of priors at their medians, which the tables are relative to.
+        Factors at the priors' medians, to which the tables are relative.
     light_ends, dark_ends, sky_ends : tuple of float, shape (2,)
         Smallest and largest factors of all priors together.
     """
@@ -198,7 +194,7 @@ class Factors:
 
     @staticmethod
     def on_light(light: float, sky: float, share: Float) -> Float:
-        """The factor on all light of each pixel, shape (n_pixel,), where the sky has such a share of it."""
+        """Return the factor on each pixel's total light, of which the sky has this share, shape (n_pixel,)."""
         return np.asarray(light * (1.0 + (sky - 1.0) * share))
 
 

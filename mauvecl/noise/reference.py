@@ -1,7 +1,7 @@
-"""The slow NumPy twin of the kernels: what they draw. The same counters, the same arithmetic, the same order of sums.
+"""Slow NumPy reference implementation of the kernels' draws.
 
-Integers are equal to the device's; so are floats where the device's arithmetic is strict, because every
-fused multiply-add here is rounded once, as there. Used by tests and by the self-test.
+Counters, arithmetic and the order of sums are those of the kernels. Integers equal the device's, and so do floats on
+devices with strict arithmetic, because each fused multiply-add is rounded once. Tests and the self-test use it.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ MAGIC = np.float32(layout.MAGIC)
 
 
 def philox(counter: Sequence[ArrayLike], seed: int) -> Words:
-    """Philox4x32-10 (Salmon et al. 2011, doi 10.1145/2063384.2063405).
+    """Compute Philox4x32-10 (Salmon et al. 2011, doi 10.1145/2063384.2063405).
 
     Parameters
     ----------
     counter : four array_like of uint32
-        Broadcast against each other.
+        Words that are broadcast against each other.
     seed : int
         The 64-bit key.
     """
@@ -50,7 +50,7 @@ def philox(counter: Sequence[ArrayLike], seed: int) -> Words:
 
 
 def words_at(realisation: ArrayLike, frame: int, stream: str, group: ArrayLike, seed: int, exposure: int = 0) -> Words:
-    """The four words that four neighbouring pixels of one realisation and frame share in a stream.
+    """Return the four words that four neighbouring pixels of a realisation and frame share in a stream.
 
     Parameters
     ----------
@@ -60,10 +60,10 @@ def words_at(realisation: ArrayLike, frame: int, stream: str, group: ArrayLike, 
     stream : str
         A key of `layout.STREAMS`.
     group : array_like of int
-        Pixel index over four.
+        Pixel index divided by four.
     seed : int
     exposure : int
-        0 for the observed exposure, `layout.REFERENCE` for the other.
+        0 for the observed exposure, `layout.REFERENCE` for the reference.
     """
     index = np.asarray(realisation, dtype=np.uint64)
     last = np.uint64((exposure + layout.STREAMS[stream]) << 24) | np.asarray(group, dtype=np.uint64)
@@ -71,10 +71,10 @@ def words_at(realisation: ArrayLike, frame: int, stream: str, group: ArrayLike, 
 
 
 def fma(a: ArrayLike, b: ArrayLike, c: ArrayLike) -> Floats:
-    """a * b + c in float32, rounded once.
+    """Compute a * b + c in float32 with a single rounding.
 
-    The product is exact in float64. The sum is rounded to odd there (its error decides the last bit), which makes the
-    second rounding, to float32, the correct one (Boldo & Melquiond 2008, doi 10.1109/TC.2007.70819).
+    The product is exact in float64. The sum is rounded to odd (its error decides the last bit), which makes the second
+    rounding, to float32, correct (Boldo & Melquiond 2008, doi 10.1109/TC.2007.70819).
     """
     product = np.asarray(a, np.float64) * np.asarray(b, np.float64)
     addend = np.asarray(c, np.float64)
@@ -95,7 +95,7 @@ def _horner(name: str, x: Floats) -> Floats:
 
 
 def normal_pair(radius_word: NDArray[np.uint32], angle_word: NDArray[np.uint32]) -> tuple[Floats, Floats]:
-    """Two standard normals from two words, by Box and Muller (1958, doi 10.1214/aoms/1177706645)."""
+    """Compute two standard normals from two words by the method of Box & Muller (1958, doi 10.1214/aoms/1177706645)."""
     t = radius_word.astype(np.float32) + np.float32(0.5)
     split = np.uint32(0x3F3504F3)
     bits = t.view(np.uint32) - split
@@ -110,7 +110,7 @@ def normal_pair(radius_word: NDArray[np.uint32], angle_word: NDArray[np.uint32])
 
 
 def alias_draw(word: NDArray[np.uint32], table: NDArray[np.uint32], bits: int) -> NDArray[np.uint32]:
-    """The alias table's column for each word; see `poisson.AliasTable`."""
+    """Return the alias table's column for each word; see `poisson.AliasTable`."""
     shift = np.uint32(layout.WORD_BITS - bits)
     column = word >> shift
     entry = table[column]
@@ -119,19 +119,19 @@ def alias_draw(word: NDArray[np.uint32], table: NDArray[np.uint32], bits: int) -
 
 
 def expansion_draw(z: Floats, offset: np.float32, slope: np.float32, cubic: np.float32) -> Floats:
-    """Poisson counts of a large mean, relative to the whole number nearest to it."""
+    """Return Poisson counts of a large mean, relative to the mean rounded to an integer."""
     curve = fma(z, cubic, np.float32(0.16666667))
     return nearest(fma(z, fma(z, curve, slope), offset))
 
 
 def nearest(x: Floats) -> Floats:
-    """Nearest whole number, ties to even, for values below 2**22."""
+    """Round to the nearest integer, ties to even, for values below 2**22."""
     return np.asarray((x + MAGIC) - MAGIC)
 
 
 @dataclass(frozen=True, eq=False)
 class Draws:
-    """What was drawn for four neighbouring pixels; each entry has the shape (n_realisation,)."""
+    """Draws of four neighbouring pixels; each array has the shape (n_realisation,)."""
 
     z: list[Floats]
     dark: list[Floats]
@@ -140,7 +140,7 @@ class Draws:
 
 
 def poisson_draw(words: Words, i: int, source: np.void, tables: NDArray[np.uint32], pairs: Sequence[Floats]) -> Floats:
-    """One pixel's count, relative to its whole number; `pairs` are the normals of the four words."""
+    """Return one pixel's count, relative to its rounded mean; `pairs` are the normals of the four words."""
     if not source["bits"]:
         return expansion_draw(pairs[i], source["offset"], source["slope"], source["cubic"])
     column = alias_draw(words[i], tables[int(source["table"]) :], int(source["bits"]))
@@ -148,14 +148,14 @@ def poisson_draw(words: Words, i: int, source: np.void, tables: NDArray[np.uint3
 
 
 def four_normals(w: Words) -> list[Floats]:
-    """Normals of four neighbouring pixels."""
+    """Return the normals of four neighbouring pixels."""
     return [*normal_pair(w[0], w[1]), *normal_pair(w[2], w[3])]
 
 
 def draws(
     scene: Scene, realisation: NDArray[np.uint64], frame: int, group: int, seed: int, *, exposure: int = 0
 ) -> Draws:
-    """Everything drawn for four pixels of one draw."""
+    """Draw everything that four pixels of one draw need."""
     job = scene.job
     address = (realisation, int(job["first_frame"]) + frame)
     place = (int(job["first_group"]) + group, seed, exposure)
@@ -178,7 +178,7 @@ def draws(
 
 
 def quantile(word: NDArray[np.uint32], finer: NDArray[np.uint32], table: Floats) -> Floats:
-    """A prior's factor, less one, at the probability that a word and its finer digits stand for."""
+    """Return a prior's factor minus one at the probability given by a word and its finer digits."""
     low_bits = 23 - layout.PRIOR_BITS
     side = word.view(np.int32) >> 31
     within = ((finer & np.uint32(0x7FFFFF)).astype(np.float32) + np.float32(0.5)) * np.float32(2.0**-23)
@@ -189,44 +189,39 @@ def quantile(word: NDArray[np.uint32], finer: NDArray[np.uint32], table: Floats)
     return fma(part, table[cell + 1] - table[cell], table[cell])
 
 
-def together(a: Floats, b: Floats) -> Floats:
-    """The product of two factors, all less one."""
+def combine_factors(a: Floats, b: Floats) -> Floats:
+    """Return the product of two factors, all minus one."""
     return fma(a, b, a + b)
 
 
 def factors(
     scene: Scene, realisation: NDArray[np.uint64], frame: int, seed: int, *, exposure: int = 0
 ) -> tuple[Floats, Floats, Floats]:
-    """Factors on light, dark and sky of one draw, over those at the priors' medians and less one.
-
-    Returns
-    -------
-    three of ndarray of float32, shape (n_realisation,)
-    """
+    """Draw factors on light, dark and sky, relative to the priors' medians and minus one, shape (n_realisation,)."""
     factor_of = {factor: np.zeros(len(realisation), np.float32) for factor in ("light", "dark", "sky")}
     kept = np.zeros(len(realisation), np.float32)
     first = int(scene.job["first_frame"]) + frame
     for (name, factor), table in zip(scene.modulations, scene.priors, strict=True):
         if name != "jitter":
             words = words_at(realisation, 0, name, 0, seed)
-            factor_of[factor] = together(factor_of[factor], quantile(words[0], words[1], table))
+            factor_of[factor] = combine_factors(factor_of[factor], quantile(words[0], words[1], table))
             continue
         for f in range(first, first + (1 if scene.frames else scene.n_frames)):
             words = words_at(realisation, f // 4, name, 0, seed, exposure)
             kept = kept + quantile(words[f % 4], words[(f + 1) % 4], table)
         if not scene.frames:
             kept = kept * (np.float32(1.0) / np.float32(scene.n_frames))
-    return together(factor_of["light"], kept), factor_of["dark"], factor_of["sky"]
+    return combine_factors(factor_of["light"], kept), factor_of["dark"], factor_of["sky"]
 
 
 def analogue(
     scene: Scene, drawn: Draws, i: int, pixel: int, k: int, light: Floats, dark: Floats, sky: Floats
 ) -> Floats:
-    """The count above the level's base before the ADC, shape (n_realisation,)."""
+    """Return the analogue count above the level's base, before the ADC, shape (n_realisation,)."""
     level, z = scene.levels[k, pixel], drawn.z[i]
     if scene.modulations:
         if any(factor == "sky" for _, factor in scene.modulations):
-            light = together(light, sky * scene.responses[k, pixel]["sky_share"])
+            light = combine_factors(light, sky * scene.responses[k, pixel]["sky_share"])
         v = _responding(scene.responses[k, pixel], level["c0"], z, light, dark, quartic=scene.quartic)
     elif scene.joint:
         first, *rest = ("c4", "c3", "c2", "c1", "c0") if scene.quartic else ("c3", "c2", "c1", "c0")
@@ -237,7 +232,7 @@ def analogue(
         v = fma(drawn.dark[i], scene.dark_counts[pixel]["gain"], fma(z, level["c1"], level["c0"]))
     if drawn.photon is not None:
         source = scene.photon_counts[k, pixel]
-        # The two of a pair use each other's words where the count comes from a normal.
+        # Both pixels of a pair use both words if the count comes from a normal.
         count = poisson_draw(drawn.photon, i, source, scene.tables, four_normals(drawn.photon))
         v = fma(count, source["gain"], v)
     if scene.cosmic:
@@ -274,7 +269,7 @@ def _quartic(zz: Floats, second: float, first: float, constant: float) -> Floats
 
 
 def digitise(v: Floats, edge: np.void, *, clip: bool) -> Floats:
-    """DN above the level's base, rounded and clipped."""
+    """Round and clip to DN above the level's base."""
     r = v + MAGIC
     if clip:
         r = np.where(r < edge["low"], edge["low"], r)
@@ -291,7 +286,7 @@ def observed(
     number: int = 0,
     scenarios: Sequence[int] | None = None,
 ) -> NDArray[np.int64]:
-    """Whole DN above the base, summed over the draws, of scenarios; of exposure `number` of several.
+    """Sum the DN above the base over the draws of exposure `number`, for each scenario.
 
     Returns
     -------
@@ -313,7 +308,7 @@ def observed(
 
 
 def clipped(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray[np.int64]:
-    """Frames that each pixel of scenario 0 spends below zero and above saturation.
+    """Count the frames in which each pixel of scenario 0 is below zero and above saturation.
 
     Returns
     -------
@@ -333,7 +328,7 @@ def clipped(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray
 
 
 def realise(scene: Scene, realisation: NDArray[np.uint64], seed: int) -> NDArray[np.int64]:
-    """Raw DN of scenario 0 summed over the frames, shape (n_realisation, n_pixel)."""
+    """Draw raw DN of scenario 0, summed over the frames, shape (n_realisation, n_pixel)."""
     above = observed(scene, realisation, seed, scenarios=[0])[0, : scene.n_pixel]
     raw: NDArray[np.int64] = (above + scene.n_draws * scene.base_dn[0][:, None]).T
     return raw

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
 from mauvecl.noise.comparison import NOISE_FREE, Comparison
-from mauvecl.noise.drawn import Drawn
+from mauvecl.noise.factor_distributions import FactorDistributions
 from mauvecl.statistics.distributions import Form, Gaussian, Mixture, QuadraticForm
 from mauvecl.statistics.nuisances import Nuisances, join_names
 
@@ -32,7 +32,9 @@ class Setting:
     comparison: Comparison = NOISE_FREE  # the subtracted reference and the choice of variances
     flares: Sequence[Expectation] = ()  # possible templates
     nuisances: Nuisances | None = None  # parameters that statistics marginalise over
-    drawn: Drawn | None = None  # random factors over which closed forms of marginalised statistics integrate
+    drawn: FactorDistributions | None = (
+        None  # random factors over which closed forms of marginalised statistics integrate
+    )
     _cache: dict[str, Any] = field(default_factory=dict, init=False, repr=False, compare=False)
 
     def __getstate__(self) -> dict[str, Any]:

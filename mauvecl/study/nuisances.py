@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import BeforeValidator, Field, model_validator
 
 from mauvecl.host.files.bounded import shortened
-from mauvecl.noise.usual import USUAL
+from mauvecl.noise.default_unknowns import DEFAULT_UNKNOWNS
 from mauvecl.study.sections import Section
 
 if TYPE_CHECKING:
@@ -97,7 +97,9 @@ class NuisanceChoice(Section):
         """Return the processes to draw: those given and, with `usual`, those of the documented set."""
         if not self.usual:
             return named
-        added: dict[str, Any] = {u.process: u.prior(temperature_c) for u in USUAL if getattr(named, u.process) is None}
+        added: dict[str, Any] = {
+            u.process: u.prior(temperature_c) for u in DEFAULT_UNKNOWNS if getattr(named, u.process) is None
+        }
         return replace(named, **added)
 
 
@@ -105,4 +107,4 @@ def usual_spreads(quiet: Expectation) -> dict[str, float]:
     """Return the standard deviations of the documented set, omitting parameters without effect, such as no sky."""
     from mauvecl.statistics.nuisances import spectrum_of
 
-    return {u.nuisance: u.sd for u in USUAL if spectrum_of(u.nuisance, quiet).any()}
+    return {u.nuisance: u.sd for u in DEFAULT_UNKNOWNS if spectrum_of(u.nuisance, quiet).any()}

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import Field, create_model, field_validator, model_validator
 
 from mauvecl.host.sky import DEFAULT_SKY
-from mauvecl.noise.varied import VARIED
+from mauvecl.noise.prior_targets import PRIOR_TARGETS
 from mauvecl.statistics.names import DEFAULT_STATISTICS, STATISTIC_NAMES
 from mauvecl.study.flare_light import FlareLight
 from mauvecl.study.section import Section as Section
@@ -195,18 +195,18 @@ class Rays(Section):
 
 
 #: Cosmic rays, and a prior for each quantity that may vary.
-_keys: Any = {"cosmic_rays": (Rays | None, None)} | dict.fromkeys(VARIED, (PriorText | None, None))
+_keys: Any = {"cosmic_rays": (Rays | None, None)} | dict.fromkeys(PRIOR_TARGETS, (PriorText | None, None))
 
 
 class NoiseProcesses(create_model("_Priors", __base__=Section, **_keys)):  # type: ignore[misc]
-    """Optional noise processes, all disabled by default; see `noise.varied.VARIED` and `noise.processes.CosmicRays`."""
+    """Optional noise processes, disabled by default; see `prior_targets.PRIOR_TARGETS` and `processes.CosmicRays`."""
 
     def processes(self) -> Processes:
         """Return the processes for the engine."""
         from mauvecl.noise.processes import Processes
 
         rays = None if self.cosmic_rays is None else self.cosmic_rays.rays()
-        given = {name: getattr(self, name) for name in VARIED}
+        given = {name: getattr(self, name) for name in PRIOR_TARGETS}
         return Processes(rays, **{name: None if text is None else text.prior() for name, text in given.items()})
 
 

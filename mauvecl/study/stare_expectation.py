@@ -28,8 +28,9 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Unknown changes of a stare under `nuisances.usual`, with the sources of `noise.usual.USUAL`: an orbital thermal
-#: cycle, pointing loss in each frame (uniform 0-5 %), the level of the sky, and slow variability of the star (assumed).
+#: Unknown changes of a stare under `nuisances.usual`, with the sources of `default_unknowns.DEFAULT_UNKNOWNS`: an
+#: orbital thermal cycle, pointing loss in each frame (uniform 0-5 %), the level of the sky, and slow variability of
+#: the star (assumed).
 USUAL_STARE: dict[str, dict[str, float]] = {
     "jitters": {"light": 0.05 / 12**0.5},
     "offsets": {"sky": 0.1},

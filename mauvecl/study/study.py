@@ -304,11 +304,11 @@ class Study(Section):
 
     def setting(self, quiet: Expectation, *flares: Expectation) -> Setting:
         """Return the input of statistics for closed forms."""
-        from mauvecl.noise.drawn import Drawn
+        from mauvecl.noise.factor_distributions import FactorDistributions
         from mauvecl.statistics.statistic import Setting
 
         unknown = self.nuisances.marginalised(quiet)
-        drawn = Drawn.by(self.drawing["processes"], quiet) if unknown else None
+        drawn = FactorDistributions.from_processes(self.drawing["processes"], quiet) if unknown else None
         return Setting(quiet, ~quiet.saturated, self.run.comparison(), flares, unknown, drawn)
 
     def expectations(self, star: Star) -> list[Expectation]:

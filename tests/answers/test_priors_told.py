@@ -14,7 +14,7 @@ from mauvecl.answers.limits.limits import limiting_magnitude
 from mauvecl.answers.signal.simulate import simulate
 from mauvecl.answers.signal.snr import snr
 from mauvecl.device.engine import Engine
-from mauvecl.noise.varied import VARIED
+from mauvecl.noise.prior_targets import PRIOR_TARGETS
 from mauvecl.study.study import Study
 
 #: Priors that contain the expectation's own value, and that do not.
@@ -43,7 +43,7 @@ def said(verb: str, engine: Engine, **sections: Any) -> list[str]:
 
 
 def test_every_prior_is_looked_at() -> None:
-    assert PRIORS.keys() == VARIED.keys()
+    assert PRIORS.keys() == PRIOR_TARGETS.keys()
 
 
 # Far from the expectation no limit settles, which is refused: one prior near it.

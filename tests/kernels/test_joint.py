@@ -13,7 +13,7 @@ from mauvecl.device.engine import Engine
 from mauvecl.device.selftest import pearson
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise import layout
-from mauvecl.noise.cumulants import MOST_SKEW, Cumulants, joint_is_exact, needs_fourth_power, polynomial
+from mauvecl.noise.cumulants import MAX_SKEW, Cumulants, joint_is_exact, needs_fourth_power, polynomial
 from mauvecl.noise.scene import prepare
 
 
@@ -113,7 +113,7 @@ def test_noise_that_is_not_smooth_is_drawn_separately() -> None:
         c = Cumulants.of(x, 1)
         assert not joint_is_exact(c).any()
         assert not prepare([x]).joint
-    assert Cumulants.of(one_pixel(500.0, 0.0, 3.0), 1).shape()[0][0] > MOST_SKEW
+    assert Cumulants.of(one_pixel(500.0, 0.0, 3.0), 1).shape()[0][0] > MAX_SKEW
     # Rounding alone, or Gaussian photons alone, need no Poisson steps smoothed.
     assert prepare([one_pixel(0.0, 500.0, 0.0, noise="gaussian")]).joint
     assert prepare([one_pixel(0.0, 0.0, 0.0)]).joint

@@ -13,7 +13,14 @@ from scipy import optimize
 from mauvecl.device.selftest import toy
 from mauvecl.host.errors import InputError
 from mauvecl.noise import reference
-from mauvecl.noise.cumulants import DRAWS_TO_NOTICE, Cumulants, joint_is_exact, left_out, needs_fourth_power, polynomial
+from mauvecl.noise.cumulants import (
+    DRAWS_TO_NOTICE,
+    Cumulants,
+    joint_is_exact,
+    needs_fourth_power,
+    polynomial,
+    truncation_distance,
+)
 from mauvecl.noise.processes import Processes, Uniform
 from mauvecl.noise.scene import prepare
 
@@ -106,7 +113,7 @@ def test_nominal_payload_at_all_settings(name: str) -> None:
         for frames in (1, 2, 10, 100):
             c = Cumulants.of(x, frames)
             assert joint_is_exact(c).all()
-            distance = left_out(c, fourth_power=needs_fourth_power(c))
+            distance = truncation_distance(c, fourth_power=needs_fourth_power(c))
             draws = (5 * np.sqrt(2 * 15.3 * np.sqrt(c.variance)) / distance).min()
             assert draws > 5e13
             below += draws < 1e14

@@ -45,9 +45,12 @@ ROWS = 50_000
 
 @pytest.mark.long
 @pytest.mark.parametrize("name", SCENES)
-def test_no_two_draws_are_tied(engine: Engine, name: str) -> None:
-    """Values, squares and neighbours' products of 64 pixels in two frames, each with each: |z| < 6.5 for 73 000
-    correlations, which fails once in 1e5 seeds for each scene (half as often again for the squares' long tails)."""
+def test_draws_are_uncorrelated(engine: Engine, name: str) -> None:
+    """Correlate values, squares and neighbours' products of 64 pixels in two frames.
+
+    The limit |z| < 6.5 for 73 000 correlations fails once in 1e5 seeds per scene, and 1.5 times as often with the long
+    tails of squares.
+    """
     x, how = SCENES[name]
     values = []
     for frame in (0, 1):
@@ -67,8 +70,8 @@ def test_no_two_draws_are_tied(engine: Engine, name: str) -> None:
     assert np.abs(found).max() < 6.5
 
 
-def test_pairs_go_one_way() -> None:
-    """No pair mixes tables with the expansion, and pairs of one kind are drawn as they would be alone."""
+def test_pairs_use_one_method() -> None:
+    """Check that no pair mixes tables with the expansion, and that pairs of one kind are drawn as alone."""
     scene = prepare([detector(MIXED, MIXED[::-1], photon_noise="poisson")], recipe="apart")
     for counts, mean in ((scene.dark_counts[:64], MIXED), (scene.photon_counts[0, :64], MIXED[::-1])):
         pairs = (counts["bits"] == 0).reshape(-1, 2)
@@ -84,16 +87,18 @@ def test_pairs_go_one_way() -> None:
     assert prepare([odd]).dark_counts["bits"][64] == 0
 
 
-def test_a_pair_that_no_table_can_hold_is_refused() -> None:
+def test_pair_beyond_range_of_tables_raises() -> None:
     x = detector(0.0, 0.0)
     x = replace(x, dark_dn=np.where(np.arange(64) == 7, 2e8, 5.0), adc_max_dn=2**31, saturation_dn=2.0**31)
-    with pytest.raises(InputError, match="pixel 7 has a Poisson mean of 2e\\+08 in one draw beside a pixel of less"):
+    with pytest.raises(InputError, match="pixel 7 has a Poisson mean of 2e\\+08 in one draw next to a pixel of less"):
         prepare([x])
 
 
-def test_an_uneven_detector_keeps_its_chi_squared(engine: Engine) -> None:
-    """The null's mean of an instrument whose dark scatters about a mean of 1000 counts, where pairs mix: it was 44.45
-    instead of 48 degrees of freedom. Five standard errors fail once in 2e6 seeds."""
+def test_chi2_of_uneven_detector_follows_closed_form(engine: Engine) -> None:
+    """Compare the null's mean for a dark that scatters about 1000 counts, where draws of both methods are adjacent.
+
+    The mean was once 44.45 instead of 48 degrees of freedom. Five standard errors fail once in 2e6 seeds.
+    """
     payload = instrument(read_noise_dn=1.0, temperature_c=9.0, pixel_map=PixelMap.made_up(2048, seed=1))
     (quiet,) = star(payload=payload, exposure=5.0)
     n = 20_000

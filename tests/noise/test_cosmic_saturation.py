@@ -20,7 +20,7 @@ SEEDS = 24
 
 @dataclass(frozen=True)
 class Case:
-    """A star below saturation with room for some hits in a frame, on pixels that are alike."""
+    """Return a star on identical pixels, so far below saturation that a frame can collect some hits."""
 
     x: Expectation
     rays: CosmicRays
@@ -64,8 +64,8 @@ class Case:
 
 
 @pytest.mark.parametrize("seed", range(SEEDS))
-def test_sums_of_frames_with_hits_are_those_of_single_frames(engine: Engine, seed: int) -> None:
-    """Sums drawn by the engine against an independent draw of each frame, in 60 classes of equal count.
+def test_sums_of_frames_with_hits_equal_independent_draws(engine: Engine, seed: int) -> None:
+    """Compare the engine's sums with independent draws of each frame, in 60 classes of equal count.
 
     A class holds pixels of one exposure, which are independent but for their means; p < 1e-7 in 24 tests: a false
     failure in 4e5.
@@ -81,8 +81,8 @@ def test_sums_of_frames_with_hits_are_those_of_single_frames(engine: Engine, see
     assert stats.chi2_contingency(np.array(counts)).pvalue > 1e-7
 
 
-def test_stacks_are_drawn_only_where_no_frame_can_be_cut_off() -> None:
-    """Over random cases, by the Poisson probability that the fewest hits too many meet in a frame."""
+def test_stacks_are_drawn_only_if_no_frame_can_be_clipped() -> None:
+    """Check random cases with the Poisson probability of the fewest hits that clip a frame."""
     stacked = 0
     for seed in range(60):
         case = Case.of(seed)

@@ -21,7 +21,7 @@ INVERSE = [pow(m, -1, 2**32) for m in (0xD2511F53, 0xCD9E8D57)]
 
 
 def unwind(words: tuple[int, int, int, int], seed: int) -> tuple[int, int, int, int]:
-    """The counter whose Philox words these are: each round is a bijection."""
+    """Return the counter that gives these Philox words, which exists because each round is a bijection."""
     k0, k1 = seed & 0xFFFFFFFF, seed >> 32
     c = words
     for r in reversed(range(10)):
@@ -34,7 +34,7 @@ def unwind(words: tuple[int, int, int, int], seed: int) -> tuple[int, int, int, 
 
 
 def place_of(words: tuple[int, int, int, int], stream: str) -> tuple[int, int, int, int]:
-    """A seed, realisation, frame and group whose words in a stream are these."""
+    """Return a seed, realisation, frame and group that give these words in a stream."""
     for seed in range(100_000):
         c = unwind(words, seed)
         if c[3] >> 24 == layout.STREAMS[stream] and c[1] < 2**31:
@@ -43,7 +43,7 @@ def place_of(words: tuple[int, int, int, int], stream: str) -> tuple[int, int, i
 
 
 def draw_one(engine: Engine, scene: Scene, index: int, seed: int) -> np.ndarray:
-    """One realisation of a scene by the production kernel."""
+    """Draw one realisation of a scene with the production kernel."""
     out = np.empty((1, scene.n_pixel), np.int32)
     tile = engine._tiles.at(index, 1, 4096)
     assert isinstance(tile, Tile)
@@ -73,7 +73,7 @@ ENDS = [
         ("cosmic", {}, {"processes": Processes(cosmic_rays=CosmicRays(rate_per_cm2_s=500.0))}),
     ],
 )
-def test_extreme_words_through_the_production_kernel(
+def test_extreme_words_in_production_kernel_equal_reference(
     engine: Engine, words: tuple[int, int, int, int], stream: str, options: dict, how: dict
 ) -> None:
     seed, index, frame, group = place_of(words, stream)
@@ -93,7 +93,7 @@ def test_extreme_words_through_the_production_kernel(
 
 
 @pytest.mark.parametrize("index", [2**32 - 1, 2**32, 2**40 - 1, 2**40, 2**62])
-def test_counter_boundaries(engine: Engine, index: int) -> None:
+def test_draws_at_counter_boundaries_equal_reference(engine: Engine, index: int) -> None:
     (x,) = star(payload=instrument(part=True, output_max_nm=320.0))
     raw = engine.realise(x, start=index - 20, count=41, seed=2**64 - 1)
     numbers = np.arange(index - 20, index + 21, dtype=np.uint64)
@@ -117,8 +117,8 @@ def wide(pixels: int) -> Expectation:
     )
 
 
-def test_as_many_pixels_as_the_counter_holds(engine: Engine) -> None:
-    """65 536 pixels: the last ones are the twin's, no two groups are alike, statistics still fit."""
+def test_largest_number_of_pixels_is_drawn(engine: Engine) -> None:
+    """Draw 65 536 pixels: the last equal the reference, all groups differ, and statistics are defined."""
     x = wide(65_536)
     raw = engine.realise(x, start=2**40, count=2, seed=3)
     scene = prepare([x])

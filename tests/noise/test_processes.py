@@ -14,24 +14,24 @@ from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError
 from mauvecl.noise import layout, reference
 from mauvecl.noise.components import components
+from mauvecl.noise.prior_targets import PRIOR_TARGETS
 from mauvecl.noise.processes import NONE, CosmicRays, Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare
-from mauvecl.noise.varied import VARIED
 from mauvecl.study.sections import NoiseProcesses
 
 N = 20_000
 
 
 def total_light(engine: Engine, processes: Processes, *, exposure: float = 5.0, mode: str = "auto") -> np.ndarray:
-    """Net DN of each realisation over its expectation, and the expectation itself."""
+    """Return each realisation's net DN relative to the expectation, and the expectation."""
     (x,) = star(magnitude=4.0, exposure=exposure)
     raw = engine.realise(x, count=N, seed=12, processes=processes, mode=mode)
     net = raw.sum(axis=1) - np.sum(x.n_frames * (x.bias_dn + x.dark_dn))
     return net / x.recorded_light_dn.sum()
 
 
-def test_a_prior_is_what_the_light_follows(engine: Engine) -> None:
-    """Summed over all pixels the light shows the factor itself: KS on 20 000, fails by chance once in 1e6."""
+def test_light_follows_distribution_of_prior(engine: Engine) -> None:
+    """Compare the light summed over pixels, which measures the factor: KS on 20 000 draws fails once in 1e6."""
     noise = total_light(engine, NONE).std()
     found = total_light(engine, Processes(light_loss=Uniform(0.24, 0.44)))
     low, high = (1 - 0.44) / (1 - 0.34), (1 - 0.24) / (1 - 0.34)
@@ -42,8 +42,8 @@ def test_a_prior_is_what_the_light_follows(engine: Engine) -> None:
 
 
 @pytest.mark.parametrize("sd", [0.01, 0.1])
-def test_a_prior_has_its_own_moments(engine: Engine, sd: float) -> None:
-    """A normal prior with far cuts, as the light shows it: five standard errors each, by chance once in 4e5."""
+def test_light_has_moments_of_normal_prior(engine: Engine, sd: float) -> None:
+    """Compare the light's moments for a normal prior with wide cuts: five standard errors fail once in 4e5."""
     light = total_light(engine, Processes(qe_scale=Normal(1.0, sd, 0.5, 1.5)))
     noise = total_light(engine, NONE).var()
     variance = light.var() - noise
@@ -52,8 +52,8 @@ def test_a_prior_has_its_own_moments(engine: Engine, sd: float) -> None:
     assert abs(stats.kurtosis(light)) < 5 * np.sqrt(24 / N)
 
 
-def test_jitter_shares_words_but_no_chance(engine: Engine) -> None:
-    """Frames take finer digits from each other's words: no correlation; five standard errors, by chance once in 2e5."""
+def test_jitter_of_frames_is_uncorrelated(engine: Engine) -> None:
+    """Check frames, which take finer digits from each other's words: five standard errors fail once in 2e5."""
     (x,) = star(magnitude=2.0, exposure=5.0)
     jitter = Processes(jitter=Normal(0.1, 0.02, 0.0, 0.5))
     lost = []
@@ -65,7 +65,7 @@ def test_jitter_shares_words_but_no_chance(engine: Engine) -> None:
         assert np.abs(found).max() < 5 / np.sqrt(5000)
 
 
-def test_the_detector_temperature_moves_the_dark(engine: Engine) -> None:
+def test_dark_follows_detector_temperature(engine: Engine) -> None:
     (x,) = star(magnitude=30.0, exposure=5.0)
     raw = engine.realise(x, count=N, seed=3, processes=Processes(detector_temperature=Uniform(13.0, 21.0)))
     dark = (raw.sum(axis=1) - x.bias_dn.sum()) / x.dark_dn.sum()
@@ -83,7 +83,7 @@ def test_the_detector_temperature_moves_the_dark(engine: Engine) -> None:
 
 @pytest.mark.long
 def test_jitter_is_drawn_for_every_frame(engine: Engine) -> None:
-    """One frame loses a uniform share; ten lose the mean of ten, stacked or frame by frame: six standard errors."""
+    """Compare the losses of one frame and of ten, stacked and frame by frame, with the prior: six standard errors."""
     most = Processes(jitter=Uniform(0.0, 0.05))
     one = total_light(engine, most)
     assert stats.kstest(one, stats.uniform(0.95, 0.05).cdf).statistic < 0.02 + 2.6 / np.sqrt(N)
@@ -94,8 +94,8 @@ def test_jitter_is_drawn_for_every_frame(engine: Engine) -> None:
         assert abs(own / (0.05**2 / 12 / 10) - 1) < 6 * np.sqrt(2 / N) * ten.var() / own
 
 
-def test_cosmic_rays(engine: Engine) -> None:
-    """Counts of hit pixels and their charge, against the compound distribution they are drawn from."""
+def test_cosmic_rays_follow_compound_distribution(engine: Engine) -> None:
+    """Compare the number of hit pixels and their charge with the compound distribution."""
     rays = CosmicRays(rate_per_cm2_s=40.0)
     (x,) = star(exposure=5.0)
     clean, hit = (engine.realise(x, count=2000, seed=9, processes=p) for p in (NONE, Processes(cosmic_rays=rays)))
@@ -113,8 +113,8 @@ def test_cosmic_rays(engine: Engine) -> None:
     assert abs(electrons.size - single.size - expected * rate / 2) < 6 * np.sqrt(expected * rate / 2)
 
 
-def test_the_charge_of_a_stack() -> None:
-    """Mean and variance of a compound Poisson sum: rate times the first two moments of one hit."""
+def test_charge_has_moments_of_compound_poisson_sum() -> None:
+    """Compare mean and variance with the rate times the first two moments of one hit."""
     rays = CosmicRays(rate_per_cm2_s=3000.0)
     for seconds in (5.0, 50.0, 600.0):
         p = rays.charge(seconds)
@@ -130,8 +130,8 @@ def test_the_charge_of_a_stack() -> None:
     assert weighted[3] < 1e-15 < weighted[2] < weighted[4]
 
 
-def test_one_process_moves_no_other(engine: Engine) -> None:
-    """Without its own effect on a pixel, a process changes no bit of what the others drew."""
+def test_process_does_not_change_draws_of_others(engine: Engine) -> None:
+    """Check that a process changes no bit of pixels on which it has no effect."""
     (x,) = star(exposure=5.0)
     clean = engine.realise(x, count=200, seed=4)
     # Hits only: pixels without one are as they were.
@@ -164,11 +164,11 @@ def test_one_process_moves_no_other(engine: Engine) -> None:
             lambda: prepare(
                 star(magnitude=3.0, exposure=80_000.0), mode="stacked", processes=Processes(qe_scale=Uniform(0.5, 1.5))
             ),
-            r"the priors carry pixel \d+ of G2V",
+            r"the priors move pixel \d+ of G2V",
         ),
     ],
 )
-def test_what_cannot_be_is_refused(make, sentence: str) -> None:
+def test_invalid_process_raises(make, sentence: str) -> None:
     with pytest.raises(InputError, match=sentence):
         make()
 
@@ -176,8 +176,8 @@ def test_what_cannot_be_is_refused(make, sentence: str) -> None:
 @pytest.mark.long
 @pytest.mark.parametrize("recipe", ["joint", "apart"])
 @pytest.mark.parametrize("name", ["mauve", "mauve-electrons"])
-def test_components_add_up_and_scatter_as_they_should(engine: Engine, name: str, recipe: str) -> None:
-    """A spectrum taken apart: its parts sum to the engine's count, and each has its own moments."""
+def test_components_have_correct_sum_and_moments(engine: Engine, name: str, recipe: str) -> None:
+    """Check that components add up to the engine's count and have their own moments."""
     (x,) = star(payload=instrument(name), exposure=50.0)
     processes = Processes(cosmic_rays=CosmicRays()) if recipe == "joint" else NONE
     table = components(x, realisation=7, seed=5, recipe=recipe, processes=processes)
@@ -206,8 +206,8 @@ def test_components_add_up_and_scatter_as_they_should(engine: Engine, name: str,
     np.testing.assert_allclose(steps, np.rint(steps), atol=1e-6)
 
 
-def test_no_two_draws_share_a_counter(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Every counter that a run with all processes visits, listed: none twice, in any realisation, frame or exposure."""
+def test_draws_have_different_counters(monkeypatch: pytest.MonkeyPatch) -> None:
+    """List all counters of a run with all processes: none occurs twice in any realisation, frame or exposure."""
     seen: list[np.ndarray] = []
     philox = reference.philox
 
@@ -256,8 +256,8 @@ def test_no_two_draws_share_a_counter(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("level", [Uniform(0.5, 1.5), Uniform(0.2, 9.0)])
-def test_the_sky_follows_its_own_level(engine: Engine, level: Uniform) -> None:
-    """The sky's spectrum alone moves, and jitter dims it like the star: five standard errors, by chance once in 1e5."""
+def test_sky_follows_its_level(engine: Engine, level: Uniform) -> None:
+    """Check that only the sky changes, and that jitter dims it like the star: five standard errors fail once in 1e5."""
     (star_alone,) = star(payload=instrument(part=True))
     # As bright as the star, of another shape.
     slope = np.linspace(0.5, 1.5, star_alone.wavelength_nm.size)
@@ -281,7 +281,7 @@ def test_the_sky_follows_its_own_level(engine: Engine, level: Uniform) -> None:
         assert abs(of_sky.var() / wanted - 1) < 5 * error + abs(mean - 1) * noise[1] / wanted
 
 
-def test_the_list_of_what_priors_vary_is_one() -> None:
-    """The processes' fields, the study's keys and the list of what may vary name the same things in the same order."""
+def test_processes_and_study_have_keys_of_prior_targets() -> None:
+    """Compare the names and order of the processes' fields, the study's keys and the prior targets."""
     fields = [field.name for field in dataclasses.fields(Processes)]
-    assert fields == ["cosmic_rays", *VARIED] == list(NoiseProcesses.model_fields)
+    assert fields == ["cosmic_rays", *PRIOR_TARGETS] == list(NoiseProcesses.model_fields)

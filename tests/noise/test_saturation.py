@@ -19,7 +19,7 @@ STATISTICS = ("chi2", "chi2_element", "matched", "uv_excess")
 
 
 def bright(seed: int) -> tuple[Expectation, Expectation]:
-    """A star whose brightest pixel lies around saturation, and a flare that carries more of them there."""
+    """Return a star whose brightest pixel is close to saturation, and a flare that saturates more pixels."""
     some = np.random.default_rng(seed)
     frames = int(some.choice([1, 1, 2, 5]))
     frame_s = float(some.uniform(3.0, 7.0))
@@ -37,8 +37,8 @@ def bright(seed: int) -> tuple[Expectation, Expectation]:
 
 @pytest.mark.long
 @pytest.mark.parametrize("seed", range(12))
-def test_closed_forms_are_those_of_what_is_drawn(engine: Engine, seed: int) -> None:
-    """Means, variances and statistics of random bright stars and flares, in single frames and sums of some.
+def test_closed_forms_follow_simulation(engine: Engine, seed: int) -> None:
+    """Compare means, variances and statistics of random bright stars and flares, in single frames and sums.
 
     Five standard errors for 8 statistics, six for 198 pixels: by chance once in 1e5 seeds.
     """
@@ -64,8 +64,8 @@ def test_closed_forms_are_those_of_what_is_drawn(engine: Engine, seed: int) -> N
             assert abs(seen.mean - form.mean) < 5 * seen.std / np.sqrt(N) + known
 
 
-def test_the_twin_cuts_off_alike(engine: Engine) -> None:
-    """Counts of frames cut off, and rows, equal to the twin's; as often as the closed form says, to 5 sigma."""
+def test_clipped_counts_equal_reference(engine: Engine) -> None:
+    """Compare clipped frames and rows with the reference, and their frequency with the closed form, to 5 sigma."""
     quiet, flare = bright(1)
     index = np.arange(64, dtype=np.uint64)
     for x in (quiet, flare):
@@ -79,8 +79,8 @@ def test_the_twin_cuts_off_alike(engine: Engine) -> None:
         assert np.abs(counts - trials * x.cut_share).max() < 5 * spread.max()
 
 
-def test_priors_that_carry_light_to_saturation_are_drawn_frame_by_frame(engine: Engine) -> None:
-    """A stack cannot be cut off: what the prior may reach decides, not the mean."""
+def test_priors_that_reach_saturation_are_drawn_frame_by_frame(engine: Engine) -> None:
+    """Choose the mode by the prior's range instead of the mean, since stacks cannot be clipped."""
     quiet, _ = bright(1)
     stack = replace(quiet, n_frames=4, source_electrons=0.5 * quiet.source_electrons)
     assert not prepare([stack]).frames
@@ -89,8 +89,8 @@ def test_priors_that_carry_light_to_saturation_are_drawn_frame_by_frame(engine: 
     assert engine.realise(stack, count=2000, seed=2, processes=brighter).max() == 4 * 59_578
 
 
-def test_signal_to_noise_is_that_of_what_is_recorded(engine: Engine) -> None:
-    """The formula's S/N of pixels deep in saturation is the simulated one; five standard errors and the root's bend."""
+def test_snr_of_saturated_pixels_follows_simulation(engine: Engine) -> None:
+    """Compare formula and simulation deep in saturation: five standard errors and the bias of the square root."""
     quiet, flare = bright(1)
     for x in (quiet, flare):
         found = engine.snr(x, realisations=N, seed=3).pixel
@@ -100,8 +100,8 @@ def test_signal_to_noise_is_that_of_what_is_recorded(engine: Engine) -> None:
         np.testing.assert_allclose(x.signal_dn / budget["total"].value, x.snr(), rtol=1e-12)
 
 
-def test_a_flare_that_saturates_every_pixel_has_no_number(engine: Engine) -> None:
-    """Its values are those of saturation alone: NaN and a sentence, beside another flare's numbers."""
+def test_flare_that_saturates_every_pixel_gives_nan(engine: Engine) -> None:
+    """Return NaN and a message for this flare, and numbers for another one."""
     quiet, flare = bright(1)
     blinding = replace(flare, source_electrons=flare.source_electrons + 2e5, name="blinding")
     found = engine.detect(quiet, [flare, blinding], realisations=N, seed=4, statistics=("chi2", "matched"))
@@ -123,8 +123,8 @@ def test_a_flare_that_saturates_every_pixel_has_no_number(engine: Engine) -> Non
     )
 
 
-def test_what_saturates_is_told() -> None:
-    """How many pixels, and in what share of exposures; at times where no mean is saturated."""
+def test_saturated_pixels_and_exposures_are_reported() -> None:
+    """Report the number of pixels and the fraction of exposures, even if no mean is saturated."""
     from mauvecl.host.expectation import _saturation
 
     quiet, flare = bright(1)

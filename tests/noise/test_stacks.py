@@ -18,12 +18,12 @@ from mauvecl.noise.cumulants import Cumulants, stack_is_exact
 from mauvecl.noise.processes import Processes, Uniform
 from mauvecl.noise.scene import prepare
 
-#: By exact convolution no stack that is allowed is told from its frames sooner, in draws of one pixel.
+#: Smallest number of draws of one pixel that distinguish an allowed stack from its frames, by exact convolution.
 SOONEST = 4e13
 
 
 def quiet(read: float, frames: int, *, dark: float = 0.0, light: float = 0.0, gain: float = 0.6, **kind) -> Expectation:
-    """Eight pixels whose bias lies at different places in a DN."""
+    """Return eight pixels whose bias has different fractions of a DN."""
     x = toy(8, frames, read=read, dark=dark, light=light, **kind)
     full = np.ones(8)
     return replace(
@@ -36,7 +36,7 @@ def quiet(read: float, frames: int, *, dark: float = 0.0, light: float = 0.0, ga
 
 
 def both(x: Expectation, pixel: int) -> tuple[np.ndarray, np.ndarray, int]:
-    """Exact probabilities of the exposure's whole DN, frame by frame and as a stack, and the DN they start from."""
+    """Return the exact probabilities of whole DN, frame by frame and as a stack, and the first DN."""
     one, n = Cumulants.of(x, 1), x.n_frames
     read, dark, light = one.gaussian[pixel], x.dark_dn[pixel] / x.dark_step_dn[pixel], x.source_electrons[pixel]
     poisson = [(dark, float(x.dark_step_dn[pixel]))]
@@ -51,8 +51,8 @@ def both(x: Expectation, pixel: int) -> tuple[np.ndarray, np.ndarray, int]:
 
 
 @pytest.mark.long
-def test_the_worst_stack_that_is_allowed() -> None:
-    """A search over read noise, counts, gain, frames and phase for what tells a stack from its frames soonest."""
+def test_worst_allowed_stack_is_indistinguishable_from_frames() -> None:
+    """Search read noise, counts, gain, frames and phase for the stack that is easiest to distinguish."""
     tried = 0
 
     def merit(point: np.ndarray) -> float:
@@ -77,8 +77,8 @@ def test_the_worst_stack_that_is_allowed() -> None:
 
 
 @pytest.mark.long
-def test_random_stacks_of_quiet_frames() -> None:
-    """Where `auto` stacks, mean, variance and shape are those of the frames; where they are not, it draws frames."""
+def test_auto_mode_stacks_only_where_moments_agree() -> None:
+    """Check that `auto` draws frames wherever mean, variance or shape of the stack would differ."""
     generator = np.random.default_rng(14)
     stacked = wrong = 0
     for _ in range(150):
@@ -102,9 +102,11 @@ def test_random_stacks_of_quiet_frames() -> None:
     assert wrong > 20
 
 
-def test_a_nearly_noiseless_detector(engine: Engine) -> None:
-    """Read noise .15 DN, no dark, 20 frames: the stack's means were off by .38 standard deviations, its variance 118
-    times too large. Pearson's five sigma of each pixel's mean and variance: fails once in 1e5 seeds."""
+def test_nearly_noiseless_detector_is_drawn_frame_by_frame(engine: Engine) -> None:
+    """Compare means and variances for a read noise of 0.15 DN, no dark and 20 frames; fails once in 1e5 seeds.
+
+    A stack would have means off by 0.38 standard deviations and a variance 118 times too large.
+    """
     x = quiet(0.15, 20)
     rows = 40_000
     assert prepare([x]).frames
@@ -119,15 +121,15 @@ def test_a_nearly_noiseless_detector(engine: Engine) -> None:
         assert abs(((raw[:, pixel] - mean) ** 2).mean() - variance) < 5 * spread + 1e-9
 
 
-def test_priors_may_take_the_noise_away() -> None:
-    """Gaussian photons blur the rounding; the least light that a prior leaves decides."""
+def test_mode_follows_least_light_of_prior() -> None:
+    """Choose the mode by the least light that a prior allows, whose photons smooth the rounding least."""
     x = quiet(0.1, 100, light=60.0)
     assert not prepare([x]).frames
     assert prepare([x], processes=Processes(qe_scale=Uniform(0.01, 1.0))).frames
 
 
-def test_the_payload_is_stacked() -> None:
-    """As it is, its read noise of 12 DN makes noise of all rounding."""
+def test_payload_is_drawn_as_stack() -> None:
+    """Draw stacks, since the read noise of 12 DN smooths all rounding."""
     for name in ("mauve", "mauve-electrons"):
         for temperature in (-40.0, 21.0):
             for exposure in (10.0, 500.0):

@@ -12,7 +12,7 @@ from mauvecl.lightcurve.stares.components import STEADY
 from mauvecl.lightcurve.stares.scene import Flares, StareScene, unique
 from mauvecl.lightcurve.stares.sums import SumTable
 from mauvecl.noise import layout, reference
-from mauvecl.noise.reference import MAGIC, fma, four_normals, together
+from mauvecl.noise.reference import MAGIC, combine_factors, fma, four_normals
 
 Floats = NDArray[np.float32]
 Numbers = NDArray[np.uint64]
@@ -50,8 +50,8 @@ def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int) -> dic
     star, star_less_one, sky, sky_less_one, dark, dark_less_one = scene.known[:6, frame]
     light = moved["light"]
     return {
-        "star": fma(star, together(light, moved["star"]), star_less_one),
-        "sky": fma(sky, together(light, moved["sky"]), sky_less_one),
+        "star": fma(star, combine_factors(light, moved["star"]), star_less_one),
+        "sky": fma(sky, combine_factors(light, moved["sky"]), sky_less_one),
         "dark": fma(dark, exponential_less_one(moved["temperature"] * scene.staring["dark_slope"]), dark_less_one),
         "light": light,
     }

@@ -18,7 +18,7 @@ from scipy import special
 
 from mauvecl.host.errors import InputError
 from mauvecl.noise import layout
-from mauvecl.noise.drawn import at_score
+from mauvecl.noise.factor_distributions import quantile_at_score
 from mauvecl.results.requests.fap import check_atom
 from mauvecl.statistics.distributions import Form, Mixture, QuadraticForm
 from mauvecl.statistics.intervals import CONFIDENCE, Interval
@@ -295,7 +295,7 @@ def _factors(
             score = np.where(moved, mean + sd * score, score)
             # Ratio of the moved density to the prior's.
             ratio += (score[:, 0] ** 2 - ((score[:, 0] - mean) / sd) ** 2) / 2 - np.log(sd)
-        factors[factor] *= 1.0 + at_score(table, score).mean(axis=1, keepdims=True)
+        factors[factor] *= 1.0 + quantile_at_score(table, score).mean(axis=1, keepdims=True)
     return {name: values - 1.0 for name, values in factors.items()}, np.log(2.0) - np.logaddexp(0.0, ratio)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
-from mauvecl.noise.drawn import Drawn
+from mauvecl.noise.factor_distributions import FactorDistributions
 from mauvecl.noise.scene import Scene
 from mauvecl.statistics.distributions import Form
 from mauvecl.statistics.linear import Linear, Matched
@@ -56,7 +56,7 @@ class Hypotheses:
     def __post_init__(self) -> None:
         self._chosen = statistics_by_name(self.asked)
         self.statistics = tuple(self._chosen)
-        drawn = Drawn.of(self.scene) if self.nuisances else None
+        drawn = FactorDistributions.of(self.scene) if self.nuisances else None
         self.setting = Setting(self.quiet, self.scene.used, self.scene.comparison, self.flares, self.nuisances, drawn)
         shaped = next((name for name, one in self._chosen.items() if one.shaped), None)
         if shaped is not None and not self.flares:

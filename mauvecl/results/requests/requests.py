@@ -15,7 +15,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.host.quantities import count
 from mauvecl.noise.comparison import NOISE_FREE, Comparison
-from mauvecl.noise.drawing import AUTOMATIC, Drawing, DrawingWords
+from mauvecl.noise.drawing import AUTOMATIC, Drawing, DrawingOptions
 from mauvecl.noise.scene import BATCH, Scene, prepare
 from mauvecl.results.requests.channels import ChannelPlan, plan_channels
 from mauvecl.results.requests.fap import Tails
@@ -70,7 +70,7 @@ class Countable:
     @classmethod
     def of(cls, *what: Any, **how: Any) -> Self:
         """Make a request from keywords that may include the fields of a `Drawing`."""
-        words = {name: how.pop(name) for name in DrawingWords.__annotations__ if name in how}
+        words = {name: how.pop(name) for name in DrawingOptions.__annotations__ if name in how}
         return cls(*what, **how | {"drawing": Drawing(**words)})
 
     def __getstate__(self) -> dict[str, Any]:

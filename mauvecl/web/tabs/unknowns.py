@@ -9,7 +9,7 @@ import numpy as np
 from scipy import special
 
 from mauvecl.answers.detection.unknown_cost import spoken, unknown_cost
-from mauvecl.noise.usual import USUAL
+from mauvecl.noise.default_unknowns import DEFAULT_UNKNOWNS
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.web.closed import percent
 from mauvecl.web.figures import Canvas
@@ -25,7 +25,9 @@ Row = tuple[str, float, float]
 @lru_cache(maxsize=4)
 def costs(closed: Closed) -> tuple[float, list[Row]]:
     """The matched S/N of the flare with everything known, and with each unknown alone and together."""
-    alone = [NuisanceChoice.model_validate({u.nuisance: _spread(u.sd)}) for u in USUAL] + [NuisanceChoice(tilt="free")]
+    alone = [NuisanceChoice.model_validate({u.nuisance: _spread(u.sd)}) for u in DEFAULT_UNKNOWNS] + [
+        NuisanceChoice(tilt="free")
+    ]
     chosen = {spoken(choice).removeprefix("the "): choice for choice in alone}
     chosen["all the usual together"] = NuisanceChoice(usual=True)
     if closed.study.nuisances.own:

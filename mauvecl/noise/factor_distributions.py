@@ -1,4 +1,4 @@
-"""What priors draw, as nodes with weights: closed forms integrate over them where the engine draws."""
+"""Distributions of the random factors on light, dark and sky, as quadrature nodes for closed forms."""
 
 from __future__ import annotations
 
@@ -15,40 +15,34 @@ from mauvecl.noise.prior_tables import nodes
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
+    from mauvecl.noise.prior_targets import SignalPart
     from mauvecl.noise.processes import Processes
     from mauvecl.noise.scene import Scene
-    from mauvecl.noise.varied import Modulated
 
 Float = NDArray[np.float64]
 
-#: Nodes of the trapezoidal rule over a prior's normal score, and how far they reach. It converges exponentially for
-#: what is smooth over a step (Trefethen & Weideman 2014, doi 10.1137/130932132).
+#: Number of nodes of the trapezoidal rule over a prior's normal score, and its range. The rule converges exponentially
+#: for functions that are smooth over a step (Trefethen & Weideman 2014, doi 10.1137/130932132).
 NODES, REACH = 281, 7.0
 SCORE = np.linspace(-REACH, REACH, NODES)
 WEIGHTS = np.exp(-(SCORE**2) / 2) / np.exp(-(SCORE**2) / 2).sum()
-#: Every so many of them do for sums of squares, which are wide; a weighted sum may be narrower than a prior by far.
+#: Sums of squares use every tenth node, since they are wide; weighted sums may be much narrower than a prior.
 COARSE = 10
-#: Nodes of Gauss and Hermite's rule for factors beside the first.
+#: Nodes of the Gauss-Hermite rule for factors after the first.
 FEW = 7
-#: A factor counts as a normal amplitude of a known spectrum if one standard deviation of it moves no pixel's variance
-#: by more than this fraction, in weighted sums and in sums of squares, and its values lie this near a straight line of
-#: the score, root mean square in standard deviations.
+#: A factor is treated as a normal amplitude of a known spectrum if one standard deviation changes no pixel's variance
+#: by more than this fraction (for weighted sums, and for sums of squares), and its values deviate from a linear
+#: function of the score by less than `STRAIGHT` standard deviations, root mean square.
 VARIANCE_FRACTION = {True: 1e-2, False: 1e-3}
 STRAIGHT = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class Spread:
-    """A factor's distribution.
+class FactorDistribution:
+    """Distribution of a factor as quadrature nodes."""
 
-    Attributes
-    ----------
-    values, weights : ndarray, shape (n,)
-        Nodes and their weights, which sum to one.
-    """
-
-    values: Float
-    weights: Float
+    values: Float  # shape (n,)
+    weights: Float  # shape (n,), sum one
 
     @property
     def mean(self) -> float:
@@ -60,64 +54,48 @@ class Spread:
 
     @property
     def normal(self) -> bool:
-        """Whether the factor is a straight line of a normal score."""
+        """Whether the factor is a linear function of a normal score."""
         if self.values.size == 1:
             return True
         off = self.values - self.mean - self.sd * SCORE
         return float(np.sqrt(self.weights @ off**2)) <= STRAIGHT * self.sd
 
 
-NOTHING = Spread(np.ones(1), np.ones(1))
+UNIT_FACTOR = FactorDistribution(np.ones(1), np.ones(1))
 
 
 @dataclass(frozen=True)
 class Node:
-    """One set of factors.
-
-    Attributes
-    ----------
-    probability : float
-        Of it.
-    dark, light, sky : float
-        Factors.
-    scores : dict of str to float
-        Their normal scores.
-    """
+    """Quadrature node: a set of factors on dark, light and sky."""
 
     probability: float
     dark: float
     light: float
     sky: float
-    scores: dict[str, float]
+    scores: dict[str, float]  # normal score of each factor
 
     def on(self, x: Expectation) -> tuple[Float, Float]:
-        """DN and DN^2 added to means and variances of an exposure, each shape (n_pixel,)."""
-        # The sky's light follows the factors on all light, too.
+        """Return the changes of an exposure's means (DN) and variances (DN^2), each shape (n_pixel,)."""
+        # Factors on all light include the sky's.
         more = (self.light - 1.0) * x.recorded_light_dn + self.light * (self.sky - 1.0) * x.sky_dn
         dark = (self.dark - 1.0) * x.n_frames
         return more + dark * x.dark_dn, x.gain_dn_per_electron * more + dark * x.dark_variance_dn2
 
 
 @dataclass(frozen=True, eq=False)
-class Drawn:
-    """What is drawn of the factors on light, dark and sky, averaged over an exposure.
+class FactorDistributions:
+    """Distributions of the drawn factors on light, dark and sky, averaged over an exposure."""
 
-    Attributes
-    ----------
-    spreads : mapping of str to Spread
-        Of those that are drawn.
-    """
-
-    spreads: Mapping[str, Spread]
+    spreads: Mapping[str, FactorDistribution]
 
     @classmethod
-    def of(cls, scene: Scene) -> Drawn | None:
-        """Of a scene; None where nothing is drawn."""
+    def of(cls, scene: Scene) -> FactorDistributions | None:
+        """Return the distributions of a scene, or None if it draws no factors."""
         return cls._of(scene.modulations, scene.priors, scene.medians, scene.n_frames)
 
     @classmethod
-    def by(cls, processes: Processes, quiet: Expectation) -> Drawn | None:
-        """What a scene of a star would hold, without its arrays; None where nothing is drawn."""
+    def from_processes(cls, processes: Processes, quiet: Expectation) -> FactorDistributions | None:
+        """Return the distributions of processes for a star, or None if they draw no factors."""
         if not processes.modulations:
             return None
         factors = processes.factors(quiet.conditions)
@@ -127,34 +105,34 @@ class Drawn:
     @classmethod
     def _of(
         cls,
-        modulations: Sequence[tuple[str, Modulated]],
+        modulations: Sequence[tuple[str, SignalPart]],
         tables: NDArray[np.float32],
         medians: tuple[float, float, float],
         n_frames: int,
-    ) -> Drawn | None:
-        spreads: dict[str, list[Spread]] = {}
+    ) -> FactorDistributions | None:
+        spreads: dict[str, list[FactorDistribution]] = {}
         for (name, factor), table in zip(modulations, tables, strict=True):
             one = _of_table(table)
             if name == "jitter" and n_frames > 1:
                 one = _normal(one.mean, one.sd / np.sqrt(n_frames))
             spreads.setdefault(factor, []).append(one)
         median = dict(zip(("light", "dark", "sky"), medians, strict=True))
-        return cls({name: _together(ones, median[name]) for name, ones in spreads.items()}) if spreads else None
+        return cls({name: _product(ones, median[name]) for name, ones in spreads.items()}) if spreads else None
 
     def nodes(self, x: Expectation, *, weighted: bool) -> tuple[list[Node], Float]:
-        """What the factors do to an exposure.
+        """Return the nodes over which a statistic of an exposure is integrated.
 
         Parameters
         ----------
         x : Expectation
         weighted : bool
-            For a weighted sum, or for a sum of squares.
+            Whether the statistic is a weighted sum instead of a sum of squares.
 
         Returns
         -------
         nodes : list of Node
         rows : ndarray, shape (k, n_pixel)
-            Of normal amplitudes beside them: DN of one standard deviation.
+            Spectra of factors treated as normal amplitudes, DN per standard deviation.
         """
         gain, light, sky = x.gain_dn_per_electron, x.recorded_light_dn, x.sky_dn
         dark, dark_variance = x.n_frames * x.dark_dn, x.n_frames * x.dark_variance_dn2
@@ -163,7 +141,7 @@ class Drawn:
         every, few = 1 if weighted else COARSE, np.polynomial.hermite_e.hermegauss(FEW)
         score, weight = SCORE[::every], WEIGHTS[::every] / WEIGHTS[::every].sum()
         for name, (part, variance) in moved.items():
-            spread = self.spreads.get(name, NOTHING)
+            spread = self.spreads.get(name, UNIT_FACTOR)
             if spread.normal and (spread.sd * variance <= VARIANCE_FRACTION[weighted] * x.variance_dn2).all():
                 if spread.sd:
                     rows.append(spread.sd * part)
@@ -179,26 +157,26 @@ class Drawn:
         return nodes, np.array(rows).reshape(len(rows), light.size)
 
 
-def _normal(mean: float, sd: float) -> Spread:
-    return Spread(mean + sd * SCORE, WEIGHTS)
+def _normal(mean: float, sd: float) -> FactorDistribution:
+    return FactorDistribution(mean + sd * SCORE, WEIGHTS)
 
 
-def _of_table(table: NDArray[np.float32]) -> Spread:
-    """Of a device's table of quantiles: a factor over that at the median."""
-    return Spread(1.0 + at_score(table, SCORE), WEIGHTS)
+def _of_table(table: NDArray[np.float32]) -> FactorDistribution:
+    """Return the distribution given by a device's quantile table, relative to the factor at the median."""
+    return FactorDistribution(1.0 + quantile_at_score(table, SCORE), WEIGHTS)
 
 
-def at_score(table: NDArray[np.float32], score: Float) -> Float:
-    """What a device's table of quantiles holds where a standard normal has a value; shape as given."""
+def quantile_at_score(table: NDArray[np.float32], score: Float) -> Float:
+    """Interpolate a device's quantile table at standard normal scores; the result has the shape of `score`."""
     below, above = special.ndtr(score), special.ndtr(-score)
     tail, (low, high) = nodes(), np.split(table.astype(np.float64), 2)
     return np.asarray(np.where(below < 0.5, np.interp(below, tail, low), np.interp(above, tail, high)))
 
 
-def _together(ones: list[Spread], median: float) -> Spread:
-    """The product of independent factors; of several by its mean and variance."""
+def _product(ones: list[FactorDistribution], median: float) -> FactorDistribution:
+    """Return the distribution of a product of independent factors; of several, a normal with its mean and variance."""
     if len(ones) == 1:
-        return Spread(median * ones[0].values, ones[0].weights)
+        return FactorDistribution(median * ones[0].values, ones[0].weights)
     mean = np.prod([one.mean for one in ones])
     square = np.prod([one.mean**2 + one.sd**2 for one in ones])
     return _normal(float(median * mean), float(median * np.sqrt(square - mean**2)))

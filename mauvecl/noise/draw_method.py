@@ -1,4 +1,4 @@
-"""How scenarios must be drawn, chosen by what their noise allows; what cannot be drawn is refused."""
+"""Choice of the method by which the noise of scenarios is drawn."""
 
 from __future__ import annotations
 
@@ -18,44 +18,28 @@ from mauvecl.noise.processes import CosmicRays, Factors
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
 
-#: `frames` is chosen where a pixel's mean is within this many sigma of a rail.
+#: Frames are drawn one by one if a pixel's mean is within this many standard deviations of a rail.
 RAIL_SIGMA = 8.0
-#: Counts further from their base than this are not rounded to whole DN by the device.
+#: The device does not round counts correctly beyond this distance from their base.
 REACH_DN = 2.0**22
-#: Groups of four pixels have 24 bits in the counter.
+#: Limit of the counter's 24 bits for groups of four pixels.
 MAX_PIXELS = 65_536
 
 
 @dataclass(frozen=True, eq=False)
-class Choice:
-    """How scenarios are drawn.
-
-    Attributes
-    ----------
-    frames, joint, quartic, photons : bool
-        See `Scene`.
-    each : int
-        Frames in one draw.
-    cumulants : list of Cumulants
-        Of one draw of each scenario.
-    """
+class DrawMethod:
+    """Method by which scenarios are drawn; see `Scene` for the switches."""
 
     frames: bool
     joint: bool
     quartic: bool
     photons: bool
-    each: int
-    cumulants: list[Cumulants]
+    each: int  # frames per draw
+    cumulants: list[Cumulants]  # of one draw of each scenario
 
 
-def choose(scenarios: Sequence[Expectation], drawing: Drawing, factors: Factors) -> Choice:
-    """How scenarios are drawn.
-
-    Raises
-    ------
-    InputError
-        If they cannot be drawn as asked for, or not together.
-    """
+def choose_method(scenarios: Sequence[Expectation], drawing: Drawing, factors: Factors) -> DrawMethod:
+    """Choose the method for scenarios. Raises InputError if they cannot be drawn as requested, or not together."""
     quiet, processes = scenarios[0], drawing.processes
     modulations = processes.modulations
     if quiet.wavelength_nm.size > MAX_PIXELS:
@@ -73,7 +57,7 @@ def choose(scenarios: Sequence[Expectation], drawing: Drawing, factors: Factors)
             f"{modulations[0][0]} varies within a run, and the noise of {quiet.name} cannot be drawn jointly, expected "
             "Gaussian noise of 1.5 Poisson counts and more in each pixel, more where counts are few, or no such process"
         )
-    return Choice(
+    return DrawMethod(
         frames=frames,
         joint=joint,
         quartic=joint and any(needs_fourth_power(c, varying=bool(modulations)) for row in varied for c in row),
@@ -84,9 +68,9 @@ def choose(scenarios: Sequence[Expectation], drawing: Drawing, factors: Factors)
 
 
 def near_rail(x: Expectation, factors: Factors, rays: CosmicRays | None) -> NDArray[np.bool_]:
-    """Pixels whose single frame comes within `RAIL_SIGMA` of zero or of saturation, shape (n_pixel,).
+    """Return the pixels whose frames come within `RAIL_SIGMA` of zero or saturation, shape (n_pixel,).
 
-    With priors wherever they carry it, and with as many hits of cosmic rays as a frame may collect.
+    The limits include all values allowed by the priors and the largest number of cosmic rays per frame.
     """
     variance, light = x.unsaturated_variance_dn2 / x.n_frames, x.light_dn / x.n_frames
     mean = x.mean_raw_dn
@@ -103,7 +87,7 @@ def near_rail(x: Expectation, factors: Factors, rays: CosmicRays | None) -> NDAr
 
 
 def _corners(factors: Factors) -> list[tuple[float, float, float]]:
-    """Factors on light, dark and sky over all that the priors allow, neighbours at most a factor of 2 apart."""
+    """Return a grid of factors on light, dark and sky that spans the priors in steps of at most 2."""
     ends = (factors.light_ends, factors.dark_ends, factors.sky_ends)
     grids = [np.geomspace(low, high, 1 + int(np.ceil(np.log2(high / low)))) for low, high in ends]
     return [(float(light), float(dark), float(sky)) for light in grids[0] for dark in grids[1] for sky in grids[2]]
@@ -115,7 +99,7 @@ def _scaled(x: Expectation, c: Cumulants, corner: tuple[float, float, float]) ->
 
 
 def _joint(scenarios: Sequence[Expectation], varied: Sequence[Sequence[Cumulants]], recipe: Recipe) -> bool:
-    """Whether every pixel's noise may come from one normal, whatever the factors on light and dark."""
+    """Return whether each pixel's noise can be drawn from one normal for all factors on light and dark."""
     if recipe == "apart":
         return False
     for x, c in ((x, c) for x, row in zip(scenarios, varied, strict=True) for c in row):
@@ -125,7 +109,7 @@ def _joint(scenarios: Sequence[Expectation], varied: Sequence[Sequence[Cumulants
                 pixel = int(np.argmin(exact))
                 raise InputError(
                     f"recipe = 'joint', and pixel {pixel} of {x.name} has {np.sqrt(c.gaussian[pixel]):.3g} DN of "
-                    "Gaussian noise beside Poisson counts, expected recipe 'apart' or 'auto'"
+                    "Gaussian noise next to Poisson counts, expected recipe 'apart' or 'auto'"
                 )
             return False
     return True
@@ -139,11 +123,11 @@ def _draw_frames(
     corners: Sequence[tuple[float, float, float]],
 ) -> bool:
     if scenarios[0].n_frames == 1 or mode == "frames":
-        # One frame is its own stack: the same draws either way.
+        # For a single frame, both modes give the same draws.
         return mode == "frames" and scenarios[0].n_frames > 1
     for x in scenarios:
         near = near_rail(x, factors, rays)
-        # The less light and dark, the less the rounding is noise.
+        # The approximation of rounding as noise is worst for the least light and dark.
         coarse = ~stack_is_exact(_scaled(x, Cumulants.of(x, 1), corners[0]), x)
         for pixels, why in (
             (near, f"cannot clip, and a frame comes within {RAIL_SIGMA:g} sigma of zero or saturation"),
@@ -161,7 +145,7 @@ def _draw_frames(
 
 
 def check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
-    """Refuse what the priors could carry further than the device rounds."""
+    """Raise InputError if the priors allow counts beyond the range in which the device rounds correctly."""
     share = sky_share(x)
     least, most = (factors.on_light(*ends, share) for ends in zip(factors.light_ends, factors.sky_ends, strict=True))
     middle = factors.on_light(factors.light, factors.sky, share)
@@ -172,7 +156,7 @@ def check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
     if (reach >= REACH_DN).any():
         pixel = int(np.argmax(reach))
         raise InputError(
-            f"the priors carry pixel {pixel} of {x.name} {reach[pixel]:.3g} DN away from its mean, expected less than "
+            f"the priors move pixel {pixel} of {x.name} {reach[pixel]:.3g} DN away from its mean, expected less than "
             f"{REACH_DN:g}: shorten the exposure or draw frame by frame"
         )
 

@@ -6,27 +6,27 @@ import numpy as np
 import pytest
 from scenes import instrument, star
 
-from mauvecl.noise.drawn import Drawn
+from mauvecl.noise.factor_distributions import FactorDistributions
 from mauvecl.noise.processes import Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare
 from mauvecl.statistics.distributions import Gaussian, Mixture, QuadraticForm
 
 
-def drawn(**priors: Normal | Uniform) -> tuple[Drawn, float]:
-    """Of a few pixels, and by how much the dark follows the temperature."""
+def drawn(**priors: Normal | Uniform) -> tuple[FactorDistributions, float]:
+    """Return the distributions for a few pixels, and the slope of the dark with temperature."""
     quiet, *_ = star(payload=instrument(part=True))
-    found = Drawn.of(prepare([quiet], processes=Processes(**priors)))
+    found = FactorDistributions.of(prepare([quiet], processes=Processes(**priors)))
     assert found is not None
     return found, quiet.conditions["dark_slope_per_c"]
 
 
-def test_nothing_drawn_is_nothing() -> None:
+def test_no_processes_give_no_distributions() -> None:
     quiet, *_ = star(payload=instrument(part=True))
-    assert Drawn.of(prepare([quiet])) is None
+    assert FactorDistributions.of(prepare([quiet])) is None
 
 
-def test_moments_are_the_priors() -> None:
-    """The exponential of a normal temperature, a uniform loss, and the mean of ten frames' jitter; one in float32."""
+def test_moments_equal_those_of_priors() -> None:
+    """Compare the exponential of a normal temperature, a uniform loss and the mean jitter of ten frames, to float32."""
     found, slope = drawn(detector_temperature=Normal(21.0, 0.5, 17.0, 25.0))
     dark, s2 = found.spreads["dark"], (slope * 0.5) ** 2
     assert dark.mean == pytest.approx(np.exp(s2 / 2), rel=2e-6)
@@ -45,8 +45,8 @@ def test_moments_are_the_priors() -> None:
 
 
 @pytest.mark.parametrize("weighted", [True, False])
-def test_nodes_are_a_distribution(weighted: bool) -> None:
-    """Whatever is drawn: shares of one, and the factors' means."""
+def test_nodes_sum_to_one_and_have_mean_of_factors(weighted: bool) -> None:
+    """Check the sum of probabilities and the means of factors."""
     quiet, *_ = star("K3V", 3.7, payload=instrument(part=True))
     how = Processes(
         jitter=Uniform(0.0, 0.05),
@@ -54,7 +54,7 @@ def test_nodes_are_a_distribution(weighted: bool) -> None:
         light_loss=Uniform(0.2, 0.5),
         sky_level=Normal(1.0, 0.1, 0.5, 1.5),
     )
-    found = Drawn.of(prepare([quiet], processes=how))
+    found = FactorDistributions.of(prepare([quiet], processes=how))
     assert found is not None
     nodes, rows = found.nodes(quiet, weighted=weighted)
     share = np.array([node.probability for node in nodes])
@@ -66,8 +66,8 @@ def test_nodes_are_a_distribution(weighted: bool) -> None:
     assert rows[0] == pytest.approx(found.spreads["sky"].sd * quiet.sky_dn)
 
 
-def test_a_mixture_is_its_parts() -> None:
-    """Moments, tails and quantiles of normals and sums of squares drawn by turns: 4.5 standard errors of 4e5 draws."""
+def test_mixture_follows_simulation() -> None:
+    """Compare moments, tails and quantiles with draws from the components: 4.5 standard errors of 4e5 draws."""
     rng, n = np.random.default_rng(20_261_122), 400_000
     weight, shift = np.array([0.5, 2.0, 1.0]), np.array([0.3, 1.0, 0.0])
     found = Mixture((Gaussian(-1.0, 0.5), QuadraticForm(weight, shift)), np.array([0.3, 0.7]))

@@ -1,4 +1,4 @@
-"""The unknowns that `--with-unknowns` draws and marginalises over: one table, which documentation and messages read."""
+"""Default unknowns, which `--with-unknowns` draws and marginalises."""
 
 from __future__ import annotations
 
@@ -9,23 +9,25 @@ from mauvecl.noise.priors import Normal, Prior, Uniform
 
 
 @dataclass(frozen=True)
-class Usual:
-    """One unknown.
+class DefaultUnknown:
+    """Default treatment of an unknown.
 
     Attributes
     ----------
     nuisance : str
-        Its spectrum, of `statistics.nuisances.NUISANCES`.
+        Name of its spectrum in `statistics.nuisances.NUISANCES`.
     process : str
-        What draws it, of `processes.Processes`.
+        Name of the process in `processes.Processes` that draws it.
     prior : callable
-        From the detector's nominal temperature, deg C, to what is drawn.
+        Function that returns the prior for the detector's nominal temperature, deg C.
     sd : float
-        The prior standard deviation that statistics take; infinite where it is projected out.
+        Prior standard deviation for statistics; infinite if the unknown is projected out.
     scatter : float
-        Root mean square of the amplitude that is drawn.
-    drawn, marginalised, source : str
-        The same in words; a source, or the word assumption.
+        Root mean square of the drawn amplitude.
+    drawn, marginalised : str
+        Descriptions of the draw and of the marginalisation, for messages and documentation.
+    source : str
+        Source of the values, or "assumption".
     """
 
     nuisance: str
@@ -38,8 +40,8 @@ class Usual:
     source: str
 
 
-USUAL = (
-    Usual(
+DEFAULT_UNKNOWNS = (
+    DefaultUnknown(
         "dark",
         "detector_temperature",
         lambda t: Normal(t, 0.5, t - 2.5, t + 2.5),
@@ -49,7 +51,7 @@ USUAL = (
         "free: the dark current follows the temperature by an exponential, which is no normal amplitude",
         "assumption: the thermal cycle of one orbit",
     ),
-    Usual(
+    DefaultUnknown(
         "light",
         "jitter",
         lambda _: Uniform(0.0, 0.05),
@@ -59,7 +61,7 @@ USUAL = (
         "free: the mean loss is unknown too, and so is the star's own level",
         "the paper: light lost by pointing errors stays below 5 %; uniform and anew in each frame: assumption",
     ),
-    Usual(
+    DefaultUnknown(
         "sky",
         "sky_level",
         lambda _: Normal(1.0, 0.1, 0.5, 1.5),

@@ -1,6 +1,6 @@
-"""What priors may be put on: one list, which processes, the study's keys and kernels' tables follow.
+"""Values on which priors can be set; processes, study keys and kernel tables follow this list.
 
-Read before anything large is loaded: a wrong key is told at once.
+The module imports no large package, so that wrong keys are reported immediately.
 """
 
 from __future__ import annotations
@@ -16,33 +16,33 @@ if TYPE_CHECKING:
     Float = NDArray[np.float64]
 
 Conditions = Mapping[str, float]
-Modulated = Literal["light", "dark", "sky"]
+SignalPart = Literal["light", "dark", "sky"]
 
 
 @dataclass(frozen=True)
-class Varied:
-    """What a prior may be put on.
+class PriorTarget:
+    """Value on which a prior can be set.
 
     Attributes
     ----------
     low, high : float
-        Ends of what it may be.
+        Range of allowed values.
     change : callable
-        From an expectation's conditions and values drawn to the factor less one.
+        Function of an expectation's conditions and drawn values that returns the factor minus one.
     of : {"light", "dark", "sky"}
-        What the factor is on.
+        Part of the signal that the factor multiplies.
     expected : str or float
-        What the expectation has: a key of its conditions, or a value.
+        Value in the expectation, or its key in the expectation's conditions.
     """
 
     low: float
     high: float
     change: Callable[[Conditions, Float], Float]
-    of: Modulated = "light"
+    of: SignalPart = "light"
     expected: str | float = 1.0
 
     def expected_in(self, conditions: Conditions) -> float:
-        """Return the value that an expectation has."""
+        """Return the value in an expectation."""
         return conditions[self.expected] if isinstance(self.expected, str) else self.expected
 
 
@@ -52,16 +52,16 @@ def _dark_follows(at: Conditions, temperature_c: Float) -> Float:
     return np.asarray(np.expm1(at["dark_slope_per_c"] * (temperature_c - at["temperature_c"])))
 
 
-#: The one list of them, in the order of their tables in kernels; `Processes` and the study's section have these names.
-VARIED = {
-    "jitter": Varied(0.0, 0.5, lambda _, lost: -lost, expected=0.0),
-    "detector_temperature": Varied(-100.0, 100.0, _dark_follows, "dark", "temperature_c"),
-    "light_loss": Varied(
+#: All targets in the order of their tables in kernels; fields of `Processes` and keys of studies have these names.
+PRIOR_TARGETS = {
+    "jitter": PriorTarget(0.0, 0.5, lambda _, lost: -lost, expected=0.0),
+    "detector_temperature": PriorTarget(-100.0, 100.0, _dark_follows, "dark", "temperature_c"),
+    "light_loss": PriorTarget(
         0.0, 0.99, lambda at, lost: (at["light_loss"] - lost) / (1.0 - at["light_loss"]), expected="light_loss"
     ),
-    "pointing_loss": Varied(
+    "pointing_loss": PriorTarget(
         0.0, 0.99, lambda at, lost: (at["pointing_loss"] - lost) / (1.0 - at["pointing_loss"]), expected="pointing_loss"
     ),
-    "qe_scale": Varied(0.01, 100.0, lambda _, scale: scale - 1.0),
-    "sky_level": Varied(0.01, 100.0, lambda _, level: level - 1.0, "sky"),
+    "qe_scale": PriorTarget(0.01, 100.0, lambda _, scale: scale - 1.0),
+    "sky_level": PriorTarget(0.01, 100.0, lambda _, level: level - 1.0, "sky"),
 }
