@@ -13,7 +13,7 @@ from pathlib import Path
 from astropy.table import vstack
 from tables import write
 
-from mauvecl import Study, limiting_magnitude
+from mauvecl import Study, limit
 from mauvecl.answers.limits.assumptions import what_matters
 from mauvecl.statistics.registry import STATISTICS
 
@@ -41,7 +41,7 @@ def main() -> None:
     parts = []
     for amplitude in (0.081, 0.24):
         for exposure in (5.0, 50.0):
-            table = limiting_magnitude(study(exposure, amplitude, *STATISTICS)).table
+            table = limit(study(exposure, amplitude, *STATISTICS)).table
             table["exposure"] = exposure
             table.meta.clear()
             parts.append(table[list(KEPT)])

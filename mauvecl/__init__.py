@@ -10,6 +10,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from mauvecl import drawable
+from mauvecl.answers.verbs import HOMES
 from mauvecl.host.version import VERSION
 
 if sys.platform == "win32":
@@ -21,12 +22,12 @@ if TYPE_CHECKING:
     from mauvecl.answers.campaigns.plan import plan
     from mauvecl.answers.campaigns.visible import visible
     from mauvecl.answers.detection.detect import detect
-    from mauvecl.answers.detection.gaussian import gaussian_report
-    from mauvecl.answers.detection.maps import detection_map
+    from mauvecl.answers.detection.gaussian import gaussian, gaussian_report
+    from mauvecl.answers.detection.maps import detection_map, map
     from mauvecl.answers.limits.assumptions import what_matters
-    from mauvecl.answers.limits.limits import limiting_magnitude, shortest_exposure, smallest_amplitude
+    from mauvecl.answers.limits.limits import limit, limiting_magnitude, shortest_exposure, smallest_amplitude
     from mauvecl.answers.measurements.measure import measure
-    from mauvecl.answers.signal.exposures import exposure_for
+    from mauvecl.answers.signal.exposures import exposure, exposure_for
     from mauvecl.answers.signal.simulate import simulate
     from mauvecl.answers.signal.snr import snr
     from mauvecl.answers.stares.inject import inject
@@ -102,12 +103,16 @@ __all__ = [
     "detect",
     "detection_map",
     "expect",
+    "exposure",
     "exposure_for",
     "fit",
     "forecast",
+    "gaussian",
     "gaussian_report",
     "inject",
+    "limit",
     "limiting_magnitude",
+    "map",
     "measure",
     "plan",
     "shortest_exposure",
@@ -119,8 +124,8 @@ __all__ = [
     "what_matters",
 ]
 
-#: Where each is at home; `bulk` is a module.
-_HOMES = {
+#: Where each is at home, verbs apart; `bulk` is a module.
+_HOMES = HOMES | {
     "BalmerFlare": "host.stars.flare_spectra",
     "Blackbody": "host.stars.flare_spectra",
     "FlareModel": "results.measurements.model",
@@ -159,21 +164,10 @@ _HOMES = {
     "Uniform": "noise.priors",
     "bulk": "store",
     "departures": "results.detection.departures",
-    "detect": "answers.detection.detect",
-    "detection_map": "answers.detection.maps",
     "expect": "host.expectation",
     "exposure_for": "answers.signal.exposures",
-    "gaussian_report": "answers.detection.gaussian",
-    "inject": "answers.stares.inject",
-    "limiting_magnitude": "answers.limits.limits",
-    "measure": "answers.measurements.measure",
     "shortest_exposure": "answers.limits.limits",
-    "plan": "answers.campaigns.plan",
-    "simulate": "answers.signal.simulate",
     "smallest_amplitude": "answers.limits.limits",
-    "snr": "answers.signal.snr",
-    "stare": "answers.stares.stare",
-    "visible": "answers.campaigns.visible",
     "what_matters": "answers.limits.assumptions",
 }
 

@@ -9,22 +9,20 @@ import os
 import re
 import sys
 from collections.abc import Callable
+from importlib import import_module
+from pkgutil import iter_modules
 from typing import Annotated
 
 import typer
 
+from mauvecl.answers.verbs import VERBS
+from mauvecl.cli import verbs
 from mauvecl.cli.boundary import EXIT_CODES, guarded
+from mauvecl.cli.verb import COMMANDS
 from mauvecl.cli.verbs.about import devices, schema, selftest
 from mauvecl.cli.verbs.bulk import export, realise, verify
-from mauvecl.cli.verbs.detect import detect, gaussian
-from mauvecl.cli.verbs.injections import inject
 from mauvecl.cli.verbs.library import app as library
-from mauvecl.cli.verbs.limits import detection_map, limit
-from mauvecl.cli.verbs.measurements import measure
-from mauvecl.cli.verbs.observe import exposure, simulate, snr
-from mauvecl.cli.verbs.orbits import plan, visible
 from mauvecl.cli.verbs.serve import serve
-from mauvecl.cli.verbs.stares import stare
 from mauvecl.host.version import VERSION
 
 app = typer.Typer(
@@ -56,10 +54,13 @@ def _broken(command: str, most: int = 72) -> str:
     return "\n".join(lines)
 
 
-# In the order of `--help`: one star, flares, hours and campaigns, bulk, mauvecl itself.
-for verb in (simulate, snr, exposure, detect, limit, detection_map, gaussian, measure, stare, inject, visible, plan,
-             realise, verify, export, serve, devices, selftest, schema):  # fmt: skip
-    app.command("map" if verb is detection_map else None, help=_help(verb))(verb)
+for module in iter_modules(verbs.__path__, f"{verbs.__name__}."):
+    import_module(module.name)
+# In the order of `--help`: the questions, bulk, mauvecl itself.
+for name in VERBS:
+    app.command(name, help=_help(COMMANDS[name]))(COMMANDS[name])
+for verb in (realise, verify, export, serve, devices, selftest, schema):
+    app.command(help=_help(verb))(verb)
 for command in library.registered_commands:
     command.help = _help(command.callback) if command.callback else None
 app.add_typer(library, name="library")

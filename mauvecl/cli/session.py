@@ -225,6 +225,16 @@ class Session:
         if self._checkpoint is not None and not self._lost:
             self._checkpoint.forget()
 
+    def ask(self, study: Study) -> Any:
+        """Return the answer of the session's verb; a pool draws where the verb has something to count."""
+        from mauvecl.answers.verbs import VERBS
+
+        verb = VERBS[self.verb]
+        if not verb.counts:
+            return verb.ask(study)
+        with self.pool(unit=verb.counts) as engine:
+            return verb.ask(study, engine, None if verb.counts == "realisations" else self.meter)
+
     def answer(self, answer: Answer, show: Callable[[], None]) -> None:
         """Tell an answer and leave its files.
 

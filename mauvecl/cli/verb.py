@@ -26,6 +26,9 @@ from mauvecl.cli.values import as_text
 if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
+#: The command of each verb that takes a study, by its name; `takes_study` fills it.
+COMMANDS: dict[str, Callable[..., None]] = {}
+
 
 def takes_study(
     *groups: Mapping[str, Flag],
@@ -128,6 +131,7 @@ def takes_study(
         command.__name__, command.__doc__ = verb.__name__, verb.__doc__
         command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
         command.__annotations__ = {p.name: p.annotation for p in parameters}
+        COMMANDS[called] = command
         return command
 
     return decorate

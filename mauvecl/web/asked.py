@@ -9,9 +9,9 @@ import numpy as np
 
 from mauvecl.answers.campaigns.plan import PlanAnswer, plan
 from mauvecl.answers.campaigns.visible import visible
+from mauvecl.answers.detection import maps
 from mauvecl.answers.detection.detect import DetectAnswer, detect
-from mauvecl.answers.detection.maps import MapResult, detection_map
-from mauvecl.answers.limits.limits import limiting_magnitude
+from mauvecl.answers.limits.limits import limit
 from mauvecl.answers.signal.snr import SnrAnswer, snr
 from mauvecl.answers.stares.inject import InjectAnswer, inject
 from mauvecl.host.errors import InputError
@@ -34,7 +34,7 @@ def detect_and_snr(study: Study, pool: Pool) -> tuple[DetectAnswer, SnrAnswer]:
     return detect(study, pool), snr(study, pool)
 
 
-def map_around(study: Study, pool: Pool) -> MapResult:
+def map_around(study: Study, pool: Pool) -> maps.MapResult:
     """A coarse map around the question's own star."""
     star, amplitude = study.star[0], study.flare.amplitudes[0]
     middle = 7.0 if star.magnitude is None else star.magnitude
@@ -47,7 +47,7 @@ def map_around(study: Study, pool: Pool) -> MapResult:
     data = study.model_dump()
     data["map"] |= {"x": x, "y": y}
     data["run"] |= run
-    return detection_map(Study.build(data, "page"), pool)
+    return maps.map(Study.build(data, "page"), pool)
 
 
 def completeness(study: Study, pool: Pool) -> InjectAnswer:
@@ -85,7 +85,7 @@ def _visible(study: Study) -> dict[str, Any]:
 #: What may be computed on demand, by name: what is then known, by name.
 SIMULATED: dict[str, Callable[[Study, Pool], dict[str, Any]]] = {
     "detection": _detection,
-    "limit": lambda study, pool: {"limit": limiting_magnitude(study, pool)},
+    "limit": lambda study, pool: {"limit": limit(study, pool)},
     "map": lambda study, pool: {"map": map_around(study, pool)},
     "completeness": lambda study, pool: {"completeness": completeness(study, pool)},
     "visible": lambda study, pool: _visible(study),

@@ -11,7 +11,6 @@ from scipy import stats
 
 from mauvecl import Engine, InputError, Study, measure
 from mauvecl.answers.measurements.measure import MeasureAnswer
-from mauvecl.host.plotting import picture
 from mauvecl.host.stars.bands import photons
 
 
@@ -86,8 +85,8 @@ def test_faint_and_bright_flares_have_tables_and_pictures(amplitude: float, engi
     study = study_of("measure.fits=20", f"flare.amplitudes=[{amplitude}]", spectrum={"balmer_jump": 2.0})
     answer = measure(study, engine)
     assert len(answer.table) == sum(len(one.truth) for one in answer.flares)
-    for name, (function, shown) in answer.pictures.items():
-        picture(function, shown, path=tmp_path / f"{name}.png")
+    for name, draw in answer.pictures.items():
+        draw(tmp_path / f"{name}.png")
         assert (tmp_path / f"{name}.png").exists()
 
 

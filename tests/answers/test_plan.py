@@ -193,7 +193,7 @@ def test_completeness_as_an_argument(study: Study) -> None:
         return Completeness(edge, np.array([0.0, 0.0, 1.0, 1.0]), "bolometric", "a step")
 
     one = study.with_settings(["plan.targets=[{name = 'eps Eri', alpha = 2.0, rate_per_day = 0.5, at_erg = 1e33}]"])
-    answer = plan(one, none_below)
+    answer = plan(one, completeness=none_below)
     assert answer.table["expected"][0] == pytest.approx(0.5 * 5, rel=0.02)
     mean = answer.table["expected"][0]
     # Rates of one's own have no scatter: Poisson's alone.

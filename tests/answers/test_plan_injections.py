@@ -33,7 +33,7 @@ def test_stretches_are_the_targets() -> None:
         seen.append(looked)
         return closed_form(one, looked)
 
-    plan(study, kept)
+    plan(study, completeness=kept)
     asked = question_of(study, seen[0])
     orbit = study.orbit.orbit().elements.period_s
     assert asked.stare.orbit_s - asked.stare.orbit_gap_s == pytest.approx(seen[0].window_s)
@@ -61,7 +61,7 @@ def test_campaigns_close_through_the_search() -> None:
         seen.append(looked)
         return closed_form(one, looked)
 
-    form = plan(study, kept).planned[0].completeness
+    form = plan(study, completeness=kept).planned[0].completeness
     assert form is not None
     star, law = inject(question_of(study, seen[0])).stars[0], study.plan.law()
     widths = np.array(star.injected.half_widths_s)

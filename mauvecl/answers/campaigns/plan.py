@@ -277,10 +277,10 @@ def _measured(one: Planned) -> str:
 @public
 def plan(
     study: Study,
-    completeness: CompletenessOf | None = None,
-    *,
     engine: Stares | Pool | None = None,
     progress: Callable[[int, int], None] | None = None,
+    *,
+    completeness: CompletenessOf | None = None,
 ) -> PlanAnswer:
     """A campaign on a study's targets.
 
@@ -288,13 +288,13 @@ def plan(
     ----------
     study : Study
         Its ``plan`` names the targets, its ``orbit`` when and from where.
-    completeness : callable, optional
-        The share of flares recovered by bolometric energy; as the study's ``plan.completeness`` has it unless given: by
-        injections into drawn noise, or in closed form.
     engine : Stares or Pool, optional
         Who draws injections; the default device. The checkpoint of a pool keeps each target that is finished.
     progress : callable, optional
         Called as ``progress(done, total)`` in targets.
+    completeness : callable, optional
+        The share of flares recovered by bolometric energy; as the study's ``plan.completeness`` has it unless given: by
+        injections into drawn noise, or in closed form.
 
     Raises
     ------
@@ -336,6 +336,8 @@ def plan(
             days = observed * 3600 / DAY_S
             recovered = Yield.about(0.0, 0.0) if its is None else Yield.of(rates, its, days)
         planned.append(Planned(looked, exposed, observed, its, rates, recovered, best, why))
+    if progress is not None:
+        progress(len(stars), len(stars))
     return PlanAnswer(study, seen, tuple(planned))
 
 

@@ -26,7 +26,9 @@ from mauvecl.study.study import Study
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
 
+    from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
+    from mauvecl.runs.pool import Pool
     from mauvecl.study.assumptions import Use
 
 Float = NDArray[np.float64]
@@ -263,13 +265,19 @@ class VisibleAnswer(Answer):
 
 
 @public
-def visible(study: Study) -> VisibleAnswer:
+def visible(
+    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
+) -> VisibleAnswer:
     """When a study's targets are seen.
 
     Parameters
     ----------
     study : Study
         Its ``orbit`` says from where, when, and what must hold.
+    engine : Engine or Pool, optional
+        Not used: nothing is drawn.
+    progress : callable, optional
+        Called once, with the number of targets, at the end.
 
     Raises
     ------
@@ -288,4 +296,7 @@ def visible(study: Study) -> VisibleAnswer:
     o = study.orbit
     track = o.orbit().track(o.times())
     directions = np.array([one.direction for one in targets])
-    return VisibleAnswer(study, targets, Visibility.of(track, directions, o.limits.limits()))
+    answer = VisibleAnswer(study, targets, Visibility.of(track, directions, o.limits.limits()))
+    if progress is not None:
+        progress(len(targets), len(targets))
+    return answer

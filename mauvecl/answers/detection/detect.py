@@ -185,8 +185,17 @@ def _tails(star: StarDetection, share: int) -> QTable:
 
 
 @public
-def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
+def detect(
+    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
+) -> DetectAnswer:
     """Null and flare distributions of every star of a study, in every cell of its sweep.
+
+    Parameters
+    ----------
+    study : Study
+    engine : Engine or Pool, optional
+    progress : callable, optional
+        Called as ``progress(done, total)`` in stars.
 
     Raises
     ------
@@ -198,6 +207,11 @@ def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
     check_fap(run.fap, run.realisations, run.tails)
     prepared = [(at, cell, star, cell.expectations(star)) for at, cell in study.cells() for star in cell.star]
     campaign_told = [text for _, cell, _, (quiet, *_) in prepared for text in _campaign(cell, quiet)]
+
+    if engine is None:
+        from mauvecl.device.engine import Engine as Default
+
+        engine = Default()
 
     def answered(one: tuple[Mapping[str, float | str], Study, Star, list[Expectation]]) -> StarDetection:
         at, cell, star, (quiet, *flares) = one
@@ -216,6 +230,8 @@ def detect(study: Study, engine: Engine | Pool) -> DetectAnswer:
             # What is drawn nothing for is computed while the devices count the next star.
             paper = _paper(study, [group for *_, group in prepared])
         stars.append(star)
+        if progress is not None:
+            progress(len(stars), len(prepared))
     costs = [text for (_, cell, *_), one in zip(prepared, stars, strict=True) for text in _template_costs(cell, one)]
     answer = DetectAnswer(study, stars)
     blinding = [f"{text[:-1]} ({star.title})." for star in stars for text in star.detection.messages]

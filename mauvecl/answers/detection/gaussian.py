@@ -27,6 +27,8 @@ from mauvecl.study.questions import Axis, Sweep
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from astropy.table import QTable, Table
 
     from mauvecl.device.engine import Engine
@@ -242,7 +244,9 @@ def _of_thresholds(tested: QTable, flares: QTable) -> dict[str, float | str]:
 
 
 @public
-def gaussian_report(study: Study, engine: Engine | Pool | None = None) -> GaussianReport:
+def gaussian(
+    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
+) -> GaussianReport:
     """The usual formula beside the simulation, over magnitude and exposure or what else the study sweeps.
 
     Parameters
@@ -250,6 +254,8 @@ def gaussian_report(study: Study, engine: Engine | Pool | None = None) -> Gaussi
     study : Study
         Without a sweep: magnitudes from 4 to 12, exposures of 5, 50 and 600 s.
     engine : Engine or Pool, optional
+    progress : callable, optional
+        Called as ``progress(done, total)`` in stars, each of which is asked for its S/N and then for its flares.
 
     Raises
     ------
@@ -261,4 +267,16 @@ def gaussian_report(study: Study, engine: Engine | Pool | None = None) -> Gaussi
     engine = engine or Default()
     if not study.sweep.axes:
         study = study.model_copy(update={"sweep": GRID})
-    return GaussianReport(study, snr(study, engine), detect(study, engine))
+
+    def told_of(part: int) -> Callable[[int, int], None]:
+        def told(done: int, total: int) -> None:
+            if progress is not None:
+                progress(part * total + done, 2 * total)
+
+        return told
+
+    return GaussianReport(study, snr(study, engine, told_of(0)), detect(study, engine, told_of(1)))
+
+
+#: The older name.
+gaussian_report = gaussian

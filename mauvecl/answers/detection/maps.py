@@ -112,8 +112,8 @@ class MapResult(Answer):
 
 
 @public
-def detection_map(
-    study: Study, engine: Engine | Pool | None = None, *, progress: Callable[[int, int], None] | None = None
+def map(
+    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> MapResult:
     """Detection probability of the study's first star and flare over its map's axes.
 
@@ -297,3 +297,7 @@ def _fill(
             limit = result.closed_form(statistic, template=k).isf(run.fap)
             if k not in result.blinding:
                 values["closed_form"][at] = result.closed_form(statistic, k).sf(limit)
+
+
+#: The older name, which does not hide Python's own `map`.
+detection_map = map

@@ -258,8 +258,8 @@ def solve(
 
 
 @public
-def limiting_magnitude(
-    study: Study, engine: Engine | Pool | None = None, *, progress: Callable[[int, int], None] | None = None
+def limit(
+    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> LimitResult:
     """Limits of a study's stars and flares, by every statistic it names.
 
@@ -312,16 +312,20 @@ def limiting_magnitude(
     return result
 
 
+#: The older name.
+limiting_magnitude = limit
+
+
 @public
 def smallest_amplitude(study: Study, engine: Engine | Pool | None = None) -> LimitResult:
-    """The smallest flare that is detected; as `limiting_magnitude`."""
-    return limiting_magnitude(_asking(study, "amplitude"), engine)
+    """The smallest flare that is detected; as `limit`."""
+    return limit(_asking(study, "amplitude"), engine)
 
 
 @public
 def shortest_exposure(study: Study, engine: Engine | Pool | None = None) -> LimitResult:
-    """The shortest exposure in which the flares are detected; as `limiting_magnitude`."""
-    return limiting_magnitude(_asking(study, "exposure"), engine)
+    """The shortest exposure in which the flares are detected; as `limit`."""
+    return limit(_asking(study, "exposure"), engine)
 
 
 def _asking(study: Study, of: str) -> Study:

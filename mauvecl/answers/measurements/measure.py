@@ -210,14 +210,16 @@ class MeasureAnswer(Answer):
 
 
 @public
-def measure(study: Study, engine: Engine, progress: Callable[[int, int], None] | None = None) -> MeasureAnswer:
+def measure(
+    study: Study, engine: Engine | None = None, progress: Callable[[int, int], None] | None = None
+) -> MeasureAnswer:
     """Forecast and simulate what is measured of a study's flares in one exposure.
 
     Parameters
     ----------
     study : Study
-    engine : Engine
-        Draws the exposures.
+    engine : Engine, optional
+        Draws the exposures; the default device.
     progress : callable, optional
         Receives the flares that are done, and all of them.
 
@@ -232,6 +234,10 @@ def measure(study: Study, engine: Engine, progress: Callable[[int, int], None] |
         raise InputError("flare amplitude = 0 in a measurement, expected one above 0")
     prepared = [(at, cell, star, cell.expectations(star)) for at, cell in study.cells() for star in cell.star]
     flares: list[MeasuredFlare] = []
+    if engine is None:
+        from mauvecl.device.engine import Engine as Default
+
+        engine = Default()
     n = sum(len(group) - 1 for *_, group in prepared)
     done = 0
     for at, cell, star, (quiet, *lit) in prepared:

@@ -20,10 +20,14 @@ from mauvecl.study.sections import Star
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     import astropy.units as u
     from astropy.table import QTable, Table
 
+    from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
+    from mauvecl.runs.pool import Pool
     from mauvecl.study.assumptions import Use
 
 Per = Literal["pixel", "element"]
@@ -120,10 +124,53 @@ def place_of(x: Expectation, wavelength_nm: float, per: Per) -> int:
 
 
 @public
+def exposure(
+    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
+) -> ExposureResult:
+    """The fewest frames whose closed-form S/N at a wavelength reaches a wanted one.
+
+    Parameters
+    ----------
+    study : Study
+        Its ``signal`` says which; its exposure does not matter.
+    engine : Engine or Pool, optional
+        Not used: nothing is drawn.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in stars.
+
+    Raises
+    ------
+    InputError
+        For an S/N that no exposure up to 1e7 s reaches, or a wavelength outside the spectrum, if it holds of every
+        star; of some it is told by a message.
+    """
+    snr, wavelength_nm, per = study.signal.snr, study.signal.wavelength_nm, study.signal.per
+    if snr is None or wavelength_nm is None:
+        missing = "S/N" if snr is None else "wavelength"
+        raise InputError(f"no wanted {missing}, expected `signal.snr` and `signal.wavelength_nm`")
+    answered, failed = [], []
+    for done, star in enumerate(study.star, 1):
+        try:
+            answered.append(_one(study, star, snr, wavelength_nm, per))
+        except InputError as error:
+            # One star's failure does not lose the others'.
+            failed.append(error)
+        if progress is not None:
+            progress(done, len(study.star))
+    if not answered:
+        raise failed[0]
+    exposures, seen = zip(*answered, strict=True)
+    long = [f"{e.star} needs more than a day: {np.ceil(e.exposure_s / DAY_S):.0f} exposures of a day at most, added up."
+            for e in exposures if e.exposure_s > DAY_S]  # fmt: skip
+    messages = [*(f"NO ANSWER: {error}." for error in failed), *collect_messages(list(seen)), *long]
+    return ExposureResult(study, exposures, tuple(messages), seen)
+
+
+@public
 def exposure_for(
     study: Study, snr: float | None = None, wavelength_nm: u.Quantity | float | None = None, *, per: Per | None = None
 ) -> ExposureResult:
-    """The fewest frames whose closed-form S/N at a wavelength reaches a wanted one.
+    """Answer `exposure` for an S/N and a wavelength that may be given here.
 
     Parameters
     ----------
@@ -138,30 +185,12 @@ def exposure_for(
     Raises
     ------
     InputError
-        For an S/N that no exposure up to 1e7 s reaches, or a wavelength outside the spectrum, if it holds of every
-        star; of some it is told by a message.
+        As `exposure`.
     """
     if wavelength_nm is not None:
         wavelength_nm = number("wavelength", wavelength_nm, "nm")
     study = study.with_changes({"signal": {"snr": snr, "wavelength_nm": wavelength_nm, "per": per}}, None, "exposure")
-    snr, wavelength_nm, per = study.signal.snr, study.signal.wavelength_nm, study.signal.per
-    if snr is None or wavelength_nm is None:
-        missing = "S/N" if snr is None else "wavelength"
-        raise InputError(f"no wanted {missing}, expected `signal.snr` and `signal.wavelength_nm`")
-    answered, failed = [], []
-    for star in study.star:
-        try:
-            answered.append(_one(study, star, snr, wavelength_nm, per))
-        except InputError as error:
-            # One star's failure does not lose the others'.
-            failed.append(error)
-    if not answered:
-        raise failed[0]
-    exposures, seen = zip(*answered, strict=True)
-    long = [f"{e.star} needs more than a day: {np.ceil(e.exposure_s / DAY_S):.0f} exposures of a day at most, added up."
-            for e in exposures if e.exposure_s > DAY_S]  # fmt: skip
-    messages = [*(f"NO ANSWER: {error}." for error in failed), *collect_messages(list(seen)), *long]
-    return ExposureResult(study, exposures, tuple(messages), seen)
+    return exposure(study)
 
 
 def _one(study: Study, star: Star, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposure, Expectation]:

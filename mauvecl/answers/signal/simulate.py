@@ -15,9 +15,13 @@ from mauvecl.study.messages import collect_messages
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from astropy.table import QTable, Table
 
+    from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
+    from mauvecl.runs.pool import Pool
     from mauvecl.study.assumptions import Use
 
 
@@ -78,11 +82,31 @@ class SimulateAnswer(Answer):
 
 
 @public
-def simulate(study: Study, *, realisation: int = 0, flaring: bool = False) -> SimulateAnswer:
-    """One observation of every star of a study, taken apart; with its flares too where asked."""
+def simulate(
+    study: Study,
+    engine: Engine | Pool | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    realisation: int = 0,
+    flaring: bool = False,
+) -> SimulateAnswer:
+    """One observation of every star of a study, taken apart; with its flares too where asked.
+
+    Parameters
+    ----------
+    study : Study
+    engine : Engine or Pool, optional
+        Not used: the NumPy reference implementation draws.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in stars.
+    realisation : int
+        Number of the realisation.
+    flaring : bool
+        Whether the flares of the study are observed, too.
+    """
     realisation = count("realisation", realisation)
     observations, everything = [], []
-    for star in study.star:
+    for done, star in enumerate(study.star, 1):
         xs = study.expectations(star) if flaring else study.expect([star.source()])
         for i, x in enumerate(xs):
             title = label(star, x) + (f", flare {100 * study.flare.amplitudes[i - 1]:g} %" if i else "")
@@ -90,4 +114,6 @@ def simulate(study: Study, *, realisation: int = 0, flaring: bool = False) -> Si
             table.meta["study"] = study.text()
             observations.append((title, x, describe_columns(table)))
         everything += xs
+        if progress is not None:
+            progress(done, len(study.star))
     return SimulateAnswer(study, observations, collect_messages(everything, study.processes.processes()))

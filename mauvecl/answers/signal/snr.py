@@ -98,8 +98,17 @@ class SnrAnswer(Answer):
 
 
 @public
-def snr(study: Study, engine: Engine | Pool) -> SnrAnswer:
+def snr(
+    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
+) -> SnrAnswer:
     """S/N distributions of every star of a study, without flares, in every cell of its sweep.
+
+    Parameters
+    ----------
+    study : Study
+    engine : Engine or Pool, optional
+    progress : callable, optional
+        Called as ``progress(done, total)`` in stars.
 
     Raises
     ------
@@ -118,13 +127,22 @@ def snr(study: Study, engine: Engine | Pool) -> SnrAnswer:
         for *_, x in prepared:
             place_of(x, asked, "element")
 
+    if engine is None:
+        from mauvecl.device.engine import Engine as Default
+
+        engine = Default()
+
     def answered(one: tuple[str, Mapping[str, float | str], Expectation]) -> StarSnr:
         name, at, x = one
         return StarSnr(name, at, engine.snr(x, realisations=run.realisations, seed=run.seed, **study.drawing), asked)
 
     if isinstance(engine, Pool):
         engine.expect(len(prepared) * run.realisations)
-    stars = list(map_in_order(engine, answered, prepared))
+    stars: list[StarSnr] = []
+    for one in map_in_order(engine, answered, prepared):
+        stars.append(one)
+        if progress is not None:
+            progress(len(stars), len(prepared))
     return SnrAnswer(
         study,
         stars,

@@ -228,7 +228,7 @@ def _search(star: StarCompleteness) -> QTable:
 
 @public
 def inject(
-    study: Study, engine: Stares | Pool | None = None, *, progress: Callable[[int, int], None] | None = None
+    study: Study, engine: Stares | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> InjectAnswer:
     """Completeness of a study's search at each of its stars, in every cell of its sweep.
 

@@ -285,15 +285,23 @@ class StareAnswer(Answer):
 
 
 @public
-def stare(study: Study, stares: Stares, *, checkpoint: Checkpoint | None = None) -> StareAnswer:
+def stare(
+    study: Study,
+    engine: Stares | None = None,
+    progress: Callable[[int, int], None] | None = None,
+    *,
+    checkpoint: Checkpoint | None = None,
+) -> StareAnswer:
     """One simulated stare at every star of a study, in every cell of its sweep.
 
     Parameters
     ----------
     study : Study
         Its section `stare`, `events`, star, flare, sky, observation; `run.seed` and `stare.number` say which stare.
-    stares : Stares
-        Draws it.
+    engine : Stares, optional
+        Draws it; the default device.
+    progress : callable, optional
+        Called as ``progress(done, total)`` in stares.
     checkpoint : Checkpoint, optional
         Keeps the frames that are drawn and the thresholds of searches.
 
@@ -309,7 +317,15 @@ def stare(study: Study, stares: Stares, *, checkpoint: Checkpoint | None = None)
         raise InputError(f"a stare of {frames} frames, each with a spectrum, expected at most {MOST_SHOWN}")
     # Everything is looked at before anything is drawn: bad input shows at once.
     prepared = [(star, at, cell, *expect_stare(cell, star)) for at, cell in study.cells() for star in cell.star]
-    drawn = [_drawn(study, stares, checkpoint, *one) for one in prepared]
+    if engine is None:
+        from mauvecl.device.stares import Stares as Default
+
+        engine = Default()
+    drawn: list[StarStare] = []
+    for one_star in prepared:
+        drawn.append(_drawn(study, engine, checkpoint, *one_star))
+        if progress is not None:
+            progress(len(drawn), len(prepared))
     messages = collect_messages([staring.quiet for _, _, _, staring, _ in prepared]) + orbit_lines(study)
     messages += dict.fromkeys(
         line for *_, cell, staring, events in prepared for line in unused_lines(cell, staring, events)

@@ -30,10 +30,7 @@ def detect(
 
     Example: mauvecl detect --star K5V --magnitude 6 --amplitude 0.05 --amplitude 0.1 --exposure 30
     """
-    from mauvecl.answers.detection.detect import detect as compute
-
-    with session.pool() as engine:
-        answer = compute(study, engine)
+    answer = session.ask(study)
     session.answer(answer, lambda: _show_detections(answer))
 
 
@@ -115,10 +112,7 @@ def gaussian(
 
     Example: mauvecl gaussian --star G2V --sweep magnitude=6,10 --sweep exposure=5,50
     """
-    from mauvecl.answers.detection.gaussian import gaussian_report
-
-    with session.pool() as engine:
-        answer = gaussian_report(study, engine)
+    answer = session.ask(study)
     session.answer(answer, lambda: _show_promises(answer))
 
 

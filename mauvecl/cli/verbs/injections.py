@@ -67,10 +67,7 @@ def inject(study: Study, session: Session) -> None:
 
     mauvecl inject --star M3V --magnitude 9 --orbit-gap 2100 --with-unknowns --sweep flare_temperature=7000,10000,15000
     """
-    from mauvecl.answers.stares.inject import inject as compute
-
-    with session.pool(unit="injections") as engine:
-        answer = compute(study, engine, progress=session.meter)
+    answer = session.ask(study)
     session.answer(answer, lambda: _show(answer))
 
 

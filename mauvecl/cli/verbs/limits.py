@@ -33,10 +33,7 @@ def limit(
 
     Example: mauvecl limit --star G2V --amplitude 0.24 --exposure 50
     """
-    from mauvecl.answers.limits.limits import limiting_magnitude
-
-    with session.pool(unit="limits") as engine:
-        answer = limiting_magnitude(study, engine, progress=session.meter)
+    answer = session.ask(study)
     if assumptions:
         from mauvecl.answers.limits.assumptions import what_matters
 
@@ -118,10 +115,7 @@ def detection_map(
 
     Example: mauvecl map --star G2V --x magnitude:4:10:16 --y amplitude:0.01:1:16:log
     """
-    from mauvecl.answers.detection.maps import detection_map as compute
-
-    with session.pool(unit="cells") as engine:
-        answer = compute(study, engine, progress=session.meter)
+    answer = session.ask(study)
     session.answer(answer, lambda: _show_map(answer))
 
 

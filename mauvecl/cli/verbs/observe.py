@@ -77,10 +77,7 @@ def snr(
 
     mauvecl snr --star G2V --sweep magnitude=4,6,8,10 --sweep exposure=5,50,600
     """
-    from mauvecl.answers.signal.snr import snr as compute
-
-    with session.pool() as engine:
-        answer = compute(study, engine)
+    answer = session.ask(study)
     session.answer(answer, lambda: _show_snr(answer))
 
 
@@ -126,9 +123,7 @@ def exposure(
 
     Example: mauvecl exposure --snr 10 --at 300 --star G2V --magnitude 7.4
     """
-    from mauvecl.answers.signal.exposures import exposure_for
-
-    answer = exposure_for(study)
+    answer = session.ask(study)
     session.answer(answer, lambda: _show_exposures(answer))
 
 

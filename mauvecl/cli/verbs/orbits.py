@@ -93,9 +93,7 @@ def visible(study: Study, session: Session) -> None:
 
     Example: mauvecl visible --look-at "eps Eri" --look-at "AU Mic" --start 2027-01-01 --days 365
     """
-    from mauvecl.answers.campaigns.visible import visible as compute
-
-    answer = compute(study)
+    answer = session.ask(study)
     session.answer(answer, lambda: _show_visible(answer))
 
 
@@ -141,8 +139,7 @@ def plan(study: Study, session: Session) -> None:
         with session.metered("targets") as meter:
             answer = compute(study, progress=meter)
     else:
-        with session.pool(unit="targets") as engine:
-            answer = compute(study, engine=engine, progress=session.meter)
+        answer = session.ask(study)
     session.answer(answer, lambda: _show_plan(answer))
 
 

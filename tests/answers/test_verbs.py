@@ -1,0 +1,68 @@
+"""One registry of verbs: the same name and signature in Python and on the command line."""
+
+from __future__ import annotations
+
+import inspect
+from typing import Any
+
+import pytest
+import typer.main
+
+import mauvecl
+from mauvecl import Study
+from mauvecl.answers.answer import Answer
+from mauvecl.answers.verbs import VERBS
+from mauvecl.cli.app import app
+from mauvecl.device.engine import Engine
+
+FEW = ["run.realisations=2000", "run.fap=0.1", 'run.statistics=["matched"]', 'star=[{library="G2V", magnitude=7.4}]',
+       "flare.amplitudes=[0.24]"]  # fmt: skip
+#: Short questions, one to a verb whose answer takes less than seconds.
+QUICK: dict[str, list[str]] = {
+    "simulate": [],
+    "snr": [],
+    "exposure": ["signal.snr=10", "signal.wavelength_nm=300"],
+    "detect": [],
+    "limit": ["limit.power=0.9"],
+    "gaussian": ['sweep.axes=[{quantity="exposure", values=[50, 300]}]'],
+    "map": ['map.x={quantity="magnitude", start=6, stop=8, steps=2}',
+            'map.y={quantity="amplitude", start=0.1, stop=0.3, steps=2}'],
+    "visible": ['orbit.targets=["eps Eri", "AU Mic"]', "orbit.days=5"],
+    "plan": ["plan.targets=[{name = 'eps Eri'}]", "orbit.days=31", "plan.completeness='closed form'"],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", VERBS)
+def test_a_verb_has_one_name_and_one_signature(name: str) -> None:
+    verb = VERBS[name]
+    assert getattr(mauvecl, name) is verb.ask
+    assert verb.ask.__name__ == name
+    assert name in mauvecl.__all__
+    for older in verb.older:
+        assert getattr(mauvecl, older) is verb.ask
+        assert older in mauvecl.__all__
+    study, engine, progress, *own = inspect.signature(verb.ask).parameters.values()
+    assert [one.name for one in (study, engine, progress)] == ["study", "engine", "progress"]
+    assert (study.default, engine.default, progress.default) == (inspect.Parameter.empty, None, None)
+    assert all(one.kind is one.KEYWORD_ONLY and one.default is not one.empty for one in own)
+    returned = inspect.signature(verb.ask).return_annotation
+    module: Any = inspect.getmodule(inspect.unwrap(verb.ask))
+    assert issubclass(getattr(module, returned), Answer)
+
+
+def test_the_command_line_has_every_verb_in_order() -> None:
+    group = typer.main.get_command(app)
+    assert list(group.commands)[: len(VERBS)] == list(VERBS)  # type: ignore[attr-defined]
+
+
+@pytest.mark.parametrize("name", QUICK)
+def test_progress_ends_with_all_of_it(name: str, engine: Engine) -> None:
+    """By the positions of the arguments, which are the same for all verbs."""
+    seen: list[tuple[int, int]] = []
+    drawing = None if name == "plan" else engine
+    answer = VERBS[name].ask(Study().with_settings(FEW + QUICK[name]), drawing, lambda *told: seen.append(told))
+    assert isinstance(answer, Answer)
+    done, total = zip(*seen, strict=True)
+    assert list(done) == sorted(done)
+    assert done[-1] == total[-1] > 0
+    assert len(set(total)) == 1
