@@ -7,9 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mauvecl.answers.signal import exposures
 from mauvecl.answers.signal.exposures import exposure_for, snr_at
+from mauvecl.cli.verbs.observe import show_exposures
 from mauvecl.device.engine import Engine
 from mauvecl.host.errors import InputError
+from mauvecl.host.tables import Column
 from mauvecl.study.study import Study
 
 
@@ -90,3 +93,22 @@ def test_the_answer_is_written_and_drawn(tmp_path: Path) -> None:
         exposure_for(study(), 10.0)
     found.plot(tmp_path / "exposure.png")
     assert (tmp_path / "exposure.png").read_bytes()[:4] == b"\x89PNG"
+
+
+def test_a_column_is_defined_once(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """One more column stands in the file, in JSON and on the terminal, with its unit, description and format."""
+    less = Column("frame_less", "snr_one_frame_less", "DN", "for this test", "one less", lambda value: f"<{value:.1f}>")
+    monkeypatch.setattr(exposures, "COLUMNS", (*exposures.COLUMNS, less))
+    answer = exposure_for(study(), 10.0, 300.0)
+    (row,) = answer.exposures
+    assert answer.table["frame_less"].unit == "DN"
+    assert answer.table["frame_less"].info.description == "for this test"
+    assert answer.table["frame_less"].value[0] == row.snr_one_frame_less
+    assert answer.as_json()["rows"][0]["frame_less"] == row.snr_one_frame_less
+    show_exposures(answer)
+    shown = capsys.readouterr().out
+    assert "one less" in shown
+    assert f"<{row.snr_one_frame_less:.1f}>" in shown
+    # Columns without a heading are in files alone.
+    assert "wanted" in answer.table.colnames
+    assert "wanted" not in shown

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, ClassVar, Literal
 
@@ -12,7 +13,7 @@ from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.quantities import number
 from mauvecl.host.ranges import DAY_S
-from mauvecl.host.tables import make_table
+from mauvecl.host.tables import Column, table_of
 from mauvecl.study.labels import describe_columns, label
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.quantities import QUANTITIES
@@ -48,6 +49,27 @@ class Exposure:
     saturated: bool
 
 
+def _floored(snr: float) -> str:
+    """Return an S/N to three digits, rounded down: what falls short must not look as if it did not."""
+    return f"{math.floor(1000 * snr) / 1000:.3f}"
+
+
+#: The table of exposures.
+COLUMNS = (
+    Column("star", heading="star"),
+    Column("wavelength", "wavelength_nm", "nm"),
+    Column("per"),
+    Column("wanted"),
+    Column("exposure", "exposure_s", "s", "the fewest frames whose closed-form S/N reaches the wanted one",
+           "exposure (s)", ".10g"),
+    Column("frames", heading="frames"),
+    Column("snr", heading="S/N", format=".3f"),
+    Column("snr_one_frame_less", heading="a frame less", format=_floored),
+    Column("saturated", "", "", "whether the pixel, or one of the element, saturates in a single frame", "saturation",
+           lambda saturated: "SATURATED" if saturated else ""),
+)  # fmt: skip
+
+
 @dataclass(frozen=True)
 class ExposureResult(Answer):
     """What `exposure_for` answers, one row per star.
@@ -71,19 +93,7 @@ class ExposureResult(Answer):
     @property
     def table(self) -> QTable:
         """One row per star."""
-        columns = (
-            ("star", "star"),
-            ("wavelength", "wavelength_nm", "", "nm"),
-            ("per", "per"),
-            ("wanted", "wanted"),
-            ("exposure", "exposure_s", "the fewest frames whose closed-form S/N reaches the wanted one", "s"),
-            ("frames", "frames"),
-            ("snr", "snr"),
-            ("snr_one_frame_less", "snr_one_frame_less"),
-            ("saturated", "saturated", "whether the pixel, or one of the element, saturates in a single frame"),
-        )
-        made = ((name, [getattr(r, of) for r in self.exposures], *more) for name, of, *more in columns)
-        return describe_columns(make_table(made, study=self.study.text()))
+        return describe_columns(table_of(COLUMNS, self.exposures, study=self.study.text()))
 
     @property
     def tables(self) -> dict[str, Table]:

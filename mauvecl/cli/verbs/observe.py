@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -124,24 +123,17 @@ def exposure(
     Example: mauvecl exposure --snr 10 --at 300 --star G2V --magnitude 7.4
     """
     answer = session.ask(study)
-    session.answer(answer, lambda: _show_exposures(answer))
+    session.answer(answer, lambda: show_exposures(answer))
 
 
-def _show_exposures(answer: ExposureResult) -> None:
+def show_exposures(answer: ExposureResult) -> None:
+    from mauvecl.answers.signal.exposures import COLUMNS
     from mauvecl.cli.console import show_table
-
-    def floored(snr: float) -> float:
-        # What falls short must not look as if it did not.
-        return math.floor(1000 * snr) / 1000
+    from mauvecl.host.tables import texts_of
 
     wanted = answer.study.signal
     show_table(
         f"Exposure for an S/N of {wanted.snr:g} per {wanted.per} at {wanted.wavelength_nm:g} nm "
         "(closed form, whole frames)",
-        ("star", "exposure (s)", "frames", "S/N", "a frame less", "saturation"),
-        [
-            (e.star, f"{e.exposure_s:.10g}", str(e.frames), f"{e.snr:.3f}", f"{floored(e.snr_one_frame_less):.3f}",
-             "SATURATED" if e.saturated else "")
-            for e in answer.exposures
-        ],
-    )  # fmt: skip
+        *texts_of(COLUMNS, answer.exposures),
+    )
