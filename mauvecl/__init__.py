@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from mauvecl.lightcurve.flares.events import Cooling, Event
     from mauvecl.lightcurve.flares.shapes import SHAPES, TableShape
     from mauvecl.lightcurve.stares.curves import Sinusoid
+    from mauvecl.lightcurve.stares.measured import measure_along
     from mauvecl.lightcurve.stares.stare import Stare
     from mauvecl.noise.comparison import Comparison
     from mauvecl.noise.priors import Normal, Uniform
@@ -114,6 +115,7 @@ __all__ = [
     "limiting_magnitude",
     "map",
     "measure",
+    "measure_along",
     "plan",
     "shortest_exposure",
     "simulate",
@@ -166,6 +168,7 @@ _HOMES = HOMES | {
     "departures": "results.detection.departures",
     "expect": "host.expectation",
     "exposure_for": "answers.signal.exposures",
+    "measure_along": "lightcurve.stares.measured",
     "shortest_exposure": "answers.limits.limits",
     "smallest_amplitude": "answers.limits.limits",
     "what_matters": "answers.limits.assumptions",

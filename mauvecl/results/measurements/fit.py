@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
@@ -94,6 +94,15 @@ class Measurement:
                 axis = 1 if name in ("low", "high") else 0
                 values[name] = np.concatenate([getattr(part, name) for part in parts], axis)
         return cls(**values)
+
+    def rows(self, which: NDArray[Any]) -> Self:
+        """Return the measurements of some frames, by number or mask."""
+        kept: dict[str, Any] = {}
+        for one in fields(self):
+            value = getattr(self, one.name)
+            if isinstance(value, np.ndarray):
+                kept[one.name] = value[:, which] if one.name in ("low", "high") else value[which]
+        return replace(self, **kept)
 
     def column(self, name: str) -> int:
         """Return the place of a quantity.

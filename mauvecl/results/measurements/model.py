@@ -7,7 +7,7 @@ continuum, and emission lines. Everything but the temperature is linear, so that
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import TYPE_CHECKING, Self
 
@@ -178,6 +178,21 @@ class FlareModel:
             kelvin, scale, names, parts, every, list(bands_nm), quiet.exposure_s, distance_pc, radius_rsun
         )
         return cls(np.log(kelvin), counts[:NODES], counts[NODES:], names, derived)
+
+    def stacked(self, n: int, light: float = 1.0) -> Self:
+        """Return the model of exposures that are n times as long, with a factor on all light that is known.
+
+        Parameters
+        ----------
+        n : int
+        light : float
+            Mean share of the flare's light that reaches the detector.
+        """
+        derived = tuple(
+            replace(one, factors=n * one.factors) if one.name.startswith("energy") and one.factors is not None else one
+            for one in self.derived
+        )
+        return replace(self, hot=n * light * self.hot, fixed=n * light * self.fixed, derived=derived)
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -1,0 +1,202 @@
+"""Flares measured along a stare: temperature, area and luminosity against time, in bins of a chosen S/N."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mauvecl.host.arguments import public
+from mauvecl.host.errors import InputError
+from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.results.measurements.fit import LEVELS, Measurement, fit
+from mauvecl.results.measurements.reduction import Reduction
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from astropy.table import QTable
+
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.results.measurements.model import FlareModel
+    from mauvecl.statistics.nuisances import Nuisances
+
+Float = NDArray[np.float64]
+
+#: Bins span at most this many frames, which bounds the time that the search for them takes.
+MOST_FRAMES_PER_BIN = 4096
+#: Temperatures tried for the filter that chooses the bins: one in this many of the model's.
+EVERY = 8
+#: Bins whose known conditions agree to this many digits are fitted together.
+DIGITS = 6
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredBins:
+    """Flares measured in bins of consecutive frames.
+
+    Attributes
+    ----------
+    first, count : ndarray of int, shape (n_bin,)
+        First frame of each bin, and number of frames in it.
+    start_s, end_s : ndarray, shape (n_bin,)
+    found : Measurement
+        One row per bin. Amplitudes, fluxes and luminosities are means over the bin; energies are those within it.
+    """
+
+    first: NDArray[np.intp]
+    count: NDArray[np.intp]
+    start_s: Float
+    end_s: Float
+    found: Measurement
+
+    def table(self) -> QTable:
+        """Return times, estimates, errors and intervals, one row per bin."""
+        from astropy import units
+
+        from mauvecl.host.tables import make_table
+
+        found = self.found
+        columns: list[tuple[object, ...]] = [
+            ("start", self.start_s, "start of the bin, from the start of the stare", "s"),
+            ("end", self.end_s, "end of the bin", "s"),
+            ("frames", self.count, "frames of the bin"),
+            ("snr", found.snr, "S/N of the flare in the bin"),
+        ]
+        for q, (name, unit) in enumerate(zip(found.names, found.units, strict=True)):
+            column, unit = name.replace(" ", "_"), str(units.Unit(unit))
+            columns += [
+                (column, found.estimates[:, q], f"{name} of the flare", unit),
+                (f"{column}_error", found.errors[:, q], "its standard error", unit),
+            ]
+            for level, *ends in zip(found.levels, found.low, found.high, strict=True):
+                columns += [
+                    (f"{column}_{side}_{100 * level:.0f}", values[:, q],
+                     f"{side}er end of its {100 * level:.4g} % interval; infinite where there is none", unit)
+                    for side, values in zip(("low", "high"), ends, strict=True)
+                ]  # fmt: skip
+        columns += [
+            ("chi2", found.chi2, f"chi-squared of the fit, of {found.dof} degrees of freedom"),
+            ("p_value", found.p_value, "probability of a chi-squared at least as large where the model is right"),
+        ]
+        return make_table(columns)
+
+
+@public
+def measure_along(
+    frames: ArrayLike,
+    quiet: Expectation,
+    model: FlareModel,
+    nuisances: Nuisances | None = None,
+    *,
+    snr_per_bin: float = 20.0,
+    stare: Stare | None = None,
+    levels: Sequence[float] = LEVELS,
+) -> MeasuredBins:
+    """Measure a flare against time, in bins of consecutive frames in which it reaches an S/N.
+
+    Each bin is the shortest run of frames, after the bin before, in which a matched filter reaches `snr_per_bin`; its
+    frames are added up and fitted as one exposure (`fit`). Frames without enough light, before, between and after
+    flares, are in no bin. The filter has the temperature that fits the brightest part of the stare. Since the noise,
+    too, decides where a bin ends, amplitudes are too large by about one error over `snr_per_bin`; below an S/N of 8,
+    noise alone makes bins now and then.
+
+    Parameters
+    ----------
+    frames : array_like, shape (n_frame, n_pixel)
+        Raw DN of single frames.
+    quiet : Expectation
+        One frame of the quiescent star.
+    model : FlareModel
+        Of one frame.
+    nuisances : Nuisances, optional
+        Unknown amplitudes of known spectra, of one frame. They are constant within a bin, and each bin has its own.
+    snr_per_bin : float
+    stare : Stare, optional
+        Times of the frames and what is known of their conditions; frames without gaps and changes by default. No bin
+        extends over a gap.
+    levels : sequence of float
+        Nominal coverage of the intervals.
+
+    Raises
+    ------
+    InputError
+        For frames of another shape, an expectation of several frames, or a stare in which no bin reaches the S/N.
+    """
+    raw = np.asarray(frames, np.float64)
+    if stare is None:
+        here = quiet.conditions["temperature_c"]
+        stare = Stare.of(max(len(raw), 1) * quiet.frame_s, frame_s=quiet.frame_s, temperature_c=here)
+    n_pixel = quiet.wavelength_nm.size
+    if raw.shape != (stare.n_frames, n_pixel):
+        raise InputError(f"frames of the shape {raw.shape}, expected {(stare.n_frames, n_pixel)}")
+    if not np.isfinite(raw).all():
+        raise InputError("frames hold undefined values, expected finite numbers")
+    if quiet.n_frames != 1:
+        raise InputError(f"an exposure of {quiet.n_frames} frames, expected one frame of the quiescent star")
+    if not 0.0 < snr_per_bin < np.inf:
+        raise InputError(f"snr_per_bin = {snr_per_bin:g}, expected a number above 0")
+    # Known strengths of star, sky, dark and flare in each frame.
+    known = np.column_stack([stare.light * stare.star, stare.light * stare.sky, stare.dark_factor(quiet), stare.light])
+    bins = _bins(raw, quiet, model, nuisances, known, stare, snr_per_bin)
+    if not bins:
+        raise InputError(f"no bin of the stare reaches snr_per_bin = {snr_per_bin:g}, expected a lower one")
+    first, end = np.array(bins).T
+    alike: dict[tuple[float, ...], list[int]] = {}
+    for k, (a, b) in enumerate(bins):
+        mean = known[a:b].mean(axis=0).round(DIGITS)
+        alike.setdefault((float(b - a), *map(float, mean)), []).append(k)
+    parts = []
+    for (length, star, sky, dark, light), rows in alike.items():
+        n = int(length)
+        stacked = replace(
+            quiet, n_frames=n, source_electrons=star * quiet.source_electrons,
+            sky_electrons=sky * quiet.sky_electrons, dark_dn=dark * quiet.dark_dn,
+        )  # fmt: skip
+        unknown = None if nuisances is None else replace(nuisances, spectra=n * nuisances.spectra)
+        added = np.array([raw[first[k] : end[k]].sum(axis=0) for k in rows])
+        parts.append(fit(added, stacked, model.stacked(n, light), unknown, levels=levels))
+    order = np.argsort(np.concatenate(list(alike.values())))
+    found = Measurement.joined(parts).rows(order)
+    return MeasuredBins(first, end - first, stare.start_s[first], stare.start_s[end - 1] + stare.frame_s, found)
+
+
+def _bins(
+    raw: Float,
+    quiet: Expectation,
+    model: FlareModel,
+    nuisances: Nuisances | None,
+    known: Float,
+    stare: Stare,
+    snr: float,
+) -> list[tuple[int, int]]:
+    """Return first frames and ends of the shortest runs of frames in which a matched filter reaches an S/N."""
+    reduction = Reduction.of(model, quiet, None, nuisances)
+    means = np.vstack([quiet.net_source_dn, quiet.sky_dn, quiet.dark_dn, quiet.bias_dn])
+    strengths = np.column_stack([known[:, :3], np.ones(len(known))])
+    sums = raw @ reduction.weights.T - strengths @ (means @ reduction.weights.T)
+    total = np.vstack([np.zeros(sums.shape[1]), np.cumsum(sums, axis=0)])
+    shapes = reduction.hot[::EVERY] / np.linalg.norm(reduction.hot[::EVERY], axis=1)[:, None]
+    widths = 2 ** np.arange(int(np.log2(len(raw))) + 1)
+    best = [((total[w:] - total[:-w]) @ shapes.T).max(axis=0) / np.sqrt(w) for w in widths]
+    node = int(np.argmax(np.max(best, axis=0)))
+    light = model.hot[::EVERY][node]
+    weights = shapes[node] @ reduction.weights
+    # A frame's value has a variance of one, and in proportion to the flare's light that of its photons.
+    per_value = float(weights**2 @ (quiet.gain_dn_per_electron * light) / (weights @ light))
+    value = total @ shapes[node]
+    bins = []
+    gaps = np.flatnonzero(np.diff(stare.numbers) > 1) + 1
+    for begin, stop in zip([0, *gaps], [*gaps, len(raw)], strict=True):
+        start = int(begin)
+        for end in range(int(begin) + 1, int(stop) + 1):
+            earliest = max(start, end - MOST_FRAMES_PER_BIN)
+            gain = value[end] - value[earliest:end]
+            variance = np.arange(end - earliest, 0, -1) + per_value * np.maximum(gain, 0.0)
+            reached = np.flatnonzero(gain >= snr * np.sqrt(variance))
+            if reached.size:
+                bins.append((earliest + int(reached[-1]), end))
+                start = end
+    return bins

@@ -1,0 +1,169 @@
+"""Flares measured against time: a flare that cools, a steady one, known changes of conditions, refusals."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+import scipy
+
+from mauvecl import (
+    Cooling,
+    Engine,
+    Event,
+    Expectation,
+    FlareModel,
+    InputError,
+    Instrument,
+    Nuisances,
+    Sinusoid,
+    Source,
+    Stare,
+    expect,
+    fit,
+    measure_along,
+)  # fmt: skip
+
+MAUVE = Instrument.load("mauve")
+STEADY = Cooling(9000.0, 9000.0, 1.0)
+SEEDS = 20
+
+
+@cache
+def star() -> Source:
+    return Source.from_library("M3V").at_magnitude(9.0)
+
+
+@cache
+def quiet() -> Expectation:
+    return expect(star(), MAUVE, exposure=5.0)
+
+
+@cache
+def model() -> FlareModel:
+    return FlareModel.of(star(), MAUVE, quiet(), distance_pc=5.0, radius_rsun=0.4)
+
+
+def lit_frames(cooling: Cooling, stare: Stare) -> tuple[list[Expectation], np.ndarray]:
+    """Return frames with a flare that peaks at 52 s, each of one temperature, and these temperatures.
+
+    Each frame is an expectation of its own: neither the model's spectra nor its conditions are those of the fits.
+    """
+    x, start = quiet(), stare.start_s
+    event = Event(52.0, 40.0, 1.5, cooling)
+    rise = event.amplitude * event.form.mean_over(np.column_stack([start, start + 5.0]), 52.0, 40.0)
+    kelvin, dark = cooling.at(start + 2.5 - 52.0), stare.dark_factor(x)
+    lit = []
+    for k in range(stare.n_frames):
+        flaring = expect(star().flaring(float(rise[k]), float(kelvin[k])), MAUVE, exposure=5.0)
+        added = flaring.source_electrons - x.source_electrons
+        lit.append(replace(
+            x, source_electrons=stare.light[k] * (stare.star[k] * x.source_electrons + added),
+            sky_electrons=stare.light[k] * stare.sky[k] * x.sky_electrons, dark_dn=dark[k] * x.dark_dn,
+        ))  # fmt: skip
+    return lit, kelvin
+
+
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("cooling", "unknown"),
+    [
+        (Cooling(14_000.0, 7000.0, 80.0), None),
+        (Cooling(14_000.0, 7000.0, 80.0), {"dark": np.inf, "light": 0.02}),
+        (STEADY, {"dark": np.inf, "light": 0.02}),
+    ],
+    ids=["cools", "cools-unknown", "steady-unknown"],
+)
+def test_the_temperature_is_followed_with_honest_errors(
+    cooling: Cooling, unknown: dict[str, float] | None, engine: Engine
+) -> None:
+    """Drawn pixels of 20 stares. Pulls of ln T have mean 0 and variance 1 over all bins.
+
+    False failures: 1e-6 on each side of both, and of the coverage (94 to 96 %). The truth of a bin is the fit to its
+    frames without noise, which lies between the temperatures of its frames.
+    """
+    nuisances = None if unknown is None else Nuisances.of(quiet(), unknown)
+    lit, kelvin = lit_frames(cooling, Stare.of(300.0))
+    means = np.array([one.recorded_dn for one in lit])
+    raw = np.stack([engine.realise(one, count=SEEDS, seed=600 + k) for k, one in enumerate(lit)], axis=1)
+    pulls, inside = [], 0
+    truths: dict[tuple[int, int], float] = {}
+    for frames in raw:
+        along = measure_along(frames, quiet(), model(), nuisances, snr_per_bin=25.0)
+        assert (along.found.snr > 0.85 * 25.0).all()
+        assert (along.first[1:] >= along.first[:-1] + along.count[:-1]).all()
+        for k, (first, n) in enumerate(zip(along.first, along.count, strict=True)):
+            some = slice(first, first + n)
+            if (first, n) not in truths:
+                unknown_n = None if nuisances is None else replace(nuisances, spectra=n * nuisances.spectra)
+                one = replace(quiet(), n_frames=int(n))
+                exact = fit(means[some].sum(axis=0), one, model().stacked(int(n)), unknown_n)
+                truths[first, n] = float(exact.estimates[0, 0])
+            truth = truths[first, n]
+            assert 0.995 * kelvin[some].min() < truth < 1.005 * kelvin[some].max()
+            estimate, error = along.found.estimates[k, 0], along.found.errors[k, 0]
+            pulls.append(np.log(estimate / truth) * estimate / error)
+            inside += along.found.low[1, k, 0] <= truth <= along.found.high[1, k, 0]
+    z, n = np.array(pulls), len(pulls)
+    assert n > 100
+    assert abs(z.mean()) < scipy.stats.norm.isf(1e-6) / np.sqrt(n)
+    assert scipy.stats.chi2.ppf(1e-6, n) < np.sum(z**2) < scipy.stats.chi2.isf(1e-6, n)
+    assert scipy.stats.binom.ppf(1e-6, n, 0.94) <= inside <= scipy.stats.binom.isf(1e-6, n, 0.96)
+    # What is followed moves by many errors, or not at all.
+    spread = max(truths.values()) / min(truths.values())
+    assert spread > 1.15 if cooling is not STEADY else spread < 1.005
+
+
+def test_known_conditions_gaps_and_units() -> None:
+    """Frames without noise: 9000 K in every bin, with the right area and luminosity, and no bin over a gap."""
+    how = {"thermal": 3.0, "throughput": Sinusoid(0.2, 300.0), "variability": Sinusoid(0.05, 200.0), "orbit_s": 400.0}
+    stare = Stare.of(300.0, gaps=[(90.0, 115.0)], **how)  # type: ignore[arg-type]
+    lit, _ = lit_frames(STEADY, stare)
+    frames = np.array([one.recorded_dn for one in lit])
+    along = measure_along(frames, quiet(), model(), stare=stare)
+    found = along.found
+    np.testing.assert_allclose(found.estimates[:, 0], 9000.0, rtol=3e-3)
+    assert (found.chi2 < 0.1).all()
+    assert not ((along.start_s < 90.0) & (along.end_s > 115.0)).any()
+    assert (along.start_s < 90.0).any()
+    assert (along.start_s >= 115.0).any()
+    event = Event(52.0, 40.0, 1.5)
+    rise = 1.5 * event.form.mean_over(np.column_stack([along.start_s, along.end_s]), 52.0, 40.0)
+    values = [model().values(9000.0, [float(one)]) for one in rise]
+    for name in ("area", "luminosity bolometric", "filling factor"):
+        got = found.estimates[:, found.column(name)]
+        np.testing.assert_allclose(got, [one[name] for one in values], rtol=1e-2)
+    energy = found.estimates[:, found.column("energy bolometric")]
+    np.testing.assert_allclose(
+        energy, found.estimates[:, found.column("luminosity bolometric")] * (along.end_s - along.start_s), rtol=1e-9
+    )
+    table = along.table()
+    assert str(table["luminosity_bolometric"].unit) == "erg / s"
+    assert list(table["temperature"].value) == list(found.estimates[:, 0])
+    # Without the conditions the flare is another.
+    wrong = measure_along(frames, quiet(), model())
+    assert np.abs(wrong.found.estimates[:, 0] / 9000.0 - 1).max() > 0.02
+
+
+def test_stares_without_a_flare_have_no_bins(engine: Engine) -> None:
+    """200 frames of noise. False failures: below 1e-9, for 20 000 runs of frames at 8 standard deviations."""
+    raw = engine.realise(quiet(), count=200, seed=3)
+    with pytest.raises(InputError, match="no bin of the stare reaches snr_per_bin = 8"):
+        measure_along(raw, quiet(), model(), snr_per_bin=8.0)
+
+
+def test_what_cannot_be_is_named() -> None:
+    one = quiet().recorded_dn[None]
+    for frames, how, text in (
+        (one[:, :7], {}, r"shape \(1, 7\)"),
+        (one[0], {}, "shape"),
+        (one, {"snr_per_bin": 0.0}, "snr_per_bin = 0"),
+        (one, {"stare": Stare.of(50.0)}, r"expected \(10, "),
+        (one * np.nan, {}, "undefined"),
+    ):
+        with pytest.raises(InputError, match=text):
+            measure_along(frames, quiet(), model(), **how)
+    with pytest.raises(InputError, match="an exposure of 10 frames"):
+        measure_along(one, replace(quiet(), n_frames=10), model())
