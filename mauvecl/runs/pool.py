@@ -327,7 +327,7 @@ class Pool:
 
 
 def map_in_order(
-    engine: Engine | Pool | Stares, work: Callable[[Item], Answer], items: Iterable[Item]
+    engine: Engine | Pool | Stares | None, work: Callable[[Item], Answer], items: Iterable[Item]
 ) -> Iterator[Answer]:
     """Apply `work` to items and yield the results in order; with a pool, several items are in progress at once."""
     if not isinstance(engine, Pool):

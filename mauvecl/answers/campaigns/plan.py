@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, ClassVar
@@ -14,6 +14,7 @@ from mauvecl.answers.campaigns.conditions import Met
 from mauvecl.answers.campaigns.planned import (
     NOTHING,
     CompletenessOf,
+    Looked,
     Planned,
     closed_form,
     looked_of,
@@ -27,6 +28,7 @@ from mauvecl.host.orbit.conditions import PARTICLES_SOURCE, THERMAL_SOURCE
 from mauvecl.host.tables import make_table
 from mauvecl.lightcurve.search.null import DAY_S
 from mauvecl.lightcurve.search.yields import Yield, recovered_per_day
+from mauvecl.runs.pool import map_in_order
 from mauvecl.study.labels import describe_columns, stack_tables
 from mauvecl.study.messages import SATURATED, collect_messages
 from mauvecl.study.sections import Rays
@@ -318,26 +320,35 @@ def plan(
     names, hours = seen.visibility.by_month()
     completeness = completeness or _completeness(study, engine)
     met = Met.along(seen.visibility.track) if study.plan.along_orbit else None
-    planned: list[Planned] = []
-    for k, (text, star, target) in enumerate(zip(study.plan.targets, stars, seen.targets, strict=True)):
-        if progress is not None:
-            progress(k, len(stars))
-        looked = looked_of(study, text, star, target, seen, k, met)
+
+    def looked() -> Iterator[tuple[int, Looked]]:
+        for k, (text, star, target) in enumerate(zip(study.plan.targets, stars, seen.targets, strict=True)):
+            yield k, looked_of(study, text, star, target, seen, k, met)
+
+    def planned_for(item: tuple[int, Looked]) -> Planned:
+        k, one = item
         exposed = float(seen.visibility.hours[k])
         observed = exposed if study.plan.hours is None else min(exposed, study.plan.hours)
         order = np.argsort(-hours[:, k], kind="stable")[: study.plan.best_months]
         best = tuple(names[i] for i in sorted(order) if hours[i, k] > 0)
         its = None
-        if looked.window_s > 0:
-            its = completeness(study, looked) if looked.signal_per_frame > 0 else NOTHING
-        rates, why = rates_of(study, text, looked)
+        if one.window_s > 0:
+            its = completeness(study, one) if one.signal_per_frame > 0 else NOTHING
+        rates, why = rates_of(study, study.plan.targets[k], one)
         recovered = None
         if rates is not None:
             days = observed * 3600 / DAY_S
             recovered = Yield.about(0.0, 0.0) if its is None else Yield.of(rates, its, days)
-        planned.append(Planned(looked, exposed, observed, its, rates, recovered, best, why))
+        return Planned(one, exposed, observed, its, rates, recovered, best, why)
+
+    planned: list[Planned] = []
     if progress is not None:
-        progress(len(stars), len(stars))
+        progress(0, len(stars))
+    # With a pool, the noise of one target is drawn while the threshold of the next is sampled.
+    for one in map_in_order(engine, planned_for, looked()):
+        planned.append(one)
+        if progress is not None:
+            progress(len(planned), len(stars))
     return PlanAnswer(study, seen, tuple(planned))
 
 
