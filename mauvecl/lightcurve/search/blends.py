@@ -37,8 +37,11 @@ LIGHT_BEFORE, LIGHT_AFTER = 5.0, 80.0
 LOG_AMPLITUDES = (-27.0, 14.0)
 #: Relative change of chi-squared at which a fit ends, and evaluations after which it has not converged.
 CONVERGED, MOST_EVALUATIONS = 1e-7, 100
-#: Difference from 1 of the root of what chi-squared rises by, at which an end of an interval is found; most refits.
+#: Difference from 1 of the root of what chi-squared rises by over what it is to rise by, at which an end of an interval
+#: is found; most refits.
 CLOSE, MOST_REFITS = 0.02, 12
+#: Ways beyond an end of an interval, over the way to it, where another optimum is looked for.
+BEYOND = (1.5, 1.5, 1.5)
 #: Fall of chi-squared during profiling that shows a better fit than the one that was thought the best.
 BETTER = 0.05
 
@@ -352,7 +355,7 @@ class Block:
         return covariance
 
     def interval(
-        self, best: Blended, j: int, column: int, factor: Factor | None = None
+        self, best: Blended, j: int, column: int, factor: Factor | None = None, rises: float = 1.0
     ) -> tuple[Interval, Blended | None]:
         """A parameter's interval, or that of a product; a better fit where profiling comes across one.
 
@@ -363,6 +366,8 @@ class Block:
             Flare and column.
         factor : callable, optional
             In place of the column: amplitude times half-width times this.
+        rises : float, optional
+            What chi-squared rises by at the ends.
         """
         covariance, theta = self.covariance(best.theta), best.theta
         weights = np.zeros(theta.shape)
@@ -378,33 +383,24 @@ class Block:
         sd = np.sqrt(variance) if variance > 0 else 1e-3
         found: list[tuple[float, bool]] = []
         for sign, end in zip((-1.0, 1.0), ends, strict=True):
-            inner, outer, root_inner, root_outer = 0.0, np.inf, 0.0, np.inf
-            step, start, at_end = sd, theta, False
-            for _ in range(MOST_REFITS):
-                at_end = sign * (middle + sign * step - end) >= 0
-                step = abs(end - middle) if at_end else step
-                guess = start if start is not theta or variance <= 0 else theta + along * sign * step / variance
-                one = self.fit(guess, (j, column, float(middle + sign * step), factor))
-                rise = one.chi2 - best.chi2
-                if rise < -BETTER:
-                    return Interval(np.nan, np.nan), self.fit(one.theta)
-                root = np.sqrt(max(rise, 0.0))
-                if abs(root - 1.0) < CLOSE or (at_end and root < 1.0):
-                    break
-                start = one.theta
-                if root < 1.0:
-                    inner, root_inner = step, root
-                else:
-                    outer, root_outer = step, root
-                if np.isinf(outer):
-                    step = step * min(1.0 / max(root, 0.25), 4.0) * 1.02
-                else:
-                    # Nearly straight between the two: regula falsi, away from the ends.
-                    share = (1.0 - root_inner) / (root_outer - root_inner)
-                    step = inner + (outer - inner) * float(np.clip(share, 0.08, 0.92))
-            else:
-                at_end = True
-            found.append((float(middle + sign * step), bool(at_end and root < 1.0 - CLOSE)))
+            furthest = abs(end - middle)
+
+            def refit(step: float, start: Float | None, sign: float = sign) -> Blended:
+                straight = theta + along * sign * step / variance if variance > 0 else theta
+                fixed = j, column, float(middle + sign * step), factor
+                return self.fit(straight if start is None else start, fixed)
+
+            reached, probes = _reached(refit, best.chi2, rises, sd * np.sqrt(rises), furthest), list(BEYOND)
+            while probes and reached.better is None and reached.step < furthest:
+                # Behind a rise there may be another fall, of another optimum.
+                step = min(reached.step * probes.pop(0), furthest)
+                fits = [refit(step, start) for start in (None, reached.theta, theta)]
+                one = min(fits, key=lambda fit: fit.chi2)
+                if one.chi2 - best.chi2 < rises * (1.0 - CLOSE) ** 2:
+                    reached = _reached(refit, best.chi2, rises, step, furthest, one.theta)
+            if reached.better is not None:
+                return Interval(np.nan, np.nan), self.fit(reached.better.theta)
+            found.append((float(middle + sign * reached.step), reached.open))
         (low, open_low), (high, open_high) = found
         return Interval(low, high, open_low, open_high), None
 
@@ -415,3 +411,57 @@ class Block:
             left = float(self.data @ self.data)
             return replace(blended, theta=rest, chi2=left, dof=self.data.size - self.basis.shape[1])
         return self.fit(rest)
+
+
+@dataclass(frozen=True, eq=False)
+class _Reached:
+    """Where chi-squared has risen by what it is to rise by: the way from the best fit, and whether it runs on.
+
+    Where a fit is better than the best one, `better` is that fit.
+    """
+
+    step: float
+    open: bool
+    theta: Float
+    better: Blended | None = None
+
+
+def _reached(
+    refit: Callable[[float, Float | None], Blended], chi2: float, rises: float, step: float, furthest: float,
+    start: Float | None = None,
+) -> _Reached:  # fmt: skip
+    """Return the end of an interval on one side, from a first guess of the way to it.
+
+    Parameters
+    ----------
+    refit : callable
+        The best fit at some way from the best, from a start or from the tangent.
+    chi2, rises : float
+        Of the best fit, and what it is to rise by.
+    step, furthest : float
+        First guess, and the way to the end of what is fitted.
+    start : ndarray, optional
+        Where the first fit begins.
+    """
+    inner, outer, root_inner, root_outer = 0.0, np.inf, 0.0, np.inf
+    for _ in range(MOST_REFITS):
+        at_end = step >= furthest
+        step = min(step, furthest)
+        one = refit(step, start)
+        if one.chi2 - chi2 < -BETTER:
+            return _Reached(step, False, one.theta, one)
+        root = float(np.sqrt(max(one.chi2 - chi2, 0.0) / rises))
+        if abs(root - 1.0) < CLOSE or (at_end and root < 1.0):
+            return _Reached(step, at_end and root < 1.0 - CLOSE, one.theta)
+        start = one.theta
+        if root < 1.0:
+            inner, root_inner = step, root
+        else:
+            outer, root_outer = step, root
+        if np.isinf(outer):
+            step *= min(1.0 / max(root, 0.25), 4.0) * 1.02
+        else:
+            # Nearly straight between the two: regula falsi, away from the ends.
+            share = (1.0 - root_inner) / (root_outer - root_inner)
+            step = inner + (outer - inner) * float(np.clip(share, 0.08, 0.92))
+    return _Reached(step, root < 1.0 - CLOSE, one.theta)
