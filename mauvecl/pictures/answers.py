@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from mauvecl.pictures.style import (
 from mauvecl.results.requests.fap import NoThresholdError
 from mauvecl.statistics.registry import label
 from mauvecl.statistics.statistic import LinearStatistic
+from mauvecl.study.parts import First, note_of, part_note
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -41,9 +43,9 @@ Shown = tuple[str, "Detection", Sequence[str]]
 MOST_STARS = 6
 
 
-def _few(answer: DetectAnswer) -> list[Shown]:
+def _few(answer: DetectAnswer) -> First[Shown]:
     """More stars would be too small to read."""
-    return [star.shown for star in answer.stars[:MOST_STARS]]
+    return First([star.shown for star in answer.stars], MOST_STARS, "stars")
 
 
 def _alone(found: Detection) -> list[Shown]:
@@ -76,7 +78,9 @@ def detection(plt: Any, stars: Sequence[Shown], fap: float = 1e-3) -> Any:
     headline(
         figure,
         f"Detection statistics without a flare and with one, {exposures}, "
-        f"{first.realisations:,} realisations each; nominal throughput{_left_out(stars)}",
+        f"{first.realisations:,} realisations each; nominal throughput",
+        note_of(stars),
+        _flare_note(stars),
     )
     return figure
 
@@ -86,10 +90,10 @@ def _drawn_flares(names: Sequence[str]) -> list[int]:
     return [round(k) for k in np.linspace(0, len(names) - 1, min(len(names), MOST_FLARES))]
 
 
-def _left_out(stars: Sequence[Shown]) -> str:
-    """Return the end of a title that states how many of the flares are drawn, or nothing if all are."""
+def _flare_note(stars: Sequence[Shown]) -> str:
+    """Return how many of the flares are drawn, or nothing if all are."""
     most = max(len(names) for *_, names in stars)
-    return f"; {MOST_FLARES} of {most} flares" if most > MOST_FLARES else ""
+    return part_note(min(MOST_FLARES, most), most, "flares")
 
 
 def _distributions(axis: Any, outcome: Detection, flares: Sequence[str], statistic: str, fap: float) -> None:
@@ -148,7 +152,7 @@ def named_roc(curve: Roc, name: str = "", **how: Any) -> Any:
 def roc(plt: Any, curves: Sequence[tuple[str, Roc]]) -> Any:
     """Receiver operating characteristics with their areas."""
     figure, axis = plt.subplots(figsize=(3.6, 2.9))
-    for colour, (name, curve) in zip(COLOURS, curves, strict=False):
+    for colour, (name, curve) in zip(cycle(COLOURS), curves, strict=False):
         table = curve.table()
         seen = np.asarray(table["fap"]) > 0
         text = f"{name}: area {curve.area.value:.4f}"
@@ -198,7 +202,9 @@ def spectra(plt: Any, stars: Sequence[Shown]) -> Any:
     legend_below(figure, handles, shown)
     headline(
         figure,
-        f"Mean spectra as Mauve would see them; nominal throughput, not a flight calibration{_left_out(stars)}",
+        "Mean spectra as Mauve would see them; nominal throughput, not a flight calibration",
+        note_of(stars),
+        _flare_note(stars),
     )
     return figure
 
@@ -239,8 +245,7 @@ def observation(plt: Any, title: str, table: QTable) -> Any:
 @picture_of(
     "SnrAnswer",
     "snr",
-    given=lambda answer: ([(star.title, star.result) for star in answer.stars],),
-    when=lambda answer: len(answer.stars) <= MOST_STARS,
+    given=lambda answer: (First([(star.title, star.result) for star in answer.stars], MOST_STARS, "stars"),),
 )
 @picture_of("SnrResult", "snr", given=lambda result: ([(result.expectation.name, result)],))
 @drawn
@@ -278,7 +283,7 @@ def signal_to_noise(plt: Any, stars: Sequence[tuple[str, SnrResult | Expectation
             axis.set_xlim(200, 700)
     handles, names = axes[0][0].get_legend_handles_labels()
     legend_below(figure, handles, names)
-    headline(figure, "S/N of one exposure; nominal throughput, not a flight calibration")
+    headline(figure, "S/N of one exposure; nominal throughput, not a flight calibration", note_of(stars))
     for axis in axes[-1]:
         axis.set_xlabel("wavelength (nm)")
     return figure

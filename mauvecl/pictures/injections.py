@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import cycle
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -9,6 +10,7 @@ import numpy as np
 
 from mauvecl.pictures.registry import picture_of
 from mauvecl.pictures.style import COLOURS, MOST_COLUMNS, STYLE, canvas, finished, headline, legend_below
+from mauvecl.study.parts import First, part_note
 
 if TYPE_CHECKING:
     from mauvecl.answers.stares.inject import InjectAnswer
@@ -27,8 +29,8 @@ MOST_MAPS = 6
 CONTOURS = (0.1, 0.5, 0.9)
 
 
-def _panels(answer: InjectAnswer) -> tuple[Any, list[Any], list[Any]]:
-    stars = answer.stars[:MOST_MAPS]
+def _panels(answer: InjectAnswer) -> tuple[Any, First[Any], list[Any]]:
+    stars = First(answer.stars, MOST_MAPS, "stars")
     columns = min(len(stars), MOST_COLUMNS)
     rows = -(-len(stars) // columns)
     figure, axes = canvas().subplots(rows, columns, figsize=(3.6 * columns + 0.8, 3.2 * rows), squeeze=False)
@@ -37,13 +39,14 @@ def _panels(answer: InjectAnswer) -> tuple[Any, list[Any], list[Any]]:
     return figure, stars, list(axes.flat)
 
 
-def _titled(figure: Any, answer: InjectAnswer) -> None:
+def _titled(figure: Any, answer: InjectAnswer, *notes: str) -> None:
     choice, flare = answer.study.search, answer.study.flare
     alarms = "false alarm" if choice.false_alarms == 1 else "false alarms"
     headline(
         figure,
         f"Flares of {flare.light().describe()}, {choice.false_alarms:g} {alarms} per star-{choice.per}; nominal "
         "throughput",
+        *notes,
     )
 
 
@@ -66,7 +69,7 @@ def maps(answer: InjectAnswer, path: str | Path | None) -> Any:
             axis.clabel(lines, fmt=lambda level: f"{100 * level:g} %", fontsize=7)
         if mesh is not None:
             figure.colorbar(mesh, ax=axes, label="completeness")
-        _titled(figure, answer)
+        _titled(figure, answer, stars.note)
         return finished(figure, path)
 
 
@@ -75,10 +78,11 @@ def curves(answer: InjectAnswer, path: str | Path | None) -> Any:
     """Completeness over size at some half-widths, with 95 % intervals; the figure where no path is given."""
     with canvas().rc_context(STYLE):
         figure, stars, axes = _panels(answer)
+        widths = len(stars[0].injected.half_widths_s)
         for star, axis in zip(stars, axes, strict=False):
             f = star.injected
             picked = np.unique(np.linspace(0, len(f.half_widths_s) - 1, MOST_CURVES).round().astype(int))
-            for k, colour in zip(picked, COLOURS, strict=False):
+            for k, colour in zip(picked, cycle(COLOURS), strict=False):
                 axis.fill_between(
                     f.sizes, f.completeness_low[k], f.completeness_high[k], color=colour, alpha=0.25, linewidth=0
                 )
@@ -89,7 +93,7 @@ def curves(answer: InjectAnswer, path: str | Path | None) -> Any:
                 xscale="log", xlabel=SIZES[star.sizes.of], ylabel="completeness", ylim=(-0.02, 1.02), title=star.title
             )
         legend_below(figure, *axes[0].get_legend_handles_labels())
-        _titled(figure, answer)
+        _titled(figure, answer, stars.note, part_note(min(MOST_CURVES, widths), widths, "half-widths"))
         return finished(figure, path)
 
 
@@ -107,7 +111,7 @@ def energies(answer: InjectAnswer, path: str | Path | None) -> Any:
                 mesh = axis.pcolormesh(_edges(x), _edges(y), z, cmap="RdBu_r", vmin=-0.3, vmax=0.3)
         if mesh is not None:
             figure.colorbar(mesh, ax=axes, label="recovered over injected energy, median (dex)")
-        _titled(figure, answer)
+        _titled(figure, answer, stars.note)
         return finished(figure, path)
 
 

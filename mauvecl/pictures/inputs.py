@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -58,7 +59,7 @@ def expectation(plt: Any, x: Expectation) -> Any:
 def magnitudes(plt: Any, source: Source, values: Sequence[float], band: str = "V") -> Any:
     """A spectrum at several magnitudes: the paper's figure of the rescaled HD 37202."""
     figure, axis = plt.subplots(figsize=(3.6, 2.7))
-    for colour, value in zip(COLOURS, values, strict=False):
+    for colour, value in zip(cycle(COLOURS), values, strict=False):
         star = source.at_magnitude(value, band)
         axis.semilogy(star.wavelength_nm, star.flux_flam, color=colour, label=f"{band} = {value:g}")
     axis.set(xlabel=WAVELENGTH, ylabel=FLUX, xlim=RANGE_NM, title=source.name)
@@ -108,7 +109,7 @@ def efficiencies(plt: Any, instrument: Instrument) -> Any:
     """Each optical element's efficiency: the paper's figure of the payload's components."""
     w = np.linspace(*RANGE_NM, 501)
     figure, axis = plt.subplots(figsize=(3.6, 2.9))
-    for colour, (name, text) in zip(COLOURS, OPTICS.items(), strict=False):
+    for colour, (name, text) in zip(cycle(COLOURS), OPTICS.items(), strict=False):
         axis.plot(w, 100 * getattr(instrument, name).at(w), color=colour, label=text)
     axis.set(xlabel=WAVELENGTH, ylabel="efficiency (%)", xlim=RANGE_NM, ylim=(0, 105))
     axis.set_title(f"{instrument.name}: nominal, some of it assumed")

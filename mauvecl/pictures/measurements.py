@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.pictures.registry import picture_of
-from mauvecl.pictures.style import COLOURS, NULL, drawn
+from mauvecl.pictures.style import COLOURS, NULL, drawn, headline
 from mauvecl.results.measurements.fit import forecast
 from mauvecl.results.measurements.reduction import variance_of
+from mauvecl.study.parts import First, note_of
 
 if TYPE_CHECKING:
     from mauvecl.answers.measurements.measure import MeasureAnswer, MeasuredFlare
@@ -24,7 +25,7 @@ MOST_FLARES = 4
 
 
 def _few(answer: MeasureAnswer) -> tuple[Any, ...]:
-    return (answer.flares[:MOST_FLARES],)
+    return (First(answer.flares, MOST_FLARES, "flares"),)
 
 
 @picture_of("MeasureAnswer", "fit", given=_few)
@@ -47,6 +48,7 @@ def fits(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
         lower.set(xlabel="wavelength (nm)", ylabel="residual / noise")
         upper.set(title=one.name, ylabel="DN per resolution element")
         upper.legend(loc="best")
+    headline(figure, note_of(flares))
     return figure
 
 
@@ -64,6 +66,7 @@ def contours(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
         if np.isfinite(one.truth[:2]).all():
             axis.plot(*one.truth[:2], "x", color="black")
         axis.set(xlabel="temperature (K)", ylabel="amplitude", title=one.name)
+    headline(figure, note_of(flares))
     return figure
 
 
@@ -86,6 +89,7 @@ def pulls(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
         axis.plot(x, np.exp(-(x**2) / 2) / np.sqrt(2 * np.pi), color=NULL, linestyle="--", label="normal")
         axis.set(xlabel="(estimate - truth) / error", ylabel="density", title=one.name)
         axis.legend(loc="best")
+    headline(figure, note_of(flares))
     return figure
 
 
@@ -104,4 +108,5 @@ def errors(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
                 axis.plot(FACTORS * linear[0], relative, line, color=colour, label=f"{one.fitted.names[q]}, {whose}")
         axis.set(xscale="log", yscale="log", xlabel="amplitude", ylabel="relative error", title=one.name)
         axis.legend(loc="best")
+    headline(figure, note_of(flares))
     return figure

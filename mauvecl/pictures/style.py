@@ -147,8 +147,11 @@ class TitledAxes:
         return self._ax.legend(handles, names, loc="best")
 
 
-def headline(figure: Any, text: str, fontsize: float = 9.0) -> None:
+def headline(figure: Any, text: str, *notes: str, fontsize: float = 9.0) -> None:
     """A title over all panels, broken into as many lines as the figure's width needs."""
+    text = "; ".join(filter(None, (text, *notes)))
+    if not text:
+        return
     title = figure.suptitle(text, fontsize=fontsize)
     if title is None:
         return

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import cycle
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -33,7 +34,7 @@ def unknowns(plt: Any, answer: UnknownTable) -> Any:
         axis.plot(
             relative, power(known * relative / amplitude, fap), color="black", linewidth=3, label="everything known"
         )
-        for colour, (unknown, cost) in zip(COLOURS, costs.items(), strict=False):
+        for colour, (unknown, cost) in zip(cycle(COLOURS), costs.items(), strict=False):
             axis.plot(relative, power(cost.marginal * relative / amplitude, fap), color=colour, label=unknown)
             axis.plot(relative, power(cost.plain * relative / amplitude, fap), color=colour, linestyle="--")
         axis.set(xscale="log", xlabel=QUANTITIES["amplitude"].axis, ylim=(-0.02, 1.02), title=star)
@@ -46,7 +47,7 @@ def unknowns(plt: Any, answer: UnknownTable) -> Any:
     for i, name in enumerate(every):
         values = [answer.smallest(star, name) for star in stars]
         place = np.arange(len(stars)) + (i - len(names) / 2) * width
-        below.bar(place, values, width, color="black" if name is None else COLOURS[i - 1])
+        below.bar(place, values, width, color="black" if name is None else COLOURS[(i - 1) % len(COLOURS)])
     below.set(yscale="log", ylabel="smallest flare amplitude", xticks=range(len(stars)), xticklabels=stars)
     below.set_title(
         f"Detected with a probability of {answer.study.limit.power:g}, marginalised over each unknown; "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -9,12 +10,16 @@ import typer
 from mauvecl.cli.console import INTERVAL, short
 from mauvecl.cli.flags import DETECTION, DRAWS, FLARE, LIMIT, MAP, NUISANCES, SWEEP, UNKNOWN
 from mauvecl.cli.verb import takes_study
+from mauvecl.study.parts import First
 
 if TYPE_CHECKING:
     from mauvecl.answers.detection.maps import MapResult
     from mauvecl.answers.limits.limits import Limit, LimitResult
     from mauvecl.cli.session import Session
     from mauvecl.study.study import Study
+
+#: Unknowns whose shares of a scatter are shown, at most.
+MOST_SHARES = 3
 
 
 @takes_study(LIMIT, FLARE, DRAWS, DETECTION, NUISANCES, UNKNOWN, SWEEP)
@@ -99,8 +104,14 @@ def _unknown(one: Limit, digits: str) -> tuple[str, str]:
     """The range of the limits over what is unknown, and the three unknowns that explain most of it."""
     assert one.unknown is not None
     low, high = one.unknown.range
-    first = list(one.unknown.shares.items())[:3]
-    return f"{low:{digits}} to {high:{digits}}", ", ".join(f"{name} {100 * share:.0f} %" for name, share in first)
+    return f"{low:{digits}} to {high:{digits}}", _largest(one.unknown.shares)
+
+
+def _largest(shares: Mapping[str, float]) -> str:
+    """Return the first of the shares in words, and how many there are."""
+    first = First(shares.items(), MOST_SHARES, "unknowns")
+    note = f" ({first.note})" if first.note else ""
+    return ", ".join(f"{name} {100 * share:.0f} %" for name, share in first) + note
 
 
 @takes_study(MAP, FLARE, DRAWS, DETECTION, NUISANCES, UNKNOWN, name="map", fewer=True)
@@ -129,9 +140,8 @@ def _show_map(answer: MapResult) -> None:
         return value if isinstance(value, str) else f"{value:.3g}"
 
     for statistic, parts in answer.shares.items():
-        told = ", ".join(f"{name} {100 * share:.0f} %" for name, share in list(parts.items())[:3])
         draws = f"{study.unknowns.draws} draws of what is unknown"
-        show([f"{statistic}, averaged over {draws}: its scatter is from {told}."])
+        show([f"{statistic}, averaged over {draws}: its scatter is from {_largest(parts)}."])
     corner = f"{study.map.y.quantity}, {study.map.x.quantity}"
     for statistic, probability in zip(answer.statistics, answer.probability, strict=True):
         rows = [(text(y), *(f"{100 * p:.0f}" for p in row)) for y, row in zip(answer.y, probability, strict=True)]

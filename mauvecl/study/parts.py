@@ -1,0 +1,41 @@
+"""Parts of what is too much to show, with a note that states how much is left out."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterable
+from itertools import islice
+from typing import TypeVar
+
+T = TypeVar("T")
+
+
+class First(list[T]):
+    """The first of several things, and a note on how many there are.
+
+    Parameters
+    ----------
+    things : collection
+    most : int
+        Things that are kept, at most.
+    name : str
+        What the things are, in the plural.
+
+    Attributes
+    ----------
+    note : str
+        As in "6 of 9 stars shown"; empty if all are kept.
+    """
+
+    def __init__(self, things: Collection[T], most: int, name: str) -> None:
+        super().__init__(islice(things, most))
+        self.note = part_note(len(self), len(things), name)
+
+
+def part_note(shown: int, total: int, name: str) -> str:
+    """Return the note on a part of several things, as in "6 of 9 stars shown", or nothing for all of them."""
+    return f"{shown} of {total} {name} shown" if shown < total else ""
+
+
+def note_of(things: Iterable[object]) -> str:
+    """Return the note of things that are a part of more, or nothing."""
+    return things.note if isinstance(things, First) else ""
