@@ -632,7 +632,7 @@ def test_command_and_program_are_the_question(link: str, tmp_path: Path) -> None
     seen: list[Study] = []
     from mauvecl.cli import session
 
-    def stop(self: Any) -> Any:
+    def stop(self: Any, **_: Any) -> Any:
         seen.append(self.study)
         raise InputError("seen")
 
