@@ -1,4 +1,4 @@
-"""Pictures of answers: detections, curves, spectra, one observation, S/N."""
+"""Pictures of detections, receiver operating characteristics, spectra, observations and S/N."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from mauvecl.pictures.registry import picture_of
 from mauvecl.pictures.style import (
     COLOURS,
     COLUMN,
-    MOST_COLUMNS,
+    MAX_COLUMNS,
     NULL,
     UNBROKEN,
-    drawn,
     headline,
     legend_below,
     plain_numbers,
+    styled_picture,
 )
 from mauvecl.results.requests.fap import NoThresholdError
 from mauvecl.statistics.registry import label
@@ -39,12 +39,12 @@ if TYPE_CHECKING:
 MOST_FLARES = 16
 #: A star: title, findings, and its flares' names.
 Shown = tuple[str, "Detection", Sequence[str]]
-#: Stars in one picture, at most.
+#: Largest number of stars in a picture.
 MOST_STARS = 6
 
 
 def _few(answer: DetectAnswer) -> First[Shown]:
-    """More stars would be too small to read."""
+    """Limit the number of stars so that each panel stays readable."""
     return First([star.shown for star in answer.stars], MOST_STARS, "stars")
 
 
@@ -54,12 +54,12 @@ def _alone(found: Detection) -> list[Shown]:
 
 @picture_of("DetectAnswer", "detection", given=lambda answer: (_few(answer), answer.study.run.fap))
 @picture_of("Detection", "detection", given=lambda found: (_alone(found),))
-@drawn
+@styled_picture
 def detection(plt: Any, stars: Sequence[Shown], fap: float = 1e-3) -> Any:
-    """Null and flare distributions: a row per star, a column per statistic."""
+    """Plot null and flare distributions, with a row per star and a column per statistic."""
     first = stars[0][1]
     statistics = first.statistics
-    columns = min(len(statistics), MOST_COLUMNS)
+    columns = min(len(statistics), MAX_COLUMNS)
     rows = -(-len(statistics) // columns)
     figure, axes = plt.subplots(
         rows * len(stars), columns, figsize=(COLUMN * columns, 2.6 * rows * len(stars) + 0.4), squeeze=False
@@ -107,7 +107,7 @@ def _distributions(axis: Any, outcome: Detection, flares: Sequence[str], statist
         middle, height = (edges[1:] + edges[:-1]) / 2, counts / counts.max()
         axis.fill_between(middle, height, step="mid", color=colour, alpha=0.3, linewidth=0)
         axis.step(middle, height, where="mid", color=colour, label=name)
-    # Where a statistic is scaled by the flare, each has a threshold of its own.
+    # Statistics that are scaled by the flare have a threshold per flare.
     own = chosen if one.shaped and not linear else [0]
     for i, k in enumerate(own):
         try:
@@ -117,7 +117,7 @@ def _distributions(axis: Any, outcome: Detection, flares: Sequence[str], statist
         colour = COLOURS[i % len(COLOURS)] if len(own) > 1 else "black"
         name = f"threshold, fap {fap:g} per test"
         axis.axvline(cut, color=colour, linewidth=0.9, linestyle="--", label=None if len(own) > 1 else name)
-    # Means lie decades apart.
+    # Means differ by decades.
     if linear:
         axis.set_xscale("function", functions=(lambda x: np.arcsinh(x / 2), lambda y: 2 * np.sinh(y)))
         low, high = axis.get_xlim()
@@ -126,7 +126,7 @@ def _distributions(axis: Any, outcome: Detection, flares: Sequence[str], statist
     else:
         axis.set_xscale("log")
         low, high = axis.get_xlim()
-        # Under two decades a power of ten alone says too little.
+        # Below two decades, powers of ten alone are too sparse.
         digits = (
             (1,)
             if high / low > 100
@@ -144,13 +144,13 @@ def _distributions(axis: Any, outcome: Detection, flares: Sequence[str], statist
 
 @picture_of("Roc", "roc")
 def named_roc(curve: Roc, name: str = "", **how: Any) -> Any:
-    """One receiver operating characteristic with its area."""
+    """Plot a receiver operating characteristic with its area."""
     return roc([(name, curve)], **how)
 
 
-@drawn
+@styled_picture
 def roc(plt: Any, curves: Sequence[tuple[str, Roc]]) -> Any:
-    """Receiver operating characteristics with their areas."""
+    """Plot receiver operating characteristics with their areas."""
     figure, axis = plt.subplots(figsize=(3.6, 2.9))
     for colour, (name, curve) in zip(cycle(COLOURS), curves, strict=False):
         table = curve.table()
@@ -167,9 +167,9 @@ def roc(plt: Any, curves: Sequence[tuple[str, Roc]]) -> Any:
 
 
 @picture_of("DetectAnswer", "spectra", given=lambda answer: (_few(answer),))
-@drawn
+@styled_picture
 def spectra(plt: Any, stars: Sequence[Shown]) -> Any:
-    """Mean spectra per second with the noise of a pixel; beneath, what flares add, in sigma of an element's noise."""
+    """Plot mean spectra per second with pixel noise and, below, the flares in sigma of an element's noise."""
     figure, axes = plt.subplots(
         2, len(stars), figsize=(COLUMN * max(len(stars), 1), 5.0), squeeze=False, sharex=True, height_ratios=(3, 2)
     )
@@ -190,7 +190,7 @@ def spectra(plt: Any, stars: Sequence[Shown]) -> Any:
         above.plot(quiet.wavelength_nm, mean, color="black", linestyle="--", label="no flare")
         above.set_title(f"{title}, {quiet.exposure_s:g} s")
         below.axhline(1.0, color=NULL, linewidth=0.8, linestyle="--")
-        # A hundredth of a sigma is nothing.
+        # The axis omits values below 0.01 sigma.
         below.set_yscale("log")
         below.set_ylim(bottom=max(below.get_ylim()[0], 0.03))
         plain_numbers(below)
@@ -210,7 +210,7 @@ def spectra(plt: Any, stars: Sequence[Shown]) -> Any:
 
 
 def _whole(x: Expectation) -> NDArray[np.bool_]:
-    """Elements with as many pixels as the others have, to one: the last one of the spectrum may be a part."""
+    """Return the complete elements; the last one of the spectrum may have fewer pixels."""
     pixels = np.bincount(x.element, minlength=x.element_wavelength_nm.size)
     return np.asarray(pixels >= np.median(pixels) - 1)
 
@@ -218,9 +218,9 @@ def _whole(x: Expectation) -> NDArray[np.bool_]:
 @picture_of(
     "SimulateAnswer", "observation", each=lambda answer: [(title, table) for title, _, table in answer.observations]
 )
-@drawn
+@styled_picture
 def observation(plt: Any, title: str, table: QTable) -> Any:
-    """One raw spectrum and what it is made of, as the paper's figure of components."""
+    """Plot a raw spectrum and its components, as the paper's figure of components."""
     panels = (
         ("raw", "raw spectrum"),
         ("source", "star"),
@@ -248,9 +248,9 @@ def observation(plt: Any, title: str, table: QTable) -> Any:
     given=lambda answer: (First([(star.title, star.result) for star in answer.stars], MOST_STARS, "stars"),),
 )
 @picture_of("SnrResult", "snr", given=lambda result: ([(result.expectation.name, result)],))
-@drawn
+@styled_picture
 def signal_to_noise(plt: Any, stars: Sequence[tuple[str, SnrResult | Expectation]]) -> Any:
-    """S/N per pixel and per resolution element: closed form, and the spread of realisations where there are some."""
+    """Plot the closed-form S/N per pixel and resolution element, and the spread of realisations if simulated."""
     from mauvecl.results.snr import SnrResult
 
     figure, axes = plt.subplots(len(stars), 2, figsize=(7.6, 2.6 * len(stars) + 0.4), squeeze=False, sharex=True)

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 
 class Picture(Figure):
-    """A matplotlib figure that any notebook displays."""
+    """Matplotlib figure that notebooks display."""
 
     def _repr_png_(self) -> bytes:
         content = io.BytesIO()

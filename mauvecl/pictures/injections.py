@@ -1,4 +1,4 @@
-"""Pictures of completeness: maps over half-width and size, curves, energies recovered."""
+"""Pictures of completeness: maps over half-width and size, curves and recovered energies."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.pictures.registry import picture_of
-from mauvecl.pictures.style import COLOURS, MOST_COLUMNS, STYLE, canvas, finished, headline, legend_below
+from mauvecl.pictures.style import COLOURS, MAX_COLUMNS, STYLE, canvas, headline, legend_below, save_or_return
 from mauvecl.study.parts import First, part_note
 
 if TYPE_CHECKING:
     from mauvecl.answers.stares.inject import InjectAnswer
 
-#: What the axes of sizes are called.
+#: Labels of the size axes.
 SIZES = {
     "amplitude": "flare amplitude",
     "duration": "equivalent duration (s)",
     "energy": "bolometric energy (erg)",
     "band_energy": "energy in the band (erg)",
 }
-#: Half-widths with curves of their own, at most.
+#: Largest number of half-widths with a curve each.
 MOST_CURVES = 6
-#: Maps in one picture, at most.
+#: Largest number of maps in a picture.
 MOST_MAPS = 6
 CONTOURS = (0.1, 0.5, 0.9)
 
 
 def _panels(answer: InjectAnswer) -> tuple[Any, First[Any], list[Any]]:
     stars = First(answer.stars, MOST_MAPS, "stars")
-    columns = min(len(stars), MOST_COLUMNS)
+    columns = min(len(stars), MAX_COLUMNS)
     rows = -(-len(stars) // columns)
     figure, axes = canvas().subplots(rows, columns, figsize=(3.6 * columns + 0.8, 3.2 * rows), squeeze=False)
     for axis in axes.flat[len(stars) :]:
@@ -52,7 +52,7 @@ def _titled(figure: Any, answer: InjectAnswer, *notes: str) -> None:
 
 @picture_of("InjectAnswer", "completeness")
 def maps(answer: InjectAnswer, path: str | Path | None) -> Any:
-    """Completeness over half-width and size, one panel per star; the figure where no path is given."""
+    """Plot completeness over half-width and size, one panel per star; without a path, return the figure."""
     with canvas().rc_context(STYLE):
         figure, stars, axes = _panels(answer)
         mesh = None
@@ -60,7 +60,7 @@ def maps(answer: InjectAnswer, path: str | Path | None) -> Any:
             x, y, z = np.array(star.injected.half_widths_s), star.injected.sizes, star.injected.completeness.T
             axis.set(xscale="log", yscale="log", xlabel="half-width (s)", ylabel=SIZES[star.sizes.of], title=star.title)
             if x.size < 2:
-                # One half-width has no width to be drawn with.
+                # A single half-width defines no cell width.
                 axis.plot(star.injected.completeness[0], y)
                 axis.set(xscale="linear", xlabel="completeness")
                 continue
@@ -70,12 +70,12 @@ def maps(answer: InjectAnswer, path: str | Path | None) -> Any:
         if mesh is not None:
             figure.colorbar(mesh, ax=axes, label="completeness")
         _titled(figure, answer, stars.note)
-        return finished(figure, path)
+        return save_or_return(figure, path)
 
 
 @picture_of("InjectAnswer", "curves")
 def curves(answer: InjectAnswer, path: str | Path | None) -> Any:
-    """Completeness over size at some half-widths, with 95 % intervals; the figure where no path is given."""
+    """Plot completeness over size at some half-widths, with 95 % intervals; without a path, return the figure."""
     with canvas().rc_context(STYLE):
         figure, stars, axes = _panels(answer)
         widths = len(stars[0].injected.half_widths_s)
@@ -94,12 +94,12 @@ def curves(answer: InjectAnswer, path: str | Path | None) -> Any:
             )
         legend_below(figure, *axes[0].get_legend_handles_labels())
         _titled(figure, answer, stars.note, part_note(min(MOST_CURVES, widths), widths, "half-widths"))
-        return finished(figure, path)
+        return save_or_return(figure, path)
 
 
 @picture_of("InjectAnswer", "energies", when=lambda answer: all(star.fitted for star in answer.stars))
 def energies(answer: InjectAnswer, path: str | Path | None) -> Any:
-    """Recovered over injected energy of found flares over half-width and size; the figure where no path is given."""
+    """Plot recovered over injected energy of found flares; without a path, return the figure."""
     with canvas().rc_context(STYLE):
         figure, stars, axes = _panels(answer)
         mesh = None
@@ -112,10 +112,10 @@ def energies(answer: InjectAnswer, path: str | Path | None) -> Any:
         if mesh is not None:
             figure.colorbar(mesh, ax=axes, label="recovered over injected energy, median (dex)")
         _titled(figure, answer, stars.note)
-        return finished(figure, path)
+        return save_or_return(figure, path)
 
 
 def _edges(middles: Any) -> Any:
-    """Edges of cells whose middles are evenly spaced in the logarithm, about."""
+    """Return the edges of cells whose centres are about evenly spaced in the logarithm."""
     steps = np.sqrt(middles[1:] / middles[:-1])
     return np.concatenate([[middles[0] / steps[0]], middles[:-1] * steps, [middles[-1] * steps[-1]]])

@@ -1,4 +1,4 @@
-"""Pictures of what goes into an expectation: spectra, sky, line function, optics. Nothing is drawn by chance here."""
+"""Pictures of the inputs of an expectation: spectra, sky, line spread function and optics."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.pictures.registry import picture_of
-from mauvecl.pictures.style import COLOURS, NULL, drawn
+from mauvecl.pictures.style import COLOURS, NULL, styled_picture
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -31,9 +31,9 @@ OPTICS = {
 
 
 @picture_of("Source", "source")
-@drawn
+@styled_picture
 def source(plt: Any, star: Source) -> Any:
-    """A spectrum where Mauve sees it."""
+    """Plot a spectrum in Mauve's wavelength range."""
     inside = (star.wavelength_nm >= RANGE_NM[0]) & (star.wavelength_nm <= RANGE_NM[1])
     figure, axis = plt.subplots(figsize=(3.6, 2.7))
     axis.plot(star.wavelength_nm[inside], star.flux_flam[inside], color=COLOURS[0], linewidth=0.8)
@@ -42,9 +42,9 @@ def source(plt: Any, star: Source) -> Any:
 
 
 @picture_of("Expectation", "expectation")
-@drawn
+@styled_picture
 def expectation(plt: Any, x: Expectation) -> Any:
-    """Mean signal of an exposure, with its noise."""
+    """Plot the mean signal of an exposure with its noise."""
     table = x.table
     w, mean, noise = (table[name].value for name in ("wavelength", "signal", "noise"))
     figure, axis = plt.subplots(figsize=(3.6, 2.7))
@@ -55,9 +55,9 @@ def expectation(plt: Any, x: Expectation) -> Any:
     return figure
 
 
-@drawn
+@styled_picture
 def magnitudes(plt: Any, source: Source, values: Sequence[float], band: str = "V") -> Any:
-    """A spectrum at several magnitudes: the paper's figure of the rescaled HD 37202."""
+    """Plot a spectrum at several magnitudes, as the paper's figure of the rescaled HD 37202."""
     figure, axis = plt.subplots(figsize=(3.6, 2.7))
     for colour, value in zip(cycle(COLOURS), values, strict=False):
         star = source.at_magnitude(value, band)
@@ -67,9 +67,9 @@ def magnitudes(plt: Any, source: Source, values: Sequence[float], band: str = "V
     return figure
 
 
-@drawn
+@styled_picture
 def zodiacal(plt: Any, source: Source, sky: Sky, instrument: Instrument) -> Any:
-    """A spectrum with zodiacal light, and the light alone: the paper's figure of the residual."""
+    """Plot a spectrum with zodiacal light, and the zodiacal light, as the paper's figure of the residual."""
     light = sky.spectrum(instrument.field_of_view_arcsec2)
     figure, (above, below) = plt.subplots(2, 1, figsize=(3.6, 4.0), sharex=True)
     added = 0.0 if light is None else np.interp(source.wavelength_nm, light.wavelength_nm, light.flux_flam)
@@ -83,9 +83,9 @@ def zodiacal(plt: Any, source: Source, sky: Sky, instrument: Instrument) -> Any:
     return figure
 
 
-@drawn
+@styled_picture
 def convolved(plt: Any, source: Source, instrument: Instrument) -> Any:
-    """A spectrum and the same through the line function: the paper's figure of the convolution.
+    """Plot a spectrum and its convolution with the line spread function, as the paper's figure.
 
     Light alone is shown: the line function acts on what the optics and the detector would see all of.
     """
@@ -96,7 +96,7 @@ def convolved(plt: Any, source: Source, instrument: Instrument) -> Any:
     flat = electrons_per_second(instrument, source.wavelength_nm, np.ones_like(source.flux_flam))
     figure, axis = plt.subplots(figsize=(3.6, 2.7))
     axis.plot(source.wavelength_nm, source.flux_flam, color=COLOURS[1], linewidth=0.8, label="as given")
-    # Relative to a flat spectrum: the line function's effect without the efficiencies'.
+    # Division by a flat spectrum removes the efficiencies and leaves the effect of the line spread function.
     axis.plot(w, seen / flat, color=COLOURS[2], label="through Mauve's line function")
     top = 1.1 * float((seen / flat).max())
     axis.set(xlabel=WAVELENGTH, ylabel=FLUX, xlim=RANGE_NM, ylim=(0, top), title=source.name)
@@ -104,9 +104,9 @@ def convolved(plt: Any, source: Source, instrument: Instrument) -> Any:
     return figure
 
 
-@drawn
+@styled_picture
 def efficiencies(plt: Any, instrument: Instrument) -> Any:
-    """Each optical element's efficiency: the paper's figure of the payload's components."""
+    """Plot each optical element's efficiency, as the paper's figure of the payload's components."""
     w = np.linspace(*RANGE_NM, 501)
     figure, axis = plt.subplots(figsize=(3.6, 2.9))
     for colour, (name, text) in zip(cycle(COLOURS), OPTICS.items(), strict=False):
@@ -117,9 +117,9 @@ def efficiencies(plt: Any, instrument: Instrument) -> Any:
     return figure
 
 
-@drawn
+@styled_picture
 def throughput(plt: Any, instrument: Instrument) -> Any:
-    """Quantum efficiency, and the end-to-end throughput with it: the paper's figure of both."""
+    """Plot the quantum efficiency and the end-to-end throughput, which includes it, as the paper's figure."""
     w = np.linspace(*RANGE_NM, 501)
     figure, (above, below) = plt.subplots(2, 1, figsize=(3.6, 4.0), sharex=True)
     above.plot(w, 100 * instrument.quantum_efficiency(w), color=COLOURS[0])
@@ -135,9 +135,9 @@ def throughput(plt: Any, instrument: Instrument) -> Any:
     return figure
 
 
-@drawn
+@styled_picture
 def flares(plt: Any, source: Source, amplitudes: Sequence[float]) -> Any:
-    """A star's spectrum at several stages of a flare: the paper's figures of the inputs."""
+    """Plot a star's spectrum at several stages of a flare, as the paper's figures of the inputs."""
     figure, axis = plt.subplots(figsize=(3.6, 2.7))
     for k in reversed(range(len(amplitudes))):
         star = source.flaring(amplitudes[k])

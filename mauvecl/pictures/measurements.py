@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.pictures.registry import picture_of
-from mauvecl.pictures.style import COLOURS, NULL, drawn, headline
+from mauvecl.pictures.style import COLOURS, NULL, headline, styled_picture
 from mauvecl.results.measurements.fit import forecast
 from mauvecl.results.measurements.reduction import variance_of
 from mauvecl.study.parts import First, note_of
@@ -16,11 +16,11 @@ from mauvecl.study.parts import First, note_of
 if TYPE_CHECKING:
     from mauvecl.answers.measurements.measure import MeasureAnswer, MeasuredFlare
 
-#: Rises of chi-squared that enclose 68.27 and 95 % in two dimensions.
+#: Increases of chi-squared that enclose 68.27 and 95 % in two dimensions.
 RISES = (2.30, 5.99)
-#: Factors of the amplitude over which errors are drawn.
+#: Factors on the amplitude over which errors are plotted.
 FACTORS = np.geomspace(0.1, 10.0, 25)
-#: Flares in one picture, at most.
+#: Largest number of flares in a picture.
 MOST_FLARES = 4
 
 
@@ -29,9 +29,9 @@ def _few(answer: MeasureAnswer) -> tuple[Any, ...]:
 
 
 @picture_of("MeasureAnswer", "fit", given=_few)
-@drawn
+@styled_picture
 def fits(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
-    """The first exposure per resolution element, less unknowns, with the fitted flare; residuals; a column per fit."""
+    """Plot the first exposure minus unknowns with the fitted flare, and the residuals, with a column per fit."""
     figure, axes = plt.subplots(
         2, len(flares), figsize=(3.6 * len(flares), 4.6), squeeze=False, sharex=True, height_ratios=(2, 1)
     )
@@ -53,9 +53,9 @@ def fits(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
 
 
 @picture_of("MeasureAnswer", "contours", given=_few)
-@drawn
+@styled_picture
 def contours(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
-    """Expected confidence regions of temperature and amplitude, unknowns marginalised over."""
+    """Plot expected confidence regions of temperature and amplitude, with unknowns marginalised."""
     from mauvecl.answers.measurements.measure import contour
 
     figure, axes = plt.subplots(1, len(flares), figsize=(3.4 * len(flares), 3.2), squeeze=False)
@@ -71,13 +71,13 @@ def contours(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
 
 
 @picture_of("MeasureAnswer", "pulls", given=_few)
-@drawn
+@styled_picture
 def pulls(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
-    """Estimates less the truth over their standard errors, beside the standard normal."""
+    """Plot the pulls of estimates, (estimate - truth) / standard error, and the standard normal."""
     figure, axes = plt.subplots(1, len(flares), figsize=(3.4 * len(flares), 3.0), squeeze=False)
     x = np.linspace(-5.0, 5.0, 201)
     for axis, one in zip(axes[0], flares, strict=True):
-        # Temperature, amplitude, and the jump where it is fitted.
+        # The parameters are temperature, amplitude and, if fitted, the Balmer jump.
         for colour, q in zip(COLOURS, range(min(3, len(one.truth))), strict=False):
             if one.found.names[q].startswith("flux") or not np.isfinite(one.truth[q]):
                 continue
@@ -94,9 +94,9 @@ def pulls(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
 
 
 @picture_of("MeasureAnswer", "errors", given=_few)
-@drawn
+@styled_picture
 def errors(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
-    """Errors of temperature and amplitude in advance against the amplitude: everything known, and unknowns not."""
+    """Plot forecast errors of temperature and amplitude against the amplitude, with and without unknowns."""
     figure, axes = plt.subplots(1, len(flares), figsize=(3.4 * len(flares), 3.0), squeeze=False)
     for axis, one in zip(axes[0], flares, strict=True):
         kelvin, linear = float(np.exp(one.perfect.log_k[0])), one.perfect.amplitudes[0]

@@ -1,4 +1,4 @@
-"""A plan's report as one page of HTML that needs nothing beside it."""
+"""Report of a plan as one self-contained HTML page."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ STYLE = (
 
 @document_of("PlanAnswer", "plan.html", when=lambda answer: answer.study.plan.report == "html")
 def report_html(answer: PlanAnswer) -> bytes:
-    """The report: summary, a section for each target with its pictures where matplotlib is there, assumptions."""
+    """Return the report: summary, a section per target (with pictures if matplotlib is installed), assumptions."""
     parts = [
         f"<!doctype html><html lang=en><meta charset=utf-8><title>Mauve: {escape(heading(answer))}</title>",
         f"<style>{STYLE}</style><h1>Mauve: yields of a campaign</h1>",

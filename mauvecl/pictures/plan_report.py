@@ -1,4 +1,4 @@
-"""A plan as pictures: all targets beside each other, and a report for a proposal's appendix, a page for each target."""
+"""Pictures of a plan: an overview of all targets, and a PDF report for proposals with a page per target."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import numpy as np
 from mauvecl.answers.campaigns.plan_text import LEGEND, SUMMARY, heading, summary_rows, target_lines
 from mauvecl.host.version import VERSION
 from mauvecl.pictures.registry import document_of, picture_of
-from mauvecl.pictures.style import COLOURS, NULL, STYLE, canvas, finished
+from mauvecl.pictures.style import COLOURS, NULL, STYLE, canvas, save_or_return
 from mauvecl.pictures.visibility import calendar
 
 if TYPE_CHECKING:
@@ -21,33 +21,33 @@ if TYPE_CHECKING:
 
 #: A4, and its margin, inches.
 PAGE, MARGIN = (8.27, 11.69), 0.6
-#: Width of a letter over its size, about, by which lines are broken; distance of lines over their size.
+#: Approximate width of a letter divided by its size, for line breaks; line spacing divided by the size.
 LETTER, LINE = 0.53, 1.4
-#: Where columns of the summary begin, and of the assumptions, as parts of the width between the margins.
+#: Starts of the columns of the summary and of the assumptions, as fractions of the text width.
 SUMMARY_AT = (0.0, 0.16, 0.235, 0.34, 0.425, 0.51, 0.605, 0.685, 0.755, 0.86)
 ASSUMED_AT = (0.0, 0.24, 0.5)
-#: Margins of a target's panels, as parts of the figure: to compute them takes longer than to draw the figure.
+#: Margins of a target's panels, as fractions of the figure; computing them takes longer than drawing the figure.
 PANELS = {"left": 0.085, "right": 0.905, "top": 0.955, "bottom": 0.09, "hspace": 0.5}
 
 
 @picture_of("PlanAnswer", "plan")
 def overview(answer: PlanAnswer, path: str | Path | None) -> Any:
-    """Flares expected of each target with 95 % of campaigns, and E50 to E90."""
+    """Plot each target's expected number of flares with the range of 95 % of campaigns, and E50 to E90."""
     plt = canvas()
     with plt.rc_context(STYLE):
         figure, axes = plt.subplots(1, 2, figsize=(7.4, 0.24 * len(answer.planned) + 1.5), sharey=True)
         _overview(axes, answer)
-        return finished(figure, path)
+        return save_or_return(figure, path)
 
 
 @picture_of("PlanAnswer", "visible")
 def visible(answer: PlanAnswer, path: str | Path | None = None) -> Any:
-    """Hours of exposure a day of all targets."""
+    """Plot the daily hours of exposure of all targets."""
     return calendar(answer.seen, path)
 
 
 def overview_png(answer: PlanAnswer) -> bytes:
-    """The same as PNG."""
+    """Return the overview as PNG."""
     plt = canvas()
     with plt.rc_context(STYLE):
         figure = overview(answer, None)
@@ -59,7 +59,7 @@ def _overview(axes: Any, answer: PlanAnswer) -> None:
     n = len(answer.planned)
     for k, one in enumerate(answer.planned):
         if one.recovered is not None and one.recovered.high > 0:
-            # A logarithmic axis has no zero.
+            # A logarithmic axis cannot show zero.
             least = max(one.recovered.low, 0.05)
             left.plot([least, max(one.recovered.high, least)], [k, k], color=COLOURS[0], linewidth=2.5, alpha=0.5)
             left.plot([max(one.recovered.expected, 0.05)], [k], "o", color=COLOURS[0], ms=4)
@@ -69,7 +69,7 @@ def _overview(axes: Any, answer: PlanAnswer) -> None:
             right.plot(ends[:1], [k], "o", color=COLOURS[4], ms=4)
     left.set(xscale="log", xlabel="flares recovered", xlim=(0.05, None))
     left.set_title("expected (dot); 95 % of campaigns")
-    # Whole decades: a part of one has labels that run into each other.
+    # Limits at whole decades avoid labels that overlap.
     ends = [
         energy for one in answer.planned for energy in (one.energy_at(0.5), one.energy_at(0.9)) if np.isfinite(energy)
     ]
@@ -82,11 +82,11 @@ def _overview(axes: Any, answer: PlanAnswer) -> None:
 
 @document_of("PlanAnswer", "plan.pdf", when=lambda answer: answer.study.plan.report == "pdf")
 def pdf_bytes(answer: PlanAnswer) -> bytes:
-    """The report as PDF: the summary, a page for each target, every assumption."""
+    """Return the report as PDF: summary, a page per target, and all assumptions."""
     from matplotlib.backends.backend_pdf import PdfPages
 
     plt, made = canvas(), io.BytesIO()
-    # Without a date the same plan is the same file.
+    # Without a date, equal plans give equal files.
     about = {"Title": f"Mauve: {heading(answer)}", "Creator": f"mauvecl {VERSION}", "CreationDate": None}
     with plt.rc_context(STYLE | {"pdf.fonttype": 42}), PdfPages(made, metadata=about) as pages:
         targets = [_target(plt, answer, k) for k in range(len(answer.planned))]
@@ -97,7 +97,7 @@ def pdf_bytes(answer: PlanAnswer) -> bytes:
 
 
 def target_png(answer: PlanAnswer, k: int) -> bytes:
-    """The pictures of one target as PNG."""
+    """Return the pictures of a target as PNG."""
     plt = canvas()
     with plt.rc_context(STYLE):
         figure = plt.figure(figsize=(7.4, 5.4), layout="none")
@@ -109,7 +109,7 @@ def _png(plt: Any, figure: Any) -> bytes:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
 
     made = io.BytesIO()
-    # As savefig makes it, which draws each picture twice.
+    # savefig gives the same result, but draws each picture twice.
     figure.set_dpi(110)
     FigureCanvasAgg(figure).print_png(made)  # type: ignore[no-untyped-call]
     plt.close(figure)
@@ -117,7 +117,7 @@ def _png(plt: Any, figure: Any) -> bytes:
 
 
 class Sheets:
-    """Text from the top of a page down, on as many pages as it takes."""
+    """Text that flows over as many pages as it needs."""
 
     def __init__(self, plt: Any) -> None:
         self._plt = plt
@@ -125,7 +125,7 @@ class Sheets:
         self.left_in = 0.0
 
     def line(self, cells: Sequence[tuple[float, str]], size: float, **how: Any) -> None:
-        """Cells side by side, each wrapped up to the next one's place, which is a part of the width."""
+        """Write cells at fractions of the text width, each wrapped before the start of the next."""
         edges = [*(place for place, _ in cells[1:]), 1.0]
         width = PAGE[0] - 2 * MARGIN
         wrapped = []
@@ -139,13 +139,13 @@ class Sheets:
                                 parse_math=False, **how)  # fmt: skip
 
     def rule(self) -> None:
-        """A line across the page."""
+        """Draw a line across the page."""
         y = self.take(0.06) / PAGE[1]
         ends = (MARGIN / PAGE[0], 1 - MARGIN / PAGE[0])
         self.pages[-1].add_artist(self._plt.Line2D(ends, (y, y), color=NULL, linewidth=0.5))
 
     def take(self, height_in: float) -> float:
-        """So much of a page, a new one where the last has less left; its top, inches from the bottom."""
+        """Reserve a height, on a new page if necessary, and return its top in inches from the bottom."""
         if not self.pages or self.left_in < height_in:
             self.pages.append(self._plt.figure(figsize=PAGE, layout="none"))
             self.left_in = PAGE[1] - 2 * MARGIN
@@ -191,7 +191,7 @@ def _assumptions(plt: Any, answer: PlanAnswer) -> list[Any]:
 
 def _target(plt: Any, answer: PlanAnswer, k: int) -> Any:
     figure = plt.figure(figsize=PAGE, layout="none")
-    # Words above, the pictures below them between the margins.
+    # The text is above the pictures.
     margin = MARGIN / PAGE[0]
     pictures = figure.subfigures(2, 3, height_ratios=[0.43, 0.57], width_ratios=[margin, 1 - 2 * margin, margin])[1, 1]
     figure.text(margin, 0.96, answer.planned[k].name, fontsize=14, va="top", parse_math=False)
@@ -209,7 +209,7 @@ def _target(plt: Any, answer: PlanAnswer, k: int) -> Any:
 
 
 def _panels(figure: Any, answer: PlanAnswer, k: int) -> None:
-    """Hours a day with elongation, hours by month, and recovered share with the rate by energy."""
+    """Plot daily hours with elongation, monthly hours, and recovered fraction with the rate by energy."""
     one, seen = answer.planned[k], answer.seen
     top, bottom = figure.subplots(2, 1)
     figure.subplots_adjust(**PANELS)
@@ -251,7 +251,7 @@ def _panels(figure: Any, answer: PlanAnswer, k: int) -> None:
 
 
 def _plain_decades(axis: Any) -> None:
-    """Label whole decades as 1e33; ticks between them and powers set as formulas take most of the time of drawing."""
+    """Label whole decades as 1e33, since minor ticks and formulas take most of the drawing time."""
     from matplotlib.ticker import FuncFormatter, NullLocator
 
     axis.set_minor_locator(NullLocator())

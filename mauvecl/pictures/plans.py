@@ -1,4 +1,4 @@
-"""Pictures to plan by: maps, limits, noise budgets, S/N over a sweep, exposures."""
+"""Pictures for planning: maps, limits, noise budgets, S/N over a sweep, exposures."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from mauvecl.pictures.style import (
     COLUMN,
     NULL,
     UNBROKEN,
-    drawn,
     headline,
     legend_below,
     plain_numbers,
+    styled_picture,
 )
 from mauvecl.statistics.registry import label
 from mauvecl.study.labels import full_label
@@ -32,14 +32,14 @@ if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
 
 
-#: Contours from the lowest probability on.
+#: Probabilities of contours, in ascending order.
 STROKES = (":", "--", "-", "-.")
 
 
 @picture_of("MapResult", "map")
-@drawn
+@styled_picture
 def detection_map(plt: Any, answer: MapResult) -> Any:
-    """Detection probability over two quantities, one panel per statistic."""
+    """Plot the detection probability over two quantities, one panel per statistic."""
     question = answer.study.map
     figure, axes = plt.subplots(
         1, len(answer.statistics), figsize=(COLUMN * len(answer.statistics) + 0.5, 3.4), squeeze=False, sharey=True
@@ -52,7 +52,7 @@ def detection_map(plt: Any, answer: MapResult) -> Any:
     for axis, statistic, probability in zip(axes[0], answer.statistics, answer.probability, strict=True):
         mesh = axis.pcolormesh(x, y, probability, cmap="cividis", vmin=0, vmax=1, shading="nearest")
         if min(probability.shape) > 1:
-            # Lines lie close where a map is steep: told apart by their strokes, and by no words among them.
+            # Lines are close where a map is steep, so line styles distinguish them instead of labels.
             levels = sorted(question.contours)
             strokes = [STROKES[k % len(STROKES)] for k in range(len(levels))]
             axis.contour(x, y, probability, levels=levels, colors="white", linewidths=2.4)
@@ -84,9 +84,9 @@ def detection_map(plt: Any, answer: MapResult) -> Any:
 
 
 @picture_of("LimitResult", "limit")
-@drawn
+@styled_picture
 def limits(plt: Any, answer: LimitResult) -> Any:
-    """Detection probability at every simulated value, and the limits."""
+    """Plot the detection probability at every simulated value, and the limits."""
     of, power = answer.study.limit.of, answer.study.limit.power
     figure, axis = plt.subplots(figsize=(COLUMN, 3.0 + 0.17 * len(answer.limits)))
     for k, limit in enumerate(answer.limits):
@@ -122,7 +122,7 @@ def limits(plt: Any, answer: LimitResult) -> Any:
     return figure
 
 
-#: Noise by origin, in the colours of the paper's figure as far as colour-blind readers can tell them apart.
+#: Labels and colours of noise by origin: the paper's colours where colour-blind readers can distinguish them.
 ORIGINS = {
     "source_photon": ("source photons", "#009E73"),
     "dark": ("dark current", "#CC79A7"),
@@ -134,16 +134,16 @@ ORIGINS = {
 
 @picture_of("SnrAnswer", "noise-budget")
 def noise_budgets(answer: SnrAnswer, path: str | Path | None = None) -> Any:
-    """Noise of a pixel by origin against wavelength, one panel per star and cell, as the paper's figure has it."""
+    """Plot pixel noise by origin against wavelength, one panel per star and cell, as in the paper."""
     each = len(answer.study.cells())
     observed = [(star, star.result.expectation) for star in answer.stars]
     named = [(star.title if star.at else f"{star.title}, {x.exposure_s:g} s", x) for star, x in observed]
     return noise_budget(named, each=each, path=path)
 
 
-@drawn
+@styled_picture
 def noise_budget(plt: Any, observed: Sequence[tuple[str, Expectation]], *, each: int = 1) -> Any:
-    """Noise of a pixel by origin against wavelength: titles and expectations, in so many columns."""
+    """Plot pixel noise by origin against wavelength for titled expectations, in `each` columns."""
     stars = len(observed) // each
     figure, axes = plt.subplots(
         stars, each, figsize=(COLUMN * min(each, 6), 2.3 * stars + 0.7), squeeze=False, sharex=True, sharey="col"
@@ -155,7 +155,7 @@ def noise_budget(plt: Any, observed: Sequence[tuple[str, Expectation]], *, each:
         axis.set_title(title)
         axis.set_yscale("log")
         axis.set_xlim(200, 700)
-    # Zodiacal light can be far below everything else.
+    # The axis is limited, since zodiacal light can be far below everything else.
     for axis in axes.ravel():
         axis.set_ylim(bottom=max(axis.get_ylim()[0], axis.get_ylim()[1] * 1e-4))
     for axis in axes[:, 0]:
@@ -169,9 +169,9 @@ def noise_budget(plt: Any, observed: Sequence[tuple[str, Expectation]], *, each:
 
 
 @picture_of("SnrAnswer", "snr-sweep", when=lambda answer: answer.study.sweep.axes)
-@drawn
+@styled_picture
 def snr_sweep(plt: Any, answer: SnrAnswer) -> Any:
-    """S/N of some elements against what is swept first, a line for each value of the rest."""
+    """Plot the S/N of some elements against the first swept quantity, a line per value of the others."""
     from mauvecl.answers.signal.exposures import place_of
 
     first = answer.study.sweep.axes[0].quantity
@@ -198,7 +198,7 @@ def snr_sweep(plt: Any, answer: SnrAnswer) -> Any:
             axis.set_xscale("log")
         axis.set_title(f"{wavelength:g} nm")
         axis.set_xlabel(QUANTITIES[first].axis)
-    # One scale for all of them, once all are drawn.
+    # The common scale is set after all panels are drawn.
     axes[0][0].set_ylim(bottom=0.1)
     for axis in axes[0]:
         plain_numbers(axis)
@@ -210,13 +210,13 @@ def snr_sweep(plt: Any, answer: SnrAnswer) -> Any:
 
 
 @picture_of("GaussianReport", "gaussian")
-@drawn
+@styled_picture
 def gaussian(plt: Any, answer: GaussianReport) -> Any:
-    """How far each promise of the usual formula holds in every cell."""
+    """Plot how well each prediction of the Gaussian formula holds in every cell."""
     from matplotlib.ticker import MaxNLocator
 
     cells = answer.cells
-    # Column, what it is, what is promised, and the least that an axis shows to either side of it.
+    # Column, label, predicted value, and smallest range of the axis on either side of it.
     panels = (
         ("snr_off_by", "mean S/N\nless formula", 0.0, 0.1),
         ("coverage_low", "share of 1-sigma\nintervals right", 0.6827, 0.03),
@@ -243,9 +243,9 @@ def gaussian(plt: Any, answer: GaussianReport) -> Any:
 
 
 @picture_of("ExposureResult", "exposure")
-@drawn
+@styled_picture
 def exposures(plt: Any, answer: ExposureResult) -> Any:
-    """S/N against exposure for each star, which grows with the root of it."""
+    """Plot the S/N of each star against exposure."""
     figure, axis = plt.subplots(figsize=(COLUMN, 2.9 + 0.17 * len(answer.exposures)))
     for k, e in enumerate(answer.exposures):
         colour = COLOURS[k % len(COLOURS)]

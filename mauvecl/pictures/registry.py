@@ -1,4 +1,4 @@
-"""The registry of pictures: the decorators with which each function says what it draws, and under which name."""
+"""Registry of pictures: decorators that register the class and name of each picture."""
 
 from __future__ import annotations
 
@@ -16,13 +16,13 @@ from mauvecl.host.quantities import shown
 from mauvecl.pictures.style import AXES
 
 F = TypeVar("F", bound=Callable[..., Any])
-#: Modules that a search for pictures must not import: matplotlib is loaded only when a picture is drawn.
+#: Modules that a search for pictures must not import, since matplotlib is loaded only when a picture is drawn.
 WITHOUT_PICTURES = ("figure",)
 
 
 @dataclass(frozen=True)
 class Entry:
-    """A function that draws, or writes a document, with the class that it is for.
+    """Function that draws a picture or writes a document of a class.
 
     Attributes
     ----------
@@ -53,13 +53,13 @@ class Entry:
         return [(0, self.name, partial(self.make, *given))]
 
 
-#: By the name of the class: importing the classes themselves would import every answer to draw one.
+#: Entries by class name, since importing the classes would import every answer.
 PICTURES: defaultdict[str, list[Entry]] = defaultdict(list)
 DOCUMENTS: defaultdict[str, list[Entry]] = defaultdict(list)
 
 
 def picture_of(kind: str, name: str, **how: Any) -> Callable[[F], F]:
-    """Register a function as a picture of a class; the first one registered is what `plot` draws.
+    """Register a function as a picture of a class; `plot` draws the first one.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def picture_of(kind: str, name: str, **how: Any) -> Callable[[F], F]:
 
 
 def document_of(kind: str, name: str, **how: Any) -> Callable[[F], F]:
-    """Register a function that returns the bytes of a document, such as a report; `name` has its ending."""
+    """Register a function that returns the bytes of a document, such as a report; `name` has an extension."""
     return _registers(DOCUMENTS, kind, name, how)
 
 
@@ -87,17 +87,17 @@ def _registers(entries: defaultdict[str, list[Entry]], kind: str, name: str, how
 
 
 def pictures_of(thing: Any) -> dict[str, Callable[..., Any]]:
-    """Return every picture of a thing by the name of its file: a function of `path` and `ax`."""
+    """Return every picture of an object by file name, as functions of `path` and `ax`."""
     return {name: partial(_draw, draw) for name, draw in _found(PICTURES, thing)}
 
 
 def documents_of(thing: Any) -> dict[str, Callable[[], bytes]]:
-    """Return what makes each document of a thing, by the full name of its file."""
+    """Return the function of each document of an object, by file name."""
     return dict(_found(DOCUMENTS, thing))
 
 
 def _found(entries: defaultdict[str, list[Entry]], thing: Any) -> list[tuple[str, Callable[..., Any]]]:
-    """Return the entries for a thing's class, numbered ones in the order of their numbers."""
+    """Return the entries of an object's class, numbered ones in the order of their numbers."""
     load()
     own = next((entries[kind.__name__] for kind in type(thing).__mro__ if kind.__name__ in entries), [])
     made = sorted((one for entry in own for one in entry.of(thing)), key=lambda one: one[0])
@@ -106,7 +106,7 @@ def _found(entries: defaultdict[str, list[Entry]], thing: Any) -> list[tuple[str
 
 @cache
 def load() -> None:
-    """Import every module of pictures, so that each registers what it draws."""
+    """Import all modules of pictures, so that they register their functions."""
     for module in iter_modules([str(Path(__file__).parent)]):
         if module.name not in WITHOUT_PICTURES:
             import_module(f"{__package__}.{module.name}")

@@ -1,4 +1,4 @@
-"""Pictures of stares: light curves in bands, and the dynamic spectrum."""
+"""Pictures of stares: light curves in bands, and dynamic spectra."""
 
 from __future__ import annotations
 
@@ -9,22 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.pictures.registry import picture_of
-from mauvecl.pictures.style import COLOURS, NULL, drawn, headline
+from mauvecl.pictures.style import COLOURS, NULL, headline, styled_picture
 
 if TYPE_CHECKING:
     from mauvecl.answers.stares.stare import StareAnswer, StarStare
 
 Float = NDArray[np.float64]
-#: Points of a light curve, and rows of a dynamic spectrum, at most: more are means of several frames.
+#: Largest number of points of a light curve, and of rows of a dynamic spectrum; longer stares are averaged.
 MOST_POINTS, MOST_ROWS = 4000, 600
-#: Longest time that is shown in seconds, and in minutes, s.
+#: Longest durations that are shown in seconds, and in minutes, s.
 IN_SECONDS_S, IN_MINUTES_S = 600.0, 4 * 3600.0
 
 
 @picture_of("StareAnswer", "light-curve", each=lambda answer: [(one,) for one in answer.stares])
-@drawn
+@styled_picture
 def light_curves(plt: Any, one: StarStare) -> Any:
-    """Light curves in all bands, relative to the quiescent star; dotted: flares put in, triangles: found."""
+    """Plot light curves in all bands, relative to the quiescent star.
+
+    Dotted lines are injected flares, triangles detections.
+    """
     from mauvecl.answers.stares.stare import Searched
 
     stare, light = one.staring.stare, one.light
@@ -55,9 +58,9 @@ def light_curves(plt: Any, one: StarStare) -> Any:
     return figure
 
 
-@drawn
+@styled_picture
 def beside(plt: Any, answers: Sequence[tuple[str, StareAnswer]], band: int = 0) -> Any:
-    """One band's light curves of several answers to studies of the same stars: a row to a star, a column to an answer.
+    """Plot a band's light curves of several answers, with a row per star and a column per answer.
 
     Parameters
     ----------
@@ -86,12 +89,12 @@ def beside(plt: Any, answers: Sequence[tuple[str, StareAnswer]], band: int = 0) 
 
 
 @picture_of("StareAnswer", "dynamic-spectrum", each=lambda answer: [(one,) for one in answer.stares])
-@drawn
+@styled_picture
 def dynamic_spectrum(plt: Any, one: StarStare) -> Any:
-    """Light in every resolution element and frame, as standard deviations from the median over the stare."""
+    """Plot each resolution element and frame, in standard deviations from the median over the stare."""
     stare, light = one.staring.stare, one.light
     scale, unit = _time(stare.duration_s)
-    # Whole stare on a regular grid, gaps empty.
+    # The stare is shown on a regular grid with empty gaps.
     step = -(-(int(stare.numbers[-1]) + 1) // MOST_ROWS)
     rows = stare.numbers // step
     n_rows = int(rows[-1]) + 1
@@ -132,11 +135,11 @@ def _time(duration_s: float) -> tuple[float, str]:
 
 
 def _runs(numbers: NDArray[np.int64]) -> list[NDArray[np.intp]]:
-    """Frames between gaps."""
+    """Return the runs of frames between gaps."""
     return np.split(np.arange(numbers.size), np.flatnonzero(np.diff(numbers) > 1) + 1)
 
 
 def _binned(values: Float, step: int) -> Float:
-    """Means of so many values each; the rest at the end is one of its own."""
+    """Average groups of `step` values; the last group may be smaller."""
     edges = np.arange(0, values.size, max(1, step))
     return np.asarray(np.add.reduceat(values, edges) / np.diff(np.append(edges, values.size)))

@@ -1,4 +1,4 @@
-"""One style for all pictures: colours, names on axes, what a figure becomes at the end."""
+"""Common style of all pictures: colours, axes and output."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.files.whole import write_whole
 
 P = ParamSpec("P")
-#: The caller's axes to draw in; None if the picture makes its own figure.
+#: Caller's axes to draw in; None if the picture creates its own figure.
 AXES: ContextVar[Any] = ContextVar("axes", default=None)
-#: Okabe and Ito's colours, which colour-blind readers can tell apart (jfly.uni-koeln.de/color).
+#: Colours of Okabe & Ito, which colour-blind readers can distinguish (jfly.uni-koeln.de/color).
 COLOURS = ("#0072B2", "#56B4E9", "#009E73", "#E69F00", "#D55E00", "#CC79A7", "#000000")
 NULL = "#777777"
 #: Panels side by side.
-MOST_COLUMNS = 3
+MAX_COLUMNS = 3
 #: Width of one column of a journal, inches.
 COLUMN = 3.5
-#: A space at which no line ends.
+#: No-break space.
 UNBROKEN = "\N{NO-BREAK SPACE}"
-#: Share of a figure's width that titles and legends may take.
+#: Largest fraction of a figure's width for titles and legends.
 INSIDE = 0.97
 
 STYLE = {
@@ -44,20 +44,20 @@ STYLE = {
 
 
 def available() -> bool:
-    """Whether matplotlib is installed."""
+    """Return whether matplotlib is installed."""
     from importlib.util import find_spec
 
     return find_spec("matplotlib") is not None
 
 
 def canvas() -> Any:
-    """Return what makes figures: independent ones, or parts of the caller's axes."""
+    """Return the canvas that creates figures, or parts of the caller's axes."""
     ax = AXES.get()
     return Canvas() if ax is None else Within(Canvas(), ax)
 
 
 class Canvas:
-    """The functions of pyplot that pictures need, without its windows, its backend and its list of open figures."""
+    """Functions of pyplot that pictures need, without its windows, backend and list of open figures."""
 
     def __init__(self) -> None:
         import matplotlib as mpl
@@ -66,7 +66,7 @@ class Canvas:
         self.rc_context, self.rcParams, self.Line2D = mpl.rc_context, mpl.rcParams, Line2D
 
     def figure(self, **how: Any) -> Any:
-        """Return an empty figure that Agg draws."""
+        """Return an empty figure that Agg renders."""
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
         from mauvecl.pictures.figure import Picture
@@ -87,7 +87,7 @@ class Canvas:
 
 
 class Within:
-    """A canvas whose new figures are the caller's axes."""
+    """Canvas whose new figures are the caller's axes."""
 
     def __init__(self, plt: Any, ax: Any) -> None:
         self._plt, self._ax = plt, ax
@@ -96,7 +96,7 @@ class Within:
         return getattr(self._plt, name)
 
     def subplots(self, rows: int = 1, columns: int = 1, *, squeeze: bool = True, **how: Any) -> Any:
-        """The axes themselves for one panel; panels in their place for more."""
+        """Return the axes for one panel; for more, panels that replace them."""
         if rows == columns == 1:
             axes = self._ax if squeeze else np.array([[self._ax]])
             return TitledAxes(self._ax), axes
@@ -105,7 +105,7 @@ class Within:
         return part, part.subplots(rows, columns, squeeze=squeeze, **how)
 
     def figure(self, **_: Any) -> Any:
-        """A part of the caller's figure, where the axes are.
+        """Return the part of the caller's figure that the axes occupy.
 
         Raises
         ------
@@ -121,11 +121,11 @@ class Within:
         return self._ax.figure.add_subfigure(spec)
 
     def close(self, figure: Any) -> None:
-        """The figure stays the caller's."""
+        """Do nothing, since the figure belongs to the caller."""
 
 
 class TitledAxes:
-    """Axes for a figure: its title is theirs."""
+    """Axes that act as a figure, with its title and legend in the axes."""
 
     def __init__(self, ax: Any) -> None:
         self._ax = ax
@@ -135,20 +135,20 @@ class TitledAxes:
 
     @property
     def bbox(self) -> Any:
-        """As wide as the axes."""
+        """Bounding box of the axes."""
         return self._ax.bbox
 
     def suptitle(self, text: str, **_: Any) -> Any:
-        """The axes' own title, where they have none."""
+        """Set the axes' title, unless they have one."""
         return None if self._ax.get_title(loc="left") else self._ax.set_title(text)
 
     def legend(self, handles: Sequence[Any], names: Sequence[str], **_: Any) -> Any:
-        """A legend within the axes."""
+        """Add a legend within the axes."""
         return self._ax.legend(handles, names, loc="best")
 
 
 def headline(figure: Any, text: str, *notes: str, fontsize: float = 9.0) -> None:
-    """A title over all panels, broken into as many lines as the figure's width needs."""
+    """Add a title above all panels, wrapped to the figure's width."""
     text = "; ".join(filter(None, (text, *notes)))
     if not text:
         return
@@ -165,7 +165,7 @@ def headline(figure: Any, text: str, *notes: str, fontsize: float = 9.0) -> None
 
 
 def legend_below(figure: Any, handles: Sequence[Any], names: Sequence[str]) -> None:
-    """A legend under all panels, in as many columns as fit."""
+    """Add a legend below all panels, in as many columns as fit."""
     for columns in range(len(names), 0, -1):
         legend = figure.legend(handles, names, loc="outside lower center", ncols=columns)
         if columns == 1 or legend.get_window_extent(_renderer(figure)).width <= INSIDE * figure.bbox.width:
@@ -174,7 +174,7 @@ def legend_below(figure: Any, handles: Sequence[Any], names: Sequence[str]) -> N
 
 
 def plain_numbers(axis: Any) -> None:
-    """Logarithmic ticks as people write numbers: 0.1, 20, 500; in between only where there are few decades."""
+    """Label logarithmic ticks as plain numbers (0.1, 20, 500), with intermediate ticks only over few decades."""
     from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
     for one in (axis.xaxis, axis.yaxis):
@@ -189,32 +189,29 @@ def plain_numbers(axis: Any) -> None:
 
 
 def _renderer(figure: Any) -> Any:
-    """What measures text."""
+    """Return the renderer that measures text."""
     from matplotlib.backends.backend_agg import RendererAgg
 
     size = figure.bbox
     return RendererAgg(size.width, size.height, figure.dpi)  # type: ignore[no-untyped-call]
 
 
-def drawn(draw: Callable[Concatenate[Any, P], Any]) -> Callable[..., Any]:
-    """A picture of what draws on a canvas and gives the figure: in our style, saved where a path is given."""
+def styled_picture(draw: Callable[Concatenate[Any, P], Any]) -> Callable[..., Any]:
+    """Decorate a function that draws on a canvas: apply the common style, and save the figure if a path is given."""
 
     @wraps(draw)
     def picture(*what: Any, path: str | Path | None = None, **how: Any) -> Any:
         plt = canvas()
         with plt.rc_context(STYLE):
-            return finished(draw(plt, *what, **how), path)
+            return save_or_return(draw(plt, *what, **how), path)
 
     return picture
 
 
-def finished(figure: Any, path: str | Path | None) -> Any:
-    """Save a figure under a path, in the form of its ending (.png, .pdf, .svg), or hand it out.
+def save_or_return(figure: Any, path: str | Path | None) -> Any:
+    """Save a figure in the format of the path's extension (.png, .pdf, .svg), or return it if there is no path.
 
-    Raises
-    ------
-    InputError
-        If it cannot be written; what was at its place is still there.
+    Raises InputError, without changing an existing file, if the figure cannot be written.
     """
     canvas().close(figure)
     if path is None:
@@ -223,7 +220,7 @@ def finished(figure: Any, path: str | Path | None) -> Any:
     if place.suffix == ".png":
         from matplotlib.backends.backend_agg import FigureCanvasAgg
 
-        # As savefig makes it, which draws each picture twice.
+        # savefig gives the same result, but draws each picture twice.
         whole.set_dpi(canvas().rcParams["savefig.dpi"])
         FigureCanvasAgg(whole).print_png(drawn)  # type: ignore[no-untyped-call]
     else:

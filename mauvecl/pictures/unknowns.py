@@ -1,4 +1,4 @@
-"""Pictures of what unknowns cost: power against amplitude, and which unknown limits which star."""
+"""Pictures of the cost of unknowns: power against amplitude, and the unknown that limits each star."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.pictures.registry import picture_of
-from mauvecl.pictures.style import COLOURS, drawn
+from mauvecl.pictures.style import COLOURS, styled_picture
 from mauvecl.study.quantities import QUANTITIES
 
 if TYPE_CHECKING:
@@ -16,9 +16,9 @@ if TYPE_CHECKING:
 
 
 @picture_of("UnknownTable", "unknowns")
-@drawn
+@styled_picture
 def unknowns(plt: Any, answer: UnknownTable) -> Any:
-    """One panel per star, plain dashed and marginalised solid, and the smallest amplitude of each; closed forms."""
+    """Plot closed-form power per star (dashed plain, solid marginalised), and the smallest amplitudes."""
     from mauvecl.answers.detection.unknown_table import power
 
     stars = list(dict.fromkeys(star for star, _ in answer.costs))

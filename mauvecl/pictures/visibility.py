@@ -1,4 +1,4 @@
-"""Pictures of what is seen from the orbit and when."""
+"""Pictures of the visibility of targets from the orbit."""
 
 from __future__ import annotations
 
@@ -9,29 +9,29 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.pictures.registry import picture_of
-from mauvecl.pictures.style import STYLE, canvas, finished, headline
+from mauvecl.pictures.style import STYLE, canvas, headline, save_or_return
 
 if TYPE_CHECKING:
     from mauvecl.answers.campaigns.visible import VisibleAnswer
 
-#: Targets that get a calendar each; more are rows of one picture.
+#: Largest number of targets with a calendar each; more targets are rows of one picture.
 MOST_CALENDARS = 6
 
 
 @picture_of("VisibleAnswer", "visible")
 def calendar(answer: VisibleAnswer, path: str | Path | None) -> Any:
-    """Hours of exposure a day: a calendar for each target, or a row where there are many."""
+    """Plot daily hours of exposure: a calendar per target or, for many targets, a row."""
     plt = canvas()
     draw = _calendars if len(answer.targets) <= MOST_CALENDARS else _rows
     with plt.rc_context(STYLE):
         figure = draw(plt, answer)
         kind = "mean orbit" if answer.study.orbit.orbit().resolved(answer.times) == "mean" else "SGP4"
         headline(figure, f"Hours of exposure a day ({kind}); limits are assumptions, no stray light")
-        return finished(figure, path)
+        return save_or_return(figure, path)
 
 
 def _calendars(plt: Any, answer: VisibleAnswer) -> Any:
-    """Days of the month across, months down."""
+    """Plot calendars with days of the month across and months down."""
     n = len(answer.targets)
     across = 1 if n == 1 else 2
     down = -(-n // across)
@@ -63,7 +63,7 @@ def _calendars(plt: Any, answer: VisibleAnswer) -> Any:
 
 
 def _rows(plt: Any, answer: VisibleAnswer) -> Any:
-    """Targets down, days across."""
+    """Plot targets down and days across."""
     n = len(answer.targets)
     figure, axis = plt.subplots(figsize=(7.4, min(0.16 * n + 1.4, 20.0)))
     hours = np.array([answer.visibility.by_day(k) for k in range(n)])

@@ -22,7 +22,7 @@ assert "matplotlib.pyplot" not in sys.modules
 
 
 @pytest.mark.parametrize("backend", ["module://matplotlib_inline.backend_inline", "module://no.such.backend", "TkAgg"])
-def test_any_backend_that_a_kernel_names(backend: str, tmp_path: Path) -> None:
+def test_picture_works_with_backend_named_by_kernel(backend: str, tmp_path: Path) -> None:
     for words in (("-m", "mauvecl", *WORDS), ("-c", PYTHON)):
         done = subprocess.run(
             [sys.executable, *words],
@@ -35,7 +35,7 @@ def test_any_backend_that_a_kernel_names(backend: str, tmp_path: Path) -> None:
     assert (tmp_path / "out" / "exposure.png").stat().st_size > 1000
 
 
-def test_the_command_line_runs_with_a_backend_that_does_not_exist(tmp_path: Path) -> None:
+def test_command_line_works_with_unknown_backend(tmp_path: Path) -> None:
     done = subprocess.run(
         [sys.executable, "-m", "mauvecl", *WORDS],
         cwd=tmp_path,

@@ -24,7 +24,7 @@ from mauvecl.answers.signal.exposures import exposure_for
 from mauvecl.answers.signal.simulate import simulate
 from mauvecl.answers.signal.snr import snr
 from mauvecl.device.engine import Engine
-from mauvecl.pictures.style import COLUMN, STYLE, canvas, finished, headline, legend_below
+from mauvecl.pictures.style import COLUMN, STYLE, canvas, headline, legend_below, save_or_return
 from mauvecl.study.study import Study
 
 FEW = ("run.realisations=2000", "run.fap=0.1")
@@ -60,7 +60,7 @@ CASES: dict[str, tuple[Any, tuple[str, ...], bool]] = {
 
 
 def drawn(answer: Answer) -> Iterator[tuple[str, Any, Any]]:
-    """Name, figure and renderer of each picture."""
+    """Yield name, figure and renderer of each picture."""
     with mpl.rc_context():
         for name, draw in answer.pictures.items():
             figure = draw()
@@ -70,7 +70,7 @@ def drawn(answer: Answer) -> Iterator[tuple[str, Any, Any]]:
 
 
 def shown_ticks(axis: Any) -> list[Text]:
-    """Labels of ticks that lie within the view."""
+    """Return the tick labels that lie within the view."""
     low, high = sorted(axis.get_view_interval())
     margin = 1e-9 * (high - low)
     ticks = [*axis.get_major_ticks(), *axis.get_minor_ticks()]
@@ -83,7 +83,7 @@ SHORT = ("detect, one statistic", "limit of exposure", "map", "snr", "exposure")
 
 
 @pytest.mark.parametrize("case", long_but(CASES, *SHORT))
-def test_everything_is_inside_and_apart(case: str, engine: Engine) -> None:
+def test_texts_are_inside_figure_and_do_not_overlap(case: str, engine: Engine) -> None:
     ask, settings, column = CASES[case]
     answer = ask(Study().with_settings(list(settings)), engine)
     exposures = {f"{x.exposure_s:g}" for x in answer.inputs}
@@ -121,8 +121,8 @@ def test_everything_is_inside_and_apart(case: str, engine: Engine) -> None:
             assert any(f"{value} s" in words or "exposure (s)" in words for value in exposures), (name, words)
 
 
-def test_a_flare_that_is_detected_is_seen(engine: Engine) -> None:
-    """The 5 % flare, hidden in the noise of a pixel, rises to four sigma of an element beneath."""
+def test_detected_flare_is_visible(engine: Engine) -> None:
+    """Check that the 5 % flare, hidden in pixel noise, reaches four sigma of an element in the lower panel."""
     answer = detect(Study().with_settings([*FEW, ONE, "flare.amplitudes=[0.05]", ONLY]), engine)
     figure = answer.pictures["spectra"]()
     (line,) = [line for line in figure.axes[1].lines if len(line.get_ydata()) > 2]
@@ -131,8 +131,8 @@ def test_a_flare_that_is_detected_is_seen(engine: Engine) -> None:
     assert line.get_xdata()[-1] < answer.stars[0].detection.quiet.element_wavelength_nm[-1]
 
 
-def test_a_picture_is_what_savefig_makes_of_it(tmp_path: Path) -> None:
-    """Drawn once, where savefig draws twice; to the last byte."""
+def test_saved_picture_equals_savefig(tmp_path: Path) -> None:
+    """Compare all bytes with those of savefig, which draws the picture twice."""
     plt = canvas()
 
     def made() -> Any:
@@ -147,5 +147,5 @@ def test_a_picture_is_what_savefig_makes_of_it(tmp_path: Path) -> None:
     twice = io.BytesIO()
     with plt.rc_context(STYLE):
         made().savefig(twice, format="png")
-        once = finished(made(), tmp_path / "once.png")
+        once = save_or_return(made(), tmp_path / "once.png")
     assert once.read_bytes() == twice.getvalue()

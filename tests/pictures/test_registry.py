@@ -20,7 +20,7 @@ import mauvecl.pictures
 from mauvecl import InputError, Source
 from mauvecl.drawable import Drawable
 from mauvecl.pictures import registry
-from mauvecl.pictures.style import drawn
+from mauvecl.pictures.style import styled_picture
 
 ROOT = Path(__file__).parent.parent.parent
 #: The packages that lie below the pictures.
@@ -76,7 +76,7 @@ def test_a_picture_is_added_in_one_place(monkeypatch: pytest.MonkeyPatch, tmp_pa
     monkeypatch.setattr(registry, "PICTURES", copied)
 
     @registry.picture_of("Source", "line", each=lambda star: [(star, 1), (star, 2)])
-    @drawn
+    @styled_picture
     def line(plt, star, power):
         figure, axis = plt.subplots()
         axis.plot(star.wavelength_nm, star.flux_flam**power)
