@@ -26,6 +26,8 @@ LETTER, LINE = 0.53, 1.4
 #: Starts of the columns of the summary and of the assumptions, as fractions of the text width.
 SUMMARY_AT = (0.0, 0.16, 0.235, 0.34, 0.425, 0.51, 0.605, 0.685, 0.755, 0.86)
 ASSUMED_AT = (0.0, 0.24, 0.5)
+#: Number of colours kept in the pictures of an HTML report.
+COLOURS_KEPT = 64
 #: Margins of a target's panels, as fractions of the figure; computing them takes longer than drawing the figure.
 PANELS = {"left": 0.085, "right": 0.905, "top": 0.955, "bottom": 0.09, "hspace": 0.5}
 
@@ -107,11 +109,16 @@ def target_png(answer: PlanAnswer, k: int) -> bytes:
 
 def _png(plt: Any, figure: Any) -> bytes:
     from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from PIL import Image
 
     made = io.BytesIO()
-    # savefig gives the same result, but draws each picture twice.
+    # savefig draws each picture twice.
     figure.set_dpi(110)
-    FigureCanvasAgg(figure).print_png(made)  # type: ignore[no-untyped-call]
+    drawn = FigureCanvasAgg(figure)
+    drawn.draw()  # type: ignore[no-untyped-call]
+    # A palette holds the few colours of a figure in a fourth of the bytes: a report may hold hundreds.
+    colours = Image.fromarray(np.asarray(drawn.buffer_rgba())[:, :, :3])  # type: ignore[no-untyped-call]
+    colours.quantize(COLOURS_KEPT, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(made, "png")
     plt.close(figure)
     return made.getvalue()
 

@@ -164,6 +164,8 @@ def test_report(answer: PlanAnswer, study: Study) -> None:
     for planned in answer.planned:
         assert f"<h2>{planned.name}</h2>" in html
     assert html.count("data:image/png") == len(answer.planned)  # the overview; none of the star that is never seen
+    # Hundreds of targets are to open quickly.
+    assert max(len(picture) for picture in re.findall(r"data:image/png;base64,([^\"']+)", html)) < 45_000
     names = set(answer.assumptions["assumption"])
     assert {"stray light", "duration of flares", "noise of a stare", "throughput", "earth_limb_deg"} <= names
 
