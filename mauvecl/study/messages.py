@@ -30,11 +30,12 @@ def collect_messages(expectations: list[Expectation], processes: Processes | Non
     All answers report the saturation of stars and flares through this function.
     """
     texts = [message for x in expectations for message in (*x.messages, *_coarse(x))]
-    return worst_first([*(_off_centre(expectations, processes) if processes else ()), *texts])
+    outside = off_centre(expectations, processes) if processes else []
+    return worst_first([*(f"OUTSIDE THE PRIOR: {text}." for text in outside), *texts])
 
 
-def _off_centre(expectations: list[Expectation], processes: Processes) -> list[str]:
-    """Return a message for each prior that excludes the value of an expectation."""
+def off_centre(expectations: list[Expectation], processes: Processes) -> list[str]:
+    """Return a clause for each prior that excludes the value of an expectation."""
     sentences = []
     for name, _ in processes.modulations:
         first, last = getattr(processes, name).quantile(np.array([0.0, 1.0]))
@@ -42,9 +43,9 @@ def _off_centre(expectations: list[Expectation], processes: Processes) -> list[s
         outside = sorted(value for value in values if not first - TINY <= value <= last + TINY)
         if outside:
             sentences.append(
-                f"OUTSIDE THE PRIOR: {name} is drawn from {first:g} to {last:g}, and the expectation, which is "
+                f"{name} is drawn from {first:g} to {last:g}, and the expectation, which is "
                 f"subtracted, has {', '.join(f'{value:g}' for value in outside)}: every exposure differs from it, and "
-                "thresholds hold that difference."
+                "thresholds hold that difference"
             )
     return sentences
 

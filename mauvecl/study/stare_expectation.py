@@ -39,17 +39,22 @@ USUAL_STARE: dict[str, dict[str, float]] = {
 }
 
 
-def stare_of(study: Study) -> Stare:
-    """Return the stare of a study.
-
-    Raises InputError if the study has processes that only apply to single exposures.
-    """
+def refuse_priors(study: Study) -> None:
+    """Raise InputError for processes that only apply to single exposures, in questions about stares."""
     processes = study.processes.processes()
     if processes.modulations:
         name, _ = processes.modulations[0]
         raise InputError(
             f"processes.{name} applies to single exposures only, expected jitters, offsets, drifts or cycles in [stare]"
         )
+
+
+def stare_of(study: Study) -> Stare:
+    """Return the stare of a study.
+
+    Raises InputError if the study has processes that only apply to single exposures.
+    """
+    refuse_priors(study)
     q, instrument = study.stare, study.load_instrument()
     spreads: dict[str, dict[Changing, float]] = {
         how: {of: getattr(q, how)[of] for of in CHANGING if of in getattr(q, how)}

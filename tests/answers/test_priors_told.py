@@ -3,17 +3,25 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import pytest
 from answers import small
+from typer.testing import CliRunner
 
+from mauvecl.answers.campaigns.plan import plan
 from mauvecl.answers.detection.detect import detect
 from mauvecl.answers.detection.maps import detection_map
 from mauvecl.answers.limits.limits import limiting_magnitude
 from mauvecl.answers.signal.simulate import simulate
 from mauvecl.answers.signal.snr import snr
+from mauvecl.answers.stares.inject import inject
+from mauvecl.answers.stares.stare import stare
+from mauvecl.cli.app import app
 from mauvecl.device.engine import Engine
+from mauvecl.device.stares import Stares
+from mauvecl.host.errors import InputError
 from mauvecl.noise.prior_targets import PRIOR_TARGETS
 from mauvecl.study.study import Study
 
@@ -61,3 +69,42 @@ def test_a_swept_value_counts(engine: Engine) -> None:
     prior = {"detector_temperature": {"uniform": [18.0, 22.0]}}
     (sentence,) = said("detect", engine, processes=prior, sweep=sweep)
     assert "has 10:" in sentence
+
+
+@pytest.mark.parametrize("of", ["amplitude", "magnitude", "exposure"])
+def test_a_limit_that_does_not_settle_names_the_prior(engine: Engine, of: str) -> None:
+    study = small(
+        star=[{"library": "G2V", "magnitude": 7.4}],
+        flare={"amplitudes": [0.24]},
+        run={"realisations": 10_000, "seed": 3, "fap": 0.01, "statistics": ["chi2"]},
+        processes={"light_loss": {"uniform": [0.6, 0.7]}},
+        limit={"of": of, "power": 0.5},
+    )
+    with pytest.raises(InputError, match=r"light_loss is drawn from 0\.6 to 0\.7, and the expectation.* has 0\.34"):
+        limiting_magnitude(study, engine)
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_stares_have_no_priors_of_exposures(name: str) -> None:
+    """Verbs of stares refuse them by name, so that none can miss the expectation."""
+    study = small(star=[{"library": "G2V", "magnitude": 7.4}], processes={name: {"uniform": PRIORS[name][1]}})
+    for completeness in ("closed form", "injections"):
+        planned = study.with_settings(
+            ["plan.targets=[{name = 'eps Eri'}]", "orbit.days=10", f"plan.completeness='{completeness}'"]
+        )
+        with pytest.raises(InputError, match=name):
+            plan(planned)
+    stares = Stares()
+    for verb in (stare, inject):
+        with pytest.raises(InputError, match=name):
+            verb(study, stares)
+
+
+@pytest.mark.parametrize("name", PRIORS)
+def test_realise_names_them(tmp_path: Path, name: str) -> None:
+    for ends, there in zip(PRIORS[name], (False, True), strict=True):
+        prior = f"processes.{name}={{uniform = {ends}}}"
+        given = ["--star", "G2V", "-m", "7.4", "-n", "10", "--set", prior, "--output", str(tmp_path / f"{there}.zarr")]
+        done = CliRunner().invoke(app, ["realise", *given])
+        assert done.exit_code == 0, done.output
+        assert ("OUTSIDE THE PRIOR" in done.output) == there

@@ -9,6 +9,8 @@ import pytest
 from answers import small
 
 from mauvecl.answers.detection.detect import detect
+from mauvecl.answers.detection.maps import detection_map
+from mauvecl.answers.limits.limits import limiting_magnitude
 from mauvecl.device.engine import Engine
 
 NUISANCES: dict[str, dict[str, Any]] = {
@@ -58,3 +60,30 @@ def test_some_are_lowered_and_some_are_not(engine: Engine) -> None:
         if found[temperature_k]:
             assert answer.table["probability"][0] < 0.01 < 0.9 < answer.table["probability"][1]
     assert found == {4000.0: True, 10_000.0: False}
+
+
+@pytest.mark.parametrize("temperature_k", [4000.0, 10_000.0])
+def test_maps_and_limits_name_what_detect_names(engine: Engine, temperature_k: float) -> None:
+    """In every cell of a map the same as `detect`, and a limit that cannot be has it as the cause."""
+    sections = {
+        "star": [{"library": "G2V", "magnitude": 7.4}],
+        "flare": {"amplitudes": [0.3], "temperature_k": temperature_k},
+        "observation": {"exposure_s": 50.0},
+        "run": {"realisations": 10_000, "seed": 3, "fap": 0.01, "statistics": ["uv_excess", "matched"]},
+        "map": {
+            "x": {"quantity": "amplitude", "values": [0.2, 0.3]},
+            "y": {"quantity": "exposure", "values": [5.0, 50.0]},
+        },
+        **NUISANCES["both"],
+    }
+    named = [t for t in detect(small(**sections), engine).messages if t.startswith("WRONG SIGN")]
+    of_map = [t for t in detection_map(small(**sections), engine).messages if t.startswith("WRONG SIGN")]
+    assert len(of_map) == len(named)
+    # Of magnitudes, one so bright that most pixels saturate turns the sign.
+    for of in ("amplitude", "exposure"):
+        found = limiting_magnitude(small(**sections, limit={"of": of, "power": 0.5}), engine)
+        assert [one.statistic for one in found.limits] == ["uv_excess", "matched"][len(named) :]
+        assert ["WRONG SIGN" in text for text in found.failed] == [True] * len(named)
+    if named:
+        assert temperature_k == 4000.0
+        assert "uv_excess falls with the flare in 4 of 4 cells" in of_map[0]

@@ -32,6 +32,7 @@ from mauvecl.runs.pool import map_in_order
 from mauvecl.study.labels import describe_columns, stack_tables
 from mauvecl.study.messages import SATURATED, collect_messages
 from mauvecl.study.sections import Rays
+from mauvecl.study.stare_expectation import refuse_priors
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -315,6 +316,7 @@ def plan(
         raise InputError("the plan has no targets, expected some, such as `plan.targets='targets.csv'`")
     if study.orbit.targets:
         raise InputError("both orbit.targets and plan.targets are given, expected the plan's")
+    refuse_priors(study)
     stars = [star_of(study, text) for text in study.plan.targets]
     seen = visible(study)
     names, hours = seen.visibility.by_month()

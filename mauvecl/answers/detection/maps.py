@@ -17,6 +17,7 @@ from mauvecl.results.requests.fap import check_fap
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import describe_columns, label
 from mauvecl.study.messages import SATURATED, collect_messages, worst_first
+from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.study.quantities import OF_SPECTRUM, UNITS
 from mauvecl.study.study import Study
 from mauvecl.study.unknowns import average, drawn, shares
@@ -141,6 +142,7 @@ def map(
     studies = (study,) if unknown is None else unknown.studies
     seen: list[Expectation] = []
     of_flares: list[str] = []
+    lowered: set[Lowered] = set()
     maps = []
     for number, one in enumerate(studies):
 
@@ -149,7 +151,7 @@ def map(
                 cells = len(x) * len(y)
                 progress(number * cells + done, len(studies) * cells)
 
-        maps.append(_map(one, x, y, engine, seen, of_flares, told_of))
+        maps.append(_map(one, x, y, engine, seen, of_flares, lowered, told_of))
     values, parts = maps[0], {}
     if unknown is not None:
         values = _averaged(maps)
@@ -170,6 +172,7 @@ def map(
         messages=[
             *_blinded(values),
             *_without_threshold(study, values),
+            *_wrong_sign(study, lowered, len(x) * len(y)),
             *worst_first([*collect_messages(seen, study.processes.processes()), *of_flares]),
             *marginal_lines(study),
             *_cost(study, x, y),
@@ -194,6 +197,8 @@ def _shown(value: float | str) -> str:
 
 
 Arrays = dict[str, NDArray[np.float64]]
+#: A statistic, and the indices of a cell in which the flare lowers it.
+Lowered = tuple[str, int, int]
 
 
 def _blinded(values: Arrays) -> list[str]:
@@ -217,6 +222,17 @@ def _without_threshold(study: Study, values: Arrays) -> list[str]:
     ]
 
 
+def _wrong_sign(study: Study, lowered: set[Lowered], cells: int) -> list[str]:
+    """Return a sentence for each weighted sum on the cells whose flare lowers it, if any."""
+    told = "marginalised over unknowns, " if study.nuisances != NuisanceChoice() else ""
+    return [
+        f"WRONG SIGN: {told}{statistic} falls with the flare in {number} of {cells} cells, and only higher values are "
+        "alarms: its detection probability says nothing of the flare there."
+        for statistic in study.run.statistics
+        if (number := sum(name == statistic for name, *_ in lowered))
+    ]
+
+
 def _map(
     study: Study,
     x: tuple[float | str, ...],
@@ -224,9 +240,13 @@ def _map(
     engine: Engine | Pool,
     seen: list[Expectation],
     of_flares: list[str],
+    lowered: set[Lowered],
     told_of: Callable[[int], None],
 ) -> Arrays:
-    """Compute the map on one instrument; add quiescent stars to `seen`, and flares' saturation to `of_flares`."""
+    """Compute the map on one instrument.
+
+    Add quiescent stars to `seen`, flares' saturation to `of_flares`, and sums that flares lower to `lowered`.
+    """
     from mauvecl.runs.pool import map_in_order
 
     shape = (len(study.run.statistics), len(y), len(x))
@@ -235,7 +255,7 @@ def _map(
     def filled(cells: list[tuple[int, int]]) -> tuple[Expectation, int, list[str]]:
         quiet, flares = _expectations(study, [(x[i], y[j]) for i, j in cells])
         if not quiet.saturated.all():
-            _fill(values, cells, study, quiet, flares, engine)
+            lowered.update(_fill(values, cells, study, quiet, flares, engine))
         return quiet, len(cells), [text for text in collect_messages(flares) if text.startswith(SATURATED)]
 
     done = 0
@@ -286,8 +306,9 @@ def _fill(
     quiet: Expectation,
     flares: list[Expectation],
     engine: Engine | Pool,
-) -> None:
-    run = study.run
+) -> list[Lowered]:
+    """Compute some cells that share a quiescent star, and return the weighted sums that their flares lower."""
+    run, lowered = study.run, []
     result = engine.detect(quiet, flares, seed=run.seed, **study.detecting(quiet))
     for s, statistic in enumerate(run.statistics):
         probabilities = result.detection_probability(run.fap, statistic)
@@ -297,6 +318,9 @@ def _fill(
             limit = result.closed_form(statistic, template=k).isf(run.fap)
             if k not in result.blinding:
                 values["closed_form"][at] = result.closed_form(statistic, k).sf(limit)
+            if result.fall(statistic, k):
+                lowered.append((statistic, i, j))
+    return lowered
 
 
 #: The older name, which does not hide Python's own `map`.

@@ -13,9 +13,11 @@ from scipy import special
 
 from mauvecl.host.errors import InputError
 from mauvecl.host.ranges import DAY_S
-from mauvecl.results.requests.hypotheses import check_shape
+from mauvecl.results.requests.hypotheses import check_shape, fall_between
 from mauvecl.statistics.intervals import Interval
 from mauvecl.statistics.registry import STATISTICS
+from mauvecl.statistics.statistic import LinearStatistic
+from mauvecl.study.messages import off_centre
 from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.sections import Star
 from mauvecl.study.study import Study
@@ -180,7 +182,28 @@ class LimitSearch:
         return InputError(
             f"the detection probability of {name}{flare} by {self.statistic} {verb} {self.power:g} at {self.of} = "
             f"{value:g}, expected a limit between {_span(self.of)}{self.saturation_clause(value)}"
+            f"{self.sign_clause(value)}"
         )
+
+    def sign_clause(self, value: float) -> str:
+        """Return what a refusal says of a weighted sum that the flare lowers at a value."""
+        quiet, flare = self.scaled(value)
+        setting, one = self.study.setting(quiet, flare), STATISTICS[self.statistic]
+        if not isinstance(one, LinearStatistic) or not setting.used.any() or flare.saturated[setting.used].all():
+            return ""
+        shape = flare if one.shaped else None
+        falls = fall_between(*(one.closed_form(setting, x, shape) for x in (quiet, flare)))
+        if not falls:
+            return ""
+        return (
+            f"; WRONG SIGN: there {self.statistic} falls by {falls:.3g} standard deviations with the flare, and only "
+            "higher values are alarms"
+        )
+
+    def prior_clause(self, value: float) -> str:
+        """Return what a refusal says of priors that exclude the values that the expectation has."""
+        outside = off_centre([self.pair(value)[0]], self.study.drawing["processes"])
+        return "".join(f"; {text}" for text in outside)
 
     def saturation_clause(self, value: float) -> str:
         """Return what a refusal says of saturation at a value, of the star or else of the flare."""
@@ -266,7 +289,13 @@ def settle(question: LimitSearch, start: float) -> Interval:
     InputError
         If the probability does not rise there, or the search does not settle.
     """
-    return (_settle_frames if question.of == "exposure" else _settle)(question, start)
+    try:
+        return (_settle_frames if question.of == "exposure" else _settle)(question, start)
+    except InputError as error:
+        outside = question.prior_clause(start)
+        if outside:
+            raise InputError(f"{error}{outside}") from error
+        raise
 
 
 def _settle(question: LimitSearch, start: float) -> Interval:
@@ -276,7 +305,7 @@ def _settle(question: LimitSearch, start: float) -> Interval:
     if not slope > 0:
         raise InputError(
             f"the detection probability does not rise towards an easier {of} at {start:g}, expected a slope there"
-            f"{question.saturation_clause(start)}"
+            f"{question.saturation_clause(start)}{question.sign_clause(start)}"
         )
     at = _coordinate(of, start)
     n = question.study.run.realisations

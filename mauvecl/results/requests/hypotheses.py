@@ -124,17 +124,22 @@ class Hypotheses:
             if not isinstance(self.statistic(name), LinearStatistic):
                 continue
             for k, flare in enumerate(self.flares):
-                null = self.closed_form(name, template=k)
-                shift = (self.closed_form(name, k).mean - null.mean) / null.std
-                if k not in self.blinding and shift < -LEAST_SHIFT:
+                falls = self.fall(name, k)
+                if falls:
                     matched = Matched().closed_form(self.setting, flare, flare)
                     told = "marginalised over unknowns, " if self.nuisances else ""
                     sentences.append(
-                        f"WRONG SIGN: {told}{name} falls by {-shift:.3g} standard deviations with flare {k + 1} of "
+                        f"WRONG SIGN: {told}{name} falls by {falls:.3g} standard deviations with flare {k + 1} of "
                         f"{self.quiet.name}, and only higher values are alarms: its detection probability says nothing "
                         f"of the flare, which matched has at {matched.mean / matched.std:.3g}."
                     )
         return tuple(sentences)
+
+    def fall(self, statistic: str, flare: int) -> float:
+        """Return the standard deviations by which a flare lowers a weighted sum, or 0 if it does not."""
+        if flare in self.blinding or not isinstance(self.statistic(statistic), LinearStatistic):
+            return 0.0
+        return fall_between(self.closed_form(statistic, template=flare), self.closed_form(statistic, flare))
 
     def closed_form(self, statistic: str, flare: int | None = None, *, template: int = 0) -> Form:
         """Return a statistic's distribution for Gaussian noise; parameters as for `Detection.distribution`."""
@@ -159,6 +164,12 @@ class Hypotheses:
             flare = template
         if flare is not None and not 0 <= flare < len(self.flares):
             raise InputError(f"flare = {flare}, expected 0 to {len(self.flares) - 1}")
+
+
+def fall_between(null: Form, flare: Form) -> float:
+    """Return the standard deviations by which a flare lowers the mean of a statistic, or 0 if it does not."""
+    shift = (flare.mean - null.mean) / null.std
+    return -shift if shift < -LEAST_SHIFT else 0.0
 
 
 def check_shape(quiet: Expectation, flare: Expectation, used: NDArray[np.bool_], number: int = 0) -> None:
