@@ -1,1 +1,1 @@
-"""The page of `mauvecl serve` (the extra ``web``): controls, closed forms at once, simulation on demand."""
+"""Page of `mauvecl serve` (extra ``web``): controls, immediate closed forms, simulation on demand."""

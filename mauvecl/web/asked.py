@@ -1,4 +1,4 @@
-"""What the page asks of a pool."""
+"""Simulations that the page requests from a pool."""
 
 from __future__ import annotations
 
@@ -22,25 +22,25 @@ from mauvecl.study.study import Study
 if TYPE_CHECKING:
     from mauvecl.runs.pool import Pool
 
-#: The map of the page: cells along each axis, and realisations of each.
+#: Cells along each axis of the page's map, and realisations per cell.
 MAP_STEPS, MAP_REALISATIONS = 8, 20_000
-#: Flares that are injected: sizes, half-widths, how many of each, and at how many places.
+#: Injected flares: numbers of sizes and half-widths, flares of each, and positions.
 INJECTED = {"of": "amplitude", "sizes": 12, "widths": 3, "count": 200, "positions": 4, "fitted": 0}
 
 
 def detect_and_snr(study: Study, pool: Pool) -> tuple[DetectAnswer, SnrAnswer]:
-    """Everything that *Simulate* refines."""
+    """Run the simulations of the button *Simulate*."""
     pool.expect(2 * study.run.realisations)
     return detect(study, pool), snr(study, pool)
 
 
 def map_around(study: Study, pool: Pool) -> maps.MapResult:
-    """A coarse map around the question's own star."""
+    """Simulate a coarse map around the question's star."""
     star, amplitude = study.star[0], study.flare.amplitudes[0]
     middle = 7.0 if star.magnitude is None else star.magnitude
     x = {"quantity": "magnitude", "start": middle - 2.5, "stop": middle + 2.5, "steps": MAP_STEPS}
     y = {"quantity": "amplitude", "start": amplitude / 10, "stop": amplitude * 3, "steps": MAP_STEPS, "log": True}
-    # A statistic alone, and as few realisations as the false-alarm probability allows.
+    # One statistic and the fewest realisations that the false-alarm probability allows keep the map fast.
     fewest = int(np.ceil(100 / study.run.fap))
     n = min(max(MAP_REALISATIONS, fewest), study.run.realisations)
     run = {"realisations": n, "statistics": [study.run.statistics[-1]]}
@@ -51,7 +51,7 @@ def map_around(study: Study, pool: Pool) -> maps.MapResult:
 
 
 def completeness(study: Study, pool: Pool) -> InjectAnswer:
-    """What a search of a stare of one orbit finds, coarsely."""
+    """Simulate the completeness of a search of one orbit's stare on a coarse grid."""
     data = study.model_dump()
     data["injections"] |= INJECTED
     data["search"] |= {"nulls": 0}
@@ -59,7 +59,7 @@ def completeness(study: Study, pool: Pool) -> InjectAnswer:
 
 
 def planned(study: Study) -> PlanAnswer:
-    """What a campaign on the target would find, without injections."""
+    """Compute the yield of a campaign on the target, without injections."""
     for name in study.orbit.targets:
         if Target.of(name).spectral_type is None:
             raise InputError(
@@ -77,12 +77,12 @@ def _detection(study: Study, pool: Pool) -> dict[str, Any]:
 
 
 def _visible(study: Study) -> dict[str, Any]:
-    """The answer with its tables, which are dear to make and looked at again and again."""
+    """Compute the visibility with its tables, which are slow to make and read repeatedly."""
     answer = visible(study)
     return {"visible": answer, "seen": {name: getattr(answer, name) for name in ("table", "months", "by_day")}}
 
 
-#: What may be computed on demand, by name: what is then known, by name.
+#: Functions of the simulations by name; they return answers by name.
 SIMULATED: dict[str, Callable[[Study, Pool], dict[str, Any]]] = {
     "detection": _detection,
     "limit": lambda study, pool: {"limit": limit(study, pool)},
@@ -91,5 +91,5 @@ SIMULATED: dict[str, Callable[[Study, Pool], dict[str, Any]]] = {
     "visible": lambda study, pool: _visible(study),
     "plan": lambda study, pool: {"plan": planned(study)},
 }
-#: Those that draw by the pool.
+#: Simulations that use the pool's devices.
 DRAWING = {"detection", "limit", "map"}

@@ -1,4 +1,4 @@
-"""The answer card: the probability and what it holds for, in words."""
+"""Answer card: the probability and its conditions in words."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 from mauvecl.web.closed import Closed, between, percent, short
 from mauvecl.web.tabs.tab import Answers
 
-#: Part of the sentence that tells what the throughput is; it stands on the page once.
+#: Part of the message about the throughput, which the page shows once.
 NOMINAL = "The throughput is nominal"
 #: Answers whose messages are shown; those of others stand among them.
 TOLD = ("detection", "completeness", "visible", "plan")
@@ -18,7 +18,7 @@ THROUGHPUT = 0.3
 
 
 def card(closed: Closed, answers: Answers) -> dict[str, Any]:
-    """What the card shows of an answer.
+    """Return the contents of the card.
 
     Returns
     -------
@@ -43,7 +43,7 @@ def card(closed: Closed, answers: Answers) -> dict[str, Any]:
         f"chance to detect {closed.words}, by the statistic {q.statistic} at a false-alarm probability of {q.fap:g} "
         "per test"
     )
-    # What is grave begins in capitals.
+    # Severe messages begin in capitals.
     notes = [(m, "danger" if m.partition(":")[0].isupper() else "info") for m in _messages(closed, answers)]
     return {
         "shown": percent(chance),
@@ -57,7 +57,7 @@ def card(closed: Closed, answers: Answers) -> dict[str, Any]:
 
 
 def _spread(closed: Closed) -> str:
-    """What the throughput's uncertainty makes of a chance."""
+    """Describe the effect of the throughput's uncertainty on a probability."""
     if closed.slow or closed.chance != closed.chance:
         return ""
     ends = [odds.probability for much in (-1, 1) for odds in closed.at(1 + much * THROUGHPUT, np.ones(1), sky=True)]

@@ -1,4 +1,4 @@
-"""What has a closed form: the answer to a question, before anything is drawn."""
+"""Closed-form answers to a visitor's question."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class Closed:
-    """The closed forms of one question.
+    """Closed-form answer to a question.
 
     Attributes
     ----------
@@ -69,7 +69,7 @@ class Closed:
             For values that cannot be together.
         """
         q, study = question, question.study(folder)
-        # What is uploaded need not be read from its file at every change.
+        # An uploaded spectrum is not read from its file at every change.
         star = study.star[0].source() if q.uploaded is None else q.uploaded.at_magnitude(q.magnitude, q.band)
         light = star, study.flaring(star, study.flare.amplitudes[0])
         quiet, flare = study.expect(list(light))
@@ -83,17 +83,17 @@ class Closed:
 
     @cached_property
     def null(self) -> Smooth:
-        """The statistic without a flare, for pictures."""
+        """Distribution of the statistic without a flare, for pictures."""
         return Smooth(self.odds.null)
 
     @cached_property
     def seen(self) -> Smooth:
-        """The statistic with the flare, for pictures."""
+        """Distribution of the statistic with the flare, for pictures."""
         return Smooth(self.odds.flaring)
 
     @cached_property
     def messages(self) -> list[str]:
-        """What the visitor must be told, worst first."""
+        """Messages for the visitor, the most severe first."""
         cost = unknown_cost("this flare", self.quiet, self.flare, self.study)
         return [
             *collect_messages([self.quiet, self.flare]),
@@ -103,7 +103,7 @@ class Closed:
 
     @property
     def words(self) -> str:
-        """The question in a sentence's words."""
+        """Question in words, as part of a sentence."""
         q, x = self.question, self.quiet
         frames = "one frame" if x.n_frames == 1 else f"{x.n_frames} frames"
         star = "your own star" if q.uploaded is not None else star_words(q.star)
@@ -113,7 +113,7 @@ class Closed:
         )
 
     def at(self, light: float, rises: Float, *, sky: bool = False) -> list[DetectionForms]:
-        """The odds with other light, which is linear; none where the star saturates every pixel.
+        """Return the closed forms for scaled light, or an empty list if the star saturates every pixel.
 
         Parameters
         ----------
@@ -136,7 +136,7 @@ class Closed:
 
     @property
     def slow(self) -> bool:
-        """Whether closed forms take too long for many of them: sums of squares, integrated over what is drawn."""
+        """Whether closed forms are slow: sums of squares integrated over random factors."""
         return isinstance(self.odds.null, Mixture) and not isinstance(self.odds.null.parts[0], Gaussian)
 
     @property
@@ -152,7 +152,7 @@ class Closed:
 
 
 def percent(value: float) -> str:
-    """A probability as a visitor reads it: nothing is certain, and nothing impossible."""
+    """Format a probability, with bounds instead of 0 and 100 %."""
     if value != value:
         return "no number"
     if value > 0.9999:
@@ -164,11 +164,11 @@ def percent(value: float) -> str:
 
 
 def between(low: float, high: float) -> str:
-    """Two probabilities as an interval."""
+    """Format an interval of probabilities."""
     ends = dict.fromkeys([percent(low), percent(high)])
     return " to ".join(ends)
 
 
 def short(value: float) -> str:
-    """A number with three significant digits and no powers of ten."""
+    """Format a number with three significant digits and no power of ten."""
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.3g}"

@@ -9,12 +9,12 @@ from tornado.iostream import IOStream
 
 
 class BoundedServer(HTTPServer):
-    """HTTP server that, where there are too many connections, closes the oldest that is not a visitor's page."""
+    """HTTP server that closes the oldest connection without a visitor's page if there are too many."""
 
     max_connections: int
 
     def initialize(self, *args: Any, **options: Any) -> None:
-        """Begin without connections."""
+        """Create a server without connections."""
         super().initialize(*args, **options)
         self._streams: list[IOStream] = []
 

@@ -1,4 +1,4 @@
-"""Who may come to the page: hosts and origins, and so many visitors at a time."""
+"""Access control of the page: hosts, origins and number of visitors."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ from mauvecl.web.visitor import Visitor
 if TYPE_CHECKING:
     from tornado.httputil import HTTPServerRequest
 
-#: Visitors at a time; each holds some megabytes (assumed to be enough for a team).
+#: Largest number of simultaneous visitors, with some megabytes each (assumed to suffice for a team).
 MOST_VISITORS = 100
 #: A host as browsers write it: name, IPv4 address or IPv6 address in brackets; and a port.
 HOST = r"(?:[a-z0-9](?:[a-z0-9.-]*[a-z0-9])?|\[[0-9a-f:.]+\])(?::\d{1,5})?"
 
 
 def local(address: str) -> bool:
-    """Whether an address lets in this machine alone.
+    """Return whether an address is reachable from this machine only.
 
     Raises
     ------
@@ -42,17 +42,17 @@ def local(address: str) -> bool:
 
 
 def netloc(address: str, port: int) -> str:
-    """Host and port as an address has them: IPv6 in brackets."""
+    """Format host and port, with IPv6 addresses in brackets."""
     return f"[{address}]:{port}" if ":" in address else f"{address}:{port}"
 
 
 def plain(host: str) -> str:
-    """A host in lower case, without the ports that go without saying."""
+    """Return a host in lower case without default ports."""
     return re.sub(r":(80|443)$", "", host.strip().lower())
 
 
 def origin(text: str) -> str:
-    """What `--allow-origin` names: a host with its port, from ``https://name`` or ``name:port``.
+    """Parse a value of `--allow-origin`, ``https://name`` or ``name:port``, to a host with its port.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def origin(text: str) -> str:
 
 
 def hosts(address: str, port: int, allowed: Iterable[str]) -> frozenset[str]:
-    """Hosts by which the page may be asked for.
+    """Return the hosts under which the page is served.
 
     Parameters
     ----------
@@ -92,14 +92,14 @@ def hosts(address: str, port: int, allowed: Iterable[str]) -> frozenset[str]:
 
 
 class Refused(RequestHandler):
-    """A sentence instead of the page."""
+    """Handler that returns an error message instead of the page."""
 
     def initialize(self, status: int, why: str) -> None:
-        """What is answered."""
+        """Set status and message."""
         self._status, self._why = status, why
 
     async def prepare(self) -> None:
-        """Answer whatever is asked."""
+        """Answer any request."""
         self.set_status(self._status)
         self.set_header("Content-Type", "text/plain; charset=utf-8")
         if self._status == 503:
@@ -108,7 +108,7 @@ class Refused(RequestHandler):
 
 
 class Door(Matcher):
-    """Matches what is not let in.
+    """Matcher of requests that are refused.
 
     Parameters
     ----------
@@ -121,16 +121,16 @@ class Door(Matcher):
 
     @classmethod
     def rule(cls, allowed: frozenset[str]) -> Rule:
-        """To stand before all others."""
+        """Return the routing rule, which must precede all others."""
         return Rule(cls(allowed), Refused)
 
     def match(self, request: HTTPServerRequest) -> dict[str, Any] | None:
-        """Why a request is refused, or None."""
+        """Return the reason for which a request is refused, or None."""
         refused = self._foreign(request) or self._too_many(request)
         return None if refused is None else {"target_kwargs": dict(zip(("status", "why"), refused, strict=True))}
 
     def _foreign(self, request: HTTPServerRequest) -> tuple[int, str] | None:
-        """A name that was bent to this machine, or a page of another server."""
+        """Return the refusal of an unknown host name (DNS rebinding) or of another server's page, or None."""
         if [plain(host) for host in request.headers.get_list("Host")] not in [[host] for host in self._allowed]:
             return 403, "The page is not served under this host name; see `mauvecl serve --allow-origin`."
         for given in request.headers.get_list("Origin"):
@@ -141,7 +141,7 @@ class Door(Matcher):
         return None
 
     def _too_many(self, request: HTTPServerRequest) -> tuple[int, str] | None:
-        """Whether the server is full."""
+        """Return the refusal if there are too many visitors, or None."""
         if request.path in ("/", "/live") and len(Visitor.here) >= MOST_VISITORS:
             return 503, "Too many visitors are here at the moment; please come again in some minutes."
         return None

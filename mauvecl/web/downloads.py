@@ -1,4 +1,4 @@
-"""What visitors take along: tables, and the study that gives them again: as a file, a program, a command."""
+"""Downloads: tables, and the study that reproduces them as a file, program or command."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ print(answer.table)
 
 
 def study_file(study: Study, name: str) -> tuple[str, bytes]:
-    """The study for the command line, with the name of its file; an uploaded star beside it, in a zip."""
+    """Return name and content of the study file, in a zip archive with an uploaded star."""
     file = study.star[0].file
     if file is None:
         return f"{name}.toml", study.toml().encode()
@@ -45,7 +45,7 @@ def study_file(study: Study, name: str) -> tuple[str, bytes]:
 
 
 def as_file(tab: Tab, name: str, ending: str, closed: Closed, answers: Answers) -> tuple[str, bytes]:
-    """A table of a tab, or the study that gives it again, with the name of its file.
+    """Return file name and content of a tab's table, or of the study that reproduces it.
 
     Parameters
     ----------
@@ -78,13 +78,13 @@ def as_file(tab: Tab, name: str, ending: str, closed: Closed, answers: Answers) 
 
 
 def as_python(question: Question) -> str:
-    """The question as a program."""
+    """Return the question as a Python program."""
     data = pformat(question.data(), indent=4, width=100, sort_dicts=False)
     return PYTHON.format(data=data.replace("\n", "\n    "))
 
 
 def as_command(question: Question) -> str:
-    """The question on the command line; an uploaded spectrum's needs its study."""
+    """Return the question as a command; an uploaded spectrum requires the study file."""
     q = question
     if q.uploaded is not None or len(q.own_unknown) > 20:
         return "mauvecl detect study.toml"

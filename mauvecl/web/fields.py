@@ -1,4 +1,4 @@
-"""The fields of the page: what each is called, what stands in it at first, and how its text is read."""
+"""Fields of the page: labels, defaults and parsers."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ MOST_CHARACTERS = 200
 
 @dataclass(frozen=True)
 class Number:
-    """A number in a range, written with a point."""
+    """Number in a range, written with a decimal point."""
 
     low: float
     high: float
     whole: bool = False
 
     def __call__(self, text: str) -> float | int:
-        """The number, or the sentence of what is accepted."""
+        """Parse the number; an error states what is accepted."""
         kind = "a whole number" if self.whole else "a number"
         accepted = f"expected {kind} from {self.low:.15g} to {self.high:.15g}"
         form = r"[+-]?\d+" if self.whole else r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?"
@@ -52,20 +52,20 @@ class Number:
 
 @dataclass(frozen=True)
 class Choice:
-    """One of some words."""
+    """One of several words."""
 
     options: tuple[str, ...]
     made: Callable[[str], Any] = str
 
     def __call__(self, text: str) -> Any:
-        """The value, or the sentence of what is accepted."""
+        """Parse the value; an error states what is accepted."""
         if text not in self.options:
             raise InputError(f"{shortened(text)} is no choice here, expected one of {', '.join(self.options)}")
         return self.made(text)
 
 
 def several(text: str) -> tuple[str, ...]:
-    """Names of simulations, each once."""
+    """Parse names of simulations, without repetitions."""
     names = [name for name in text.split(",") if name]
     if len(names) > len(SIMULATED) or not set(names) <= SIMULATED.keys():
         raise InputError(f"{shortened(text)} is no simulation, expected some of {', '.join(SIMULATED)}")
@@ -73,7 +73,7 @@ def several(text: str) -> tuple[str, ...]:
 
 
 def points(text: str) -> tuple[tuple[float, float], ...] | None:
-    """A spectrum as pairs of nm and DN of the exposure; empty where nothing is entered, None for an uploaded one."""
+    """Parse a spectrum as pairs of nm and DN of the exposure; None for an uploaded one."""
     if text == UPLOADED_UNKNOWN:
         return None
     number = Number(-1e30, 1e30)
@@ -87,20 +87,20 @@ def points(text: str) -> tuple[tuple[float, float], ...] | None:
 
 
 class Draws(NamedTuple):
-    """How many realisations, and whether the tail beyond them is sampled."""
+    """Number of realisations, and whether the tail beyond them is sampled."""
 
     number: int
     tails: str
 
 
 def draws(text: str) -> Draws:
-    """From a choice such as "100000" or "100000 sampled"."""
+    """Parse a choice such as "100000" or "100000 sampled"."""
     number, _, tails = text.partition(" ")
     return Draws(int(number), tails or "counted")
 
 
 def star_name(text: str) -> str:
-    """The library's name of a star, found by any of its names in any case and spacing; not a star kept on a server."""
+    """Return the library's name of a star from any of its names, except stars stored on the server."""
     if text == UPLOADED:
         return UPLOADED
     if not text.strip():
@@ -112,7 +112,7 @@ def star_name(text: str) -> str:
 
 
 def seen_target(text: str) -> str:
-    """What to look at: nothing, a name of the embedded list, or coordinates."""
+    """Parse a target: empty, a name of the embedded list, or coordinates."""
     from mauvecl.host.orbit.targets import Target
 
     try:
@@ -127,7 +127,7 @@ def seen_target(text: str) -> str:
 
 
 def star_names() -> list[str]:
-    """Every name of every embedded star, once."""
+    """Return the distinct names of all embedded stars."""
     rows = [row for row in library_table() if row["kept"] == "embedded"]
     names = [str(row[column]) for row in rows for column in ("name", "alias", "star")]
     # A collection's name in front of a type says nothing that the type does not.
@@ -140,12 +140,12 @@ def _key(name: str) -> str:
 
 @cache
 def _spaced() -> dict[str, str]:
-    """Names as the library spells them: GJ581, gj 581 and GJ  581 are one star."""
+    """Normalise the case and spacing of a name, as in GJ581, gj 581 and GJ  581."""
     return {_key(name): name for name in star_names()}
 
 
 def star_words(name: str) -> str:
-    """A star of the library in a sentence: its type, and the star whose spectrum it is."""
+    """Describe a star of the library by its type and the star of its spectrum."""
     entry = embedded(name)
     star = name if entry is None else entry["star"]
     if star == name:
@@ -156,7 +156,7 @@ def star_words(name: str) -> str:
 
 @dataclass(frozen=True)
 class Slider:
-    """How a number is moved: between ends, by a step, or by a factor; whole frames are steps of theirs."""
+    """Range and step of a slider, additive or by factors; exposures move by whole frames."""
 
     low: float
     high: float
@@ -166,7 +166,7 @@ class Slider:
 
 @dataclass(frozen=True)
 class Field:
-    """One field.
+    """Field of the page.
 
     Attributes
     ----------

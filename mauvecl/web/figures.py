@@ -1,4 +1,4 @@
-"""Figures as the page draws them: one look in a light and a dark theme, the same colour for the same thing."""
+"""Figures of the page in a light and a dark theme."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ MORE_MARKS = ("H alpha",)
 
 @dataclass(frozen=True)
 class Ink:
-    """The colours of a theme; those of things are Okabe and Ito's, lighter on dark ground."""
+    """Colours of a theme, after Okabe & Ito, lighter on dark ground."""
 
     text: str
     grid: str
@@ -63,7 +63,7 @@ DASHES = ("6 3", "9 3 2 3", "2 2")
 
 
 class Canvas:
-    """A figure and the sources that it draws.
+    """Figure with its data sources.
 
     Parameters
     ----------
@@ -118,30 +118,30 @@ class Canvas:
             self._mark()
 
     def source(self, name: str, *columns: str) -> ColumnDataSource:
-        """An empty source, by which data come."""
+        """Add an empty data source."""
         return ColumnDataSource({column: [] for column in columns}, name=name)
 
     def line(self, name: str, called: str, colour: str, *, show: str = "", step: bool = False, **how: Any) -> Any:
-        """A named line of columns x and y."""
+        """Add a named line of columns x and y."""
         source = self.source(name, "x", "y")
         kind: Any = partial(self.plot.step, mode="center") if step else self.plot.line
         made = kind("x", "y", source=source, color=self.ink[colour], **({"line_width": 1.6} | how))
         return self._told(made, called, colour, "dash" if "line_dash" in how else "line", show)
 
     def band(self, name: str, called: str, colour: str, *, show: str = "", alpha: float = 0.22) -> Any:
-        """A band of columns x, low and high."""
+        """Add a band of columns x, low and high."""
         source = self.source(name, "x", "low", "high")
         made = self.plot.varea("x", "low", "high", source=source, fill_color=self.ink[colour], fill_alpha=alpha)
         return self._told(made, called, colour, "band", show)
 
     def dots(self, name: str, called: str, colour: str, *, size: float = 5, show: str = "", **how: Any) -> Any:
-        """Dots of columns x and y."""
+        """Add dots of columns x and y."""
         source = self.source(name, "x", "y")
         made = self.plot.scatter("x", "y", source=source, size=size, color=self.ink[colour], **how)
         return self._told(made, called, colour, "dot", show)
 
     def pinned(self, kind: Any = None, *columns: str, halo: str = "") -> None:
-        """A line for each scenario that may be pinned, of columns x and y or as named; tabs have the key."""
+        """Add a line for each scenario that can be pinned; its columns are x and y or as named."""
         columns, kind = columns or ("x", "y"), kind or self.plot.line
         for k, (colour, dash) in enumerate(zip(self.ink.pins, DASHES, strict=True)):
             source, name = self.source(f"pin {k}", *columns), f"pinned {k + 1}"
@@ -152,7 +152,7 @@ class Canvas:
                 kind(*columns, source=source, name=name, tags=["pins"], **look)
 
     def own_point(self, called: str = "your question") -> Any:
-        """The question's own point."""
+        """Add a marker of the question."""
         source = self.source("own", "x", "y")
         made = self.plot.scatter(
             "x", "y", source=source, size=13, marker="circle", fill_color=self.ink.own, line_color=self.ink.ground,
@@ -161,7 +161,7 @@ class Canvas:
         return self._told(made, called, "own", "dot", "")
 
     def rule(self, name: str, called: str, along: str, colour: str = "threshold", dash: str = "dashed") -> Any:
-        """A straight line through the picture, put where it belongs later."""
+        """Add a straight line whose position is set later."""
         dimension: Literal["height", "width"] = "height" if along == "x" else "width"
         span = Span(dimension=dimension, location=None, line_color=self.ink[colour], line_dash=dash, name=name)
         self.plot.add_layout(span)
@@ -169,7 +169,7 @@ class Canvas:
         return span
 
     def saturated(self) -> None:
-        """Strips where pixels saturate."""
+        """Add strips that mark saturated pixels."""
         made = self.plot.vstrip(
             "x0", "x1", source=self.source("saturated", "x0", "x1"), fill_color=self.ink.own, fill_alpha=0.18,
             line_color=None, hatch_pattern="/", hatch_color=self.ink.own, hatch_alpha=0.5,
@@ -178,7 +178,7 @@ class Canvas:
         self.legend.append(("saturated", self.ink.own, "band", "if any"))
 
     def tooltips(self, made: Any, *lines: tuple[str, str], mode: Literal["mouse", "hline", "vline"] = "vline") -> None:
-        """What is told of a point: names, and columns with four significant digits."""
+        """Add a tooltip with columns in four significant digits."""
         columns = [column for _, column in lines]
         self.plot.add_tools(
             HoverTool(
@@ -192,13 +192,13 @@ class Canvas:
         )
 
     def _told(self, made: Any, called: str, colour: str, form: str, show: str) -> Any:
-        """What it is called in the page's own legend, and by what it is asked for."""
+        """Add an entry to the page's legend, with the tag that shows or hides it."""
         made.name, made.tags, made.visible = called, [show], not show
         self.legend.append((called, self.ink[colour], form, show))
         return made
 
     def _mark(self) -> None:
-        """Marks of spectral lines."""
+        """Add marks of spectral lines."""
         for name, places in MARKS.items():
             show = "more marks" if name in MORE_MARKS else "marks"
             for place in places:
@@ -218,7 +218,7 @@ class Canvas:
 
 
 def strips(wavelength_nm: Any, flags: Any) -> dict[str, Any]:
-    """Ends of the stretches of flagged pixels, half a pixel beyond each."""
+    """Return the ends of runs of flagged pixels, half a pixel beyond each."""
     import numpy as np
 
     padded = np.diff(np.concatenate([[0], np.asarray(flags, int), [0]]))

@@ -1,4 +1,4 @@
-"""Spectra that visitors bring, read in a process of its own: whatever they do to it, the server stays as it is."""
+"""Reader of visitors' spectra in a child process with limits, which protects the server."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ _turns = threading.BoundedSemaphore(TOGETHER)
 
 
 def read_limited(content: bytes) -> Source:
-    """A spectrum from the bytes of a file, as `Source.read` reads it, in a process with limits of memory and time.
+    """Read a spectrum from the bytes of a file, like `Source.read`, in a process with limited memory and time.
 
     Blocks for about a second, most of it for the start of Python: call it from a thread.
 
@@ -68,7 +68,7 @@ def read_limited(content: bytes) -> Source:
 
 
 def _read_apart(content: bytes) -> bytes:
-    """What the reading process writes."""
+    """Run the reading process and return its output."""
     environment = os.environ | {
         # One thread of a numerical library needs no stacks of many.
         **dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1"),
@@ -102,12 +102,12 @@ def _read_apart(content: bytes) -> bytes:
 
 
 def _here() -> str:
-    """The folder that holds the package: the reading process starts elsewhere."""
+    """Return the folder of the package, since the reading process starts in another one."""
     return str(Path(__file__).parents[2])
 
 
 def _limit(memory_mib: int, seconds: int) -> None:
-    """Take memory, time and files away from this process, for good."""
+    """Limit memory, time and files of this process permanently."""
     import resource
 
     for kind, value in (
@@ -123,7 +123,7 @@ def _limit(memory_mib: int, seconds: int) -> None:
 
 
 def _main() -> int:
-    """The reading process: bytes of a file come in on standard input, arrays go out, a sentence to standard error."""
+    """Run the reading process: file on standard input, arrays on standard output, errors on standard error."""
     memory_mib, seconds = sys.argv[1:]
     _limit(int(memory_mib), int(seconds))
     try:

@@ -1,4 +1,4 @@
-"""What a visitor asks: the values of the fields, as a study."""
+"""A visitor's question: the values of the fields as a study."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ STAR_FILE = "star.ecsv"
 
 @dataclass(frozen=True, eq=False)
 class Question:
-    """One visitor's question, every value of it right; `fields.FIELDS` says what each is."""
+    """Valid values of all fields, which `fields.FIELDS` describes."""
 
     star: str
     magnitude: float
@@ -46,7 +46,7 @@ class Question:
     uploaded: Source | None = None
 
     def study(self, folder: Path | None = None) -> Study:
-        """The question as a study.
+        """Return the question as a study.
 
         Parameters
         ----------
@@ -65,7 +65,7 @@ class Question:
         return Study.build(self.data(str(write_spectrum(self.uploaded, folder))), "page")
 
     def data(self, file: str = STAR_FILE) -> dict[str, Any]:
-        """The question as a study's data.
+        """Return the question as the data of a study.
 
         Parameters
         ----------
@@ -107,7 +107,7 @@ class Question:
 
 
 def write_spectrum(source: Source, folder: Path) -> Path:
-    """An uploaded spectrum as a file of our own, every bit of its numbers kept; once for each spectrum."""
+    """Write an uploaded spectrum to a file without loss, once per spectrum, and return its path."""
     from astropy.table import Table
 
     path = folder / source.digest / STAR_FILE

@@ -1,4 +1,4 @@
-"""What is sent as it is: the page, its parts, empty figures; each made and packed once."""
+"""Static content: the page, its assets and empty figures, each rendered and compressed once."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ _FOLDER = Path(__file__).parent / "assets"
 
 @cache
 def packed(content: bytes) -> tuple[bytes, str]:
-    """Content with gzip, and its digest."""
+    """Compress content with gzip, and return it with its digest."""
     return gzip.compress(content, 6, mtime=0), hashlib.sha256(content).hexdigest()[:16]
 
 
 @cache
 def asset(name: str) -> bytes | None:
-    """A part of the page; BokehJS comes from its own package."""
+    """Return an asset of the page; BokehJS comes from its own package."""
     if name == "bokeh.min.js":
         import bokeh
 
@@ -51,7 +51,7 @@ def asset(name: str) -> bytes | None:
 
 @cache
 def front() -> bytes:
-    """The page."""
+    """Return the page."""
     from mako.lookup import TemplateLookup
 
     from mauvecl.web import fields
@@ -97,14 +97,14 @@ def front() -> bytes:
 
 
 def _digest() -> str:
-    """Of all parts, so that browsers keep none that is old."""
+    """Return the digest of all assets, so that browsers use no old ones."""
     each = [packed(content)[1] for path in sorted(_FOLDER.iterdir()) if (content := asset(path.name)) is not None]
     return hashlib.sha256("".join(each).encode()).hexdigest()[:12]
 
 
 @cache
 def figure(theme: str, name: str, logs: str) -> bytes | None:
-    """An empty figure with its legend."""
+    """Return an empty figure with its legend."""
     from bokeh.embed import json_item
 
     from mauvecl.web.figures import INKS
@@ -118,7 +118,7 @@ def figure(theme: str, name: str, logs: str) -> bytes | None:
 
 
 def prepare() -> None:
-    """Make and pack what every visitor asks for."""
+    """Render and compress the content that every visitor requests."""
     from mauvecl.web.tabs import TABS
 
     packed(front())
@@ -133,16 +133,16 @@ def prepare() -> None:
 
 
 class Packed(RequestHandler):
-    """Answers with something made once."""
+    """Handler of static content."""
 
     def set_default_headers(self) -> None:
-        """On whatever is answered."""
+        """Set the headers of every answer."""
         self.clear_header("Server")
         for name, value in HEADERS.items():
             self.set_header(name, value)
 
     def give(self, content: bytes | None, kind: str, *, keep: bool = False) -> None:
-        """Send content, or that there is none."""
+        """Send content, or status 404 if it is None."""
         if content is None:
             self.set_status(404)
             self.set_header("Content-Type", "text/plain; charset=utf-8")
@@ -164,35 +164,35 @@ class Packed(RequestHandler):
         self.finish(content)
 
     def compute_etag(self) -> str | None:
-        """It is set where it is known."""
+        """Return None, since `give` sets the tag."""
         return None
 
     def write_error(self, status_code: int, **kwargs: Any) -> None:
-        """A sentence, and nothing of what went wrong inside."""
+        """Send a message without internal details."""
         self.set_header("Content-Type", "text/plain; charset=utf-8")
         self.finish(f"The page cannot answer this ({status_code}).\n")
 
 
 class Front(Packed):
-    """The page."""
+    """Return the page."""
 
     def get(self) -> None:
-        """The same for everybody: what a link holds, the page itself enters."""
+        """Send the page, which reads the values of a link itself."""
         self.give(front(), "html")
 
 
 class Asset(Packed):
-    """A part of the page."""
+    """Handler of assets."""
 
     def get(self, name: str) -> None:
-        """By its name."""
+        """Send an asset by name."""
         self.give(asset(name), name.rpartition(".")[2], keep="v" in self.request.arguments)
 
 
 class Figure(Packed):
-    """An empty figure."""
+    """Handler of empty figures."""
 
     def get(self, theme: str, name: str) -> None:
-        """In a theme, with some axes logarithmic."""
+        """Send a figure in a theme, with some logarithmic axes."""
         logs = "".join(sorted(set(self.get_query_argument("log", ""))))[:2]
         self.give(figure(theme, name, logs), "json", keep="v" in self.request.arguments)

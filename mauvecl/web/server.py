@@ -1,4 +1,4 @@
-"""Start the page's server."""
+"""Server of the page."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ PING_S = 20
 
 
 def make(address: str, port: int, allowed: Sequence[str]) -> Any:
-    """A server that listens; `start` its loop.
+    """Create a listening server.
 
     Parameters
     ----------
@@ -79,7 +79,7 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
 
 
 def let_go() -> None:
-    """End connections of pages that nobody uses."""
+    """Close the connections of unused pages."""
     from mauvecl.web.visitor import UNUSED, Visitor
 
     now = time.monotonic()
@@ -89,7 +89,7 @@ def let_go() -> None:
 
 
 def warm() -> None:
-    """What the first visitor should not wait for: imports, the response matrix, kernels, the page itself."""
+    """Prepare imports, response matrix, kernels and page before the first visitor."""
     import gc
     import tempfile
     from pathlib import Path

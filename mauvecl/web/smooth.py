@@ -1,4 +1,4 @@
-"""Closed forms looked up quickly, for pictures."""
+"""Interpolated closed forms for pictures."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Smooth:
-    """A closed form looked up quickly: exact at some points, smooth in the probit between them, for pictures.
+    """Closed form that is exact at some points and interpolated in the probit between them.
 
     Parameters
     ----------
@@ -32,15 +32,15 @@ class Smooth:
             return
         at = np.linspace(form.mean - 5 * form.std, form.mean + 6 * form.std, 14)
         beyond = np.array([form.sf(value) for value in at])
-        # Where it is 0 or 1 to the last digit there is nothing to draw.
+        # Probabilities that round to 0 or 1 have no finite probit.
         kept = (beyond > 1e-12) & (beyond < 1 - 1e-12)
         self._probit = PchipInterpolator(at[kept], special.ndtri(beyond[kept]), extrapolate=True)
         self._inverse = PchipInterpolator(-special.ndtri(beyond[kept]), at[kept], extrapolate=True)
 
     def sf(self, value: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Probabilities of exceeding values."""
+        """Return the probabilities of exceeding values."""
         return np.asarray(special.ndtr(self._probit(value)))
 
     def isf(self, probability: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Values exceeded with probabilities."""
+        """Return the values that are exceeded with given probabilities."""
         return np.asarray(self._inverse(-special.ndtri(probability)))

@@ -26,7 +26,7 @@ SEEN = {"tab": Field("Tab", next(iter(TABS)), Choice(tuple(TABS))), "simulated":
 
 
 class State:
-    """The one state of a page.
+    """State of a page.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class State:
         self.uploaded, self.unknown = uploaded, unknown
 
     def enter(self, given: Mapping[str, str]) -> None:
-        """Enter text into fields; what is wrong with it is then found in `faults`."""
+        """Enter text into fields and collect errors in `faults`."""
         for name, text in given.items():
             self.entered[name] = text[:MOST_CHARACTERS]
             self.faults.pop(name, None)
@@ -70,7 +70,7 @@ class State:
             self._placed()
 
     def _settled(self) -> None:
-        """Whether so many realisations can settle such a probability."""
+        """Check that the realisations suffice for the false-alarm probability."""
         if "fap" not in self.faults and self.faults.get("realisations", "fap = ").startswith("fap = "):
             self.faults.pop("realisations", None)
             try:
@@ -79,7 +79,7 @@ class State:
                 self.faults["realisations"] = str(error)
 
     def _placed(self) -> None:
-        """Whether target and time can be read, where the sky is theirs."""
+        """Check target and time if the sky depends on them."""
         from mauvecl.host.sky.helioecliptic import offline, parse_position, parse_time
 
         read: tuple[tuple[str, Callable[[str], Any]], ...] = (("target", parse_position), ("time", parse_time))
@@ -97,16 +97,16 @@ class State:
 
     @property
     def asked(self) -> tuple[str, ...]:
-        """The text of all fields that an answer depends on."""
+        """Text of all fields on which an answer depends."""
         return tuple(self.entered[name] for name in FIELDS)
 
     @property
     def fault(self) -> str:
-        """All faults in one text, or nothing."""
+        """All errors in one text, empty if there is none."""
         return "; ".join(f"{self._fields[name].label}: {why}" for name, why in self.faults.items())
 
     def question(self) -> Question:
-        """The question.
+        """Return the question.
 
         Raises
         ------
@@ -122,18 +122,18 @@ class State:
 
     @property
     def simulated(self) -> tuple[str, ...]:
-        """What is simulated on the page."""
+        """Simulations of the page."""
         return tuple(self._values["simulated"])
 
     # Links
 
     @property
     def link(self) -> str:
-        """Everything entered, as the query of an address."""
+        """Return all entries as the query of a URL."""
         return "?" + urlencode({name: text for name, text in self.entered.items() if text or self._fields[name].first})
 
     def follow(self, link: str) -> None:
-        """Enter what a link holds, and what stands at first where it holds nothing."""
+        """Enter the values of a link, and defaults for all others."""
         query = link.removeprefix("?")
         self.stray = ""
         if len(query) > MOST_LINKED:

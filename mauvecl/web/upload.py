@@ -1,4 +1,4 @@
-"""Spectra that visitors bring."""
+"""Uploads of spectra."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ MOST_PAIRS_BYTES, MOST_PAIRS = 2**18, 4000
 
 
 def too_large(size: float) -> str:
-    """The sentence of an upload of so many bytes."""
+    """Return the error message of an upload of this many bytes."""
     return f"upload of {size / 2**20:.1f} MiB, expected at most {MOST_UPLOADED / 2**20:g} MiB"
 
 
 def read_upload(name: str, content: bytes) -> Source:
-    """A spectrum from a visitor; nothing of it is trusted, least of all its name.
+    """Read an untrusted spectrum from a visitor.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ def read_upload(name: str, content: bytes) -> Source:
 
 
 def read_pairs(name: str, content: bytes) -> Points:
-    """A spectrum of something unknown from a visitor: two columns as text, nm and DN of the exposure.
+    """Read the spectrum of a nuisance parameter: text with two columns, nm and DN of the exposure.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""One visitor: a connection on which the page asks, and the server answers; nothing is kept when it ends."""
+"""A visitor's connection, on which the page sends requests; no state outlives it."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ UPLOADS: dict[str, tuple[Callable[[str, bytes], Any], str]] = {
 
 
 class Visitor(WebSocketHandler):
-    """The connection of one page.
+    """WebSocket connection of a page.
 
     Messages are JSON: ``ask`` says what is asked, ``n`` numbers it, ``link`` holds the fields. Answers have the same
     ``n``; of several questions in a row only the last need be answered.
@@ -69,7 +69,7 @@ class Visitor(WebSocketHandler):
     here: set[Visitor] = set()  # noqa: RUF012
 
     def initialize(self) -> None:
-        """A new connection."""
+        """Set up a new connection."""
         self.used = time.monotonic()
         self.job: Job | None = None
         self._drawing: Job | None = None
@@ -84,16 +84,16 @@ class Visitor(WebSocketHandler):
         self._folder = tempfile.TemporaryDirectory(prefix="mauvecl-page-")
 
     def check_origin(self, origin: str) -> bool:
-        """The door has asked already, and more exactly: IPv6 too."""
+        """Accept every origin, since `access.AccessMatcher` has checked it."""
         return True
 
     def open(self, *args: str, **kwargs: str) -> None:
-        """A visitor has come."""
+        """Register the visitor."""
         self.here.add(self)
         self.tell(hello=VERSION)
 
     def on_close(self) -> None:
-        """The visitor is gone: nothing more is computed for them."""
+        """Cancel all work for a visitor who has left."""
         self.here.discard(self)
         for job in (self.job, self._drawing):
             if job is not None:
@@ -101,7 +101,7 @@ class Visitor(WebSocketHandler):
         self._folder.cleanup()
 
     def tell(self, content: bytes | None = None, **told: Any) -> None:
-        """Send a message, and bytes behind it."""
+        """Send a message, followed by bytes."""
         if self.ws_connection is None:
             return
         try:
@@ -112,7 +112,7 @@ class Visitor(WebSocketHandler):
             return
 
     def on_message(self, message: str | bytes) -> None:
-        """Whatever comes; what is no question of the page's ends the connection."""
+        """Handle a message; an invalid one closes the connection."""
         self.used = time.monotonic()
         if isinstance(message, bytes):
             self._content(message)
@@ -133,13 +133,13 @@ class Visitor(WebSocketHandler):
     # Closed forms
 
     def state(self, link: str) -> State:
-        """What is entered."""
+        """Enter values."""
         state = State(self._uploads.get("star"), self._uploads.get("own_unknown"))
         state.follow(link)
         return state
 
     def _ask_answer(self, asked: dict[str, Any]) -> None:
-        """The answer and the pictures of a tab; a later question takes the place of one that waits."""
+        """Send the answer and a tab's pictures; a later question replaces a waiting one."""
         self._next = asked
         if not self._answering:
             self._answering = True
@@ -170,7 +170,7 @@ class Visitor(WebSocketHandler):
         await self._or_why(answer(), **told)
 
     def closed(self, state: State) -> Closed:
-        """The closed forms of a question; the last one's are remembered."""
+        """Return the closed forms of a question; the last ones are cached."""
         key = self._key(state)
         if self._closed is None or self._closed[0] != key:
             self._closed = key, Closed.of(state.question(), Path(self._folder.name))
@@ -182,13 +182,13 @@ class Visitor(WebSocketHandler):
         return state.asked, None if star is None else star.digest, hash(unknown)
 
     def _begin(self, work: Coroutine[Any, Any, None]) -> None:
-        """Do something while others are served."""
+        """Run a function without blocking other visitors."""
         task = asyncio.get_running_loop().create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
     def _give(self, work: Coroutine[Any, Any, None], **told: Any) -> None:
-        """Do something that the page may ask for several times, but not without end."""
+        """Run a function that the page may request a limited number of times."""
         if len(self._tasks) < MOST_TASKS:
             self._begin(self._or_why(work, **told))
             return
@@ -196,7 +196,7 @@ class Visitor(WebSocketHandler):
         self.tell(**told, refused="too much is asked for at once, expected one thing after the other")
 
     async def _or_why(self, work: Coroutine[Any, Any, None], **told: Any) -> None:
-        """Do something, or tell why not: what was asked is wrong, or the page itself is."""
+        """Run a function, and report an invalid request or an internal error."""
         try:
             await work
         except (InputError, DeviceError) as error:
@@ -207,11 +207,11 @@ class Visitor(WebSocketHandler):
 
     @staticmethod
     async def _beside(work: Callable[[], Any]) -> Any:
-        """Do something beside the event loop."""
+        """Run a function in a thread."""
         return await asyncio.get_running_loop().run_in_executor(_closed_forms, work)
 
     def _ask_pinned(self, asked: dict[str, Any]) -> None:
-        """What a tab's pictures show of a scenario beside the question."""
+        """Send the data of a pinned scenario for a tab's pictures."""
         n = asked["n"]
         self._give(self._pinned(n, self.state(asked["link"]), str(asked.get("tab"))), n=n, pins={})
 
@@ -225,7 +225,7 @@ class Visitor(WebSocketHandler):
     # Draws and simulations
 
     def _ask_draw(self, asked: dict[str, Any]) -> None:
-        """One exposure with the flare."""
+        """Draw one exposure with the flare."""
         state = self.state(asked["link"])
         if state.faults or self._closed is None or self._closed[0] != self._key(state):
             return
@@ -244,7 +244,7 @@ class Visitor(WebSocketHandler):
         self._when_done(self._drawing, came)
 
     def _ask_simulate(self, asked: dict[str, Any]) -> None:
-        """Simulate, tell how far it is, and answer."""
+        """Simulate, report progress, and send the answer."""
         n, kind, state = asked["n"], asked.get("kind"), self.state(asked["link"])
         if self.job is not None or kind not in SIMULATED or state.faults:
             self.tell(n=n, ended="", refused="there is a simulation already, or nothing to simulate")
@@ -285,12 +285,12 @@ class Visitor(WebSocketHandler):
     # Files from and to the visitor
 
     def _ask_upload(self, asked: dict[str, Any]) -> None:
-        """A file comes with the next message."""
+        """Expect a file in the next message."""
         if asked.get("field") in UPLOADS:
             self._coming = asked["n"], asked["field"], str(asked.get("name"))
 
     def _content(self, content: bytes) -> None:
-        """The file; it is read beside the event loop, and what it is for has nothing until then."""
+        """Read an uploaded file in a thread; its field is empty until then."""
         if self._coming is None:
             self.close(1003, "expected a question as the page asks it")
             return
@@ -326,7 +326,7 @@ class Visitor(WebSocketHandler):
         self.tell(content, n=n, file=file)
 
     def file(self, state: State, tab: str, name: str, ending: str) -> tuple[str, bytes]:
-        """A table, or a study, of what is asked; the last ones are remembered."""
+        """Send a table or study of the question; the last ones are cached."""
         closed, key = self.closed(state), self._key(state)
         answers = self._answers.get(key, {})
         which = key, tab, name, ending, tuple(answers)
@@ -340,7 +340,7 @@ class Visitor(WebSocketHandler):
         return self._files[which]
 
     def _ask_export(self, asked: dict[str, Any]) -> None:
-        """The question in Python and on the command line."""
+        """Send the question as a Python program and as a command."""
         try:
             question = self.state(asked["link"]).question()
         except InputError as error:
@@ -354,12 +354,12 @@ class Visitor(WebSocketHandler):
 
 
 def tab_of(name: str) -> Tab:
-    """A tab by its name, or the first."""
+    """Return a tab by name, or the first one."""
     return TABS.get(name, next(iter(TABS.values())))
 
 
 def shown(name: str, closed: Closed, answers: Answers) -> dict[str, Any]:
-    """What a tab shows, as messages hold it."""
+    """Return the data of a tab in the form of messages."""
     tab = tab_of(name)
     pictures = {}
     for picture in tab.pictures:
@@ -373,7 +373,7 @@ def shown(name: str, closed: Closed, answers: Answers) -> dict[str, Any]:
 
 
 def packed(values: Any) -> Any:
-    """Numbers as base64 of little-endian 32-bit floats; anything else as it is."""
+    """Encode numbers as base64 of little-endian 32-bit floats; return other values unchanged."""
     if len(values) and not isinstance(values[0], (str, list)):
         array = np.asarray(values, "<f4")
         return {"f4": base64.b64encode(array.tobytes()).decode(), "shape": list(array.shape)}

@@ -1,4 +1,4 @@
-"""Simulations in the background: bounded for the server, one at a time for a visitor, and stopped at a word."""
+"""Background simulations: limited in number, one per visitor, and cancellable."""
 
 from __future__ import annotations
 
@@ -27,17 +27,17 @@ def reading(read: Callable[[str, bytes], Any], name: str, content: bytes) -> Fut
 
 
 class Cancelled(Exception):  # noqa: N818
-    """The visitor has asked for the end."""
+    """Cancellation by the visitor."""
 
 
 def _strike(thread: int | None, with_what: type[BaseException] | None) -> None:
-    """Raise an exception in a thread at its next step of Python, or take it back."""
+    """Raise an exception in a thread at its next bytecode, or withdraw it."""
     given = None if with_what is None else ctypes.py_object(with_what)
     ctypes.pythonapi.PyThreadState_SetAsyncExc(ctypes.c_ulong(thread or 0), given)
 
 
 def _engine(progress: Callable[[int, int], None]) -> Engine:
-    """This thread's engine, which tells this job's progress, from whatever thread counts."""
+    """Return this thread's engine, which reports the progress of this job from any thread."""
     if not hasattr(_own, "engine"):
         listener = _own.listener = [progress]
         _own.engine = Engine(progress=lambda done, total: listener[0](done, total))
@@ -48,7 +48,7 @@ def _engine(progress: Callable[[int, int], None]) -> Engine:
 
 @dataclass(eq=False)
 class Job:
-    """One simulation of a visitor's.
+    """Simulation for a visitor.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ class Job:
             raise Cancelled
 
     def cancel(self) -> None:
-        """Stop between two tiles, wherever nothing is drawn, or before it begins."""
+        """Cancel between tiles, outside of draws, or before the start."""
         with self._lock:
             again = self._cancelled.is_set()
             self._cancelled.set()
@@ -104,12 +104,12 @@ class Job:
 
     @property
     def standing(self) -> PoolProgress | None:
-        """How far it is, or None while it waits for its turn."""
+        """Return the progress, or None while the job waits."""
         return None if self._pool is None else self._pool.standing
 
     @property
     def told(self) -> str:
-        """How far it is, in words."""
+        """Return the progress in words."""
         s = self.standing
         if s is None or self._started is None:
             return "waiting for its turn"

@@ -86,7 +86,7 @@ def page(browser: Browser, server: Server) -> Iterator[Page]:
 
 
 def fresh(browser: Browser, address: str, **how: Any) -> Page:
-    """A new visitor's page with its first answer; what goes wrong in it fails the test."""
+    """Yield a new visitor's page with its first answer; errors in it fail the test."""
     page = browser.new_context(**how).new_page()
     page.set_default_timeout(PATIENCE)
     faults: list[str] = []
@@ -127,7 +127,7 @@ def enter(page: Page, label: str, value: str) -> None:
 
 
 def shown(page: Page) -> str:
-    """The answer, in the card's words."""
+    """Return the answer in the words of the card."""
     settled(page)
     return page.locator("#card .told").inner_text()
 
@@ -158,7 +158,7 @@ def download(page: Page, label: str) -> bytes:
 
 
 def taken(page: Page) -> bytes:
-    """The study from the dialog."""
+    """Return the study from the dialog."""
     page.get_by_role("button", name="Take along", exact=True).click()
     study = download(page, "Study for the command line")
     page.keyboard.press("Escape")

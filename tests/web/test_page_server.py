@@ -675,7 +675,7 @@ def test_serve_refuses_an_address_in_a_sentence(address: str, tmp_path: Path) ->
 
 @pytest.fixture
 def served(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
-    """A server that runs within a coroutine: called with one, it gives its outcome."""
+    """Return a function that runs a coroutine with a server and returns its outcome."""
     loop = asyncio.new_event_loop()
     asyncio.set_event_loop(loop)
     with socket.socket() as free:

@@ -1,4 +1,4 @@
-"""The tabs of the page: a file to each; a new one is added here."""
+"""Tabs of the page, one module each; a new tab is added to the list below."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Scenarios side by side: what the visitor has pinned and simulated, kept by their own browser."""
+"""Comparison of pinned and simulated scenarios, which the browser stores."""
 
 from __future__ import annotations
 

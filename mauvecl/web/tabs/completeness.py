@@ -1,4 +1,4 @@
-"""What a search of a whole stare finds: flares in time, of several lengths and sizes."""
+"""Completeness of a search of a stare for flares of several durations and sizes."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ LENGTHS = ("shortest", "middle", "longest")
 
 
 class Shares(Picture):
-    """Share of injected flares that the search finds, over their amplitude."""
+    """Fraction of injected flares that the search finds against their amplitude."""
 
     name, title = "shares", "Share of flares that a search of a stare finds"
 
@@ -68,7 +68,7 @@ class Shares(Picture):
 
 
 class Completeness(Tab):
-    """What a search of a stare finds."""
+    """Tab of completeness."""
 
     name, title = "completeness", "Stare"
     about = (

@@ -1,4 +1,4 @@
-"""Would it be seen: what the flare adds beside the noise, the statistic without and with it, and the trade."""
+"""Detection: the flare relative to the noise, distributions of the statistic, and the ROC."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ class Excess(Picture):
 
 
 class Distributions(Picture):
-    """The statistic without and with the flare, and the threshold."""
+    """Distributions of the statistic without and with the flare, and the threshold."""
 
     name, title = "distributions", "The statistic without and with the flare"
     logs = ("y",)
@@ -163,7 +163,7 @@ class Trade(Picture):
 
 
 class Detection(Tab):
-    """The first tab."""
+    """Tab of the detection, the first one."""
 
     name, title = "detection", "Detection"
     about = "What the flare adds beside the noise, and how the statistic tells it from none."

@@ -1,4 +1,4 @@
-"""How far one would still see it: detection probability over magnitude, and over magnitude and amplitude."""
+"""Limits: detection probability over magnitude, and over magnitude and amplitude."""
 
 from __future__ import annotations
 
@@ -36,19 +36,19 @@ FREE = {"magnitude", "amplitude_percent", "realisations", "seed", "see", "hours"
 
 
 def odds(closed: Closed, magnitude: float, rises: Float) -> list[DetectionForms]:
-    """`Closed.at` a magnitude."""
+    """Return `ClosedForms.at` a magnitude."""
     return closed.at(10 ** (-0.4 * (magnitude - closed.question.magnitude)), rises)
 
 
 def _key(closed: Closed) -> tuple[Any, ...]:
-    """Everything that a map depends on but for its own two axes."""
+    """Return everything on which a map depends except its axes."""
     asked = vars(closed.question).items()
     uploaded = closed.question.uploaded
     return (*(value for name, value in asked if name not in FREE), None if uploaded is None else uploaded.digest)
 
 
 class _Kept:
-    """A question that is known by what its map, or its curve, depends on."""
+    """Question identified by the values on which its map or curve depends."""
 
     def __init__(self, closed: Closed, *more: float) -> None:
         self.closed, self.key = closed, (*_key(closed), *more)
@@ -61,13 +61,13 @@ class _Kept:
 
 
 def probits(p: Float) -> Float:
-    """Probabilities as places on a normal's axis, where they are smooth; those that round to 0 or 1 at its ends."""
+    """Convert probabilities to probits, which are smooth; limit those that round to 0 or 1."""
     return np.asarray(special.ndtri(np.clip(p, 1e-15, 1 - 1e-15)))
 
 
 @lru_cache(maxsize=32)
 def _curve(kept: _Kept) -> tuple[Float, Float]:
-    """Magnitudes and probabilities, computed at more of them where they change."""
+    """Return magnitudes and probabilities, with more points where these change."""
 
     def exact(magnitudes: Float) -> list[float]:
         each = (odds(kept.closed, magnitude, np.ones(1)) for magnitude in magnitudes)
@@ -87,7 +87,7 @@ def _curve(kept: _Kept) -> tuple[Float, Float]:
 
 @lru_cache(maxsize=32)
 def _map(kept: _Kept) -> tuple[Float, Float, Float]:
-    """Magnitudes, logarithms of amplitudes in per cent, and probabilities.
+    """Return magnitudes, logarithms of amplitudes in per cent, and probabilities.
 
     Interpolated is what makes them, in standard deviations without a flare: the flare's part of the statistic and its
     spread, both as logarithms, the threshold, the skewness. A gamma distribution of these moments (Pearson's type III)
@@ -108,7 +108,7 @@ def _map(kept: _Kept) -> tuple[Float, Float, Float]:
 
 
 def _pearson(part: Float, spread: Float, cut: Float, skewness: Float) -> Float:
-    """The chance to exceed a cut, by a gamma distribution of these moments; of small skewness a normal one."""
+    """Return the probability above a cut of a gamma distribution with these moments, or of a normal at low skewness."""
     off = (cut - np.exp(part)) / np.exp(spread)
     shape = 4 / np.maximum(skewness, 1e-4) ** 2
     gamma = special.gammaincc(shape, np.maximum(shape + np.sqrt(shape) * off, 0.0))
@@ -234,7 +234,7 @@ class Map(Picture):
 
 
 def _image(x: Float, y: Float, p: Float) -> dict[str, Any]:
-    """Cells around the points at which probabilities are known."""
+    """Return the edges of cells around the points of a map."""
     half_x, half_y = 0.5 * (x[1] - x[0]), 0.5 * (y[1] - y[0])
     return {
         "image": [p], "x": [x[0] - half_x], "y": [y[0] - half_y], "dw": [x[-1] - x[0] + 2 * half_x],
@@ -250,7 +250,7 @@ def _contours(x: Float, y: Float, p: Float, *levels: float) -> dict[str, Any]:
 
 
 class Limit(Tab):
-    """How far one would still see it."""
+    """Tab of limits."""
 
     name, title = "limit", "Limit and map"
     about = "How faint a star and how small a flare one would still see."

@@ -1,4 +1,4 @@
-"""Where the noise comes from."""
+"""Noise by origin."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Budget(Picture):
 
 
 class Noise(Tab):
-    """Where the noise comes from."""
+    """Noise by origin."""
 
     name, title = "noise", "Noise"
     about = "Where the noise comes from, pixel by pixel, without a flare; of pinned scenarios the photons of the star."
@@ -66,7 +66,7 @@ class Noise(Tab):
     files = {"noise-budget": None}  # noqa: RUF012
 
     def table(self, name: str, closed: Closed, answers: Answers) -> Table:
-        """As `mauvecl snr` writes it; nothing of it is drawn."""
+        """Return the closed-form table of `mauvecl snr`."""
         study = closed.study
         parts = [({"star": label(study.star[0], closed.quiet)}, closed.quiet.noise_budget())]
         return stack_tables(parts, realisations=study.run.realisations, study=study.text())

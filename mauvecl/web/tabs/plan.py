@@ -1,4 +1,4 @@
-"""What a campaign on a target would find: flares recovered and expected."""
+"""Campaign on a target: recovered and expected flares."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ENERGIES = (1e28, 1e37)
 
 
 def _columns(answers: Answers) -> tuple[Any, Any, Any]:
-    """Energies, the share recovered at each, and how many flares of it or more there are in the campaign."""
+    """Return energies, the recovered fraction at each, and the number of flares above it in the campaign."""
     table, (star,) = answers["plan"].by_energy, answers["plan"].planned
     columns = (table["energy"].to_value("erg"), table["recovered"], table["rate_above"].to_value("1 / h") * star.hours)
     energy, recovered, above = (np.asarray(column, float) for column in columns)
@@ -29,12 +29,12 @@ def _columns(answers: Answers) -> tuple[Any, Any, Any]:
 
 
 def _energy(value: Any) -> str:
-    """As a reader has it."""
+    """Format an energy for readers."""
     return f"{value.value:.2g} erg" if np.isfinite(value) else "no energy"
 
 
 class Recovered(Picture):
-    """Share of flares that the search recovers, over their energy."""
+    """Fraction of flares that the search recovers against their energy."""
 
     name, title = "recovered", "Share of flares that the search recovers"
 
@@ -57,7 +57,7 @@ class Recovered(Picture):
 
 
 class Expected(Picture):
-    """Flares in the campaign, and those recovered, of an energy or more."""
+    """Numbers of flares, and of recovered flares, above an energy."""
 
     name, title = "expected", "Flares of so much energy or more in the campaign"
 
@@ -85,7 +85,7 @@ class Expected(Picture):
 
 
 class Plan(Tab):
-    """What a campaign would find."""
+    """Tab of campaigns."""
 
     name, title = "plan", "Plan"
     about = (

@@ -1,4 +1,4 @@
-"""What is recorded: the star and the flare in DN, one drawn exposure, and the light at the telescope."""
+"""Recorded spectra: star and flare in DN, one drawn exposure, and the light at the telescope."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Recorded(Picture):
-    """One exposure with the flare, without its pedestals, and what it is made of."""
+    """One exposure with the flare and its components, without pedestals."""
 
     name, title = "recorded", "One exposure, less bias and dark"
     logs = ("y",)
@@ -92,7 +92,7 @@ class Telescope(Picture):
 
 
 class Spectrum(Tab):
-    """What is recorded."""
+    """Tab of spectra."""
 
     name, title = "spectrum", "Spectrum"
     about = "What the detector records, and the light that comes to the telescope."
@@ -100,7 +100,7 @@ class Spectrum(Tab):
     files = {"observation": None}  # noqa: RUF012
 
     def table(self, name: str, closed: Closed, answers: Answers) -> Table:
-        """One observation with the flare, taken apart."""
+        """Return one observation with the flare and its components."""
         from mauvecl.answers.signal.simulate import simulate
 
         return simulate(closed.study, flaring=True).observations[1][2]

@@ -1,4 +1,4 @@
-"""What all tabs have in common: pictures, what is simulated for them, tables to take along."""
+"""Base classes of tabs: pictures, their simulations and downloadable tables."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Answers = Mapping[str, Any]
 
 @dataclass
 class Drawn:
-    """What a picture shows of an answer.
+    """Data of a picture.
 
     Attributes
     ----------
@@ -38,7 +38,7 @@ class Drawn:
 
 
 class Picture(ABC):
-    """One picture: an empty figure that is made once, and data for it.
+    """Picture: a static empty figure and data for it.
 
     Attributes
     ----------
@@ -67,15 +67,15 @@ class Picture(ABC):
 
     @abstractmethod
     def figure(self, ink: Any, logs: frozenset[str]) -> Any:
-        """An empty Bokeh figure in a theme's colours, with these axes logarithmic."""
+        """Return an empty Bokeh figure in a theme's colours, with these logarithmic axes."""
 
     @abstractmethod
     def drawn(self, closed: Closed, answers: Answers) -> Drawn:
-        """Its data."""
+        """Return the data of the picture."""
 
 
 class Tab(ABC):
-    """One tab.
+    """Tab of the page.
 
     Attributes
     ----------
@@ -96,13 +96,13 @@ class Tab(ABC):
     files: ClassVar[Mapping[str, str | None]] = {}
 
     def table(self, name: str, closed: Closed, answers: Answers) -> Table:
-        """One of `files`."""
+        """Return the table of one of `files`."""
         raise NotImplementedError
 
     def rows(self, closed: Closed, answers: Answers) -> list[list[str]]:
-        """A small table as text, its first row the heads; none where there is nothing to tell."""
+        """Return a small table as text with a header row; empty if there is nothing to report."""
         return []
 
     def study(self, name: str, closed: Closed, answers: Answers) -> Study:
-        """The study that gives one of `files` again."""
+        """Return the study that reproduces one of `files`."""
         return closed.study

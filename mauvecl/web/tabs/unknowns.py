@@ -1,4 +1,4 @@
-"""What it costs not to know all of the instrument."""
+"""Cost of unknown properties of the instrument."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ Row = tuple[str, float, float]
 
 @lru_cache(maxsize=4)
 def costs(closed: Closed) -> tuple[float, list[Row]]:
-    """The matched S/N of the flare with everything known, and with each unknown alone and together."""
+    """Return the flare's matched S/N with everything known, and with unknowns alone and together."""
     alone = [NuisanceChoice.model_validate({u.nuisance: _spread(u.sd)}) for u in DEFAULT_UNKNOWNS] + [
         NuisanceChoice(tilt="free")
     ]
@@ -46,12 +46,12 @@ def _spread(sd: float) -> float | str:
 
 
 def chance(snr: float, fap: float) -> float:
-    """Detection probability of a matched statistic of such an S/N."""
+    """Return the detection probability of a matched statistic with this S/N."""
     return float(special.ndtr(snr + special.ndtri(fap)))
 
 
 class Cost(Picture):
-    """The matched S/N with each unknown: plain, and marginalised."""
+    """Matched S/N with each unknown, plain and marginalised."""
 
     name, title = "cost", "What each unknown costs: the flare's S/N by the matched statistic"
 
@@ -86,7 +86,7 @@ class Cost(Picture):
 
 
 class Unknown(Tab):
-    """What it costs not to know all of the instrument."""
+    """Cost of unknown properties of the instrument."""
 
     name, title = "unknowns", "Unknowns"
     about = (

@@ -1,4 +1,4 @@
-"""When a target can be seen from the orbit."""
+"""Visibility of a target from the orbit."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 class Hours(Picture):
-    """Hours of visibility in each day, and the target's distance from the Sun."""
+    """Daily hours of visibility, and the target's distance from the Sun."""
 
     name, title = "hours", "Hours in which the target is seen, day by day"
 
@@ -55,7 +55,7 @@ class Hours(Picture):
 
 
 class Visibility(Tab):
-    """When a target can be seen."""
+    """Tab of the visibility."""
 
     name, title = "visibility", "Visibility"
     about = (
