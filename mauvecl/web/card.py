@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from mauvecl.web.closed import Closed, between, percent, short
+from mauvecl.web.closed_forms import ClosedForms, between, percent, short
 from mauvecl.web.tabs.tab import Answers
 
 #: Part of the message about the throughput, which the page shows once.
@@ -17,7 +17,7 @@ TOLD = ("detection", "completeness", "visible", "plan")
 THROUGHPUT = 0.3
 
 
-def card(closed: Closed, answers: Answers) -> dict[str, Any]:
+def card(closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     """Return the contents of the card.
 
     Returns
@@ -32,7 +32,7 @@ def card(closed: Closed, answers: Answers) -> dict[str, Any]:
         (row,) = (row for row in answers["detection"].table if row["statistic"] == q.statistic)
         cut, chance = float(row["threshold"]), float(row["probability"])
         interval = f"{between(row['low'], row['high'])}, of {q.realisations.number:,} simulated"
-        facts.append(("Closed form", percent(closed.chance)))
+        facts.append(("ClosedForms form", percent(closed.chance)))
     facts += [
         ("Threshold", f"{cut:.4g}" if cut == cut else "none"),
         ("Expected with flare", f"{closed.odds.flaring.mean:.4g}"),
@@ -56,7 +56,7 @@ def card(closed: Closed, answers: Answers) -> dict[str, Any]:
     }
 
 
-def _spread(closed: Closed) -> str:
+def _spread(closed: ClosedForms) -> str:
     """Describe the effect of the throughput's uncertainty on a probability."""
     if closed.slow or closed.chance != closed.chance:
         return ""
@@ -64,6 +64,6 @@ def _spread(closed: Closed) -> str:
     return f"; {between(min(ends), max(ends))} if the throughput is {100 * THROUGHPUT:g} % lower or higher"
 
 
-def _messages(closed: Closed, answers: Answers) -> list[str]:
+def _messages(closed: ClosedForms, answers: Answers) -> list[str]:
     of_answers = [m for name in TOLD if name in answers for m in answers[name].messages]
     return [m for m in dict.fromkeys([*of_answers, *closed.messages]) if not m.startswith(NOMINAL)]

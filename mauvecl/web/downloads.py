@@ -16,7 +16,7 @@ from mauvecl.web.question import STAR_FILE
 
 if TYPE_CHECKING:
     from mauvecl.study.study import Study
-    from mauvecl.web.closed import Closed
+    from mauvecl.web.closed_forms import ClosedForms
     from mauvecl.web.question import Question
     from mauvecl.web.tabs.tab import Answers, Tab
 
@@ -44,7 +44,7 @@ def study_file(study: Study, name: str) -> tuple[str, bytes]:
     return f"{name}.zip", out.getvalue()
 
 
-def as_file(tab: Tab, name: str, ending: str, closed: Closed, answers: Answers) -> tuple[str, bytes]:
+def as_file(tab: Tab, name: str, ending: str, closed: ClosedForms, answers: Answers) -> tuple[str, bytes]:
     """Return file name and content of a tab's table, or of the study that reproduces it.
 
     Parameters
@@ -53,7 +53,7 @@ def as_file(tab: Tab, name: str, ending: str, closed: Closed, answers: Answers) 
     name : str
         Of the tab's `files`.
     ending : {"ecsv", "fits", "study"}
-    closed : Closed
+    closed : ClosedForms
     answers : mapping
         Answers that are simulated, by name.
 

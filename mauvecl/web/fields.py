@@ -14,7 +14,7 @@ from mauvecl.host.files.bounded import shortened
 from mauvecl.host.stars.band_names import ALIASES
 from mauvecl.host.stars.catalogue import embedded, library_table
 from mauvecl.statistics.registry import STATISTICS
-from mauvecl.web.asked import SIMULATED
+from mauvecl.web.simulations import SIMULATIONS
 
 UPLOADED, UPLOADED_UNKNOWN = "uploaded star", "uploaded spectrum"
 #: Realisations that a visitor may ask for, and with a tail by importance sampling.
@@ -67,8 +67,8 @@ class Choice:
 def several(text: str) -> tuple[str, ...]:
     """Parse names of simulations, without repetitions."""
     names = [name for name in text.split(",") if name]
-    if len(names) > len(SIMULATED) or not set(names) <= SIMULATED.keys():
-        raise InputError(f"{shortened(text)} is no simulation, expected some of {', '.join(SIMULATED)}")
+    if len(names) > len(SIMULATIONS) or not set(names) <= SIMULATIONS.keys():
+        raise InputError(f"{shortened(text)} is no simulation, expected some of {', '.join(SIMULATIONS)}")
     return tuple(dict.fromkeys(names))
 
 

@@ -41,31 +41,31 @@ def make(address: str, port: int, allowed: Sequence[str]) -> Any:
     OSError
         If the port is taken.
     """
-    from mauvecl.web.doors import Door, Refused, hosts
+    from mauvecl.web.access import AccessMatcher, RefusalHandler, hosts
 
     let_in = hosts(address, port, allowed)
     from tornado.web import Application
 
     from mauvecl.web.connections import BoundedServer
-    from mauvecl.web.served import Asset, Figure, Front
+    from mauvecl.web.static_pages import AssetHandler, FigureHandler, FrontHandler
     from mauvecl.web.visitor import Visitor
 
     application = Application(
         [
-            (r"/", Front),
+            (r"/", FrontHandler),
             (r"/live", Visitor),
-            (r"/figures/([a-z]+)/([a-z]+)\.json", Figure),
-            (r"/(favicon\.svg)", Asset),
-            (r"/assets/([a-z0-9.-]+)", Asset),
+            (r"/figures/([a-z]+)/([a-z]+)\.json", FigureHandler),
+            (r"/(favicon\.svg)", AssetHandler),
+            (r"/assets/([a-z0-9.-]+)", AssetHandler),
         ],
         websocket_max_message_size=MESSAGE,
         websocket_ping_interval=PING_S,
-        default_handler_class=Refused,
+        default_handler_class=RefusalHandler,
         default_handler_args={"status": 404, "why": "There is no such page."},
         log_function=lambda handler: None,
     )
     # The door is asked before anything else.
-    application.default_router.rules.insert(0, Door.rule(let_in))
+    application.default_router.rules.insert(0, AccessMatcher.rule(let_in))
     server = BoundedServer(
         application,
         max_body_size=BODY,
@@ -94,15 +94,15 @@ def warm() -> None:
     import tempfile
     from pathlib import Path
 
-    from mauvecl.web.closed import Closed
-    from mauvecl.web.served import prepare
+    from mauvecl.web.closed_forms import ClosedForms
     from mauvecl.web.state import State
+    from mauvecl.web.static_pages import prepare
     from mauvecl.web.tabs import TABS
     from mauvecl.web.visitor import shown
     from mauvecl.web.work import Job
 
     with tempfile.TemporaryDirectory() as folder:
-        closed = Closed.of(State().question(), Path(folder))
+        closed = ClosedForms.of(State().question(), Path(folder))
     for tab in TABS:
         shown(tab, closed, {})
     Job(lambda pool: pool.realise(closed.quiet, count=1, seed=0)).future.result()
@@ -132,7 +132,7 @@ def serve(address: str, port: int, *, show: bool = False, allow_origin: Sequence
     """
     import asyncio
 
-    from mauvecl.web.doors import local, netloc
+    from mauvecl.web.access import local, netloc
     from mauvecl.web.plain_log import install
 
     async def run() -> None:

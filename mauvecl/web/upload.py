@@ -11,8 +11,8 @@ from mauvecl.host.files.bounded import shortened
 from mauvecl.host.stars.source import Source
 from mauvecl.study.weights import columns
 from mauvecl.web.fields import UPLOADED
-from mauvecl.web.limited import read_limited
 from mauvecl.web.question import Points
+from mauvecl.web.sandboxed_reader import read_limited
 
 #: Bytes of an upload, and points of its spectrum, at most.
 MOST_UPLOADED, MOST_POINTS = 4 * 2**20, 200_000

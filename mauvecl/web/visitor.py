@@ -22,11 +22,11 @@ from mauvecl.device.errors import DeviceError
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
 from mauvecl.host.version import VERSION
-from mauvecl.web.asked import DRAWING, SIMULATED
 from mauvecl.web.card import card
-from mauvecl.web.closed import Closed
+from mauvecl.web.closed_forms import ClosedForms
 from mauvecl.web.downloads import as_command, as_file, as_python, study_file
 from mauvecl.web.fields import UPLOADED, UPLOADED_UNKNOWN
+from mauvecl.web.simulations import DRAWING, SIMULATIONS
 from mauvecl.web.state import State
 from mauvecl.web.tabs import TABS
 from mauvecl.web.upload import read_pairs, read_upload
@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 
 #: Seconds between two looks at a simulation.
 LOOK_S = 0.25
-#: Closed forms, pictures and files of all visitors are made by so many threads, beside the event loop.
+#: ClosedForms forms, pictures and files of all visitors are made by so many threads, beside the event loop.
 _closed_forms = ThreadPoolExecutor(2, thread_name_prefix="mauvecl-closed")
 #: Questions whose simulations a visitor's connection remembers, and files.
 MOST_KEPT = 4
@@ -78,7 +78,7 @@ class Visitor(WebSocketHandler):
         self._tasks: set[asyncio.Task[None]] = set()
         self._coming: tuple[int, str, str] | None = None
         self._uploads: dict[str, Any] = {}
-        self._closed: tuple[tuple[Any, ...], Closed] | None = None
+        self._closed: tuple[tuple[Any, ...], ClosedForms] | None = None
         self._answers: OrderedDict[tuple[Any, ...], dict[str, Any]] = OrderedDict()
         self._files: OrderedDict[tuple[Any, ...], tuple[str, bytes]] = OrderedDict()
         self._folder = tempfile.TemporaryDirectory(prefix="mauvecl-page-")
@@ -130,7 +130,7 @@ class Visitor(WebSocketHandler):
             return
         ask(asked)
 
-    # Closed forms
+    # ClosedForms forms
 
     def state(self, link: str) -> State:
         """Enter values."""
@@ -169,11 +169,11 @@ class Visitor(WebSocketHandler):
 
         await self._or_why(answer(), **told)
 
-    def closed(self, state: State) -> Closed:
+    def closed(self, state: State) -> ClosedForms:
         """Return the closed forms of a question; the last ones are cached."""
         key = self._key(state)
         if self._closed is None or self._closed[0] != key:
-            self._closed = key, Closed.of(state.question(), Path(self._folder.name))
+            self._closed = key, ClosedForms.of(state.question(), Path(self._folder.name))
         return self._closed[1]
 
     def _key(self, state: State) -> tuple[Any, ...]:
@@ -218,7 +218,7 @@ class Visitor(WebSocketHandler):
     async def _pinned(self, n: int, state: State, name: str) -> None:
         tab = tab_of(name)
         pictures = [picture for picture in tab.pictures if picture.pins]
-        closed = await self._beside(partial(Closed.of, state.question(), Path(self._folder.name)))
+        closed = await self._beside(partial(ClosedForms.of, state.question(), Path(self._folder.name)))
         drawn = await self._beside(lambda: {p.name: p.drawn(closed, {}).sources[p.pins] for p in pictures})
         self.tell(n=n, pins={name: {c: packed(v) for c, v in columns.items()} for name, columns in drawn.items()})
 
@@ -246,7 +246,7 @@ class Visitor(WebSocketHandler):
     def _ask_simulate(self, asked: dict[str, Any]) -> None:
         """Simulate, report progress, and send the answer."""
         n, kind, state = asked["n"], asked.get("kind"), self.state(asked["link"])
-        if self.job is not None or kind not in SIMULATED or state.faults:
+        if self.job is not None or kind not in SIMULATIONS or state.faults:
             self.tell(n=n, ended="", refused="there is a simulation already, or nothing to simulate")
             return
         self._begin(self._or_why(self._simulate(n, kind, state), n=n, ended=""))
@@ -256,7 +256,7 @@ class Visitor(WebSocketHandler):
         closed = await self._beside(partial(self.closed, state))
         if self.job is not None:
             raise InputError("there is a simulation already, expected its end first")
-        job = self.job = Job(partial(SIMULATED[kind], closed.study), drawing=kind in DRAWING)
+        job = self.job = Job(partial(SIMULATIONS[kind], closed.study), drawing=kind in DRAWING)
         done = asyncio.wrap_future(job.future)
         try:
             while not (await asyncio.wait([done], timeout=LOOK_S))[0]:
@@ -358,7 +358,7 @@ def tab_of(name: str) -> Tab:
     return TABS.get(name, next(iter(TABS.values())))
 
 
-def shown(name: str, closed: Closed, answers: Answers) -> dict[str, Any]:
+def shown(name: str, closed: ClosedForms, answers: Answers) -> dict[str, Any]:
     """Return the data of a tab in the form of messages."""
     tab = tab_of(name)
     pictures = {}

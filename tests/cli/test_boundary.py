@@ -393,31 +393,34 @@ def test_what_the_disk_has_no_room_for_is_questioned(tmp_path: Path) -> None:
 @pytest.mark.long
 def test_uploads_are_read_apart(tmp_path: Path) -> None:
     from mauvecl.host.stars.source import Source
-    from mauvecl.web import limited
+    from mauvecl.web import sandboxed_reader
 
     write_star(tmp_path / "star.txt")
     content = (tmp_path / "star.txt").read_bytes()
-    assert limited.read_limited(content).digest == Source.read(tmp_path / "star.txt").digest
+    assert sandboxed_reader.read_limited(content).digest == Source.read(tmp_path / "star.txt").digest
     with pytest.raises(InputError, match="not numeric"):
-        limited.read_limited(b"200 a\n300 b\n")
+        sandboxed_reader.read_limited(b"200 a\n300 b\n")
     # Limits hold in the other process, whatever is read there.
-    with mock.patch.object(limited, "MEMORY_MIB", 64), pytest.raises(InputError, match=r"memory|ends its reader"):
-        limited.read_limited(b"".join(b"%f 1e-12\n" % nm for nm in np.linspace(170.0, 800.0, 150_000)))
+    with (
+        mock.patch.object(sandboxed_reader, "MEMORY_MIB", 64),
+        pytest.raises(InputError, match=r"memory|ends its reader"),
+    ):
+        sandboxed_reader.read_limited(b"".join(b"%f 1e-12\n" % nm for nm in np.linspace(170.0, 800.0, 150_000)))
     started = time.monotonic()
-    with mock.patch.object(limited, "SECONDS", 0.05), pytest.raises(InputError, match=r"more than 0\.05 s"):
+    with mock.patch.object(sandboxed_reader, "SECONDS", 0.05), pytest.raises(InputError, match=r"more than 0\.05 s"):
         # Python itself takes longer to start.
-        limited.read_limited(content)
+        sandboxed_reader.read_limited(content)
     with pytest.raises(InputError, match=r"unpacks to more than 64 MiB"):
-        limited.read_limited(gzip.compress(bytes(70 << 20)))
+        sandboxed_reader.read_limited(gzip.compress(bytes(70 << 20)))
     assert time.monotonic() - started < 10.0
-    with mock.patch.object(limited, "SECONDS", 0):
-        turns = [limited._turns.acquire() for _ in range(limited.TOGETHER)]
+    with mock.patch.object(sandboxed_reader, "SECONDS", 0):
+        turns = [sandboxed_reader._turns.acquire() for _ in range(sandboxed_reader.TOGETHER)]
         try:
             with pytest.raises(InputError, match="too many uploads"):
-                limited.read_limited(content)
+                sandboxed_reader.read_limited(content)
         finally:
             for _ in turns:
-                limited._turns.release()
+                sandboxed_reader._turns.release()
 
 
 def test_json_of_bad_input_is_empty(tmp_path: Path) -> None:

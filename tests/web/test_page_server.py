@@ -38,14 +38,13 @@ from mauvecl.noise.scene import prepare
 from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.study.study import Study
-from mauvecl.web import closed as closed_forms
-from mauvecl.web import doors, server, visitor
-from mauvecl.web.asked import SIMULATED, planned
-from mauvecl.web.closed import Closed, percent
+from mauvecl.web import access, closed_forms, server, visitor
+from mauvecl.web.closed_forms import ClosedForms, percent
 from mauvecl.web.downloads import as_command, as_python
 from mauvecl.web.fields import FIELDS, PRESETS, UPLOADED_UNKNOWN, star_names, star_words
 from mauvecl.web.figures import INKS
 from mauvecl.web.plain_log import Plain
+from mauvecl.web.simulations import SIMULATIONS, campaign_plan
 from mauvecl.web.state import State
 from mauvecl.web.tabs import TABS, limit
 from mauvecl.web.upload import MOST_UPLOADED, read_pairs, read_upload
@@ -120,7 +119,7 @@ def test_a_plan_needs_a_target_that_is_known() -> None:
     study = state.question().study()
     assert study.plan.hours == 50.0
     with pytest.raises(InputError, match="neither type nor magnitude nor distance of '12 34' are known, expected"):
-        planned(study)
+        campaign_plan(study)
 
 
 def test_target_and_time_are_asked_for_where_the_sky_is_theirs() -> None:
@@ -196,7 +195,7 @@ def test_presets_are_questions() -> None:
         state.enter(given)
         assert not state.faults
     with tempfile.TemporaryDirectory() as folder:
-        first = Closed.of(State().question(), Path(folder))
+        first = ClosedForms.of(State().question(), Path(folder))
     assert 0.4 < first.chance < 0.7, "at the edge of detection"
 
 
@@ -225,12 +224,12 @@ def test_nothing_is_certain(value: float, told: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def closed(tmp_path_factory: pytest.TempPathFactory) -> Closed:
-    return Closed.of(State().question(), tmp_path_factory.mktemp("closed"))
+def closed(tmp_path_factory: pytest.TempPathFactory) -> ClosedForms:
+    return ClosedForms.of(State().question(), tmp_path_factory.mktemp("closed"))
 
 
 @pytest.mark.parametrize("tab", TABS)
-def test_every_picture_finds_all_its_data(closed: Closed, tab: str) -> None:
+def test_every_picture_finds_all_its_data(closed: ClosedForms, tab: str) -> None:
     """A figure's sources and the data that come are of the same names and columns, in both themes and on all axes."""
     for picture in TABS[tab].pictures:
         drawn = picture.drawn(closed, {})
@@ -251,7 +250,7 @@ def test_the_card_is_the_engines_own_closed_form(statistic: str, tmp_path: Path)
     """What an answer on the command line is compared with, known without a scene that could be drawn."""
     state = State()
     state.enter({"statistic": statistic, "magnitude": "6", "unknown": "the usual"})
-    closed = Closed.of(state.question(), tmp_path)
+    closed = ClosedForms.of(state.question(), tmp_path)
     unknown = closed.study.nuisances.marginalised(closed.quiet)
     scene = prepare([closed.quiet, closed.flare], comparison=closed.study.run.comparison(), **closed.study.drawing)
     theory = Hypotheses(closed.quiet, (closed.flare,), (statistic,), scene, nuisances=unknown)
@@ -262,14 +261,14 @@ def test_the_card_is_the_engines_own_closed_form(statistic: str, tmp_path: Path)
     assert closed.null.sf(at) == pytest.approx([theory.closed_form(statistic).sf(x) for x in at], abs=2e-4)
 
 
-def test_other_light_is_another_question(closed: Closed) -> None:
+def test_other_light_is_another_question(closed: ClosedForms) -> None:
     """Scaled light gives what a question at that magnitude and amplitude gives."""
     at = limit.odds(closed, 10.0, np.array([1.0, 3.0]))
     assert limit.odds(closed, 8.5, np.ones(1))[0].probability == pytest.approx(closed.chance, abs=1e-12)
     state = State()
     state.enter({"magnitude": "10", "amplitude_percent": "6"})
     with tempfile.TemporaryDirectory() as folder:
-        assert at[1].probability == pytest.approx(Closed.of(state.question(), Path(folder)).chance, abs=1e-9)
+        assert at[1].probability == pytest.approx(ClosedForms.of(state.question(), Path(folder)).chance, abs=1e-9)
 
 
 @pytest.mark.parametrize("statistic", STATISTICS)
@@ -277,7 +276,7 @@ def test_the_curve_and_the_map_are_the_closed_form(statistic: str, tmp_path: Pat
     """Between the points that are computed, too: the curve to 1 %, the map to 0.05 mag and its rows."""
     state = State()
     state.enter({"statistic": statistic, "amplitude_percent": "5"})
-    closed = Closed.of(state.question(), tmp_path)
+    closed = ClosedForms.of(state.question(), tmp_path)
     x, y = limit._curve(limit._Kept(closed))
     steep = np.nonzero((y > 0.02) & (y < 0.98))[0][::6]
     exact = [limit.odds(closed, magnitude, np.ones(1))[0].probability for magnitude in x[steep]]
@@ -289,20 +288,20 @@ def test_the_curve_and_the_map_are_the_closed_form(statistic: str, tmp_path: Pat
         assert np.interp(-level, -row, columns) == pytest.approx(np.interp(-level, -y, x), abs=0.05 + shift)
 
 
-def test_the_excess_is_the_matched_statistics_own(closed: Closed) -> None:
+def test_the_excess_is_the_matched_statistics_own(closed: ClosedForms) -> None:
     """Squares of the excess per pixel add up to the matched S/N, squared."""
     pixel, _ = closed.excess
     assert np.sqrt(np.sum(pixel**2)) == pytest.approx(closed.odds.flaring.mean, rel=1e-9)
 
 
-def test_the_trade_claims_no_half_beyond_its_axis(closed: Closed, tmp_path: Path) -> None:
+def test_the_trade_claims_no_half_beyond_its_axis(closed: ClosedForms, tmp_path: Path) -> None:
     """Where more than half are detected at the least false-alarm probability shown, half of them are below it."""
     trade = next(picture for picture in TABS["detection"].pictures if picture.name == "roc")
     half = float(re.findall(r"half of them at (\S+)\. A", trade.drawn(closed, {}).text)[0])
     assert closed.seen.sf(closed.null.isf(np.array([half])))[0] == pytest.approx(0.5, abs=0.02)
     bright = State()
     bright.enter({"magnitude": "7.4"})
-    assert "half of them still below 1e-06" in trade.drawn(Closed.of(bright.question(), tmp_path), {}).text
+    assert "half of them still below 1e-06" in trade.drawn(ClosedForms.of(bright.question(), tmp_path), {}).text
 
 
 WIDE = (
@@ -510,7 +509,7 @@ def test_of_questions_in_a_row_the_last_is_answered(served: Any) -> None:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("kind", SIMULATED)
+@pytest.mark.parametrize("kind", SIMULATIONS)
 def test_cancel_ends_whatever_is_computed(served: Any, kind: str) -> None:
     """Each is ended once it has begun, and the next one is computed."""
     link = "?realisations=4000000&see=eps+Eri"
@@ -572,7 +571,7 @@ def test_every_table_is_the_same_bytes_on_the_command_line(served: Any, tmp_path
         talk = await Talk.begin(host)
         assert "entered" in await talk.upload(star_file(tmp_path / "star.txt"))
         assert "entered" in await talk.upload(b"200 1\n400 3\n700 1\n", "own_unknown", "stray.txt")
-        for kind in SIMULATED:
+        for kind in SIMULATIONS:
             ended = await talk.simulate(kind, link)
             assert ended["ended"].startswith("Done"), ended
         found = {}
@@ -652,19 +651,19 @@ def test_command_and_program_are_the_question(link: str, tmp_path: Path) -> None
 
 def test_addresses_are_checked_before_anything_is_served() -> None:
     with pytest.raises(InputError, match="is empty"):
-        doors.hosts("", 5006, [])
+        access.hosts("", 5006, [])
     with pytest.raises(InputError, match="expected `allow_origin`"):
-        doors.hosts("0.0.0.0", 5006, [])
+        access.hosts("0.0.0.0", 5006, [])
     with pytest.raises(InputError, match="expected `allow_origin`"):
-        doors.hosts("::", 5006, [])
+        access.hosts("::", 5006, [])
     with pytest.raises(InputError, match="unknown here"):
-        doors.hosts("no such host", 5006, [])
+        access.hosts("no such host", 5006, [])
     for wrong in ("*", "http://*", "", "a b", "https://x/path", "x:port", "x,y"):
         with pytest.raises(InputError, match="expected one host"):
-            doors.hosts("0.0.0.0", 5006, [wrong])
-    assert doors.hosts("127.0.0.1", 5006, []) == {"127.0.0.1:5006", "localhost:5006", "[::1]:5006"}
-    assert doors.hosts("0.0.0.0", 5006, ["https://Mauve.example.org/"]) >= {"mauve.example.org"}
-    assert "[::1]:80" not in doors.hosts("::1", 80, [])
+            access.hosts("0.0.0.0", 5006, [wrong])
+    assert access.hosts("127.0.0.1", 5006, []) == {"127.0.0.1:5006", "localhost:5006", "[::1]:5006"}
+    assert access.hosts("0.0.0.0", 5006, ["https://Mauve.example.org/"]) >= {"mauve.example.org"}
+    assert "[::1]:80" not in access.hosts("::1", 80, [])
 
 
 @pytest.mark.parametrize("address", ["", "no such host", "0.0.0.0"])
@@ -685,7 +684,7 @@ def served(monkeypatch: pytest.MonkeyPatch) -> Iterator[Any]:
     async def all_of(work: Any, address: str) -> Any:
         made = server.make(address, port, [])
         try:
-            return await work(doors.netloc(address, port))
+            return await work(access.netloc(address, port))
         finally:
             made.stop()
             await made.close_all_connections()
@@ -738,7 +737,7 @@ def test_ipv6_is_served(served: Any) -> None:
 
 
 def test_so_many_visitors_and_no_more(served: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(doors, "MOST_VISITORS", 2)
+    monkeypatch.setattr(access, "MAX_VISITORS", 2)
 
     async def work(host: str) -> None:
         here = [await Talk.begin(host) for _ in range(2)]

@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.web.closed import percent, short
+from mauvecl.web.closed_forms import percent, short
 from mauvecl.web.figures import Canvas
-from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
+from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
     from mauvecl.study.study import Study
-    from mauvecl.web.closed import Closed
+    from mauvecl.web.closed_forms import ClosedForms
 
 #: Half-widths of the flares: as many as there are lines.
 LENGTHS = ("shortest", "middle", "longest")
@@ -42,7 +42,7 @@ class Shares(Picture):
         canvas.rule("own", "amplitude of your question", "x", "own")
         return canvas
 
-    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
+    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         sources: dict[str, Any] = {}
         for k in range(len(LENGTHS)):
             sources |= {f"band {k}": {"x": [], "low": [], "high": []}, f"line {k}": {"x": [], "y": []}}
@@ -52,7 +52,7 @@ class Shares(Picture):
                 "Nothing is injected yet: Inject flares puts flares of several lengths and sizes into a stare of one "
                 "orbit, and searches it at one false alarm a month."
             )
-            return Drawn(text, sources, own)
+            return PictureData(text, sources, own)
         table, parts = answers["completeness"].completeness, []
         for k, width in enumerate(np.unique(np.asarray(table["half_width"].value))):
             rows = table[np.asarray(table["half_width"].value) == width]
@@ -64,7 +64,7 @@ class Shares(Picture):
             seen = float(np.interp(np.log(closed.question.amplitude_percent), np.log(x), share))
             parts.append(f"{percent(seen)} of those of half-width {short(width)} s")
         peak = f"{closed.question.amplitude_percent:g} %"
-        return Drawn(f"Of flares that peak at {peak} the search finds {'; '.join(parts)}.", sources, own)
+        return PictureData(f"Of flares that peak at {peak} the search finds {'; '.join(parts)}.", sources, own)
 
 
 class Completeness(Tab):
@@ -79,10 +79,10 @@ class Completeness(Tab):
     simulations = {"completeness": "Inject flares"}  # noqa: RUF012
     files = {"completeness": "completeness", "limits": "completeness"}  # noqa: RUF012
 
-    def table(self, name: str, closed: Closed, answers: Answers) -> Table:
+    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         return answers["completeness"].tables[name]
 
-    def rows(self, closed: Closed, answers: Answers) -> list[list[str]]:
+    def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
         if "completeness" not in answers:
             return []
         table = answers["completeness"].table
@@ -93,6 +93,6 @@ class Completeness(Tab):
             rows.append([called, *(f"{100 * float(row[name]):.3g} %" for name in ("e50", "e90"))])
         return rows
 
-    def study(self, name: str, closed: Closed, answers: Answers) -> Study:
+    def study(self, name: str, closed: ClosedForms, answers: Answers) -> Study:
         study: Study = answers["completeness"].study
         return study

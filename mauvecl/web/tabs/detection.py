@@ -8,14 +8,14 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.statistics.registry import label
-from mauvecl.web.closed import percent
+from mauvecl.web.closed_forms import percent
 from mauvecl.web.figures import Canvas, strips
-from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
+from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from mauvecl.web.closed import Closed
+    from mauvecl.web.closed_forms import ClosedForms
 
 
 class Excess(Picture):
@@ -35,7 +35,7 @@ class Excess(Picture):
         canvas.tooltips(told, ("wavelength (nm)", "x"), ("sigma per element", "y"))
         return canvas
 
-    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
+    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         x = closed.quiet
         pixel, element = closed.excess
         sources: dict[str, Any] = {
@@ -57,7 +57,7 @@ class Excess(Picture):
             f"element's noise; {np.count_nonzero(element > 1.96)} of {element.size} elements rise above 95 % of the "
             f"noise."
         )
-        return Drawn(text + (f" {saturated} pixels saturate." if saturated else ""), sources)
+        return PictureData(text + (f" {saturated} pixels saturate." if saturated else ""), sources)
 
 
 class Distributions(Picture):
@@ -87,7 +87,7 @@ class Distributions(Picture):
         canvas.rule("threshold", "threshold", "x")
         return canvas
 
-    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
+    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         q, cut, chance = closed.question, closed.odds.threshold, closed.chance
         sources: dict[str, Any] = {}
         for name, form in (("null", closed.null), ("flare", closed.seen)):
@@ -113,7 +113,7 @@ class Distributions(Picture):
             f"{closed.seen.mean:.4g} ± {closed.seen.std:.3g}; "
             f"{share if cut == cut else 'no threshold has this false-alarm probability'}."
         )
-        return Drawn(
+        return PictureData(
             text,
             sources,
             {"threshold": {"location": cut if cut == cut else None}, "x axis": {"axis_label": label(q.statistic)}},
@@ -139,7 +139,7 @@ class Trade(Picture):
         canvas.tooltips(told, ("false-alarm probability", "x"), ("detection probability", "y"))
         return canvas
 
-    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
+    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         q = closed.question
         faps = np.logspace(-6, 0, 121)[:-1]
         chances = closed.seen.sf(closed.null.isf(faps))
@@ -159,7 +159,7 @@ class Trade(Picture):
             f"At a false-alarm probability of {q.fap:g} {percent(closed.chance)} are detected; {where}"
             f"{faps[min(half, faps.size - 1)]:.2g}. A click chooses another false-alarm probability."
         )
-        return Drawn(text, sources)
+        return PictureData(text, sources)
 
 
 class Detection(Tab):
@@ -171,11 +171,11 @@ class Detection(Tab):
     simulations = {"detection": "Simulate"}  # noqa: RUF012
     files = {"detection": "detection", "roc": "detection"}  # noqa: RUF012
 
-    def table(self, name: str, closed: Closed, answers: Answers) -> Table:
+    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         answer = answers["detection"]
         return answer.table if name == "detection" else answer.roc
 
-    def rows(self, closed: Closed, answers: Answers) -> list[list[str]]:
+    def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
         if "detection" not in answers:
             return []
         heads = ["statistic", "mean with flare", "threshold", "detected", "95 % interval", "closed form"]

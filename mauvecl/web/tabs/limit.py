@@ -10,16 +10,16 @@ from numpy.typing import NDArray
 from scipy import special
 from scipy.interpolate import PchipInterpolator
 
-from mauvecl.web.closed import percent
+from mauvecl.web.closed_forms import percent
 from mauvecl.web.figures import Canvas
-from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
+from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
     from mauvecl.statistics.statistic import DetectionForms
     from mauvecl.study.study import Study
-    from mauvecl.web.closed import Closed
+    from mauvecl.web.closed_forms import ClosedForms
 
 Float = NDArray[np.float64]
 
@@ -35,12 +35,12 @@ FIRST, HALVINGS, CHANGE = 9, 5, 0.25
 FREE = {"magnitude", "amplitude_percent", "realisations", "seed", "see", "hours", "uploaded"}
 
 
-def odds(closed: Closed, magnitude: float, rises: Float) -> list[DetectionForms]:
+def odds(closed: ClosedForms, magnitude: float, rises: Float) -> list[DetectionForms]:
     """Return `ClosedForms.at` a magnitude."""
     return closed.at(10 ** (-0.4 * (magnitude - closed.question.magnitude)), rises)
 
 
-def _key(closed: Closed) -> tuple[Any, ...]:
+def _key(closed: ClosedForms) -> tuple[Any, ...]:
     """Return everything on which a map depends except its axes."""
     asked = vars(closed.question).items()
     uploaded = closed.question.uploaded
@@ -50,7 +50,7 @@ def _key(closed: Closed) -> tuple[Any, ...]:
 class _Kept:
     """Question identified by the values on which its map or curve depends."""
 
-    def __init__(self, closed: Closed, *more: float) -> None:
+    def __init__(self, closed: ClosedForms, *more: float) -> None:
         self.closed, self.key = closed, (*_key(closed), *more)
 
     def __eq__(self, other: object) -> bool:
@@ -132,7 +132,7 @@ class Curve(Picture):
         canvas.tooltips(told, ("magnitude", "x"), ("detected", "y"))
         return canvas
 
-    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
+    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         q, power = closed.question, closed.study.limit.power
         empty: dict[str, Any] = {"x": [], "y": []}
         sources: dict[str, Any] = {"closed form": empty, "simulated": empty}
@@ -159,7 +159,7 @@ class Curve(Picture):
                 f" Simulated: {q.band} = {one.value.value:.3f} [{one.value.low:.3f}, {one.value.high:.3f}]."
                 for one in limits
             )
-        return Drawn(text + " A click chooses a magnitude.", sources, {"power": {"location": power}})
+        return PictureData(text + " A click chooses a magnitude.", sources, {"power": {"location": power}})
 
 
 class Map(Picture):
@@ -203,7 +203,7 @@ class Map(Picture):
                           ("simulated", "#8a8678", "dot", "if any")]  # fmt: skip
         return canvas
 
-    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
+    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         q = closed.question
         sources: dict[str, Any] = {
             "own": {"x": [q.magnitude], "y": [np.log10(q.amplitude_percent)]},
@@ -230,7 +230,7 @@ class Map(Picture):
             at_x, at_y = np.meshgrid(np.array(got.x, float), np.log10(100 * np.array(got.y, float)))
             sources["simulated"] = {"x": at_x.ravel(), "y": at_y.ravel(), "p": got.probability[0].ravel()}
             text += f" {at_x.size} cells are simulated."
-        return Drawn(text + " A click chooses magnitude and amplitude.", sources)
+        return PictureData(text + " A click chooses magnitude and amplitude.", sources)
 
 
 def _image(x: Float, y: Float, p: Float) -> dict[str, Any]:
@@ -258,10 +258,10 @@ class Limit(Tab):
     simulations = {"limit": "Simulate the limit", "map": "Simulate the map"}  # noqa: RUF012
     files = {"limit": "limit", "map": "map"}  # noqa: RUF012
 
-    def table(self, name: str, closed: Closed, answers: Answers) -> Table:
+    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         return answers[name].table
 
-    def rows(self, closed: Closed, answers: Answers) -> list[list[str]]:
+    def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
         if "limit" not in answers:
             return []
         heads = ["statistic", "limiting magnitude", "95 % interval", "closed form", "simulated again there"]
@@ -273,6 +273,6 @@ class Limit(Tab):
             for one in answers["limit"].limits
         ]  # fmt: skip
 
-    def study(self, name: str, closed: Closed, answers: Answers) -> Study:
+    def study(self, name: str, closed: ClosedForms, answers: Answers) -> Study:
         study: Study = answers[name].study
         return study

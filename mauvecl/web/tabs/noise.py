@@ -8,12 +8,12 @@ import numpy as np
 
 from mauvecl.study.labels import label, stack_tables
 from mauvecl.web.figures import Canvas
-from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
+from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from mauvecl.web.closed import Closed
+    from mauvecl.web.closed_forms import ClosedForms
 
 #: Columns of the budget, with what each is called and its colour.
 PARTS = {
@@ -43,7 +43,7 @@ class Budget(Picture):
         canvas.pinned()
         return canvas
 
-    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
+    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         x, table = closed.quiet, closed.quiet.noise_budget()
         values = {name: np.asarray(table[name].value) for name in PARTS}
         # Logarithms show nothing of zero.
@@ -54,7 +54,7 @@ class Budget(Picture):
         first = max(power, key=lambda name: power[name])
         share = 100 * power[first] / (sum(power.values()) or 1.0)
         text = f"Most of the noise's power comes from {PARTS[first][0]}: {share:.0f} % over all pixels."
-        return Drawn(text, sources)
+        return PictureData(text, sources)
 
 
 class Noise(Tab):
@@ -65,7 +65,7 @@ class Noise(Tab):
     pictures = (Budget(),)
     files = {"noise-budget": None}  # noqa: RUF012
 
-    def table(self, name: str, closed: Closed, answers: Answers) -> Table:
+    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         """Return the closed-form table of `mauvecl snr`."""
         study = closed.study
         parts = [({"star": label(study.star[0], closed.quiet)}, closed.quiet.noise_budget())]

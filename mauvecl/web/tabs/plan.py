@@ -6,15 +6,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.web.closed import percent, short
+from mauvecl.web.closed_forms import percent, short
 from mauvecl.web.figures import Canvas
-from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
+from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
     from mauvecl.study.study import Study
-    from mauvecl.web.closed import Closed
+    from mauvecl.web.closed_forms import ClosedForms
 
 #: Ends of the pictures, erg: they stay, whatever is asked.
 ENERGIES = (1e28, 1e37)
@@ -45,15 +45,15 @@ class Recovered(Picture):
         canvas.tooltips(told, ("energy (erg)", "x"), ("recovered", "y"))
         return canvas
 
-    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
+    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         if "plan" not in answers:
             text = "Nothing is planned yet: name a target under Advanced, such as eps Eri, and press Plan."
-            return Drawn(text, {"recovered": {"x": [], "y": []}})
+            return PictureData(text, {"recovered": {"x": [], "y": []}})
         (row,) = answers["plan"].table
         energy, recovered, _ = _columns(answers)
         half, most = (_energy(row[name]) for name in ("E50", "E90"))
         text = f"Of the flares of {row['target']} half are recovered at {half}, 90 % at {most}."
-        return Drawn(text, {"recovered": {"x": energy, "y": recovered}})
+        return PictureData(text, {"recovered": {"x": energy, "y": recovered}})
 
 
 class Expected(Picture):
@@ -69,9 +69,9 @@ class Expected(Picture):
         canvas.tooltips(told, ("energy (erg)", "x"), ("recovered", "y"))
         return canvas
 
-    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
+    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         if "plan" not in answers:
-            return Drawn("Nothing is planned yet.", {name: {"x": [], "y": []} for name in ("all", "found")})
+            return PictureData("Nothing is planned yet.", {name: {"x": [], "y": []} for name in ("all", "found")})
         (row,) = answers["plan"].table
         energy, recovered, above = _columns(answers)
         # Each step of the rate is recovered as at its middle.
@@ -81,7 +81,7 @@ class Expected(Picture):
         known = np.isfinite(row["expected"])
         text += f"{row['expected']:.3g} flares are expected to be recovered." if known else "no rates are known."
         columns = {"all": {"x": energy, "y": above}, "found": {"x": energy, "y": np.where(flares > 0, flares, np.nan)}}
-        return Drawn(text, columns)
+        return PictureData(text, columns)
 
 
 class Plan(Tab):
@@ -96,11 +96,11 @@ class Plan(Tab):
     simulations = {"plan": "Plan"}  # noqa: RUF012
     files = dict.fromkeys(("plan", "stars", "energies", "assumptions"), "plan")
 
-    def table(self, name: str, closed: Closed, answers: Answers) -> Table:
+    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         tables: dict[str, Table] = answers["plan"].tables
         return tables[name]
 
-    def rows(self, closed: Closed, answers: Answers) -> list[list[str]]:
+    def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
         if "plan" not in answers:
             return []
         (row,) = answers["plan"].table
@@ -115,6 +115,6 @@ class Plan(Tab):
         }  # fmt: skip
         return [[*told], [*told.values()]]
 
-    def study(self, name: str, closed: Closed, answers: Answers) -> Study:
+    def study(self, name: str, closed: ClosedForms, answers: Answers) -> Study:
         study: Study = answers["plan"].study
         return study

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.web.figures import Canvas, strips
-from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
+from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from mauvecl.web.closed import Closed
+    from mauvecl.web.closed_forms import ClosedForms
 
 
 class SignalToNoise(Picture):
@@ -33,7 +33,7 @@ class SignalToNoise(Picture):
         canvas.tooltips(pixel, ("S/N per pixel", "y"))
         return canvas
 
-    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
+    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         x = closed.quiet
         pixel, element = x.snr(), x.snr_per_element()
         sources: dict[str, Any] = {
@@ -51,7 +51,7 @@ class SignalToNoise(Picture):
             f"The S/N is at most {pixel.max():.3g} a pixel, and {element.max():.3g} an element of 10.5 nm, at "
             f"{x.element_wavelength_nm[best]:.0f} nm."
         )
-        return Drawn(text, sources)
+        return PictureData(text, sources)
 
 
 class Signal(Tab):
@@ -63,5 +63,5 @@ class Signal(Tab):
     simulations = {"detection": "Simulate"}  # noqa: RUF012
     files = {"snr": "detection"}  # noqa: RUF012
 
-    def table(self, name: str, closed: Closed, answers: Answers) -> Table:
+    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         return answers["snr"].element

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.web.closed import short
+from mauvecl.web.closed_forms import short
 from mauvecl.web.figures import Canvas, strips
-from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
+from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from mauvecl.web.closed import Closed
+    from mauvecl.web.closed_forms import ClosedForms
 
 
 class Recorded(Picture):
@@ -39,7 +39,7 @@ class Recorded(Picture):
         canvas.tooltips(flare, ("with flare (DN)", "y"))
         return canvas
 
-    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
+    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         x, y = closed.quiet, closed.flare
         w, gain = x.wavelength_nm, x.n_frames * x.gain_dn_per_electron
         sky, spread = gain * x.sky_electrons, 1.96 * np.sqrt(y.variance_dn2)
@@ -61,7 +61,7 @@ class Recorded(Picture):
             f"Star and sky give up to {short(star.max())} DN in the exposure, with the flare {short(flare.max())} DN "
             f"at {w[peak]:.0f} nm; 95 % of draws lie within ±{short(spread[peak])} DN there."
         )
-        return Drawn(text, sources)
+        return PictureData(text, sources)
 
 
 class Telescope(Picture):
@@ -80,7 +80,7 @@ class Telescope(Picture):
         canvas.tooltips(flare, ("with flare", "y"))
         return canvas
 
-    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
+    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         star, flare = closed.light
         shown = (star.wavelength_nm >= 190) & (star.wavelength_nm <= 710)
         w = star.wavelength_nm[shown]
@@ -88,7 +88,7 @@ class Telescope(Picture):
         one, two = (np.where(s.flux_flam > 0, s.flux_flam, np.nan)[shown] for s in (star, flare))
         rise = np.nanmax(two / one)
         text = f"The flare multiplies the star's light by up to {short(rise)} between 190 and 710 nm."
-        return Drawn(text, {"star": {"x": w, "y": one}, "flare": {"x": w, "y": two}})
+        return PictureData(text, {"star": {"x": w, "y": one}, "flare": {"x": w, "y": two}})
 
 
 class Spectrum(Tab):
@@ -99,7 +99,7 @@ class Spectrum(Tab):
     pictures = (Recorded(), Telescope())
     files = {"observation": None}  # noqa: RUF012
 
-    def table(self, name: str, closed: Closed, answers: Answers) -> Table:
+    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         """Return one observation with the flare and its components."""
         from mauvecl.answers.signal.simulate import simulate
 

@@ -12,14 +12,14 @@ if TYPE_CHECKING:
     from numpy.typing import ArrayLike
 
     from mauvecl.study.study import Study
-    from mauvecl.web.closed import Closed
+    from mauvecl.web.closed_forms import ClosedForms
 
 #: Answers that are simulated, by name: of one question.
 Answers = Mapping[str, Any]
 
 
 @dataclass
-class Drawn:
+class PictureData:
     """Data of a picture.
 
     Attributes
@@ -70,7 +70,7 @@ class Picture(ABC):
         """Return an empty Bokeh figure in a theme's colours, with these logarithmic axes."""
 
     @abstractmethod
-    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
+    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         """Return the data of the picture."""
 
 
@@ -95,14 +95,14 @@ class Tab(ABC):
     #: Tables that can be taken along, with the simulation that each needs, or none.
     files: ClassVar[Mapping[str, str | None]] = {}
 
-    def table(self, name: str, closed: Closed, answers: Answers) -> Table:
+    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         """Return the table of one of `files`."""
         raise NotImplementedError
 
-    def rows(self, closed: Closed, answers: Answers) -> list[list[str]]:
+    def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
         """Return a small table as text with a header row; empty if there is nothing to report."""
         return []
 
-    def study(self, name: str, closed: Closed, answers: Answers) -> Study:
+    def study(self, name: str, closed: ClosedForms, answers: Answers) -> Study:
         """Return the study that reproduces one of `files`."""
         return closed.study

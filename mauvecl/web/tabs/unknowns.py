@@ -11,19 +11,19 @@ from scipy import special
 from mauvecl.answers.detection.unknown_cost import spoken, unknown_cost
 from mauvecl.noise.default_unknowns import DEFAULT_UNKNOWNS
 from mauvecl.study.nuisances import NuisanceChoice
-from mauvecl.web.closed import percent
+from mauvecl.web.closed_forms import percent
 from mauvecl.web.figures import Canvas
-from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
+from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 
 if TYPE_CHECKING:
-    from mauvecl.web.closed import Closed
+    from mauvecl.web.closed_forms import ClosedForms
 
 #: What is told of one unknown: its name, and the matched S/N plain and marginalised.
 Row = tuple[str, float, float]
 
 
 @lru_cache(maxsize=4)
-def costs(closed: Closed) -> tuple[float, list[Row]]:
+def costs(closed: ClosedForms) -> tuple[float, list[Row]]:
     """Return the flare's matched S/N with everything known, and with unknowns alone and together."""
     alone = [NuisanceChoice.model_validate({u.nuisance: _spread(u.sd)}) for u in DEFAULT_UNKNOWNS] + [
         NuisanceChoice(tilt="free")
@@ -71,7 +71,7 @@ class Cost(Picture):
         plot.x_range.start = 0
         return canvas
 
-    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
+    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         known, rows = costs(closed)
         names = [name for name, *_ in rows][::-1]
         columns: dict[str, Any] = {"name": names}
@@ -82,7 +82,7 @@ class Cost(Picture):
             f"With everything known the flare has a matched S/N of {known:.3g}; {worst[0]} leaves {worst[2]:.3g} "
             "of it, the least of these."
         )
-        return Drawn(text, {"bars": columns}, {"y range": {"factors": names}})
+        return PictureData(text, {"bars": columns}, {"y range": {"factors": names}})
 
 
 class Unknown(Tab):
@@ -95,7 +95,7 @@ class Unknown(Tab):
     )
     pictures = (Cost(),)
 
-    def rows(self, closed: Closed, answers: Answers) -> list[list[str]]:
+    def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
         known, rows = costs(closed)
         fap = closed.question.fap
         heads = ["unknown", "S/N, not looked for", "S/N, marginalised", "then detected"]

@@ -6,14 +6,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.web.closed import short
+from mauvecl.web.closed_forms import short
 from mauvecl.web.figures import Canvas
-from mauvecl.web.tabs.tab import Answers, Drawn, Picture, Tab
+from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 
 if TYPE_CHECKING:
     from astropy.table import Table
 
-    from mauvecl.web.closed import Closed
+    from mauvecl.web.closed_forms import ClosedForms
 
 
 class Hours(Picture):
@@ -29,15 +29,15 @@ class Hours(Picture):
         canvas.tooltips(told, ("hours", "y"))
         return canvas
 
-    def drawn(self, closed: Closed, answers: Answers) -> Drawn:
+    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
         orbit = closed.study.orbit
         sources: dict[str, Any] = {"area": {"x": [], "low": [], "high": []}, "hours": {"x": [], "y": []}}
         if "visible" not in answers:
             named = ", ".join(orbit.targets)
             if named:
-                return Drawn(f"When {named} is seen is not looked up yet: press Find when.", sources)
+                return PictureData(f"When {named} is seen is not looked up yet: press Find when.", sources)
             text = "No target is named yet. Name one under Advanced, such as eps Eri, and press Find when."
-            return Drawn(text, sources)
+            return PictureData(text, sources)
         table = answers["seen"]["by_day"]
         hours = np.asarray(table["hours"].to_value("h"))
         # Milliseconds, as browsers count time.
@@ -51,7 +51,7 @@ class Hours(Picture):
             f"From {orbit.start} on, {', '.join(orbit.targets)} is seen on {seen} of {hours.size} days, for "
             f"{short(float(hours.sum()))} hours in all and {hours.max():.3g} on its best day."
         )
-        return Drawn(text, sources)
+        return PictureData(text, sources)
 
 
 class Visibility(Tab):
@@ -65,10 +65,10 @@ class Visibility(Tab):
     simulations = {"visible": "Find when"}  # noqa: RUF012
     files = {"visible": "visible", "months": "visible", "days": "visible"}  # noqa: RUF012
 
-    def table(self, name: str, closed: Closed, answers: Answers) -> Table:
+    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         return answers["seen"][{"visible": "table", "months": "months", "days": "by_day"}[name]]
 
-    def rows(self, closed: Closed, answers: Answers) -> list[list[str]]:
+    def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
         if "visible" not in answers:
             return []
         table = answers["seen"]["months"]

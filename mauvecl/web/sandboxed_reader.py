@@ -77,7 +77,7 @@ def _read_apart(content: bytes) -> bytes:
         "PYTHONPATH": os.pathsep.join(filter(None, (_here(), os.environ.get("PYTHONPATH")))),
     }
     # A fresh interpreter, as spawn makes one: OpenCL does not survive a fork.
-    command = [sys.executable, "-m", "mauvecl.web.limited", str(MEMORY_MIB), str(SECONDS)]
+    command = [sys.executable, "-m", "mauvecl.web.sandboxed_reader", str(MEMORY_MIB), str(SECONDS)]
     with tempfile.TemporaryDirectory(prefix="mauvecl-upload-") as folder:
         try:
             done = subprocess.run(

@@ -1,4 +1,4 @@
-"""Closed-form answers to a visitor's question."""
+"""ClosedForms-form answers to a visitor's question."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from mauvecl.statistics.distributions import Gaussian, Mixture
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.study.messages import collect_messages
 from mauvecl.web.fields import star_words
-from mauvecl.web.smooth import Smooth
+from mauvecl.web.interpolated_form import InterpolatedForm
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -29,8 +29,8 @@ Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Closed:
-    """Closed-form answer to a question.
+class ClosedForms:
+    """ClosedForms-form answer to a question.
 
     Attributes
     ----------
@@ -54,7 +54,7 @@ class Closed:
     chance: float
 
     @classmethod
-    def of(cls, question: Question, folder: Path) -> Closed:
+    def of(cls, question: Question, folder: Path) -> ClosedForms:
         """Answer a question.
 
         Parameters
@@ -82,14 +82,14 @@ class Closed:
         return cls(q, study, light, quiet, flare, odds, chance)
 
     @cached_property
-    def null(self) -> Smooth:
+    def null(self) -> InterpolatedForm:
         """Distribution of the statistic without a flare, for pictures."""
-        return Smooth(self.odds.null)
+        return InterpolatedForm(self.odds.null)
 
     @cached_property
-    def seen(self) -> Smooth:
+    def seen(self) -> InterpolatedForm:
         """Distribution of the statistic with the flare, for pictures."""
-        return Smooth(self.odds.flaring)
+        return InterpolatedForm(self.odds.flaring)
 
     @cached_property
     def messages(self) -> list[str]:

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from tornado.httputil import HTTPServerRequest
 
 #: Largest number of simultaneous visitors, with some megabytes each (assumed to suffice for a team).
-MOST_VISITORS = 100
+MAX_VISITORS = 100
 #: A host as browsers write it: name, IPv4 address or IPv6 address in brackets; and a port.
 HOST = r"(?:[a-z0-9](?:[a-z0-9.-]*[a-z0-9])?|\[[0-9a-f:.]+\])(?::\d{1,5})?"
 
@@ -91,7 +91,7 @@ def hosts(address: str, port: int, allowed: Iterable[str]) -> frozenset[str]:
     return frozenset(plain(netloc(one, port)) for one in own) | named
 
 
-class Refused(RequestHandler):
+class RefusalHandler(RequestHandler):
     """Handler that returns an error message instead of the page."""
 
     def initialize(self, status: int, why: str) -> None:
@@ -107,7 +107,7 @@ class Refused(RequestHandler):
         await self.finish(f"{self._why}\n")
 
 
-class Door(Matcher):
+class AccessMatcher(Matcher):
     """Matcher of requests that are refused.
 
     Parameters
@@ -122,7 +122,7 @@ class Door(Matcher):
     @classmethod
     def rule(cls, allowed: frozenset[str]) -> Rule:
         """Return the routing rule, which must precede all others."""
-        return Rule(cls(allowed), Refused)
+        return Rule(cls(allowed), RefusalHandler)
 
     def match(self, request: HTTPServerRequest) -> dict[str, Any] | None:
         """Return the reason for which a request is refused, or None."""
@@ -142,6 +142,6 @@ class Door(Matcher):
 
     def _too_many(self, request: HTTPServerRequest) -> tuple[int, str] | None:
         """Return the refusal if there are too many visitors, or None."""
-        if request.path in ("/", "/live") and len(Visitor.here) >= MOST_VISITORS:
+        if request.path in ("/", "/live") and len(Visitor.here) >= MAX_VISITORS:
             return 503, "Too many visitors are here at the moment; please come again in some minutes."
         return None

@@ -132,7 +132,7 @@ def prepare() -> None:
                 packed(figure(theme, picture.name, usual) or b"")
 
 
-class Packed(RequestHandler):
+class CompressedHandler(RequestHandler):
     """Handler of static content."""
 
     def set_default_headers(self) -> None:
@@ -173,7 +173,7 @@ class Packed(RequestHandler):
         self.finish(f"The page cannot answer this ({status_code}).\n")
 
 
-class Front(Packed):
+class FrontHandler(CompressedHandler):
     """Return the page."""
 
     def get(self) -> None:
@@ -181,7 +181,7 @@ class Front(Packed):
         self.give(front(), "html")
 
 
-class Asset(Packed):
+class AssetHandler(CompressedHandler):
     """Handler of assets."""
 
     def get(self, name: str) -> None:
@@ -189,7 +189,7 @@ class Asset(Packed):
         self.give(asset(name), name.rpartition(".")[2], keep="v" in self.request.arguments)
 
 
-class Figure(Packed):
+class FigureHandler(CompressedHandler):
     """Handler of empty figures."""
 
     def get(self, theme: str, name: str) -> None:

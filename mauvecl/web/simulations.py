@@ -58,7 +58,7 @@ def completeness(study: Study, pool: Pool) -> InjectAnswer:
     return inject(Study.build(data, "page"), pool)
 
 
-def planned(study: Study) -> PlanAnswer:
+def campaign_plan(study: Study) -> PlanAnswer:
     """Compute the yield of a campaign on the target, without injections."""
     for name in study.orbit.targets:
         if Target.of(name).spectral_type is None:
@@ -83,13 +83,13 @@ def _visible(study: Study) -> dict[str, Any]:
 
 
 #: Functions of the simulations by name; they return answers by name.
-SIMULATED: dict[str, Callable[[Study, Pool], dict[str, Any]]] = {
+SIMULATIONS: dict[str, Callable[[Study, Pool], dict[str, Any]]] = {
     "detection": _detection,
     "limit": lambda study, pool: {"limit": limit(study, pool)},
     "map": lambda study, pool: {"map": map_around(study, pool)},
     "completeness": lambda study, pool: {"completeness": completeness(study, pool)},
     "visible": lambda study, pool: _visible(study),
-    "plan": lambda study, pool: {"plan": planned(study)},
+    "plan": lambda study, pool: {"plan": campaign_plan(study)},
 }
 #: Simulations that use the pool's devices.
 DRAWING = {"detection", "limit", "map"}

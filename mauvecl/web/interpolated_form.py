@@ -16,8 +16,8 @@ if TYPE_CHECKING:
     from mauvecl.statistics.distributions import Form
 
 
-class Smooth:
-    """Closed form that is exact at some points and interpolated in the probit between them.
+class InterpolatedForm:
+    """ClosedForms form that is exact at some points and interpolated in the probit between them.
 
     Parameters
     ----------
