@@ -37,7 +37,8 @@ def test_detect_answers_the_papers_question(answered: tuple[Path, str]) -> None:
     lines = text.splitlines()
     assert "not a flight calibration" in lines[0]
     assert lines[1] == "Magnitudes in V are as in catalogues: Vega has 0.03."
-    assert "false-alarm probability of 0.001 per test, 50 s (10 frames), 100,000 realisations" in lines[3]
+    assert "false-alarm probability of 0.001 per test, 50 s (10 frames), 100,000 realisations" in lines[4]
+    assert lines[3].startswith("Assumed: instrument mauve, ")
     # One line says what the unknowns of the instrument would cost.
     assert lines[2].startswith("What unknowns cost: G2V V = 7.4, flare of 0.76 %, the faintest of 8, has")
     assert "a matched S/N of 3.27 with everything known" in lines[2]
@@ -111,7 +112,7 @@ def test_a_table_is_read_back_into_its_study(answered: tuple[Path, str], tmp_pat
     table = folder / "mauvecl-detect" / "detection.ecsv"
     assert Study.read(table) == Study.read(folder / "mauvecl-detect" / "study.toml")
     (tmp_path / "no.ecsv").write_text("a b\n1 2\n")
-    assert "study 'no.ecsv' cannot be read" in run("detect", "no.ecsv", folder=tmp_path, code=2).stderr
+    assert "table 'no.ecsv' cannot be read" in run("detect", "no.ecsv", folder=tmp_path, code=2).stderr
 
 
 def test_weights_of_ones_own_in_a_study(tmp_path: Path) -> None:

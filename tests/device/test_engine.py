@@ -296,7 +296,7 @@ def test_frames_are_uncorrelated(engine: Engine) -> None:
     for frame in (0, 1, 2**32 - 1):
         scene, out = prepare([x], first_frame=frame), np.empty((20_000, x.wavelength_nm.size), np.int32)
         with scene_launches(engine.open_device, scene, 9) as run:
-            engine._tiles.over(
+            engine._tiles.for_each(
                 0, 20_000, 4 * scene.n_pixel, lambda t, n, run=run, out=out: run.realise(t, out[n : n + t.wanted])
             )
         z.append((out - x.mean_raw_dn) / np.sqrt(x.variance_dn2))

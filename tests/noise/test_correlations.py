@@ -56,7 +56,9 @@ def test_draws_are_uncorrelated(engine: Engine, name: str) -> None:
     for frame in (0, 1):
         scene, rows = prepare([x], first_frame=frame, **how), np.empty((ROWS, x.wavelength_nm.size), np.int32)
         with scene_launches(engine.open_device, scene, 17) as run:
-            engine._tiles.over(0, ROWS, 256, lambda t, n, run=run, rows=rows: run.realise(t, rows[n : n + t.wanted]))
+            engine._tiles.for_each(
+                0, ROWS, 256, lambda t, n, run=run, rows=rows: run.realise(t, rows[n : n + t.wanted])
+            )
         values.append((rows - rows.mean(axis=0)) / rows.std(axis=0))
     # Single precision moves no z by 0.01, and takes half as long.
     z = np.hstack(values, dtype=np.float32)
