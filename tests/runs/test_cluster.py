@@ -25,6 +25,7 @@ from answers import N, same, same_snr, small
 from scenes import flaring_stares, instrument, star
 from typer.testing import CliRunner
 
+from mauvecl import Study, measure
 from mauvecl.cli.app import app
 from mauvecl.device.engine import DeviceError, Engine
 from mauvecl.device.stares import Stares
@@ -122,6 +123,11 @@ def test_raw_spectra_by_two_processes(workers: DaskWorkers, tmp_path: Path, engi
     study = small().with_settings(["run.realisations=500"])
     bulk.realise(study, tmp_path / "s.zarr", Pool(workers))
     assert bulk.verify(tmp_path / "s.zarr", engine, redraw=True) == []
+
+
+def test_flares_measured_by_two_processes(workers: DaskWorkers, engine: Engine) -> None:
+    study = Study().with_settings(["star=[{library='M3V', magnitude=9}]", "flare.amplitudes=[0.5]", "measure.fits=40"])
+    assert measure(study, Pool(workers)) == measure(study, engine)
 
 
 def test_a_mistake_on_a_worker_is_a_sentence(workers: DaskWorkers) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -19,6 +19,8 @@ from mauvecl.host.tables import make_table
 from mauvecl.results.measurements.fit import LEVELS, Forecast, Measurement, fit, forecast
 from mauvecl.results.measurements.model import FlareModel
 from mauvecl.results.measurements.reduction import Reduction, variance_of
+from mauvecl.runs.checkpoint import kept
+from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.statistics.intervals import clopper_pearson
 from mauvecl.study.labels import label, stack_tables
 from mauvecl.study.measurements import fitted_models
@@ -30,6 +32,7 @@ if TYPE_CHECKING:
 
     from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
+    from mauvecl.results.sums import Arrays
     from mauvecl.statistics.nuisances import Nuisances
     from mauvecl.study.assumptions import Use
     from mauvecl.study.sections import Star
@@ -211,15 +214,15 @@ class MeasureAnswer(Answer):
 
 @public
 def measure(
-    study: Study, engine: Engine | None = None, progress: Callable[[int, int], None] | None = None
+    study: Study, engine: Engine | Pool | None = None, progress: Callable[[int, int], None] | None = None
 ) -> MeasureAnswer:
     """Forecast and simulate what is measured of a study's flares in one exposure.
 
     Parameters
     ----------
     study : Study
-    engine : Engine, optional
-        Draws the exposures; the default device.
+    engine : Engine or Pool, optional
+        Draws the exposures; the default device. The checkpoint of a pool keeps the fits that are finished.
     progress : callable, optional
         Receives the flares that are done, and all of them.
 
@@ -233,19 +236,20 @@ def measure(
     if any(not amplitude > 0.0 for _, cell in study.cells() for amplitude in cell.flare.amplitudes):
         raise InputError("flare amplitude = 0 in a measurement, expected one above 0")
     prepared = [(at, cell, star, cell.expectations(star)) for at, cell in study.cells() for star in cell.star]
-    flares: list[MeasuredFlare] = []
     if engine is None:
         from mauvecl.device.engine import Engine as Default
 
         engine = Default()
-    n = sum(len(group) - 1 for *_, group in prepared)
-    done = 0
-    for at, cell, star, (quiet, *lit) in prepared:
-        for amplitude, flare in zip(cell.flare.amplitudes, lit, strict=True):
-            flares += _measured(cell, star, quiet, flare, amplitude, InCell(label(star, quiet), at), engine)
-            done += 1
-            if progress is not None:
-                progress(done, n)
+    asked = [
+        (cell, star, quiet, flare, amplitude, InCell(label(star, quiet), at), engine)
+        for at, cell, star, (quiet, *lit) in prepared
+        for amplitude, flare in zip(cell.flare.amplitudes, lit, strict=True)
+    ]
+    flares: list[MeasuredFlare] = []
+    for done, some in enumerate(map_in_order(engine, lambda one: _measured(*one), asked), 1):
+        flares += some
+        if progress is not None:
+            progress(done, len(asked))
     messages = collect_messages([x for *_, group in prepared for x in group])
     return MeasureAnswer(study, flares, [*messages, *_wrong(flares)])
 
@@ -257,7 +261,7 @@ def _measured(
     flare: Expectation,
     amplitude: float,
     where: InCell,
-    engine: Engine,
+    engine: Engine | Pool,
 ) -> list[MeasuredFlare]:
     source, asked = star.source(), study.measure
     light = study.flare.light()
@@ -285,15 +289,25 @@ def _measured(
     weights = _matched(quiet, flare, unknown)[0]
     lit = flare.recorded_dn - quiet.recorded_dn
     snr = _matched(quiet, flare, None, lit)[1], _matched(quiet, flare, unknown, lit)[1]
-    for start in range(0, asked.fits, BATCH):
-        count = min(BATCH, asked.fits - start)
+
+    def fitted(start: int, count: int) -> Arrays:
         raw = engine.realise(flare, start=start, count=count, seed=study.run.seed, **study.drawing)
         excess = raw - quiet.recorded_dn
-        if start == 0:
-            first = excess[0]
-        detected.append(excess @ weights >= scipy.stats.norm.isf(study.run.fap))
-        for name, model in models.items():
-            found[name].append(fit(raw, quiet, model, unknown, levels=LEVELS))
+        arrays: Arrays = {"first": excess[0], "detected": excess @ weights >= scipy.stats.norm.isf(study.run.fap)}
+        for k, model in enumerate(models.values()):
+            arrays |= {f"{k} {key}": value for key, value in fit(raw, quiet, model, unknown).arrays().items()}
+        return arrays
+
+    checkpoint = engine.checkpoint if isinstance(engine, Pool) else None
+    for start in range(0, asked.fits, BATCH):
+        count = min(BATCH, asked.fits - start)
+        depends_on = ("measure", quiet, flare, unknown, list(models.values()), study.text(), start, count)
+        arrays = kept(checkpoint, depends_on, partial(fitted, start, count))
+        first = arrays["first"] if start == 0 else first
+        detected.append(arrays["detected"])
+        for k, (name, model) in enumerate(models.items()):
+            own = {key.removeprefix(f"{k} "): value for key, value in arrays.items() if key.startswith(f"{k} ")}
+            found[name].append(Measurement.of_arrays(model, LEVELS, own))
     measured = []
     for name, model in models.items():
         perfect = fit(flare.recorded_dn, quiet, model, unknown, levels=LEVELS)

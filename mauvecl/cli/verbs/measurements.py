@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mauvecl.cli.flags import DETECTION, DRAWS, FLARE, MEASURE, NUISANCES, SIZE, SWEEP, DeviceFlag
+from mauvecl.cli.flags import DETECTION, DRAWS, FLARE, MEASURE, NUISANCES, SIZE, SWEEP
 from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
@@ -15,8 +15,8 @@ if TYPE_CHECKING:
 SELECTED = {"fap": DETECTION["fap"]}
 
 
-@takes_study(FLARE, MEASURE, NUISANCES, SIZE, SELECTED, {"seed": DRAWS["seed"]}, SWEEP, draws=False)
-def measure(study: Study, session: Session, device: DeviceFlag = None) -> None:
+@takes_study(FLARE, MEASURE, NUISANCES, SIZE, SELECTED, {"seed": DRAWS["seed"]}, SWEEP)
+def measure(study: Study, session: Session) -> None:
     """What would be measured of a flare's spectrum, and how well.
 
     Temperature, area, energy, Balmer jump and lines: errors in advance, simulated fits with the coverage of their
@@ -26,13 +26,7 @@ def measure(study: Study, session: Session, device: DeviceFlag = None) -> None:
 
     mauvecl measure --star M3V --magnitude 9 --amplitude 0.5 --sweep exposure=50,300 --distance 5 --radius 0.4
     """
-    from mauvecl.answers.measurements.measure import measure as compute
-    from mauvecl.device.engine import Engine
-
-    engine = Engine(device)
-    session.opened = engine.open_device
-    with session.metered("flares") as meter:
-        answer = compute(study, engine, progress=meter)
+    answer = session.ask(study)
     session.answer(answer, lambda: _show(answer))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING, Any, Self
 
@@ -94,6 +94,17 @@ class Measurement:
                 axis = 1 if name in ("low", "high") else 0
                 values[name] = np.concatenate([getattr(part, name) for part in parts], axis)
         return cls(**values)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """Return everything that depends on the frames, for files; `of_arrays` reads it."""
+        values = {one.name: np.asarray(getattr(self, one.name)) for one in fields(self)}
+        return {name: value for name, value in values.items() if name not in ("names", "units", "levels")}
+
+    @classmethod
+    def of_arrays(cls, model: FlareModel, levels: Sequence[float], arrays: Mapping[str, NDArray[Any]]) -> Self:
+        """Return the measurement of a model's flares that `arrays` gave."""
+        given: dict[str, Any] = {**arrays, "dof": int(arrays["dof"])}
+        return cls(model.names, model.units, levels=tuple(levels), **given)
 
     def rows(self, which: NDArray[Any]) -> Self:
         """Return the measurements of some frames, by number or mask."""
@@ -213,8 +224,7 @@ def fit(
     }
     dof = joined.pop("dof")
     joined["p_value"] = np.asarray(scipy.stats.chi2.sf(joined["chi2"], dof))
-    units = tuple(one.unit for one in model.derived)
-    return Measurement(model.names, units, levels=tuple(levels), dof=int(dof.min()), **joined)
+    return Measurement(model.names, model.units, levels=tuple(levels), dof=int(dof.min()), **joined)
 
 
 def _pilot(excess: Float, model: FlareModel, reduction: Reduction) -> tuple[Float, Float]:
@@ -358,6 +368,5 @@ def forecast(
     hot, slope = reduction.spline(log_k), reduction.spline(log_k, 1)
     spread = covariance_at(model, log_k, linear, hot, slope, reduction.fixed)[0]
     signal = linear[:, :1] * hot + linear[:, 1:] @ reduction.fixed
-    units = tuple(one.unit for one in model.derived)
     values = derived_values(model, log_k, linear)[0]
-    return Forecast(model.names, units, values, np.sqrt(np.diag(spread)), spread, float(np.linalg.norm(signal)))
+    return Forecast(model.names, model.units, values, np.sqrt(np.diag(spread)), spread, float(np.linalg.norm(signal)))

@@ -199,6 +199,11 @@ class FlareModel:
         """Names of what fits report."""
         return tuple(one.name for one in self.derived)
 
+    @property
+    def units(self) -> tuple[str, ...]:
+        """Their units."""
+        return tuple(one.unit for one in self.derived)
+
     @cached_property
     def hot_spline(self) -> scipy.interpolate.CubicSpline:
         """Counts of the blackbody over log temperature."""
