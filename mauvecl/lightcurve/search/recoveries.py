@@ -1,7 +1,7 @@
 """How well found flares are recovered: fits of injected ones, held against what was injected.
 
-Each injected flare is fitted alone (`recovery`), with standard errors by curvature. Flares that `stare` finds are fitted
-together and have intervals by profile likelihood (`alarms`), which hold the truth more often near the threshold.
+Each injected flare is fitted alone (`recovery`), with standard errors by curvature. Flares that `stare` finds are
+fitted together and have intervals by profile likelihood (`alarms`), which hold the truth more often near the threshold.
 """
 
 from __future__ import annotations
