@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from mauvecl.lightcurve.usual import HALF_WIDTHS_S, RANK, WINDOW_S, Per, check_shape, per_day
+from mauvecl.lightcurve.defaults import HALF_WIDTHS_S, RANK, WINDOW_S, Per, check_shape, per_day
 from mauvecl.study.nuisances import Spread
 from mauvecl.study.sections import Section
 

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.usual import ORBIT_S, check_shape
+from mauvecl.lightcurve.defaults import ORBIT_S, check_shape
 from mauvecl.study.sections import Section
 
 if TYPE_CHECKING:

@@ -12,7 +12,7 @@ from mauvecl.host.errors import InputError
 from mauvecl.host.stars.flare import check_scales
 from mauvecl.lightcurve.flares.shapes import shape_of
 from mauvecl.lightcurve.search.bank import Bank
-from mauvecl.lightcurve.search.recovery import Fit
+from mauvecl.lightcurve.search.flare_fit import Fit
 from mauvecl.lightcurve.search.survey import Survey
 from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates, frame_nuisances
 from mauvecl.lightcurve.stares.components import Components

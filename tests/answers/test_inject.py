@@ -12,7 +12,7 @@ from mauvecl.answers.stares.inject import inject
 from mauvecl.device.engine import Engine
 from mauvecl.device.stares import Stares
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.search.injected import Injected
+from mauvecl.lightcurve.search.injected_completeness import InjectedCompleteness
 from mauvecl.runs.checkpoint import Checkpoint
 from mauvecl.runs.pool import LocalWorkers, Pool
 from mauvecl.statistics.intervals import clopper_pearson
@@ -168,17 +168,17 @@ def test_rays_and_saturation(stares):
 def test_intervals_widen_where_positions_differ():
     """Binomial where all positions are alike, of the positions alone where each finds all or nothing."""
     rng = np.random.default_rng(2)
-    alike = Injected((1.0,), np.array([0.5]), np.ones((1, 1)), rng.random((1, 20, 100)))
+    alike = InjectedCompleteness((1.0,), np.array([0.5]), np.ones((1, 1)), rng.random((1, 20, 100)))
     exact = clopper_pearson(round(alike.completeness[0, 0] * 2000), 2000)
     assert alike.completeness_high[0, 0] - alike.completeness_low[0, 0] < 1.6 * (exact.high - exact.low)
     whole = np.repeat(rng.random((1, 20, 1)), 100, axis=2)
-    apart = Injected((1.0,), np.array([0.5]), np.ones((1, 1)), whole)
+    apart = InjectedCompleteness((1.0,), np.array([0.5]), np.ones((1, 1)), whole)
     assert apart.completeness_high[0, 0] - apart.completeness_low[0, 0] > 0.35
     # Quantiles have the same: of 2000 even draws the median is known to 0.022 each way.
     half = alike.limit(0.5, 0)
     assert half.low < 0.5 < half.high
     assert half.high - half.low < 0.08
-    never = Injected((1.0,), np.array([0.5]), np.ones((1, 1)), np.full((1, 4, 5), np.inf))
+    never = InjectedCompleteness((1.0,), np.array([0.5]), np.ones((1, 1)), np.full((1, 4, 5), np.inf))
     assert never.limit(0.5, 0).value == np.inf
     assert never.never(0) == 1.0
 

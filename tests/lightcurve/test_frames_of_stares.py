@@ -8,9 +8,9 @@ from scenes import instrument, star
 from scipy.integrate import quad
 
 from mauvecl.host.errors import InputError
+from mauvecl.lightcurve.defaults import ORBIT_S
 from mauvecl.lightcurve.stares.curves import Sinusoid, Table
 from mauvecl.lightcurve.stares.stare import Stare, StareUnknown
-from mauvecl.lightcurve.usual import ORBIT_S
 
 
 def test_frames_and_gaps():

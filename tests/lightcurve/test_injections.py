@@ -14,11 +14,11 @@ from searches import DAVENPORT, KNOWN, ONE, spectra, survey
 from mauvecl.device.stares import Stares
 from mauvecl.lightcurve.search import places
 from mauvecl.lightcurve.search.bank import Bank, Level
+from mauvecl.lightcurve.search.counted_rate import consecutive_alarm_rate, consecutive_alarms
+from mauvecl.lightcurve.search.flare_fit import Fit
+from mauvecl.lightcurve.search.importance_sampling import sample_rate
+from mauvecl.lightcurve.search.injection_sites import OVERLAP, places_of
 from mauvecl.lightcurve.search.injections import Injections
-from mauvecl.lightcurve.search.null import in_a_row, in_a_row_rate
-from mauvecl.lightcurve.search.places import OVERLAP, places_of
-from mauvecl.lightcurve.search.recovery import Fit
-from mauvecl.lightcurve.search.sampled import sampled
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.noise.processes import CosmicRays
@@ -34,8 +34,8 @@ def day():
     """The bank of the theory's table, from 30 s on, and its threshold at the rate of three points above three sigma."""
     # A hundred draws: 0.015 of standard error.
     bank = Bank(tuple(30.0 * 2**k for k in range(8)), ONE, DAVENPORT, 5.0, KNOWN)
-    return bank, sampled(Search(bank, Stare.of(86_400.0)), seed=1, draws=100).threshold(
-        in_a_row_rate(3, 3.0, 5.0)
+    return bank, sample_rate(Search(bank, Stare.of(86_400.0)), seed=1, draws=100).threshold(
+        consecutive_alarm_rate(3, 3.0, 5.0)
     ).value  # fmt: skip
 
 
@@ -54,7 +54,7 @@ def test_half_are_found(day, half_width):
         each = np.where(flares > 1e-12, (3.0 - noise) / flares, np.inf)
     run = np.maximum(np.maximum(each[:, :-2], each[:, 1:-1]), each[:, 2:])[:, 90:]
     in_row = np.median(np.maximum(run.min(axis=1), 0))
-    assert in_a_row(noise[0] + 1.001 * max(run[0].min(), 0) * flares[0], 3, 3.0).any()
+    assert consecutive_alarms(noise[0] + 1.001 * max(run[0].min(), 0) * flares[0], 3, 3.0).any()
     # The bank: values are linear in the amplitude.
     search = Search(bank, Stare.of(frames * 5.0))
     critical = np.full(n, np.inf)

@@ -9,14 +9,14 @@ from searches import DAVENPORT, KNOWN, ONE, survey
 
 from mauvecl.device.stares import Stares
 from mauvecl.host.errors import InputError
+from mauvecl.lightcurve.defaults import DAYS, per_day
 from mauvecl.lightcurve.search.bank import Bank, Level
-from mauvecl.lightcurve.search.null import Counted, in_a_row, in_a_row_rate
-from mauvecl.lightcurve.search.sampled import LADDER, sampled
+from mauvecl.lightcurve.search.counted_rate import CountedRate, consecutive_alarm_rate, consecutive_alarms
+from mauvecl.lightcurve.search.importance_sampling import LADDER, sample_rate
 from mauvecl.lightcurve.search.scatter import Scatter
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.stares.curves import Sinusoid
 from mauvecl.lightcurve.stares.stare import Stare
-from mauvecl.lightcurve.usual import DAYS, per_day
 from mauvecl.study.searches import SearchChoice
 
 
@@ -24,7 +24,7 @@ class TestInARow:
     """Three consecutive points above three sigma."""
 
     def test_rate_of_the_theory(self):
-        assert in_a_row_rate(3, 3.0, 5.0) == pytest.approx(4.245e-5, rel=5e-4)
+        assert consecutive_alarm_rate(3, 3.0, 5.0) == pytest.approx(4.245e-5, rel=5e-4)
 
     def test_rate_is_that_of_the_chain(self):
         """Runs that begin, by the states of a Markov chain: how many of the last points were above."""
@@ -35,18 +35,18 @@ class TestInARow:
             state = np.array(
                 [state.sum() * (1 - above), state[0] * above, state[1] * above, (state[2] + state[3]) * above]
             )
-        assert in_a_row_rate(points, 1.5, 86_400 / frames) == pytest.approx(alarms, rel=1e-12)
+        assert consecutive_alarm_rate(points, 1.5, 86_400 / frames) == pytest.approx(alarms, rel=1e-12)
 
     def test_alarms_of_noise(self):
         """As many as the rate says: fails by chance once in 10^4 runs (4 standard errors of a Poisson count)."""
         noise = np.random.default_rng(4).standard_normal((500, 17280), dtype=np.float32)
-        expected = 500 * in_a_row_rate(3, 2.0, 5.0)
-        assert abs(in_a_row(noise, 3, 2.0).sum() - expected) < 4 * np.sqrt(expected)
+        expected = 500 * consecutive_alarm_rate(3, 2.0, 5.0)
+        assert abs(consecutive_alarms(noise, 3, 2.0).sum() - expected) < 4 * np.sqrt(expected)
 
     def test_a_long_run_is_one_alarm(self):
         values = np.array([0, 4, 4, 4, 4, 4, 0, 4, 4, 0, 4, 4, 4.0])
-        assert np.flatnonzero(in_a_row(values, 3, 3.0)).tolist() == [3, 12]
-        assert not in_a_row(values[:2], 3, 3.0).any()
+        assert np.flatnonzero(consecutive_alarms(values, 3, 3.0)).tolist() == [3, 12]
+        assert not consecutive_alarms(values[:2], 3, 3.0).any()
 
 
 def test_rates_per_day_month_and_year():
@@ -60,7 +60,7 @@ def test_rates_per_day_month_and_year():
 
 def test_counted_null_by_inversion():
     """The rate at the threshold of a rate is that rate, within a count."""
-    null = Counted(np.sort(np.random.default_rng(1).gumbel(size=1000)), 0.5)
+    null = CountedRate(np.sort(np.random.default_rng(1).gumbel(size=1000)), 0.5)
     cut = null.threshold(0.3)
     assert null.rate(cut.value).value == pytest.approx(0.3, rel=0.02)
     assert cut.low < cut.value < cut.high
@@ -74,7 +74,7 @@ def short():
     stare = Stare.of(9000.0, gaps=[(4000, 5000)])
     bank = Bank((20.0, 60.0, 180.0), np.array([[1.0, 0.0], [0.8, 0.6]]), DAVENPORT, 5.0, Level(window_s=900.0))
     search = Search(bank, stare)
-    return search, sampled(search, seed=2, draws=400)
+    return search, sample_rate(search, seed=2, draws=400)
 
 
 class TestSampled:
@@ -100,7 +100,7 @@ class TestSampled:
         """
         stare = Stare.of(5000.0)
         search = Search(SearchChoice().white_bank(5.0), stare)
-        repeats = [sampled(search, seed=seed) for seed in range(20)]
+        repeats = [sample_rate(search, seed=seed) for seed in range(20)]
         for u in (4.25, 5.0, 6.5):
             k = LADDER.index(u)
             p, error = (np.array([getattr(tail, name)[k] for tail in repeats]) for name in ("probability", "error"))
@@ -119,7 +119,7 @@ class TestSampled:
         """Independent frames: templates shorter than a frame leave P = 1 - (1 - Q)^n."""
         stare = Stare.of(500.0)
         search = Search(Bank((0.02,), ONE, DAVENPORT, 5.0, KNOWN), stare)
-        tail = sampled(search, seed=1, draws=50)
+        tail = sample_rate(search, seed=1, draws=50)
         # Both phases of a template see its one frame: they are the same filter.
         exact = -np.expm1(100 * np.log1p(-special.ndtr(-tail.thresholds)))
         kept = tail.thresholds >= 4.5
@@ -173,7 +173,7 @@ def test_false_alarms_in_random_stares(stares):
         stare, level, free = random_stare(rng)
         one, _ = survey(stare, level, (25.0, 120.0), more=free)
         days = stare.observed_s / 86_400
-        tail = sampled(one.search, seed=number, draws=25).under(Scatter.of(one, number))
+        tail = sample_rate(one.search, seed=number, draws=25).under(Scatter.of(one, number))
         cut = tail.threshold(-np.log1p(-asked) / days).value
         sums = stares.frames(one.components, stare, count=draws, seed=100 + number, method="cumulants")
         alarms += int(np.sum(one.search.largest(one.net(sums)).maximum > cut))
@@ -204,7 +204,7 @@ def test_false_alarms_where_noise_is_unknown(stares):
         offsets={"temperature": 4.0},
     )  # fmt: skip
     one, _ = survey(stare, Level(window_s=1200.0), (25.0, 80.0), magnitude=9.5, part=True)
-    known = sampled(one.search, seed=3, draws=60)
+    known = sample_rate(one.search, seed=3, draws=60)
     tail, n = known.under(Scatter.of(one, 3)), 500
     maxima = stares.reduced(one.null(n, 8))["maximum"]
     for u in (4.0, 4.5, 5.0):

@@ -107,8 +107,9 @@ def step_at(energy: float, band: str = "Kepler") -> Completeness:
 def test_recovered_from_an_energy_on() -> None:
     law = davenport2019(mass_msun=0.5, age_myr=100)
     assert recovered_per_day(law, step_at(1e33)) == pytest.approx(float(law.per_day_above(1e33)), rel=0.02)
-    with pytest.raises(InputError, match="expected one band"):
+    with pytest.raises(InputError) as error:
         recovered_per_day(law, step_at(1e33, "bolometric"))
+    assert error.value.key == "band"
 
 
 def test_yield_is_poissons_without_scatter() -> None:

@@ -60,7 +60,7 @@ def test_refusals(star):
     quiet, _ = star
     stare = Stare.of(100.0)
     light = frame_nuisances(quiet, stare, {"light": np.inf})
-    with pytest.raises(InputError, match="cannot be told from light"):
+    with pytest.raises(InputError, match="cannot be distinguished from light"):
         Templates.of(quiet, light.spectra, (1.0,), nuisances=light)
     jittered = Stare.of(100.0, jitters={"light": 0.01, "temperature": 0.1})
     assert frame_nuisances(quiet, stare) is None

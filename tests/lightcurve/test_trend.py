@@ -7,12 +7,12 @@ import pytest
 from searches import DAVENPORT, survey
 
 from mauvecl.host.errors import InputError
+from mauvecl.lightcurve.defaults import per_day
 from mauvecl.lightcurve.search.bank import Level
-from mauvecl.lightcurve.search.recovery import Fit
-from mauvecl.lightcurve.search.sampled import sampled
+from mauvecl.lightcurve.search.flare_fit import Fit
+from mauvecl.lightcurve.search.importance_sampling import sample_rate
 from mauvecl.lightcurve.stares.curves import Sinusoid
 from mauvecl.lightcurve.stares.stare import Stare
-from mauvecl.lightcurve.usual import per_day
 
 
 def drawn(one, rng, count, farther=1.0):
@@ -101,7 +101,7 @@ def test_thresholds_allow_for_what_is_left_in():
         assert tail.shifted
         maxima = one.search.largest(one.net(drawn(one, rng, count)[0])).maximum
         alarms += int(np.sum(maxima > tail.threshold(rate).value))
-        plain += int(np.sum(maxima > sampled(one.search, seed=number).threshold(rate).value))
+        plain += int(np.sum(maxima > sample_rate(one.search, seed=number).threshold(rate).value))
     expected, spread = 6 * count * asked, np.sqrt(6 * count * asked * (1 - asked))
     assert expected / 1.3 - 4 * spread < alarms < 1.3 * expected + 4 * spread
     assert plain > 1.5 * alarms

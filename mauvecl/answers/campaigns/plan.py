@@ -26,7 +26,7 @@ from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.orbit.conditions import PARTICLES_SOURCE, THERMAL_SOURCE
 from mauvecl.host.tables import make_table
-from mauvecl.lightcurve.search.null import DAY_S
+from mauvecl.lightcurve.search.counted_rate import DAY_S
 from mauvecl.lightcurve.search.yields import Yield, recovered_per_day
 from mauvecl.runs.pool import map_in_order
 from mauvecl.study.labels import describe_columns, stack_tables

@@ -15,10 +15,10 @@ from mauvecl.answers.answer import Answer, InCell
 from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.tables import make_table
-from mauvecl.lightcurve.search.injected import Injected
+from mauvecl.lightcurve.search.counted_rate import DAY_S, CountedRate, consecutive_alarm_rate
+from mauvecl.lightcurve.search.fit_accuracy import FitAccuracy, Refit
+from mauvecl.lightcurve.search.injected_completeness import InjectedCompleteness
 from mauvecl.lightcurve.search.injections import Injections
-from mauvecl.lightcurve.search.null import DAY_S, Counted, in_a_row_rate
-from mauvecl.lightcurve.search.recoveries import Fitted, Refit
 from mauvecl.lightcurve.stares.requests import Arrays
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.statistics.intervals import Interval
@@ -74,8 +74,8 @@ class StarCompleteness(InCell):
         Amplitude from which on flares saturate a used pixel, which injections leave out.
     in_a_row : float
         False alarms per star-day of the common rule in white noise.
-    injected : Injected
-    fitted : Fitted, optional
+    injected : InjectedCompleteness
+    fitted : FitAccuracy, optional
     """
 
     surveyed: StarSurvey
@@ -89,8 +89,8 @@ class StarCompleteness(InCell):
     shifted: bool
     saturates: float
     in_a_row: float
-    injected: Injected
-    fitted: Fitted | None
+    injected: InjectedCompleteness
+    fitted: FitAccuracy | None
 
     @property
     def messages(self) -> list[str]:
@@ -200,7 +200,7 @@ def _cells(star: StarCompleteness) -> QTable:
         ("injections", np.full(d.size, injected.count)),
     ]
     if star.fitted is not None:
-        columns += [(name, getattr(star.fitted, name)[d, s], text) for name, text in Fitted.COLUMNS.items()]
+        columns += [(name, getattr(star.fitted, name)[d, s], text) for name, text in FitAccuracy.COLUMNS.items()]
     return describe_columns(make_table(columns))
 
 
@@ -286,7 +286,7 @@ def _star(
     drawn = None
     if choice.nulls:
         maxima = _reduced(engine, survey.null(choice.nulls, seed, rays))["maximum"]
-        drawn = Counted(np.sort(maxima), survey.stare.observed_s / DAY_S)
+        drawn = CountedRate(np.sort(maxima), survey.stare.observed_s / DAY_S)
     tail = survey.tail(seed)
     threshold = (
         tail.threshold(choice.rate) if choice.null == "sampled" or drawn is None else drawn.threshold(choice.rate)
@@ -327,9 +327,11 @@ def _star(
         float(should),
         tail.shifted and choice.null == "sampled",
         injections.saturates,
-        in_a_row_rate(choice.points, choice.sigma, survey.stare.frame_s),
-        Injected(injections.half_widths_s, values, amplitudes, sizes.of_amplitude(critical, widths[:, None, None])),
-        Fitted.of(parts) if refit.count else None,
+        consecutive_alarm_rate(choice.points, choice.sigma, survey.stare.frame_s),
+        InjectedCompleteness(
+            injections.half_widths_s, values, amplitudes, sizes.of_amplitude(critical, widths[:, None, None])
+        ),
+        FitAccuracy.of(parts) if refit.count else None,
     )
 
 
@@ -338,7 +340,7 @@ def _reduced(engine: Stares | Pool, request: StaresRequest) -> Arrays:
 
 
 def _checked(
-    drawn: Counted | None, value: float, probability: float, error: float, longer: float
+    drawn: CountedRate | None, value: float, probability: float, error: float, longer: float
 ) -> tuple[Interval, float]:
     """False alarms per star-day of drawn stares at a value, within 4 standard errors, and what was expected."""
     if drawn is None:

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
     from mauvecl.host.stars.source import Source
     from mauvecl.lightcurve.search.blends import Factor
-    from mauvecl.lightcurve.search.recovery import Recovered
+    from mauvecl.lightcurve.search.flare_fit import FittedFlares
     from mauvecl.results.sums import Arrays
     from mauvecl.runs.checkpoint import Checkpoint
     from mauvecl.study.assumptions import Use
@@ -402,7 +402,7 @@ def _searched(
     return Searched(threshold, raised, tuple(energies), tuple(nearest), bool(tail["shifted"]))
 
 
-def _event_of(study: Study, fit: Recovered) -> Event:
+def _event_of(study: Study, fit: FittedFlares) -> Event:
     """Return a fitted flare as an event."""
     kelvin = float(np.nan_to_num(fit.temperature_k[0], nan=study.flare.temperature_k))
     return Event(float(fit.peak_s[0]), float(fit.half_width_s[0]), float(fit.amplitude[0]), kelvin, study.search.shape)

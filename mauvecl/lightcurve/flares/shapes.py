@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import shortened
-from mauvecl.lightcurve.usual import check_shape
+from mauvecl.lightcurve.defaults import check_shape
 
 Float = NDArray[np.float64]
 

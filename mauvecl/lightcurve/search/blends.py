@@ -1,9 +1,8 @@
-"""Flares that overlap, fitted together: non-linear least squares, with intervals by profile likelihood.
+"""Joint fits of overlapping flares by non-linear least squares, with intervals from the profile likelihood.
 
-A block is what is fitted at once: flares whose light overlaps, over the union of their windows, on a level that is
-marginalised as the search marginalises it (a straight line over the window of the widest flare, a continuous line of
-such pieces where the block is longer). Light of flares outside of the block is subtracted. The noise of a frame holds
-the photons of the flares themselves.
+A block is the unit of a fit: overlapping flares, over the union of their windows. The baseline is marginalised as in
+the search: a straight line over the window of the widest flare, or a continuous piecewise line in longer blocks. Flux
+of flares outside the block is subtracted. The noise of a frame includes the photon noise of the flares.
 """
 
 from __future__ import annotations
@@ -17,7 +16,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.search.recovery import Fit
+from mauvecl.lightcurve.search.flare_fit import Fit
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.search.survey import Survey
@@ -25,47 +24,35 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Columns of a flare's parameters: logarithm of the amplitude, time of the peak in s, logarithms of the half-width in s
-#: and of the temperature in K.
+#: Columns of a flare's parameters: log amplitude, peak time in s, log half-width in s, log temperature in K.
 AMPLITUDE, PEAK, WIDTH, KELVIN = range(4)
-#: Factor beyond the bank's half-widths up to which a half-width is measured.
+#: Factor by which fitted half-widths may exceed the range of the bank.
 BEYOND_BANK = 1.25
-#: Half-widths before and after a peak between which flares are taken to overlap, and beyond which light is neglected.
+#: Half-widths before and after a peak within which flares overlap, and beyond which their flux is neglected.
 OVERLAP_BEFORE, OVERLAP_AFTER = 2.0, 10.0
 LIGHT_BEFORE, LIGHT_AFTER = 5.0, 80.0
-#: Ends of the logarithm of an amplitude.
+#: Bounds of log amplitude.
 LOG_AMPLITUDES = (-27.0, 14.0)
-#: Relative change of chi-squared at which a fit ends, and evaluations after which it has not converged.
-CONVERGED, MOST_EVALUATIONS = 1e-7, 100
-#: Difference from 1 of the root of what chi-squared rises by over what it is to rise by, at which an end of an interval
-#: is found; most refits.
-CLOSE, MOST_REFITS = 0.02, 12
-#: Ways beyond an end of an interval, over the way to it, where another optimum is looked for.
+#: Relative change of chi-squared at which a fit has converged, and its largest number of evaluations.
+CONVERGED, MAX_EVALUATIONS = 1e-7, 100
+#: Relative tolerance of the root of the rise of chi-squared at an end of an interval, and largest number of refits.
+CLOSE, MAX_REFITS = 0.02, 12
+#: Distances beyond an end of an interval, relative to its distance from the fit, at which to look for other optima.
 BEYOND = (1.5, 1.5, 1.5)
-#: Fall of chi-squared during profiling that shows a better fit than the one that was thought the best.
+#: Fall of chi-squared during profiling that indicates a better fit.
 BETTER = 0.05
 
-#: Logarithm of a further factor of a profiled product, over the logarithm of the temperature, with its derivative.
+#: Logarithm of a factor in a profiled product as a function of log temperature, with its derivative.
 Factor = Callable[[float], tuple[float, float]]
 
 
 @dataclass(frozen=True, eq=False)
-class Blended:
-    """A block's flares as fitted.
+class BlendFit:
+    """Fit of the flares of a block."""
 
-    Attributes
-    ----------
-    theta : ndarray, shape (n_flare, 4)
-        Columns as `AMPLITUDE` and those after it.
-    chi2 : float
-    dof : int
-        Sums of frames, less terms of the level and parameters of flares.
-    converged : bool
-    """
-
-    theta: Float
+    theta: Float  # shape (n_flare, 4); columns as `AMPLITUDE` and following
     chi2: float
-    dof: int
+    dof: int  # number of sums less the number of baseline terms and flare parameters
     converged: bool
 
     @property
@@ -76,40 +63,25 @@ class Blended:
 
 @dataclass(frozen=True, eq=False)
 class Interval:
-    """A 68 % interval by profile likelihood.
-
-    Attributes
-    ----------
-    low, high : float
-    open_low, open_high : bool
-        Whether the interval runs into the end of what is fitted.
-    """
+    """A 68 % interval from the profile likelihood."""
 
     low: float
     high: float
-    open_low: bool = False
+    open_low: bool = False  # the interval ends at a bound of the fit
     open_high: bool = False
 
 
 @dataclass(frozen=True, eq=False)
-class Sums:
-    """The sums of a stare in which flares are fitted.
-
-    Attributes
-    ----------
-    survey : Survey
-    templates : Templates
-    net : ndarray, shape (n_frame, n_sum)
-        Less what is known.
-    """
+class StareSums:
+    """The sums of a stare to which flares are fitted."""
 
     survey: Survey
     templates: Templates
-    net: Float
+    net: Float  # sums less their known means, shape (n_frame, n_sum)
 
     @cached_property
     def response(self) -> tuple[Any, Any, float, float]:
-        """Sums of a flare of one amplitude over log temperature, their derivative, and the ends."""
+        """Sums of a flare of unit amplitude as a function of log temperature, their derivative, and its range."""
         return Fit(self.survey.bank, self.templates).response
 
     @cached_property
@@ -120,17 +92,17 @@ class Sums:
 
     @cached_property
     def covariance(self) -> Float:
-        """Of each frame's sums without a flare, shape (n_frame, n_sum, n_sum)."""
+        """Covariance of each frame's sums without a flare, shape (n_frame, n_sum, n_sum)."""
         return self.survey.covariance()
 
     @property
     def free(self) -> list[int]:
-        """Columns of parameters that are fitted."""
+        """Columns of fitted parameters."""
         return [AMPLITUDE, PEAK, WIDTH, *([KELVIN] if len(self.templates.temperatures_k) > 1 else [])]
 
     @cached_property
     def bounds(self) -> tuple[Float, Float]:
-        """Ends of a flare's parameters: the stare, the bank and the templates, shape (4,) each."""
+        """Bounds of a flare's parameters, from the stare, the bank and the templates, shape (4,) each."""
         widths, (_, _, coolest, hottest) = self.survey.bank.half_widths_s, self.response
         first, last = self.edges[0, 0], self.edges[-1, 1]
         narrow, wide = np.log(widths[0] / BEYOND_BANK), np.log(widths[-1] * BEYOND_BANK)
@@ -138,38 +110,38 @@ class Sums:
         return np.array([low, first, narrow, coolest]), np.array([high, last, wide, hottest])
 
     def frames(self, first_s: float, last_s: float) -> slice:
-        """Frames that touch a span of time."""
+        """Return the frames that overlap a time interval."""
         ends = np.searchsorted(self.edges[:, 0], [first_s - self.survey.stare.frame_s, last_s])
         return slice(int(ends[0]), int(ends[1]))
 
     def mean(self, one: Float, frames: Any) -> Float:
-        """Mean of a flare's shape over frames, throughput included, shape (n_frame,)."""
+        """Return the mean of a flare's shape over frames, including throughput, shape (n_frame,)."""
         shape = self.survey.bank.shape
         mean = shape.mean_over(self.edges[frames], one[PEAK], np.exp(one[WIDTH]))
         return np.asarray(self.survey.stare.light[frames] * mean)
 
     def light(self, theta: Float, frames: slice = slice(None)) -> Float:
-        """Sums of flares over some frames, shape (n_frame, n_sum)."""
+        """Return the mean sums of flares in some frames, shape (n_frame, n_sum)."""
         total = np.zeros_like(self.net)[frames]
         for one, inside, mean in self._shining(theta, frames):
             total[inside] += mean[:, None] * self.response[0](np.array([one[KELVIN]]))[0]
         return total
 
     def noise(self, theta: Float, light: Float, frames: slice = slice(None)) -> Float:
-        """Covariance of frames' sums with flares of some light, shape (n_frame, n_sum, n_sum)."""
+        """Return the covariance of frames' sums with flares, shape (n_frame, n_sum, n_sum)."""
         total = self.covariance[frames].copy()
         for one, inside, mean in self._shining(theta, frames):
             total[inside] += mean[:, None, None] * self.templates.noise_of(float(np.exp(one[KELVIN])))
         jitter = self.survey.stare.light_jitter
         if jitter and len(theta):
-            # All light jitters together: that of the star is in the covariance.
+            # Star and flare light jitter together; the star's jitter is already in the covariance.
             star = self.survey.directions["light"][frames]
             both = star + light
             total += jitter**2 * (both[:, :, None] * both[:, None, :] - star[:, :, None] * star[:, None, :])
         return total
 
     def _shining(self, theta: Float, frames: slice) -> Iterator[tuple[Float, slice, Float]]:
-        """Flares that shed light on some frames, where among these, and their mean amplitude there."""
+        """Yield the flares that contribute to some frames, the affected frames, and the mean amplitude in them."""
         first, last, _ = frames.indices(len(self.net))
         for one in theta:
             width = np.exp(one[WIDTH])
@@ -180,18 +152,18 @@ class Sums:
                 yield one, slice(there.start - first, there.stop - first), mean
 
     def window(self, one: Float) -> tuple[float, float]:
-        """Start and end of a flare's window, s."""
+        """Return start and end of a flare's window, s."""
         lead, tail = self.survey.bank.window(float(np.exp(one[WIDTH])))
         frame_s = self.survey.stare.frame_s
         return one[PEAK] - (lead + 1) * frame_s, one[PEAK] + (tail + 1) * frame_s
 
     def overlap(self, one: Float) -> tuple[float, float]:
-        """Start and end of a flare's light, as far as it makes others uncertain, s."""
+        """Return start and end of the interval in which a flare overlaps others, s."""
         width = np.exp(one[WIDTH])
         return one[PEAK] - OVERLAP_BEFORE * width, one[PEAK] + OVERLAP_AFTER * width
 
     def block(self, inside: Float, every: Float) -> Block:
-        """The block of some flares among all."""
+        """Build the block of the flares `inside` among all flares `every`."""
         windows = [self.window(one) for one in inside]
         used = np.zeros(len(self.net), np.bool_)
         for first, last in windows:
@@ -213,7 +185,10 @@ class Sums:
         return Block(self, used, whiten, basis, flat - basis @ (basis.T @ flat))
 
     def _level(self, used: NDArray[np.bool_], length_s: float) -> Float:
-        """Terms of the level in a block: powers of time in pieces of a length, and curves, shape (n_frame, n_term)."""
+        """Return the baseline terms of a block: splines in time with pieces of a length, and curves.
+
+        The shape is (n_frame, n_term).
+        """
         powers = self.survey.bank.level.powers
         time = self.edges[used].mean(axis=1)
         terms: list[Float] = []
@@ -233,28 +208,16 @@ class Sums:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """Frames and noise of flares that are fitted together.
+    """Frames and noise of flares that are fitted together."""
 
-    Attributes
-    ----------
-    sums : Sums
-    used : ndarray of bool, shape (n_frame,)
-        Frames of the stare.
-    whiten : ndarray, shape (n_used, n_sum, n_sum)
-    basis : ndarray, shape (n_used * n_sum, n_term)
-        Orthonormal columns of the whitened level.
-    data : ndarray, shape (n_used * n_sum,)
-        Whitened, less its projection on the level.
-    """
-
-    sums: Sums
-    used: NDArray[np.bool_]
-    whiten: Float
-    basis: Float
-    data: Float
+    sums: StareSums
+    used: NDArray[np.bool_]  # frames of the stare, shape (n_frame,)
+    whiten: Float  # whitening matrices, shape (n_used, n_sum, n_sum)
+    basis: Float  # orthonormal columns of the whitened baseline, shape (n_used * n_sum, n_term)
+    data: Float  # whitened sums less their projection on the baseline, shape (n_used * n_sum,)
 
     def model(self, theta: Float) -> tuple[Float, Float]:
-        """Whitened light of flares less its projection on the level, (n_row,), and its derivatives, (n_row, n, 4)."""
+        """Return the whitened flux less its projection on the baseline, (n_row,), and derivatives, (n_row, n, 4)."""
         edges, light = self.sums.edges[self.used], self.sums.survey.stare.light[self.used]
         shape, (value, slope, _, _) = self.sums.survey.bank.shape, self.sums.response
         derivatives = np.zeros((self.data.size, len(theta), 4))
@@ -277,19 +240,19 @@ class Block:
         return derivatives[:, :, AMPLITUDE].sum(axis=1), derivatives
 
     def chi2(self, theta: Float) -> float:
-        """Of the whitened residuals."""
+        """Return chi-squared for given parameters."""
         left = self.data - self.model(theta)[0]
         return float(left @ left)
 
-    def fit(self, theta: Float, fixed: tuple[int, int, float, Factor | None] | None = None) -> Blended:
-        """The best flares from some start.
+    def fit(self, theta: Float, fixed: tuple[int, int, float, Factor | None] | None = None) -> BlendFit:
+        """Fit all flares from a starting point.
 
         Parameters
         ----------
         theta : ndarray, shape (n_flare, 4)
         fixed : (int, int, float, callable or None), optional
-            Flare, column, value, factor: the column keeps the value; with a factor, the logarithm of the amplitude
-            plus that of the half-width plus the factor does.
+            Flare, column, value and factor of a constraint: the column has the value, or with a factor, the sum of
+            log amplitude, log half-width and the factor.
         """
         low, high = (np.tile(end, (len(theta), 1)) for end in self.sums.bounds)
         moved = np.zeros(theta.shape, np.bool_)
@@ -313,7 +276,7 @@ class Block:
         held: dict[bytes, tuple[Float, Float]] = {}
 
         def modelled(x: Float) -> tuple[Float, Float]:
-            # Residuals and derivatives are asked for at the same place, one after the other.
+            # Residuals and derivatives are evaluated at the same point, one after the other.
             if x.tobytes() not in held:
                 held.clear()
                 held[x.tobytes()] = self.model(whole(x))
@@ -336,15 +299,15 @@ class Block:
         scale[:, PEAK] = np.exp(start[:, WIDTH])
         dof = self.data.size - self.basis.shape[1] - theta.shape[0] * len(self.sums.free)
         if not moved.any():
-            return Blended(whole(start[moved]), self.chi2(whole(start[moved])), dof, True)
+            return BlendFit(whole(start[moved]), self.chi2(whole(start[moved])), dof, True)
         found = scipy.optimize.least_squares(
             residual, start[moved], jacobian, bounds=(low[moved], high[moved]), x_scale=scale[moved],
-            ftol=CONVERGED, xtol=1e-9, gtol=None, max_nfev=MOST_EVALUATIONS,
+            ftol=CONVERGED, xtol=1e-9, gtol=None, max_nfev=MAX_EVALUATIONS,
         )  # fmt: skip
-        return Blended(whole(found.x), 2 * float(found.cost), dof, bool(found.status > 0))
+        return BlendFit(whole(found.x), 2 * float(found.cost), dof, bool(found.status > 0))
 
     def covariance(self, theta: Float) -> Float:
-        """Of all parameters, by the inverse of the information, shape (n, 4, n, 4)."""
+        """Return the covariance of all parameters, the inverse of the information, shape (n, 4, n, 4)."""
         jacobian = self.model(theta)[1]
         n, free = len(theta), self.sums.free
         rows = jacobian[:, :, free].reshape(len(jacobian), -1)
@@ -355,19 +318,19 @@ class Block:
         return covariance
 
     def interval(
-        self, best: Blended, j: int, column: int, factor: Factor | None = None, rises: float = 1.0
-    ) -> tuple[Interval, Blended | None]:
-        """A parameter's interval, or that of a product; a better fit where profiling comes across one.
+        self, best: BlendFit, j: int, column: int, factor: Factor | None = None, rises: float = 1.0
+    ) -> tuple[Interval, BlendFit | None]:
+        """Return the interval of a parameter or product, and a better fit if profiling finds one.
 
         Parameters
         ----------
-        best : Blended
+        best : BlendFit
         j, column : int
             Flare and column.
         factor : callable, optional
-            In place of the column: amplitude times half-width times this.
+            If given, the interval is that of amplitude x half-width x factor.
         rises : float, optional
-            What chi-squared rises by at the ends.
+            Rise of chi-squared at the ends of the interval.
         """
         covariance, theta = self.covariance(best.theta), best.theta
         weights = np.zeros(theta.shape)
@@ -385,7 +348,7 @@ class Block:
         for sign, end in zip((-1.0, 1.0), ends, strict=True):
             furthest = abs(end - middle)
 
-            def refit(step: float, start: Float | None, sign: float = sign) -> Blended:
+            def refit(step: float, start: Float | None, sign: float = sign) -> BlendFit:
                 straight = theta + along * sign * step / variance if variance > 0 else theta
                 fixed = j, column, float(middle + sign * step), factor
                 return self.fit(straight if start is None else start, fixed)
@@ -404,8 +367,8 @@ class Block:
         (low, open_low), (high, open_high) = found
         return Interval(low, high, open_low, open_high), None
 
-    def without(self, blended: Blended, j: int) -> Blended:
-        """The best fit of all flares but one."""
+    def without(self, blended: BlendFit, j: int) -> BlendFit:
+        """Fit all flares except flare `j`."""
         rest = np.delete(blended.theta, j, axis=0)
         if not len(rest):
             left = float(self.data @ self.data)
@@ -423,11 +386,11 @@ class _Reached:
     step: float
     open: bool
     theta: Float
-    better: Blended | None = None
+    better: BlendFit | None = None
 
 
 def _reached(
-    refit: Callable[[float, Float | None], Blended], chi2: float, rises: float, step: float, furthest: float,
+    refit: Callable[[float, Float | None], BlendFit], chi2: float, rises: float, step: float, furthest: float,
     start: Float | None = None,
 ) -> _Reached:  # fmt: skip
     """Return the end of an interval on one side, from a first guess of the way to it.
@@ -444,7 +407,7 @@ def _reached(
         Where the first fit begins.
     """
     inner, outer, root_inner, root_outer = 0.0, np.inf, 0.0, np.inf
-    for _ in range(MOST_REFITS):
+    for _ in range(MAX_REFITS):
         at_end = step >= furthest
         step = min(step, furthest)
         one = refit(step, start)

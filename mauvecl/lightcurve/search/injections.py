@@ -1,11 +1,11 @@
-"""Injections: flares put into drawn frames, and the smallest amplitude at which the search finds each.
+"""Injection of flares into simulated frames, and the smallest detected amplitude of each.
 
-A template's value is a + A b + sqrt(A) c for a flare of amplitude A: a from the frames without it, as the engine draws
-them, b from its mean, c from its own photons. Templates are found for all A above the root, so that one pass over the
-templates gives, for one draw of all noise, the amplitude from which on the flare is found, and with it every amplitude
-of a map. All half-widths and amplitudes share their draws.
+The statistic of a template is a + A b + sqrt(A) c for a flare of amplitude A: a follows from simulated frames without
+the flare, b from its mean, and c from its photon noise. The flare is detected for all A above the root, so that one
+pass over the templates gives the critical amplitude of each realisation, and thereby the completeness at every
+amplitude. All half-widths and amplitudes share their realisations.
 
-The flare's own photons are taken for normal: their skewness is to that of the frame's other noise as their number is.
+The photon noise of the flare is approximated as normal; its skewness is small as long as flares add few photons.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.search.places import Place, places_of
-from mauvecl.lightcurve.search.recoveries import KEPT, Refit
-from mauvecl.lightcurve.search.survey import net_of, part_of
+from mauvecl.lightcurve.search.fit_accuracy import FIT_QUANTITIES, Refit
+from mauvecl.lightcurve.search.injection_sites import Place, places_of
+from mauvecl.lightcurve.search.survey import select_frames, subtract_known
 from mauvecl.lightcurve.stares.components import STEADY, Components
 from mauvecl.lightcurve.stares.requests import Method, StaresRequest
 from mauvecl.lightcurve.stares.sums import method_for
@@ -33,54 +33,39 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 Single = NDArray[np.float32]
 
-#: Stares that are looked at at once.
+#: Number of stares per batch.
 BLOCK = 64
-#: Frames, and the mean of a flare, are multiples of these where filters weigh them, and filters of `places.STEP`: few
-#: enough bits for sums that are exact in float64, and so the same on every machine.
+#: Frames and flare means are rounded to multiples of these, so that sums are exact in float64 and independent of the
+#: machine; filters are rounded likewise.
 NOISE_STEP, MEAN_STEP = 2.0**-11, 2.0**-20
-#: Second half of the key of the generator that places peaks.
+#: Second half of the key of the random generator for peak times.
 INJECT_KEY = 0x696E6A65
-#: Stares of one peak are numbered from the next multiple of this on: no others have these draws.
+#: Stares of each peak start at another multiple of this, so that peaks have independent realisations.
 NUMBERS = 2**32
-#: Half-widths after a flare's peak beyond which its photons' noise is left out; its light is not.
+#: Half-widths after the peak beyond which the photon noise of a flare is neglected.
 GLOW = 15.0
 
 
 @dataclass(frozen=True, eq=False)
 class Injections:
-    """Flares of one temperature and some half-widths in a searched stare.
-
-    Attributes
-    ----------
-    survey : Survey
-    flare : int
-        Which of the components' flare spectra.
-    half_widths_s : tuple of float
-    threshold : float
-    seed : int
-    positions : int
-        Times of peaks, evenly spread over the recorded frames, at random in each part.
-    draws : int
-        Of each position.
-    cosmic_rays : CosmicRays, optional
-        In frames that are then drawn pixel by pixel.
-    """
+    """Flares of one temperature and several half-widths in a stare."""
 
     survey: Survey
-    flare: int
+    flare: int  # index of the flare spectrum in the components
     half_widths_s: tuple[float, ...]
     threshold: float
     seed: int
-    positions: int
-    draws: int
-    cosmic_rays: CosmicRays | None = None
+    positions: int  # number of peak times, stratified over the recorded frames
+    draws: int  # realisations per position
+    cosmic_rays: CosmicRays | None = None  # require frames that are drawn by pixel
 
     def __post_init__(self) -> None:
         if not self.half_widths_s or not all(np.isfinite(w) and w > 0 for w in self.half_widths_s):
-            raise InputError(f"half-widths of injections {list(self.half_widths_s)} s, expected times above 0")
+            raise InputError(f"half_widths_s = {list(self.half_widths_s)}, expected times above 0")
         if self.positions < 1 or not 1 <= self.draws <= NUMBERS:
             raise InputError(
-                f"{self.positions} x {self.draws} injections, expected at least one of each and at most {NUMBERS} draws"
+                f"there are {self.positions} positions x {self.draws} draws, expected at least one of each and at most "
+                f"{NUMBERS} draws"
             )
 
     @cached_property
@@ -94,7 +79,7 @@ class Injections:
 
     @cached_property
     def response(self) -> Float:
-        """Mean sums of a flare of one amplitude in a frame, shape (n_sum,)."""
+        """Mean sums of a frame for a flare of unit amplitude, shape (n_sum,)."""
         unit = np.zeros(len(STEADY) + self.survey.components.n_flares)
         unit[:3] = 1.0
         unit[len(STEADY) + self.flare] = 1.0
@@ -110,7 +95,7 @@ class Injections:
 
     @cached_property
     def photons(self) -> Float:
-        """Root of the covariance that a flare of one amplitude adds to a frame's sums, shape (n_sum, n_sum)."""
+        """Root of the covariance that a flare of unit amplitude adds to a frame's sums, shape (n_sum, n_sum)."""
         with_it, without = np.zeros((2, len(STEADY) + self.survey.components.n_flares))
         with_it[len(STEADY) + self.flare] = 1.0
         covariance = self.survey.components.covariance(with_it) - self.survey.components.covariance(without)
@@ -119,35 +104,29 @@ class Injections:
 
     @cached_property
     def quiescent(self) -> Components:
-        """What frames are drawn of."""
+        """Components of the frames without flares."""
         components = self.survey.components
         return Components(components.quiet, components.flare_electrons[:0], components.weights)
 
     @cached_property
     def method(self) -> Method:
-        """How frames are drawn."""
+        """Method of drawing frames."""
         return method_for(self.quiescent, self.survey.stare, self.cosmic_rays)
 
     def places(self, position: int) -> tuple[Place, ...]:
-        """Every half-width at one of the peaks."""
+        """Return the sites of all half-widths at a peak time."""
         return places_of(self.survey, self.half_widths_s, float(self.peaks_s[position]), self.response)
 
     def request(self, position: int, refit: Refit | None = None) -> StaresRequest:
-        """The stares with flares at one of the peaks, what is found in them, and fits of the first ones.
-
-        Parameters
-        ----------
-        position : int
-        refit : Refit, optional
-        """
+        """Return the request for the critical amplitudes at a peak time and, with `refit`, fits of detected flares."""
         survey = self.survey
         places = self.places(position)
         reached = [place.frames for place in places if len(place.filters)]
-        # Where no template fits, a frame is drawn all the same: a request is of some.
+        # Without templates, one frame is drawn, since requests cannot be empty.
         first = min((part.start for part in reached), default=0)
         window = slice(first, max((part.stop for part in reached), default=1))
         start = (1 + position) * NUMBERS
-        stare = part_of(survey.stare, window)
+        stare = select_frames(survey.stare, window)
         injecting = Injecting(
             tuple(place.within(first) for place in places),
             self.threshold,
@@ -178,52 +157,28 @@ class Injections:
 
 @dataclass(frozen=True, eq=False)
 class Injecting:
-    """What comes of stares into which flares are put at one time.
-
-    Attributes
-    ----------
-    places : tuple of Place
-        In these frames.
-    threshold : float
-    directions : ndarray, shape (n_temperature, n_sum)
-        Of the bank.
-    response, photons : ndarray
-        As `Injections` has them.
-    known : ndarray of float32, shape (n_frame, n_sum)
-        Mean of the frames without a flare.
-    start_s : ndarray, shape (n_frame,)
-    frame_s : float
-    variance : ndarray, shape (n_frame,)
-        Of each frame's sums, as the search takes it.
-    curves : ndarray, shape (n_curve, n_frame), optional
-    start : int
-        Number of the first stare.
-    refit : Refit, optional
-        Which flares are fitted, and how.
-    trend : Trend, optional
-        What unknowns of these frames do beyond first order.
-    """
+    """Reduction of stares to the critical amplitudes of flares at one peak time."""
 
     adds: ClassVar[bool] = False
 
-    places: tuple[Place, ...]
+    places: tuple[Place, ...]  # in these frames
     threshold: float
-    directions: Float
-    response: Float
-    photons: Float
-    known: Single
-    start_s: Float
+    directions: Float  # of the bank, shape (n_temperature, n_sum)
+    response: Float  # see `Injections.response`
+    photons: Float  # see `Injections.photons`
+    known: Single  # mean of frames without a flare, shape (n_frame, n_sum)
+    start_s: Float  # shape (n_frame,)
     frame_s: float
-    variance: Float
-    curves: Float | None
-    start: int
-    refit: Refit | None = None
-    trend: Trend | None = None
+    variance: Float  # of each frame's sums, as in the search, shape (n_frame,)
+    curves: Float | None  # shape (n_curve, n_frame)
+    start: int  # number of the first stare
+    refit: Refit | None = None  # flares to fit
+    trend: Trend | None = None  # effect of unknowns on these frames beyond first order
 
     def __call__(self, values: Single, first: int, glow: Single) -> dict[str, NDArray[Any]]:
-        """The amplitude from which on each flare is found, (n_stare, n_half_width), and fits where they are asked for.
+        """Return the smallest detected amplitude of each flare, (n_stare, n_half_width), and fits if requested.
 
-        Infinite if no template fits into what is observed; zero where there is an alarm without it.
+        It is infinite if no template covers the flare, and zero if there is an alarm without it.
         """
         critical = np.full((len(values), len(self.places)), np.inf, np.float32)
         for begin in range(0, len(values), BLOCK):
@@ -234,22 +189,22 @@ class Injecting:
                     column[:] = self._critical(place, self.values(place, drawn))
         kept: dict[str, NDArray[Any]] = {"critical": critical}
         if self.refit is not None:
-            # One stare at a time: a fit knows nothing of what is fitted beside it.
+            # Stares are processed one at a time, so that fits do not depend on the batch.
             these = range(min(len(values), max(0, self.start + self.refit.count - first)))
             each = [self._fitted(self.drawn(values[k : k + 1], glow[k : k + 1]), self.refit) for k in these]
             none = np.zeros((0, *self.refit.amplitudes.shape), np.float32)
-            kept |= {name: np.array([one[name] for one in each]) if each else none for name in KEPT}
+            kept |= {name: np.array([one[name] for one in each]) if each else none for name in FIT_QUANTITIES}
         return kept
 
     def drawn(self, values: Single, glow: Single) -> Drawn:
-        """A few stares."""
+        """Prepare the random part of some stares."""
         n_sum = values.shape[2]
-        noise = np.moveaxis(net_of(values, self.known, self.trend), 2, 0)
+        noise = np.moveaxis(subtract_known(values, self.known, self.trend), 2, 0)
         own, light = np.ascontiguousarray(np.moveaxis(glow[:, :, :n_sum], 2, 0)), glow[:, :, n_sum]
         return Drawn(_multiple(noise, NOISE_STEP).astype(np.float64), own, light if light.any() else None)
 
     def values(self, place: Place, drawn: Drawn) -> tuple[Single, Single, Single]:
-        """a, b and c of the module's formula, shapes (n_temperature, n_draw or 1, n_filter)."""
+        """Return a, b and c of the module's formula, shapes (n_temperature, n_draw or 1, n_filter)."""
         filters, here = place.weights, place.frames
         mean = np.atleast_2d(place.mean if drawn.light is None else place.mean * (1 + drawn.light[:, here]))
         start, width = self.start_s[here], place.half_width_s
@@ -264,18 +219,7 @@ class Injecting:
         )
 
     def best(self, place: Place, drawn: Drawn, amplitudes: Float) -> tuple[Float, NDArray[np.int64], NDArray[np.int64]]:
-        """The largest value among the templates that count, and which: arrays (n_amplitude, n_draw).
-
-        Parameters
-        ----------
-        place : Place
-        drawn : Drawn
-        amplitudes : ndarray, shape (n_amplitude,)
-
-        Returns
-        -------
-        value, temperature, template : ndarray
-        """
+        """Return the largest value of all templates, its temperature and its template, (n_amplitude, n_draw) each."""
         a, b, c = self.values(place, drawn)
         values = np.array([a + x * b + np.sqrt(x) * c for x in amplitudes.astype(np.float32)])
         values[:, ~place.counts[:, None].repeat(a.shape[1], axis=1)] = -np.inf
@@ -286,7 +230,7 @@ class Injecting:
         return largest.astype(np.float64), temperature, template
 
     def sums(self, place: Place, drawn: Drawn, amplitudes: Float) -> Single:
-        """Frames with the flare, less what is known of them, shape (n_amplitude, n_draw, n_frame, n_sum)."""
+        """Return frames with the flare less their known mean, shape (n_amplitude, n_draw, n_frame, n_sum)."""
         here = place.frames
         mean = np.atleast_2d(place.mean if drawn.light is None else place.mean * (1 + drawn.light[:, here]))
         glow = np.sqrt(np.maximum(place.mean, 0))
@@ -298,7 +242,7 @@ class Injecting:
     def _critical(self, place: Place, values: tuple[Single, Single, Single]) -> Single:
         a, b, c = values
         left = np.float32(self.threshold) - a
-        # The root of b x^2 + c x = left, in the form that keeps its digits; zero where there is an alarm without it.
+        # Root of b x^2 + c x = left in its numerically stable form; zero if there is an alarm without the flare.
         root = np.multiply(left, 4 * b)
         root += c * c
         np.sqrt(np.maximum(root, 0, out=root), out=root)
@@ -310,8 +254,8 @@ class Injecting:
         return np.asarray(root.min(axis=(0, 2)) ** 2)
 
     def _fitted(self, drawn: Drawn, refit: Refit) -> dict[str, Single]:
-        """Of one stare: arrays (n_half_width, n_amplitude), NaN where a flare is not found."""
-        kept = {name: np.full(refit.amplitudes.shape, np.nan, np.float32) for name in KEPT}
+        """Fit the detected flares of one stare; arrays of shape (n_half_width, n_amplitude), NaN if not detected."""
+        kept = {name: np.full(refit.amplitudes.shape, np.nan, np.float32) for name in FIT_QUANTITIES}
         for d, (place, row) in enumerate(zip(self.places, refit.amplitudes, strict=True)):
             if not len(place.filters):
                 continue
@@ -336,31 +280,21 @@ class Injecting:
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """Everything random in the frames of a few stares.
+    """Random part of the frames of some stares."""
 
-    Attributes
-    ----------
-    noise : ndarray, shape (n_sum, n_draw, n_frame)
-        The sums without a flare, less what is known of them.
-    own : ndarray of float32, shape (n_sum, n_draw, n_frame)
-        Standard normal, for the flare's photons.
-    light : ndarray of float32, shape (n_draw, n_frame), optional
-        Relative change of all light, where there is any.
-    """
-
-    noise: Float
-    own: Single
-    light: Single | None
+    noise: Float  # sums without a flare less their known mean, shape (n_sum, n_draw, n_frame)
+    own: Single  # standard normals for the photon noise of the flare, shape (n_sum, n_draw, n_frame)
+    light: Single | None  # relative change of all light, shape (n_draw, n_frame)
 
 
 def _multiple(values: Single, step: float) -> Single:
-    """The nearest multiples of a power of two."""
+    """Round to multiples of a power of two."""
     values = values * np.float32(1 / step)
     return np.asarray(np.rint(values, out=values) * np.float32(step))
 
 
 def _combined(rows: Float, values: Float) -> Single:
-    """Sums over the first axis of values (n_sum, n_draw, n_filter), one after the other, (n_row, n_draw, n_filter)."""
+    """Multiply rows (n_row, n_sum) with values (n_sum, n_draw, n_filter), summing in a fixed order."""
     small = values.astype(np.float32)
     combined = np.empty((len(rows), *values.shape[1:]), np.float32)
     for row, out in zip(rows.astype(np.float32), combined, strict=True):

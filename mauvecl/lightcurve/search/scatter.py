@@ -1,10 +1,10 @@
-"""Noise that is not what a search takes it for: of stares whose light, sky or temperature are not the known ones.
+"""Effect of unknown light, sky and temperature on the false-alarm rate of a search.
 
-A search weighs frames by their known variance. Where the star is brighter than that, or the detector warmer, a
-template's value scatters by a factor r more, and exceeds u as often as u / r would be exceeded without. Where the level
-does what the search neither subtracts nor marginalises over, values are shifted, and exceed u as u less the shift would
-be. What is unknown of a stare is drawn, some of it farther out than it is distributed, with weights that make up for
-it.
+A search weights frames by their known variance. If the star is brighter or the detector warmer than assumed, the
+scatter of a template's value increases by a factor r, and it exceeds u as often as u / r is exceeded otherwise. If the
+baseline has trends that the search neither subtracts nor marginalises over, values are shifted, and exceed u as often
+as u less the shift is exceeded otherwise. The unknowns of a stare are drawn from a widened distribution and weighted
+accordingly.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.search.trials import WEIGHED_AT, Trials
+from mauvecl.lightcurve.search.false_alarm_rate import WEIGHTING_THRESHOLD, TemplateGrid
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -25,60 +25,48 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Draws of what is unknown, and times of the stare at which they are looked at.
+#: Number of draws of the unknowns, and of times in the stare at which the noise is evaluated.
 DRAWS, POINTS = 500, 16
-#: Half of the draws are so many times as far out.
-FARTHER = 1.5
+#: Factor by which half of the proposals are widened.
+WIDENING = 1.5
 #: Second half of the generator's key.
 CONDITIONS_KEY = 0x636F6E64
-#: Relative change of a scatter below which it is none.
-LEAST = 1e-6
-#: Shift of a value below which it is none, at unknowns that are far out; steps of shifts; draws of which one is taken.
-LEAST_SHIFT, SHIFT_STEP, ONE_IN = 0.2, 0.1, 4
-#: Largest shift that is told from larger ones.
-MOST_SHIFT = 60.0
+#: Relative change of the scatter that is neglected.
+NEGLIGIBLE = 1e-6
+#: Shift that is neglected, bin width of shifts, and number of draws of which one is used for shifts.
+MIN_SHIFT, SHIFT_STEP, ONE_IN = 0.2, 0.1, 4
+#: Largest shift; larger ones are counted in the last bin.
+MAX_SHIFT = 60.0
 
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """Scatter of templates' values under conditions that are drawn.
+    """Scatter and shift of templates' values for drawn conditions."""
 
-    Attributes
-    ----------
-    scales : ndarray, shape (n_draw, n)
-        Standard deviation of a template's value, at some times and for every temperature, where the search takes one.
-    weights : ndarray, shape (n_draw,)
-        Their sum is one.
-    shifts : ndarray, shape (n_shift,)
-        Means of templates' values, ascending.
-    shares : ndarray, shape (n_draw, n_shift)
-        Of templates that have each mean.
-    """
-
-    scales: Float
-    weights: Float
-    shifts: Float
-    shares: Float
+    scales: Float  # standard deviations of values at some times and all temperatures, nominally 1, shape (n_draw, n)
+    weights: Float  # of the draws, sum 1, shape (n_draw,)
+    shifts: Float  # means of values, ascending, shape (n_shift,)
+    shares: Float  # shares of templates with each mean, shape (n_draw, n_shift)
 
     @classmethod
     def of(cls, survey: Survey, seed: int, part: Survey | None = None) -> Scatter:
-        """Return what a stare's unknowns do to the frames, and to the values of templates.
+        """Draw the unknowns of a stare and compute scatter and shift of templates' values.
 
         Parameters
         ----------
         survey : Survey
         seed : int
         part : Survey, optional
-            Of frames over which values are looked at; all of them by default.
+            Part of the stare in which shifts are evaluated; all of it by default.
         """
         stare, components, rows = survey.stare, survey.components, survey.bank.directions
         at = np.unique(np.linspace(0, stare.n_frames - 1, POINTS).astype(int))
         rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, CONDITIONS_KEY]))
         n = len(stare.unknowns)
         z = rng.standard_normal((DRAWS, n))
-        z[DRAWS // 2 :] *= FARTHER
+        z[DRAWS // 2 :] *= WIDENING
         log = -np.sum(z**2, axis=1) / 2
-        weights = np.exp(log - np.logaddexp(log, log / FARTHER**2 - n * np.log(FARTHER)))
+        weights = np.exp(log - np.logaddexp(log, log / WIDENING**2 - n * np.log(WIDENING)))
         moved = {of: np.zeros((DRAWS, at.size)) for of in ("star", "light", "sky", "temperature")}
         for amplitude, one in zip(z.T, stare.unknowns, strict=True):
             moved[one.of] += amplitude[:, None] * one.sd * one.curve[at]
@@ -96,15 +84,15 @@ class Scatter:
         searched = survey if part is None else part
         if not _shifted(searched):
             return cls(scales, weights / weights.sum(), np.zeros(1), np.ones((DRAWS, 1)))
-        # Every so many draws of either half.
+        # The same share of draws from both halves.
         some = slice(None, None, ONE_IN)
         weights = weights[some]
         return cls(scales[some], weights / weights.sum(), *_shifts(searched, z[some]))
 
     @property
     def known(self) -> bool:
-        """Whether they are what the search takes them for."""
-        return bool(np.abs(self.scales - 1).max() < LEAST and not self.shifts.any())
+        """True if scatter and shift are as the search assumes."""
+        return bool(np.abs(self.scales - 1).max() < NEGLIGIBLE and not self.shifts.any())
 
     def alarmed(self, threshold: float, days: float, rate: Callable[[Float], Float]) -> Float:
         """Return the probability of an alarm in each draw, shape (n_draw,).
@@ -115,7 +103,7 @@ class Scatter:
         days : float
             Star-days of the stare.
         rate : callable
-            False alarms per star-day at a threshold where the noise is what the search takes it for.
+            False alarms per star-day at a threshold for the noise that the search assumes.
         """
         rates = np.zeros(self.weights.size)
         largest = np.zeros(self.weights.size)
@@ -124,28 +112,28 @@ class Scatter:
             largest = np.where(share > 0, shift, largest)
         if not self.shifts.any():
             return np.asarray(-np.expm1(-days * rates))
-        # Few templates with a large mean alarm all the same.
+        # A few templates with a large mean suffice for an alarm.
         return np.asarray(1 - np.exp(-days * rates) * scipy.special.ndtr(threshold - largest))
 
 
 def _shifted(survey: Survey) -> bool:
-    """Return whether unknowns far out shift a template's value."""
+    """Return whether unknowns of several standard deviations shift a template's value."""
     if survey.unknowns is None:
         return False
-    return bool(survey.search.largest(survey.left(survey.unknowns.far)).maximum.max() > LEAST_SHIFT)
+    return bool(survey.search.largest(survey.left(survey.unknowns.far)).maximum.max() > MIN_SHIFT)
 
 
 def _shifts(survey: Survey, amplitudes: Float) -> tuple[Float, Float]:
-    """Return the means of templates' values in steps, and the share of templates that have each, for each draw."""
-    bins = np.arange(-MOST_SHIFT, MOST_SHIFT + SHIFT_STEP, SHIFT_STEP)
+    """Return binned means of templates' values, and the share of templates in each bin for each draw."""
+    bins = np.arange(-MAX_SHIFT, MAX_SHIFT + SHIFT_STEP, SHIFT_STEP)
     shares = np.zeros((len(amplitudes), bins.size))
-    weights = Trials.of(survey.bank).peaked(WEIGHED_AT)
+    weights = TemplateGrid.from_bank(survey.bank).peak_probabilities(WEIGHTING_THRESHOLD)
     for draw, amplitude in enumerate(amplitudes):
         for (row, rho), weight in zip(survey.search.values(survey.left(amplitude[None])), weights, strict=True):
             means = rho[0][:, row.per_amplitude > 0]
-            place = np.clip(np.rint((means + MOST_SHIFT) / SHIFT_STEP), 0, bins.size - 1).astype(np.int64)
+            place = np.clip(np.rint((means + MAX_SHIFT) / SHIFT_STEP), 0, bins.size - 1).astype(np.int64)
             each = np.broadcast_to(weight[:, None], means.shape)
             shares[draw] += np.bincount(place.ravel(), each.ravel(), bins.size)
     shares /= shares.sum(axis=1, keepdims=True)
-    met = shares.any(axis=0)
-    return bins[met], shares[:, met]
+    used = shares.any(axis=0)
+    return bins[used], shares[:, used]

@@ -1,12 +1,12 @@
-"""The search: a bank of flares as filters in time, exact over gaps, and the largest of what they find.
+"""Search of stares for flares with a bank of matched filters, exact over gaps.
 
-For sums y of a frame with covariance one, a template s in time and c in the sums, and a level G a of unknown amplitudes
-a inside the window, the statistic is that of generalised least squares,
+For sums y of a frame with unit covariance, a template s in time and c in the sums, and a baseline G a with unknown
+amplitudes a in the window, the statistic is that of generalised least squares,
 
     rho = c . (s - P G)^T m y / sqrt((s - P G)^T m (s - P G)),   P = (G^T m G)^-1 G^T m s,
 
-with m the inverse variance of a frame, zero in gaps: normal of variance one without a flare, and the S/N of the flare
-with one. All sums over time are correlations, by FFT. (A matched filter, maximised over its templates: Turin 1960, doi
+with m the inverse variance of a frame, zero in gaps. Without a flare it is normal with unit variance; with a flare, its
+mean is the S/N. All sums over time are correlations, computed by FFT. (Matched filters: Turin 1960, doi
 10.1109/TIT.1960.1057571.)
 """
 
@@ -29,84 +29,58 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Numbers that a batch of stares holds in one array, about.
+#: Approximate number of values in an array of a batch of stares.
 BATCH = 2**21
-#: Relative weight that keeps curves apart which a window cannot tell apart.
+#: Relative regularisation for curves that are degenerate within a window.
 RIDGE = 1e-11
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
-    """The largest value of each stare, and the template that has it; arrays of shape (n_stare,).
+class LargestValue:
+    """The largest value of each stare and its template; arrays of shape (n_stare,)."""
 
-    Attributes
-    ----------
-    maximum : ndarray
-        The largest rho.
-    peak_s : ndarray
-        Time of the template's peak, s from the start of the stare.
-    half_width_s : ndarray
-    temperature : ndarray of int
-        Row of the bank's directions.
-    amplitude : ndarray
-        Peak along that direction, in standard deviations of a frame's sum.
-    """
-
-    maximum: Float
-    peak_s: Float
+    maximum: Float  # largest rho
+    peak_s: Float  # from the start of the stare
     half_width_s: Float
-    temperature: NDArray[np.int64]
-    amplitude: Float
+    temperature: NDArray[np.int64]  # row of the bank's directions
+    amplitude: Float  # of the template's peak, in standard deviations of a frame's sum
 
 
 @dataclass(frozen=True, eq=False)
 class Row:
-    """One half-width and phase over all onsets; values of rho come from `Search.rows`.
-
-    Attributes
-    ----------
-    template : Template
-    phase : int
-    peaks : ndarray of int
-        Frame of the peak for each onset, counted from the first frame of the stare, gaps included.
-    per_amplitude : ndarray, shape (n_onset,)
-        Mean of rho for a flare of this template with a peak of one; zero where it is not looked for.
-    project : ndarray, shape (n_term, n_onset)
-        P of the module's formula.
-    """
+    """One half-width and phase at all onsets; `Search.values` yields the statistics of each row."""
 
     template: Template
     phase: int
-    peaks: NDArray[np.int64]
-    per_amplitude: Float
-    project: Float
+    peaks: NDArray[np.int64]  # frame of the peak at each onset, from the first frame of the stare, including gaps
+    per_amplitude: Float  # mean of rho for a flare with unit peak, zero if not searched, shape (n_onset,)
+    project: Float  # P of the module's formula, shape (n_term, n_onset)
 
 
 class Search:
-    """A bank on the frames of a stare.
+    """Search of stares with a template bank.
 
     Parameters
     ----------
     bank : Bank
     stare : Stare
-        Of which only the times of its frames matter.
+        Only the times of its frames are used.
     curves : ndarray, shape (n_curve, n_frame), optional
-        Curves whose amplitudes are unknown in each window, where the bank's level has `cycle`: such as the sine and the
-        cosine of the orbit, or the detector's temperature.
+        Curves with unknown amplitudes in each window, such as sine and cosine of the orbit or the detector's
+        temperature; required if the bank's baseline has `cycle`.
     variance : ndarray, shape (n_frame,), optional
-        Of each frame's sums; one by default.
-
-    Raises
-    ------
-    InputError
-        If the frames are not the bank's, or curves are missing or not asked for.
+        Variance of each frame's sums; 1 by default.
     """
 
     def __init__(self, bank: Bank, stare: Stare, curves: Float | None = None, variance: Float | None = None) -> None:
         if abs(stare.frame_s - bank.frame_s) > 1e-9 * bank.frame_s:
-            raise InputError(f"a bank for frames of {bank.frame_s:g} s, and a stare with {stare.frame_s:g} s")
+            raise InputError(
+                f"the stare has frames of {stare.frame_s:g} s, expected {bank.frame_s:g} s, as in the bank",
+                key="frame_s",
+                value=stare.frame_s,
+            )
         if bank.level.cycle != (curves is not None and len(curves) > 0):
-            raise InputError("a search takes curves where its level has a cycle, expected both or neither")
+            raise InputError("only one of curves and level.cycle is given, expected both or neither", key="curves")
         self.bank, self.stare = bank, stare
         self._first = int(stare.numbers[0])
         self._at = stare.numbers - self._first
@@ -117,9 +91,9 @@ class Search:
         for curve in np.zeros((0, stare.n_frames)) if curves is None else curves:
             scale = float(np.std(curve))
             if not scale > 0:
-                raise InputError("a curve of the level does not change over the stare, expected one that does")
+                raise InputError("a baseline curve is constant over the stare, expected one that varies", key="curves")
             series.append((curve - np.mean(curve)) / scale)
-        #: Terms of the level: a power of time in the window, and a series in the stare.
+        # Terms of the baseline: a power of time in the window, and the index of a series in the stare.
         self._terms = [(power, 0) for power in bank.level.powers] + [(0, 1 + k) for k in range(len(series) - 1)]
         self._series = np.zeros((len(series), self.n_grid))
         self._series[:, self._at] = series
@@ -128,35 +102,32 @@ class Search:
 
     @cached_property
     def grid(self) -> list[Row]:
-        """Every half-width and phase, with what does not depend on data."""
+        """Rows of all half-widths and phases, with everything that does not depend on data."""
         return [row for template in self.bank.templates for row in self._rows_of(template)]
 
     @property
     def n_filters(self) -> int:
-        """Templates that are tried: half-widths, phases, onsets and temperatures."""
+        """Number of searched templates: half-widths, phases, onsets and temperatures."""
         return len(self.bank.directions) * int(sum(np.count_nonzero(row.per_amplitude) for row in self.grid))
 
-    def largest(self, sums: NDArray[Any]) -> Found:
-        """The largest value of each stare.
+    def largest(self, sums: NDArray[Any]) -> LargestValue:
+        """Return the largest value of each stare and its template.
 
         Parameters
         ----------
         sums : ndarray, shape (n_stare, n_frame, n_sum)
-            Of covariance one in each frame without a flare.
-
-        Raises
-        ------
-        InputError
-            For sums of another shape.
+            Sums with unit covariance in each frame without a flare.
         """
         sums = self._checked(sums)
         parts = [self._largest(sums[batch]) for batch in self._batches(len(sums))]
-        return Found(*(np.concatenate([getattr(p, name) for p in parts]) for name in Found.__annotations__))
+        return LargestValue(
+            *(np.concatenate([getattr(p, name) for p in parts]) for name in LargestValue.__annotations__)
+        )
 
     def values(self, sums: NDArray[Any]) -> Iterator[tuple[Row, NDArray[Any]]]:
-        """Each row with its values of rho, shape (n_stare, n_temperature, n_onset); minus infinity where none is.
+        """Yield each row with rho, shape (n_stare, n_temperature, n_onset); minus infinity if not searched.
 
-        In the precision of the sums; all stares at once: for few.
+        Values have the precision of the sums. All stares are processed at once, which suits small numbers of stares.
         """
         yield from self._values(self._checked(sums))
 
@@ -190,7 +161,7 @@ class Search:
                 yield row, correlated
 
     def template(self, row: Row, onset: int, direction: int) -> Float:
-        """What rho of one template weighs each sum with: rho = sum(template * sums), shape (n_frame, n_sum)."""
+        """Return the weights of each sum in rho of a template, shape (n_frame, n_sum): rho = sum(weights * sums)."""
         return np.asarray(self.in_time(row, np.array([onset]))[0][:, None] * self.bank.directions[direction])
 
     def in_time(self, row: Row, onsets: NDArray[np.int64]) -> Float:
@@ -214,20 +185,24 @@ class Search:
 
     @property
     def variance(self) -> Float:
-        """Of each frame's sums, as the search takes it, shape (n_frame,)."""
+        """Variance of each frame's sums, shape (n_frame,)."""
         return np.asarray(1.0 / self._weight[self._at])
 
     def _checked(self, sums: NDArray[Any]) -> NDArray[Any]:
         expected = (self.stare.n_frames, self.bank.directions.shape[1])
         if sums.ndim != 3 or sums.shape[1:] != expected:
-            raise InputError(f"sums of the shape {sums.shape}, expected (n_stare, {expected[0]}, {expected[1]})")
+            raise InputError(
+                f"sums have the shape {sums.shape}, expected (n_stare, {expected[0]}, {expected[1]})",
+                key="sums",
+                value=sums.shape,
+            )
         return sums
 
     def _batches(self, count: int) -> list[slice]:
         size = max(1, BATCH // (self._size * self.bank.directions.shape[1]))
         return [slice(i, i + size) for i in range(0, count, size)]
 
-    def _largest(self, sums: NDArray[Any]) -> Found:
+    def _largest(self, sums: NDArray[Any]) -> LargestValue:
         n = len(sums)
         every = np.arange(n)
         best = np.full(n, -np.inf)
@@ -243,7 +218,7 @@ class Search:
             width[better] = row.template.half_width_s
             temperature[better] = direction
             amplitude[better] = value[better] / row.per_amplitude[onset]
-        return Found(best, peak, width, temperature, amplitude)
+        return LargestValue(best, peak, width, temperature, amplitude)
 
     def _values(self, sums: NDArray[Any]) -> Iterator[tuple[Row, NDArray[Any]]]:
         directions = self.bank.directions.astype(_precision(sums))
@@ -255,7 +230,7 @@ class Search:
             yield row, rho
 
     def _spectra(self, sums: NDArray[Any]) -> list[NDArray[Any]]:
-        """Fourier transforms of the weighted sums times each series, zero in gaps, (n_stare, n_sum, n_frequency)."""
+        """Return transforms of the weighted sums times each series, zero in gaps, (n_stare, n_sum, n_frequency)."""
         real = _precision(sums)
         held = np.zeros((len(sums), sums.shape[2], self.n_grid), real)
         held[:, :, self._at] = self._levelled(sums) * self._weight[self._at]
@@ -266,13 +241,13 @@ class Search:
         ]
 
     def _levelled(self, sums: NDArray[Any]) -> NDArray[Any]:
-        """The sums less their level over the whole stare, which every window marginalises over: for precision alone."""
+        """Subtract the baseline fitted to the whole stare, which does not change rho but improves its precision."""
         y = np.moveaxis(sums, 2, 1)
         return np.asarray(y - (y @ self._level_span) @ self._level_span.T) if self._terms else y
 
     @cached_property
     def _level_span(self) -> Float:
-        """Orthonormal columns that span every level of the stare, (n_frame, n)."""
+        """Orthonormal columns that span all baselines of the stare, (n_frame, n)."""
         time = (self._at - self._at.mean()) / max(self.n_grid, 1)
         columns = np.array([time**power * self._series[series][self._at] for power, series in self._terms])
         span, size, _ = np.linalg.svd(columns.T, full_matrices=False)
@@ -296,13 +271,13 @@ class Search:
 
     def _rows_of(self, template: Template) -> Iterator[Row]:
         n = len(self._terms)
-        # Onsets are multiples of the stride from the start of the stare, whatever part of it is looked at.
+        # Onsets are multiples of the stride from the start of the whole stare, even if only a part is searched.
         peaks = np.arange(self._start(template), self.n_grid, template.stride)
         time = template.time
         spectra: dict[tuple[int, int], Any] = {}
 
         def over(a: int, b: int, kernel: Float) -> Float:
-            """The weighted correlation of two series' product with a kernel."""
+            """Correlate the weighted product of two series with a kernel."""
             if (a, b) not in spectra:
                 spectra[a, b] = scipy.fft.rfft(self._weight * self._series[a] * self._series[b], self._size)
             return np.asarray(self._correlated(spectra[a, b], kernel, template.first)[self._onsets(template)])
@@ -327,7 +302,7 @@ class Search:
             yield Row(template, phase, peaks, np.sqrt(np.where(tried, left, 0.0)), project)
 
     def _without_gaps(self, template: Template, phase: int) -> float:
-        """A template's power without gaps, its level marginalised by powers of time alone."""
+        """Return a template's power without gaps, marginalised over powers of time only."""
         shape = template.shapes[phase]
         columns = np.array([template.time**power for power in self.bank.level.powers])
         if columns.size:

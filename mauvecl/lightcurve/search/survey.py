@@ -1,4 +1,4 @@
-"""A stare, what its frames are made of, and how it is searched: what null, injections and one stare's search share."""
+"""Survey of a star: its stare, frame components and search, shared by false alarms, injections and single stares."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.search.null import DAY_S
-from mauvecl.lightcurve.search.sampled import Sampled, sampled
+from mauvecl.lightcurve.search.counted_rate import DAY_S
+from mauvecl.lightcurve.search.importance_sampling import SampledRate, sample_rate
 from mauvecl.lightcurve.search.scatter import Scatter
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.search.trend import Trend
@@ -18,39 +18,31 @@ from mauvecl.lightcurve.stares.requests import StaresRequest
 from mauvecl.lightcurve.stares.sums import method_for
 
 if TYPE_CHECKING:
+    from mauvecl.lightcurve.defaults import Changing
     from mauvecl.lightcurve.search.bank import Bank
     from mauvecl.lightcurve.stares.components import Components
     from mauvecl.lightcurve.stares.stare import Stare
-    from mauvecl.lightcurve.usual import Changing
     from mauvecl.noise.processes import CosmicRays
 
 Float = NDArray[np.float64]
 
-#: Share of a curve below which it is the others' sum.
-LEAST_CURVE = 1e-6
-#: Star-days of a stare that importance sampling looks at, at most.
+#: Relative norm of a curve's residual below which it is a linear combination of others.
+MIN_CURVE = 1e-6
+#: Largest length of the part of a stare that importance sampling uses, star-days.
 SAMPLED_DAYS = 2.0
 
 
 @dataclass(frozen=True, eq=False)
 class Survey:
-    """How a star is stared at and searched.
+    """Stare at a star and its search."""
 
-    Attributes
-    ----------
-    components : Components
-        With the weights of `Templates`.
-    stare : Stare
-    bank : Bank
-    """
-
-    components: Components
+    components: Components  # with the weights of `Templates`
     stare: Stare
     bank: Bank
 
     @cached_property
     def coefficients(self) -> Float:
-        """Known strengths of a frame's components without a flare, shape (n_frame, 3 + n_flare)."""
+        """Known coefficients of each frame's components without a flare, shape (n_frame, 3 + n_flare)."""
         return self.components.coefficients(self.stare)
 
     @cached_property
@@ -60,12 +52,12 @@ class Survey:
 
     @cached_property
     def directions(self) -> dict[Changing, Float]:
-        """What a small change of the star's level, of light, sky or temperature does, each (n_frame, n_sum)."""
+        """Derivatives of the mean sums by star, light, sky and temperature, shape (n_frame, n_sum) each."""
         directions: dict[Any, Float] = self.components.directions(self.coefficients)
         return directions
 
     def covariance(self, *, jittered: tuple[Changing, ...] = ("light", "sky", "temperature")) -> Float:
-        """Of each frame's sums without a flare, some of the stare's jitters included, (n_frame, n_sum, n_sum)."""
+        """Return the covariance of each frame's sums without a flare, with some jitters, (n_frame, n_sum, n_sum)."""
         covariance = self.components.covariance(self.coefficients)
         for of in jittered:
             moved = self.stare.jitters[of] * self.directions[of]
@@ -74,35 +66,35 @@ class Survey:
 
     @cached_property
     def variance(self) -> Float:
-        """Of each frame's sums, averaged over them, as the search takes it, shape (n_frame,)."""
+        """Variance of each frame's sums that the search assumes, averaged over sums, shape (n_frame,)."""
         covariance = self.covariance()
         return np.asarray(np.einsum("tkk->t", covariance) / covariance.shape[1])
 
     @cached_property
     def curves(self) -> Float | None:
-        """Curves of unknown amplitude, shape (n_curve, n_frame): of the stare's unknowns that are no straight line."""
+        """Curves of the stare's unknowns that are not straight lines, shape (n_curve, n_frame)."""
         if not self.bank.level.cycle:
             return None
         every = [unknown.curve for unknown in self.stare.unknowns]
-        # What is left of each beside a straight line and those before it.
+        # Residual of each curve after a fit of a straight line and the previous curves.
         basis = np.linalg.qr(np.vander(self.stare.start_s / max(self.stare.duration_s, 1.0), 2))[0]
         curves: list[Float] = []
         for curve in every:
             left = curve - basis @ (basis.T @ curve)
             size = float(np.linalg.norm(left))
-            if size > LEAST_CURVE * float(np.linalg.norm(curve)):
+            if size > MIN_CURVE * float(np.linalg.norm(curve)):
                 curves.append(left)
                 basis = np.column_stack([basis, left / size])
         return np.array(curves).reshape(len(curves), self.stare.n_frames)
 
     @cached_property
     def search(self) -> Search:
-        """The bank on the stare's frames."""
+        """Search of the stare's frames."""
         return Search(self.bank, self.stare, self.curves, self.variance)
 
     @cached_property
     def unknowns(self) -> Trend | None:
-        """What the stare's unknowns do; None where there are none."""
+        """Effect of the stare's unknowns, or None without unknowns."""
         slope = self.components.quiet.conditions["dark_slope_per_c"]
         return Trend.of_unknowns(
             self.stare.unknowns, self.directions, self.variance, self.stare.numbers, self.stare.frame_s, slope
@@ -110,11 +102,13 @@ class Survey:
 
     @property
     def trend(self) -> Trend | None:
-        """What the stare's unknowns do, where they do something to be seen beyond first order."""
+        """Effect of the stare's unknowns if it is significant beyond first order, else None."""
         return self.unknowns if self.unknowns is not None and self.unknowns.bends else None
 
     def left(self, amplitudes: Float) -> Float:
-        """Return what unknowns do to the sums that is not subtracted before the search, (n_stare, n_frame, n_sum).
+        """Return the effect of unknowns on the sums that is not subtracted before the search.
+
+        The shape is (n_stare, n_frame, n_sum).
 
         Parameters
         ----------
@@ -127,31 +121,31 @@ class Survey:
         return moved if self.trend is None else self.trend.subtracted(moved)
 
     def net(self, sums: NDArray[Any]) -> NDArray[np.float32]:
-        """Sums as drawn, (n_stare, n_frame, n_sum), less what is known and what unknowns do beyond first order."""
-        return net_of(sums, self.known, self.trend)
+        """Subtract from simulated sums their known mean and the fitted trend, shape (n_stare, n_frame, n_sum)."""
+        return subtract_known(sums, self.known, self.trend)
 
     def null(self, count: int, seed: int, cosmic_rays: CosmicRays | None = None) -> StaresRequest:
-        """Stares without a flare, and the largest value of each."""
+        """Return the request for the largest values of stares without a flare."""
         largest = Largest(self.bank, self.stare, self.curves, self.variance, self.known, self.trend)
         method = method_for(self.components, self.stare, cosmic_rays)
         return StaresRequest(
             self.components, self.stare, count, seed, method=method, cosmic_rays=cosmic_rays, reduction=largest
         )
 
-    def tail(self, seed: int) -> Sampled:
-        """The null by importance sampling, under what is unknown of the stare."""
+    def tail(self, seed: int) -> SampledRate:
+        """Estimate the false-alarm rate by importance sampling, including the stare's unknowns."""
         part = self.of_days(SAMPLED_DAYS)
-        return sampled(part.search, seed=seed).under(Scatter.of(self, seed, part))
+        return sample_rate(part.search, seed=seed).under(Scatter.of(self, seed, part))
 
     def of_days(self, days: float) -> Survey:
-        """The same with the first star-days of the stare alone, where it is longer."""
+        """Return the survey of at most the first `days` star-days of the stare."""
         n = int(days * DAY_S / self.stare.frame_s)
-        return self if self.stare.n_frames <= n else replace(self, stare=part_of(self.stare, slice(0, n)))
+        return self if self.stare.n_frames <= n else replace(self, stare=select_frames(self.stare, slice(0, n)))
 
 
 @dataclass(frozen=True, eq=False)
 class Largest:
-    """The largest value of each stare that is drawn."""
+    """Reduction of simulated stares to their largest values."""
 
     adds: ClassVar[bool] = False
 
@@ -164,22 +158,22 @@ class Largest:
 
     @cached_property
     def search(self) -> Search:
-        """The bank on the stare's frames."""
+        """Search of the stare's frames."""
         return Search(self.bank, self.stare, self.curves, self.variance)
 
     def __call__(self, values: NDArray[np.float32], first: int) -> dict[str, NDArray[Any]]:
-        """As ``maximum``, shape (n_stare,)."""
-        return {"maximum": self.search.largest(net_of(values, self.known, self.trend)).maximum}
+        """Return the largest values as ``maximum``, shape (n_stare,)."""
+        return {"maximum": self.search.largest(subtract_known(values, self.known, self.trend)).maximum}
 
 
-def net_of(sums: NDArray[Any], known: NDArray[Any], trend: Trend | None) -> NDArray[np.float32]:
-    """Return sums as drawn, (n_stare, n_frame, n_sum), less what is known and what unknowns do beyond first order."""
+def subtract_known(sums: NDArray[Any], known: NDArray[Any], trend: Trend | None) -> NDArray[np.float32]:
+    """Subtract from simulated sums, (n_stare, n_frame, n_sum), their known mean and, if given, the fitted trend."""
     left = sums - known
     return np.asarray(left if trend is None else trend.subtracted(left), np.float32)
 
 
-def part_of(stare: Stare, part: slice) -> Stare:
-    """Some frames of a stare, with their own times."""
+def select_frames(stare: Stare, part: slice) -> Stare:
+    """Return a stare with some of the frames."""
     names = ("start_s", "star", "light", "sky", "temperature_c")
     unknowns = tuple(replace(unknown, curve=unknown.curve[part]) for unknown in stare.unknowns)
     return replace(stare, unknowns=unknowns, **{name: getattr(stare, name)[part] for name in names})

@@ -1,8 +1,8 @@
-"""Spectral weights of a frame: flares of any temperature told from noise and from what is unknown, in a few sums.
+"""Spectral weights that reduce a frame to a few sums for flares of any temperature.
 
-The weights of a flare with the spectrum d are C^-1 d, C the covariance of a frame with what is unknown of it (METHODS
-section 7). Flares of 6000-30 000 K look much alike, so that an orthonormal basis of their weights with two or three
-rows is enough: the singular vectors of the whitened spectra.
+The optimal weights for a flare with spectrum d are C^-1 d, where C is the covariance of a frame including nuisance
+parameters (METHODS section 7). Spectra of flares of 6000-30 000 K are similar, so that two or three singular vectors of
+the whitened spectra suffice as a basis.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.usual import RANK
+from mauvecl.lightcurve.defaults import RANK
 from mauvecl.statistics.nuisances import Nuisances, join_names
 
 if TYPE_CHECKING:
@@ -25,31 +25,31 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Temperatures that a search looks for unless told, K: from the first to the last, a factor of 1.034 apart.
+#: Default temperatures of templates, K, in steps of a factor of 1.034.
 TEMPERATURES_K = tuple(float(t) for t in np.geomspace(6_000.0, 30_000.0, 49).round(-1))
-#: Angle between neighbouring flares of a bank, in the space of whitened sums: the one between them loses 1 - cos of
-#: half of it, 0.3 % of S/N.
+#: Angle between neighbouring directions of a bank in the space of whitened sums. A flare halfway between them loses
+#: 1 - cos(ANGLE / 2) = 0.3 % of its S/N.
 ANGLE = 0.15
-#: Share of the largest singular value below which a direction holds nothing but rounding.
-LEAST_SINGULAR = 1e-6
+#: Smallest singular value relative to the largest; smaller ones are rounding errors.
+MIN_SINGULAR = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
 class Templates:
-    """Weights of a frame's sums, and what flares do to these sums.
+    """Weights of a frame's sums, and the effect of flares on these sums.
 
     Attributes
     ----------
     temperatures_k : tuple of float
-        Of flares, K, ascending.
+        Flare temperatures, ascending.
     weights : ndarray, shape (n_sum, n_pixel)
-        Per DN. The sums of a quiescent frame have covariance one, what is unknown of a single frame included.
+        Weights per DN, for which sums of a quiescent frame have unit covariance, including nuisance parameters.
     directions : ndarray, shape (n_temperature, n_sum)
-        Mean sums for a flare of one amplitude.
+        Mean sums for a flare of unit amplitude.
     best : ndarray, shape (n_temperature,)
-        S/N of that flare in one frame with weights of its own: what `directions` would be as long as without loss.
+        S/N of that flare in one frame with its optimal weights: the norm of `directions` without loss.
     noise : ndarray, shape (n_temperature, n_sum, n_sum)
-        Covariance that the photons of a flare of one amplitude add to the sums of a frame.
+        Covariance that the photon noise of a flare of unit amplitude adds to the sums.
     """
 
     temperatures_k: tuple[float, ...]
@@ -68,25 +68,20 @@ class Templates:
         nuisances: Nuisances | None = None,
         rank: int = RANK,
     ) -> Self:
-        """From one frame of the quiescent star, and the spectra of flares.
+        """Compute weights from one frame of the quiescent star and flare spectra.
 
         Parameters
         ----------
         quiet : Expectation
             One frame.
         flares_dn : ndarray, shape (n_temperature, n_pixel)
-            Mean DN per frame of flares of one amplitude.
+            Mean DN per frame of flares of unit amplitude.
         temperatures_k : sequence of float
-            Of these flares, ascending; close enough for `chosen` to choose among.
+            Temperatures of these flares, ascending, in steps small enough for `chosen`.
         nuisances : Nuisances, optional
-            What is unknown of each frame apart from all others, such as jitter.
+            Nuisance parameters that are independent in each frame, such as jitter.
         rank : int
-            Sums kept, at most.
-
-        Raises
-        ------
-        InputError
-            If every pixel saturates, or a flare cannot be told from what is unknown.
+            Largest number of sums.
         """
         used = ~quiet.saturated
         if not used.any():
@@ -101,12 +96,14 @@ class Templates:
         power = np.diag(gram)
         if not (power > 1e-10 * np.einsum("tp,tp->t", plain, flares)).all():
             names = join_names(nuisances.names) if nuisances else "nothing"
-            raise InputError(f"a flare cannot be told from {names} in one frame, expected fewer unknowns of frames")
+            raise InputError(
+                f"a flare cannot be distinguished from {names} in one frame, expected fewer nuisance parameters"
+            )
         length = np.sqrt(power)
         values, vectors = np.linalg.eigh(gram / np.outer(length, length))
-        kept = [k for k in range(len(values))[::-1][:rank] if values[k] > LEAST_SINGULAR**2 * values[-1]]
+        kept = [k for k in range(len(values))[::-1][:rank] if values[k] > MIN_SINGULAR**2 * values[-1]]
         weights = (vectors[:, kept] / length[:, None] / np.sqrt(values[kept])).T @ optimal
-        # Signs are free: the hottest flare adds to each sum.
+        # Signs are arbitrary; choose them so that the hottest flare increases each sum.
         weights *= np.where(weights @ flares[-1] < 0, -1.0, 1.0)[:, None]
         photons = flares * quiet.gain_dn_per_electron
         noise = np.einsum("kp,lp,tp->tkl", weights, weights, photons, optimize=True)
@@ -114,33 +111,33 @@ class Templates:
 
     @cached_property
     def chosen(self) -> tuple[int, ...]:
-        """Flares that a bank looks for, as rows of `directions`: neighbours are `ANGLE` apart at most, about."""
+        """Rows of `directions` for a bank, spaced by at most about `ANGLE`."""
         unit = self.directions / np.linalg.norm(self.directions, axis=1, keepdims=True)
         steps = np.arccos(np.clip(np.sum(unit[1:] * unit[:-1], axis=1), -1.0, 1.0))
         along = np.concatenate([[0.0], np.cumsum(steps)])
-        # The outermost may be half of a step from the ends.
+        # The outermost directions may be half a step from the ends.
         n = max(1, int(np.ceil(along[-1] / ANGLE)))
         wanted = (np.arange(n) + 0.5) / n * along[-1]
         return tuple(dict.fromkeys(int(np.argmin(np.abs(along - w))) for w in wanted))
 
     @property
     def loss(self) -> Float:
-        """Share of S/N lost to the few sums, shape (n_temperature,)."""
+        """Share of the S/N that is lost by reducing frames to sums, shape (n_temperature,)."""
         return np.asarray(1.0 - np.linalg.norm(self.directions, axis=1) / self.best)
 
     def noise_of(self, kelvin: float) -> Float:
-        """Return what the photons of a flare add to the covariance, by the nearest temperature, (n_sum, n_sum)."""
+        """Return the covariance added by the photon noise of a flare of the nearest temperature, (n_sum, n_sum)."""
         return np.asarray(self.noise[int(np.argmin(np.abs(np.log(np.array(self.temperatures_k) / kelvin))))])
 
     def of_flares(self, flares_dn: Float) -> Float:
-        """Mean sums for flares of other temperatures, shape (n, n_sum), from their spectra, DN, (n, n_pixel)."""
+        """Return the mean sums, (n, n_sum), for flare spectra in DN, (n, n_pixel)."""
         return np.asarray(flares_dn @ self.weights.T)
 
 
 def frame_nuisances(
     quiet: Expectation, stare: Stare, more: Mapping[str, float] | Nuisances | None = None
 ) -> Nuisances | None:
-    """What is unknown of each frame: the stare's jitters, and what is named beside them.
+    """Return the nuisance parameters of each frame: the stare's jitters, and additional ones.
 
     Parameters
     ----------
@@ -148,7 +145,7 @@ def frame_nuisances(
         One frame.
     stare : Stare
     more : mapping of str to float, or Nuisances, optional
-        Standard deviations by name (infinite: projected out), which take the place of jitters of the same kind.
+        Standard deviations by name (infinite: projected out), which replace jitters of the same kind.
     """
     names = {"light": "light", "sky": "sky", "temperature": "dark"}
     jitters = {names[of]: sd for of, sd in stare.jitters.items() if sd > 0}

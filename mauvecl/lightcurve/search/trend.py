@@ -1,13 +1,14 @@
-"""What a stare's unknowns do to its sums beyond first order, as the sums themselves tell.
+"""Non-linear trends in the sums of a stare, fitted to the sums and subtracted.
 
-A search marginalises over the level of a window to first order: an offset, a slope, cycles. But the dark is exponential
-in the temperature, so that a drift bends the level, and a drift of light multiplies that of the star. That part follows
-from the amplitudes of the unknowns, and these are measured well where it matters: over the whole stare, each moves the
-sums by many standard deviations. They are fitted, and what they do beyond first order is subtracted. An error of one
-standard deviation in the level then leaves a share of it as large as the relative change of the dark: some hundredths.
+A search marginalises over the baseline of a window to first order: offset, slope and cycles. But dark current is
+exponential in temperature, so that a temperature drift is curved, and drifts of light and star multiply. This part
+follows from the amplitudes of the unknowns, which are well measured if they matter: over a whole stare, each changes
+the sums by many standard deviations. The amplitudes are fitted, and their effect beyond first order is subtracted. An
+error of one standard deviation in the baseline then leaves a few per cent of it, the relative change of the dark
+current.
 
-The fit is by Gauss and Newton, with the unknowns' own distribution as prior, of means over half a minute. Those with
-flares count less (Huber 1964, doi 10.1214/aoms/1177703732), so that a flare hardly moves the fit.
+The fit uses the Gauss-Newton method on means over half a minute, with the distribution of the unknowns as prior. Means
+with flares have less weight (Huber 1964, doi 10.1214/aoms/1177703732), so that flares hardly affect the fit.
 """
 
 from __future__ import annotations
@@ -22,51 +23,34 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from mauvecl.lightcurve.defaults import Changing
     from mauvecl.lightcurve.stares.stare import StareUnknown
-    from mauvecl.lightcurve.usual import Changing
 
 Float = NDArray[np.float64]
 
-#: Time over which the fit takes means, s: the bend within it is left out.
+#: Averaging time of the fit, s; the curvature within it is neglected.
 BLOCK_S = 30.0
-#: Standard deviations of a mean from which on it counts less.
+#: Residual in standard deviations above which a mean has less weight.
 HUBER = 3.0
-#: Steps of the fit: each gains as many digits as the change of the dark is small.
+#: Number of Gauss-Newton steps.
 STEPS = 6
-#: Standard deviations of an unknown at which its effect is looked at, and S/N of the stare below which it has none.
+#: Standard deviations of an unknown at which its effect is evaluated, and smallest significant S/N of the effect.
 REACH, LEAST = 4.0, 0.01
 
 
 @dataclass(frozen=True, eq=False)
 class Trend:
-    """The unknowns of a stare, and what they do to the sums of its frames.
+    """Effect of a stare's unknowns on the sums of its frames."""
 
-    Attributes
-    ----------
-    frames : ndarray of int, shape (n_frame,)
-        Their numbers, gaps included.
-    frame_s : float
-    variance : ndarray, shape (n_frame,)
-        Of each frame's sums.
-    of : tuple of {"star", "light", "sky", "temperature"}
-        What each unknown changes.
-    curves : ndarray, shape (n_unknown, n_frame)
-        What one standard deviation of each does to every frame.
-    star, sky, dark : ndarray, shape (n_frame, n_sum)
-        Known means of the components.
-    slope_per_c : float
-        Relative change of the dark for 1 deg C.
-    """
-
-    frames: NDArray[np.int64]
+    frames: NDArray[np.int64]  # frame numbers including gaps, shape (n_frame,)
     frame_s: float
-    variance: Float
-    of: tuple[Changing, ...]
-    curves: Float
-    star: Float
-    sky: Float
-    dark: Float
-    slope_per_c: float
+    variance: Float  # of each frame's sums, shape (n_frame,)
+    of: tuple[Changing, ...]  # quantity that each unknown changes
+    curves: Float  # change per standard deviation of each unknown, shape (n_unknown, n_frame)
+    star: Float  # known mean, shape (n_frame, n_sum)
+    sky: Float  # known mean, shape (n_frame, n_sum)
+    dark: Float  # known mean, shape (n_frame, n_sum)
+    slope_per_c: float  # relative change of the dark current per deg C
 
     @classmethod
     def of_unknowns(
@@ -78,16 +62,7 @@ class Trend:
         frame_s: float,
         slope_per_c: float,
     ) -> Trend | None:
-        """Return the trend of a stare's unknowns; None where there are none.
-
-        Parameters
-        ----------
-        unknowns : sequence of StareUnknown
-        directions : mapping of str to ndarray
-            As `Survey.directions`: what a small change of each does to the sums of every frame.
-        variance, frames, frame_s, slope_per_c
-            As the attributes.
-        """
+        """Return the trend of a stare's unknowns, or None without unknowns; for `directions`, see `Survey`."""
         if not unknowns:
             return None
         sky = directions["light"] - directions["star"]
@@ -98,18 +73,18 @@ class Trend:
 
     @cached_property
     def far(self) -> Float:
-        """Amplitudes that are far out: all together and each alone, with either sign, (n, n_unknown)."""
+        """Amplitudes of `REACH` standard deviations, together and each alone, with both signs, (n, n_unknown)."""
         rows = np.vstack([np.eye(len(self.of)), np.ones(len(self.of))])
         return np.asarray(REACH * np.vstack([rows, -rows]))
 
     @cached_property
     def bends(self) -> bool:
-        """Whether unknowns do anything to be seen beyond first order."""
+        """True if the effect of unknowns beyond first order is significant."""
         beyond = self.beyond(self.far)
         return bool((np.sum(beyond**2 / self.variance[:, None], axis=(1, 2)) > LEAST**2).any())
 
     def moved(self, amplitudes: Float) -> Float:
-        """Return what unknowns do to the sums, (n_stare, n_frame, n_sum).
+        """Return the effect of unknowns on the sums, (n_stare, n_frame, n_sum).
 
         Parameters
         ----------
@@ -119,26 +94,26 @@ class Trend:
         return self._moved(self._changes(amplitudes))
 
     def part(self, part: slice) -> Trend:
-        """Return that of some frames."""
+        """Return the trend of some frames."""
         names = ("frames", "variance", "star", "sky", "dark")
         return replace(self, curves=self.curves[:, part], **{name: getattr(self, name)[part] for name in names})
 
     def subtracted(self, sums: NDArray[Any]) -> NDArray[np.float64]:
-        """Return sums less what their unknowns do beyond first order.
+        """Fit the unknowns to sums and subtract their effect beyond first order.
 
         Parameters
         ----------
         sums : ndarray, shape (n_stare, n_frame, n_sum)
-            Less what is known of them.
+            Sums less their known mean.
         """
         left = np.array(sums, np.float64)
-        # One at a time: sums of products may be rounded otherwise beside others.
+        # One stare at a time, since the rounding of matrix products may depend on the number of stares.
         for one in left:
             one -= self.beyond(self.fitted(one[None]))[0]
         return left
 
     def beyond(self, amplitudes: Float) -> Float:
-        """Return what unknowns do but for constant multiples of their curves, (n_stare, n_frame, n_sum).
+        """Return the effect of unknowns less its linear part, (n_stare, n_frame, n_sum).
 
         Parameters
         ----------
@@ -169,7 +144,7 @@ class Trend:
 
     @cached_property
     def _linear(self) -> dict[str, Float]:
-        """The sums' mean response to each kind of change, shape (n_sum,)."""
+        """Mean response of the sums to each kind of change, shape (n_sum,)."""
         star, sky, dark = (x.mean(axis=0) for x in (self.star, self.sky, self.dark))
         return {"star": star, "light": star + sky, "sky": sky, "temperature": self.slope_per_c * dark}
 
@@ -204,7 +179,7 @@ class Trend:
         return changes
 
     def _moved(self, changes: Mapping[str, Float]) -> Float:
-        """Return what changes do to the sums, (n_stare, n_frame, n_sum)."""
+        """Return the effect of changes on the sums, (n_stare, n_frame, n_sum)."""
         light = changes["light"] + 1
         star, sky = light * (1 + changes["star"]) - 1, light * (1 + changes["sky"]) - 1
         warm = np.expm1(self.slope_per_c * changes["temperature"])

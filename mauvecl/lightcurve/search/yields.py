@@ -1,4 +1,4 @@
-"""How many flares a campaign recovers, and what their energies tell of how often the star flares."""
+"""Number of flares that a campaign recovers, and the flare rates that follow from recovered energies."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from mauvecl.lightcurve.search.completeness import Completeness
 
 Float = NDArray[np.float64]
 
-#: Energies over which rates are summed, per decade.
+#: Energy steps per decade for sums of rates.
 PER_DECADE = 100
-#: Nodes over the scatter of a rate.
+#: Number of quantiles of the scatter of a rate.
 NODES = 1000
-#: Exponents among which the likeliest is looked for, and energies of the grid on which flares are summed.
+#: Range of fitted exponents, and number of energies of the grid for sums of flares.
 EXPONENTS, GRID = (1.01, 6.0), 1200
 
 
 @dataclass(frozen=True)
 class Yield:
-    """Flares that a campaign recovers.
+    """Number of flares that a campaign recovers.
 
     Attributes
     ----------
     expected : float
-        Their mean at the rate itself, without its scatter.
+        Mean at the nominal rate.
     low, high : int
-        95 % of campaigns lie between: the scatter of the rate and Poisson's.
+        Central 95 % of campaigns, with the scatter of the rate and Poisson noise.
     at_least_one : float
-        Probability, over both.
+        Probability of at least one flare, with the same scatter.
     """
 
     expected: float
@@ -44,31 +44,27 @@ class Yield:
 
     @classmethod
     def of(cls, rates: Rates, completeness: Completeness, days: float) -> Yield:
-        """By a distribution, the share recovered and the time that is observed; energies of the same band.
-
-        Raises
-        ------
-        InputError
-            For energies of different bands, or a negative time.
-        """
+        """Compute the yield from flare rates, completeness and observed days; energies must be in the same band."""
         expected = recovered_per_day(rates, completeness) * _checked(days)
         return cls.about(expected, rates.scatter_dex)
 
     @classmethod
     def about(cls, expected: float, scatter_dex: float) -> Yield:
-        """By the number expected and the scatter of its logarithm."""
-        # Equal shares of the scatter: a Poisson distribution is narrower than it, and wants them close together.
+        """Compute the yield from the expected number and the scatter of its logarithm."""
+        # Many quantiles are needed, since the Poisson distribution may be narrower than the scatter.
         nodes = stats.norm.ppf((np.arange(NODES) + 0.5) / NODES) if scatter_dex > 0 else np.zeros(1)
         means = expected * 10.0 ** (scatter_dex * nodes)
 
         def quantile(probability: float) -> int:
-            return smallest(lambda n: float(np.mean(stats.poisson.cdf(n, means))) >= probability, float(means.max()))
+            return smallest_integer(
+                lambda n: float(np.mean(stats.poisson.cdf(n, means))) >= probability, float(means.max())
+            )
 
         return cls(expected, quantile(0.025), quantile(0.975), float(np.abs(np.expm1(-means)).mean()))
 
 
-def smallest(reached: Callable[[int], bool], most: float) -> int:
-    """The smallest whole number from 0 for which something that stays true is true."""
+def smallest_integer(reached: Callable[[int], bool], most: float) -> int:
+    """Return the smallest n >= 0 for which a monotone predicate holds."""
     low, high = -1, int(most + 20 * np.sqrt(most) + 20)
     while high - low > 1:
         middle = (low + high) // 2
@@ -77,14 +73,18 @@ def smallest(reached: Callable[[int], bool], most: float) -> int:
 
 
 def recovered_per_day(rates: Rates, completeness: Completeness) -> float:
-    """Flares a day that are recovered: the rate in each small step of energy times the completeness there."""
+    """Return the recovered flares per day, the integral of rate times completeness over energy."""
     if rates.band != completeness.band:
-        raise InputError(f"rates in {rates.band!r} and completeness in {completeness.band!r}, expected one band")
+        raise InputError(
+            f"rates are in {rates.band!r} and the completeness in {completeness.band!r}, expected the same band",
+            key="band",
+            value=rates.band,
+        )
     low, high = completeness.decades
     edges = 10 ** np.linspace(low, high, max(2, round((high - low) * PER_DECADE)))
     above = rates.per_day_above(edges)
     chance = completeness.at(np.sqrt(edges[1:] * edges[:-1]))
-    # Beyond the table the last value holds.
+    # The completeness is constant above the table.
     return float(np.sum((above[:-1] - above[1:]) * chance) + above[-1] * completeness.probability[-1])
 
 
@@ -96,26 +96,17 @@ def _checked(days: float) -> float:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A power law fitted to recovered flares.
-
-    Attributes
-    ----------
-    alpha, alpha_sd : float
-    log10_rate, log10_rate_sd : float
-        Of flares of `pivot_erg` or more, a day.
-    pivot_erg : float
-    flares : int
-    """
+    """Power law fitted to recovered flares."""
 
     alpha: float
     alpha_sd: float
-    log10_rate: float
+    log10_rate: float  # of flares per day with energies of at least `pivot_erg`
     log10_rate_sd: float
     pivot_erg: float
     flares: int
 
     def law(self, band: str = "Kepler") -> PowerLaw:
-        """As rates."""
+        """Return the power law as flare rates."""
         return PowerLaw.through(self.alpha, self.pivot_erg, 10**self.log10_rate, band=band, source="fitted")
 
 
@@ -127,30 +118,25 @@ def fit_power_law(
     error_dex: float = 0.0,
     bias_dex: float = 0.0,
 ) -> Fitted:
-    """Exponent and rate of the flares behind those recovered, by maximum likelihood.
+    """Estimate exponent and rate of flares from recovered energies by maximum likelihood.
 
     Recovered energies are a Poisson process of density days * dN/dlogE * completeness, blurred by the error of a
-    recovered energy; standard deviations are by the curvature of the likelihood.
+    recovered energy; standard errors follow from the curvature of the likelihood.
 
     Parameters
     ----------
     energy_erg : ndarray, shape (n,)
-        As recovered.
+        Recovered energies, at least 3.
     completeness : Completeness
-        By true energy.
+        Completeness by true energy.
     days : float
-        Observed.
+        Observed time.
     error_dex, bias_dex : float
-        Normal error of the logarithm of a recovered energy: its standard deviation and mean.
-
-    Raises
-    ------
-    InputError
-        For fewer than 3 flares, energies that cannot be, or no time.
+        Standard deviation and mean of the normal error of the logarithm of a recovered energy.
     """
     logs = np.log10(np.asarray(energy_erg, np.float64))
     if logs.size < 3 or not np.isfinite(logs).all():
-        raise InputError(f"{logs.size} recovered flares, expected at least 3 with energies above 0")
+        raise InputError(f"energy_erg has {logs.size} flares, expected at least 3 with energies above 0")
     if _checked(days) == 0:
         raise InputError("days = 0, expected a time that was observed")
     pivot = float(np.median(logs))
@@ -158,7 +144,7 @@ def fit_power_law(
     step = float(x[1] - x[0])
     chance = completeness.at(10**x)
     recovered = logs - bias_dex
-    # Where nothing is recovered nothing is to be known of the density, which may be huge there.
+    # The density is unconstrained where the completeness is zero, and may be huge there.
     used = chance > 0
     x, chance = x[used], chance[used]
     blur = None
@@ -166,11 +152,11 @@ def fit_power_law(
         blur = stats.norm.pdf(recovered[:, None], x, error_dex) * step
 
     def seen(alpha: float) -> Float:
-        """Recovered flares a day and dex of true energy, for a rate of one above the pivot."""
+        """Return recovered flares per day and dex of true energy, for a rate of 1 above the pivot."""
         return np.asarray((alpha - 1) * np.log(10) * 10 ** ((1 - alpha) * (x - pivot)) * chance)
 
     def cost(alpha: float, log10_rate: float | None = None) -> float:
-        """Minus the logarithm of the likelihood; at the best rate for the exponent unless one is given."""
+        """Return the negative log likelihood, by default at the best rate for the exponent."""
         flares = seen(alpha)
         at = np.interp(recovered, x, flares) if blur is None else blur @ flares
         mean = days * step * flares.sum()
@@ -191,7 +177,7 @@ def fit_power_law(
 
 
 def _curvature(cost: Callable[[Float], float], at: Float) -> Float:
-    """Second derivatives by central differences, (2, 2)."""
+    """Return second derivatives by central differences, (2, 2)."""
     h = 1e-3
     second = np.empty((2, 2))
     steps = h * np.eye(2)

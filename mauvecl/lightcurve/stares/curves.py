@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
-from mauvecl.lightcurve.usual import ORBIT_S
+from mauvecl.lightcurve.defaults import ORBIT_S
 
 Float = NDArray[np.float64]
 

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
+from mauvecl.lightcurve.defaults import CHANGING, ORBIT_S, Changing
 from mauvecl.lightcurve.stares.curves import Curve, Sinusoid
-from mauvecl.lightcurve.usual import CHANGING, ORBIT_S, Changing
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation

@@ -1,7 +1,8 @@
-"""How well found flares are recovered: fits of injected ones, held against what was injected.
+"""Accuracy of fits to detected injections.
 
-Each injected flare is fitted alone (`recovery`), with standard errors by curvature. Flares that `stare` finds are
-fitted together and have intervals by profile likelihood (`alarms`), which hold the truth more often near the threshold.
+Each injected flare is fitted alone (`flare_fit`), with standard errors from the curvature. Flares that `stare` detects
+are fitted together and have intervals from the profile likelihood (`alarms`), which have better coverage near the
+threshold.
 """
 
 from __future__ import annotations
@@ -14,44 +15,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
-    from mauvecl.lightcurve.search.places import Place
-    from mauvecl.lightcurve.search.recovery import Fit, Recovered
+    from mauvecl.lightcurve.search.flare_fit import Fit, FittedFlares
+    from mauvecl.lightcurve.search.injection_sites import Place
 
 Float = NDArray[np.float64]
 
-#: What is kept of each fit: its value over the injected one, peaks in half-widths, and whether the equivalent duration
-#: is within its own standard error.
-KEPT = ("energy", "amplitude", "half_width", "temperature", "peak", "covered")
+#: Quantities of each fit: ratios of fitted to injected values, the peak offset in half-widths, and whether the
+#: equivalent duration is within its standard error.
+FIT_QUANTITIES = ("energy", "amplitude", "half_width", "temperature", "peak", "covered")
 
 
 @dataclass(frozen=True, eq=False)
 class Refit:
-    """Which injected flares are fitted.
-
-    Attributes
-    ----------
-    fit : Fit
-    amplitudes : ndarray, shape (n_half_width, n_amplitude)
-        Of the flares, which are fitted where they are found.
-    temperature_k : float
-        Of the flares.
-    count : int
-        Stares of each peak whose flares are: the first ones.
-    """
+    """Injected flares to fit if they are detected."""
 
     fit: Fit
-    amplitudes: Float
-    temperature_k: float
-    count: int
+    amplitudes: Float  # injected amplitudes, shape (n_half_width, n_amplitude)
+    temperature_k: float  # temperature of the injected flares
+    count: int  # number of stares per peak time with fits, the first ones
 
     @property
     def kelvin(self) -> Float:
-        """Temperatures that the bank looks for, shape (n_temperature,)."""
+        """Temperatures of the bank, shape (n_temperature,)."""
         templates = self.fit.templates
         return np.array(templates.temperatures_k)[list(templates.chosen)]
 
-    def compared(self, recovered: Recovered, amplitude: Float, place: Place) -> dict[str, NDArray[Any]]:
-        """What was recovered of flares of some amplitudes at a place, by the names of `KEPT`, shape (n_amplitude,)."""
+    def compared(self, recovered: FittedFlares, amplitude: Float, place: Place) -> dict[str, NDArray[Any]]:
+        """Compare fits with the injected flares, by the names of `FIT_QUANTITIES`, shape (n_amplitude,) each."""
         duration = amplitude * place.half_width_s * self.fit.bank.shape.equivalent_duration
         off = np.abs(recovered.equivalent_duration_s - duration)
         return {
@@ -65,10 +55,10 @@ class Refit:
 
 
 @dataclass(frozen=True, eq=False)
-class Fitted:
-    """How well the found flares of each cell are recovered; arrays of shape (n_half_width, n_size), NaN for none found.
+class FitAccuracy:
+    """Accuracy of fits in each cell; arrays of shape (n_half_width, n_size), NaN without detections.
 
-    Attributes are named and described by `COLUMNS`.
+    `COLUMNS` describes the attributes.
     """
 
     fitted: Float
@@ -97,8 +87,8 @@ class Fitted:
 
     @classmethod
     def of(cls, parts: Sequence[Mapping[str, NDArray[Any]]]) -> Self:
-        """From the fits of all positions, by the names of `KEPT`, shape (n_stare, n_half_width, n_size) each."""
-        each = {name: np.moveaxis(np.concatenate([part[name] for part in parts]), 0, 2) for name in KEPT}
+        """Summarise the fits of all positions, arrays by `FIT_QUANTITIES` of shape (n_stare, n_half_width, n_size)."""
+        each = {name: np.moveaxis(np.concatenate([part[name] for part in parts]), 0, 2) for name in FIT_QUANTITIES}
         count = np.isfinite(each["energy"]).sum(axis=2)
         none = count == 0
 
@@ -122,6 +112,6 @@ class Fitted:
 
 
 def _quiet_median(values: NDArray[Any], none: NDArray[np.bool_]) -> Float:
-    """The median, where a temperature is fitted at all."""
+    """Return the median over stares, NaN for cells without fitted temperatures."""
     blank = none | ~np.isfinite(values).any(axis=2)
     return np.where(blank, np.nan, np.nanmedian(np.where(blank[:, :, None], 0.0, values), axis=2))

@@ -1,9 +1,8 @@
-"""What a found flare was: onset, amplitude, half-width, temperature and equivalent duration, with their errors.
+"""Fits of single flares: peak, amplitude, half-width, temperature and equivalent duration, with standard errors.
 
-A fit of least squares from the template that found it, over the level that the search marginalises over (Levenberg
-1944, doi 10.1090/qam/10666; Marquardt 1963, doi 10.1137/0111030); errors from the inverse of the information. Flares
-near the threshold are seen when noise helps them, so that their amplitudes come out too large: the fit does not mend
-that.
+Least squares from the template that detected the flare, with the baseline of the search (Levenberg 1944, doi
+10.1090/qam/10666; Marquardt 1963, doi 10.1137/0111030); errors from the inverse of the information. Amplitudes of
+flares near the threshold are biased high, because noise contributes to their detection; fits do not correct for that.
 """
 
 from __future__ import annotations
@@ -22,59 +21,45 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Steps of a fit, at most, and the change of chi-squared at which it ends.
+#: Largest number of steps of a fit, and the change of chi-squared at which it has converged.
 STEPS, ENOUGH = 30, 1e-3
-#: Frames are averaged as long as a half-width holds so many averages.
+#: Frames are averaged if at least this many averages remain per half-width.
 FINE = 25
-#: Damping to begin with; divided and multiplied by after a step that was better or worse.
+#: Initial damping, and its divisor and factor after successful and failed steps.
 DAMPING, EASIER, HARDER = 1e-2, 5.0, 4.0
-#: Relative step of the derivatives by differences.
+#: Relative step of numerical derivatives.
 DIFFERENCE = 1e-3
-#: Factor that a half-width may change by in one step.
+#: Largest change of peak, in half-widths, and of log half-width in one step.
 LARGEST_STEP = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Recovered:
-    """Flares as a fit has them; arrays of shape (n,), and standard errors beside them.
-
-    Attributes
-    ----------
-    peak_s, peak_error_s : ndarray
-    amplitude, amplitude_error : ndarray
-        Relative rise of the photons in the band, as the templates have it.
-    half_width_s, half_width_error_s : ndarray
-    temperature_k, temperature_error_k : ndarray
-        NaN where only one temperature is known.
-    equivalent_duration_s, equivalent_duration_error_s : ndarray
-        What energies are in proportion to.
-    snr : ndarray
-        Of the fit.
-    """
+class FittedFlares:
+    """Fitted flares and standard errors; arrays of shape (n,)."""
 
     peak_s: Float
     peak_error_s: Float
-    amplitude: Float
+    amplitude: Float  # relative rise of the photons in the band
     amplitude_error: Float
     half_width_s: Float
     half_width_error_s: Float
-    temperature_k: Float
+    temperature_k: Float  # NaN if the templates have only one temperature
     temperature_error_k: Float
-    equivalent_duration_s: Float
+    equivalent_duration_s: Float  # proportional to the energy
     equivalent_duration_error_s: Float
     snr: Float
 
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """How flares are fitted.
+    """Least-squares fit of single flares.
 
     Attributes
     ----------
     bank : Bank
-        Of the search that found them: its shape, level and windows.
+        Bank of the search, which defines shape, baseline and windows.
     templates : Templates
-        What flares do to the sums of a frame.
+        Effect of flares on the sums of a frame.
     """
 
     bank: Bank
@@ -82,7 +67,7 @@ class Fit:
 
     @cached_property
     def response(self) -> tuple[Any, Any, float, float]:
-        """The sums of a flare of one amplitude over log temperature, their derivative, and the ends."""
+        """Sums of a flare of unit amplitude as a function of log temperature, their derivative, and its range."""
         logs = np.log(self.templates.temperatures_k)
         if logs.size == 1:
             row = self.templates.directions[0]
@@ -101,20 +86,20 @@ class Fit:
         temperature_k: ArrayLike,
         variance: Float | None = None,
         curves: Float | None = None,
-    ) -> Recovered:
-        """Fit one flare to each of some light curves.
+    ) -> FittedFlares:
+        """Fit one flare to each of several light curves.
 
         Parameters
         ----------
         sums : ndarray, shape (n, n_frame, n_sum)
-            Less what is known, of the given variance.
+            Sums less their known mean.
         start_s : ndarray, shape (n_frame,)
         peak_s, half_width_s, temperature_k : array_like, shape (n,)
-            Where fits begin: those of the template that found each.
+            Starting points, such as those of the template that detected each flare.
         variance : ndarray, shape (n_frame,), optional
-            Of each frame's sums; one by default.
+            Variance of each frame's sums; 1 by default.
         curves : ndarray, shape (n_curve, n_frame), optional
-            As the search takes them.
+            Baseline curves; see `Search`.
         """
         n = len(sums)
         peak, log_width, log_kelvin = (
@@ -127,34 +112,34 @@ class Fit:
         used = weight.any(axis=0)
         weight, level, start_s = weight[:, used], level[:, used], start_s[used]
         edges = np.column_stack([start_s, start_s + several * self.bank.frame_s])
-        y = _beside(np.asarray(sums[:, used], np.float64), weight, level)
+        y = _remove_baseline(np.asarray(sums[:, used], np.float64), weight, level)
         response, slope, coolest, hottest = self.response
         log_kelvin = np.clip(log_kelvin, coolest, hottest)
         amplitude = np.full(n, np.nan)
 
-        def looked(peak: Float, log_width: Float) -> tuple[Float, Float]:
-            """Products of the shape and its derivatives with each other, (n, 3, 3), and with the sums, (n, 3, K)."""
+        def inner_products(peak: Float, log_width: Float) -> tuple[Float, Float]:
+            """Return products of shape and derivatives with each other, (n, 3, 3), and with the sums, (n, 3, K)."""
             width = np.exp(log_width)
             step = DIFFERENCE * width
             here, later, wider = (
                 self.bank.shape.mean_over(edges, p[:, None], w[:, None])
                 for p, w in ((peak, width), (peak + step, width), (peak, width * np.exp(DIFFERENCE)))
             )
-            three = _beside(
+            three = _remove_baseline(
                 np.stack([here, (later - here) / DIFFERENCE, (wider - here) / DIFFERENCE], 2), weight, level
             )
             weighted = three * weight[:, :, None]
             return np.einsum("nti,ntj->nij", weighted, three), np.einsum("nti,ntk->nik", weighted, y)
 
         def fitted(products: tuple[Float, Float], log_kelvin: Float) -> tuple[Float, Float]:
-            """The best amplitude, and what chi-squared falls by."""
+            """Return the best amplitude, and the fall of chi-squared."""
             r = response(log_kelvin)
             along = np.einsum("nk,nk->n", products[1][:, 0], r)
             power = products[0][:, 0, 0] * np.einsum("nk,nk->n", r, r)
             best = np.maximum(along / np.maximum(power, 1e-300), 1e-12)
             return best, 2 * best * along - best**2 * power
 
-        products = looked(peak, log_width)
+        products = inner_products(peak, log_width)
         amplitude, gain = fitted(products, log_kelvin)
         damping = np.full(n, DAMPING)
         going = np.ones(n, np.bool_)
@@ -167,7 +152,7 @@ class Fit:
             move[~going] = 0
             there = peak + move[:, 1] * np.exp(log_width), log_width + move[:, 2]
             kelvin = np.clip(log_kelvin + move[:, 3], coolest, hottest)
-            tried = looked(*there)
+            tried = inner_products(*there)
             best, reached = fitted(tried, kelvin)
             better = going & (reached > gain)
             small = np.abs(reached - gain) < ENOUGH
@@ -182,12 +167,12 @@ class Fit:
             if not going.any():
                 break
         information, _ = self._normal(products, amplitude, response(log_kelvin), slope(log_kelvin))
-        return self._told(peak, log_width, log_kelvin, amplitude, gain, information)
+        return self._with_errors(peak, log_width, log_kelvin, amplitude, gain, information)
 
     def _averaged(
         self, several: int, sums: NDArray[Any], start_s: Float, variance: Float | None, curves: Float | None
     ) -> tuple[NDArray[Any], Float, Float | None, Float | None]:
-        """Averages of so many frames that follow each other; what gaps leave of fewer is left out."""
+        """Average groups of consecutive frames; incomplete groups at gaps are dropped."""
         if several == 1:
             return sums, start_s, variance, curves
         number = np.rint(start_s / self.bank.frame_s).astype(np.int64)
@@ -203,7 +188,7 @@ class Fit:
     def _windows(
         self, start_s: Float, peak: Float, width: Float, variance: Float | None, curves: Float | None
     ) -> tuple[Float, Float]:
-        """Weights of frames, zero outside of a flare's window, (n, n_frame); and the level's terms, (n, n_frame, p)."""
+        """Return weights of frames, zero outside the windows, (n, n_frame), and baseline terms, (n, n_frame, p)."""
         n, frame_s = peak.size, self.bank.frame_s
         weight = np.zeros((n, start_s.size))
         terms = np.zeros((n, start_s.size, len(self.bank.level.powers) + (0 if curves is None else len(curves))))
@@ -217,7 +202,7 @@ class Fit:
             for j, row in enumerate(rows):
                 terms[k, :, j] = row
         if terms.shape[2]:
-            # Orthonormal in each window, so that the level is a sum of products.
+            # Orthonormal in each window, so that a projection is a sum of products.
             root = np.sqrt(weight)[:, :, None]
             basis = np.linalg.qr(root * terms)[0]
             terms = np.divide(basis, root, out=np.zeros_like(basis), where=root > 0)
@@ -225,7 +210,7 @@ class Fit:
 
     @staticmethod
     def _normal(products: tuple[Float, Float], amplitude: Float, r: Float, dr: Float) -> tuple[Float, Float]:
-        """The information on log amplitude, peak in half-widths, log half-width, log temperature, and the gradient."""
+        """Return information and gradient for log amplitude, peak in half-widths, log half-width, log temperature."""
         shapes, data = products
         # Each derivative is a product of one in time and one in the sums.
         time, sums = np.array([0, 1, 2, 0]), np.stack([r, r, r, dr], axis=1)
@@ -233,15 +218,15 @@ class Fit:
         information = amplitude[:, None, None] ** 2 * shapes[:, time][:, :, time] * inner
         left = data[:, time] - amplitude[:, None, None] * shapes[:, time, 0][:, :, None] * r[:, None]
         pull = amplitude[:, None] * np.einsum("nik,nik->ni", left, sums)
-        # What cannot be told stays as it is.
+        # Parameters without information keep their values.
         blind = np.einsum("nii->ni", information) <= 0
         information[blind] = 0
         np.einsum("nii->ni", information)[blind] = 1.0
         return information, pull
 
-    def _told(
+    def _with_errors(
         self, peak: Float, log_width: Float, log_kelvin: Float, amplitude: Float, gain: Float, information: Float
-    ) -> Recovered:
+    ) -> FittedFlares:
         width, kelvin = np.exp(log_width), np.exp(log_kelvin)
         several = len(self.templates.temperatures_k) > 1
         if not several:
@@ -251,15 +236,15 @@ class Fit:
         both = np.sqrt(np.maximum(covariance[:, 0, 0] + covariance[:, 2, 2] + 2 * covariance[:, 0, 2], 0.0))
         duration = amplitude * width * self.bank.shape.equivalent_duration
         none = np.full(peak.size, np.nan)
-        return Recovered(
+        return FittedFlares(
             peak, width * error[:, 1], amplitude, amplitude * error[:, 0], width, width * error[:, 2],
             kelvin if several else none, kelvin * error[:, 3] if several else none,
             duration, duration * both, np.sqrt(np.maximum(gain, 0.0)),
         )  # fmt: skip
 
 
-def _beside(values: Float, weight: Float, level: Float) -> Float:
-    """Values (n, n_frame, k) less their weighted projection on orthonormal terms (n, n_frame, p)."""
+def _remove_baseline(values: Float, weight: Float, level: Float) -> Float:
+    """Subtract from values (n, n_frame, k) their weighted projection on orthonormal terms (n, n_frame, p)."""
     if not level.shape[2]:
         return values
     amounts = np.einsum("ntp,ntk->npk", level * weight[:, :, None], values, optimize=True)

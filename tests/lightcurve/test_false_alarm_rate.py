@@ -8,30 +8,30 @@ from scipy import special
 from searches import DAVENPORT, KNOWN, ONE
 
 from mauvecl.host.errors import InputError
+from mauvecl.lightcurve.defaults import HALF_WIDTHS_S
 from mauvecl.lightcurve.search.bank import Bank, Level
 from mauvecl.lightcurve.search.completeness import default_bank, search_threshold
-from mauvecl.lightcurve.search.null import DAY_S, Counted
-from mauvecl.lightcurve.search.sampled import sampled
+from mauvecl.lightcurve.search.counted_rate import DAY_S, CountedRate
+from mauvecl.lightcurve.search.false_alarm_rate import TemplateGrid
+from mauvecl.lightcurve.search.importance_sampling import sample_rate
 from mauvecl.lightcurve.search.search import Search
-from mauvecl.lightcurve.search.trials import Trials
 from mauvecl.lightcurve.stares.stare import Stare
-from mauvecl.lightcurve.usual import HALF_WIDTHS_S
 
 
 def test_bank_of_the_page():
     """Eight filters a factor of two apart: .41 to .48 tests a frame, the median of a day at 3.73 (TIME.md)."""
     bank = Bank(tuple(30 * 2.0**k for k in range(8)), ONE, DAVENPORT, 5.0, KNOWN)
-    trials = Trials.of(bank)
-    assert 0.41 < trials.per_frame_above(3.5) < trials.per_frame_above(3.73) < 0.51
+    grid = TemplateGrid.from_bank(bank)
+    assert 0.41 < grid.trials_per_frame(3.5) < grid.trials_per_frame(3.73) < 0.51
     assert search_threshold(np.log(2), bank) == pytest.approx(3.73, abs=0.05)
     # No constant: twice as many far out.
-    assert trials.per_frame_above(6.5) > 1.9 * trials.per_frame_above(3.5)
+    assert grid.trials_per_frame(6.5) > 1.9 * grid.trials_per_frame(3.5)
 
 
 def test_known_answer_of_one_filter():
     """Frames that know nothing of each other: both phases of a template shorter than a frame are the same filter."""
-    alone = Trials.of(Bank((0.02,), ONE, DAVENPORT, 5.0, KNOWN))
-    assert alone.per_frame_above(5.0) == pytest.approx(1.0, rel=1e-4)
+    alone = TemplateGrid.from_bank(Bank((0.02,), ONE, DAVENPORT, 5.0, KNOWN))
+    assert alone.trials_per_frame(5.0) == pytest.approx(1.0, rel=1e-4)
 
 
 @pytest.mark.parametrize("widths", [HALF_WIDTHS_S, (20.0, 40.0, 80.0, 160.0)])
@@ -43,10 +43,10 @@ def test_beside_importance_sampling(widths):
     """
     directions = ONE if widths is HALF_WIDTHS_S else np.array([[1.0, 0.0], [0.95, 0.312], [0.8, 0.6]])
     bank = Bank(widths, directions, DAVENPORT, 5.0, Level(window_s=900.0))
-    tail, trials = sampled(Search(bank, Stare.of(12_000.0)), seed=2, draws=120), Trials.of(bank)
+    tail, grid = sample_rate(Search(bank, Stare.of(12_000.0)), seed=2, draws=120), TemplateGrid.from_bank(bank)
     for u, p, error in zip(tail.thresholds[4:], tail.probability[4:], tail.error[4:], strict=True):
         truth = -np.log1p(-p) / (tail.days * 86_400)
-        off, spread = trials.per_second(float(u)) / truth - 1, 4 * error / p
+        off, spread = grid.false_alarms_per_second(float(u)) / truth - 1, 4 * error / p
         assert -spread < off < 0.1 + spread
 
 
@@ -57,9 +57,9 @@ def test_beside_counts():
     """
     bank, stare, rng = default_bank(), Stare.of(21_600.0), np.random.default_rng(1)
     maxima = Search(bank, stare).largest(rng.standard_normal((600, stare.n_frames, 1), dtype=np.float32)).maximum
-    null = Counted(np.sort(maxima), stare.observed_s / DAY_S)
+    null = CountedRate(np.sort(maxima), stare.observed_s / DAY_S)
     for u in (3.5, 3.75, 4.0):
-        rate, expected = null.rate(u), Trials.of(bank).per_second(u) * 86_400
+        rate, expected = null.rate(u), TemplateGrid.from_bank(bank).false_alarms_per_second(u) * 86_400
         spread = 2 * (rate.high - rate.low) / 3.92 * 2
         assert rate.value - spread < expected < 1.2 * rate.value + spread
         assert special.ndtr(-u) * 17_280 * 0.45 < rate.value - spread / 4
@@ -68,7 +68,7 @@ def test_beside_counts():
 def test_threshold_by_inversion():
     for rate in (1.0, 1 / 30, 4e-5):
         cut = search_threshold(rate)
-        assert Trials.of(default_bank()).per_second(cut) * 86_400 == pytest.approx(rate)
+        assert TemplateGrid.from_bank(default_bank()).false_alarms_per_second(cut) * 86_400 == pytest.approx(rate)
     for wrong, words in ((0.0, "above 0"), (1e6, "expected 3e-84 to 262"), (1e-99, "expected 3e-84 to 262")):
         with pytest.raises(InputError, match=words):
             search_threshold(wrong)

@@ -1,4 +1,4 @@
-"""What injections say: completeness over size and half-width with intervals, and limits."""
+"""Completeness of injected flares by size and half-width, with intervals, and size limits."""
 
 from __future__ import annotations
 
@@ -14,26 +14,17 @@ Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
-class Injected:
-    """Injected flares: which of them a search finds.
-
-    Attributes
-    ----------
-    half_widths_s : tuple of float
-    sizes : ndarray, shape (n_size,)
-    amplitudes : ndarray, shape (n_half_width, n_size)
-    critical : ndarray, shape (n_half_width, n_position, n_draw)
-        Size from which on each draw is found.
-    """
+class InjectedCompleteness:
+    """Detection of injected flares."""
 
     half_widths_s: tuple[float, ...]
-    sizes: Float
-    amplitudes: Float
-    critical: Float
+    sizes: Float  # shape (n_size,)
+    amplitudes: Float  # shape (n_half_width, n_size)
+    critical: Float  # smallest size that is detected in each draw, shape (n_half_width, n_position, n_draw)
 
     @property
     def count(self) -> int:
-        """Injections of each cell."""
+        """Injections per cell."""
         return int(self.critical[0].size)
 
     @cached_property
@@ -47,21 +38,21 @@ class Injected:
 
     @property
     def completeness(self) -> Float:
-        """Fraction found, shape (n_half_width, n_size)."""
+        """Detected fraction, shape (n_half_width, n_size)."""
         return self._cells[0]
 
     @property
     def completeness_low(self) -> Float:
-        """Lower ends of its 95 % intervals."""
+        """Lower limits of the 95 % intervals of `completeness`."""
         return self._cells[1]
 
     @property
     def completeness_high(self) -> Float:
-        """Upper ends of its 95 % intervals."""
+        """Upper limits of the 95 % intervals of `completeness`."""
         return self._cells[2]
 
     def _completeness(self, critical: Float, size: float) -> Interval:
-        """Fraction found at a size; the interval is of as many independent draws as positions that differ leave."""
+        """Return the detected fraction at a size, with an interval for the effective number of independent draws."""
         each = np.mean(critical <= size, axis=1)
         fraction, trials = float(each.mean()), self._independent(each, critical.size)
         around = clopper_pearson(round(fraction * trials), trials)
@@ -69,7 +60,7 @@ class Injected:
 
     @staticmethod
     def _independent(each: Float, count: int) -> int:
-        """Independent draws that scatter as much: fewer than `count` where positions differ (Kish's design effect)."""
+        """Return the effective number of independent draws, reduced if positions differ (Kish's design effect)."""
         fraction = float(each.mean())
         binomial = fraction * (1 - fraction) / count
         if not binomial > 0 or each.size < 2:
@@ -77,26 +68,26 @@ class Injected:
         return max(1, int(count * min(1.0, binomial / max(float(each.var(ddof=1)) / each.size, 1e-300))))
 
     def limit(self, power: float, half_width: int | None) -> Interval:
-        """The size of which a fraction `power` is found, with 95 %; infinite where that many never are.
+        """Return the size at which the fraction `power` is detected, with a 95 % interval; infinite if never reached.
 
         Parameters
         ----------
         power : float
         half_width : int, optional
-            Which; all of them alike, evenly in the logarithm, by default.
+            Index of a half-width; by default the average over all.
         """
         critical = self.critical if half_width is None else self.critical[half_width : half_width + 1]
         by_position = np.moveaxis(critical, 1, 0).reshape(critical.shape[1], -1)
         ordered = np.sort(by_position, axis=None)
         value = float(ordered[min(int(np.ceil(power * ordered.size)), ordered.size) - 1])
         trials = self._independent(np.mean(by_position <= value, axis=1), ordered.size)
-        # Half-widths share their draws: they are no draws more.
+        # Half-widths share draws and do not add independent ones.
         trials = max(1, min(trials, self.count))
         ranks = [int(k / trials * ordered.size) for k in central_counts(trials, power)]
         low, high = (float(ordered[min(max(k, 0), ordered.size - 1)]) for k in ranks)
         return Interval(value, min(low, value), max(high, value))
 
     def never(self, half_width: int | None) -> float:
-        """Fraction for which no template fits into what is observed."""
+        """Return the fraction that no template can detect because of gaps."""
         critical = self.critical if half_width is None else self.critical[half_width]
         return float(np.mean(np.isinf(critical)))

@@ -1,4 +1,4 @@
-"""Where a flare is injected: its half-width and time in a stare, and the templates that can find it there."""
+"""Injection sites: half-width and time of a flare in a stare, and the templates that can detect it."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.lightcurve.search.search import Search
-from mauvecl.lightcurve.search.survey import part_of
+from mauvecl.lightcurve.search.survey import select_frames
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -21,11 +21,11 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 Single = NDArray[np.float32]
 
-#: A template counts as finding a flare if it finds this share of the S/N that the best one does.
+#: Smallest share of the best template's S/N for which a template counts as a detection.
 OVERLAP = 0.3
-#: Filters are multiples of this.
+#: Filters are multiples of this, so that sums are exact.
 STEP = 2.0**-18
-#: Half-widths by which templates may differ from a flare's, and templates before and after its peak that are tried.
+#: Largest ratio of half-widths of template and flare, and half-widths before and after the peak with templates.
 WIDEST, BEFORE, AFTER = 10.0, 3.0, 5.0
 #: Frames up to which a stare is searched as a whole: its search is there, and no part of it is much smaller.
 WHOLE = 20_000
@@ -33,44 +33,29 @@ WHOLE = 20_000
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """A flare's half-width and time in a stare, and the templates that can find it.
-
-    Attributes
-    ----------
-    half_width_s, peak_s : float
-    first : int
-        Frame of the stare from which on templates reach.
-    filters : ndarray of float32, shape (n_filter, n_frame)
-        What the value of each template weighs frames with: times a row of the bank's directions, summed.
-    mean : ndarray of float32, shape (n_frame,)
-        The flare's mean in these frames for an amplitude of one.
-    widths_s, peaks_s : ndarray, shape (n_filter,)
-        The templates' own.
-    counts : ndarray of bool, shape (n_temperature, n_filter)
-        Those that count as finding it.
-    """
+    """Half-width and time of a flare in a stare, and the templates that can detect it."""
 
     half_width_s: float
     peak_s: float
-    first: int
-    filters: Single
-    mean: Single
-    widths_s: Float
-    peaks_s: Float
-    counts: NDArray[np.bool_]
+    first: int  # first frame of the stare that a template covers
+    filters: Single  # weights of frames in the statistic of each template, shape (n_filter, n_frame)
+    mean: Single  # mean of the flare in these frames at unit amplitude, shape (n_frame,)
+    widths_s: Float  # half-widths of the templates, shape (n_filter,)
+    peaks_s: Float  # peak times of the templates, shape (n_filter,)
+    counts: NDArray[np.bool_]  # templates that count as a detection, shape (n_temperature, n_filter)
 
     @property
     def frames(self) -> slice:
-        """Of the stare, to which templates reach."""
+        """Frames of the stare that templates cover."""
         return slice(self.first, self.first + self.mean.size)
 
     @cached_property
     def weights(self) -> Float:
-        """The filters as sums over frames take them, shape (n_frame, n_filter)."""
+        """Transposed filters in double precision, shape (n_frame, n_filter)."""
         return np.ascontiguousarray(self.filters.T, np.float64)
 
     def within(self, first: int) -> Place:
-        """The same in the part of the stare that begins with a frame."""
+        """Return the site in the part of the stare that starts with frame `first`."""
         return replace(self, first=self.first - first)
 
 
@@ -159,7 +144,7 @@ def _near(survey: Survey, reaches: Sequence[_Reach]) -> tuple[Search, int]:
     near = {width for reach in reaches for width in reach.half_widths_s}
     bank = replace(survey.bank, half_widths_s=tuple(sorted(near)))
     curves = None if survey.curves is None else survey.curves[:, part]
-    return Search(bank, part_of(stare, part), curves, survey.variance[part]), part.start
+    return Search(bank, select_frames(stare, part), curves, survey.variance[part]), part.start
 
 
 def _filters(search: Search, seen: Sequence[_Seen]) -> dict[int, tuple[NDArray[np.int64], Single]]:

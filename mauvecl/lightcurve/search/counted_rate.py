@@ -1,8 +1,8 @@
-"""How often a search alarms without a flare: the largest values of simulated stares, counted; the common rule.
+"""Rate of false alarms, counted in simulated stares, and the conventional rule of consecutive points.
 
-Rates are false alarms per star-day, 86 400 s of frames (gaps do not count). Alarms come in clumps, of which a search
-reports the largest, so that the probability of none in t star-days is exp(-rate t). Where counting ends, `sampled` goes
-on.
+Rates are false alarms per star-day, 86 400 s of frames (gaps do not count). Alarms occur in clusters, of which a search
+reports the largest value, so that the probability of no alarm in t star-days is exp(-rate t). `importance_sampling`
+covers rates that are too small to count.
 """
 
 from __future__ import annotations
@@ -20,27 +20,19 @@ from mauvecl.statistics.intervals import Interval, central_counts, clopper_pears
 Float = NDArray[np.float64]
 
 DAY_S = 86_400.0
-#: Alarms that a counted threshold rests on at least.
-FEWEST_ALARMS = 10
+#: Smallest number of alarms for a counted threshold.
+MIN_ALARMS = 10
 
 
 @dataclass(frozen=True, eq=False)
-class Counted:
-    """The largest values of stares without a flare.
+class CountedRate:
+    """False-alarm rate from the largest values of stares without a flare."""
 
-    Attributes
-    ----------
-    maxima : ndarray, shape (n_stare,)
-        Ascending.
-    days : float
-        Star-days of each stare.
-    """
-
-    maxima: Float
-    days: float
+    maxima: Float  # ascending, shape (n_stare,)
+    days: float  # star-days of each stare
 
     def rate(self, threshold: float) -> Interval:
-        """False alarms per star-day at a threshold, with 95 %; infinite where every stare has one."""
+        """Return the false alarms per star-day at a threshold, with a 95 % interval; infinite if all stares alarm."""
         n = self.maxima.size
         above = n - int(np.searchsorted(self.maxima, threshold, side="left"))
         p = clopper_pearson(above, n)
@@ -49,32 +41,29 @@ class Counted:
         return Interval(*values)
 
     def threshold(self, rate: float) -> Interval:
-        """The value with so many false alarms per star-day, with 95 %.
+        """Return the threshold for a number of false alarms per star-day, with a 95 % interval.
 
-        Raises
-        ------
-        InputError
-            If fewer than 10 of the stares would have one, or fewer than 10 none.
+        Raises InputError if it is expected that fewer than 10 stares alarm, or fewer than 10 do not.
         """
         n = self.maxima.size
         alarmed = -np.expm1(-rate * self.days)
-        if min(alarmed, 1 - alarmed) * n < FEWEST_ALARMS:
+        if min(alarmed, 1 - alarmed) * n < MIN_ALARMS:
             raise InputError(
-                f"{rate:g} false alarms per star-day are {alarmed * n:.3g} of {n} simulated stares, expected at least "
-                f"{FEWEST_ALARMS} with one and as many without"
+                f"{rate:g} false alarms per star-day occur in {alarmed * n:.3g} of {n} simulated stares, expected at "
+                f"least {MIN_ALARMS} with an alarm and as many without"
             )
         low, high = central_counts(n, 1 - alarmed)
         places = np.clip([round(n * (1 - alarmed)), low, high], 0, n - 1)
         return Interval(*(float(self.maxima[k]) for k in places))
 
 
-def in_a_row(values: NDArray[Any], points: int, sigma: float) -> NDArray[np.bool_]:
-    """Where the common rule alarms: frames that end a run of so many consecutive ones above so many sigma.
+def consecutive_alarms(values: NDArray[Any], points: int, sigma: float) -> NDArray[np.bool_]:
+    """Return the frames that complete a run of `points` consecutive frames above `sigma`.
 
     Parameters
     ----------
     values : ndarray, shape (..., n_frame)
-        In standard deviations; the first `points` of a longer run end in one alarm.
+        Values in standard deviations. A longer run has one alarm, at its frame number `points`.
     points : int
     sigma : float
     """
@@ -88,9 +77,9 @@ def in_a_row(values: NDArray[Any], points: int, sigma: float) -> NDArray[np.bool
     return alarm
 
 
-def in_a_row_rate(points: int, sigma: float, frame_s: float) -> float:
-    """False alarms per star-day of `in_a_row` in white noise: runs of at least so many points."""
+def consecutive_alarm_rate(points: int, sigma: float, frame_s: float) -> float:
+    """Return the false alarms per star-day of the rule of consecutive points in white noise."""
     above = float(scipy.special.ndtr(-sigma))
     frames = DAY_S / frame_s
-    # A run begins with the first frame, or after one that is not above.
+    # A run starts at the first frame or after a frame that is not above sigma.
     return above**points * (1 + (frames - points) * (1 - above))
