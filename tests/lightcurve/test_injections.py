@@ -12,7 +12,7 @@ from scipy import special
 from searches import DAVENPORT, KNOWN, ONE, spectra, survey
 
 from mauvecl.device.stares import Stares
-from mauvecl.lightcurve.search import places
+from mauvecl.lightcurve.search import injection_sites
 from mauvecl.lightcurve.search.bank import Bank, Level
 from mauvecl.lightcurve.search.counted_rate import consecutive_alarm_rate, consecutive_alarms
 from mauvecl.lightcurve.search.flare_fit import Fit
@@ -190,7 +190,7 @@ def test_places_are_those_of_each_flare_alone_and_of_part_of_the_stare(injection
     widths = tuple(np.sort(10 ** rng.uniform(0.8, 2.5, 4)))
     peak = float(rng.uniform(-50.0, 950.0))
     together = places_of(injections.survey, widths, peak, injections.response)
-    monkeypatch.setattr(places, "WHOLE", 0)
+    monkeypatch.setattr(injection_sites, "WHOLE", 0)
     for width, place in zip(widths, together, strict=True):
         (alone,) = places_of(injections.survey, (width,), peak, injections.response)
         assert (place.half_width_s, place.peak_s, place.first) == (width, peak, alone.first)
@@ -199,7 +199,7 @@ def test_places_are_those_of_each_flare_alone_and_of_part_of_the_stare(injection
         np.testing.assert_array_equal(place.peaks_s, alone.peaks_s)
         np.testing.assert_array_equal(place.mean, alone.mean)
         # Filters are rounded to multiples of a step: sums in another order may round one to the next.
-        np.testing.assert_allclose(place.filters, alone.filters, rtol=0, atol=1.01 * places.STEP)
+        np.testing.assert_allclose(place.filters, alone.filters, rtol=0, atol=1.01 * injection_sites.STEP)
 
 
 @dataclass(frozen=True)
