@@ -29,7 +29,7 @@ def collect_messages(expectations: list[Expectation], processes: Processes | Non
 
     All answers report the saturation of stars and flares through this function.
     """
-    texts = [message for x in expectations for message in (*x.messages, *_coarse(x))]
+    texts = [message for x in expectations for message in (*_without_light(x), *x.messages, *_coarse(x))]
     outside = off_centre(expectations, processes) if processes else []
     return worst_first([*(f"OUTSIDE THE PRIOR: {text}." for text in outside), *texts])
 
@@ -48,6 +48,17 @@ def off_centre(expectations: list[Expectation], processes: Processes) -> list[st
                 "thresholds hold that difference"
             )
     return sentences
+
+
+def _without_light(x: Expectation) -> tuple[str, ...]:
+    """Return the message on an exposure without light of the star, if it has none."""
+    electrons = float(np.sum(x.source_electrons)) * x.n_frames
+    if electrons >= 1.0:
+        return ()
+    return (
+        f"NO LIGHT: {x.name} gives {electrons:.2g} electrons in all {x.wavelength_nm.size} pixels of an exposure of "
+        f"{x.exposure_s:g} s: there is nothing to see of it, and its S/N is 0.",
+    )
 
 
 def worst_first(messages: Iterable[str]) -> list[str]:

@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import json
 
+import pytest
+
 from mauvecl.answers.report import json_text
+from mauvecl.answers.signal.simulate import simulate
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.study import Study
 
@@ -22,3 +25,11 @@ def test_json_has_no_number_that_is_none() -> None:
         "a": [None, 1.5],
         "b": {"c": [None, "NaN"]},
     }
+
+
+@pytest.mark.parametrize(("magnitude", "dark"), [(7.4, False), (20.0, False), (24.0, True), (25.0, True)])
+def test_a_star_without_light_is_named(magnitude: float, dark: bool) -> None:
+    """Less than one electron in all pixels of an exposure is said; S/N of 0 does not stand without a word."""
+    study = Study().with_settings([f"star=[{{library = 'G2V', magnitude = {magnitude}}}]"])
+    messages = simulate(study).messages
+    assert any(text.startswith("NO LIGHT: G2V gives 0.") for text in messages) == dark
