@@ -88,7 +88,7 @@ def test_numbers_as_text_in_settings_raise() -> None:
         'star.0.magnitude="5"',
     ):
         with pytest.raises(InputError, match=r"expected a number without quotes"):
-            Study().with_settings([f"{key}={value}"])
+            Study().with_settings([text])
 
 
 def test_booleans_in_settings_and_files_raise(tmp_path: Path) -> None:
