@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import difflib
-from typing import TYPE_CHECKING, Annotated, Any, Literal, cast, get_args, get_origin
+from typing import TYPE_CHECKING, Any, cast, get_args
 
 from pydantic import (
     BaseModel,
@@ -46,16 +46,11 @@ class Record(BaseModel, metaclass=_InputErrorMeta):
     @field_validator("*", mode="wrap")
     @classmethod
     def _no_truth_as_number(cls, given: Any, validate: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
-        """Refuse true and false where a number or text is expected, and numbers in quotes where a number is.
-
-        pydantic takes true and false for 1 and 0, and "5" for 5.
-        """
+        """Refuse true and false where a number or text is expected; pydantic takes them for 1 and 0."""
         annotation = cls.model_fields[str(info.field_name)].annotation
         values = list(given.values()) if isinstance(given, dict) and not _model_in(annotation) else given
         if holds_truth(values) and not _takes_truth(annotation):
             raise PydanticCustomError("truth", "Input should be no truth value")
-        if _number_as_text(values) and _takes_numbers_only(annotation):
-            raise PydanticCustomError("text", "Input should be a number, not text")
         return validate(given)
 
     def __setattr__(self, name: str, value: Any) -> None:
@@ -73,31 +68,6 @@ def holds_truth(given: Any) -> bool:
         return any(map(holds_truth, given))
     # NumPy's own too, which need not be loaded.
     return type(given).__name__ in ("bool", "bool_")
-
-
-def _number_as_text(given: Any) -> bool:
-    """Return whether a value is a number written as text, or a list that has one."""
-    if isinstance(given, list | tuple):
-        return any(map(_number_as_text, given))
-    if not isinstance(given, str):
-        return False
-    try:
-        float(given)
-    except ValueError:
-        return False
-    return True
-
-
-def _takes_numbers_only(annotation: Any) -> bool:
-    """Return whether a type has numbers and neither text, paths nor anything else that is read from text."""
-    parts = [part for part in get_args(annotation) if part is not type(None) and part is not Ellipsis]
-    if get_origin(annotation) is Literal:
-        return True
-    if get_origin(annotation) is Annotated:
-        return _takes_numbers_only(parts[0])
-    if get_origin(annotation) is dict:
-        return _takes_numbers_only(parts[-1])
-    return all(map(_takes_numbers_only, parts)) if parts else annotation in (int, float)
 
 
 def _takes_truth(annotation: Any) -> bool:
@@ -140,8 +110,6 @@ def _sentence(model: type[BaseModel], error: ValidationError) -> str:
         return f"{value}, expected {told.partition('should have ')[2].partition(' after')[0]}"
     if first["type"] == "truth":
         return f"{value}, expected a number or text, not true or false"
-    if first["type"] == "text":
-        return f"{value}, expected a number without quotes"
     if first["type"] == "path_type":
         return f"{value}, expected a path"
     return f"{value}: {told.lower()}" if told == first["msg"] else f"{value}, expected {told}"

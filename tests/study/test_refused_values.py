@@ -15,7 +15,6 @@ import mauvecl
 from mauvecl.host.errors import InputError
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.records import Record
-from mauvecl.study.orbits import LimitsText
 from mauvecl.study.study import Study
 
 
@@ -67,28 +66,6 @@ def test_booleans_as_numbers_raise(model: type[Record], name: str, value: Any) -
     with pytest.raises(ValidationError) as error:
         model.model_validate({name: value})
     assert any(fault["loc"][0] == name for fault in error.value.errors())
-
-
-@pytest.mark.parametrize(("model", "name"), NUMERIC)
-@pytest.mark.parametrize("value", ["5", "1e3", ["0.5"], [0.5, "1"], ("2",)])
-def test_numbers_as_text_raise(model: type[Record], name: str, value: Any) -> None:
-    """All numeric keys that take no text reject numbers in quotes, alone and in lists."""
-    if str in plain(model.model_fields[name].annotation) or model is LimitsText:
-        pytest.skip("takes text: a word beside numbers, which flags pass on as it was typed")
-    with pytest.raises(ValidationError) as error:
-        model.model_validate({name: value})
-    assert any(fault["loc"][0] == name for fault in error.value.errors())
-
-
-def test_numbers_as_text_in_settings_raise() -> None:
-    for text in (
-        'observation.exposure_s="5"',
-        'flare.amplitudes=["0.1"]',
-        'nuisances.dark="5"',
-        'star.0.magnitude="5"',
-    ):
-        with pytest.raises(InputError, match=r"expected a number without quotes"):
-            Study().with_settings([text])
 
 
 def test_booleans_in_settings_and_files_raise(tmp_path: Path) -> None:
