@@ -335,7 +335,7 @@ def test_a_scheduler_that_dies(tmp_path: Path, scene: list[Expectation]) -> None
 @pytest.mark.parametrize(
     ("where", "kind", "sentence"),
     [
-        ("local:0", InputError, "--cluster 'local:0', expected local:N with N from 1"),
+        ("local:0", InputError, "cluster = 'local:0', expected local:N with N from 1"),
         ("nowhere.json", InputError, "expected local:N, an address such as tcp://host:8786, or a scheduler file"),
         ("tcp://127.0.0.1:1", DeviceError, "no scheduler answers at tcp://127.0.0.1:1, expected one within"),
     ],
