@@ -42,6 +42,7 @@ INNER = (
     "Nuisances.rows", "Nuisances.finite", "Processes.factors", "Normal.quantile", "Uniform.quantile",
     "Stares.", "Pool.stares", "Sinusoid.mean_over", "PixelMap.over", "Instrument.per_pixel", "Stare.along",
     "Engine.realise_and_count", "Study.detecting", "bulk.unfinished", "bulk.state", "bulk.draw",
+    "FlareModel", "FlareWithLines", "fit", "forecast", "measure_along",
 )  # fmt: skip
 
 

@@ -45,7 +45,7 @@ def test_keys_of_files_belong_to_stars_of_files(tmp_path: Path) -> None:
     done = CliRunner().invoke(app, ["simulate", "--star", "G2V", "--extend", "K5V", "-o", str(tmp_path)])
     assert isinstance(done.exception, InputError)
     assert "--extend without a spectrum file among the stars" in str(done.exception)
-    with pytest.raises(InputError, match="a star of the library has extend, expected them of a file only"):
+    with pytest.raises(InputError, match="a star of the library has extend, expected a star from a file"):
         Study.build({"star": [{"library": "G2V", "extend": "K5V"}]}, "test")
     study = Study.build({"star": [{"file": "x.txt", "extend": "K5V", "flux_unit": "Jy"}]}, "test")
     star = study.at("star", "G2V").star[0]

@@ -61,7 +61,7 @@ class EnergyScale:
     """
 
     band: str
-    kind: Kind
+    kind: Literal["band", "bolometric"]
     erg_per_s: float
     how: str
 
