@@ -74,7 +74,7 @@ class EnergyScale:
         band: str = "Kepler",
         flare_k: float = 10_000.0,
         flare: FlareSpectrum | None = None,
-        kind: Kind = "bolometric",
+        kind: Literal["band", "bolometric"] = "bolometric",
         geometry: Geometry = "added",
         photosphere_k: float | None = None,
     ) -> Self:
@@ -127,7 +127,7 @@ class EnergyScale:
         band: str = "Kepler",
         flare_k: float = 10_000.0,
         flare: FlareSpectrum | None = None,
-        kind: Kind = "bolometric",
+        kind: Literal["band", "bolometric"] = "bolometric",
         geometry: Geometry = "added",
         photosphere_k: float | None = None,
     ) -> Self:
@@ -194,7 +194,7 @@ class EnergyScale:
         star: str,
         band: str,
         flare: FlareSpectrum,
-        kind: Kind,
+        kind: Literal["band", "bolometric"],
         geometry: Geometry,
         photosphere_k: float | None,
     ) -> Self:
