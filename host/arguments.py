@@ -16,7 +16,20 @@ from .quantities import is_quantity, numbers, shown, unit_of, word_of
 Given = TypeVar("Given", bound=Callable[..., Any])
 
 #: Annotations that stand for one of some words: which, is the function's own matter.
-TEXTS = ("str", "Literal", "System", "Order", "Signal", "Geometry", "Per", "Tails", "Weighted", "Lookup", "Method")
+TEXTS = (
+    "str",
+    "Literal",
+    "System",
+    "Order",
+    "Signal",
+    "Geometry",
+    "Per",
+    "Kind",
+    "Tails",
+    "Weighted",
+    "Lookup",
+    "Method",
+)
 #: Those of one number as well.
 ARRAYS = ("Float", "ArrayLike")
 SEVERAL = ("tuple", "list", "Sequence", "Collection", "Iterable")
@@ -25,8 +38,8 @@ SHORT = {"Prior": "Uniform | Normal", "Curve": "Sinusoid | Table", "Progress": "
 #: Classes that are told apart by their names, since rooms below know none above.
 CLASSES = (
     "Checkpoint", "Comparison", "Cooling", "CosmicRays", "Detection", "Device", "EnergyScale", "Engine",
-    "Expectation", "Linear", "Normal", "Nuisances", "Pool", "Shape", "Sinusoid", "Sky", "Source", "Star", "Stare",
-    "Stares", "Study", "Table", "Tiles", "Uniform",
+    "Expectation", "FlareModel", "FlareSpectrum", "Linear", "Normal", "Nuisances", "Pool", "Shape", "Sinusoid",
+    "Sky", "Source", "Star", "Stare", "Stares", "Study", "Table", "Tiles", "Uniform",
 )  # fmt: skip
 #: What arguments are called in a sentence where their own names would not tell.
 CALLED = {"quiet": "the quiescent star"}

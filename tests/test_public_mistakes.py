@@ -36,13 +36,12 @@ WRONG = {
 NEVER = ("a Quantity of another unit", "a list of two kinds", "an object")
 FREE = ("Any", "object", "dict[str, Any]", "str")
 #: Made by functions that are tried, with fields of their own names; and what is a part of the engine's inner side.
-MADE = ("Detection", "Expectation", "Instrument", "Study", "Stare")
+MADE = ("Detection", "Expectation", "FlareModel", "Instrument", "Measurement", "MeasuredBins", "Study", "Stare")
 INNER = (
     "Detection.collect", "Detection.of", "DaskWorkers", "LocalWorkers.submit", "Engine.count", "Linear.", "TableShape.",
     "Nuisances.rows", "Nuisances.finite", "Processes.factors", "Normal.quantile", "Uniform.quantile",
     "Stares.", "Pool.stares", "Sinusoid.mean_over", "PixelMap.over", "Instrument.per_pixel", "Stare.along",
     "Engine.realise_and_count", "Study.detecting", "bulk.unfinished", "bulk.state", "bulk.draw",
-    "FlareModel", "FlareWithLines", "fit", "forecast", "measure_along",
 )  # fmt: skip
 
 
@@ -52,9 +51,13 @@ def star() -> Any:
 
 
 @cache
+def part() -> Any:
+    return mauvecl.Instrument.load("mauve").with_(output_min_nm=300.0, output_max_nm=306.0)
+
+
+@cache
 def pair() -> Any:
-    payload = mauvecl.Instrument.load("mauve").with_(output_min_nm=300.0, output_max_nm=306.0)
-    return tuple(mauvecl.expect(s, payload, exposure=5) for s in (star(), star().flaring(0.5)))
+    return tuple(mauvecl.expect(s, part(), exposure=5) for s in (star(), star().flaring(0.5)))
 
 
 @cache
@@ -109,7 +112,9 @@ def fitting() -> dict[str, Any]:
         "Detection.statistic.name": "chi2", "Expectation.per_element.values": pixels, "Source.wavelength_nm":
         np.linspace(170, 1200, 1200), "Source.from_arrays.wavelength": np.linspace(170, 1200, 1200),
         "Nuisances.of.sd": {"dark": 0.1}, "Normal.sd": 1.0, "Source.from_library.name": "G2V", "Linear.name": "mine",
-        "Instrument.build.values": {},
+        "Instrument.build.values": {}, "model": mauvecl.FlareModel.of(star(), part(), quiet), "kelvin": 9000.0,
+        "amplitudes": (0.1,), "continuum": mauvecl.BalmerFlare(9000.0), "frames": flare.recorded_dn[None],
+        "measure_along.frames": np.tile(flare.recorded_dn, (3, 1)),
     }  # fmt: skip
 
 

@@ -66,7 +66,6 @@ def with_flare(
         Temperature of the photosphere, which ``replaces`` requires.
     """
     check_amplitude(amplitude)
-    check_spectrum(spectrum)
     light = _photons_in_band(wavelength_nm, flux_flam, spectrum, band, geometry, photosphere_temperature_k)
     grid, quiescent = _on_grid(wavelength_nm, flux_flam, spectrum)
     body = spectrum.flux(grid)
@@ -88,12 +87,6 @@ def with_flare(
             f"expected at most {light.ratio - 1.0:.3g}"
         )
     return grid, quiescent * (1.0 - filling) + filling * light.ratio * light.star / light.hot * body
-
-
-def check_spectrum(spectrum: object) -> None:
-    """Raise InputError if an object is no spectrum of a flare."""
-    if not hasattr(spectrum, "grid"):
-        raise InputError(f"spectrum is a {type(spectrum).__name__}, expected a FlareSpectrum, such as BalmerFlare")
 
 
 def _on_grid(wavelength_nm: Float, flux_flam: Float, spectrum: FlareSpectrum) -> tuple[Float, Float]:
@@ -132,7 +125,6 @@ def added_light(
 
 def check_scales(spectrum: FlareSpectrum) -> None:
     """Raise InputError if some lines of a flare do not scale with its amplitude."""
-    check_spectrum(spectrum)
     if spectrum.fixed_lines:
         raise InputError(
             f"a flare of {spectrum.describe()} has lines that do not scale with its amplitude, expected lines as a "

@@ -1,4 +1,4 @@
-"""Whether an answer's folder is as its run wrote it: digests of its files, and of the run record itself."""
+"""Comparison of an answer's folder with what its run wrote, by digests of its files and of the run record."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import Any
 from mauvecl.host.arguments import public
 from mauvecl.host.errors import InputError
 from mauvecl.host.files.parsed import read_text
+from mauvecl.study.study_text import read_embedded_study
 
 #: Name of the run record in a folder, and its key that holds the digest of all others.
 RECORD, OWN_DIGEST = "run.json", "record_digest"
@@ -46,8 +47,18 @@ def record_digest(record: Mapping[str, Any]) -> str:
 
 
 def is_answer(folder: Path) -> bool:
-    """Return whether a folder holds a run record, or a study that one belongs to; stores hold neither."""
-    return (folder / RECORD).is_file() or ((folder / "study.toml").is_file() and not (folder / "zarr.json").exists())
+    """Return whether a folder holds a run record, or the study and a table of an answer whose record is missing."""
+    if (folder / RECORD).is_file():
+        return True
+    return (folder / "study.toml").is_file() and any(map(_is_table_of_answer, folder.glob("*.ecsv")))
+
+
+def _is_table_of_answer(path: Path) -> bool:
+    """Return whether a table has a study in its metadata, which a user's own tables do not."""
+    try:
+        return bool(read_embedded_study(path))
+    except InputError:
+        return False
 
 
 @public

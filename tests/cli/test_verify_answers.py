@@ -57,6 +57,17 @@ def test_every_changed_or_missing_file_is_noticed(verb: str, tmp_path: Path, mon
     assert verify_answer(out) == []
 
 
+def test_a_study_of_ones_own_is_no_answer(tmp_path: Path) -> None:
+    """A study next to a user's own table was written by no run: nothing is missing there."""
+    (tmp_path / "study.toml").write_text("[run]\nfap = 0.01\n", encoding="utf-8")
+    header = "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: amplitude, datatype: float64}\n"
+    (tmp_path / "flares.ecsv").write_text(f"{header}amplitude\n0.1\n", encoding="utf-8")
+    assert "'.' is no store of spectra" in run("verify", ".", folder=tmp_path, code=2).stderr
+    with pytest.raises(InputError) as error:
+        verify_answer(tmp_path)
+    assert error.value.key == "folder"
+
+
 def test_every_value_of_the_record_counts(tmp_path: Path) -> None:
     """Each entry of the record changed or removed, and digests of files changed along with the files."""
     out = ask("exposure", tmp_path)

@@ -61,7 +61,7 @@ class EnergyScale:
     """
 
     band: str
-    kind: Literal["band", "bolometric"]
+    kind: Kind
     erg_per_s: float
     how: str
 
@@ -74,7 +74,7 @@ class EnergyScale:
         band: str = "Kepler",
         flare_k: float = 10_000.0,
         flare: FlareSpectrum | None = None,
-        kind: Literal["band", "bolometric"] = "bolometric",
+        kind: Kind = "bolometric",
         geometry: Geometry = "added",
         photosphere_k: float | None = None,
     ) -> Self:
@@ -127,7 +127,7 @@ class EnergyScale:
         band: str = "Kepler",
         flare_k: float = 10_000.0,
         flare: FlareSpectrum | None = None,
-        kind: Literal["band", "bolometric"] = "bolometric",
+        kind: Kind = "bolometric",
         geometry: Geometry = "added",
         photosphere_k: float | None = None,
     ) -> Self:
@@ -194,7 +194,7 @@ class EnergyScale:
         star: str,
         band: str,
         flare: FlareSpectrum,
-        kind: Literal["band", "bolometric"],
+        kind: Kind,
         geometry: Geometry,
         photosphere_k: float | None,
     ) -> Self:

@@ -126,6 +126,8 @@ def measure_along(
         For frames of another shape, an expectation of several frames, or a stare in which no bin reaches the S/N.
     """
     raw = np.asarray(frames, np.float64)
+    if raw.ndim != 2:
+        raise InputError(f"frames of the shape {raw.shape}, expected two dimensions: frames and pixels")
     if stare is None:
         here = quiet.conditions["temperature_c"]
         stare = Stare.of(max(len(raw), 1) * quiet.frame_s, frame_s=quiet.frame_s, temperature_c=here)
