@@ -88,7 +88,7 @@ def converted(raw: RawSpectrum, wavelength_unit: Any = None, flux_unit: Any = No
 
 @dataclass(frozen=True)
 class _Scale:
-    """How the numbers of a column are meant."""
+    """The scale of a column's numbers: linear, logarithm or magnitude."""
 
     unit: Any
     is_assumed: bool

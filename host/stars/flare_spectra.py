@@ -311,12 +311,12 @@ class FlareWithLines(FlareSpectrum):
 
     @property
     def surface(self) -> bool:  # type: ignore[override]
-        """Whether `flux` is that of the flare's surface."""
+        """True if `flux` is that of the flare's surface."""
         return self.continuum.surface
 
     @property
     def fixed_lines(self) -> bool:  # type: ignore[override]
-        """Whether some lines have a flux of their own."""
+        """True if some lines have a fixed flux at the telescope."""
         return any(self.fluxes_cgs.values())
 
     @property

@@ -70,7 +70,7 @@ class Outcome:
 
     @property
     def current(self) -> bool:
-        """Whether the outcome is still valid."""
+        """True if the outcome is still valid."""
         return not any(why for _, why in self.tried) or 0 <= time.time() - self.time_s < OUTCOME_LIFETIME_S
 
 

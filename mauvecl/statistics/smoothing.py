@@ -143,7 +143,7 @@ def _interpolation(n: int, step: int) -> tuple[NDArray[np.int64], Float]:
         Lagrange polynomials through the nearest eight centres.
     """
     even = np.linspace(0, n - 1, -(-(n - 1) // step) + 1).round().astype(int)
-    # One more centre beside each end, where interpolation is least accurate.
+    # One more centre next to each end, where interpolation is least accurate.
     centres = np.unique([*even, step // 2, n - 1 - step // 2]) if step > 1 else np.arange(n)
     points = min(POINTS, centres.size)
     between = np.zeros((n, centres.size))

@@ -41,7 +41,7 @@ log = logging.getLogger(__name__)
 
 #: Seconds between two looks at a simulation.
 LOOK_S = 0.25
-#: ClosedForms forms, pictures and files of all visitors are made by so many threads, beside the event loop.
+#: Number of threads, besides the event loop, that make closed forms, pictures and files for all visitors.
 _closed_forms = ThreadPoolExecutor(2, thread_name_prefix="mauvecl-closed")
 #: Questions whose simulations a visitor's connection remembers, and files.
 MOST_KEPT = 4

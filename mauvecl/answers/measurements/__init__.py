@@ -1,1 +1,1 @@
-"""What would be measured of flares."""
+"""Forecasts and simulations of the measurement of flares."""

@@ -1,4 +1,4 @@
-"""What would be measured of a study's flares: errors in advance, simulated fits, and what too simple models do."""
+"""Measurement of a study's flares: forecast errors, simulated fits, and the bias of models that are too simple."""
 
 from __future__ import annotations
 
@@ -163,7 +163,7 @@ class MeasuredFlare(InCell):
 
 @dataclass(eq=False)
 class MeasureAnswer(Answer):
-    """What `mauvecl measure` answers.
+    """The answer of `mauvecl measure`.
 
     Attributes
     ----------

@@ -103,7 +103,7 @@ class StarCompleteness(InCell):
                 "marginalise over what changes in the stare (see [search] frame, cycle, window_s), or set "
                 'search.null = "counted".'
             )
-        # The chance of as many alarms or more where so many are expected.
+        # The probability of at least this many alarms if the expected number is right.
         if scipy.special.gammainc(max(self.alarmed, 1e-300), self.expected) < LEAST_CHANCE:
             messages.append(
                 f"FALSE ALARMS of {self.title} are more than were asked for: {self.alarmed} of the drawn stares have "

@@ -174,7 +174,7 @@ def fit(
     Raises
     ------
     InputError
-        For frames of another shape, or a flare that cannot be told from what is unknown.
+        If frames have another shape, or the flare is degenerate with the unknowns.
 
     Examples
     --------
@@ -360,7 +360,7 @@ def forecast(
     Raises
     ------
     InputError
-        For a flare that is not of the model, or cannot be told from what is unknown.
+        If the flare is not of the model, or is degenerate with the unknowns.
     """
     counts = model.counts(temperature_k, amplitudes)
     reduction = Reduction.of(model, expectation, counts, nuisances)

@@ -1,6 +1,6 @@
-"""What a flare adds to a frame, as a function of its temperature and of amplitudes in which it is linear.
+"""Model of the light that a flare adds to a frame: its temperature, and amplitudes in which it is linear.
 
-A model is a blackbody, whose spectrum depends on one temperature, and components of fixed shape beside it: a Balmer
+A model is a blackbody, whose spectrum depends on one temperature, and components of fixed shape next to it: a Balmer
 continuum, and emission lines. Everything but the temperature is linear, so that a fit searches in one dimension.
 """
 
@@ -211,7 +211,7 @@ class FlareModel:
 
     @cached_property
     def splines(self) -> tuple[scipy.interpolate.CubicSpline | None, ...]:
-        """What derived quantities are made of, over log temperature."""
+        """Splines over log temperature from which derived quantities are computed."""
         values = [one.factors if one.ratio is None else one.ratio for one in self.derived]
         return tuple(None if value is None else scipy.interpolate.CubicSpline(self.log_k, value) for value in values)
 

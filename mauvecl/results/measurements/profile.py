@@ -27,7 +27,7 @@ Float = NDArray[np.float64]
 
 #: Parabolas through three temperatures that refine the best node, and the factor by which they get narrower.
 REFINEMENTS, NARROWER = 3, 8.0
-#: A search for the best temperature alone begins at one in so many of the model's nodes.
+#: The search for the best temperature starts from every `COARSE`-th node of the model.
 COARSE = 4
 #: Steps of the search for the end of an interval.
 STEPS = 12
@@ -94,7 +94,7 @@ class Profile:
         return np.asarray(base + np.maximum(amplitude, 0.0) ** 2 / variance)
 
     def gain_at_nodes(self, every: int = 1) -> Float:
-        """Return `gain` at one in so many of the model's temperatures, shape (n, n_node)."""
+        """Return `gain` at each `every`-th temperature of the model, shape (n, n_node)."""
         product = self.rest @ (self.hot_nodes[::every] / self._lengths[::every, None]).T
         return np.asarray(np.maximum(product, 0.0) ** 2 + np.einsum("nk,nk->n", self.along, self.along)[:, None])
 
@@ -285,7 +285,7 @@ def covariance(model: FlareModel, profile: Profile, best: Best) -> Float:
 def covariance_at(model: FlareModel, log_k: Float, linear: Float, hot: Float, slope: Float, fixed: Float) -> Float:
     """Return the covariance of quantities, (n, n_derived, n_derived), from whitened sums and their derivative.
 
-    NaN where a flare adds no light, or its temperature and amplitudes cannot be told apart.
+    NaN where a flare adds no light, or its temperature and amplitudes are degenerate.
     """
     n, m = linear.shape
     jacobian = np.zeros((n, m + 1, hot.shape[1]))

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 Float = NDArray[np.float64]
 
-#: Temperatures whose spectra span the directions: one in so many of the model's nodes.
+#: The spectra of every `EVERY`-th node of the model span the directions.
 EVERY = 4
 #: Directions with less than this share of the largest eigenvalue hold rounding only.
 LEAST = 1e-11
@@ -88,7 +88,7 @@ class Reduction:
         Raises
         ------
         InputError
-            If every pixel saturates, or a flare cannot be told from what is unknown.
+            If every pixel saturates, or the flare is degenerate with the unknowns.
         """
         variance, used = variance_of(quiet, added_dn)
         if left_out is not None:
