@@ -5,7 +5,7 @@ BIN := .venv/bin
 # Compiled files are kept whatever the shell says: the tests start Python some hundred times.
 unexport PYTHONDONTWRITEBYTECODE
 
-.PHONY: demo check quick test test-all lint docs mutants clean
+.PHONY: demo check quick test lint docs mutants clean
 
 .venv/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "mauvecl needs Python 3.11 or newer, found " + sys.version.split()[0])'
@@ -25,10 +25,6 @@ demo: .venv/plot.stamp
 PYTEST := OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest --dist loadfile --no-loadscope-reorder
 
 test: .venv/test.stamp
-	$(PYTEST) -n 3 -m 'not slow'
-
-# With the tests that take most of a minute each.
-test-all: .venv/test.stamp
 	$(PYTEST) -n 3
 
 lint: .venv/test.stamp .venv/lint.stamp

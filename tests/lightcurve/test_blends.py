@@ -115,7 +115,6 @@ def one_flare(known, seed: int, snr: float) -> tuple[Event, list[Alarm]]:
 
 
 @pytest.mark.long
-@pytest.mark.slow
 @pytest.mark.parametrize("seed", [108, 118, 228, 251])
 def test_intervals_reach_the_other_optimum(known, seed):
     # Chi-squared at the true half-width is within one of its least, beyond a rise that once ended the interval.
@@ -125,7 +124,6 @@ def test_intervals_reach_the_other_optimum(known, seed):
 
 
 @pytest.mark.long
-@pytest.mark.slow
 def test_intervals_hold_the_truth_near_the_threshold(known):
     # 68 % intervals at S/N 6. At a coverage of 65 % each quantity fails once in 1000 runs.
     names = ("peak_s", "half_width_s", "equivalent_duration_s")
@@ -158,7 +156,6 @@ def test_intervals_hold_the_truth_above_the_threshold(known):
 
 
 @pytest.mark.long
-@pytest.mark.slow
 def test_more_than_200_flares_are_found():
     # S/N 60 each, 12 half-widths apart; once no more than 200 were listed.
     known = survey_of("stare.duration_s=26000", "search.window_s=150", "search.half_widths_s=[10.0]")

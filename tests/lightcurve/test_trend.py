@@ -82,7 +82,6 @@ def test_false_alarms_with_random_drifts_and_cycles():
 
 
 @pytest.mark.long
-@pytest.mark.slow
 def test_thresholds_allow_for_what_is_left_in():
     """Cycles and drifts that the search does not marginalise over: the threshold rises with them, or is refused.
 
