@@ -41,7 +41,7 @@ quick: .venv/test.stamp
 	$(PYTEST) -n 2 -q -m 'not long'
 
 docs: .venv/docs.stamp
-	$(BIN)/sphinx-build -W -q -b html docs docs/_build
+	OPENBLAS_NUM_THREADS=1 $(BIN)/sphinx-build -W -q -b html docs docs/_build
 
 mutants: .venv/test.stamp
 	$(BIN)/python tools/mutation_check.py

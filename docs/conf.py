@@ -21,7 +21,8 @@ myst_enable_extensions = ["dollarmath", "amsmath"]
 # Notebooks and the gallery are executed at every build; an error in one is an error of the build.
 nb_execution_mode = "force"
 nb_execution_raise_on_error = True
-nb_execution_timeout = 300
+nb_execution_timeout = 900
+nb_execution_show_tb = True
 nb_merge_streams = True
 html_theme = "pydata_sphinx_theme"
 # Every page on the left of every page.

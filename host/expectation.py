@@ -14,15 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.quantities import number
+from mauvecl.schema.ranges import EXPOSURES, check_exposure
+
 from ..drawable import Drawable
-from .arguments import public
 from .content import ContentEquality
-from .errors import InputError
 from .instrument.instrument import Instrument
 from .instrument.line import Line
 from .measured_noise import negative_means_message
-from .quantities import number
-from .ranges import EXPOSURES, check_exposure
 from .response import Order, electrons_per_second
 from .sky import DEFAULT_SKY
 from .sky.zodiacal import Sky

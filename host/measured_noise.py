@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from .errors import InputError
+from mauvecl.schema.errors import InputError
+
 from .instrument.line import Line
 from .response import Order, electrons_per_second
 from .spectra.scatter import point_noise

@@ -23,7 +23,8 @@ from numpy.polynomial.legendre import leggauss, legvander
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import csr_array
 
-from .errors import InputError
+from mauvecl.schema.errors import InputError
+
 from .instrument.instrument import Instrument
 from .instrument.line import Line
 

@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from mauvecl.answers.stares.stare import stare
     from mauvecl.device.engine import Engine
     from mauvecl.device.stares import Stares
-    from mauvecl.host.errors import InputError
     from mauvecl.host.expectation import Expectation, expect
     from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.instrument.pixel_map import PixelMap
@@ -56,6 +55,7 @@ if TYPE_CHECKING:
     from mauvecl.results.measurements.model import FlareModel
     from mauvecl.runs.cluster import DaskWorkers
     from mauvecl.runs.pool import LocalWorkers, Pool
+    from mauvecl.schema.errors import InputError
     from mauvecl.statistics.linear import Linear
     from mauvecl.statistics.nuisances import Nuisances
     from mauvecl.store import bulk
@@ -145,7 +145,7 @@ _HOMES = HOMES | {
     "Engine": "device.engine",
     "Event": "lightcurve.flares.events",
     "Expectation": "host.expectation",
-    "InputError": "host.errors",
+    "InputError": "schema.errors",
     "Instrument": "host.instrument.instrument",
     "Linear": "statistics.linear",
     "LocalWorkers": "runs.pool",

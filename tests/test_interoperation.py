@@ -16,9 +16,9 @@ from typer.testing import CliRunner
 
 from mauvecl import Source
 from mauvecl.cli.app import app
-from mauvecl.host.errors import InputError
 from mauvecl.host.stars.flare import blackbody
 from mauvecl.host.stars.flare_table import flares_of, read_flares
+from mauvecl.schema.errors import InputError
 
 
 def test_a_synphot_spectrum_in_and_out() -> None:

@@ -19,8 +19,8 @@ import pytest
 import mauvecl
 from mauvecl import bulk
 from mauvecl.device.errors import DeviceError
-from mauvecl.host.errors import InputError
-from mauvecl.host.records import Record
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.records import Record
 
 WRONG = {
     "a Quantity of another unit": 3 * u.kg,

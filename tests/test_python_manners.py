@@ -32,7 +32,7 @@ from mauvecl import (
     simulate,
     snr,
 )
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 
 
 def study(**settings: object) -> Study:

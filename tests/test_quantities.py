@@ -22,8 +22,8 @@ from hypothesis import strategies as st
 
 import mauvecl
 from mauvecl import bulk
-from mauvecl.host.errors import InputError
-from mauvecl.host.quantities import unit_of
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.quantities import unit_of
 
 #: What each kind is measured in, and names of parameters that are of it.
 UNITS = {

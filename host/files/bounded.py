@@ -11,7 +11,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
 
 #: Largest file that is read, and largest content that it may unpack to, MiB; the environment can set others.
 LIMITS = {"MAUVECL_LARGEST_FILE_MIB": 256, "MAUVECL_LARGEST_CONTENT_MIB": 512}
@@ -119,8 +120,3 @@ def _unpack(content: bytes, start: Callable[[], Any], form: str, what: str) -> b
     except (OSError, EOFError, zlib.error, lzma.LZMAError, MemoryError) as error:
         raise InputError(f"{what} is damaged {form} ({error}), expected a whole file") from error
     return b"".join(pieces)
-
-
-def shortened(text: str, most: int = 80) -> str:
-    """Return foreign text for a message: quoted, on one line, of bounded length."""
-    return repr(text if len(text) <= most else f"{text[: most - 23]}...{text[-20:]}")

@@ -7,8 +7,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InputError
-from .bounded import limit_bytes, read_bytes, shortened, unpacked
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
+
+from .bounded import limit_bytes, read_bytes, unpacked
 from .parsed import as_text, parsing
 
 if TYPE_CHECKING:

@@ -11,8 +11,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
-from .bounded import read_bytes, shortened
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import printable, shortened
+
+from .bounded import read_bytes
 
 #: Sizes that a number of a user may have, apart from 0: products of several stay within double precision.
 SMALLEST, LARGEST = 1e-30, 1e30
@@ -52,7 +54,7 @@ def parsing(what: str, expected: str) -> Iterator[None]:
         raise InputError(f"{what} needs more memory than there is, expected {expected}") from error
     except Exception as error:
         reason = next((line.strip() for line in str(error).splitlines() if line.strip()), "") or type(error).__name__
-        raise InputError(f"{what} cannot be read ({_plain(reason, 160)}), expected {expected}") from error
+        raise InputError(f"{what} cannot be read ({printable(reason, 160)}), expected {expected}") from error
 
 
 def read_text(path: Path, what: str) -> str:
@@ -86,7 +88,7 @@ def toml(text: str, what: str) -> dict[str, Any]:
         try:
             tree = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
-            raise InputError(f"{what} is not valid TOML: {_plain(str(error), 160)}") from error
+            raise InputError(f"{what} is not valid TOML: {printable(str(error), 160)}") from error
     possible(tree, what)
     return tree
 
@@ -112,7 +114,7 @@ def possible(data: Any, what: str) -> None:
             fault = f"is nested more than {DEEPEST} deep, expected less"
             key = shortened(key, 40)
         if fault:
-            raise InputError(f"{what}: {_plain(key, 80) or 'the value'} {fault}")
+            raise InputError(f"{what}: {printable(key, 80) or 'the value'} {fault}")
         if isinstance(value, Mapping):
             for name, item in value.items():
                 if isinstance(name, str) and (bad := _fault(name)):
@@ -140,19 +142,3 @@ def _fault(value: Any, largest: float = LARGEST) -> str | None:
         if not text.isprintable() and (bad := next((c for c in text if c == "\0" or "\ud800" <= c <= "\udfff"), None)):
             return f"= {shortened(text)} holds the character {bad!r}, expected text"
     return None
-
-
-def shown(value: Any, most: int = 80) -> str:
-    """Return any value for a message, however large or deep."""
-    try:
-        return _plain(repr(value), most)
-    except (ValueError, RecursionError):
-        # Python does not print integers of more than some thousand digits.
-        return f"a value of the type {type(value).__name__}"
-
-
-def _plain(text: str, most: int) -> str:
-    """Return text on one line, of bounded length, in printable characters."""
-    if len(text) > most:
-        text = f"{text[: most - 23]}...{text[-20:]}"
-    return "".join(c if c.isprintable() else repr(c)[1:-1] for c in text)

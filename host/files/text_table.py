@@ -6,8 +6,10 @@ import warnings
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import InputError
-from .bounded import read_bytes, shortened, unpacked
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
+
+from .bounded import read_bytes, unpacked
 from .ecsv import check_cells, parse_ecsv
 from .parsed import as_text, parsing
 

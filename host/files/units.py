@@ -7,8 +7,8 @@ import warnings
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
 
-from ..errors import InputError
-from .bounded import shortened
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
 
 if TYPE_CHECKING:
     import astropy.units as u

@@ -7,7 +7,7 @@ import os
 import secrets
 from pathlib import Path
 
-from ..errors import InputError
+from mauvecl.schema.errors import InputError
 
 #: Prefix of files that are being written.
 UNFINISHED = ".unfinished-"

@@ -10,7 +10,8 @@ import astropy.units as u
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError
+from mauvecl.schema.errors import InputError
+
 from ..files.ecsv import read_numbers
 from ..files.units import unit_of
 

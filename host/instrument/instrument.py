@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
-from ..arguments import public
-from ..errors import InputError
-from ..quantities import count, is_quantity, number, numbers, unit_of
-from ..records import Record, input_error
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.quantities import count, is_quantity, number, numbers, unit_of
+from mauvecl.schema.records import Record, input_error
+
 from .curve import Curve
 from .pixel_map import MAX_PIXELS, PixelMap
 

@@ -6,8 +6,9 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
-from ..files.bounded import shortened
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
+
 from ..files.parsed import read_text, toml
 from .curve import Curve
 from .instrument import CURVES, LABELS, Instrument

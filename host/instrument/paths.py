@@ -7,8 +7,9 @@ from importlib import resources
 from importlib.resources.abc import Traversable
 from pathlib import Path
 
-from ..errors import InputError
-from ..files.bounded import shortened
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
+
 from ..files.parsed import is_file
 
 

@@ -10,11 +10,12 @@ import astropy.units as u
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arguments import public
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.quantities import count
+
 from ..content import ContentEquality
-from ..errors import InputError
 from ..files.ecsv import read_numbers
-from ..quantities import count
 
 Float = NDArray[np.float64]
 

@@ -7,7 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from mauvecl.schema.errors import InputError
+
 from .orbit import Track
 from .radiation import proton_map
 

@@ -11,8 +11,9 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError
-from ..files.bounded import shortened
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
+
 from ..files.parsed import read_text
 from .earth import GRAVITY, J2, RADIUS_KM
 from .time_grid import DAY_S, utc_text

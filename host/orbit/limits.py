@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass, fields
 from typing import Literal
 
-from ..errors import InputError
+from mauvecl.schema.errors import InputError
 
 EclipseRule = Literal["any", "only", "never"]
 

@@ -10,7 +10,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from mauvecl.schema.errors import InputError
+
 from .bodies import Bodies
 from .earth import GRAVITY, Vectors, subsatellite_point, to_j2000, unit
 from .elements import Elements

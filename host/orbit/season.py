@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from mauvecl.schema.errors import InputError
+
 from ..sky.helioecliptic import HelioEcliptic
 from ..sky.zodiacal import zodiacal_brightness
 from .bodies import Bodies

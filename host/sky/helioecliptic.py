@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..errors import InputError
+from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from astropy.coordinates import SkyCoord

@@ -11,9 +11,10 @@ import astropy.units as u
 import numpy as np
 from numpy.typing import NDArray
 
-from ..arguments import public
-from ..errors import InputError
-from ..quantities import number
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.quantities import number
+
 from .helioecliptic import HelioEcliptic, helioecliptic
 
 if TYPE_CHECKING:

@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from mauvecl.schema.errors import InputError
+
 from ..files.units import flux_kind, is_spectral, is_stated, linear, unit_of
 from .air import vacuum_wavelengths
 from .range import check_assumed_unit

@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from mauvecl.schema.errors import InputError
+
 from .range import MIN_MEASURED, NEEDED_NM, SPAN_NM, is_gap, likely_unit, measured_part
 from .scatter import point_noise
 from .values import BRIGHTEST, FAINTEST, check_values

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..errors import InputError
+from mauvecl.schema.errors import InputError
+
 from .roles import Role, role_of
 
 Float = NDArray[np.float64]

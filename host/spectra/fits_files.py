@@ -8,7 +8,8 @@ import warnings
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from ..errors import InputError
+from mauvecl.schema.errors import InputError
+
 from ..files.parsed import parsing
 from .file_table import Column, FileTable
 from .fits_images import axis_of, is_spectrum_image, paired_images, rows_of

@@ -7,8 +7,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import InputError
-from ..files.bounded import read_bytes, shortened, unpacked
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
+
+from ..files.bounded import read_bytes, unpacked
 
 if TYPE_CHECKING:
     import astropy.units as u

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 
-from ..errors import InputError
-from ..files.bounded import shortened
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
+
 from ..files.units import balanced, is_spectral, unit_of
 
 #: Longest header whose text is searched.

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from functools import lru_cache
 from typing import Literal
 
-from ..errors import InputError
+from mauvecl.schema.errors import InputError
+
 from ..files.units import SCALE, FluxKind, balanced, flux_kind, is_spectral, is_stated, unit_of
 
 Kind = Literal[

@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InputError
-from ..files.bounded import shortened
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
+
 from .choice import Choice, listed, plain
 from .file_table import FileTable
 

@@ -8,8 +8,9 @@ import warnings
 from functools import partial
 from typing import Any
 
-from ..errors import InputError
-from ..files.bounded import shortened
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
+
 from ..files.ecsv import parse_ecsv
 from .file_table import Column, FileTable
 

@@ -9,7 +9,8 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 
-from ..errors import InputError
+from mauvecl.schema.errors import InputError
+
 from ..files.units import flux_kind, is_spectral, is_stated, unit_of
 from .choice import AXES, listed
 from .roles import divided, role_of, words_of

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from ..errors import InputError
+from mauvecl.schema.errors import InputError
 
 #: Range of wavelengths, nm, from gamma rays to metre waves: their products stay within double precision.
 NEAREST_NM, FARTHEST_NM = 1e-6, 1e9

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..errors import InputError
+from mauvecl.schema.errors import InputError
 
 #: Aliases by band name.
 ALIASES = {

@@ -17,9 +17,10 @@ import numpy as np
 from astropy.constants import c, h
 from numpy.typing import NDArray
 
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
+
 from ..array_cache import array_cache
-from ..errors import InputError
-from ..files.bounded import shortened
 from .band_names import known_band
 from .catalogue import band_table, find, spectrum_table
 

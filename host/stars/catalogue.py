@@ -8,7 +8,8 @@ from functools import cache, lru_cache
 from importlib.resources import files
 from typing import TYPE_CHECKING
 
-from ..errors import InputError
+from mauvecl.schema.errors import InputError
+
 from ..files.ecsv import Numbers, parse_numbers
 
 if TYPE_CHECKING:

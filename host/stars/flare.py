@@ -10,9 +10,10 @@ import numpy as np
 from astropy.constants import c, h, k_B
 from numpy.typing import NDArray
 
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.ranges import check_amplitude, check_temperature
+
 from ..array_cache import array_cache
-from ..errors import InputError
-from ..ranges import check_amplitude, check_temperature
 from .bands import ANGSTROM, photons
 
 if TYPE_CHECKING:

@@ -15,11 +15,12 @@ from typing import Any, ClassVar, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..arguments import public
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.quantities import number
+from mauvecl.schema.ranges import check_temperature
+
 from ..content import ContentEquality
-from ..errors import InputError
-from ..quantities import number
-from ..ranges import check_temperature
 from ..spectra.ends import check_points
 from ..spectra.formats import read_spectrum
 from ..spectra.range import NEEDED_NM

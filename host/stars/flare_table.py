@@ -8,9 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import InputError
-from ..files.bounded import read_bytes, shortened, unpacked
-from ..files.parsed import LARGEST, SMALLEST, as_text, parsing, shown
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened, shown
+
+from ..files.bounded import read_bytes, unpacked
+from ..files.parsed import LARGEST, SMALLEST, as_text, parsing
 from ..files.text_table import text_table
 
 if TYPE_CHECKING:

@@ -14,8 +14,10 @@ from pathlib import Path
 from typing import IO
 from urllib.parse import urljoin, urlsplit
 
-from ..errors import InputError
-from ..files.bounded import limit_bytes, shortened
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
+
+from ..files.bounded import limit_bytes
 from ..files.parsed import parsing
 from ..version import VERSION
 from .own_stars import OwnStar, add

@@ -15,7 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..errors import InputError
+from mauvecl.schema.errors import InputError
+
 from ..files.bounded import read_bytes
 from ..files.ecsv import read_ecsv
 from ..files.whole import write_whole

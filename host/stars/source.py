@@ -12,12 +12,13 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.quantities import number
+from mauvecl.schema.ranges import check_magnitude
+
 from ...drawable import Drawable
-from ..arguments import public
 from ..content import ContentEquality
-from ..errors import InputError
-from ..quantities import number
-from ..ranges import check_magnitude
 from ..spectra.ends import (
     check_flux,
     check_measured,

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from mauvecl.host.arguments import public
-from mauvecl.host.errors import InputError
 from mauvecl.host.files.parsed import read_text
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
 from mauvecl.study.study_text import read_embedded_study
 
 #: Name of the run record in a folder, and its key that holds the digest of all others.

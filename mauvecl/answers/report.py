@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.checked import OWN_DIGEST, RECORD, digest_of, record_digest
-from mauvecl.host.errors import InputError
 from mauvecl.host.files.parsed import read_text
 from mauvecl.host.files.whole import write_whole
 from mauvecl.host.version import VERSION
+from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from astropy.table import Table

@@ -74,7 +74,7 @@ def guarded(app: typer.Typer) -> int:
 
 def _run(app: typer.Typer) -> int:
     # Click's own classes are private to newer versions of typer.
-    from mauvecl.host.errors import InputError
+    from mauvecl.schema.errors import InputError
 
     try:
         code = app(standalone_mode=False)

@@ -7,7 +7,7 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.store.form import Store
@@ -40,9 +40,9 @@ def question_values(study: Study, *, detects: bool) -> None:
         For the first of them.
     """
     from mauvecl.host.instrument.paths import instrument_path
-    from mauvecl.host.ranges import check_amplitude, check_exposure, check_magnitude, check_temperature
     from mauvecl.host.stars.band_names import known_band
     from mauvecl.results.requests.fap import check_fap
+    from mauvecl.schema.ranges import check_amplitude, check_exposure, check_magnitude, check_temperature
     from mauvecl.statistics.names import check_statistic
     from mauvecl.study.star_names import check_spectrum
 

@@ -20,7 +20,7 @@ def study_of(
     default: Callable[[dict[str, Any]], Study] | None,
 ) -> Study:
     """A study file, or the default, with the flags on top, and ``--set`` on top of those."""
-    from mauvecl.host.errors import InputError
+    from mauvecl.schema.errors import InputError
     from mauvecl.study.study import Study
 
     study = Study.read(file) if file is not None else default(given) if default else Study()
@@ -80,7 +80,7 @@ def holds_study(file: Path) -> bool:
 
 
 def sky_of(given: dict[str, Any]) -> dict[str, Any]:
-    from mauvecl.host.errors import InputError
+    from mauvecl.schema.errors import InputError
 
     if "time" not in given:
         return {}
@@ -98,8 +98,8 @@ def sky_of(given: dict[str, Any]) -> dict[str, Any]:
 
 def nuisances_of(study: Study, texts: list[str]) -> dict[str, Any]:
     """What is unknown, as words: dark=0.1, or a file's name, as in stray.txt=free."""
-    from mauvecl.host.errors import InputError
-    from mauvecl.host.files.bounded import shortened
+    from mauvecl.schema.errors import InputError
+    from mauvecl.schema.text import shortened
     from mauvecl.statistics.names import NUISANCES
 
     nuisances: dict[str, Any] = {}
@@ -119,7 +119,7 @@ def nuisances_of(study: Study, texts: list[str]) -> dict[str, Any]:
 
 
 def stars_of(study: Study, given: dict[str, Any]) -> list[dict[str, Any]] | None:
-    from mauvecl.host.errors import InputError
+    from mauvecl.schema.errors import InputError
 
     if "star" not in given:
         return None

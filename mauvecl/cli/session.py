@@ -87,7 +87,7 @@ class Session:
         InputError
             If a file of the answer, which is printed by now, could not be written.
         """
-        from mauvecl.host.errors import InputError
+        from mauvecl.schema.errors import InputError
 
         self._held.close()
         if kind is None and self._lost:
@@ -201,7 +201,7 @@ class Session:
 
     def leave(self, write: Callable[[], Path | Sequence[Path]]) -> None:
         """Have files written; one that cannot be is told at the end, when the answer is out."""
-        from mauvecl.host.errors import InputError
+        from mauvecl.schema.errors import InputError
 
         try:
             made = write()

@@ -10,8 +10,8 @@ from pathlib import Path
 from types import NoneType
 from typing import Annotated, Any, get_args, get_origin
 
-from mauvecl.host.errors import InputError
-from mauvecl.host.files.bounded import shortened
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
 
 
 def number(text: str, flag: str) -> float:

@@ -89,7 +89,7 @@ def takes_study(
         def command(study_file: Path | None = None, **values: Any) -> None:
             from mauvecl.cli.foresight import question_time, question_values
             from mauvecl.cli.session import Session
-            from mauvecl.host.errors import InputError
+            from mauvecl.schema.errors import InputError
 
             for key, (shown, read) in readers.items():
                 if values.get(key) is not None and not isinstance(values[key], int | float):

@@ -14,8 +14,6 @@ from mauvecl.device.program import DeviceRecord, devices
 from mauvecl.device.stares import Stares
 from mauvecl.device.tiles import Progress, Tile, Tiles
 from mauvecl.device.variants import ELEMENT_CHUNK, detection_launches, scene_launches
-from mauvecl.host.arguments import public
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.stares.requests import StaresRequest
 from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.drawing import Drawing, DrawingOptions
@@ -36,6 +34,8 @@ from mauvecl.results.requests.requests import (
 )
 from mauvecl.results.snr import Counts, SnrResult, elements, observers
 from mauvecl.results.sums import Arrays, DetectionSums, SnrSums, pack_detection, pack_snr
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.linear import Linear
 from mauvecl.statistics.names import DEFAULT_STATISTICS
 from mauvecl.statistics.nuisances import Nuisances, as_nuisances

@@ -27,8 +27,8 @@ from mauvecl.device import processor
 from mauvecl.device.drivers import driver_sources
 from mauvecl.device.errors import DeviceError
 from mauvecl.device.kernel_cache import kernel_cache
-from mauvecl.host.errors import InputError
 from mauvecl.host.version import VERSION
+from mauvecl.schema.errors import InputError
 
 #: Variable that sets the child's limit of processor time, and its default in seconds; 0 builds without a child. The
 #: child needs 3 s on a processor of 2024.

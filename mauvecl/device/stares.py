@@ -11,8 +11,6 @@ from numpy.typing import NDArray
 from mauvecl.device.device import Device
 from mauvecl.device.stare_launches import StareLaunches
 from mauvecl.device.tiles import Progress, Tile, Tiles
-from mauvecl.host.arguments import public
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.stares.components import Components
 from mauvecl.lightcurve.stares.requests import Arrays, Kept, Method, StaresRequest, joined
 from mauvecl.lightcurve.stares.scene import Flares, StareScene, padded_frames
@@ -20,6 +18,8 @@ from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.lightcurve.stares.sums import check_sums
 from mauvecl.noise.processes import CosmicRays
 from mauvecl.results.requests.requests import Shard
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
 
 Floats = NDArray[np.float32]
 

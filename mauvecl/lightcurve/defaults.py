@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from typing import Literal, get_args
 
-from mauvecl.host.errors import InputError
-from mauvecl.host.files.bounded import shortened
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
 
 #: Shapes of flares: `flares.shapes.SHAPES`.
 SHAPE_NAMES = ("davenport2014", "tovarmendoza2022", "fiducial")

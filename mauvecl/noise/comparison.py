@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Self
 
-from mauvecl.host.arguments import public
-from mauvecl.host.errors import InputError
-from mauvecl.host.quantities import count
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.quantities import count
 
 #: Largest number of quiescent exposures in a stack.
 MAX_EXPOSURES = 1000

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.errors import InputError
 from mauvecl.noise.cumulants import Cumulants, joint_is_exact, needs_fourth_power, stack_is_exact
 from mauvecl.noise.drawing import Drawing, Mode, Recipe
 from mauvecl.noise.pixels import sky_share
 from mauvecl.noise.processes import CosmicRays, Factors
+from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal, TypedDict, get_args
 
-from mauvecl.host.errors import InputError
 from mauvecl.noise.processes import NONE, Processes
+from mauvecl.schema.errors import InputError
 
 Mode = Literal["auto", "frames", "stacked"]
 Recipe = Literal["auto", "joint", "apart"]

@@ -7,11 +7,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.errors import InputError
 from mauvecl.noise import layout
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.noise.poisson import LARGEST_MEAN, SMALLEST_EXPANDED, AliasTable, table_set
 from mauvecl.noise.processes import Factors
+from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation

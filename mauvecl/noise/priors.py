@@ -8,8 +8,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from mauvecl.host.errors import InputError
-from mauvecl.host.quantities import number
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.quantities import number
 
 if TYPE_CHECKING:
     import numpy as np

@@ -11,13 +11,13 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.arguments import public
-from mauvecl.host.errors import InputError
-from mauvecl.host.quantities import count, number
 from mauvecl.noise import layout
 from mauvecl.noise.prior_tables import table_of
 from mauvecl.noise.prior_targets import PRIOR_TARGETS, Conditions, SignalPart
 from mauvecl.noise.priors import Normal, Prior, Uniform
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.quantities import count, number
 
 __all__ = ["NONE", "CosmicRays", "Factors", "Normal", "Prior", "Processes", "Uniform"]
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any, TypeVar
 
-from mauvecl.host.errors import InputError
-from mauvecl.host.quantities import shown
 from mauvecl.pictures.style import AXES
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.quantities import shown
 
 F = TypeVar("F", bound=Callable[..., Any])
 #: Modules that a search for pictures must not import, since matplotlib is loaded only when a picture is drawn.

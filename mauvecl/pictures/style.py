@@ -11,8 +11,8 @@ from typing import Any, Concatenate, ParamSpec
 
 import numpy as np
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.files.whole import write_whole
+from mauvecl.schema.errors import InputError
 
 P = ParamSpec("P")
 #: Caller's axes to draw in; None if the picture creates its own figure.

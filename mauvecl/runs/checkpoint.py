@@ -24,13 +24,13 @@ from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import read_bytes
 from mauvecl.host.files.parsed import json_data, read_text
 from mauvecl.host.files.whole import UNFINISHED, write_whole
 from mauvecl.host.version import VERSION
 from mauvecl.runs.durable import differing_keys, locked
 from mauvecl.runs.shards import FORM, fingerprint
+from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.results.sums import Arrays

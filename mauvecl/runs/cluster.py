@@ -18,15 +18,15 @@ from urllib.parse import urlsplit
 from mauvecl.device.errors import DeviceError
 from mauvecl.device.first_build import THREADS
 from mauvecl.device.program import DeviceRecord
-from mauvecl.host.arguments import public
-from mauvecl.host.errors import InputError
-from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import is_file, json_data, read_text
 from mauvecl.host.version import VERSION
 from mauvecl.results.requests.requests import Countable, Shard
 from mauvecl.results.sums import Arrays
 from mauvecl.runs.pool import Stopped
 from mauvecl.runs.shards import Task
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
 
 if TYPE_CHECKING:
     from distributed import Client

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 
 
 @contextlib.contextmanager

@@ -16,13 +16,13 @@ from numpy.typing import NDArray
 from mauvecl.device.engine import DeviceError, DeviceRecord, Engine
 from mauvecl.device.stares import Stares
 from mauvecl.device.tiles import Progress
-from mauvecl.host.arguments import public
-from mauvecl.host.errors import InputError
-from mauvecl.host.quantities import count as whole
 from mauvecl.lightcurve.stares.requests import StaresRequest, StareSums
 from mauvecl.results.requests.requests import DetectRequest, RealiseRequest, Shard, SnrRequest
 from mauvecl.results.sums import Arrays, DetectionSums, SnrSums
 from mauvecl.runs.shards import Task, fingerprint, shards
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.quantities import count as whole
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.arguments import public
 from mauvecl.host.content import ContentEquality
-from mauvecl.host.errors import InputError
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.statistic import Float, LinearStatistic, Setting
 
 if TYPE_CHECKING:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 
 #: All statistics in the order of tables and plots.
 STATISTIC_NAMES = ("chi2", "chi2_element", "chi2_pair", "matched", "uv_excess", "paper")

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.arguments import public
 from mauvecl.host.content import ContentEquality
-from mauvecl.host.errors import InputError
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.names import NUISANCES
 
 if TYPE_CHECKING:

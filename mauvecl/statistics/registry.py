@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.chi2 import Chi2, Chi2Element, Chi2Pair
 from mauvecl.statistics.linear import Linear, Matched, UvExcess
 from mauvecl.statistics.names import check_statistic

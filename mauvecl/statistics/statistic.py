@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any, ClassVar, TypeVar, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.errors import InputError
 from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.factor_distributions import FactorDistributions
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.distributions import Form, Gaussian, Mixture, QuadraticForm
 from mauvecl.statistics.nuisances import Nuisances, join_names
 

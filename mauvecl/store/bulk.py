@@ -13,12 +13,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.arguments import public
-from mauvecl.host.errors import InputError
 from mauvecl.host.files.whole import UNFINISHED, write_whole
-from mauvecl.host.quantities import count as whole
 from mauvecl.runs.durable import locked
 from mauvecl.runs.pool import Pool, map_in_order
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.quantities import count as whole
 from mauvecl.store.export import Selection, export
 from mauvecl.store.form import CRC_BYTES, Chunk, Store, StoredScene, crc, digest
 from mauvecl.study.study import Study

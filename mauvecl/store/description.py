@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import read_bytes
 from mauvecl.host.version import VERSION
+from mauvecl.schema.errors import InputError
 from mauvecl.study.messages import collect_messages as messages_of
 
 if TYPE_CHECKING:

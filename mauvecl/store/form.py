@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.files.bounded import read_bytes
 from mauvecl.host.files.parsed import toml
 from mauvecl.host.files.whole import UNFINISHED, write_whole
 from mauvecl.runs.durable import differing_keys
+from mauvecl.schema.errors import InputError
 from mauvecl.store.description import describe, study_in
 from mauvecl.study.labels import full_label, label
 from mauvecl.study.study import Study

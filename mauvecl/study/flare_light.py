@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
-from mauvecl.host.errors import InputError
-from mauvecl.study.section import Section
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.section import Section
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.flare_spectra import FlareSpectrum

@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from mauvecl.study.section import Section
+from mauvecl.schema.section import Section
 
 if TYPE_CHECKING:
     from mauvecl.study.study import Study

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import BeforeValidator, Field, model_validator
 
-from mauvecl.host.files.bounded import shortened
 from mauvecl.noise.default_unknowns import DEFAULT_UNKNOWNS
+from mauvecl.schema.text import shortened
 from mauvecl.study.sections import Section
 
 if TYPE_CHECKING:

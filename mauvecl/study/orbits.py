@@ -8,11 +8,10 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationError, ValidationInfo, field_validator, model_validator
 
-from mauvecl.host.errors import InputError
-from mauvecl.host.files.bounded import shortened
-from mauvecl.host.files.parsed import shown
 from mauvecl.host.files.text_table import read_text_table
-from mauvecl.host.records import holds_truth, input_error
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.records import holds_truth, input_error
+from mauvecl.schema.text import shortened, shown
 from mauvecl.study.sections import Section
 
 if TYPE_CHECKING:

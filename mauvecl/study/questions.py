@@ -8,7 +8,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.sections import Section
 

@@ -9,9 +9,9 @@ from pydantic import Field, create_model, field_validator, model_validator
 
 from mauvecl.host.sky import DEFAULT_SKY
 from mauvecl.noise.prior_targets import PRIOR_TARGETS
+from mauvecl.schema.section import Section as Section
 from mauvecl.statistics.names import DEFAULT_STATISTICS, STATISTIC_NAMES
 from mauvecl.study.flare_light import FlareLight
-from mauvecl.study.section import Section as Section
 
 if TYPE_CHECKING:
     from mauvecl.host.sky.zodiacal import Sky

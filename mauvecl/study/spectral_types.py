@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import re
 
-from mauvecl.host.errors import InputError
-from mauvecl.host.files.bounded import shortened
 from mauvecl.host.stars.catalogue import library_table
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
 
 #: Spectral classes in order of decreasing temperature.
 CLASSES = "OBAFGKM"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 
 
 def has_spectrum(name: str) -> bool:

@@ -8,13 +8,13 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.stars.flare import check_scales
 from mauvecl.lightcurve.defaults import CHANGING, Changing
 from mauvecl.lightcurve.flares.energies import EnergyScale, Kind, amplitude_of, amplitude_of_peak
 from mauvecl.lightcurve.flares.events import Cooling, Event, check_seen, coefficients, temperatures_of
 from mauvecl.lightcurve.stares.observed import StareExpectation
 from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.schema.errors import InputError
 from mauvecl.study.stare_section import EventText
 
 if TYPE_CHECKING:

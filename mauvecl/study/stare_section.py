@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, model_validator
 
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.defaults import ORBIT_S, check_shape
+from mauvecl.schema.errors import InputError
 from mauvecl.study.sections import Section
 
 if TYPE_CHECKING:
@@ -144,8 +144,8 @@ class EventText(Section):
 
     def load_shape(self, default: str) -> Shape:
         """Return the shape, or the published shape named `default` if none is given."""
-        from mauvecl.host.files.bounded import shortened
         from mauvecl.lightcurve.flares.shapes import TableShape, shape_of
+        from mauvecl.schema.text import shortened
         from mauvecl.study.weights import read_columns
 
         if self.shape_file is None:

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import Field, ValidationError, model_validator
 
-from mauvecl.host.arguments import public
-from mauvecl.host.errors import InputError
-from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import possible, read_text, toml
-from mauvecl.host.quantities import number
-from mauvecl.host.records import input_error
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.quantities import number
+from mauvecl.schema.records import input_error
+from mauvecl.schema.text import shortened
 from mauvecl.study.flare_light import drop_default_spectrum, resolve_spectrum_paths
 from mauvecl.study.measurements import MeasureQuestion, drop_default_measure
 from mauvecl.study.nuisances import NuisanceChoice

@@ -8,11 +8,12 @@ import tomllib
 from pathlib import Path
 from typing import Any
 
-from mauvecl.host.errors import InputError
-from mauvecl.host.files.bounded import read_bytes, shortened
+from mauvecl.host.files.bounded import read_bytes
 from mauvecl.host.files.ecsv import read_ecsv
 from mauvecl.host.files.parsed import parsing, read_text, toml
 from mauvecl.host.spectra.formats import without_columns
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
 
 
 def read_embedded_study(path: Path) -> str:

@@ -8,7 +8,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.stars.flare import check_scales
 from mauvecl.lightcurve.flares.shapes import shape_of
 from mauvecl.lightcurve.search.bank import Bank
@@ -16,6 +15,7 @@ from mauvecl.lightcurve.search.flare_fit import Fit
 from mauvecl.lightcurve.search.survey import Survey
 from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates, frame_nuisances
 from mauvecl.lightcurve.stares.components import Components
+from mauvecl.schema.errors import InputError
 from mauvecl.study.flare_light import FlareLight
 from mauvecl.study.stare_expectation import energy_scale, stare_of
 

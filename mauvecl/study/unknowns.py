@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.host.errors import InputError
 from mauvecl.results.requests.fap import MIN_IN_TAIL
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.intervals import CONFIDENCE, Interval
 
 if TYPE_CHECKING:

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.errors import InputError
-from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.parsed import LARGEST, SMALLEST, parsing, read_text
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
 
 if TYPE_CHECKING:
     from mauvecl.statistics.linear import Linear

@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Any
 from tornado.routing import Matcher, Rule
 from tornado.web import RequestHandler
 
-from mauvecl.host.errors import InputError
-from mauvecl.host.files.bounded import shortened
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
 from mauvecl.web.visitor import Visitor
 
 if TYPE_CHECKING:

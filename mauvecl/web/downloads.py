@@ -11,7 +11,7 @@ from pathlib import Path
 from pprint import pformat
 from typing import TYPE_CHECKING
 
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 from mauvecl.web.question import STAR_FILE
 
 if TYPE_CHECKING:

@@ -9,10 +9,10 @@ from dataclasses import dataclass
 from functools import cache
 from typing import Any, NamedTuple
 
-from mauvecl.host.errors import InputError
-from mauvecl.host.files.bounded import shortened
 from mauvecl.host.stars.band_names import ALIASES
 from mauvecl.host.stars.catalogue import embedded, library_table
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.web.simulations import SIMULATIONS
 

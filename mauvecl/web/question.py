@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
 from mauvecl.web.fields import UPLOADED, Draws
 

@@ -13,8 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.stars.source import Source
+from mauvecl.schema.errors import InputError
 
 #: Memory of the reading process, MiB: Python with astropy and synphot maps some 400, a spectrum of 4 MiB as text 300.
 MEMORY_MIB = 1536

@@ -14,9 +14,9 @@ from mauvecl.answers.detection.detect import DetectAnswer, detect
 from mauvecl.answers.limits.limits import limit
 from mauvecl.answers.signal.snr import SnrAnswer, snr
 from mauvecl.answers.stares.inject import InjectAnswer, inject
-from mauvecl.host.errors import InputError
-from mauvecl.host.files.bounded import shortened
 from mauvecl.host.orbit.targets import Target
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:

@@ -6,9 +6,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from mauvecl.host.errors import InputError
-from mauvecl.host.files.bounded import shortened
 from mauvecl.host.stars.source import Source
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
 from mauvecl.study.weights import columns
 from mauvecl.web.fields import UPLOADED
 from mauvecl.web.question import Points

@@ -19,9 +19,9 @@ import numpy as np
 from tornado.websocket import WebSocketClosedError, WebSocketHandler
 
 from mauvecl.device.errors import DeviceError
-from mauvecl.host.errors import InputError
-from mauvecl.host.files.bounded import shortened
 from mauvecl.host.version import VERSION
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
 from mauvecl.web.card import card
 from mauvecl.web.closed_forms import ClosedForms
 from mauvecl.web.downloads import as_command, as_file, as_python, study_file

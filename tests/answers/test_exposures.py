@@ -11,8 +11,8 @@ from mauvecl.answers.signal import exposures
 from mauvecl.answers.signal.exposures import exposure_for, snr_at
 from mauvecl.cli.verbs.observe import show_exposures
 from mauvecl.device.engine import Engine
-from mauvecl.host.errors import InputError
 from mauvecl.host.tables import Column
+from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
 
 

@@ -11,10 +11,10 @@ from commands import run
 from mauvecl.answers.stares.inject import inject
 from mauvecl.device.engine import Engine
 from mauvecl.device.stares import Stares
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.search.injected_completeness import InjectedCompleteness
 from mauvecl.runs.checkpoint import Checkpoint
 from mauvecl.runs.pool import LocalWorkers, Pool
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.intervals import clopper_pearson
 from mauvecl.study.study import Study
 

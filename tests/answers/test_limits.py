@@ -13,7 +13,7 @@ from mauvecl.answers.limits.assumptions import what_matters
 from mauvecl.answers.limits.limits import limiting_magnitude, shortest_exposure, smallest_amplitude
 from mauvecl.answers.limits.search import LimitSearch
 from mauvecl.device.engine import Engine
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.study import Study
 

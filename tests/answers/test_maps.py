@@ -10,7 +10,7 @@ from astropy.table import QTable
 
 from mauvecl.answers.detection.maps import detection_map
 from mauvecl.device.engine import Engine
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
 
 N = 20_000

@@ -14,11 +14,11 @@ from mauvecl.answers.campaigns.plan_text import SUMMARY_COLUMNS, summary_rows, t
 from mauvecl.answers.campaigns.planned import Looked
 from mauvecl.answers.campaigns.planned_injections import question_of
 from mauvecl.answers.report import write_study, write_table
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.flares.energies import EnergyScale, quiescent_luminosity
 from mauvecl.lightcurve.flares.rates import davenport2019
 from mauvecl.lightcurve.search.completeness import Completeness
 from mauvecl.lightcurve.stares.along import stare_along
+from mauvecl.schema.errors import InputError
 from mauvecl.study.orbits import read_targets
 from mauvecl.study.spectral_types import nearest_spectrum, subtype
 from mauvecl.study.stare_expectation import stare_of

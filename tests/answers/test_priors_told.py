@@ -21,8 +21,8 @@ from mauvecl.answers.stares.stare import stare
 from mauvecl.cli.app import app
 from mauvecl.device.engine import Engine
 from mauvecl.device.stares import Stares
-from mauvecl.host.errors import InputError
 from mauvecl.noise.prior_targets import PRIOR_TARGETS
+from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
 
 #: Priors that contain the expectation's own value, and that do not.

@@ -17,7 +17,7 @@ from commands import ended, run
 from mauvecl.answers.stares.stare import StareAnswer, stare
 from mauvecl.device.engine import Engine
 from mauvecl.device.stares import Stares
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 from mauvecl.study.stare_expectation import stare_of
 from mauvecl.study.study import Study
 

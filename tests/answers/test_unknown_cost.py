@@ -20,13 +20,13 @@ from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, u
 from mauvecl.answers.detection.unknown_table import power, unknown_table
 from mauvecl.answers.limits.limits import limiting_magnitude
 from mauvecl.device.engine import Engine
-from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import expect
 from mauvecl.host.sky.zodiacal import Sky
 from mauvecl.host.stars.source import Source
 from mauvecl.noise.default_unknowns import DEFAULT_UNKNOWNS
 from mauvecl.noise.scene import prepare
 from mauvecl.results.requests.requests import DetectRequest
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.nuisances import Nuisances
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.study.study import Study

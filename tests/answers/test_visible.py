@@ -11,8 +11,8 @@ from astropy.table import Table
 from mauvecl import Study, visible
 from mauvecl.answers.campaigns.calendars import Entry, calendar_bytes
 from mauvecl.answers.campaigns.visible import SEEN_H, VisibleAnswer
-from mauvecl.host.errors import InputError
 from mauvecl.host.sky.zodiacal import Sky
+from mauvecl.schema.errors import InputError
 
 NAMES = ("eps Eri", "AU Mic", "EK Dra")
 

@@ -18,7 +18,7 @@ import pytest
 from commands import ended, run
 
 from mauvecl.cli import foresight
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
 
 OBSERVE = ("simulate", "--no-pictures", "--star", "G2V", "--magnitude", "7.4")

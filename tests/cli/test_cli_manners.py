@@ -18,7 +18,7 @@ from typer.testing import CliRunner
 from mauvecl.cli import flags
 from mauvecl.cli.app import app
 from mauvecl.cli.verbs import injections, orbits
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
 
 VERBS: dict[str, Any] = {

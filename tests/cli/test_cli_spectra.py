@@ -9,7 +9,7 @@ import pytest
 from typer.testing import CliRunner
 
 from mauvecl.cli.app import app
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
 
 FILES = Path(__file__).parents[1] / "data" / "spectra"

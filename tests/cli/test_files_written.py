@@ -12,10 +12,10 @@ import pytest
 from answers import small
 
 from mauvecl.cli.app import app
-from mauvecl.host.errors import InputError
 from mauvecl.host.files.whole import write_whole
 from mauvecl.runs.checkpoint import Checkpoint
 from mauvecl.runs.durable import locked
+from mauvecl.schema.errors import InputError
 from mauvecl.store.export import Selection, export
 
 FEW = ("--star", "G2V", "-m", "7.4", "--exposure", "5", "--seed", "1")

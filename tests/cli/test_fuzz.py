@@ -318,7 +318,7 @@ def test_flare_tables(folder: Path, kind: int, ending: str, place: float, splice
 @many(25)
 @given(lines=st.lists(st.tuples(NUMBERS, NUMBERS).map(" ".join), max_size=4), junk=st.binary(max_size=8))
 def test_weights(folder: Path, lines: list[str], junk: bytes) -> None:
-    from mauvecl.host.errors import InputError
+    from mauvecl.schema.errors import InputError
     from mauvecl.study.weights import read_weights
 
     file = folder / "weights.txt"

@@ -13,8 +13,8 @@ from commands import ended
 import mauvecl
 from mauvecl import Engine, Instrument, Sky, Source, Study
 from mauvecl.cli.naming import with_flags
-from mauvecl.host.errors import InputError
-from mauvecl.host.quantities import count, number, numbers
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.quantities import count, number, numbers
 
 ROOT = Path(mauvecl.__file__).parent
 #: The command line itself, and the command that the page offers.

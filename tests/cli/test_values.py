@@ -12,7 +12,7 @@ from typer.main import get_command
 from mauvecl.cli.app import app
 from mauvecl.cli.values import count, several
 from mauvecl.cli.values import number as number_of
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 
 
 @pytest.mark.parametrize(

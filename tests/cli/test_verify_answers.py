@@ -11,7 +11,7 @@ from commands import run
 from test_files_written import VERBS
 
 from mauvecl.answers.checked import verify_answer
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 
 MORE = {
     "gaussian": ("gaussian", "--star", "G2V", "-m", "7.4", "-n", "10000", "--fap", "0.01", "--sweep", "exposure=5"),

@@ -19,7 +19,6 @@ from scipy import stats
 from mauvecl.device.engine import Engine
 from mauvecl.device.selftest import toy
 from mauvecl.device.variants import scene_launches
-from mauvecl.host.errors import InputError
 from mauvecl.host.instrument.pixel_map import PixelMap
 from mauvecl.noise import reference
 from mauvecl.noise.comparison import NOISE_FREE, Comparison
@@ -30,6 +29,7 @@ from mauvecl.results.counts.tally import Tally
 from mauvecl.results.requests.channels import ChannelPlan, plan_channels
 from mauvecl.results.requests.requests import DetectRequest
 from mauvecl.results.snr import elements, observers
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.registry import STATISTICS
 
 RAYS = CosmicRays(rate_per_cm2_s=200.0)

@@ -18,7 +18,7 @@ RUN = """
 import hashlib, sys
 from mauvecl.device import first_build, kernel_cache, processor, selftest
 from mauvecl.device.engine import DeviceError, Engine
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 {before}
 try:
     engine = Engine()

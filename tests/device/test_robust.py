@@ -15,7 +15,7 @@ import pytest
 from mauvecl.device.engine import DeviceError, Engine, devices
 from mauvecl.device.kernel_cache import kernel_cache
 from mauvecl.device.selftest import toy
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 
 
 def test_device_is_chosen_by_name_or_number() -> None:

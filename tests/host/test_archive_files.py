@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 from astropy.io import fits
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.stars.source import Source
+from mauvecl.schema.errors import InputError
 
 HERE = Path(__file__).parents[1] / "data" / "spectra"
 ANGSTROM = {"wavelength_unit": "Angstrom"}

@@ -10,8 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from mauvecl.host.errors import InputError
-from mauvecl.host.files.bounded import read_bytes, shortened, unpacked
+from mauvecl.host.files.bounded import read_bytes, unpacked
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
 
 PACKERS = pytest.mark.parametrize("pack", [gzip.compress, bz2.compress, lzma.compress])
 

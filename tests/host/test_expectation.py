@@ -12,11 +12,11 @@ import astropy.units as u
 import numpy as np
 import pytest
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation, expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.sky.zodiacal import Sky
 from mauvecl.host.stars.source import Source
+from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
 
 

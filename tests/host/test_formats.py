@@ -10,8 +10,8 @@ import pytest
 from astropy.io import fits
 from astropy.table import MaskedColumn, Table
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.stars.source import Source
+from mauvecl.schema.errors import InputError
 
 FLAM = u.erg / (u.s * u.cm**2 * u.AA)
 NM = np.arange(170.0, 1100.0, 1.0)

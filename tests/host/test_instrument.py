@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.instrument.curve import Curve
 from mauvecl.host.instrument.instrument import CURVES, LABELS, Instrument
+from mauvecl.schema.errors import InputError
 
 # Computed independently of this code: wavelength nm, total efficiency, effective area cm^2.
 PUBLISHED = [

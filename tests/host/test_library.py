@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from astropy.table import Table
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.stars import bands, catalogue
 from mauvecl.host.stars.band_names import ALIASES
 from mauvecl.host.stars.source import Source
+from mauvecl.schema.errors import InputError
 
 
 def near_ultraviolet(name: str) -> float:

@@ -18,12 +18,12 @@ from astropy.io import fits
 from typer.testing import CliRunner
 
 from mauvecl.cli.app import app
-from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.stars import hst_collections, own_stars
 from mauvecl.host.stars.catalogue import library_table
 from mauvecl.host.stars.source import Source
+from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
 
 

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation, expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.instrument.pixel_map import PixelMap
 from mauvecl.host.stars.source import Source
+from mauvecl.schema.errors import InputError
 
 
 def seen(payload: Instrument) -> Expectation:

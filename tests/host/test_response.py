@@ -11,10 +11,10 @@ from scipy.integrate import quad
 from scipy.special import erf
 
 from mauvecl.host import response
-from mauvecl.host.errors import InputError
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.instrument.line import Line
 from mauvecl.host.response import Order, electrons_per_second, response_matrix
+from mauvecl.schema.errors import InputError
 
 Float = NDArray[np.float64]
 

@@ -13,9 +13,9 @@ from astropy.coordinates import SkyCoord, solar_system_ephemeris
 from astropy.time import Time
 from astropy.utils import iers
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.sky.helioecliptic import HelioEcliptic, helioecliptic
 from mauvecl.host.sky.zodiacal import Lookup, Sky, zodiacal_brightness, zodiacal_table
+from mauvecl.schema.errors import InputError
 
 # The paper's table, longitude 180 to 0 downwards, latitude 0 to 90 across.
 PAPER = """

@@ -11,13 +11,13 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.stars import bands, catalogue
 from mauvecl.host.stars.band_names import ALIASES
 from mauvecl.host.stars.flare import blackbody
 from mauvecl.host.stars.source import Source
+from mauvecl.schema.errors import InputError
 
 DATA = Path(__file__).parents[1] / "data"
 LIBRARY = Path(catalogue.__file__).parent / "library"

@@ -20,9 +20,9 @@ from astropy.table import Column, Table
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.spectra.roles import role_of
 from mauvecl.host.stars.source import Source
+from mauvecl.schema.errors import InputError
 
 FLAM = u.erg / (u.s * u.cm**2 * u.AA)
 NM = np.arange(170.0, 1000.0, 2.0)

@@ -15,9 +15,9 @@ import pytest
 from astropy.io import fits, votable
 from astropy.table import Column, MaskedColumn, Table
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.stars.source import Source
+from mauvecl.schema.errors import InputError
 
 FLAM = u.erg / (u.s * u.cm**2 * u.AA)
 #: Two nm apart; not straight, so that a wrong order, unit or shift shows at each point.

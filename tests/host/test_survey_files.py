@@ -17,11 +17,11 @@ import pytest
 from astropy.io import fits
 from astropy.table import Table
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.stars.source import Source
+from mauvecl.schema.errors import InputError
 
 DATA = Path(__file__).parents[1] / "data" / "spectra"
 LOG_STEP, LOG_START, N_LOG = 1e-4, 3.5682, 3909

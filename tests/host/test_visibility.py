@@ -10,7 +10,6 @@ import pytest
 from astropy.table import Table
 from numpy.typing import NDArray
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.orbit import constraints
 from mauvecl.host.orbit.conditions import Particles, Thermal
 from mauvecl.host.orbit.earth import direction, unit
@@ -23,6 +22,7 @@ from mauvecl.host.orbit.time_grid import TimeGrid
 from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.host.sky.helioecliptic import helioecliptic, offline
 from mauvecl.host.sky.zodiacal import zodiacal_brightness
+from mauvecl.schema.errors import InputError
 
 AXIS_KM = 6879.0
 

@@ -11,7 +11,6 @@ from scenes import instrument, star
 from scipy import optimize
 
 from mauvecl.device.selftest import toy
-from mauvecl.host.errors import InputError
 from mauvecl.noise import reference
 from mauvecl.noise.cumulants import (
     DRAWS_TO_NOTICE,
@@ -23,6 +22,7 @@ from mauvecl.noise.cumulants import (
 )
 from mauvecl.noise.processes import Processes, Uniform
 from mauvecl.noise.scene import prepare
+from mauvecl.schema.errors import InputError
 
 #: By exact convolution no allowed draw is told apart sooner; the condition's own estimate is right to 4 % there.
 SOONEST = 4e13

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from mauvecl.device.probes import Probes
-from mauvecl.host.errors import InputError
 from mauvecl.noise import reference
 from mauvecl.noise.prior_tables import nodes
 from mauvecl.noise.priors import Normal, Prior, Uniform
 from mauvecl.noise.processes import Factors, Processes
+from mauvecl.schema.errors import InputError
 
 CONDITIONS = {"temperature_c": 21.0, "dark_slope_per_c": 0.0684, "light_loss": 0.34, "pointing_loss": 0.02}
 #: What each prior's value makes of the light or the dark.

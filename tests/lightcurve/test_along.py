@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.orbit.conditions import Thermal
 from mauvecl.host.orbit.limits import Limits
 from mauvecl.host.orbit.orbit import Orbit
@@ -12,6 +11,7 @@ from mauvecl.host.orbit.time_grid import TimeGrid
 from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.lightcurve.stares.along import OrbitStare, stare_along
 from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.schema.errors import InputError
 
 START, HOURS = "2026-09-20T03:00:00", 8.0
 

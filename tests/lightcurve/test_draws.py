@@ -11,9 +11,9 @@ from scipy import special
 
 from mauvecl.device.engine import Engine
 from mauvecl.device.stares import Stares
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.stares.components import Components
 from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.schema.errors import InputError
 
 METHODS = ["pixels", "cumulants"]
 

@@ -8,13 +8,13 @@ import pytest
 from astropy import constants
 from astropy.modeling.models import BlackBody
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.stars.bands import band
 from mauvecl.host.stars.source import Source
 from mauvecl.lightcurve.flares import energies
 from mauvecl.lightcurve.flares.energies import EnergyScale, share_within
 from mauvecl.lightcurve.flares.events import Event
 from mauvecl.lightcurve.flares.shapes import SHAPES
+from mauvecl.schema.errors import InputError
 
 
 @pytest.mark.parametrize(

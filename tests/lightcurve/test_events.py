@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.stars.flare import blackbody
 from mauvecl.lightcurve.flares.events import Cooling, Event, check_seen, coefficients, temperatures_of
 from mauvecl.lightcurve.flares.shapes import SHAPES
+from mauvecl.schema.errors import InputError
 
 START = np.arange(400) * 5.0
 

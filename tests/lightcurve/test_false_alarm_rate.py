@@ -7,7 +7,6 @@ import pytest
 from scipy import special
 from searches import DAVENPORT, KNOWN, ONE
 
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.defaults import HALF_WIDTHS_S
 from mauvecl.lightcurve.search.bank import Bank, Level
 from mauvecl.lightcurve.search.completeness import default_bank, search_threshold
@@ -16,6 +15,7 @@ from mauvecl.lightcurve.search.false_alarm_rate import TemplateGrid
 from mauvecl.lightcurve.search.importance_sampling import sample_rate
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.schema.errors import InputError
 
 
 def test_bank_of_the_page():

@@ -7,10 +7,10 @@ import pytest
 from scenes import instrument, star
 from scipy.integrate import quad
 
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.defaults import ORBIT_S
 from mauvecl.lightcurve.stares.curves import Sinusoid, Table
 from mauvecl.lightcurve.stares.stare import Stare, StareUnknown
+from mauvecl.schema.errors import InputError
 
 
 def test_frames_and_gaps():

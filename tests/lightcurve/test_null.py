@@ -8,7 +8,6 @@ from scipy import special
 from searches import DAVENPORT, KNOWN, ONE, survey
 
 from mauvecl.device.stares import Stares
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.defaults import DAYS, per_day
 from mauvecl.lightcurve.search.bank import Bank, Level
 from mauvecl.lightcurve.search.counted_rate import CountedRate, consecutive_alarm_rate, consecutive_alarms
@@ -17,6 +16,7 @@ from mauvecl.lightcurve.search.scatter import Scatter
 from mauvecl.lightcurve.search.search import Search
 from mauvecl.lightcurve.stares.curves import Sinusoid
 from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.schema.errors import InputError
 from mauvecl.study.searches import SearchChoice
 
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.flares.energies import EnergyScale, in_band
 from mauvecl.lightcurve.flares.rates import (
     PowerLaw,
@@ -27,6 +26,7 @@ from mauvecl.lightcurve.search.completeness import (
     search_threshold,
 )
 from mauvecl.lightcurve.search.yields import Yield, fit_power_law, recovered_per_day
+from mauvecl.schema.errors import InputError
 
 
 def test_davenport2019() -> None:

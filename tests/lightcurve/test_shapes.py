@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.integrate import quad
 
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.flares.shapes import SHAPES, Fiducial, TableShape, half_width_of_altaipony, shape_of
+from mauvecl.schema.errors import InputError
 
 #: Where each shape has a kink or a step.
 KINKS = {"davenport2014": [-1.0, 0.0], "tovarmendoza2022": [0.0], "fiducial": [0.0, Fiducial.BOX], "table": [0.0, 1.0]}

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from searches import spectra
 
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.search.templates import TEMPERATURES_K, Templates, frame_nuisances
 from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.schema.errors import InputError
 
 CASES = {
     "known": {},

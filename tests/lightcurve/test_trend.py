@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 from searches import DAVENPORT, survey
 
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.defaults import per_day
 from mauvecl.lightcurve.search.bank import Level
 from mauvecl.lightcurve.search.flare_fit import Fit
 from mauvecl.lightcurve.search.importance_sampling import sample_rate
 from mauvecl.lightcurve.stares.curves import Sinusoid
 from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.schema.errors import InputError
 
 
 def drawn(one, rng, count, farther=1.0):

@@ -12,7 +12,6 @@ from scenes import instrument, star
 
 from mauvecl.device.engine import Engine
 from mauvecl.device.stares import Stares
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.stares import twin
 from mauvecl.lightcurve.stares.components import Components
 from mauvecl.lightcurve.stares.requests import StaresRequest
@@ -21,6 +20,7 @@ from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.lightcurve.stares.sums import SumTable
 from mauvecl.noise.processes import CosmicRays
 from mauvecl.results.requests.requests import Shard
+from mauvecl.schema.errors import InputError
 
 SEED = 2**63 + 12345
 #: Around the boundary of the counter's first word.

@@ -11,12 +11,12 @@ from scenes import instrument, star
 from mauvecl.device.engine import Engine
 from mauvecl.device.selftest import toy
 from mauvecl.device.variants import scene_launches
-from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.host.instrument.pixel_map import PixelMap
 from mauvecl.noise.poisson import SMALLEST_EXPANDED, alias_table
 from mauvecl.noise.processes import CosmicRays, Normal, Processes
 from mauvecl.noise.scene import prepare
+from mauvecl.schema.errors import InputError
 
 #: Sixteen groups of four; pixel i of group g has a mean for the expansion where bit i of g is set, else for a table.
 MIXED = np.array([1500.0 + 7 * g if g >> i & 1 else 300.0 + 11 * g for g in range(16) for i in range(4)])

@@ -11,11 +11,11 @@ from scenes import instrument, star
 from mauvecl.device.engine import Engine
 from mauvecl.device.tiles import Tile
 from mauvecl.device.variants import scene_launches
-from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise import layout, reference
 from mauvecl.noise.processes import CosmicRays, Processes
 from mauvecl.noise.scene import Scene, prepare
+from mauvecl.schema.errors import InputError
 
 INVERSE = [pow(m, -1, 2**32) for m in (0xD2511F53, 0xCD9E8D57)]
 

@@ -11,12 +11,12 @@ from scenes import instrument, star
 from scipy import stats
 
 from mauvecl.device.engine import Engine
-from mauvecl.host.errors import InputError
 from mauvecl.noise import layout, reference
 from mauvecl.noise.components import components
 from mauvecl.noise.prior_targets import PRIOR_TARGETS
 from mauvecl.noise.processes import NONE, CosmicRays, Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare
+from mauvecl.schema.errors import InputError
 from mauvecl.study.sections import NoiseProcesses
 
 N = 20_000

@@ -12,11 +12,11 @@ from scipy import optimize
 
 from mauvecl.device.engine import Engine
 from mauvecl.device.selftest import toy
-from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise.cumulants import Cumulants, stack_is_exact
 from mauvecl.noise.processes import Processes, Uniform
 from mauvecl.noise.scene import prepare
+from mauvecl.schema.errors import InputError
 
 #: Smallest number of draws of one pixel that distinguish an allowed stack from its frames, by exact convolution.
 SOONEST = 4e13

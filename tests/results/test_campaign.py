@@ -8,8 +8,8 @@ from scipy import stats
 
 from mauvecl.answers.detection.detect import detect
 from mauvecl.device.engine import Engine
-from mauvecl.host.errors import InputError
 from mauvecl.results.detection.campaign import campaign, per_test
+from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
 
 

@@ -10,7 +10,6 @@ from scenes import instrument, star
 from scipy import stats
 
 from mauvecl.device.engine import Engine
-from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import expect
 from mauvecl.host.sky.zodiacal import Sky
 from mauvecl.host.stars.source import Source
@@ -18,6 +17,7 @@ from mauvecl.results import numpy_kernels
 from mauvecl.results.counts.tally import Distribution, Grid, Tally
 from mauvecl.results.detection.detection import Detection
 from mauvecl.results.detection.roc import Roc
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.linear import Linear, Matched
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.statistics.statistic import Setting

@@ -12,7 +12,6 @@ import pytest
 from scenes import instrument, star
 
 from mauvecl.device.engine import Engine
-from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise.comparison import Comparison
 from mauvecl.noise.processes import CosmicRays, Normal, Processes, Uniform
@@ -20,6 +19,7 @@ from mauvecl.results.counts.tally import Distribution
 from mauvecl.results.detection.detection import Detection
 from mauvecl.results.requests.channels import plan_channels
 from mauvecl.results.snr import PERCENTAGES
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.intervals import central_counts
 from mauvecl.statistics.linear import Linear
 from mauvecl.statistics.registry import STATISTICS

@@ -8,11 +8,11 @@ from scenes import instrument, star
 from scipy import special
 
 from mauvecl.device.engine import Engine
-from mauvecl.host.errors import InputError
 from mauvecl.noise.comparison import Comparison
 from mauvecl.noise.processes import Normal, Processes, Uniform
 from mauvecl.results.detection.detection import Detection
 from mauvecl.results.detection.tails import tail
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.linear import Linear
 from mauvecl.statistics.registry import STATISTICS
 

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mauvecl.host.errors import InputError
 from mauvecl.noise import layout
 from mauvecl.results import numpy_kernels
 from mauvecl.results.counts.tally import Distribution, Grid, Tally
 from mauvecl.results.detection.roc import Roc
+from mauvecl.schema.errors import InputError
 
 
 def distribution(values: np.ndarray, grid: Grid) -> Distribution:

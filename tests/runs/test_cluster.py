@@ -29,12 +29,12 @@ from mauvecl import Study, measure
 from mauvecl.cli.app import app
 from mauvecl.device.engine import DeviceError, Engine
 from mauvecl.device.stares import Stares
-from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.results.requests.requests import RealiseRequest, Shard
 from mauvecl.runs.cluster import DaskWorkers
 from mauvecl.runs.pool import Pool, Stopped, map_in_order
 from mauvecl.runs.shards import Task
+from mauvecl.schema.errors import InputError
 from mauvecl.store import bulk
 
 pytestmark = [pytest.mark.long, pytest.mark.usefixtures("small_shards")]

@@ -23,7 +23,6 @@ from mauvecl.answers.detection.maps import detection_map
 from mauvecl.answers.limits.limits import limiting_magnitude
 from mauvecl.answers.signal.snr import snr
 from mauvecl.device.engine import DeviceError, Engine
-from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise.comparison import Comparison
 from mauvecl.noise.drawing import Drawing
@@ -35,6 +34,7 @@ from mauvecl.runs import shards
 from mauvecl.runs.checkpoint import Checkpoint, _digest_of
 from mauvecl.runs.pool import LocalWorkers, Pool, Stopped, map_in_order
 from mauvecl.runs.shards import fingerprint
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.linear import Linear
 from mauvecl.study.study import Study
 

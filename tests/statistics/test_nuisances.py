@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation, expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.sky.zodiacal import Sky
 from mauvecl.host.stars.source import Source
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.distributions import QuadraticForm
 from mauvecl.statistics.linear import Linear, Matched
 from mauvecl.statistics.nuisances import Nuisances

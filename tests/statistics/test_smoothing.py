@@ -9,9 +9,9 @@ from scipy import stats
 from scipy.ndimage import gaussian_filter1d
 
 from mauvecl import Instrument, Sky, Source, expect
-from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise.comparison import Comparison
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.distributions import QuadraticForm
 from mauvecl.statistics.smoothing import SMOOTHING_NM, Smoothing
 

@@ -22,9 +22,9 @@ from typer.testing import CliRunner
 
 from mauvecl.cli.app import app
 from mauvecl.device.engine import Engine
-from mauvecl.host.errors import InputError
 from mauvecl.host.files import whole
 from mauvecl.runs.durable import locked
+from mauvecl.schema.errors import InputError
 from mauvecl.store import bulk
 from mauvecl.store import form as store
 from mauvecl.store.export import Selection, _study, export

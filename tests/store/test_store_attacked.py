@@ -17,8 +17,8 @@ from stores import CHUNK, Painter, flip, forked, killed, study, tree
 from typer.testing import CliRunner
 
 from mauvecl.cli.app import app
-from mauvecl.host.errors import InputError
 from mauvecl.runs.durable import locked
+from mauvecl.schema.errors import InputError
 from mauvecl.store import bulk
 from mauvecl.store.description import signed
 from mauvecl.store.export import Selection

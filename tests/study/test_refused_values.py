@@ -12,9 +12,9 @@ from commands import run
 from pydantic import BaseModel, ValidationError
 
 import mauvecl
-from mauvecl.host.errors import InputError
 from mauvecl.host.instrument.instrument import Instrument
-from mauvecl.host.records import Record
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.records import Record
 from mauvecl.study.study import Study
 
 

@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 from mauvecl.answers.detection.detect import detect
 from mauvecl.cli.app import app
 from mauvecl.device.engine import Engine
-from mauvecl.host.errors import InputError
 from mauvecl.host.stars.source import Source
+from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
 
 PART = {"changes": {"output_min_nm": 300.0, "output_max_nm": 330.0}}

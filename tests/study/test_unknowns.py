@@ -12,7 +12,7 @@ from mauvecl.answers.detection.maps import detection_map
 from mauvecl.answers.limits.limits import limiting_magnitude
 from mauvecl.answers.limits.search import LimitSearch, MarginalLimitSearch
 from mauvecl.device.engine import Engine
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.study import Study
 from mauvecl.study.unknowns import REST, average, drawn, shares

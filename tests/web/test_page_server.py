@@ -33,9 +33,9 @@ from tornado.websocket import websocket_connect
 from typer.testing import CliRunner
 
 from mauvecl.cli.app import app
-from mauvecl.host.errors import InputError
 from mauvecl.noise.scene import prepare
 from mauvecl.results.requests.hypotheses import Hypotheses
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.study.study import Study
 from mauvecl.web import access, closed_forms, server, visitor

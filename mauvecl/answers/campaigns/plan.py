@@ -22,13 +22,13 @@ from mauvecl.answers.campaigns.planned import (
     star_of,
 )
 from mauvecl.answers.campaigns.visible import VisibleAnswer, visible
-from mauvecl.host.arguments import public
-from mauvecl.host.errors import InputError
 from mauvecl.host.orbit.conditions import PARTICLES_SOURCE, THERMAL_SOURCE
 from mauvecl.host.tables import make_table
 from mauvecl.lightcurve.search.counted_rate import DAY_S
 from mauvecl.lightcurve.search.yields import Yield, recovered_per_day
 from mauvecl.runs.pool import map_in_order
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
 from mauvecl.study.labels import describe_columns, stack_tables
 from mauvecl.study.messages import SATURATED, collect_messages
 from mauvecl.study.sections import Rays

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from mauvecl.answers.campaigns.conditions import Conditions, Met, hits_variance_dn2
-from mauvecl.host.errors import InputError
 from mauvecl.host.orbit.targets import Target
 from mauvecl.lightcurve.flares.energies import EnergyScale, quiescent_luminosity
 from mauvecl.lightcurve.flares.rates import BOLOMETRIC, Rates
 from mauvecl.lightcurve.search.completeness import Completeness, frame_signal
 from mauvecl.lightcurve.search.yields import Yield
+from mauvecl.schema.errors import InputError
 from mauvecl.study.orbits import PlanTarget
 from mauvecl.study.sections import SkyLight, Star
 from mauvecl.study.spectral_types import nearest_spectrum

@@ -12,13 +12,13 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.campaigns.calendars import Entry, calendar_bytes
-from mauvecl.host.arguments import public
 from mauvecl.host.orbit.bodies import Bodies
 from mauvecl.host.orbit.season import elongation_deg, zodiacal_light
 from mauvecl.host.orbit.targets import Target
 from mauvecl.host.orbit.time_grid import DAY_S, TimeGrid
 from mauvecl.host.orbit.visibility import Visibility, Windows
 from mauvecl.host.tables import make_table
+from mauvecl.schema.calls import public
 from mauvecl.study.labels import describe_columns, stack_tables
 from mauvecl.study.orbits import targets_of
 from mauvecl.study.study import Study

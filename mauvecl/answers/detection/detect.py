@@ -11,8 +11,6 @@ import numpy as np
 
 from mauvecl.answers.answer import Answer, InCell
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
-from mauvecl.host.arguments import public
-from mauvecl.host.errors import InputError
 from mauvecl.results.detection.campaign import campaign, per_test
 from mauvecl.results.detection.departures import departure_table
 from mauvecl.results.detection.detection import Detection
@@ -20,6 +18,8 @@ from mauvecl.results.detection.paper import PAPER_G2V, WHY, reconstruct
 from mauvecl.results.detection.roc import ROC_ROWS
 from mauvecl.results.requests.fap import check_fap, countable
 from mauvecl.runs.pool import Pool, map_in_order
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.distributions import QuadraticForm
 from mauvecl.statistics.linear import Linear, Matched
 from mauvecl.statistics.statistic import Setting

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.errors import InputError
 from mauvecl.noise.default_unknowns import DEFAULT_UNKNOWNS
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.linear import Matched
 from mauvecl.statistics.names import NUISANCES
 from mauvecl.statistics.nuisances import Nuisances, join_names

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.limits.search import LimitSearch
-from mauvecl.host.arguments import public
 from mauvecl.host.tables import make_table
 from mauvecl.noise.processes import Uniform
+from mauvecl.schema.calls import public
 from mauvecl.study.labels import describe_columns
 from mauvecl.study.sections import Star, Unknowns
 from mauvecl.study.study import Study

@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.host.errors import InputError
-from mauvecl.host.ranges import DAY_S
 from mauvecl.results.requests.hypotheses import check_shape, fall_between
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.ranges import DAY_S
 from mauvecl.statistics.intervals import Interval
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.statistics.statistic import LinearStatistic

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import numpy as np
 
 from mauvecl.answers.answer import Answer
-from mauvecl.host.arguments import public
-from mauvecl.host.errors import InputError
-from mauvecl.host.quantities import number
-from mauvecl.host.ranges import DAY_S
 from mauvecl.host.tables import Column, table_of
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.quantities import number
+from mauvecl.schema.ranges import DAY_S
 from mauvecl.study.labels import describe_columns, label
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.quantities import QUANTITIES

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from mauvecl.answers.answer import Answer
-from mauvecl.host.arguments import public
-from mauvecl.host.quantities import count
 from mauvecl.noise.components import components
+from mauvecl.schema.calls import public
+from mauvecl.schema.quantities import count
 from mauvecl.study.labels import describe_columns, label
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.study import Study

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from mauvecl.answers.answer import Answer, InCell
 from mauvecl.answers.signal.exposures import place_of
-from mauvecl.host.arguments import public
 from mauvecl.runs.pool import Pool, map_in_order
+from mauvecl.schema.calls import public
 from mauvecl.study.labels import label, stack_tables
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.study import Study

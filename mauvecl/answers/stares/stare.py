@@ -11,14 +11,14 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from mauvecl.answers.answer import Answer, InCell
-from mauvecl.host.arguments import public
-from mauvecl.host.errors import InputError
 from mauvecl.host.tables import make_table
 from mauvecl.lightcurve.flares.energies import Kind
 from mauvecl.lightcurve.flares.events import Event, coefficients, temperatures_of
 from mauvecl.lightcurve.search.alarms import Alarm, alarms
 from mauvecl.lightcurve.stares.observed import Draw, Light, StareExpectation, seen
 from mauvecl.runs.checkpoint import kept
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
 from mauvecl.study.labels import describe_columns, label, stack_tables
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.stare_expectation import energy_of, expect_stare, orbit_lines, stare_of, threshold_line, unused_lines

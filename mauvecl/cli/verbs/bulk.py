@@ -46,7 +46,7 @@ def realise(study: Study, session: Session) -> None:
     """
     from mauvecl.cli.foresight import question_room
     from mauvecl.cli.session import told_of_interrupts, working
-    from mauvecl.host.errors import InputError
+    from mauvecl.schema.errors import InputError
     from mauvecl.store import bulk
     from mauvecl.store.export import ENDINGS
     from mauvecl.store.form import Store
@@ -133,7 +133,7 @@ def verify(
     """
     from mauvecl.answers.checked import is_answer
     from mauvecl.cli.console import Meter, show, show_table
-    from mauvecl.host.errors import InputError
+    from mauvecl.schema.errors import InputError
 
     if is_answer(store):
         if repair or redraw or rows is not None:
@@ -206,7 +206,7 @@ def export(
 
 
 def _rows_of(text: str | None) -> tuple[int, int] | None:
-    from mauvecl.host.errors import InputError
+    from mauvecl.schema.errors import InputError
 
     if text is None:
         return None

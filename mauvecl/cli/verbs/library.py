@@ -83,8 +83,8 @@ def add(
 
     Example: mauvecl library add my-star.txt --name "HD 1234"
     """
-    from mauvecl.host.errors import InputError
     from mauvecl.host.stars.own_stars import add
+    from mauvecl.schema.errors import InputError
 
     if name is not None and len(files) > 1:
         raise InputError(f"--name {name!r} for {len(files)} files, expected one file")

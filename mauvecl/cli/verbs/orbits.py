@@ -18,8 +18,8 @@ if TYPE_CHECKING:
 
 def _range(text: str) -> Any:
     """Two declinations, -46.4:31.8, or none."""
-    from mauvecl.host.errors import InputError
-    from mauvecl.host.files.bounded import shortened
+    from mauvecl.schema.errors import InputError
+    from mauvecl.schema.text import shortened
 
     if text.strip().lower() == "none":
         return "none"

@@ -30,8 +30,8 @@ def serve(
 
     Example: mauvecl serve --show
     """
-    from mauvecl.host.errors import InputError
-    from mauvecl.host.files.bounded import shortened
+    from mauvecl.schema.errors import InputError
+    from mauvecl.schema.text import shortened
 
     number = within(port, "--port", read=count, low=1, high=65535)
     if find_spec("bokeh") is None or find_spec("tornado") is None:

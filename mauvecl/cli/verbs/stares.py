@@ -31,7 +31,7 @@ def stare(
     """
     from mauvecl.answers.stares.stare import stare as compute
     from mauvecl.device.stares import Stares
-    from mauvecl.host.errors import InputError
+    from mauvecl.schema.errors import InputError
 
     if given["energy"] and (given["amplitude"] or given["flares"]):
         raise InputError("--energy is given beside --amplitude or --flares, expected one of them")

@@ -23,14 +23,14 @@ from typing import TYPE_CHECKING, Literal, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.arguments import public
-from mauvecl.host.errors import InputError
-from mauvecl.host.ranges import FLARE_TEMPERATURES_K
 from mauvecl.host.stars.bands import band as find_band
 from mauvecl.host.stars.bands import photons
 from mauvecl.host.stars.flare import Geometry, added_light, blackbody
 from mauvecl.host.stars.flare_spectra import PARSEC_CM, STEFAN_BOLTZMANN, SUN_CM, Blackbody, FlareSpectrum
 from mauvecl.lightcurve.flares.shapes import Shape, shape_of
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.ranges import FLARE_TEMPERATURES_K
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source

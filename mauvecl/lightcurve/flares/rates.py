@@ -14,12 +14,12 @@ from typing import Literal, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.host.errors import InputError
-from mauvecl.host.files.bounded import shortened
 from mauvecl.host.files.text_table import read_text_table
-from mauvecl.host.ranges import FLARE_TEMPERATURES_K
 from mauvecl.host.stars.flare_spectra import Blackbody, FlareSpectrum
 from mauvecl.lightcurve.flares.energies import flux_in_band
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.ranges import FLARE_TEMPERATURES_K
+from mauvecl.schema.text import shortened
 
 Float = NDArray[np.float64]
 #: What published energies are; see `Rates`.

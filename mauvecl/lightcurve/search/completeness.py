@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import optimize, stats
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.lightcurve.defaults import HALF_WIDTHS_S as BANK_S
 from mauvecl.lightcurve.flares.energies import EnergyScale
@@ -17,6 +16,7 @@ from mauvecl.lightcurve.flares.shapes import Shape, shape_of
 from mauvecl.lightcurve.search.bank import Bank
 from mauvecl.lightcurve.search.counted_rate import DAY_S
 from mauvecl.lightcurve.search.false_alarm_rate import TemplateGrid
+from mauvecl.schema.errors import InputError
 
 Float = NDArray[np.float64]
 

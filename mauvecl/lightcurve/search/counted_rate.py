@@ -14,7 +14,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.intervals import Interval, central_counts, clopper_pearson
 
 Float = NDArray[np.float64]

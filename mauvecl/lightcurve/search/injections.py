@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.search.fit_accuracy import FIT_QUANTITIES, Refit
 from mauvecl.lightcurve.search.injection_sites import Place, places_of
 from mauvecl.lightcurve.search.survey import select_frames, subtract_known
 from mauvecl.lightcurve.stares.components import STEADY, Components
 from mauvecl.lightcurve.stares.requests import Method, StaresRequest
 from mauvecl.lightcurve.stares.sums import method_for
+from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.search.survey import Survey

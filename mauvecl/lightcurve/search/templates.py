@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.defaults import RANK
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.nuisances import Nuisances, join_names
 
 if TYPE_CHECKING:

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import optimize, stats
 
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.flares.rates import PowerLaw, Rates
 from mauvecl.lightcurve.search.completeness import Completeness
+from mauvecl.schema.errors import InputError
 
 Float = NDArray[np.float64]
 

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.orbit.conditions import Particles, Thermal
 from mauvecl.host.orbit.constraints import sunlight
 from mauvecl.host.orbit.limits import Limits
@@ -17,6 +16,7 @@ from mauvecl.host.orbit.targets import Target
 from mauvecl.host.orbit.time_grid import DAY_S, TimeGrid
 from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.lightcurve.stares.stare import MOST_FRAMES, Stare
+from mauvecl.schema.errors import InputError
 
 Float = NDArray[np.float64]
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.arguments import public
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.defaults import ORBIT_S
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
 
 Float = NDArray[np.float64]
 

@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.host.arguments import public
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.stares.stare import Stare
 from mauvecl.results.measurements.fit import LEVELS, Measurement, fit
 from mauvecl.results.measurements.reduction import Reduction
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

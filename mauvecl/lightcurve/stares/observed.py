@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.stares.components import MOST_STATISTICS, Components
+from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation

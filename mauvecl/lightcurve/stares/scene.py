@@ -11,13 +11,13 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.stares.components import MOST_STATISTICS, STEADY, Components
 from mauvecl.noise import layout
 from mauvecl.noise.cumulants import Cumulants, joint_is_exact
 from mauvecl.noise.pixels import padded
 from mauvecl.noise.processes import CosmicRays, Processes
 from mauvecl.noise.scene import Scene, prepare
+from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.stares.stare import Stare

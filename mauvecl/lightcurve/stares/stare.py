@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.arguments import public
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.defaults import CHANGING, ORBIT_S, Changing
 from mauvecl.lightcurve.stares.curves import Curve, Sinusoid
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation

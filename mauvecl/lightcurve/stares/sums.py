@@ -15,10 +15,10 @@ from typing import TYPE_CHECKING, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.errors import InputError
 from mauvecl.lightcurve.stares.components import STEADY, Components
 from mauvecl.lightcurve.stares.scene import Flares, StareScene, unique
 from mauvecl.noise.cumulants import expansion_error
+from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.stares.requests import Method

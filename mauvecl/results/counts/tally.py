@@ -11,9 +11,9 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.errors import InputError
 from mauvecl.noise import layout
 from mauvecl.results.counts.far import UNIT_BITS, FarCounts, FarTally, SparseCounts, is_above
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.intervals import Interval, central_counts
 
 

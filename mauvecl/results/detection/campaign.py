@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.intervals import Interval, central_counts, clopper_pearson
 
 #: Number of simulated campaigns with overlapping stacks.

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.host.arguments import public
 from mauvecl.host.tables import make_table
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.results.requests.fap import countable
+from mauvecl.schema.calls import public
 from mauvecl.statistics.distributions import Form
 from mauvecl.statistics.intervals import Interval
 from mauvecl.statistics.statistic import Differences, LinearStatistic, QuadraticStatistic

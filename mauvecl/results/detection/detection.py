@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.drawable import Drawable
-from mauvecl.host.arguments import public
 from mauvecl.host.content import ContentEquality
-from mauvecl.host.quantities import count
 from mauvecl.host.tables import make_table, set_descriptions
 from mauvecl.results.counts.tally import Distribution, TailSamples, Tally
 from mauvecl.results.detection.roc import Roc
 from mauvecl.results.requests.channels import ChannelPlan, Key
 from mauvecl.results.requests.fap import NoThresholdError, Tails, check_atom, check_fap, countable
 from mauvecl.results.requests.hypotheses import Hypotheses
+from mauvecl.schema.calls import public
+from mauvecl.schema.quantities import count
 from mauvecl.statistics.detection_interval import detection_interval
 from mauvecl.statistics.intervals import Interval, central_counts, clopper_pearson
 from mauvecl.statistics.statistic import LinearStatistic

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.host.errors import InputError
 from mauvecl.noise import layout
 from mauvecl.noise.factor_distributions import quantile_at_score
 from mauvecl.results.requests.fap import check_atom
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.distributions import Form, Mixture, QuadraticForm
 from mauvecl.statistics.intervals import CONFIDENCE, Interval
 from mauvecl.statistics.statistic import Differences

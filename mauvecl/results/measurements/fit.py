@@ -10,11 +10,11 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
-from mauvecl.host.arguments import public
-from mauvecl.host.errors import InputError
 from mauvecl.results.measurements.model import FlareModel, derived_values
 from mauvecl.results.measurements.profile import Profile, covariance, covariance_at, intervals
 from mauvecl.results.measurements.reduction import Reduction
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.nuisances import Nuisances
 
 if TYPE_CHECKING:

@@ -15,9 +15,6 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.host.arguments import public
-from mauvecl.host.errors import InputError
-from mauvecl.host.ranges import FLARE_TEMPERATURES_K
 from mauvecl.host.response import Order, response_matrix
 from mauvecl.host.stars.bands import photons
 from mauvecl.host.stars.flare import blackbody
@@ -31,6 +28,9 @@ from mauvecl.host.stars.flare_spectra import (
     EmissionLine,
     balmer_continuum,
 )
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.ranges import FLARE_TEMPERATURES_K
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation

@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.linear import Linear
 from mauvecl.statistics.nuisances import Nuisances, join_names
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Literal
 
-from mauvecl.host.errors import InputError
+from mauvecl.schema.errors import InputError
 
 #: Smallest number of realisations beyond a threshold; rarer tails raise InputError and are never extrapolated.
 MIN_IN_TAIL = 100

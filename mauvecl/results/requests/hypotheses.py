@@ -9,11 +9,11 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.host.arguments import public
-from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
 from mauvecl.noise.factor_distributions import FactorDistributions
 from mauvecl.noise.scene import Scene
+from mauvecl.schema.calls import public
+from mauvecl.schema.errors import InputError
 from mauvecl.statistics.distributions import Form
 from mauvecl.statistics.linear import Linear, Matched
 from mauvecl.statistics.nuisances import Nuisances

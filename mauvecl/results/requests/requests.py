@@ -11,15 +11,15 @@ from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Any, ClassVar, Protocol, Self
 
-from mauvecl.host.errors import InputError
 from mauvecl.host.expectation import Expectation
-from mauvecl.host.quantities import count
 from mauvecl.noise.comparison import NOISE_FREE, Comparison
 from mauvecl.noise.drawing import AUTOMATIC, Drawing, DrawingOptions
 from mauvecl.noise.scene import BATCH, Scene, prepare
 from mauvecl.results.requests.channels import ChannelPlan, plan_channels
 from mauvecl.results.requests.fap import Tails
 from mauvecl.results.requests.hypotheses import Hypotheses
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.quantities import count
 from mauvecl.statistics.linear import Linear
 from mauvecl.statistics.names import DEFAULT_STATISTICS
 from mauvecl.statistics.nuisances import Nuisances, as_nuisances

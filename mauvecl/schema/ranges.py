@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from .errors import InputError
+from mauvecl.schema.errors import InputError
 
 #: Magnitudes of a star.
 MAGNITUDES = (-30.0, 40.0)

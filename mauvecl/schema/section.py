@@ -6,8 +6,8 @@ from typing import Any
 
 from pydantic import ValidationInfo, field_validator
 
-from mauvecl.host.quantities import is_quantity, numbers, unit_of
-from mauvecl.host.records import Record
+from mauvecl.schema.quantities import is_quantity, numbers, unit_of
+from mauvecl.schema.records import Record
 
 
 def plain(key: str, given: Any) -> Any:

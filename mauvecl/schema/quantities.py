@@ -9,7 +9,7 @@ import math
 import operator
 from typing import TYPE_CHECKING, Any
 
-from .errors import InputError
+from mauvecl.schema.errors import InputError
 
 if TYPE_CHECKING:
     import numpy as np

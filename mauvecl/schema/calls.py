@@ -10,8 +10,8 @@ from functools import cache, wraps
 from inspect import Signature, isclass, isfunction, signature
 from typing import Any, NamedTuple, TypeVar, cast
 
-from .errors import InputError
-from .quantities import is_quantity, numbers, shown, unit_of, word_of
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.quantities import is_quantity, numbers, shown, unit_of, word_of
 
 Given = TypeVar("Given", bound=Callable[..., Any])
 

@@ -15,9 +15,8 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from .errors import InputError
-from .files.bounded import shortened
-from .files.parsed import shown
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened, shown
 
 if TYPE_CHECKING:
     from pydantic._internal._model_construction import ModelMetaclass
