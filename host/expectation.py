@@ -555,7 +555,7 @@ def _sky(given: Any) -> Sky:
 
 
 def _seconds(exposure: Any) -> float:
-    seconds = number("exposure", exposure, "s", expected=EXPOSURES.removeprefix("expected "))
+    seconds = number("exposure", exposure, "s", expected=EXPOSURES)
     check_exposure(seconds)
     return seconds
 

@@ -83,10 +83,7 @@ def verify_answer(folder: str | Path) -> list[FileFault]:
     folder = Path(folder)
     if not is_answer(folder):
         raise InputError(
-            f"{str(folder)!r} holds no {RECORD}, expected the output folder of a verb",
-            key="folder",
-            value=str(folder),
-            expected="the output folder of a verb",
+            f"{str(folder)!r} holds no {RECORD}", "the output folder of a verb", key="folder", value=str(folder)
         )
     if not (folder / RECORD).is_file():
         return [FileFault(RECORD, "missing")]

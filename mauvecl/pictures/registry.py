@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 from mauvecl.pictures.style import AXES
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.quantities import shown
+from mauvecl.schema.text import shown
 
 F = TypeVar("F", bound=Callable[..., Any])
 #: Modules that a search for pictures must not import, since matplotlib is loaded only when a picture is drawn.

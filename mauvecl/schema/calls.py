@@ -11,7 +11,7 @@ from inspect import Signature, isclass, isfunction, signature
 from typing import Any, NamedTuple, TypeVar, cast
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.quantities import is_quantity, numbers, shown, unit_of, word_of
+from mauvecl.schema.quantities import is_quantity, numbers, unit_of, word_of
 
 Given = TypeVar("Given", bound=Callable[..., Any])
 
@@ -112,13 +112,8 @@ def _taken(name: str, value: Any, kinds: tuple[_Kind, ...]) -> Any:
     )
     if any(word in expected for word in CLASSES):
         called = CALLED.get(name, name if name[-1:].isdigit() else f"the {name}")
-        raise InputError(
-            f"{called} is of the type {type(value).__name__}, expected {expected}",
-            key=name,
-            value=value,
-            expected=expected,
-        )
-    raise InputError(f"{name} = {shown(value)}, expected {expected}", key=name, value=value, expected=expected)
+        raise InputError(f"{called} is of the type {type(value).__name__}", expected, key=name, value=value)
+    raise InputError.of(name, value, expected)
 
 
 @cache

@@ -5,6 +5,8 @@ from __future__ import annotations
 import re
 from typing import Any
 
+from mauvecl.schema.text import shown
+
 #: The usual sentence: ``key = value, expected this``, after the name of a file or section where there is one.
 _SENTENCE = re.compile(
     r"(?:[^:=]*: )?(?P<key>[A-Za-z_][\w. ]*?) = (?P<value>.+?)(?:, expected (?P<expected>.+))?$", re.S
@@ -18,6 +20,17 @@ class InputError(ValueError):
     and keys of studies, with remedies in backticks, as in ```extend``` or ```resume=True```; the command line writes
     flags in their place and exits with code 2.
 
+    Parameters
+    ----------
+    fault : str
+        What is wrong.
+    expected : str, optional
+        What is accepted; ends the sentence.
+    key : str, optional
+        The parameter, or the key of a study such as ``run.fap``.
+    value : object, optional
+        The value of the key.
+
     Attributes
     ----------
     key : str or None
@@ -29,12 +42,33 @@ class InputError(ValueError):
     """
 
     def __init__(
-        self, message: str = "", *, key: str | None = None, value: Any = None, expected: str | None = None
+        self, fault: str = "", expected: str | None = None, *, key: str | None = None, value: Any = None
     ) -> None:
+        message = f"{fault}, expected {expected}" if expected else fault
         super().__init__(message)
-        shown = _SENTENCE.match(message)
-        if key is None and shown is not None:
-            key, value = shown["key"].replace(" ", "_"), shown["value"] if value is None else value
+        found = _SENTENCE.match(message)
+        if key is None and found is not None:
+            key, value = found["key"].replace(" ", "_"), found["value"] if value is None else value
         if expected is None and ", expected " in message:
             expected = message.partition(", expected ")[2]
         self.key, self.value, self.expected = key, value, expected
+
+    @classmethod
+    def of(cls, key: str, value: Any, expected: str, *, unit: str = "", where: str = "") -> InputError:
+        """Return the error of one value: ``where: key = value unit, expected this``.
+
+        Parameters
+        ----------
+        key : str
+            The parameter or key. Words such as "flare amplitude" stand for the parameter `flare_amplitude`.
+        value : object
+            Shown on one line, shortened.
+        expected : str
+            What is accepted.
+        unit : str, optional
+            Unit of a plain number.
+        where : str, optional
+            File or section that holds the value.
+        """
+        place, after = f"{where}: " if where else "", f" {unit}" if unit else ""
+        return cls(f"{place}{key} = {shown(value)}{after}", expected, key=key.replace(" ", "_"), value=value)

@@ -99,7 +99,7 @@ def number(
         one = _plain(what, value, unit, wanted)
         plain = float(one) if not one.ndim else math.nan
     if not (math.isfinite(plain) and low <= plain <= high):
-        raise _unusable(what, value, wanted)
+        raise InputError.of(what, value, wanted)
     return plain
 
 
@@ -114,12 +114,7 @@ def numbers(
     bad = ~(np.isfinite(plain) & (plain >= low) & (plain <= high))
     if bad.any():
         first = plain[np.unravel_index(int(np.argmax(bad)), plain.shape)]
-        raise InputError(
-            f"{what} = {first:g}{f' {unit}' if unit else ''}, expected {wanted}",
-            key=_key(what),
-            value=float(first),
-            expected=wanted,
-        )
+        raise InputError.of(what, float(first), wanted, unit=unit)
     return plain
 
 
@@ -138,10 +133,10 @@ def count(what: str, value: Any, *, low: int = 0, high: int = 2**63 - 1) -> int:
     except TypeError:
         plain = number(what, value, expected=wanted)
         if not plain.is_integer():
-            raise _unusable(what, value, wanted) from None
+            raise InputError.of(what, value, wanted) from None
         whole = int(plain)
     if not low <= whole <= high:
-        raise _unusable(what, whole, wanted)
+        raise InputError.of(what, whole, wanted)
     return whole
 
 
@@ -155,7 +150,7 @@ def _plain(what: str, value: Any, unit: str, wanted: str) -> NDArray[np.float64]
             raise TypeError("no number")
         return np.asarray(value, np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise _unusable(what, value, wanted) from error
+        raise InputError.of(what, value, wanted) from error
 
 
 def _converted(value: Any, unit: str) -> Any:
@@ -185,23 +180,8 @@ def word_of(unit: str) -> str:
     return WORDS.get(unit, unit)
 
 
-def _unusable(what: str, value: Any, wanted: str) -> InputError:
-    return InputError(f"{what} = {shown(value)}, expected {wanted}", key=_key(what), value=value, expected=wanted)
-
-
-def _key(what: str) -> str:
-    """Return the parameter that a sentence calls so: "flare temperature" is `flare_temperature`."""
-    return what.replace(" ", "_")
-
-
 def _expected(unit: str, low: float, high: float) -> str:
     word = WORDS.get(unit, unit)
     if math.isfinite(low) and math.isfinite(high):
         return f"{low:g} to {high:g}{f' {unit}' if unit else ''}"
     return f"{word} of at least {low:g}" if math.isfinite(low) else word
-
-
-def shown(value: Any) -> str:
-    """A value for a sentence: on one line, and short."""
-    text = " ".join((str(value) if hasattr(value, "unit") else repr(value)).split())
-    return text if len(text) <= 60 else f"{text[:57]}..."

@@ -12,7 +12,7 @@ MAGNITUDES = (-30.0, 40.0)
 FLARE_TEMPERATURES_K = (1_000.0, 200_000.0)
 #: Seconds of the longest exposure.
 DAY_S = 86_400.0
-EXPOSURES = "expected a time above 0 and up to one day (86400 s)"
+EXPOSURES = "a time above 0 and up to one day (86400 s)"
 
 
 def check_magnitude(value: float) -> None:
@@ -24,7 +24,7 @@ def check_magnitude(value: float) -> None:
     """
     low, high = MAGNITUDES
     if not low <= value <= high:
-        raise InputError(f"magnitude = {value!r}, expected {low:g} to {high:g}")
+        raise InputError.of("magnitude", value, f"{low:g} to {high:g}")
 
 
 def check_amplitude(value: float) -> None:
@@ -35,7 +35,7 @@ def check_amplitude(value: float) -> None:
     InputError
     """
     if not (math.isfinite(value) and value >= 0.0):
-        raise InputError(f"flare amplitude = {value!r}, expected a finite number of at least 0")
+        raise InputError.of("flare amplitude", value, "a finite number of at least 0")
 
 
 def check_temperature(what: str, value: float) -> None:
@@ -47,7 +47,7 @@ def check_temperature(what: str, value: float) -> None:
     """
     low, high = FLARE_TEMPERATURES_K
     if not low <= value <= high:
-        raise InputError(f"{what} = {value!r} K, expected {low:g} to {high:g} K")
+        raise InputError.of(what, value, f"{low:g} to {high:g} K", unit="K")
 
 
 def check_exposure(seconds: float) -> None:
@@ -58,4 +58,4 @@ def check_exposure(seconds: float) -> None:
     InputError
     """
     if not 0 < seconds <= DAY_S:
-        raise InputError(f"exposure = {seconds:g} s, {EXPOSURES}")
+        raise InputError.of("exposure", seconds, EXPOSURES, unit="s")

@@ -81,7 +81,9 @@ def input_error(where: str, model: type[BaseModel], error: ValidationError) -> I
     inner = first.get("ctx", {}).get("error")
     if isinstance(inner, InputError):
         # What read the value knows more of it than where it stands.
-        return InputError(message, key=inner.key or key, value=inner.value, expected=inner.expected)
+        known = InputError(message, key=inner.key or key, value=inner.value)
+        known.expected = inner.expected
+        return known
     return InputError(message, key=key, value=None if first["type"] == "missing" else value)
 
 

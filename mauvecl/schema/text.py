@@ -12,8 +12,13 @@ def shortened(text: str, most: int = 80) -> str:
 
 def shown(value: Any, most: int = 80) -> str:
     """Return any value for a message, however large or deep."""
+    if hasattr(value, "unit"):
+        return printable(str(value), most)
+    if hasattr(value, "dtype") and getattr(value, "ndim", 1) == 0:
+        # NumPy's numbers print their type as well.
+        value = value.item()
     try:
-        return printable(repr(value), most)
+        return printable(" ".join(repr(value).split()) if hasattr(value, "dtype") else repr(value), most)
     except (ValueError, RecursionError):
         # Python does not print integers of more than some thousand digits.
         return f"a value of the type {type(value).__name__}"

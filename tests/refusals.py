@@ -1,0 +1,38 @@
+"""Refusals of bad input: tests check the key, the value and what is expected, not the sentence."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import pytest
+
+from mauvecl.schema.errors import InputError
+
+_ANY = object()
+
+
+@contextmanager
+def refused(key: str | None, value: Any = _ANY, *, expected: str | None = None) -> Iterator[pytest.ExceptionInfo]:
+    """Check that the block raises an InputError of one sentence about a key.
+
+    Parameters
+    ----------
+    key : str or None
+        The parameter, or key of a study, that the error names.
+    value : object, optional
+        The error's value.
+    expected : str, optional
+        What the error says is accepted, or the part of it that matters.
+    """
+    with pytest.raises(InputError) as caught:
+        yield caught
+    error = caught.value
+    assert error.key == key, f"{error.key}: {error}"
+    if value is not _ANY:
+        assert error.value == value, str(error)
+    assert error.expected, f"nothing is expected in: {error}"
+    if expected is not None:
+        assert expected in error.expected
+    assert "\n" not in str(error)
