@@ -145,7 +145,7 @@ def _plain(what: str, value: Any, unit: str, wanted: str) -> NDArray[np.float64]
 
     try:
         if is_quantity(value):
-            value = _converted(value, unit)
+            value = without_unit(value, unit)
         if isinstance(value, str | bytes) or np.asarray(value).dtype.kind not in "iuf":
             raise TypeError("no number")
         return np.asarray(value, np.float64)
@@ -153,7 +153,12 @@ def _plain(what: str, value: Any, unit: str, wanted: str) -> NDArray[np.float64]
         raise InputError.of(what, value, wanted) from error
 
 
-def _converted(value: Any, unit: str) -> Any:
+def without_unit(value: Any, unit: str) -> Any:
+    """Return a Quantity as plain numbers: a float, or an array of its shape.
+
+    Raises ValueError if its unit has no equivalent in `unit`. Wavelengths may be frequencies or energies, and
+    temperatures may be on any scale.
+    """
     import astropy.units as u
 
     # What detectors count is called DN here and adu elsewhere.
@@ -164,9 +169,10 @@ def _converted(value: Any, unit: str) -> Any:
     elif wanted.is_equivalent(u.K) or wanted == u.deg_C:
         equivalent = u.temperature()
     try:
-        return value.to_value(wanted, equivalent)
+        converted = value.to_value(wanted, equivalent)
     except u.UnitsError as error:
-        raise TypeError(str(error)) from error
+        raise ValueError(str(error)) from error
+    return converted if getattr(converted, "ndim", 0) else float(converted)
 
 
 def _no_truth(value: Any) -> Any:

@@ -6,6 +6,7 @@ from typing import Any
 
 from pydantic import ValidationInfo, field_validator
 
+from mauvecl.schema.fields import Unit
 from mauvecl.schema.quantities import is_quantity, numbers, unit_of
 from mauvecl.schema.records import Record
 
@@ -32,4 +33,8 @@ class Section(Record):
     @classmethod
     def _in_its_unit(cls, given: Any, info: ValidationInfo) -> Any:
         """Convert a Quantity to the unit of the key, and times and coordinates to text."""
-        return plain(info.field_name or "", given)
+        name = info.field_name or ""
+        if any(isinstance(known, Unit) for known in cls.model_fields[name].metadata):
+            # The annotation converts it.
+            return given
+        return plain(name, given)
