@@ -107,7 +107,7 @@ def question_time(study: Study, *, device: str | None, cluster: str | None, insi
         return
     scenarios = 1 + len(study.flare.amplitudes)
     combinations = study.sweep.size
-    drawn = count * len(study.star) * combinations * scenarios * study.load_instrument().pixels
+    drawn = count * len(study.star) * combinations * scenarios * study.observation.load_instrument().pixels
     rate, by = _rate(device, cluster)
     years = drawn / rate / YEAR_S
     if years > 1.0:

@@ -42,7 +42,7 @@ def _instrument(study: Study, swept: set[str]) -> str:
         text += f" with another {', '.join(o.changes)}"
     if "detector_temperature" in swept:
         return f"{text}, detector temperature as swept"
-    return f"{text}, detector at {study.load_instrument().temperature_c:g} deg C"
+    return f"{text}, detector at {study.observation.load_instrument().temperature_c:g} deg C"
 
 
 def _sky(study: Study, swept: set[str]) -> str:

@@ -14,6 +14,7 @@ from mauvecl.statistics.names import DEFAULT_STATISTICS, STATISTIC_NAMES
 from mauvecl.study.flare_light import FlareLight
 
 if TYPE_CHECKING:
+    from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.sky.zodiacal import Sky
     from mauvecl.host.stars.flare_spectra import FlareSpectrum
     from mauvecl.host.stars.source import Source
@@ -114,6 +115,14 @@ class Observation(Section):
     mode: Literal["auto", "frames", "stacked"] = "auto"
     recipe: Literal["auto", "joint", "apart"] = "auto"
     changes: dict[str, float | int | str] = Field(default_factory=dict)
+
+    def load_instrument(self) -> Instrument:
+        """Load the instrument and apply `changes` and the detector temperature."""
+        from mauvecl.host.instrument.instrument import Instrument
+
+        instrument = Instrument.load(self.instrument)
+        changes = self.changes | ({} if self.temperature_c is None else {"temperature_c": self.temperature_c})
+        return instrument.with_(**changes) if changes else instrument
 
 
 class SkyLight(Section):

@@ -55,7 +55,7 @@ def stare_of(study: Study) -> Stare:
     Raises InputError if the study has processes that only apply to single exposures.
     """
     refuse_priors(study)
-    q, instrument = study.stare, study.load_instrument()
+    q, instrument = study.stare, study.observation.load_instrument()
     spreads: dict[str, dict[Changing, float]] = {
         how: {of: getattr(q, how)[of] for of in CHANGING if of in getattr(q, how)}
         for how in ("jitters", "offsets", "drifts", "cycles")
@@ -139,7 +139,7 @@ def orbit_lines(study: Study) -> list[str]:
     if not study.stare.along_orbit:
         return []
     o = study.orbit
-    times = TimeGrid(o.start, study.stare.duration_s / DAY_S, study.load_instrument().frame_s)
+    times = TimeGrid(o.start, study.stare.duration_s / DAY_S, study.observation.load_instrument().frame_s)
     assumed = (
         "Limits, temperatures and windows of a stare along the orbit are assumptions; stray light is not modelled."
     )

@@ -37,7 +37,6 @@ if TYPE_CHECKING:
     import astropy.units as u
 
     from mauvecl.host.expectation import Expectation
-    from mauvecl.host.instrument.instrument import Instrument
     from mauvecl.host.stars.source import Source
     from mauvecl.noise.processes import Prior
     from mauvecl.statistics.statistic import Setting
@@ -215,14 +214,6 @@ class Study(Section):
         """Return the study as TOML for an answer's table, with spectrum files by name and digest."""
         return with_file_digests(self.toml())
 
-    def load_instrument(self) -> Instrument:
-        """Load the instrument and apply the study's ``changes`` and detector temperature."""
-        from mauvecl.host.instrument.instrument import Instrument
-
-        instrument, o = Instrument.load(self.observation.instrument), self.observation
-        changes = o.changes | ({} if o.temperature_c is None else {"temperature_c": o.temperature_c})
-        return instrument.with_(**changes) if changes else instrument
-
     def with_instrument(self, changes: Mapping[str, Any]) -> Self:
         """Return a copy with other values of the instrument; see `Instrument.with_`."""
         o = self.observation
@@ -286,7 +277,7 @@ class Study(Section):
         o = self.observation
         processes = self.processes.processes()
         if self.nuisances.usual:
-            processes = self.nuisances.processes(processes, self.load_instrument().temperature_c)
+            processes = self.nuisances.processes(processes, self.observation.load_instrument().temperature_c)
         return {"mode": o.mode, "recipe": o.recipe, "processes": processes}
 
     def detecting(self, quiet: Expectation) -> dict[str, Any]:
@@ -313,9 +304,9 @@ class Study(Section):
 
     def expectations(self, star: Star) -> list[Expectation]:
         """Return the expectations of a star without a flare and with each flare."""
-        source = star.source()
-        flares = [self.flaring(source, amplitude) for amplitude in self.flare.amplitudes]
-        return self.expect([source, *flares])
+        from mauvecl.study.cases import Case
+
+        return Case(self.model_copy(update={"star": (star,)})).expectations
 
     def flaring(self, source: Source, amplitude: float) -> Source:
         """Return a star with a flare of the study's spectrum and geometry."""
@@ -332,7 +323,7 @@ class Study(Section):
         """Compute the expectations of sources for the study's instrument, sky and exposure."""
         from mauvecl.host.expectation import expect
 
-        instrument, sky, o = self.load_instrument(), self.sky.sky(), self.observation
+        instrument, sky, o = self.observation.load_instrument(), self.sky.sky(), self.observation
         how: dict[str, Any] = {"exposure": o.exposure_s, "sky": sky, "order": o.order, "signal": o.signal}
         return [expect(s, instrument, **how) for s in sources]
 

@@ -141,7 +141,7 @@ def injected_sizes(study: Study, sizes: Sizes, unit_snr: float, threshold: float
     """Return the sizes that a study injects, ascending; by default around a completeness of one half."""
     asked = study.injections
     widths = np.array([asked.half_width_low_s, asked.half_width_high_s])
-    frames = widths / study.load_instrument().frame_s
+    frames = widths / study.observation.load_instrument().frame_s
     # S/N of a known flare on a known baseline: (A / sigma) sqrt(square integral x half-width in frames).
     amplitude = threshold / unit_snr / np.sqrt(shape_of(study.search.shape).square_integral * frames)
     half = sizes.of_amplitude(amplitude, widths)

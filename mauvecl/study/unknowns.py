@@ -55,7 +55,7 @@ def drawn(study: Study) -> DrawnStudies:
     sequence = qmc.LatinHypercube(len(priors), rng=np.random.default_rng(study.run.seed))
     even = sequence.random(asked.draws)
     values = np.column_stack([prior.quantile(even[:, k]) for k, prior in enumerate(priors.values())])
-    area = study.load_instrument().collecting_area_cm2
+    area = study.observation.load_instrument().collecting_area_cm2
     run = study.run.model_copy(update={"realisations": realisations_each(study)})
     certain = study.model_copy(update={"unknowns": type(asked)(), "run": run})
     studies = []
@@ -66,7 +66,7 @@ def drawn(study: Study) -> DrawnStudies:
             changes["collecting_area_cm2"] = changes.pop("qe_scale") * area
         changed = certain.with_instrument(changes)
         try:
-            changed.load_instrument()
+            changed.observation.load_instrument()
         except InputError as error:
             raise InputError(f"the priors of unknown values include impossible ones: {error}") from error
         studies.append(changed)

@@ -173,7 +173,7 @@ def test_what_is_assumed_moves_the_limit_as_physics_says() -> None:
     # Poisson in electrons has 0.77 of the dark noise.
     assert rows["dark counts are Poisson in"]["at_high_end"] > rows["dark counts are Poisson in"]["at_low_end"]
     lossy = asked.with_instrument({"light_loss": 0.44})
-    assert lossy.load_instrument().light_loss == 0.44
+    assert lossy.observation.load_instrument().light_loss == 0.44
     root = LimitSearch(lossy, lossy.star[0], 0.24, "matched").root()
     assert rows["light loss"]["at_high_end"] == pytest.approx(root, abs=1e-3)
     assert Study.build(lossy.model_dump(), "again") == lossy

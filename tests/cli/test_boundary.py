@@ -348,7 +348,7 @@ def test_what_takes_more_than_a_year_is_questioned(words: tuple[str, ...], tmp_p
 
 def test_how_long_a_year_is() -> None:
     study = Study()
-    drawn = len(study.star) * (1 + len(study.flare.amplitudes)) * study.load_instrument().pixels
+    drawn = len(study.star) * (1 + len(study.flare.amplitudes)) * study.observation.load_instrument().pixels
     year = int(foresight.YEAR_S * foresight.CORE_RATE * (os.cpu_count() or 1) / drawn)
     here = {"device": None, "cluster": None}
     foresight.question_time(study.with_settings([f"run.realisations={int(year * 0.99)}"]), **here, insist=False)

@@ -72,7 +72,7 @@ def test_booleans_in_settings_and_files_raise(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"star\.0\.bin_nm = True"):
         Study().with_settings(["star.0.bin_nm=true"])
     with pytest.raises(InputError, match=r"observation\.changes = "):
-        Study().with_settings(["observation.changes.read_noise_dn=true"]).load_instrument()
+        Study().with_settings(["observation.changes.read_noise_dn=true"]).observation.load_instrument()
     study = tmp_path / "study.toml"
     study.write_text("[flare]\namplitudes = [true]\n", encoding="utf-8")
     assert "flare.amplitudes" in run("simulate", study, folder=tmp_path, code=2).stderr

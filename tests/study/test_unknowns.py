@@ -43,8 +43,8 @@ def test_draws_follow_their_priors() -> None:
     assert np.sort(column["temperature_c"])[::64] == pytest.approx(np.linspace(13, 20, 8), abs=8 / 512)
     cut = stats.truncnorm(-3, 3, loc=0.34, scale=0.1)
     np.testing.assert_allclose(np.sort(cut.cdf(column["light_loss"])), (np.arange(512) + 0.5) / 512, atol=1 / 512)
-    one = draws.studies[7].load_instrument()
-    nominal = Study().load_instrument()
+    one = draws.studies[7].observation.load_instrument()
+    nominal = Study().observation.load_instrument()
     assert one.light_loss == column["light_loss"][7]
     assert one.collecting_area_cm2 == pytest.approx(column["qe_scale"][7] * nominal.collecting_area_cm2)
     again = drawn(study({"draws": 512}))

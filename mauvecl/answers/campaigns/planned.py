@@ -181,7 +181,7 @@ def looked_of(
     lengths = seen.windows[k].length_s
     window = float(np.median(lengths)) if lengths.size else 0.0
     sky, source = sky_behind(seen, k), star.source()
-    one = stared_at(study.at("exposure", study.load_instrument().frame_s), star, sky, conditions)
+    one = stared_at(study.at("exposure", study.observation.load_instrument().frame_s), star, sky, conditions)
     quiet, flare = one.expect([source, one.flaring(source, SMALL)])
     rays = one.processes.cosmic_rays
     hits = None if rays is None else hits_variance_dn2(rays, quiet)

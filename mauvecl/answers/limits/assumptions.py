@@ -125,7 +125,7 @@ def _moves(study: Study, star: Star, amplitude: float | None, statistic: str) ->
     question = LimitSearch(study, star, amplitude, statistic)
     nominal = question.root()
     moves = []
-    for assumption in assumptions(study.load_instrument()):
+    for assumption in assumptions(study.observation.load_instrument()):
         ends = [
             LimitSearch(study.with_instrument(change), star, amplitude, statistic).root(near=nominal)
             for change in assumption.changes

@@ -173,7 +173,7 @@ class LimitSearch:
     @cached_property
     def frame_s(self) -> float:
         """Seconds of one frame."""
-        return self.study.load_instrument().frame_s
+        return self.study.observation.load_instrument().frame_s
 
     def _beyond(self, value: float, verb: str) -> InputError:
         star = self.study.star[0]

@@ -270,7 +270,7 @@ def _measured(
     models = {
         name: FlareModel.of(
             source,
-            study.load_instrument(),
+            study.observation.load_instrument(),
             quiet,
             jump=jump,
             lines=lines,

@@ -14,10 +14,10 @@ from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.quantities import number
 from mauvecl.schema.ranges import DAY_S
-from mauvecl.study.labels import describe_columns, label
+from mauvecl.study.cases import Case, cases
+from mauvecl.study.labels import describe_columns
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.quantities import QUANTITIES
-from mauvecl.study.sections import Star
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -159,14 +159,15 @@ def exposure(
         missing = "S/N" if snr is None else "wavelength"
         raise InputError(f"no wanted {missing}, expected `signal.snr` and `signal.wavelength_nm`")
     answered, failed = [], []
-    for done, star in enumerate(study.star, 1):
+    prepared = cases(study, swept=False)
+    for done, case in enumerate(prepared, 1):
         try:
-            answered.append(_one(study, star, snr, wavelength_nm, per))
+            answered.append(_one(case, snr, wavelength_nm, per))
         except InputError as error:
             # One star's failure does not lose the others'.
             failed.append(error)
         if progress is not None:
-            progress(done, len(study.star))
+            progress(done, len(prepared))
     if not answered:
         raise failed[0]
     exposures, seen = zip(*answered, strict=True)
@@ -203,10 +204,9 @@ def exposure_for(
     return exposure(study)
 
 
-def _one(study: Study, star: Star, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposure, Expectation]:
-    source, frame_s = star.source(), study.load_instrument().frame_s
-
-    (frame,) = study.at("exposure", frame_s).expect([source])
+def _one(case: Case, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposure, Expectation]:
+    """Return the fewest frames for an S/N, and the expectation of as many."""
+    frame, frame_s = case.one_frame.quiet, case.instrument.frame_s
 
     def after(frames: int) -> Expectation:
         # As many frames as it takes: they may fill several exposures.
@@ -216,7 +216,7 @@ def _one(study: Study, star: Star, snr: float, wavelength_nm: float, per: Per) -
     longest = QUANTITIES["exposure"].high
     if not one > 0 or (snr / one) ** 2 * frame_s > longest:
         raise InputError(
-            f"{label(star, frame)} has an S/N of {one:.3g} per {per} at {wavelength_nm:g} nm in one frame, "
+            f"{case.one_frame.label} has an S/N of {one:.3g} per {per} at {wavelength_nm:g} nm in one frame, "
             f"expected enough for {snr:g} within {longest:g} s{frame.saturation_clause}"
         )
     # S/N grows with the root of the frames, to rounding: the neighbours settle it.
@@ -229,7 +229,7 @@ def _one(study: Study, star: Star, snr: float, wavelength_nm: float, per: Per) -
     place = place_of(x, wavelength_nm, per)
     here = x.saturated[x.element == place] if per == "element" else x.saturated[[place]]
     answer = Exposure(
-        star=label(star, x),
+        star=case.one_frame.label,
         wavelength_nm=wavelength_nm,
         per=per,
         wanted=snr,

@@ -10,6 +10,7 @@ from mauvecl.answers.answer import Answer
 from mauvecl.noise.components import components
 from mauvecl.schema.calls import public
 from mauvecl.schema.quantities import count
+from mauvecl.study.cases import cases
 from mauvecl.study.labels import describe_columns, label
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.study import Study
@@ -106,14 +107,15 @@ def simulate(
     """
     realisation = count("realisation", realisation)
     observations, everything = [], []
-    for done, star in enumerate(study.star, 1):
-        xs = study.expectations(star) if flaring else study.expect([star.source()])
+    prepared = cases(study, swept=False)
+    for done, case in enumerate(prepared, 1):
+        xs = case.expectations if flaring else [case.quiet]
         for i, x in enumerate(xs):
-            title = label(star, x) + (f", flare {100 * study.flare.amplitudes[i - 1]:g} %" if i else "")
-            table = components(x, realisation=realisation, seed=study.run.seed, **study.drawing)
+            title = label(case.star, x) + (f", flare {100 * case.amplitudes[i - 1]:g} %" if i else "")
+            table = components(x, realisation=realisation, seed=study.run.seed, **case.draw_options)
             table.meta["study"] = study.text()
             observations.append((title, x, describe_columns(table)))
         everything += xs
         if progress is not None:
-            progress(done, len(study.star))
+            progress(done, len(prepared))
     return SimulateAnswer(study, observations, collect_messages(everything, study.processes.processes()))

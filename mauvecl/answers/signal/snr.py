@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, ClassVar
 
@@ -10,7 +10,8 @@ from mauvecl.answers.answer import Answer, InCell
 from mauvecl.answers.signal.exposures import place_of
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import public
-from mauvecl.study.labels import label, stack_tables
+from mauvecl.study.cases import Case, cases
+from mauvecl.study.labels import stack_tables
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.study import Study
 
@@ -116,15 +117,10 @@ def snr(
         For anything in the study that cannot be.
     """
     # Everything is looked at before anything is drawn: bad input shows at once.
-    prepared = [
-        (label(star, x), at, x)
-        for at, cell in study.cells()
-        for star in cell.star
-        for x in cell.expect([star.source()])
-    ]
-    run, asked = study.run, study.signal.wavelength_nm
+    prepared, run, asked = cases(study), study.run, study.signal.wavelength_nm
+    quiet = [case.quiet for case in prepared]
     if asked is not None:
-        for *_, x in prepared:
+        for x in quiet:
             place_of(x, asked, "element")
 
     if engine is None:
@@ -132,9 +128,9 @@ def snr(
 
         engine = Default()
 
-    def answered(one: tuple[str, Mapping[str, float | str], Expectation]) -> StarSnr:
-        name, at, x = one
-        return StarSnr(name, at, engine.snr(x, realisations=run.realisations, seed=run.seed, **study.drawing), asked)
+    def answered(case: Case) -> StarSnr:
+        result = engine.snr(case.quiet, realisations=run.realisations, seed=run.seed, **case.draw_options)
+        return StarSnr(case.label, case.at, result, asked)
 
     if isinstance(engine, Pool):
         engine.expect(len(prepared) * run.realisations)
@@ -147,7 +143,7 @@ def snr(
         study,
         stars,
         [
-            *collect_messages([x for _, _, x in prepared], study.processes.processes()),
+            *collect_messages(quiet, study.processes.processes()),
             *filter(None, map(_cut_off, stars)),
         ],
     )

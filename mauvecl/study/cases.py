@@ -1,0 +1,192 @@
+"""Cases of a study: what answers need of each star at each combination of sweep values, computed on first use."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cached_property, lru_cache
+from typing import TYPE_CHECKING, Any, Self
+
+from mauvecl.study.questions import Sweep
+
+if TYPE_CHECKING:
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.instrument.instrument import Instrument
+    from mauvecl.host.sky.zodiacal import Sky
+    from mauvecl.host.stars.source import Source
+    from mauvecl.noise.processes import Processes
+    from mauvecl.statistics.nuisances import Nuisances
+    from mauvecl.statistics.statistic import Setting
+    from mauvecl.study.sections import Observation, SkyLight, Star
+    from mauvecl.study.study import Study
+
+
+#: Number of stars whose spectra a study's cases keep, since a sweep may have any number of them.
+MAX_SOURCES = 16
+
+
+class Loader:
+    """Stars, instruments and skies that the cases of a study share; each is loaded once.
+
+    `source` returns the spectrum of a star, by default that of the study's section.
+    """
+
+    def __init__(self, source: Callable[[Star], Source] | None = None) -> None:
+        self.source: Callable[[Star], Source] = lru_cache(MAX_SOURCES)(source or (lambda star: star.source()))
+        self.sky: Callable[[SkyLight], Sky] = lru_cache(MAX_SOURCES)(lambda light: light.sky())
+        self._instruments: dict[str, Instrument] = {}
+
+    def instrument(self, observation: Observation) -> Instrument:
+        """Return the instrument of an observation."""
+        key = repr((observation.instrument, observation.temperature_c, sorted(observation.changes.items())))
+        if key not in self._instruments:
+            self._instruments[key] = observation.load_instrument()
+        return self._instruments[key]
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    """One star at one combination of sweep values.
+
+    Nothing is loaded or computed before it is asked for, and each thing only once.
+
+    Examples
+    --------
+    >>> from mauvecl import Study
+    >>> from mauvecl.study.cases import cases
+    >>> first, second = cases(Study())
+    >>> first.label, round(first.quiet.exposure_s), len(first.flares)
+    ('K3V V = 3.7', 50, 4)
+    """
+
+    study: Study  # with this star alone, at these values, without a sweep
+    at: Mapping[str, float | str] = field(default_factory=dict)  # sweep values by quantity
+    loader: Loader = field(default_factory=Loader)
+
+    @property
+    def star(self) -> Star:
+        """The study's section of the star."""
+        return self.study.star[0]
+
+    @property
+    def amplitudes(self) -> tuple[float, ...]:
+        """Amplitudes of the flares."""
+        return self.study.flare.amplitudes
+
+    @cached_property
+    def label(self) -> str:
+        """Name and magnitude of the star, for tables and plots."""
+        from mauvecl.study.labels import label
+
+        return label(self.star, self.quiet)
+
+    @property
+    def source(self) -> Source:
+        """Spectrum of the star without a flare."""
+        return self.loader.source(self.star)
+
+    @property
+    def instrument(self) -> Instrument:
+        """The instrument, with the study's changes and detector temperature."""
+        return self.loader.instrument(self.study.observation)
+
+    @property
+    def sky(self) -> Sky:
+        """The sky behind the star."""
+        return self.loader.sky(self.study.sky)
+
+    @cached_property
+    def quiet(self) -> Expectation:
+        """Expectation of the star without a flare."""
+        return self.expect(self.source)[0]
+
+    @cached_property
+    def flares(self) -> list[Expectation]:
+        """Expectations of the star with each of the study's flares."""
+        return self.expect(*map(self.flaring, self.amplitudes))
+
+    @property
+    def expectations(self) -> list[Expectation]:
+        """Expectations without a flare and with each flare."""
+        return [self.quiet, *self.flares]
+
+    @cached_property
+    def processes(self) -> Processes:
+        """Noise processes to draw."""
+        processes = self.study.processes.processes()
+        if self.study.nuisances.usual:
+            return self.study.nuisances.processes(processes, self.instrument.temperature_c)
+        return processes
+
+    @property
+    def draw_options(self) -> dict[str, Any]:
+        """Arguments of the engine's methods: mode, recipe and processes."""
+        o = self.study.observation
+        return {"mode": o.mode, "recipe": o.recipe, "processes": self.processes}
+
+    def flaring(self, amplitude: float, temperature_k: float | None = None) -> Source:
+        """Return the star with a flare, by default of the study's temperature."""
+        f = self.study.flare
+        return self.source.flaring(
+            amplitude,
+            spectrum=f.light(temperature_k),
+            band=f.band,
+            geometry=f.geometry,
+            photosphere_temperature=f.photosphere_temperature_k,
+        )
+
+    def expect(self, *sources: Source) -> list[Expectation]:
+        """Compute the expectations of sources for the instrument, sky and exposure."""
+        from mauvecl.host.expectation import expect
+
+        o = self.study.observation
+        how: dict[str, Any] = {"exposure": o.exposure_s, "sky": self.sky, "order": o.order, "signal": o.signal}
+        return [expect(source, self.instrument, **how) for source in sources]
+
+    def unknowns(self, quiet: Expectation | None = None) -> Nuisances | None:
+        """Return the nuisance parameters that statistics are marginalised over, or None.
+
+        Their spectra are those of `quiet`, by default the star without a flare.
+        """
+        return self.study.nuisances.marginalised(self.quiet if quiet is None else quiet)
+
+    def detect_options(self, quiet: Expectation | None = None) -> dict[str, Any]:
+        """Return all arguments of `Engine.detect` except expectations and seed; `quiet` as for `unknowns`."""
+        run = self.study.run
+        how = {"realisations": run.realisations, "statistics": run.statistics, "tails": run.tails}
+        return self.draw_options | how | {"nuisances": self.unknowns(quiet), "comparison": run.comparison()}
+
+    def setting(self, quiet: Expectation, *flares: Expectation) -> Setting:
+        """Return the input of statistics for closed forms."""
+        from mauvecl.noise.factor_distributions import FactorDistributions
+        from mauvecl.statistics.statistic import Setting
+
+        unknown = self.unknowns(quiet)
+        drawn = FactorDistributions.from_processes(self.processes, quiet) if unknown else None
+        return Setting(quiet, ~quiet.saturated, self.study.run.comparison(), flares, unknown, drawn)
+
+    def with_value(self, quantity: str, value: float | str) -> Self:
+        """Return the case at another value of a quantity of `quantities.QUANTITIES`."""
+        return replace(self, study=self.study.at(quantity, value))
+
+    def with_sections(self, **sections: Any) -> Self:
+        """Return the case with other sections of the study, such as ``flare``."""
+        return replace(self, study=self.study.model_copy(update=sections))
+
+    @cached_property
+    def one_frame(self) -> Self:
+        """The same case with an exposure of a single frame."""
+        exposure = {"exposure_s": self.instrument.frame_s}
+        return self.with_sections(observation=self.study.observation.model_copy(update=exposure))
+
+
+def cases(study: Study, *, swept: bool = True) -> list[Case]:
+    """Return the cases of a study: every star at every combination of sweep values, or at the study's own values."""
+    loader = Loader()
+    found = []
+    for values in study.sweep.cells() if swept else ({},):
+        cell = study.model_copy(update={"sweep": Sweep()})
+        for quantity, value in values.items():
+            cell = cell.at(quantity, value)
+        found += [Case(cell.model_copy(update={"star": (star,)}), values, loader) for star in cell.star]
+    return found
