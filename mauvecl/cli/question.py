@@ -98,9 +98,9 @@ def sky_of(given: dict[str, Any]) -> dict[str, Any]:
 
 def nuisances_of(study: Study, texts: list[str]) -> dict[str, Any]:
     """What is unknown, as words: dark=0.1, or a file's name, as in stray.txt=free."""
+    from mauvecl.noise.unknowns import NUISANCES
     from mauvecl.schema.errors import InputError
     from mauvecl.schema.text import shortened
-    from mauvecl.statistics.names import NUISANCES
 
     nuisances: dict[str, Any] = {}
     own = {name: one.model_dump(exclude_none=True) for name, one in study.nuisances.own.items()}

@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import math
-from typing import Literal, get_args
+from typing import Literal
 
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
 #: Shapes of flares: `flares.shapes.SHAPES`.
 SHAPE_NAMES = ("davenport2014", "tovarmendoza2022", "fiducial")
-#: Quantities that change between frames: the quiescent level of the star; the throughput for the light of star, flare
-#: and sky; the brightness of the sky; the temperature of the detector.
-Changing = Literal["star", "light", "sky", "temperature"]
-CHANGING: tuple[Changing, ...] = get_args(Changing)
 #: Period of the flown orbit, s: 94.635 min, from the mean motion of 15.21638735 revolutions a day in the public
 #: elements of NORAD 66756, epoch 2026 day 257.
 ORBIT_S = 86_400.0 / 15.21638735

@@ -15,9 +15,9 @@ from mauvecl.noise.prior_tables import nodes
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
-    from mauvecl.noise.prior_targets import SignalPart
     from mauvecl.noise.processes import Processes
     from mauvecl.noise.scene import Scene
+    from mauvecl.noise.unknowns import SignalPart
 
 Float = NDArray[np.float64]
 

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from mauvecl.noise.unknowns import CHANGING, PROCESSES
+
 WORD_BITS = 32
 
 #: Stream of each random process, the top byte of the counter's last word, so that a new process changes no other.
@@ -18,19 +20,13 @@ STREAMS = {
     "dark": 1,
     "photon": 2,
     "cosmic": 3,
-    "jitter": 4,
-    "detector_temperature": 5,
-    "light_loss": 6,
-    "pointing_loss": 7,
-    "qe_scale": 8,
     "split": 9,
     "split_dark": 10,
-    "sky_level": 11,
     "stare_unknown": 16,
     "stare_frame": 17,
     "stare_sums": 18,
     "stare_glow": 19,
-}
+} | {name: process.stream for name, process in PROCESSES.items()}
 #: Offset of the stream for draws of a reference exposure.
 REFERENCE = 64
 
@@ -182,7 +178,7 @@ STARING = np.dtype(
 #: Rows of the known properties of frames: coefficients, the same minus one, and the factor on all light.
 KNOWN_OF_FRAMES = ("star", "star_less_one", "sky", "sky_less_one", "dark", "dark_less_one", "light")
 #: Parts of the signal that unknowns of a stare change, in the order of their numbers.
-MOVED = ("star", "light", "sky", "temperature")
+MOVED = CHANGING
 #: Frames are padded to a multiple of this.
 FRAME_BLOCK = 16
 #: Taylor coefficients of q in exp(r) = 1 + r + r^2 q(r), with an error below 2e-8 for |r| <= ln(2) / 2; and ln(2) in

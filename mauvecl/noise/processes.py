@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from mauvecl.noise import layout
 from mauvecl.noise.prior_tables import table_of
-from mauvecl.noise.prior_targets import PRIOR_TARGETS, Conditions, SignalPart
 from mauvecl.noise.priors import Normal, Prior, Uniform
+from mauvecl.noise.unknowns import PROCESSES, Conditions, SignalPart
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.quantities import count, number
@@ -142,7 +142,7 @@ class Processes:
     @property
     def modulations(self) -> tuple[tuple[str, SignalPart], ...]:
         """Names of the enabled priors and the part of the signal that each changes."""
-        return tuple((name, varied.of) for name, varied in PRIOR_TARGETS.items() if getattr(self, name) is not None)
+        return tuple((name, varied.of) for name, varied in PROCESSES.items() if getattr(self, name) is not None)
 
     def factors(self, conditions: Conditions) -> Factors:
         """Compute the quantile tables of the priors' factors on light, dark or sky.
@@ -156,7 +156,7 @@ class Processes:
         ends = {"light": (1.0, 1.0), "dark": (1.0, 1.0), "sky": (1.0, 1.0)}
         centre = dict.fromkeys(ends, 1.0)
         for row, (name, factor) in enumerate(self.modulations):
-            prior, varied = getattr(self, name), PRIOR_TARGETS[name]
+            prior, varied = getattr(self, name), PROCESSES[name]
             change = partial(varied.change, conditions)
             first, last = prior.quantile(np.array([0.0, 1.0]))
             if not (varied.low <= first and last <= varied.high):

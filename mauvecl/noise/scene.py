@@ -15,8 +15,8 @@ from mauvecl.noise.cumulants import polynomial
 from mauvecl.noise.draw_method import DrawMethod, check_reach, choose_method
 from mauvecl.noise.drawing import Drawing, DrawingOptions
 from mauvecl.noise.poisson import AliasTable, table_of
-from mauvecl.noise.prior_targets import SignalPart
 from mauvecl.noise.processes import Factors
+from mauvecl.noise.unknowns import SignalPart
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation

@@ -14,17 +14,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.content import ContentEquality
+from mauvecl.noise.unknowns import NUISANCES
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.statistics.names import NUISANCES
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
 
 Float = NDArray[np.float64]
-
-#: Half-width and middle of the output range, nm, which normalise the spectrum of `tilt`.
-TILT_NM, MIDDLE_NM = 250.0, 450.0
 
 
 @public
@@ -150,15 +147,9 @@ class Nuisances(ContentEquality):
 
 def spectrum_of(name: str, quiet: Expectation) -> Float:
     """Return the spectrum of one of `NUISANCES`, DN of the exposure for unit amplitude, shape (n_pixel,)."""
-    if name == "dark":
-        return np.asarray(quiet.n_frames * quiet.dark_dn * quiet.conditions["dark_slope_per_c"])
-    if name == "light":
-        return np.asarray(quiet.recorded_light_dn)
-    if name == "sky":
-        return np.asarray(quiet.sky_dn)
-    if name == "tilt":
-        return np.asarray(quiet.recorded_light_dn * (quiet.wavelength_nm - MIDDLE_NM) / TILT_NM)
-    raise InputError(f"the unknown {name!r} has no spectrum, expected one of {', '.join(NUISANCES)} or a file")
+    if name not in NUISANCES:
+        raise InputError(f"the unknown {name!r} has no spectrum, expected one of {', '.join(NUISANCES)} or a file")
+    return np.asarray(NUISANCES[name].spectrum(quiet))
 
 
 def as_nuisances(given: Nuisances | Mapping[str, float] | None, quiet: Expectation) -> Nuisances | None:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mauvecl.noise.cumulants import Cumulants, stack_is_exact
-from mauvecl.noise.prior_targets import PRIOR_TARGETS
+from mauvecl.noise.unknowns import PROCESSES
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -39,7 +39,7 @@ def off_centre(expectations: list[Expectation], processes: Processes) -> list[st
     sentences = []
     for name, _ in processes.modulations:
         first, last = getattr(processes, name).quantile(np.array([0.0, 1.0]))
-        values = {PRIOR_TARGETS[name].expected_in(x.conditions) for x in expectations}
+        values = {PROCESSES[name].expected_in(x.conditions) for x in expectations}
         outside = sorted(value for value in values if not first - TINY <= value <= last + TINY)
         if outside:
             sentences.append(

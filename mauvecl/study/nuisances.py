@@ -6,9 +6,9 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
-from pydantic import BeforeValidator, Field, model_validator
+from pydantic import BeforeValidator, Field, create_model, model_validator
 
-from mauvecl.noise.default_unknowns import DEFAULT_UNKNOWNS
+from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, Amplitude, default_processes
 from mauvecl.schema.text import shortened
 from mauvecl.study.sections import Section
 
@@ -63,48 +63,49 @@ class OwnNuisance(Section):
         return at_pixels(f"points of {shortened(name)}", "DN", np.array(self.points), wavelength_nm)
 
 
-class NuisanceChoice(Section):
+_keys: Any = (
+    {"usual": (bool, False)}
+    | dict.fromkeys(NUISANCES, (Spread | None, None))
+    | {"own": (dict[str, OwnNuisance], Field(default_factory=dict))}
+)
+
+
+class NuisanceChoice(create_model("_Amplitudes", __base__=Section, **_keys)):  # type: ignore[misc]
     """Prior standard deviations of the amplitudes that statistics are marginalised over, or "free" (projected out).
 
     With `usual` the documented set is drawn and marginalised over; values given here replace those of the set.
     """
 
-    usual: bool = False
-    dark: Spread | None = None
-    light: Spread | None = None
-    sky: Spread | None = None
-    tilt: Spread | None = None
-    own: dict[str, OwnNuisance] = Field(default_factory=dict)
-
     def marginalised(self, quiet: Expectation) -> Nuisances | None:
         """Return the nuisance parameters for the engine, or None if there are none."""
         from mauvecl.statistics.nuisances import Nuisances
 
-        sd: dict[str, float] = {}
-        if self.usual:
-            sd |= usual_spreads(quiet)
-        for name in ("dark", "light", "sky", "tilt"):
-            spread = getattr(self, name)
-            if spread is not None:
-                sd[name] = float("inf") if spread == "free" else spread
+        sd = usual_spreads(quiet) if self.usual else {}
+        sd |= {name: float("inf") if spread == "free" else spread for name, spread in self.spreads().items()}
         own: dict[str, NDArray[np.float64]] = {}
         for name, one in self.own.items():
             own[name] = one.spectrum(name, quiet.wavelength_nm)
             sd[name] = float("inf") if one.sd == "free" else float(one.sd)
         return Nuisances.of(quiet, sd, own) if sd else None
 
+    def spreads(self) -> dict[str, float | Literal["free"]]:
+        """Return the given standard deviations of amplitudes with built-in spectra."""
+        return {name: spread for name in NUISANCES if (spread := getattr(self, name)) is not None}
+
     def processes(self, named: Processes, temperature_c: float) -> Processes:
         """Return the processes to draw: those given and, with `usual`, those of the documented set."""
         if not self.usual:
             return named
-        added: dict[str, Any] = {
-            u.process: u.prior(temperature_c) for u in DEFAULT_UNKNOWNS if getattr(named, u.process) is None
-        }
-        return replace(named, **added)
+        added = default_processes(temperature_c)
+        return replace(named, **{name: prior for name, prior in added.items() if getattr(named, name) is None})  # type: ignore[arg-type]
 
 
 def usual_spreads(quiet: Expectation) -> dict[str, float]:
     """Return the standard deviations of the documented set, omitting parameters without effect, such as no sky."""
     from mauvecl.statistics.nuisances import spectrum_of
 
-    return {u.nuisance: u.sd for u in DEFAULT_UNKNOWNS if spectrum_of(u.nuisance, quiet).any()}
+    return {
+        row.name: row.prior.sd
+        for row in DOCUMENTED_NUISANCES
+        if isinstance(row.prior, Amplitude) and spectrum_of(row.name, quiet).any()
+    }

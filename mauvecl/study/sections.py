@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import Field, create_model, field_validator, model_validator
 
 from mauvecl.host.sky import DEFAULT_SKY
-from mauvecl.noise.prior_targets import PRIOR_TARGETS
+from mauvecl.noise.priors import Normal, Uniform
+from mauvecl.noise.unknowns import INSTRUMENT_VALUES, PROCESSES
 from mauvecl.schema.section import Section as Section
 from mauvecl.statistics.names import DEFAULT_STATISTICS, STATISTIC_NAMES
 from mauvecl.study.flare_light import FlareLight
@@ -174,10 +175,15 @@ class PriorText(Section):
         self.prior()
         return self
 
+    @classmethod
+    def of(cls, prior: Prior) -> Self:
+        """Return the text of a prior."""
+        if isinstance(prior, Uniform):
+            return cls(uniform=(prior.low, prior.high))
+        return cls(normal=(prior.mean, prior.sd), between=(prior.low, prior.high))
+
     def prior(self) -> Prior:
         """Return the prior for the engine."""
-        from mauvecl.noise.priors import Normal, Uniform
-
         if self.normal is not None and self.between is not None:
             return Normal(*self.normal, *self.between)
         return Uniform(*(self.uniform or (0.0, 0.0)))  # the validator ensures that one of them is given
@@ -204,18 +210,18 @@ class Rays(Section):
 
 
 #: Cosmic rays, and a prior for each quantity that may vary.
-_keys: Any = {"cosmic_rays": (Rays | None, None)} | dict.fromkeys(PRIOR_TARGETS, (PriorText | None, None))
+_keys: Any = {"cosmic_rays": (Rays | None, None)} | dict.fromkeys(PROCESSES, (PriorText | None, None))
 
 
 class NoiseProcesses(create_model("_Priors", __base__=Section, **_keys)):  # type: ignore[misc]
-    """Optional noise processes, disabled by default; see `prior_targets.PRIOR_TARGETS` and `processes.CosmicRays`."""
+    """Optional noise processes, disabled by default; see `unknowns.PROCESSES` and `processes.CosmicRays`."""
 
     def processes(self) -> Processes:
         """Return the processes for the engine."""
         from mauvecl.noise.processes import Processes
 
         rays = None if self.cosmic_rays is None else self.cosmic_rays.rays()
-        given = {name: getattr(self, name) for name in PRIOR_TARGETS}
+        given = {name: getattr(self, name) for name in PROCESSES}
         return Processes(rays, **{name: None if text is None else text.prior() for name, text in given.items()})
 
 
@@ -249,36 +255,35 @@ class Run(Section):
         return Comparison.of(self.reference, self.variances)
 
 
-class Unknowns(Section):
+#: Number of draws, priors by name, and names of known values.
+_unknown_keys: Any = (
+    {"draws": (Annotated[int, Field(ge=0, le=4096)], 0)}
+    | {
+        name: (PriorText | None, PriorText.of(row.prior))
+        for name, row in INSTRUMENT_VALUES.items()
+        if isinstance(row.prior, Uniform | Normal)
+    }
+    | {"known": (tuple[str, ...], ())}
+)
+
+
+class Unknowns(create_model("_InstrumentValues", __base__=Section, **_unknown_keys)):  # type: ignore[misc]
     """Priors of instrument values that are unknown but constant; ignored unless `draws` is positive.
 
     The documentation page on nominal values explains the default priors.
     """
 
-    draws: Annotated[int, Field(ge=0, le=4096)] = 0
-    temperature_c: PriorText | None = PriorText(uniform=(13.0, 21.0))
-    light_loss: PriorText | None = PriorText(normal=(0.34, 0.10), between=(0.04, 0.64))
-    pointing_loss: PriorText | None = PriorText(uniform=(0.0, 0.05))
-    qe_scale: PriorText | None = PriorText(normal=(1.0, 0.3), between=(0.3, 1.7))
-    conversion_uv_per_electron: PriorText | None = PriorText(uniform=(20.0, 25.0))
-    read_noise_dn: PriorText | None = PriorText(normal=(12.0, 1.0), between=(9.0, 15.0))
-    known: tuple[str, ...] = ()
-
     @model_validator(mode="after")
     def _possible(self) -> Self:
         if self.draws == 1:
             raise ValueError("unknowns.draws = 1, expected 0 or at least 2")
-        other = next((name for name in self.known if name not in self._names()), None)
+        other = next((name for name in self.known if name not in INSTRUMENT_VALUES), None)
         if other is not None:
-            raise ValueError(f"unknowns.known names {other!r}, expected some of {', '.join(self._names())}")
+            raise ValueError(f"unknowns.known names {other!r}, expected some of {', '.join(INSTRUMENT_VALUES)}")
         self.priors()
         return self
 
-    @classmethod
-    def _names(cls) -> list[str]:
-        return [name for name in cls.model_fields if name not in ("draws", "known")]
-
     def priors(self) -> dict[str, Prior]:
         """Return the priors of unknown values by the instrument's names, and of `qe_scale`."""
-        given = {name: getattr(self, name) for name in self._names() if name not in self.known}
+        given = {name: getattr(self, name) for name in INSTRUMENT_VALUES if name not in self.known}
         return {name: text.prior() for name, text in given.items() if text is not None}

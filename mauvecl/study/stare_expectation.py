@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mauvecl.host.stars.flare import check_scales
-from mauvecl.lightcurve.defaults import CHANGING, Changing
 from mauvecl.lightcurve.flares.energies import EnergyScale, Kind, amplitude_of, amplitude_of_peak
 from mauvecl.lightcurve.flares.events import Cooling, Event, check_seen, coefficients, temperatures_of
 from mauvecl.lightcurve.stares.observed import StareExpectation
 from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.noise.unknowns import CHANGING, COURSES, Changing, default_spreads
 from mauvecl.schema.errors import InputError
 from mauvecl.study.stare_section import EventText
 
@@ -27,16 +27,6 @@ if TYPE_CHECKING:
     from mauvecl.study.study import Study
 
 Float = NDArray[np.float64]
-
-#: Unknown changes of a stare under `nuisances.usual`, with the sources of `default_unknowns.DEFAULT_UNKNOWNS`: an
-#: orbital thermal cycle, pointing loss in each frame (uniform 0-5 %), the level of the sky, and slow variability of
-#: the star (assumed).
-USUAL_STARE: dict[str, dict[str, float]] = {
-    "jitters": {"light": 0.05 / 12**0.5},
-    "offsets": {"sky": 0.1},
-    "drifts": {"star": 0.01},
-    "cycles": {"temperature": 0.5},
-}
 
 
 def refuse_priors(study: Study) -> None:
@@ -57,12 +47,10 @@ def stare_of(study: Study) -> Stare:
     refuse_priors(study)
     q, instrument = study.stare, study.observation.load_instrument()
     spreads: dict[str, dict[Changing, float]] = {
-        how: {of: getattr(q, how)[of] for of in CHANGING if of in getattr(q, how)}
-        for how in ("jitters", "offsets", "drifts", "cycles")
+        how: {of: getattr(q, how)[of] for of in CHANGING if of in getattr(q, how)} for how in COURSES
     }
     if study.nuisances.usual:
-        for how, documented in USUAL_STARE.items():
-            spreads[how] = {**documented, **spreads[how]}  # type: ignore[dict-item]
+        spreads = {how: documented | spreads[how] for how, documented in default_spreads().items()}
 
     def curve(name: str) -> Curve | None:
         text: CurveText | None = getattr(q, name)

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from pydantic import Field, model_validator
 
 from mauvecl.lightcurve.defaults import ORBIT_S, check_shape
+from mauvecl.noise.unknowns import COURSES, Changing
 from mauvecl.schema.errors import InputError
 from mauvecl.study.sections import Section
 
@@ -53,7 +54,7 @@ class CurveText(Section):
         return Table(columns[:, 0], columns[:, 1])
 
 
-Spreads = dict[Literal["star", "light", "sky", "temperature"], Annotated[float, Field(gt=0)]]
+Spreads = dict[Changing, Annotated[float, Field(gt=0)]]
 
 
 class StareQuestion(Section):
@@ -94,7 +95,7 @@ class StareQuestion(Section):
     @property
     def has_unknowns(self) -> bool:
         """True if the stare has unknown changes."""
-        return bool(self.jitters or self.offsets or self.drifts or self.cycles)
+        return any(getattr(self, course) for course in COURSES)
 
     def all_gaps(self) -> list[tuple[float, float]]:
         """Return the given gaps and the gap at the end of every orbit."""
@@ -188,7 +189,7 @@ def drop_default_stare(data: dict[str, Any], study: Study) -> None:
     if study.stare == StareQuestion():
         del data["stare"]
     else:
-        for how in ("jitters", "offsets", "drifts", "cycles"):
+        for how in COURSES:
             if not data["stare"][how]:
                 del data["stare"][how]
     if not study.events:

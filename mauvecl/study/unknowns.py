@@ -11,12 +11,13 @@ import itertools
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
+from mauvecl.noise.unknowns import INSTRUMENT_VALUES
 from mauvecl.results.requests.fap import MIN_IN_TAIL
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.intervals import CONFIDENCE, Interval
@@ -55,15 +56,14 @@ def drawn(study: Study) -> DrawnStudies:
     sequence = qmc.LatinHypercube(len(priors), rng=np.random.default_rng(study.run.seed))
     even = sequence.random(asked.draws)
     values = np.column_stack([prior.quantile(even[:, k]) for k, prior in enumerate(priors.values())])
-    area = study.observation.load_instrument().collecting_area_cm2
+    nominal = study.observation.load_instrument()
     run = study.run.model_copy(update={"realisations": realisations_each(study)})
     certain = study.model_copy(update={"unknowns": type(asked)(), "run": run})
     studies = []
     for row in values:
-        changes = dict(zip(priors, (float(v) for v in row), strict=True))
-        if "qe_scale" in changes:
-            # The collecting area has the same effect.
-            changes["collecting_area_cm2"] = changes.pop("qe_scale") * area
+        changes: dict[str, Any] = {}
+        for name, value in zip(priors, row, strict=True):
+            changes |= INSTRUMENT_VALUES[name].changes(nominal, float(value))
         changed = certain.with_instrument(changes)
         try:
             changed.observation.load_instrument()
@@ -75,9 +75,9 @@ def drawn(study: Study) -> DrawnStudies:
 
 def realisations_each(study: Study) -> int:
     """Return the realisations per draw: an equal share, but enough to count the threshold of each draw."""
-    run = study.run
+    run, draws = study.run, int(study.unknowns.draws)
     fewest = int(np.ceil(MIN_IN_TAIL / run.fap)) if run.tails == "counted" else 1000
-    return max(run.realisations // study.unknowns.draws, fewest)
+    return max(run.realisations // draws, fewest)
 
 
 def average(intervals: Sequence[Interval]) -> Interval:

@@ -21,7 +21,7 @@ from mauvecl.answers.stares.stare import stare
 from mauvecl.cli.app import app
 from mauvecl.device.engine import Engine
 from mauvecl.device.stares import Stares
-from mauvecl.noise.prior_targets import PRIOR_TARGETS
+from mauvecl.noise.unknowns import PROCESSES
 from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
 
@@ -51,7 +51,7 @@ def said(verb: str, engine: Engine, **sections: Any) -> list[str]:
 
 
 def test_every_prior_is_looked_at() -> None:
-    assert PRIORS.keys() == PRIOR_TARGETS.keys()
+    assert PRIORS.keys() == PROCESSES.keys()
 
 
 # Far from the expectation no limit settles, which is refused: one prior near it.

@@ -23,8 +23,8 @@ from mauvecl.device.engine import Engine
 from mauvecl.host.expectation import expect
 from mauvecl.host.sky.zodiacal import Sky
 from mauvecl.host.stars.source import Source
-from mauvecl.noise.default_unknowns import DEFAULT_UNKNOWNS
 from mauvecl.noise.scene import prepare
+from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, PROCESSES
 from mauvecl.results.requests.requests import DetectRequest
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.nuisances import Nuisances
@@ -63,7 +63,7 @@ def test_the_cost_is_that_of_the_methods(
     assert f"{found.marginal:.3g} marginalised" in line
     # Where the study names none, the documented ones, and it says so.
     (line,) = cost_lines([unknown_cost("it", *asked.expectations(asked.star[0]), study())], study())
-    assert all(u.nuisance in line for u in DEFAULT_UNKNOWNS)
+    assert all(row.name in line for row in DOCUMENTED_NUISANCES)
     assert not marginal_lines(study())
 
 
@@ -185,8 +185,9 @@ def test_the_usual_unknowns_are_drawn_where_the_study_observes() -> None:
 
 def test_the_documentation_holds_the_usual_unknowns() -> None:
     page = re.sub(r"\s+", " ", (Path(__file__).parents[2] / "docs" / "unknowns.md").read_text(encoding="utf-8"))
-    for one in DEFAULT_UNKNOWNS:
-        for text in (one.drawn, one.marginalised, one.source):
+    for row in DOCUMENTED_NUISANCES:
+        process = PROCESSES[row.process]
+        for text in (process.drawn, row.marginalised, process.source):
             assert text in page
 
 

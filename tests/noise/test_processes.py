@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from dataclasses import replace
 
 import numpy as np
@@ -13,11 +12,9 @@ from scipy import stats
 from mauvecl.device.engine import Engine
 from mauvecl.noise import layout, reference
 from mauvecl.noise.components import components
-from mauvecl.noise.prior_targets import PRIOR_TARGETS
 from mauvecl.noise.processes import NONE, CosmicRays, Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare
 from mauvecl.schema.errors import InputError
-from mauvecl.study.sections import NoiseProcesses
 
 N = 20_000
 
@@ -279,9 +276,3 @@ def test_sky_follows_its_level(engine: Engine, level: Uniform) -> None:
         # A uniform value's variance scatters by less than a normal's; the noise's grows with the light at most.
         wanted = sd**2 + noise[1]
         assert abs(of_sky.var() / wanted - 1) < 5 * error + abs(mean - 1) * noise[1] / wanted
-
-
-def test_processes_and_study_have_keys_of_prior_targets() -> None:
-    """Compare the names and order of the processes' fields, the study's keys and the prior targets."""
-    fields = [field.name for field in dataclasses.fields(Processes)]
-    assert fields == ["cosmic_rays", *PRIOR_TARGETS] == list(NoiseProcesses.model_fields)

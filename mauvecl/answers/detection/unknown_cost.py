@@ -9,10 +9,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.noise.default_unknowns import DEFAULT_UNKNOWNS
+from mauvecl.noise.unknowns import DOCUMENTED_NUISANCES, NUISANCES, PROCESSES, Amplitude
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.linear import Matched
-from mauvecl.statistics.names import NUISANCES
 from mauvecl.statistics.nuisances import Nuisances, join_names
 from mauvecl.statistics.statistic import Setting
 from mauvecl.study.nuisances import NuisanceChoice
@@ -73,7 +72,7 @@ def unknown_cost(of: str, quiet: Expectation, flare: Expectation, study: Study) 
 
 def scatter(unknown: Nuisances, *, usual: bool) -> NDArray[np.float64]:
     """How far amplitudes scatter, shape (k,): as drawn where they are the documented ones, else their prior."""
-    drawn = {u.nuisance: u.scatter for u in DEFAULT_UNKNOWNS if usual}
+    drawn = {row.name: row.scatter for row in DOCUMENTED_NUISANCES if usual}
     return np.array(
         [drawn.get(name, sd) if np.isinf(sd) else sd for name, sd in zip(unknown.names, unknown.sd, strict=True)]
     )
@@ -99,19 +98,17 @@ def marginal_lines(study: Study) -> list[str]:
     """What the statistics of an answer are marginalised over, and what is drawn for it."""
     if study.nuisances == NuisanceChoice():
         return []
-    drawn = f"; drawn: {'; '.join(u.drawn for u in DEFAULT_UNKNOWNS)}" if study.nuisances.usual else ""
+    texts = [PROCESSES[row.process].drawn for row in DOCUMENTED_NUISANCES]
+    drawn = f"; drawn: {'; '.join(texts)}" if study.nuisances.usual else ""
     return [f"Statistics are marginalised over {spoken(study.nuisances)}{drawn}."]
-
-
-#: What they are called in a sentence.
-CALLED = {"dark": "the dark level", "light": "the light level", "sky": "the sky level", "tilt": "the response's colour"}
 
 
 def spoken(choice: NuisanceChoice) -> str:
     """Unknowns in a sentence: the dark level (+-0.5 deg C) and the light level (free)."""
-    sd: dict[str, float | str] = {u.nuisance: u.sd for u in DEFAULT_UNKNOWNS} if choice.usual else {}
-    sd |= {name: value for name in NUISANCES if (value := getattr(choice, name)) is not None}
-    sizes = [f"{CALLED[name]} ({_size(value, '%' if name != 'dark' else 'deg C')})" for name, value in sd.items()]
+    documented = DOCUMENTED_NUISANCES if choice.usual else ()
+    sd: dict[str, float | str] = {row.name: row.prior.sd for row in documented if isinstance(row.prior, Amplitude)}
+    sd |= choice.spreads()
+    sizes = [f"{NUISANCES[name].label} ({_size(value, NUISANCES[name].unit)})" for name, value in sd.items()]
     return join_names(sizes + [f"{name!r} ({_size(one.sd, '')})" for name, one in choice.own.items()])
 
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.limits.search import LimitSearch
 from mauvecl.host.tables import make_table
-from mauvecl.noise.processes import Uniform
+from mauvecl.noise.priors import Uniform
+from mauvecl.noise.unknowns import INSTRUMENT_VALUES
 from mauvecl.schema.calls import public
 from mauvecl.study.labels import describe_columns
 from mauvecl.study.sections import Star, Unknowns
@@ -30,26 +31,14 @@ class Assumption:
     changes: tuple[Mapping[str, Any], Mapping[str, Any]]
 
 
-#: What the uncertain values of the payload are called in tables.
-NAMES = {
-    "temperature_c": "detector temperature (C)",
-    "light_loss": "light loss",
-    "pointing_loss": "pointing loss",
-    "qe_scale": "quantum efficiency, scale",
-    "conversion_uv_per_electron": "charge conversion (uV per electron)",
-    "read_noise_dn": "read noise (DN)",
-}
-
-
 def assumptions(nominal: Instrument) -> tuple[Assumption, ...]:
-    """The uncertain values of the payload and their ranges, those of a study's `Unknowns` to one standard deviation."""
+    """Return the uncertain values of the payload and their ranges; normal priors extend to one standard deviation."""
     rows = []
     for name, prior in Unknowns().priors().items():
         ends = (prior.low, prior.high) if isinstance(prior, Uniform) else (prior.mean - prior.sd, prior.mean + prior.sd)
-        # The quantum efficiency scales all light alike, as the area does.
-        key, scale = ("collecting_area_cm2", nominal.collecting_area_cm2) if name == "qe_scale" else (name, 1.0)
-        low, high = ({key: scale * float(f"{end:.12g}")} for end in ends)
-        rows.append(Assumption(NAMES[name], (f"{ends[0]:g}", f"{ends[1]:g}"), (low, high)))
+        value = INSTRUMENT_VALUES[name]
+        low, high = (value.changes(nominal, float(f"{end:.12g}")) for end in ends)
+        rows.append(Assumption(value.label, (f"{ends[0]:g}", f"{ends[1]:g}"), (low, high)))
     dark = Assumption(
         "dark counts are Poisson in", ("DN", "electrons"), ({"dark_unit": "DN"}, {"dark_unit": "electrons"})
     )

@@ -18,11 +18,11 @@ from mauvecl.lightcurve.stares.requests import StaresRequest
 from mauvecl.lightcurve.stares.sums import method_for
 
 if TYPE_CHECKING:
-    from mauvecl.lightcurve.defaults import Changing
     from mauvecl.lightcurve.search.bank import Bank
     from mauvecl.lightcurve.stares.components import Components
     from mauvecl.lightcurve.stares.stare import Stare
     from mauvecl.noise.processes import CosmicRays
+    from mauvecl.noise.unknowns import Changing
 
 Float = NDArray[np.float64]
 

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from mauvecl.lightcurve.defaults import Changing
     from mauvecl.lightcurve.stares.stare import StareUnknown
+    from mauvecl.noise.unknowns import Changing
 
 Float = NDArray[np.float64]
 

@@ -259,7 +259,7 @@ class StareScene:
     @property
     def _spreads(self) -> dict[str, Float]:
         """Standard deviation of what is drawn of each frame, shape (n_frame,) each."""
-        variances = {of: np.full(self.stare.n_frames, self.stare.jitters.get(of, 0.0) ** 2) for of in layout.MOVED}  # type: ignore[call-overload]
+        variances = {of: np.full(self.stare.n_frames, self.stare.jitters.get(of, 0.0) ** 2) for of in layout.MOVED}
         for unknown in self.stare.unknowns:
             variances[unknown.of] += (unknown.sd * unknown.curve) ** 2
         return {of: np.sqrt(variance) for of, variance in variances.items()}

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 from numpy.typing import NDArray
 
-from mauvecl.lightcurve.defaults import CHANGING, ORBIT_S, Changing
+from mauvecl.lightcurve.defaults import ORBIT_S
 from mauvecl.lightcurve.stares.curves import Curve, Sinusoid
+from mauvecl.noise.unknowns import CHANGING, STARE_CHANGES, Changing
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
 
@@ -21,8 +22,6 @@ if TYPE_CHECKING:
     from mauvecl.host.orbit.targets import Target
 
 Float = NDArray[np.float64]
-#: Unit of each, for messages and tables.
-CHANGING_UNITS: dict[Changing, str] = {"star": "", "light": "", "sky": "", "temperature": "deg C"}
 #: Frames of a stare, at most: twenty years of 5 s, five bytes of a frame number.
 MOST_FRAMES = 2**27
 #: Relative changes are of a level that is there: a standard deviation beyond this would reach below zero.
@@ -199,9 +198,10 @@ class Stare:
             return np.zeros(start.size) if curve is None else curve.mean_over(start, float(frame_s))
 
         spread = dict(jitters or {})
-        other = next((name for name in spread if name not in ("light", "sky", "temperature")), None)
+        known = STARE_CHANGES["jitters"]
+        other = next((name for name in spread if name not in known), None)
         if other is not None:
-            raise InputError(f"a jitter of {other!r}, expected one of light, sky, temperature")
+            raise InputError(f"a jitter of {other!r}, expected one of {', '.join(known)}")
         return cls(
             start,
             float(frame_s),
@@ -320,6 +320,6 @@ def _check_of(name: str, of: str) -> None:
 def _check_spread(name: str, of: Changing, sd: float, least: float = 1e-300) -> None:
     most = 100.0 if of == "temperature" else LARGEST_SPREAD
     if not least <= sd <= most:
-        unit = CHANGING_UNITS[of]
+        unit = STARE_CHANGES["offsets"][of].unit
         above = "0" if least == 0 else "above 0"
         raise InputError(f"the {name} has the standard deviation {sd:g}, expected {above} to {most:g} {unit}".rstrip())

@@ -38,7 +38,7 @@ def strengths(scene: StareScene, numbers: Numbers, frame: int, seed: int) -> dic
     -------
     dict of str to ndarray of float32, shape (n_stare,)
     """
-    moved = {name: np.zeros(len(numbers), np.float32) for name in layout.MOVED}
+    moved = {str(name): np.zeros(len(numbers), np.float32) for name in layout.MOVED}
     if scene.staring["jittered"]:
         drawn = four_normals(reference.words_at(numbers, int(scene.numbers[frame]), "stare_frame", 0, seed))
         for name, z in zip(("light", "sky", "temperature"), drawn, strict=False):

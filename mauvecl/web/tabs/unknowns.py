@@ -9,7 +9,7 @@ import numpy as np
 from scipy import special
 
 from mauvecl.answers.detection.unknown_cost import spoken, unknown_cost
-from mauvecl.noise.default_unknowns import DEFAULT_UNKNOWNS
+from mauvecl.noise.unknowns import NUISANCES, Amplitude
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.web.closed_forms import percent
 from mauvecl.web.figures import Canvas
@@ -25,9 +25,8 @@ Row = tuple[str, float, float]
 @lru_cache(maxsize=4)
 def costs(closed: ClosedForms) -> tuple[float, list[Row]]:
     """Return the flare's matched S/N with everything known, and with unknowns alone and together."""
-    alone = [NuisanceChoice.model_validate({u.nuisance: _spread(u.sd)}) for u in DEFAULT_UNKNOWNS] + [
-        NuisanceChoice(tilt="free")
-    ]
+    # Those without a default prior are projected out.
+    alone = [NuisanceChoice.model_validate({name: _spread(row.prior)}) for name, row in NUISANCES.items()]
     chosen = {spoken(choice).removeprefix("the "): choice for choice in alone}
     chosen["all the usual together"] = NuisanceChoice(usual=True)
     if closed.study.nuisances.own:
@@ -41,8 +40,8 @@ def costs(closed: ClosedForms) -> tuple[float, list[Row]]:
     return known, rows
 
 
-def _spread(sd: float) -> float | str:
-    return "free" if np.isinf(sd) else sd
+def _spread(prior: object) -> float | str:
+    return prior.sd if isinstance(prior, Amplitude) and np.isfinite(prior.sd) else "free"
 
 
 def chance(snr: float, fap: float) -> float:

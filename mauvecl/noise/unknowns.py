@@ -1,0 +1,347 @@
+"""Registry of unknowns: values that an observer does not know, and how draws and statistics treat them.
+
+Study keys, random streams, kernel tables, nuisance spectra and the documented set that `--with-unknowns` selects follow
+from the rows of this module. It imports no large package, so that wrong keys are reported immediately.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
+
+from mauvecl.noise.priors import Normal, Prior, Uniform
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.instrument.instrument import Instrument
+
+    Float = NDArray[np.float64]
+
+Conditions = Mapping[str, float]
+SignalPart = Literal["light", "dark", "sky"]
+#: What an unknown is of: a part of the signal, the wavelength dependence of the response, or an instrument value.
+Of = Literal["star", "light", "sky", "dark", "response", "instrument"]
+#: How often an unknown takes another value.
+When = Literal["frame", "exposure", "stare", "campaign"]
+#: Whether realisations are drawn with other values, statistics are marginalised over them, or both.
+Treatment = Literal["drawn", "marginalised", "both"]
+#: Quantities of a stare that change: the quiescent level of the star; the throughput for the light of star, flare and
+#: sky; the brightness of the sky; the temperature of the detector.
+Changing = Literal["star", "light", "sky", "temperature"]
+CHANGING: tuple[Changing, ...] = get_args(Changing)
+#: Sections of a stare's unknowns: independent from frame to frame; constant; a change per hour; an orbital cycle.
+Course = Literal["jitters", "offsets", "drifts", "cycles"]
+COURSES: tuple[Course, ...] = get_args(Course)
+#: Half-width and middle of the output range, nm, which normalise the spectrum of `tilt`.
+TILT_NM, MIDDLE_NM = 250.0, 450.0
+
+
+@dataclass(frozen=True)
+class Amplitude:
+    """Normal prior of zero mean for the amplitude of a known change; flat if the standard deviation is infinite."""
+
+    sd: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Unknown:
+    """Value that an observer does not know.
+
+    Attributes
+    ----------
+    name : str
+        Its key in a section of studies.
+    of : str
+        Changed part of the signal, or "instrument".
+    when : {"frame", "exposure", "stare", "campaign"}
+        How often it takes another value.
+    prior : Uniform, Normal or Amplitude, optional
+        Default prior; None if it is known by default.
+    treatment : {"drawn", "marginalised", "both"}
+    label : str
+        Description in messages and tables.
+    source : str
+        Source of the default prior, or "assumption".
+    """
+
+    name: str
+    of: Of
+    when: When
+    prior: Prior | Amplitude | None = None
+    treatment: Treatment
+    label: str = ""
+    source: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Process(Unknown):
+    """Unknown factor on light, dark or sky, drawn per frame or exposure.
+
+    Attributes
+    ----------
+    stream : int
+        Its number in `layout.STREAMS`.
+    low, high : float
+        Range of allowed values.
+    change : callable
+        Function of an expectation's conditions and drawn values that returns the factor minus one.
+    expected : str or float
+        Value in the expectation, or its key in the expectation's conditions.
+    drawn : str
+        Description of the default prior for messages and documentation.
+    """
+
+    of: SignalPart = "light"
+    when: When = "exposure"
+    treatment: Treatment = "drawn"
+    stream: int
+    low: float
+    high: float
+    change: Callable[[Conditions, Float], Float]
+    expected: str | float = 1.0
+    drawn: str = ""
+
+    def expected_in(self, conditions: Conditions) -> float:
+        """Return the value in an expectation."""
+        return conditions[self.expected] if isinstance(self.expected, str) else self.expected
+
+
+@dataclass(frozen=True, kw_only=True)
+class Nuisance(Unknown):
+    """Unknown amplitude of a known spectrum, which statistics marginalise over.
+
+    Attributes
+    ----------
+    spectrum : callable
+        Function of a quiescent expectation that returns DN of the exposure for unit amplitude, shape (n_pixel,).
+    unit : str
+        Unit in messages; relative amplitudes are shown in per cent.
+    process : str
+        Process that draws it in the documented set.
+    scatter : float
+        Root mean square of the amplitude that this process draws.
+    marginalised : str
+        Description of the default prior for messages and documentation.
+    """
+
+    when: When = "exposure"
+    treatment: Treatment = "marginalised"
+    spectrum: Callable[[Expectation], Float]
+    unit: str = "%"
+    process: str = ""
+    scatter: float = math.nan
+    marginalised: str = ""
+
+
+@dataclass(frozen=True, kw_only=True)
+class StareChange(Unknown):
+    """Unknown change during a stare, drawn for each stare or frame; its prior is a normal amplitude.
+
+    `unit` is that of the amplitude, empty if it is relative; `name` is the changed quantity.
+    """
+
+    name: Changing
+    treatment: Treatment = "drawn"
+    unit: str = ""
+    course: Course
+
+
+@dataclass(frozen=True, kw_only=True)
+class InstrumentValue(Unknown):
+    """Unknown but constant value of the instrument, over which answers are averaged.
+
+    Attributes
+    ----------
+    scales : str, optional
+        Value of the instrument that the unknown multiplies; by default it replaces the value of its own name.
+    """
+
+    of: Of = "instrument"
+    when: When = "campaign"
+    treatment: Treatment = "drawn"
+    scales: str | None = None
+
+    def changes(self, nominal: Instrument, value: float) -> dict[str, Any]:
+        """Return the changes of an instrument that set a value."""
+        return {self.name: value} if self.scales is None else {self.scales: value * getattr(nominal, self.scales)}
+
+
+Row = TypeVar("Row", bound=Unknown)
+
+
+def _dark_follows(at: Conditions, temperature_c: Float) -> Float:
+    import numpy as np
+
+    return np.asarray(np.expm1(at["dark_slope_per_c"] * (temperature_c - at["temperature_c"])))
+
+
+def _lost(key: str) -> Callable[[Conditions, Float], Float]:
+    """Return the change of light by a loss that replaces the expectation's."""
+    return lambda at, lost: (at[key] - lost) / (1.0 - at[key])
+
+
+def _by_name(*rows: Row) -> dict[str, Row]:
+    return {row.name: row for row in rows}
+
+
+#: Processes in the order of their tables in kernels: fields of `processes.Processes`, keys of studies' ``processes``.
+PROCESSES = _by_name(
+    Process(
+        name="jitter",
+        when="frame",
+        stream=4,
+        low=0.0,
+        high=0.5,
+        change=lambda _, lost: -lost,
+        expected=0.0,
+        prior=Uniform(0.0, 0.05),
+        drawn="share of the light lost in each frame, uniform, 0-5 %",
+        source="the paper: light lost by pointing errors stays below 5 %; uniform and anew in each frame: assumption",
+    ),
+    Process(
+        name="detector_temperature",
+        of="dark",
+        stream=5,
+        low=-100.0,
+        high=100.0,
+        change=_dark_follows,
+        expected="temperature_c",
+        # Relative to the nominal temperature; see `default_processes`.
+        prior=Normal(0.0, 0.5, -2.5, 2.5),
+        drawn="detector temperature, normal, +-0.5 deg C around the nominal one, cut at 2.5 deg C",
+        source="assumption: the thermal cycle of one orbit",
+    ),
+    Process(name="light_loss", stream=6, low=0.0, high=0.99, change=_lost("light_loss"), expected="light_loss"),
+    Process(
+        name="pointing_loss", stream=7, low=0.0, high=0.99, change=_lost("pointing_loss"), expected="pointing_loss"
+    ),
+    Process(name="qe_scale", stream=8, low=0.01, high=100.0, change=lambda _, scale: scale - 1.0),
+    Process(
+        name="sky_level",
+        of="sky",
+        stream=11,
+        low=0.01,
+        high=100.0,
+        change=lambda _, level: level - 1.0,
+        prior=Normal(1.0, 0.1, 0.5, 1.5),
+        drawn="factor on the sky's light, normal, 1 +- 0.1, cut at 0.5 and 1.5",
+        source="assumption: the scatter of the zodiacal light about its model",
+    ),
+)
+
+#: Nuisance parameters with built-in spectra; keys of studies' ``nuisances``.
+NUISANCES = _by_name(
+    Nuisance(
+        name="dark",
+        of="dark",
+        label="the dark level",
+        unit="deg C",
+        spectrum=lambda quiet: quiet.n_frames * quiet.dark_dn * quiet.conditions["dark_slope_per_c"],
+        process="detector_temperature",
+        scatter=0.5,
+        prior=Amplitude(math.inf),
+        marginalised="free: the dark current follows the temperature by an exponential, which is no normal amplitude",
+    ),
+    Nuisance(
+        name="light",
+        of="light",
+        label="the light level",
+        spectrum=lambda quiet: quiet.recorded_light_dn,
+        process="jitter",
+        scatter=0.05 / 3**0.5,
+        prior=Amplitude(math.inf),
+        marginalised="free: the mean loss is unknown too, and so is the star's own level",
+    ),
+    Nuisance(
+        name="sky",
+        of="sky",
+        label="the sky level",
+        spectrum=lambda quiet: quiet.sky_dn,
+        process="sky_level",
+        scatter=0.1,
+        prior=Amplitude(0.1),
+        marginalised="10 %",
+    ),
+    Nuisance(
+        name="tilt",
+        of="response",
+        label="the response's colour",
+        spectrum=lambda quiet: quiet.recorded_light_dn * (quiet.wavelength_nm - MIDDLE_NM) / TILT_NM,
+    ),
+)
+#: Nuisance parameters of the documented set.
+DOCUMENTED_NUISANCES = tuple(row for row in NUISANCES.values() if row.prior is not None)
+
+
+#: Default amplitudes of a stare's unknowns and their sources.
+_STARE_DEFAULTS: dict[tuple[Course, Changing], tuple[float, str]] = {
+    ("jitters", "light"): (0.05 / 12**0.5, "standard deviation of the losses of the process jitter"),
+    ("offsets", "sky"): (0.1, "assumption: the scatter of the zodiacal light about its model"),
+    ("drifts", "star"): (0.01, "assumption: slow variability of the star"),
+    ("cycles", "temperature"): (0.5, "assumption: the thermal cycle of one orbit"),
+}
+
+
+def _stare_change(course: Course, name: Changing) -> StareChange:
+    sd, source = _STARE_DEFAULTS.get((course, name), (None, ""))
+    return StareChange(
+        name=name,
+        of="dark" if name == "temperature" else name,
+        when="frame" if course == "jitters" else "stare",
+        prior=None if sd is None else Amplitude(sd),
+        unit="deg C" if name == "temperature" else "",
+        source=source,
+        course=course,
+    )
+
+
+#: Unknown changes of a stare by course and quantity; keys of studies' ``stare``. No jitter of the star alone is drawn.
+STARE_CHANGES: dict[Course, dict[Changing, StareChange]] = {
+    course: {name: _stare_change(course, name) for name in CHANGING if (course, name) != ("jitters", "star")}
+    for course in COURSES
+}
+
+#: Constant instrument values of which a campaign knows only priors; keys of studies' ``unknowns``. The documentation
+#: page on nominal values explains the default priors.
+INSTRUMENT_VALUES = _by_name(
+    InstrumentValue(name="temperature_c", label="detector temperature (C)", prior=Uniform(13.0, 21.0)),
+    InstrumentValue(name="light_loss", label="light loss", prior=Normal(0.34, 0.10, 0.04, 0.64)),
+    InstrumentValue(name="pointing_loss", label="pointing loss", prior=Uniform(0.0, 0.05)),
+    InstrumentValue(
+        name="qe_scale",
+        label="quantum efficiency, scale",
+        prior=Normal(1.0, 0.3, 0.3, 1.7),
+        # The collecting area has the same effect.
+        scales="collecting_area_cm2",
+    ),
+    InstrumentValue(
+        name="conversion_uv_per_electron", label="charge conversion (uV per electron)", prior=Uniform(20.0, 25.0)
+    ),
+    InstrumentValue(name="read_noise_dn", label="read noise (DN)", prior=Normal(12.0, 1.0, 9.0, 15.0)),
+)
+
+
+def default_processes(temperature_c: float) -> dict[str, Prior]:
+    """Return the documented priors of the processes, for the detector's nominal temperature."""
+    priors: dict[str, Prior] = {}
+    for row in PROCESSES.values():
+        prior = row.prior
+        if row.expected == "temperature_c" and isinstance(prior, Normal):
+            t = temperature_c
+            prior = Normal(t + prior.mean, prior.sd, t + prior.low, t + prior.high)
+        if isinstance(prior, Uniform | Normal):
+            priors[row.name] = prior
+    return priors
+
+
+def default_spreads() -> dict[Course, dict[Changing, float]]:
+    """Return the documented standard deviations of a stare's unknowns."""
+    return {
+        course: {name: row.prior.sd for name, row in rows.items() if isinstance(row.prior, Amplitude)}
+        for course, rows in STARE_CHANGES.items()
+    }

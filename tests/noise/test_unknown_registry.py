@@ -1,0 +1,91 @@
+"""Registry of unknowns: study keys, streams and defaults are views of its rows."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from mauvecl.lightcurve.stares.stare import Stare
+from mauvecl.noise import layout
+from mauvecl.noise.processes import Processes
+from mauvecl.noise.unknowns import (
+    COURSES,
+    DOCUMENTED_NUISANCES,
+    INSTRUMENT_VALUES,
+    NUISANCES,
+    PROCESSES,
+    STARE_CHANGES,
+    default_processes,
+    default_spreads,
+)
+from mauvecl.schema.errors import InputError
+from mauvecl.study.nuisances import NuisanceChoice
+from mauvecl.study.sections import NoiseProcesses, Unknowns
+from mauvecl.study.stare_section import StareQuestion
+
+ROWS = [
+    *PROCESSES.values(),
+    *NUISANCES.values(),
+    *INSTRUMENT_VALUES.values(),
+    *(row for rows in STARE_CHANGES.values() for row in rows.values()),
+]
+
+
+def test_keys_of_studies_are_the_registry() -> None:
+    """Compare names and order of the processes' fields and of the keys of each section with the registry."""
+    fields = [field.name for field in dataclasses.fields(Processes)]
+    assert fields == ["cosmic_rays", *PROCESSES] == list(NoiseProcesses.model_fields)
+    assert list(NuisanceChoice.model_fields) == ["usual", *NUISANCES, "own"]
+    assert list(Unknowns.model_fields) == ["draws", *INSTRUMENT_VALUES, "known"]
+    assert set(COURSES) <= StareQuestion.model_fields.keys()
+
+
+def test_every_default_prior_has_a_source_or_documentation() -> None:
+    for row in ROWS:
+        if row.prior is not None and row.name not in INSTRUMENT_VALUES and row.treatment == "drawn":
+            assert row.source, row.name
+    for row in DOCUMENTED_NUISANCES:
+        assert row.marginalised
+        assert row.scatter > 0
+        assert PROCESSES[row.process].of == row.of
+
+
+def test_streams_of_processes_are_those_of_the_rows() -> None:
+    assert all(layout.STREAMS[name] == row.stream for name, row in PROCESSES.items())
+
+
+def test_default_values_of_documented_set() -> None:
+    """The documented values, written out: the views must not change them."""
+    priors = {name: vars(prior) for name, prior in default_processes(21.0).items()}
+    assert priors == {
+        "jitter": {"low": 0.0, "high": 0.05},
+        "detector_temperature": {"mean": 21.0, "sd": 0.5, "low": 18.5, "high": 23.5},
+        "sky_level": {"mean": 1.0, "sd": 0.1, "low": 0.5, "high": 1.5},
+    }
+    assert default_spreads() == {
+        "jitters": {"light": 0.05 / 12**0.5},
+        "offsets": {"sky": 0.1},
+        "drifts": {"star": 0.01},
+        "cycles": {"temperature": 0.5},
+    }
+    assert {name: text.model_dump(exclude_none=True) for name, text in Unknowns() if name in INSTRUMENT_VALUES} == {
+        "temperature_c": {"uniform": (13.0, 21.0)},
+        "light_loss": {"normal": (0.34, 0.10), "between": (0.04, 0.64)},
+        "pointing_loss": {"uniform": (0.0, 0.05)},
+        "qe_scale": {"normal": (1.0, 0.3), "between": (0.3, 1.7)},
+        "conversion_uv_per_electron": {"uniform": (20.0, 25.0)},
+        "read_noise_dn": {"normal": (12.0, 1.0), "between": (9.0, 15.0)},
+    }
+
+
+@pytest.mark.parametrize("row", [row for rows in STARE_CHANGES.values() for row in rows.values()], ids=str)
+def test_stares_take_every_change_of_the_registry(row: object) -> None:
+    stare = Stare.of(6000.0, **{row.course: {row.name: 0.01}})  # type: ignore[attr-defined]
+    assert any(stare.jitters.values()) or stare.unknowns
+
+
+def test_jitter_outside_the_registry_is_refused() -> None:
+    with pytest.raises(InputError) as error:
+        Stare.of(6000.0, jitters={"star": 0.01})
+    assert error.value.expected == "one of light, sky, temperature"
