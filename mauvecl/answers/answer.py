@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 from mauvecl.drawable import Drawable, documents_of
 from mauvecl.host.content import ContentEquality
+from mauvecl.schema.tables import View, records
 from mauvecl.study.labels import full_label
 
 if TYPE_CHECKING:
@@ -43,6 +44,9 @@ class Answer(Drawable, ContentEquality, ABC):
     #: Parts of the study that the answer uses.
     USES: ClassVar[tuple[Use, ...]]
 
+    #: Properties with the tables that JSON holds, by key; "rows" is the first table by default.
+    JSON: ClassVar[Mapping[str, str]] = {}
+
     if TYPE_CHECKING:
 
         @property
@@ -71,6 +75,11 @@ class Answer(Drawable, ContentEquality, ABC):
         return assumption_line(self.study, self.USES)
 
     @property
+    def views(self) -> list[View]:
+        """Tables as people read them, in the terminal and on the page."""
+        return []
+
+    @property
     def remarks(self) -> list[str]:
         """What is said below the tables."""
         return []
@@ -82,10 +91,10 @@ class Answer(Drawable, ContentEquality, ABC):
         return str(next(iter(self.tables.values()))._repr_html_())
 
     def as_json(self) -> dict[str, Any]:
-        """What `--json` prints."""
-        from mauvecl.answers.report import rows
-
-        return {"messages": list(self.messages), "rows": rows(next(iter(self.tables.values())))}
+        """Return what `--json` prints."""
+        tables = {key: getattr(self, name) for key, name in self.JSON.items()}
+        found = tables or {"rows": next(iter(self.tables.values()))}
+        return {"messages": list(self.messages)} | {key: records(table) for key, table in found.items()}
 
     def write(self, folder: str | Path) -> list[Path]:
         """Every table, and the study that gives them again.

@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Self
 
+from mauvecl.schema.tables import INTERVAL, View
+
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
     from rich.table import Table
@@ -15,8 +17,6 @@ if TYPE_CHECKING:
 
 #: Work shorter than this shows no progress.
 PATIENCE_S = 2.0
-#: Heading of an interval, which stays next to the column before it.
-INTERVAL = "95 % interval"
 #: Columns of a table that goes into a pipe or a file, at most.
 WIDEST = 100_000
 #: Share of the work from which the time left is told: the first tile's rate says little.
@@ -131,6 +131,14 @@ def show(lines: Sequence[str]) -> None:
     console = Console(highlight=False, soft_wrap=True, markup=False, emoji=False)
     for line in lines:
         console.print(line)
+
+
+def show_view(view: View) -> None:
+    """Print a table of an answer, or the sentence in its place."""
+    if view.table is None:
+        show([view.title])
+    else:
+        show_table(view.title, *view.texts())
 
 
 def show_table(title: str, columns: Sequence[str], cells: Sequence[Sequence[Any]]) -> None:

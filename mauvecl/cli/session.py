@@ -235,15 +235,8 @@ class Session:
         with self.pool(unit=verb.counts) as engine:
             return verb.ask(study, engine, None if verb.counts == "realisations" else self.meter)
 
-    def answer(self, answer: Answer, show: Callable[[], None]) -> None:
-        """Tell an answer and leave its files.
-
-        Parameters
-        ----------
-        answer : Answer
-        show : callable
-            Prints its tables.
-        """
+    def answer(self, answer: Answer, show: Callable[[], None] | None = None) -> None:
+        """Print an answer and write its files."""
         self.say([*answer.messages, answer.assumed])
         with told_of_interrupts(self._written):
             self._leave_all(answer)
@@ -254,7 +247,13 @@ class Session:
             told = {"assumed": answer.assumed, "messages": [with_flags(line) for line in content["messages"]]}
             self.print_json(told | {key: value for key, value in content.items() if key != "messages"})
             return
-        show()
+        from mauvecl.cli.console import show_view
+
+        if show is not None:
+            show()
+        else:
+            for view in answer.views:
+                show_view(view)
         self.say(answer.remarks)
         self.finish()
 

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from mauvecl.drawable import Drawable
 from mauvecl.host.content import ContentEquality
-from mauvecl.host.tables import make_table, set_descriptions
 from mauvecl.noise import layout
 from mauvecl.noise.reference import Floats, fma
 from mauvecl.noise.scene import Scene
 from mauvecl.results.counts.far import SparseCounts
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.tables import make_table, set_descriptions
 
 if TYPE_CHECKING:
     from astropy.table import QTable

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from mauvecl.schema.tables import Column, percent, short
 from mauvecl.study.quantities import QUANTITIES, UNITS
 from mauvecl.study.sections import Star
 
@@ -14,6 +16,7 @@ if TYPE_CHECKING:
     from astropy.table import QTable
 
     from mauvecl.host.expectation import Expectation
+    from mauvecl.study.study import Study
 
 
 def label(star: Star, x: Expectation) -> str:
@@ -46,6 +49,30 @@ def stack_tables(parts: Iterable[tuple[Mapping[str, float | str], QTable]], **me
     whole = vstack(tables)
     whole.meta |= shared | meta
     return describe_columns(whole)
+
+
+def place_columns(study: Study, *own: str) -> tuple[Column, ...]:
+    """Return the columns of the star and of what a study sweeps, for rows with a `label` and the values `at` a cell.
+
+    `own` names quantities for which a table has columns of its own.
+    """
+    return (
+        Column("star", "label", description=QUANTITIES["star"].description, heading="star"),
+        *(quantity_column(axis.quantity) for axis in study.sweep.axes if axis.quantity not in own),
+    )
+
+
+def quantity_column(name: str, get: str | Callable[[Any], Any] = "", description: str = "") -> Column:
+    """Return the column of a quantity, by default of its value `at` a cell of the sweep."""
+    quantity = QUANTITIES[name]
+    return Column(
+        name, get or (lambda row: row.at[name]), quantity.unit, description or quantity.description, name, short
+    )
+
+
+def amplitude_column(get: str | Callable[[Any], Any] = "amplitude", description: str = "") -> Column:
+    """Return the column of a flare's amplitude, which people read in per cent."""
+    return replace(quantity_column("amplitude", get, description), heading="flare", format=percent("g"))
 
 
 def full_label(name: str, at: Mapping[str, float | str]) -> str:

@@ -9,10 +9,10 @@ import pytest
 
 from mauvecl.answers.signal import exposures
 from mauvecl.answers.signal.exposures import exposure_for, snr_at
-from mauvecl.cli.verbs.observe import show_exposures
+from mauvecl.cli.console import show_view
 from mauvecl.device.engine import Engine
-from mauvecl.host.tables import Column
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.tables import Column
 from mauvecl.study.study import Study
 
 
@@ -105,7 +105,8 @@ def test_a_column_is_defined_once(monkeypatch: pytest.MonkeyPatch, capsys: pytes
     assert answer.table["frame_less"].info.description == "for this test"
     assert answer.table["frame_less"].value[0] == row.snr_one_frame_less
     assert answer.as_json()["rows"][0]["frame_less"] == row.snr_one_frame_less
-    show_exposures(answer)
+    (view,) = answer.views
+    show_view(view)
     shown = capsys.readouterr().out
     assert "one less" in shown
     assert f"<{row.snr_one_frame_less:.1f}>" in shown

@@ -7,7 +7,8 @@ import re
 import pytest
 
 from mauvecl.cli import console
-from mauvecl.cli.console import INTERVAL, Meter, show_table
+from mauvecl.cli.console import Meter, show_table
+from mauvecl.schema.tables import INTERVAL
 
 
 class Clock:

@@ -23,12 +23,12 @@ from mauvecl.answers.campaigns.planned import (
 )
 from mauvecl.answers.campaigns.visible import VisibleAnswer, visible
 from mauvecl.host.orbit.conditions import PARTICLES_SOURCE, THERMAL_SOURCE
-from mauvecl.host.tables import make_table
 from mauvecl.lightcurve.search.counted_rate import DAY_S
 from mauvecl.lightcurve.search.yields import Yield, recovered_per_day
 from mauvecl.runs.pool import map_in_order
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.tables import make_table
 from mauvecl.study.labels import describe_columns, stack_tables
 from mauvecl.study.messages import SATURATED, collect_messages
 from mauvecl.study.sections import Rays

@@ -17,8 +17,8 @@ from mauvecl.host.orbit.season import elongation_deg, zodiacal_light
 from mauvecl.host.orbit.targets import Target
 from mauvecl.host.orbit.time_grid import DAY_S, TimeGrid
 from mauvecl.host.orbit.visibility import Visibility, Windows
-from mauvecl.host.tables import make_table
 from mauvecl.schema.calls import public
+from mauvecl.schema.tables import make_table
 from mauvecl.study.labels import describe_columns, stack_tables
 from mauvecl.study.orbits import targets_of
 from mauvecl.study.study import Study

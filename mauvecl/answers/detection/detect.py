@@ -3,27 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property, partial
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from operator import itemgetter
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from mauvecl.answers.answer import Answer, InCell
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
+from mauvecl.results.detection import departures
 from mauvecl.results.detection.campaign import campaign, per_test
 from mauvecl.results.detection.departures import departure_table
-from mauvecl.results.detection.detection import Detection
+from mauvecl.results.detection.detection import COLUMNS, Detection
 from mauvecl.results.detection.paper import PAPER_G2V, WHY, reconstruct
-from mauvecl.results.detection.roc import ROC_ROWS
+from mauvecl.results.detection.roc import AREA_COLUMNS, ROC_ROWS
+from mauvecl.results.detection.roc import COLUMNS as ROC_COLUMNS
 from mauvecl.results.requests.fap import check_fap, countable
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.tables import Column, View, stacked, table_of
 from mauvecl.statistics.distributions import QuadraticForm
 from mauvecl.statistics.linear import Linear, Matched
 from mauvecl.statistics.statistic import Setting
-from mauvecl.study.labels import label, prepend_columns, stack_tables
+from mauvecl.study.labels import amplitude_column, label, place_columns
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.sections import Star
 from mauvecl.study.study import PAPER_STARS, Study
@@ -38,6 +43,8 @@ if TYPE_CHECKING:
     from mauvecl.study.questions import CampaignQuestion
 
 
+#: Columns of what is found of one flare by one statistic.
+FOUND = COLUMNS[1:]
 #: Rows of the tables of ROC and of extremes, which many flares share.
 MOST_ROWS = 100_000
 
@@ -71,16 +78,28 @@ class DetectAnswer(Answer):
     """
 
     USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "unknowns", "seed")
+    JSON = MappingProxyType({"rows": "table", "departures": "departures"})
 
     study: Study
     stars: list[StarDetection]
     messages: list[str] = field(default_factory=list)
     paper: list[str] = field(default_factory=list)
 
+    @property
+    def columns(self) -> tuple[Column, ...]:
+        """Columns of the table of detections."""
+        amplitude = amplitude_column(
+            lambda star: np.repeat(star.amplitudes, len(star.detection.statistics)),
+            f"relative rise of the photons in the band {self.study.flare.band}",
+        )
+        return (*place_columns(self.study, "amplitude"), amplitude, *FOUND)
+
     @cached_property
     def table(self) -> QTable:
         """One row per star, cell, flare and statistic."""
-        return self._together(self._detections)
+        fap, names = self.study.run.fap, [column.name for column in FOUND]
+        parts = [(star, star.detection.table(fap)[names]) for star in self.stars]
+        return stacked(self.columns[: -len(FOUND)], parts, study=self.study.text())
 
     @cached_property
     def departures(self) -> QTable:
@@ -88,7 +107,34 @@ class DetectAnswer(Answer):
 
         Empty where thresholds are not counted.
         """
-        return self._together(self._departures)
+        fap = self.study.run.fap
+        parts = [(star, departure_table(star.detection, star.amplitudes, fap)) for star in self.stars]
+        return stacked(place_columns(self.study, "amplitude"), parts, study=self.study.text())
+
+    @property
+    def views(self) -> list[View]:
+        run, quiet = self.study.run, [star.detection.quiet for star in self.stars]
+        exposures = " and ".join(dict.fromkeys(f"{x.exposure_s:g} s ({x.n_frames} frames)" for x in quiet))
+        found = View(
+            f"Detection at a false-alarm probability of {run.fap:g} per test, {exposures}, {run.realisations:,} "
+            "realisations",
+            self.columns,
+            self.table,
+        )
+        if not len(self.departures):
+            return [found]
+        differing = self.departures[self.departures["differs"]]
+        if not len(differing):
+            line = (
+                f"At the thresholds for Gaussian noise the simulated false-alarm probability is {run.fap:g} within 4 "
+                "standard errors, for every statistic."
+            )
+            return [found, View(line)]
+        title = (
+            "Where the simulation differs from the closed form: false-alarm probability at the threshold that should "
+            f"give {run.fap:g}"
+        )
+        return [found, View(title, (*place_columns(self.study, "amplitude"), *departures.COLUMNS), differing)]
 
     @property
     def roc(self) -> QTable:
@@ -96,7 +142,22 @@ class DetectAnswer(Answer):
 
         Many flares share `MOST_ROWS` rows, so that each curve has fewer than its 200.
         """
-        return self._together(partial(_rocs, share=self._share(1)))
+        rows = min(ROC_ROWS, self._share(1))
+
+        def curve(star: StarDetection, statistic: str, flare: int) -> QTable:
+            found = star.detection.roc(statistic, flare)
+            area = {column.name: column.value(found) for column in AREA_COLUMNS}
+            points = found.points(rows) | area
+            columns = (*ROC_COLUMNS, *(replace(column, get="") for column in AREA_COLUMNS))
+            return table_of(columns, [points], realisations=found.realisations)
+
+        parts = [
+            ({"star": star, "statistic": statistic, "amplitude": amplitude}, curve(star, statistic, flare))
+            for star in self.stars
+            for statistic in star.detection.statistics
+            for flare, amplitude in enumerate(star.amplitudes)
+        ]
+        return self._of_statistics(parts)
 
     @property
     def tails(self) -> QTable:
@@ -104,7 +165,24 @@ class DetectAnswer(Answer):
 
         Many flares share `MOST_ROWS` rows, so that each distribution has fewer than its 1000.
         """
-        return self._together(partial(_tails, share=self._share(2)))
+        rows, parts = self._share(2), []
+        for star in self.stars:
+            detection = star.detection
+            for statistic in detection.statistics:
+                for flare, amplitude in enumerate(star.amplitudes):
+                    kept = [(amplitude, detection.tail_samples(statistic, flare))]
+                    if detection.statistic(statistic).shaped or flare == 0:
+                        kept.append((0.0, detection.tail_samples(statistic, template=flare)))
+                    place = {"star": star, "statistic": statistic, "template": amplitude}
+                    parts += [(place | {"amplitude": value}, samples[:rows]) for value, samples in kept]
+        template = Column("template", description="amplitude of the flare that the statistic looks for")
+        return self._of_statistics(parts, template, seed=self.study.run.seed)
+
+    def _of_statistics(self, parts: list[tuple[dict[str, Any], QTable]], *more: Column, **meta: object) -> QTable:
+        """Stack tables of one star, statistic and amplitude each."""
+        place = [column.of(itemgetter("star")) for column in place_columns(self.study, "amplitude")]
+        statistic = Column("statistic", description="detection statistic")
+        return stacked((*place, statistic, amplitude_column(), *more), parts, **meta, study=self.study.text())
 
     def _share(self, each: int) -> int:
         """Return the rows of each curve or distribution, of which every flare and statistic has at most `each`."""
@@ -126,62 +204,7 @@ class DetectAnswer(Answer):
         return self.paper
 
     def as_json(self) -> dict[str, Any]:
-        from mauvecl.answers.report import rows
-
-        tables = {"rows": rows(self.table), "departures": rows(self.departures)}
-        return {"messages": self.messages, "paper": self.paper} | tables
-
-    def _detections(self, star: StarDetection) -> QTable:
-        table = star.detection.table(self.study.run.fap)
-        table.remove_column("name")
-        amplitudes = np.repeat(star.amplitudes, len(star.detection.statistics))
-        table.add_column(amplitudes, name="amplitude", index=0)
-        table["amplitude"].info.description = f"relative rise of the photons in the band {self.study.flare.band}"
-        return table
-
-    def _departures(self, star: StarDetection) -> QTable:
-        return departure_table(star.detection, star.amplitudes, self.study.run.fap)
-
-    def _together(self, table_of: Callable[[StarDetection], QTable]) -> QTable:
-        parts = []
-        for star in self.stars:
-            # A flare's amplitude has its own column.
-            swept = {name: value for name, value in star.at.items() if name != "amplitude"}
-            parts.append(({"star": star.label, **swept}, table_of(star)))
-        return stack_tables(parts, study=self.study.text())
-
-
-def _rocs(star: StarDetection, share: int) -> QTable:
-    from astropy.table import vstack
-
-    parts = []
-    for statistic in star.detection.statistics:
-        for flare, amplitude in enumerate(star.amplitudes):
-            curve = star.detection.roc(statistic, flare).table(min(ROC_ROWS, share))
-            for name in ("area", "area_low", "area_high"):
-                curve[name] = curve.meta.pop(name)
-            curve["area"].info.description = "under the curve; 95 % interval by DeLong's method"
-            prepend_columns(curve, {"statistic": statistic, "amplitude": amplitude})
-            parts.append(curve)
-    return vstack(parts)
-
-
-def _tails(star: StarDetection, share: int) -> QTable:
-    from astropy.table import vstack
-
-    parts = []
-    for statistic in star.detection.statistics:
-        for flare, amplitude in enumerate(star.amplitudes):
-            kept = [(amplitude, star.detection.tail_samples(statistic, flare))]
-            if star.detection.statistic(statistic).shaped or flare == 0:
-                kept.append((0.0, star.detection.tail_samples(statistic, template=flare)))
-            for name, every in kept:
-                table = every[:share]
-                prepend_columns(table, {"statistic": statistic, "amplitude": name, "template": amplitude})
-                parts.append(table)
-    samples = vstack(parts)
-    samples.meta["seed"] = star.detection.seed
-    return samples
+        return {"paper": self.paper} | super().as_json()
 
 
 @public

@@ -17,10 +17,10 @@ from scipy import special
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.detect import DetectAnswer, detect
 from mauvecl.answers.signal.snr import SnrAnswer, snr
-from mauvecl.host.tables import set_descriptions
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.results.snr import steps_of
 from mauvecl.schema.calls import public
+from mauvecl.schema.tables import set_descriptions
 from mauvecl.study.labels import describe_columns
 from mauvecl.study.quantities import UNITS
 from mauvecl.study.questions import Axis, Sweep

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
-from mauvecl.host.tables import make_table
 from mauvecl.results.requests.fap import check_fap
 from mauvecl.schema.calls import public
+from mauvecl.schema.tables import make_table
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import describe_columns, label
 from mauvecl.study.messages import SATURATED, collect_messages, worst_first

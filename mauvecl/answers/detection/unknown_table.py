@@ -12,7 +12,7 @@ from scipy import special
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import Cost, spoken, unknown_cost
-from mauvecl.host.tables import set_descriptions
+from mauvecl.schema.tables import set_descriptions
 from mauvecl.study.labels import describe_columns, label
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.nuisances import NuisanceChoice

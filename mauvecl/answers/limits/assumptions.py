@@ -6,10 +6,10 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from mauvecl.answers.limits.search import LimitSearch
-from mauvecl.host.tables import make_table
 from mauvecl.noise.priors import Uniform
 from mauvecl.noise.unknowns import INSTRUMENT_VALUES
 from mauvecl.schema.calls import public
+from mauvecl.schema.tables import make_table
 from mauvecl.study.labels import describe_columns
 from mauvecl.study.sections import Star, Unknowns
 from mauvecl.study.study import Study

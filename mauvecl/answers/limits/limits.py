@@ -12,10 +12,10 @@ import numpy as np
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import Cost, cost_lines, marginal_lines, unknown_cost
 from mauvecl.answers.limits.search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle
-from mauvecl.host.tables import make_table
 from mauvecl.results.requests.fap import check_fap
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.tables import make_table
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import describe_columns, label, stack_tables
 from mauvecl.study.messages import SATURATED, collect_messages, worst_first

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer, InCell
 from mauvecl.answers.measurements.truth import Truth
-from mauvecl.host.tables import make_table
 from mauvecl.results.measurements.fit import LEVELS, Forecast, Measurement, fit, forecast
 from mauvecl.results.measurements.model import FlareModel
 from mauvecl.results.measurements.reduction import Reduction, variance_of
@@ -21,6 +20,7 @@ from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.tables import make_table
 from mauvecl.statistics.intervals import clopper_pearson
 from mauvecl.study.labels import label, stack_tables
 from mauvecl.study.measurements import fitted_models

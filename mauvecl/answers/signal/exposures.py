@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, ClassVar, Literal
 import numpy as np
 
 from mauvecl.answers.answer import Answer
-from mauvecl.host.tables import Column, table_of
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.quantities import number
 from mauvecl.schema.ranges import DAY_S
+from mauvecl.schema.tables import Column, View, table_of
 from mauvecl.study.cases import Case, cases
-from mauvecl.study.labels import describe_columns
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.study import Study
@@ -54,19 +53,20 @@ def _floored(snr: float) -> str:
     return f"{math.floor(1000 * snr) / 1000:.3f}"
 
 
-#: The table of exposures.
+#: Columns of the table of exposures.
 COLUMNS = (
-    Column("star", heading="star"),
-    Column("wavelength", "wavelength_nm", "nm"),
-    Column("per"),
-    Column("wanted"),
+    Column("star", description=QUANTITIES["star"].description, heading="star"),
+    Column("wavelength", "wavelength_nm", "nm", "vacuum wavelength, the middle of the pixel or element"),
+    Column("per", description="pixel, or resolution element of 10.5 nm"),
+    Column("wanted", description="wanted S/N"),
     Column("exposure", "exposure_s", "s", "the fewest frames whose closed-form S/N reaches the wanted one",
            "exposure (s)", ".10g"),
-    Column("frames", heading="frames"),
-    Column("snr", heading="S/N", format=".3f"),
-    Column("snr_one_frame_less", heading="a frame less", format=_floored),
-    Column("saturated", "", "", "whether the pixel, or one of the element, saturates in a single frame", "saturation",
-           lambda saturated: "SATURATED" if saturated else ""),
+    Column("frames", description="frames of the exposure", heading="frames"),
+    Column("snr", description="closed-form S/N reached", heading="S/N", format=".3f"),
+    Column("snr_one_frame_less", description="closed-form S/N of one frame less", heading="a frame less",
+           format=_floored),
+    Column("saturated", description="whether the pixel, or one of the element, saturates in a single frame",
+           heading="saturation", format=lambda saturated: "SATURATED" if saturated else ""),
 )  # fmt: skip
 
 
@@ -93,12 +93,18 @@ class ExposureResult(Answer):
     @property
     def table(self) -> QTable:
         """One row per star."""
-        return describe_columns(table_of(COLUMNS, self.exposures, study=self.study.text()))
+        return table_of(COLUMNS, self.exposures, study=self.study.text())
 
     @property
     def tables(self) -> dict[str, Table]:
         """The one table."""
         return {"exposure": self.table}
+
+    @property
+    def views(self) -> list[View]:
+        wanted = self.study.signal
+        title = f"Exposure for an S/N of {wanted.snr:g} per {wanted.per} at {wanted.wavelength_nm:g} nm"
+        return [View(f"{title} (closed form, whole frames)", COLUMNS, self.table)]
 
     @property
     def inputs(self) -> list[Expectation]:

@@ -12,7 +12,6 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer, InCell
-from mauvecl.host.tables import make_table
 from mauvecl.lightcurve.search.counted_rate import DAY_S, CountedRate, consecutive_alarm_rate
 from mauvecl.lightcurve.search.fit_accuracy import FitAccuracy, Refit
 from mauvecl.lightcurve.search.injected_completeness import InjectedCompleteness
@@ -21,6 +20,7 @@ from mauvecl.lightcurve.stares.requests import Arrays
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.tables import make_table
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.labels import describe_columns, label, stack_tables
 from mauvecl.study.messages import collect_messages

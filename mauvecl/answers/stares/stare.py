@@ -11,7 +11,6 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from mauvecl.answers.answer import Answer, InCell
-from mauvecl.host.tables import make_table
 from mauvecl.lightcurve.flares.energies import Kind
 from mauvecl.lightcurve.flares.events import Event, coefficients, temperatures_of
 from mauvecl.lightcurve.search.alarms import Alarm, alarms
@@ -19,6 +18,7 @@ from mauvecl.lightcurve.stares.observed import Draw, Light, StareExpectation, se
 from mauvecl.runs.checkpoint import kept
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.tables import make_table
 from mauvecl.study.labels import describe_columns, label, stack_tables
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.stare_expectation import energy_of, expect_stare, orbit_lines, stare_of, threshold_line, unused_lines

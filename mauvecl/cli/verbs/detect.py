@@ -5,14 +5,11 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING
 
-from mauvecl.cli.console import INTERVAL, short
+from mauvecl.cli.console import short
 from mauvecl.cli.flags import CAMPAIGN, COUNTED, DETECTION, DRAWS, FLARE, NUISANCES, SWEEP, TEMPLATE
 from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
-    from astropy.table import QTable
-
-    from mauvecl.answers.detection.detect import DetectAnswer
     from mauvecl.answers.detection.gaussian import GaussianReport
     from mauvecl.cli.session import Session
     from mauvecl.study.study import Study
@@ -30,73 +27,7 @@ def detect(
 
     Example: mauvecl detect --star K5V --magnitude 6 --amplitude 0.05 --amplitude 0.1 --exposure 30
     """
-    answer = session.ask(study)
-    session.answer(answer, lambda: _show_detections(answer))
-
-
-def _show_detections(answer: DetectAnswer) -> None:
-    from mauvecl.cli.console import show_table
-
-    study = answer.study
-    run = study.run
-    exposures = " and ".join(
-        dict.fromkeys(f"{x.exposure_s:g} s ({x.n_frames} frames)" for x in (s.detection.quiet for s in answer.stars))
-    )
-    swept = [axis.quantity for axis in study.sweep.axes if axis.quantity != "amplitude"]
-    columns = (
-        "flare",
-        "statistic",
-        "expected",
-        "simulated",
-        "reduced",
-        "threshold",
-        "detected",
-        INTERVAL,
-        "closed form",
-    )
-    cells = []
-    for row in answer.table:
-        amplitude, digits = f"{100 * row['amplitude']:g} %", (row["expected"], row["mean"])
-        reduced = "" if math.isnan(row["reduced"]) else f"{row['reduced']:.3f}"
-        probability = f"{row['probability']:.4f}", f"[{row['low']:.4f}, {row['high']:.4f}]"
-        if row["probability"] != row["probability"]:
-            probability = "saturated" if row["threshold"] == row["threshold"] else "no threshold", ""
-        cells.append(
-            (row["star"], *(short(row[name]) for name in swept), amplitude, row["statistic"],
-             *(f"{value:.2f}" for value in digits), reduced, f"{row['threshold']:.2f}", *probability,
-             f"{row['closed_form_probability']:.4f}")
-        )  # fmt: skip
-    show_table(
-        f"Detection at a false-alarm probability of {run.fap:g} per test, {exposures}, {run.realisations:,} "
-        "realisations",
-        ("star", *swept, *columns),
-        cells,
-    )
-    _show_departures(answer.departures, run.fap)
-
-
-def _show_departures(table: QTable, fap: float) -> None:
-    """Where the simulation differs from the closed form, or that it does not."""
-    from mauvecl.cli.console import show, show_table
-
-    differing = table[table["differs"]]
-    if len(table) and not len(differing):
-        show(
-            [f"At the thresholds for Gaussian noise the simulated false-alarm probability is {fap:g} within 4 standard "
-             "errors, for every statistic."]
-        )  # fmt: skip
-    if len(differing):
-        flares = ["" if math.isnan(a) else f"{100 * a:g} %" for a in differing["amplitude"]]
-        show_table(
-            f"Where the simulation differs from the closed form: false-alarm probability at the threshold that should "
-            f"give {fap:g}",
-            ("star", "statistic", "flare", "simulated", INTERVAL, "ratio", "why"),
-            [
-                (row["star"], row["statistic"], flare, f"{row['fap']:.3g}",
-                 f"[{row['fap_low']:.3g}, {row['fap_high']:.3g}]", f"{row['ratio']:.3f}", row["why"])
-                for row, flare in zip(differing, flares, strict=True)
-            ],
-        )  # fmt: skip
+    session.answer(session.ask(study))
 
 
 @takes_study(DRAWS, DETECTION, COUNTED, SWEEP, fewer=True)

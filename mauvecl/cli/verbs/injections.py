@@ -73,7 +73,8 @@ def inject(study: Study, session: Session) -> None:
 
 def _show(answer: InjectAnswer) -> None:
     from mauvecl.answers.stares.inject import SIZE_UNITS
-    from mauvecl.cli.console import INTERVAL, short, show_table
+    from mauvecl.cli.console import short, show_table
+    from mauvecl.schema.tables import INTERVAL
 
     choice = answer.study.search
     alarms = "false alarm" if choice.false_alarms == 1 else "false alarms"

@@ -7,9 +7,10 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from mauvecl.cli.console import INTERVAL, short
+from mauvecl.cli.console import short
 from mauvecl.cli.flags import DETECTION, DRAWS, FLARE, LIMIT, MAP, NUISANCES, SWEEP, UNKNOWN
 from mauvecl.cli.verb import takes_study
+from mauvecl.schema.tables import INTERVAL
 from mauvecl.study.parts import First
 
 if TYPE_CHECKING:

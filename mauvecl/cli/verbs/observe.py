@@ -11,7 +11,6 @@ from mauvecl.cli.flags import AT, COUNTED, DRAWS, FLARE, SIGNAL, SWEEP
 from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
-    from mauvecl.answers.signal.exposures import ExposureResult
     from mauvecl.answers.signal.simulate import SimulateAnswer
     from mauvecl.answers.signal.snr import SnrAnswer
     from mauvecl.cli.session import Session
@@ -122,18 +121,4 @@ def exposure(
 
     Example: mauvecl exposure --snr 10 --at 300 --star G2V --magnitude 7.4
     """
-    answer = session.ask(study)
-    session.answer(answer, lambda: show_exposures(answer))
-
-
-def show_exposures(answer: ExposureResult) -> None:
-    from mauvecl.answers.signal.exposures import COLUMNS
-    from mauvecl.cli.console import show_table
-    from mauvecl.host.tables import texts_of
-
-    wanted = answer.study.signal
-    show_table(
-        f"Exposure for an S/N of {wanted.snr:g} per {wanted.per} at {wanted.wavelength_nm:g} nm "
-        "(closed form, whole frames)",
-        *texts_of(COLUMNS, answer.exposures),
-    )
+    session.answer(session.ask(study))

@@ -56,7 +56,7 @@ class MeasuredBins:
         """Return times, estimates, errors and intervals, one row per bin."""
         from astropy import units
 
-        from mauvecl.host.tables import make_table
+        from mauvecl.schema.tables import make_table
 
         found = self.found
         columns: list[tuple[object, ...]] = [

@@ -3,17 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import special
 
-from mauvecl.host.tables import make_table
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.results.requests.fap import countable
 from mauvecl.schema.calls import public
+from mauvecl.schema.tables import INTERVAL, Column, interval, percent, table_of
 from mauvecl.statistics.distributions import Form
 from mauvecl.statistics.intervals import Interval
 from mauvecl.statistics.statistic import Differences, LinearStatistic, QuadraticStatistic
@@ -129,32 +129,33 @@ def departure_table(detection: Detection, amplitudes: Sequence[float], fap: floa
     `amplitudes` are those of the detection's flares.
     """
     rows = departures(detection, fap) if countable(fap, detection.realisations) else []
-    shaped = [detection.statistic(d.statistic).shaped for d in rows]
-    numbers = (
-        ("gaussian_threshold", [d.threshold for d in rows], "threshold for Gaussian noise"),
-        ("fap", [d.simulated.value for d in rows], "simulated false-alarm probability there"),
-        ("fap_low", [d.simulated.low for d in rows], "its 95 % interval, lower end"),
-        ("fap_high", [d.simulated.high for d in rows], "its 95 % interval, upper end"),
-        ("ratio", [d.ratio for d in rows], "simulated over wanted false-alarm probability"),
-        ("ratio_error", [d.error for d in rows], "standard error of the ratio"),
-        ("skew", [d.skew for d in rows], "predicted change of the ratio by the noise's skew and kurtosis"),
-        ("rounding", [d.rounding for d in rows], "predicted change of the ratio by the ADC's steps"),
-        ("clipping", [d.clipping for d in rows], "predicted change of the ratio by the ADC's ends"),
-    )
-    differs = np.array([d.differs for d in rows], bool)
-    return make_table(
-        (
-            ("statistic", np.array([d.statistic for d in rows], str)),
-            (
-                "amplitude",
-                np.array([amplitudes[d.template] if s else np.nan for d, s in zip(rows, shaped, strict=True)]),
-            ),
-            *((name, np.array(values, float), text) for name, values, text in numbers),
-            ("differs", differs, "whether chance does not explain the ratio: 4 standard errors"),
-            ("why", np.array([d.why for d in rows], str)),
-        ),
-        fap=fap,
-    )
+
+    def amplitude(row: Departure) -> float:
+        return amplitudes[row.template] if detection.statistic(row.statistic).shaped else float("nan")
+
+    columns = [replace(one, get=amplitude) if one.name == "amplitude" else one for one in COLUMNS]
+    return table_of(columns, rows, fap=fap)
+
+
+#: Columns of the table of departures.
+COLUMNS = (
+    Column("statistic", description="detection statistic", heading="statistic", kind=str),
+    Column("amplitude", description="flare amplitude: relative rise of the photons in the flare's band",
+           heading="flare", format=percent("g")),
+    Column("gaussian_threshold", "threshold", description="threshold for Gaussian noise"),
+    Column("fap", "simulated.value", description="simulated false-alarm probability there", heading="simulated",
+           format=".3g"),
+    Column("fap_low", "simulated.low", description="its 95 % interval, lower end", heading=INTERVAL,
+           format=interval(".3g"), others=("fap_high",)),
+    Column("fap_high", "simulated.high", description="its 95 % interval, upper end"),
+    Column("ratio", description="simulated over wanted false-alarm probability", heading="ratio", format=".3f"),
+    Column("ratio_error", "error", description="standard error of the ratio"),
+    Column("skew", description="predicted change of the ratio by the noise's skew and kurtosis"),
+    Column("rounding", description="predicted change of the ratio by the ADC's steps"),
+    Column("clipping", description="predicted change of the ratio by the ADC's ends"),
+    Column("differs", description="whether chance does not explain the ratio: 4 standard errors", kind=bool),
+    Column("why", description="main cause of a difference from the closed form", heading="why", kind=str),
+)  # fmt: skip
 
 
 def _skewed_fap(detection: Detection, statistic: str, template: int, null: Form, cut: float) -> float:

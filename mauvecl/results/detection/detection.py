@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from mauvecl.drawable import Drawable
 from mauvecl.host.content import ContentEquality
-from mauvecl.host.tables import make_table, set_descriptions
 from mauvecl.results.counts.tally import Distribution, TailSamples, Tally
 from mauvecl.results.detection.roc import Roc
 from mauvecl.results.requests.channels import ChannelPlan, Key
@@ -20,6 +19,7 @@ from mauvecl.results.requests.fap import NoThresholdError, Tails, check_atom, ch
 from mauvecl.results.requests.hypotheses import Hypotheses
 from mauvecl.schema.calls import public
 from mauvecl.schema.quantities import count
+from mauvecl.schema.tables import INTERVAL, Column, interval, number, table_of
 from mauvecl.statistics.detection_interval import detection_interval
 from mauvecl.statistics.intervals import Interval, central_counts, clopper_pearson
 from mauvecl.statistics.statistic import LinearStatistic
@@ -217,9 +217,7 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         self._check(statistic, flare, template)
         key: Key = (statistic, "flare", flare) if flare is not None else self._null_key(statistic, template)
         self._at(key)
-        kept = self._samples[key]
-        told = "of the statistic, as the device computed it"
-        return make_table([("realisation", kept.realisations), ("value", kept.values, told)])
+        return table_of(TAIL_COLUMNS, [self._samples[key]])
 
     def roc(self, statistic: str = "chi2", flare: int = 0) -> Roc:
         """Return the ROC curve and the area under it."""
@@ -236,37 +234,44 @@ class Detection(Drawable, ContentEquality, Hypotheses):
 
         Undefined values are NaN; see `detection_probability`.
         """
-        from astropy.table import QTable
-
-        columns = (
-            "name", "statistic", "dof", "expected", "mean", "std", "reduced", "threshold", "threshold_low",
-            "threshold_high", "probability", "low", "high", "closed_form_threshold", "closed_form_probability",
-        )  # fmt: skip
         probability = {statistic: self.detection_probability(fap, statistic) for statistic in self.statistics}
-        rows = []
-        for flare, x in enumerate(self.flares):
-            for statistic in self.statistics:
-                d, p = self.distribution(statistic, flare), probability[statistic][flare]
-                try:
-                    cut = self.threshold(fap, statistic, template=flare)
-                except NoThresholdError:
-                    cut = Interval(np.nan, np.nan, np.nan)
-                theory = self.closed_form(statistic, flare)
-                limit = self.closed_form(statistic, template=flare).isf(fap)
-                dof = self.dof(statistic)
-                # A weighted sum has no reduced value.
-                reduced = np.nan if isinstance(self.statistic(statistic), LinearStatistic) else d.mean / dof
-                of_flare, power = (theory.mean, d.mean, d.std, reduced), theory.sf(limit)
-                if flare in self.blinding:
-                    of_flare, power = (np.nan,) * 4, np.nan
-                row = (x.name, statistic, dof, *of_flare, cut.value, cut.low, cut.high, p.value, p.low, p.high)
-                rows.append((*row, limit, power))
-        table = QTable(rows=rows, names=columns)
-        errors = [self._fap_error(fap, s, flare) for flare in range(len(self.flares)) for s in self.statistics]
-        table["fap_error"] = errors
-        table.meta |= {"fap": fap, "realisations": self.realisations, "exposure_s": self.quiet.exposure_s}
-        table.meta["tails"] = "counted" if countable(fap, self.realisations) else "importance sampling"
-        return set_descriptions(table, DESCRIPTIONS)
+        rows = [
+            self._row(fap, statistic, flare, probability[statistic][flare])
+            for flare in range(len(self.flares))
+            for statistic in self.statistics
+        ]
+        tails = "counted" if countable(fap, self.realisations) else "importance sampling"
+        about = {"realisations": self.realisations, "exposure_s": self.quiet.exposure_s, "tails": tails}
+        return table_of(COLUMNS, rows, fap=fap, **about)
+
+    def _row(self, fap: float, statistic: str, flare: int, probability: Interval) -> dict[str, Any]:
+        """Return the row of one flare and statistic, as `COLUMNS` have it."""
+        d, dof = self.distribution(statistic, flare), self.dof(statistic)
+        try:
+            cut = self.threshold(fap, statistic, template=flare)
+        except NoThresholdError:
+            cut = Interval(np.nan, np.nan, np.nan)
+        theory = self.closed_form(statistic, flare)
+        limit = self.closed_form(statistic, template=flare).isf(fap)
+        # A weighted sum has no reduced value.
+        reduced = np.nan if isinstance(self.statistic(statistic), LinearStatistic) else d.mean / dof
+        of_flare = (theory.mean, d.mean, d.std, reduced, theory.sf(limit))
+        if flare in self.blinding:
+            of_flare = (np.nan,) * 5
+        keys = ("expected", "mean", "std", "reduced", "closed_form_probability")
+        return dict(zip(keys, of_flare, strict=True)) | {
+            "name": self.flares[flare].name,
+            "statistic": statistic,
+            "dof": dof,
+            "threshold": cut.value,
+            "threshold_low": cut.low,
+            "threshold_high": cut.high,
+            "probability": probability.value,
+            "low": probability.low,
+            "high": probability.high,
+            "closed_form_threshold": limit,
+            "fap_error": self._fap_error(fap, statistic, flare),
+        }
 
     def _fap_error(self, fap: float, statistic: str, template: int) -> float:
         """Return the relative standard error of the false-alarm probability at a threshold, NaN where there is none."""
@@ -297,19 +302,39 @@ class Detection(Drawable, ContentEquality, Hypotheses):
         return cut
 
 
-DESCRIPTIONS = {
-    "dof": "degrees of freedom without a flare",
-    "expected": "closed-form mean with the flare",
-    "mean": "simulated mean with the flare",
-    "std": "simulated standard deviation with the flare",
-    "reduced": "simulated mean over degrees of freedom; none for weighted sums",
-    "threshold": "simulated threshold at the false-alarm probability, per test",
-    "threshold_low": "its 95 % interval, lower end",
-    "threshold_high": "its 95 % interval, upper end",
-    "probability": "detection probability at that threshold",
-    "low": "its 95 % interval, lower end, the threshold's error included",
-    "high": "its 95 % interval, upper end, the threshold's error included",
-    "closed_form_threshold": "threshold for Gaussian noise",
-    "closed_form_probability": "detection probability for Gaussian noise",
-    "fap_error": "relative standard error of the false-alarm probability at the threshold",
-}
+def _detected(probability: float, threshold: float) -> str:
+    """Return a detection probability, or why there is none."""
+    if probability == probability:
+        return f"{probability:.4f}"
+    return "saturated" if threshold == threshold else "no threshold"
+
+
+#: Columns of the table of detections.
+COLUMNS = (
+    Column("name"),
+    Column("statistic", description="detection statistic", heading="statistic"),
+    Column("dof", description="degrees of freedom without a flare"),
+    Column("expected", description="closed-form mean with the flare", heading="expected", format=".2f"),
+    Column("mean", description="simulated mean with the flare", heading="simulated", format=".2f"),
+    Column("std", description="simulated standard deviation with the flare"),
+    Column("reduced", description="simulated mean over degrees of freedom; none for weighted sums", heading="reduced",
+           format=number(".3f")),
+    Column("threshold", description="simulated threshold at the false-alarm probability, per test",
+           heading="threshold", format=".2f"),
+    Column("threshold_low", description="its 95 % interval, lower end"),
+    Column("threshold_high", description="its 95 % interval, upper end"),
+    Column("probability", description="detection probability at that threshold", heading="detected",
+           format=_detected, others=("threshold",)),
+    Column("low", description="its 95 % interval, lower end, the threshold's error included", heading=INTERVAL,
+           format=interval(".4f"), others=("high",)),
+    Column("high", description="its 95 % interval, upper end, the threshold's error included"),
+    Column("closed_form_threshold", description="threshold for Gaussian noise"),
+    Column("closed_form_probability", description="detection probability for Gaussian noise", heading="closed form",
+           format=".4f"),
+    Column("fap_error", description="relative standard error of the false-alarm probability at the threshold"),
+)  # fmt: skip
+#: Columns of the table of extremes.
+TAIL_COLUMNS = (
+    Column("realisation", "realisations", description="number of the realisation, by which it can be drawn again"),
+    Column("value", "values", description="of the statistic, as the device computed it"),
+)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from scipy import special
 
 from mauvecl.drawable import Drawable
-from mauvecl.host.tables import make_table
+from mauvecl.schema.tables import Column, table_of
 from mauvecl.statistics.intervals import CONFIDENCE, Interval, clopper_pearson, clopper_pearson_ends
 
 if TYPE_CHECKING:
@@ -22,6 +22,22 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 #: Rows of a curve's table.
 ROC_ROWS = 200
+#: Columns of a curve's table.
+COLUMNS = (
+    Column("threshold", description="value at and above which a detection is claimed"),
+    Column("fap", description="false-alarm probability per test, with a 95 % Clopper-Pearson interval"),
+    Column("fap_low", description="95 % interval of the false-alarm probability, lower end"),
+    Column("fap_high", description="95 % interval of the false-alarm probability, upper end"),
+    Column("probability", description="detection probability, with a 95 % Clopper-Pearson interval"),
+    Column("probability_low", description="95 % interval of the detection probability, lower end"),
+    Column("probability_high", description="95 % interval of the detection probability, upper end"),
+)
+#: Columns of the area, in tables of several curves.
+AREA_COLUMNS = (
+    Column("area", "area.value", description="under the curve; 95 % interval by DeLong's method"),
+    Column("area_low", "area.low", description="95 % interval of the area, lower end"),
+    Column("area_high", "area.high", description="95 % interval of the area, upper end"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,13 +90,16 @@ class Roc(Drawable):
 
         Both ends are included. Probabilities have Clopper-Pearson intervals; the metadata contain the area.
         """
+        area = {column.name: column.value(self) for column in AREA_COLUMNS}
+        return table_of(COLUMNS, [self.points(rows)], realisations=self.realisations, **area)
+
+    def points(self, rows: int = ROC_ROWS) -> dict[str, Float]:
+        """Return at most `rows` points of the curve with their intervals, by the names of `COLUMNS`."""
         n = self.realisations
         wanted = np.append(np.geomspace(1.0, 1.0 / n, max(rows - 1, 1)), 0.0)
         chosen = np.unique(np.minimum(np.searchsorted(-self.fap, -wanted), self.fap.size - 1))
-        columns: list[tuple[object, ...]] = [("threshold", self.threshold[chosen])]
-        for name, what, chance in (("fap", "false-alarm", self.fap), ("probability", "detection", self.probability)):
-            values, low, high = clopper_pearson_ends(np.rint(chance[chosen] * n).astype(np.int64), n)
-            text = f"{what} probability{' per test' * (name == 'fap')}, with a 95 % Clopper-Pearson interval"
-            columns += [(name, values, text), (f"{name}_low", low), (f"{name}_high", high)]
-        area = dict(zip(("area", "area_low", "area_high"), astuple(self.area), strict=True))
-        return make_table(columns, realisations=n, **area)
+        points = {"threshold": self.threshold[chosen]}
+        for name, chance in (("fap", self.fap), ("probability", self.probability)):
+            ends = clopper_pearson_ends(np.rint(chance[chosen] * n).astype(np.int64), n)
+            points |= dict(zip((name, f"{name}_low", f"{name}_high"), ends, strict=True))
+        return points

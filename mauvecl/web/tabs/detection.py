@@ -169,20 +169,9 @@ class Detection(Tab):
     about = "What the flare adds beside the noise, and how the statistic tells it from none."
     pictures = (Excess(), Distributions(), Trade())
     simulations = {"detection": "Simulate"}  # noqa: RUF012
+    shows = "detection"
     files = {"detection": "detection", "roc": "detection"}  # noqa: RUF012
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         answer = answers["detection"]
         return answer.table if name == "detection" else answer.roc
-
-    def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
-        if "detection" not in answers:
-            return []
-        heads = ["statistic", "mean with flare", "threshold", "detected", "95 % interval", "closed form"]
-        return [heads] + [
-            [
-                str(row["statistic"]), f"{row['mean']:.5g}", f"{row['threshold']:.5g}", percent(row["probability"]),
-                f"{percent(row['low'])} to {percent(row['high'])}", percent(row["closed_form_probability"]),
-            ]
-            for row in answers["detection"].table
-        ]  # fmt: skip

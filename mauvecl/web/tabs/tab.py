@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 
 #: Answers that are simulated, by name: of one question.
 Answers = Mapping[str, Any]
+#: Columns that the page does not show: its question has one star and one flare.
+FIXED = ("star", "amplitude", "target")
 
 
 @dataclass
@@ -85,6 +87,10 @@ class Tab(ABC):
     pictures : tuple of Picture
     simulations : dict of str
         What can be simulated here, with what the button is called.
+    shows : str
+        Name of the answer whose table is shown below the pictures.
+    view : int
+        Number of that table among the answer's `views`.
     """
 
     name: ClassVar[str]
@@ -92,6 +98,8 @@ class Tab(ABC):
     about: ClassVar[str]
     pictures: ClassVar[tuple[Picture, ...]] = ()
     simulations: ClassVar[Mapping[str, str]] = {}
+    shows: ClassVar[str] = ""
+    view: ClassVar[int] = 0
     #: Tables that can be taken along, with the simulation that each needs, or none.
     files: ClassVar[Mapping[str, str | None]] = {}
 
@@ -101,7 +109,10 @@ class Tab(ABC):
 
     def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
         """Return a small table as text with a header row; empty if there is nothing to report."""
-        return []
+        if self.shows not in answers:
+            return []
+        headings, cells = answers[self.shows].views[self.view].texts(FIXED)
+        return [headings, *cells]
 
     def study(self, name: str, closed: ClosedForms, answers: Answers) -> Study:
         """Return the study that reproduces one of `files`."""

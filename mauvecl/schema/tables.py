@@ -1,0 +1,164 @@
+"""Tables whose columns are defined once, for files, JSON, the terminal and the page."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cache
+from operator import attrgetter, itemgetter
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from astropy.table import QTable, Table
+
+#: Heading of an interval, which stays next to the column before it.
+INTERVAL = "95 % interval"
+
+
+@dataclass(frozen=True)
+class Column:
+    """A column of a table.
+
+    Attributes
+    ----------
+    name : str
+        Name in files and JSON; empty for a column that only people read.
+    get : str or callable
+        Attribute or key of a row that holds the value, or a function of the row; the column's name if empty. A value
+        may be an array: the row then stands for as many rows of the table. None is a missing value.
+    unit, description : str
+    heading : str
+        Heading for people; without one, only files and JSON have the column.
+    format : str or callable
+        Format specification of a value, or a function that returns its text.
+    others : tuple of str
+        Further columns whose values `format` takes after the column's own.
+    kind : type, optional
+        Type of the values of a table without rows, or with missing values.
+    """
+
+    name: str
+    get: str | Callable[[Any], Any] = ""
+    unit: str = ""
+    description: str = ""
+    heading: str = ""
+    format: str | Callable[..., str] = ""
+    others: tuple[str, ...] = ()
+    kind: type | None = None
+
+    def value(self, row: object) -> Any:
+        """Return the value or values of a row."""
+        if callable(self.get):
+            return self.get(row)
+        key = self.get or self.name
+        return row[key] if isinstance(row, Mapping) else attrgetter(key)(row)
+
+    def of(self, part: Callable[[Any], Any]) -> Column:
+        """Return the column for rows of which only a part has its value."""
+        return replace(self, get=lambda row: self.value(part(row)))
+
+    def text(self, record: Mapping[str, Any]) -> str:
+        """Return a cell as people read it, from the values of its row by column."""
+        values = [record[name] for name in (self.name, *self.others) if name]
+        return self.format(*values) if callable(self.format) else format(values[0], self.format)
+
+
+@dataclass(frozen=True)
+class View:
+    """A table as people read it: a title and some of its columns. Without a table, the title is a sentence."""
+
+    title: str
+    columns: Sequence[Column] = ()
+    table: Table | None = None
+
+    def texts(self, hidden: Collection[str] = ()) -> tuple[list[str], list[list[str]]]:
+        """Return headings and cells, without `hidden` columns and those whose cells are all empty."""
+        found = [] if self.table is None else records(self.table)
+        shown = [one for one in self.columns if one.heading and one.name not in hidden]
+        cells = [[one.text(record) for record in found] for one in shown]
+        filled = [k for k, texts in enumerate(cells) if any(texts) or not found]
+        return [shown[k].heading for k in filled], [list(row) for row in zip(*(cells[k] for k in filled), strict=True)]
+
+
+def table_of(columns: Iterable[Column], rows: Iterable[object], **meta: object) -> QTable:
+    """Return the table of rows for files and JSON, with units and descriptions."""
+    import astropy.units as u
+    import numpy as np
+    from astropy.table import QTable
+
+    table, unit_of = QTable(), cache(u.Unit)
+    named = [one for one in columns if one.name]
+    parts = [np.broadcast_arrays(*(np.atleast_1d(one.value(row)) for one in named)) for row in rows]
+    for k, column in enumerate(named):
+        values = np.concatenate([np.array([], column.kind or float)] * (not parts) + [part[k] for part in parts])
+        if not values.size and column.kind is not None:
+            values = values.astype(column.kind)
+        if values.dtype == object:
+            missing = np.array([value is None for value in values])
+            values = np.ma.MaskedArray(np.where(missing, 0, values).astype(column.kind or float), missing)
+        table[column.name] = values * unit_of(column.unit) if column.unit else values
+        table[column.name].info.description = column.description or None
+    table.meta |= meta
+    return table
+
+
+def stacked(first: Sequence[Column], parts: Iterable[tuple[object, Table]], **meta: object) -> QTable:
+    """Return tables as one, each after the `first` columns of its row; keep metadata that all share, and add `meta`."""
+    every = list(parts)
+    (_, one), *_ = every
+    shared = {k: v for k, v in one.meta.items() if all(k in t.meta and t.meta[k] == v for _, t in every)}
+
+    def taken(name: str) -> Column:
+        unit, text = str(one[name].unit or ""), one[name].info.description or ""
+        return Column(name, lambda part: getattr(part[1][name], "value", part[1][name]), unit, text)
+
+    columns = [each.of(itemgetter(0)) for each in first]
+    return table_of([*columns, *map(taken, one.colnames)], every, **shared | meta)
+
+
+def records(table: Table) -> list[dict[str, Any]]:
+    """Return the rows of a table as plain values by column, None where a value is missing."""
+    columns = [getattr(table[name], "value", table[name]).tolist() for name in table.colnames]
+    return [dict(zip(table.colnames, values, strict=True)) for values in zip(*columns, strict=True)]
+
+
+def number(spec: str, undefined: str = "") -> Callable[[float], str]:
+    """Return a function that formats a number, and returns `undefined` for NaN."""
+    return lambda value: format(value, spec) if value == value else undefined
+
+
+def percent(spec: str) -> Callable[[float], str]:
+    """Return a function that formats a fraction as a percentage; empty for NaN."""
+    return lambda value: f"{100 * value:{spec}} %" if value == value else ""
+
+
+def interval(spec: str) -> Callable[[float, float], str]:
+    """Return a function that formats the ends of an interval; empty for NaN."""
+    return lambda low, high: f"[{low:{spec}}, {high:{spec}}]" if low == low else ""
+
+
+def short(value: float | str) -> str:
+    """Format a number or a name without its unit."""
+    return value if isinstance(value, str) else f"{value:g}"
+
+
+def make_table(columns: Iterable[tuple[Any, ...]], **meta: object) -> QTable:
+    """Make a table of columns given as (name, values), (name, values, description) or (..., description, unit)."""
+    import astropy.units as u
+    import numpy as np
+    from astropy.table import QTable
+
+    table, units = QTable(), cache(u.Unit)
+    for name, values, *more in columns:
+        text, unit = (*more, "", "")[:2]
+        table[name] = np.asarray(values) * units(unit) if unit else values
+        table[name].info.description = text or None
+    table.meta |= meta
+    return table
+
+
+def set_descriptions(table: QTable, texts: Mapping[str, str]) -> QTable:
+    """Set the descriptions of columns in place and return the table."""
+    for name, text in texts.items():
+        table[name].info.description = text
+    return table
