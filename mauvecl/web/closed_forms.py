@@ -94,11 +94,12 @@ class ClosedForms:
     @cached_property
     def messages(self) -> list[str]:
         """Messages for the visitor, the most severe first."""
-        cost = unknown_cost("this flare", self.quiet, self.flare, self.study)
+        nuisances = self.study.nuisances
+        cost = unknown_cost("this flare", self.quiet, self.flare, nuisances, self.study.run.comparison())
         return [
             *collect_messages([self.quiet, self.flare]),
-            *marginal_lines(self.study),
-            *cost_lines([cost], self.study),
+            *marginal_lines(nuisances),
+            *cost_lines([cost], nuisances),
         ]
 
     @property

@@ -55,16 +55,18 @@ def test_the_cost_is_that_of_the_methods(
     nuisances: dict[str, Any], known: float, plain: float, marginal: float
 ) -> None:
     asked = study(**nuisances)
-    found = unknown_cost("it", *asked.expectations(asked.star[0]), asked)
+    found = unknown_cost("it", *asked.expectations(asked.star[0]), asked.nuisances, asked.run.comparison())
     assert found.known == pytest.approx(known, rel=0.01)
     assert found.plain == pytest.approx(plain, rel=0.022)
     assert found.marginal == pytest.approx(marginal, rel=0.01)
-    (line,) = cost_lines([found], asked)
+    (line,) = cost_lines([found], asked.nuisances)
     assert f"{found.marginal:.3g} marginalised" in line
     # Where the study names none, the documented ones, and it says so.
-    (line,) = cost_lines([unknown_cost("it", *asked.expectations(asked.star[0]), study())], study())
+    none = NuisanceChoice()
+    found = unknown_cost("it", *asked.expectations(asked.star[0]), none, asked.run.comparison())
+    (line,) = cost_lines([found], none)
     assert all(row.name in line for row in DOCUMENTED_NUISANCES)
-    assert not marginal_lines(study())
+    assert not marginal_lines(none)
 
 
 def test_every_answer_says_what_unknowns_cost(engine: Engine) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from operator import itemgetter
@@ -28,9 +28,9 @@ from mauvecl.schema.tables import Column, View, stacked, table_of
 from mauvecl.statistics.distributions import QuadraticForm
 from mauvecl.statistics.linear import Linear, Matched
 from mauvecl.statistics.statistic import Setting
-from mauvecl.study.labels import amplitude_column, label, place_columns
+from mauvecl.study.cases import Case, cases
+from mauvecl.study.labels import amplitude_column, place_columns
 from mauvecl.study.messages import collect_messages
-from mauvecl.study.sections import Star
 from mauvecl.study.study import PAPER_STARS, Study
 from mauvecl.study.weights import read_weights
 
@@ -228,39 +228,38 @@ def detect(
     # Everything is looked at before anything is drawn: bad input shows at once.
     run = study.run
     check_fap(run.fap, run.realisations, run.tails)
-    prepared = [(at, cell, star, cell.expectations(star)) for at, cell in study.cells() for star in cell.star]
-    campaign_told = [text for _, cell, _, (quiet, *_) in prepared for text in _campaign(cell, quiet)]
+    prepared = cases(study)
+    expectations = [x for case in prepared for x in case.expectations]
+    campaigns = [text for case in prepared for text in _campaign(case)]
 
     if engine is None:
         from mauvecl.device.engine import Engine as Default
 
         engine = Default()
 
-    def answered(one: tuple[Mapping[str, float | str], Study, Star, list[Expectation]]) -> StarDetection:
-        at, cell, star, (quiet, *flares) = one
-        how = cell.detecting(quiet)
-        own = [read_weights(name, path, quiet.wavelength_nm) for name, path in run.weights.items()]
-        how["statistics"] = (*run.statistics, *own, *_other_templates(cell, star, quiet))
-        detection = engine.detect(quiet, flares, seed=run.seed, **how)
-        return StarDetection(label(star, quiet), at, cell.flare.amplitudes, detection)
+    def detected(case: Case) -> StarDetection:
+        own = [read_weights(name, path, case.quiet.wavelength_nm) for name, path in run.weights.items()]
+        how = case.detect_options() | {"statistics": (*run.statistics, *own, *_other_templates(case))}
+        detection = engine.detect(case.quiet, case.flares, seed=run.seed, **how)
+        return StarDetection(case.label, case.at, case.amplitudes, detection)
 
     if isinstance(engine, Pool):
         engine.expect(len(prepared) * run.realisations)
     stars: list[StarDetection] = []
     paper: list[str] = []
-    for star in map_in_order(engine, answered, prepared):
+    for star in map_in_order(engine, detected, prepared):
         if not stars:
-            # What is drawn nothing for is computed while the devices count the next star.
-            paper = _paper(study, [group for *_, group in prepared])
+            # The devices count the next star meanwhile.
+            paper = _paper(prepared)
         stars.append(star)
         if progress is not None:
             progress(len(stars), len(prepared))
-    costs = [text for (_, cell, *_), one in zip(prepared, stars, strict=True) for text in _template_costs(cell, one)]
+    costs = [text for case, one in zip(prepared, stars, strict=True) for text in _template_costs(case, one)]
     answer = DetectAnswer(study, stars)
     blinding = [f"{text[:-1]} ({star.title})." for star in stars for text in star.detection.messages]
     blinding += [f"{t[:-1]} ({star.title})." for star in stars for t in star.detection.without_threshold(run.fap)]
     blinding += [f"{t[:-1]} ({star.title})." for star in stars for t in star.detection.lowered]
-    messages = [*blinding, *collect_messages([x for *_, group in prepared for x in group], study.processes.processes())]
+    messages = [*blinding, *collect_messages(expectations, study.processes.processes())]
     errors = answer.table["fap_error"][np.isfinite(answer.table["fap_error"])]
     if not countable(run.fap, run.realisations) and errors.size:
         messages.append(
@@ -269,18 +268,18 @@ def detect(
             "100 beyond them."
         )
     unknown = [
-        unknown_cost(f"{star.label}, flare of {100 * amplitude:g} %", star.detection.quiet, flare, cell)
-        for (_, cell, *_), star in zip(prepared, stars, strict=True)
-        for amplitude, flare in zip(star.amplitudes, star.detection.flares, strict=True)
+        unknown_cost(f"{case.label}, flare of {100 * a:g} %", case.quiet, flare, study.nuisances, run.comparison())
+        for case in prepared
+        for a, flare in zip(case.amplitudes, case.flares, strict=True)
     ]
-    last = [*_few_terms(stars), *marginal_lines(study), *cost_lines(unknown, study)]
-    answer.messages = list(dict.fromkeys([*messages, *campaign_told, *costs, *last]))
+    last = [*_few_terms(stars), *marginal_lines(study.nuisances), *cost_lines(unknown, study.nuisances)]
+    answer.messages = list(dict.fromkeys([*messages, *campaigns, *costs, *last]))
     answer.paper = paper
     return answer
 
 
 def _few_terms(stars: Sequence[StarDetection]) -> list[str]:
-    """How few pixels' worth of noise the paper's own sum holds."""
+    """Return a sentence on the number of independent squares of the paper's sum, if it is asked for."""
     forms = [
         star.detection.closed_form("paper", template=flare)
         for star in stars
@@ -297,38 +296,36 @@ def _few_terms(stars: Sequence[StarDetection]) -> list[str]:
     ]
 
 
-def _other_templates(study: Study, star: Star, quiet: Expectation) -> list[Linear]:
-    """Matched statistics that look for flares of other temperatures than the study's."""
-    filters = []
-    for temperature in study.run.template_temperatures_k:
-        source = star.source()
-        other = study.at("flare_temperature", temperature)
-        (shape,) = other.expect([other.flaring(source, study.flare.amplitudes[0])])
-        setting = Setting(quiet, ~quiet.saturated, study.run.comparison())
+def _other_templates(case: Case) -> list[Linear]:
+    """Return matched statistics that look for flares of other temperatures than the study's."""
+    filters, quiet = [], case.quiet
+    for temperature in case.study.run.template_temperatures_k:
+        (shape,) = case.expect(case.with_value("flare_temperature", temperature).flaring(case.amplitudes[0]))
+        setting = Setting(quiet, ~quiet.saturated, case.study.run.comparison())
         filters.append(Linear(f"matched {temperature:g} K", Matched().weights_per_dn(setting, shape)))
     return filters
 
 
-def _template_costs(study: Study, star: StarDetection) -> list[str]:
-    """What looking for the wrong temperature costs, for Gaussian noise."""
-    detection, lines = star.detection, []
-    for temperature in study.run.template_temperatures_k:
+def _template_costs(case: Case, star: StarDetection) -> list[str]:
+    """Return sentences on the S/N lost to templates of another temperature, for Gaussian noise."""
+    detection, lines, light = star.detection, [], case.study.flare.light().describe()
+    for temperature in case.study.run.template_temperatures_k:
         right = Matched().closed_form(detection.setting, detection.flares[0], detection.flares[0]).mean
         name = f"matched {temperature:g} K"
         kept = detection.closed_form(name, 0).mean / detection.closed_form(name).std / right if right else 0.0
         lines.append(
-            f"{star.label}: looking for a flare of {temperature:g} K in one of {study.flare.light().describe()} keeps "
+            f"{star.label}: looking for a flare of {temperature:g} K in one of {light} keeps "
             f"{100 * kept:.1f} % of the matched statistic's S/N."
         )
     return lines
 
 
-def _campaign(study: Study, quiet: Expectation) -> list[str]:
-    """What one test's false-alarm probability means for the campaign that the study names."""
-    asked = study.campaign
+def _campaign(case: Case) -> list[str]:
+    """Return sentences on the false alarms of the campaign that a study has, if any."""
+    asked, run, stack = case.study.campaign, case.study.run, case.quiet.n_frames
     if asked.frames is None:
         return []
-    many = campaign(study.run.fap, asked.frames, quiet.n_frames, step=asked.step, seed=study.run.seed)
+    many = campaign(run.fap, asked.frames, stack, step=asked.step, seed=run.seed)
     text = (
         f"A campaign of {asked.frames} frames makes {many.tests} tests: at {many.fap:g} per test "
         f"{many.expected:.3g} false alarms are expected, and the chance of any is {many.independent:.3g} if tests "
@@ -337,11 +334,11 @@ def _campaign(study: Study, quiet: Expectation) -> list[str]:
     if many.overlapping is not None:
         o = many.overlapping
         text += f"; with the overlap of its stacks {o.value:.3g} [{o.low:.3g}, {o.high:.3g}] for a linear statistic"
-    return [text + ".", *_wanted(asked, many.tests, quiet.n_frames, study.run.seed)]
+    return [text + ".", *_wanted(asked, many.tests, stack, run.seed)]
 
 
 def _wanted(asked: CampaignQuestion, tests: int, stack: int, seed: int) -> list[str]:
-    """What a test may have for the campaign's wanted values."""
+    """Return sentences on the false-alarm probability per test for the campaign's wanted values."""
     lines = []
     if asked.fap is not None and asked.frames is not None:
         one = per_test(asked.fap, asked.frames, stack, step=asked.step, seed=seed)
@@ -364,17 +361,17 @@ def _wanted(asked: CampaignQuestion, tests: int, stack: int, seed: int) -> list[
     return lines
 
 
-def _paper(study: Study, prepared: list[list[Expectation]]) -> list[str]:
-    """The paper's G2V values beside their reconstruction and the calibrated ones."""
-    if PAPER_STARS[1] not in study.star or study.observation.exposure_s != 50.0 or study.sweep.axes:
+def _paper(prepared: Sequence[Case]) -> list[str]:
+    """Return the paper's G2V values with their reconstruction, if its star is among the cases."""
+    case = next((case for case in prepared if case.star == PAPER_STARS[1] and not case.at), None)
+    if case is None or case.study.observation.exposure_s != 50.0:
         return []
-    quiet, *flares = prepared[study.star.index(PAPER_STARS[1])]
     lines = []
-    for amplitude, flare in zip(study.flare.amplitudes, flares, strict=True):
+    for amplitude, flare in zip(case.amplitudes, case.flares, strict=True):
         if amplitude not in PAPER_G2V:
             continue
         chi2, reduced = PAPER_G2V[amplitude]
-        ours = reconstruct(quiet, flare)
+        ours = reconstruct(case.quiet, flare)
         lines.append(
             f"G2V, {100 * amplitude:g} % flare: the paper has chi2 = {chi2:g}, reduced {reduced:g}; "
             f"reconstructed here {ours.value:.2f} ({ours.low:.2f}-{ours.high:.2f})"

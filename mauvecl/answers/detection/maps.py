@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -15,6 +15,7 @@ from mauvecl.results.requests.fap import check_fap
 from mauvecl.schema.calls import public
 from mauvecl.schema.tables import make_table
 from mauvecl.statistics.intervals import Interval
+from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import describe_columns, label
 from mauvecl.study.messages import SATURATED, collect_messages, worst_first
 from mauvecl.study.nuisances import NuisanceChoice
@@ -29,6 +30,8 @@ if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
     from mauvecl.runs.pool import Pool
     from mauvecl.study.assumptions import Use
+    from mauvecl.study.questions import MapQuestion
+    from mauvecl.study.sections import Run
 
 #: Quantities of the flare alone: cells that differ in them share their quiescent star, and one launch.
 OF_FLARE = ("amplitude", "flare_temperature", *OF_SPECTRUM)
@@ -138,18 +141,19 @@ def map(
     study = study.model_copy(update={"star": study.star[:1]}).at("amplitude", study.flare.amplitudes[0])
     axes = study.map.x, study.map.y
     x, y = (axis.points() for axis in axes)
-    unknown = drawn(study) if study.unknowns.draws else None
-    studies = (study,) if unknown is None else unknown.studies
+    (case,) = cases(study, swept=False)
+    unknown = drawn(case.study) if study.unknowns.draws else None
+    draws = [case] if unknown is None else [replace(case, study=one) for one in unknown.studies]
     seen: list[Expectation] = []
     of_flares: list[str] = []
     lowered: set[Lowered] = set()
     maps = []
-    for number, one in enumerate(studies):
+    for number, one in enumerate(draws):
 
         def told_of(done: int, number: int = number) -> None:
             if progress is not None:
                 cells = len(x) * len(y)
-                progress(number * cells + done, len(studies) * cells)
+                progress(number * cells + done, len(draws) * cells)
 
         maps.append(_map(one, x, y, engine, seen, of_flares, lowered, told_of))
     values, parts = maps[0], {}
@@ -171,11 +175,11 @@ def map(
         statistics=study.run.statistics,
         messages=[
             *_blinded(values),
-            *_without_threshold(study, values),
-            *_wrong_sign(study, lowered, len(x) * len(y)),
+            *_without_threshold(study.run, values),
+            *_wrong_sign(case, lowered, len(x) * len(y)),
             *worst_first([*collect_messages(seen, study.processes.processes()), *of_flares]),
-            *marginal_lines(study),
-            *_cost(study, x, y),
+            *marginal_lines(study.nuisances),
+            *_cost(case, x, y),
         ],
         shares=parts,
         quiet=quiet,
@@ -183,13 +187,15 @@ def map(
     )
 
 
-def _cost(study: Study, x: tuple[float | str, ...], y: tuple[float | str, ...]) -> list[str]:
-    """What unknowns cost in the middle of the map."""
-    middle = x[len(x) // 2], y[len(y) // 2]
-    quiet, (flare,) = _expectations(study, [middle])
+def _cost(case: Case, x: tuple[float | str, ...], y: tuple[float | str, ...]) -> list[str]:
+    """Return the sentence on what unknowns cost in the middle of the map."""
+    middle, study = (x[len(x) // 2], y[len(y) // 2]), case.study
+    there = _cell(case, *middle)
+    (flare,) = there.flares
     names = (axis.quantity.replace("_", " ") for axis in (study.map.x, study.map.y))
     at = " and ".join(f"{name} {_shown(value)}" for name, value in zip(names, middle, strict=True))
-    return cost_lines([unknown_cost(f"the cell of {at}", quiet, flare, study)], study)
+    cost = unknown_cost(f"the cell of {at}", there.quiet, flare, study.nuisances, study.run.comparison())
+    return cost_lines([cost], study.nuisances)
 
 
 def _shown(value: float | str) -> str:
@@ -210,31 +216,31 @@ def _blinded(values: Arrays) -> list[str]:
     return [f"SATURATED: every pixel that counts saturates in {cells} of {form.size} cells: no number there."]
 
 
-def _without_threshold(study: Study, values: Arrays) -> list[str]:
+def _without_threshold(run: Run, values: Arrays) -> list[str]:
     """Return a sentence for each statistic on cells where no threshold has the false-alarm probability, if any."""
     missing = np.isnan(values["probability"]) & ~np.isnan(values["closed_form"])
     return [
         f"NO THRESHOLD: in {int(there.sum())} of {there.size} cells no threshold of {statistic} has a false-alarm "
-        f"probability of {study.run.fap:g}, because one value is more probable, as saturated pixels give it: no number "
+        f"probability of {run.fap:g}, because one value is more probable, as saturated pixels give it: no number "
         "there; `mauvecl detect` names the probabilities that thresholds have."
-        for statistic, there in zip(study.run.statistics, missing, strict=True)
+        for statistic, there in zip(run.statistics, missing, strict=True)
         if there.any()
     ]
 
 
-def _wrong_sign(study: Study, lowered: set[Lowered], cells: int) -> list[str]:
+def _wrong_sign(case: Case, lowered: set[Lowered], cells: int) -> list[str]:
     """Return a sentence for each weighted sum on the cells whose flare lowers it, if any."""
-    told = "marginalised over unknowns, " if study.nuisances != NuisanceChoice() else ""
+    told = "marginalised over unknowns, " if case.study.nuisances != NuisanceChoice() else ""
     return [
         f"WRONG SIGN: {told}{statistic} falls with the flare in {number} of {cells} cells, and only higher values are "
         "alarms: its detection probability says nothing of the flare there."
-        for statistic in study.run.statistics
+        for statistic in case.study.run.statistics
         if (number := sum(name == statistic for name, *_ in lowered))
     ]
 
 
 def _map(
-    study: Study,
+    case: Case,
     x: tuple[float | str, ...],
     y: tuple[float | str, ...],
     engine: Engine | Pool,
@@ -249,17 +255,18 @@ def _map(
     """
     from mauvecl.runs.pool import map_in_order
 
-    shape = (len(study.run.statistics), len(y), len(x))
+    shape = (len(case.study.run.statistics), len(y), len(x))
     values = {name: np.full(shape, np.nan) for name in ("probability", "low", "high", "closed_form")}
 
     def filled(cells: list[tuple[int, int]]) -> tuple[Expectation, int, list[str]]:
-        quiet, flares = _expectations(study, [(x[i], y[j]) for i, j in cells])
+        group = [_cell(case, x[i], y[j]) for i, j in cells]
+        quiet, flares = group[0].quiet, group[0].expect(*(one.flaring(one.amplitudes[0]) for one in group))
         if not quiet.saturated.all():
-            lowered.update(_fill(values, cells, study, quiet, flares, engine))
+            lowered.update(_fill(values, cells, group[0], flares, engine))
         return quiet, len(cells), [text for text in collect_messages(flares) if text.startswith(SATURATED)]
 
     done = 0
-    for quiet, count, texts in map_in_order(engine, filled, _groups(study, x, y)):
+    for quiet, count, texts in map_in_order(engine, filled, _groups(case.study.map, x, y)):
         seen.append(quiet)
         of_flares.extend(texts)
         done += count
@@ -268,7 +275,7 @@ def _map(
 
 
 def _averaged(maps: list[Arrays]) -> Arrays:
-    """The mean over draws of the unknown, with its interval; NaN where a draw has none."""
+    """Return the mean over draws of the unknown, with its interval; NaN if a draw has none."""
     values = {name: np.mean([one[name] for one in maps], axis=0) for name in ("probability", "closed_form")}
     values |= {name: np.full_like(values["probability"], np.nan) for name in ("low", "high")}
     for at in zip(*np.nonzero(np.isfinite(values["probability"])), strict=True):
@@ -277,9 +284,11 @@ def _averaged(maps: list[Arrays]) -> Arrays:
     return values
 
 
-def _groups(study: Study, x: tuple[float | str, ...], y: tuple[float | str, ...]) -> list[list[tuple[int, int]]]:
-    """Cells (i, j) that share a quiescent star."""
-    flare_x, flare_y = (axis.quantity in OF_FLARE for axis in (study.map.x, study.map.y))
+def _groups(
+    question: MapQuestion, x: tuple[float | str, ...], y: tuple[float | str, ...]
+) -> list[list[tuple[int, int]]]:
+    """Return the cells (i, j) in groups that share a quiescent star."""
+    flare_x, flare_y = (axis.quantity in OF_FLARE for axis in (question.x, question.y))
     every = [[(i, j) for i in range(len(x))] for j in range(len(y))]
     if flare_x and flare_y:
         return [[cell for row in every for cell in row]]
@@ -290,26 +299,22 @@ def _groups(study: Study, x: tuple[float | str, ...], y: tuple[float | str, ...]
     return [[cell] for row in every for cell in row]
 
 
-def _expectations(study: Study, cells: list[tuple[float | str, float | str]]) -> tuple[Expectation, list[Expectation]]:
-    """The quiescent star that some cells share, and each cell's flare."""
-    names = study.map.x.quantity, study.map.y.quantity
-    studies = [study.at(names[0], a).at(names[1], b) for a, b in cells]
-    source = studies[0].star[0].source()
-    quiet, *flares = studies[0].expect([source, *(s.flaring(source, s.flare.amplitudes[0]) for s in studies)])
-    return quiet, flares
+def _cell(case: Case, x: float | str, y: float | str) -> Case:
+    """Return the case of a cell."""
+    question = case.study.map
+    return case.with_value(question.x.quantity, x).with_value(question.y.quantity, y)
 
 
 def _fill(
     values: dict[str, NDArray[np.float64]],
     cells: list[tuple[int, int]],
-    study: Study,
-    quiet: Expectation,
+    case: Case,
     flares: list[Expectation],
     engine: Engine | Pool,
 ) -> list[Lowered]:
-    """Compute some cells that share a quiescent star, and return the weighted sums that their flares lower."""
-    run, lowered = study.run, []
-    result = engine.detect(quiet, flares, seed=run.seed, **study.detecting(quiet))
+    """Compute cells that share the quiescent star of a case, and return the weighted sums that their flares lower."""
+    run, lowered = case.study.run, []
+    result = engine.detect(case.quiet, flares, seed=run.seed, **case.detect_options())
     for s, statistic in enumerate(run.statistics):
         probabilities = result.detection_probability(run.fap, statistic)
         for k, ((i, j), p) in enumerate(zip(cells, probabilities, strict=True)):

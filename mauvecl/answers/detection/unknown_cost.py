@@ -1,4 +1,4 @@
-"""What it costs not to know all of the instrument: a flare's S/N by closed forms (METHODS section 7)."""
+"""Loss of a flare's S/N to unknown instrument values, by closed forms (METHODS section 7)."""
 
 from __future__ import annotations
 
@@ -18,74 +18,59 @@ from mauvecl.study.nuisances import NuisanceChoice
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
-    from mauvecl.study.study import Study
+    from mauvecl.noise.comparison import Comparison
 
 
 @dataclass(frozen=True)
 class Cost:
-    """The S/N of one flare by the matched statistic.
+    """S/N of a flare by the matched statistic."""
 
-    Attributes
-    ----------
-    of : str
-        Star and flare.
-    known : float
-        With everything known.
-    plain : float
-        Where things are unknown, and the statistic does not know of it: its noise has their scatter.
-    marginal : float
-        Where it is marginalised over them.
+    of: str  # star and flare
+    known: float  # with everything known
+    plain: float  # with unknowns that scatter the statistic, which ignores them
+    marginal: float  # with a statistic that is marginalised over them
+
+
+def unknown_cost(
+    of: str, quiet: Expectation, flare: Expectation, nuisances: NuisanceChoice, comparison: Comparison
+) -> Cost:
+    """Return the S/N of a flare with and without unknowns, or with the documented ones if none are given.
+
+    `of` names star and flare.
     """
-
-    of: str
-    known: float
-    plain: float
-    marginal: float
-
-
-def unknown_cost(of: str, quiet: Expectation, flare: Expectation, study: Study) -> Cost:
-    """What a study's unknowns cost, or the documented ones where it names none.
-
-    Parameters
-    ----------
-    of : str
-        Star and flare, for the reader.
-    quiet, flare : Expectation
-    study : Study
-    """
-    unknown = _chosen(study).marginalised(quiet)
-    used, comparison, matched = ~quiet.saturated, study.run.comparison(), Matched()
+    chosen, used, matched = _or_documented(nuisances), ~quiet.saturated, Matched()
+    unknown = chosen.marginalised(quiet)
     plain = Setting(quiet, used, comparison)
     delta = np.where(used, flare.recorded_light_dn - quiet.recorded_light_dn, 0.0)
     if unknown is None or not delta.any():
         return Cost(of, 0.0, 0.0, 0.0)
     weights = matched.plain_weights(plain, flare)
     known = float(weights @ delta)
-    spread = scatter(unknown, usual=_chosen(study).usual) * np.abs(unknown.spectra @ weights)
+    spread = scatter(unknown, usual=chosen.usual) * np.abs(unknown.spectra @ weights)
     try:
         marginal = matched.weights_per_dn(Setting(quiet, used, comparison, nuisances=unknown), flare)
     except InputError:
-        # What is looked for is what is unknown.
+        # The flare has the spectrum of an unknown.
         marginal = np.zeros_like(weights)
     return Cost(of, known, float(known / np.sqrt(1.0 + np.sum(spread**2))), float(marginal @ delta))
 
 
 def scatter(unknown: Nuisances, *, usual: bool) -> NDArray[np.float64]:
-    """How far amplitudes scatter, shape (k,): as drawn where they are the documented ones, else their prior."""
+    """Return the standard deviations of nuisance amplitudes, shape (k,): as drawn by default, or else of the prior."""
     drawn = {row.name: row.scatter for row in DOCUMENTED_NUISANCES if usual}
     return np.array(
         [drawn.get(name, sd) if np.isinf(sd) else sd for name, sd in zip(unknown.names, unknown.sd, strict=True)]
     )
 
 
-def cost_lines(costs: Sequence[Cost], study: Study) -> list[str]:
-    """One sentence on the faintest flare; none where no flare shows."""
+def cost_lines(costs: Sequence[Cost], nuisances: NuisanceChoice) -> list[str]:
+    """Return a sentence on the faintest flare, or none if no flare has a signal."""
     shown = [cost for cost in costs if cost.known > 0]
     if not shown:
         return []
     faintest = min(shown, key=lambda cost: cost.known)
-    named = study.nuisances != NuisanceChoice()
-    which = spoken(study.nuisances) if named else f"the usual unknowns ({spoken(_chosen(study))})"
+    named = nuisances != NuisanceChoice()
+    which = spoken(nuisances) if named else f"the usual unknowns ({spoken(_or_documented(nuisances))})"
     others = f", the faintest of {len(shown)}," if len(shown) > 1 else ""
     return [
         f"What unknowns cost: {faintest.of}{others} has a matched S/N of {faintest.known:.3g} with everything known; "
@@ -94,17 +79,17 @@ def cost_lines(costs: Sequence[Cost], study: Study) -> list[str]:
     ]
 
 
-def marginal_lines(study: Study) -> list[str]:
-    """What the statistics of an answer are marginalised over, and what is drawn for it."""
-    if study.nuisances == NuisanceChoice():
+def marginal_lines(nuisances: NuisanceChoice) -> list[str]:
+    """Return a sentence on what statistics are marginalised over and which unknowns are drawn, or none."""
+    if nuisances == NuisanceChoice():
         return []
     texts = [PROCESSES[row.process].drawn for row in DOCUMENTED_NUISANCES]
-    drawn = f"; drawn: {'; '.join(texts)}" if study.nuisances.usual else ""
-    return [f"Statistics are marginalised over {spoken(study.nuisances)}{drawn}."]
+    drawn = f"; drawn: {'; '.join(texts)}" if nuisances.usual else ""
+    return [f"Statistics are marginalised over {spoken(nuisances)}{drawn}."]
 
 
 def spoken(choice: NuisanceChoice) -> str:
-    """Unknowns in a sentence: the dark level (+-0.5 deg C) and the light level (free)."""
+    """Return the unknowns as text, such as "the dark level (+-0.5 deg C) and the light level (free)"."""
     documented = DOCUMENTED_NUISANCES if choice.usual else ()
     sd: dict[str, float | str] = {row.name: row.prior.sd for row in documented if isinstance(row.prior, Amplitude)}
     sd |= choice.spreads()
@@ -118,5 +103,5 @@ def _size(sd: float | str, unit: str) -> str:
     return f"+-{100 * float(sd) if unit == '%' else float(sd):g} {unit}".rstrip()
 
 
-def _chosen(study: Study) -> NuisanceChoice:
-    return study.nuisances if study.nuisances != NuisanceChoice() else NuisanceChoice(usual=True)
+def _or_documented(nuisances: NuisanceChoice) -> NuisanceChoice:
+    return nuisances if nuisances != NuisanceChoice() else NuisanceChoice(usual=True)

@@ -13,7 +13,8 @@ from scipy import special
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import Cost, spoken, unknown_cost
 from mauvecl.schema.tables import set_descriptions
-from mauvecl.study.labels import describe_columns, label
+from mauvecl.study.cases import cases
+from mauvecl.study.labels import describe_columns
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.nuisances import NuisanceChoice
 
@@ -112,23 +113,15 @@ class UnknownTable(Answer):
 
 
 def unknown_table(study: Study, unknowns: Mapping[str, NuisanceChoice] = SHOWN) -> UnknownTable:
-    """A study's stars and flares under each of several unknowns.
-
-    Parameters
-    ----------
-    study : Study
-    unknowns : mapping of NuisanceChoice
-        By what they are called.
-    """
+    """Compute the S/N of a study's flares under each of several unknowns, which are given by name."""
     costs: dict[tuple[str, float], dict[str, Cost]] = {}
     quiets = []
-    for star in study.star:
-        quiet, *flares = study.expectations(star)
-        quiets.append(quiet)
-        name = label(star, quiet)
-        for amplitude, flare in zip(study.flare.amplitudes, flares, strict=True):
-            costs[name, amplitude] = {
-                unknown: unknown_cost(name, quiet, flare, study.model_copy(update={"nuisances": choice}))
+    comparison = study.run.comparison()
+    for case in cases(study, swept=False):
+        quiets.append(case.quiet)
+        for amplitude, flare in zip(case.amplitudes, case.flares, strict=True):
+            costs[case.label, amplitude] = {
+                unknown: unknown_cost(case.label, case.quiet, flare, choice, comparison)
                 for unknown, choice in unknowns.items()
             }
     return UnknownTable(study, costs, tuple(quiets))

@@ -195,7 +195,7 @@ class LimitResult(Answer):
         )
         costs = [one.cost for one in self.limits if one.cost is not None]
         failed = [f"NO LIMIT: {text}." for text in self.failed]
-        return [*failed, *stars, *marginal_lines(self.study), *cost_lines(costs, self.study)]
+        return [*failed, *stars, *marginal_lines(self.study.nuisances), *cost_lines(costs, self.study.nuisances)]
 
     def as_json(self) -> dict[str, Any]:
         from mauvecl.answers.report import rows
@@ -253,7 +253,7 @@ def solve(
         unknown=question.unknown(theory) if isinstance(question, MarginalLimitSearch) else None,
         messages=tuple(m for m in collect_messages([quiet, flare]) if m.startswith(SATURATED)),
         quiet=quiet,
-        cost=unknown_cost(where, quiet, flare, question.study),
+        cost=unknown_cost(where, quiet, flare, study.nuisances, study.run.comparison()),
     )
 
 

@@ -33,8 +33,7 @@ def costs(closed: ClosedForms) -> tuple[float, list[Row]]:
         chosen["your own spectrum"] = NuisanceChoice(own=closed.study.nuisances.own)
     rows, known = list[Row](), 0.0
     for name, choice in chosen.items():
-        study = closed.study.model_copy(update={"nuisances": choice})
-        cost = unknown_cost(name, closed.quiet, closed.flare, study)
+        cost = unknown_cost(name, closed.quiet, closed.flare, choice, closed.study.run.comparison())
         known = cost.known or known
         rows.append((name, cost.plain, cost.marginal))
     return known, rows
