@@ -56,12 +56,11 @@ def fits(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
 @styled_picture
 def contours(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
     """Plot expected confidence regions of temperature and amplitude, with unknowns marginalised."""
-    from mauvecl.answers.measurements.measure import contour
-
     figure, axes = plt.subplots(1, len(flares), figsize=(3.4 * len(flares), 3.2), squeeze=False)
     for axis, one in zip(axes[0], flares, strict=True):
-        kelvin, amplitude, rise = contour(one)
-        axis.contour(kelvin, amplitude, rise, levels=RISES, colors=[COLOURS[0]], linestyles=["-", "--"])
+        for rise, line in zip(RISES, ("-", "--"), strict=True):
+            kelvin, low, high = one.region(rise)
+            axis.plot(np.append(kelvin, kelvin[::-1]), np.append(low, high[::-1]), line, color=COLOURS[0])
         axis.plot(one.perfect.estimates[0, 0], one.perfect.estimates[0, 1], "+", color=COLOURS[4])
         if np.isfinite(one.truth[:2]).all():
             axis.plot(*one.truth[:2], "x", color="black")

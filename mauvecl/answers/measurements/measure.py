@@ -12,10 +12,9 @@ import scipy
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer, InCell
-from mauvecl.answers.measurements.truth import Truth
-from mauvecl.results.measurements.fit import LEVELS, Forecast, Measurement, fit, forecast
-from mauvecl.results.measurements.model import FlareModel
-from mauvecl.results.measurements.reduction import Reduction, variance_of
+from mauvecl.answers.measurements.expected import ExpectedMeasurement, expected_measurements, matched_filter
+from mauvecl.results.measurements.fit import LEVELS, Measurement, fit
+from mauvecl.results.measurements.reduction import variance_of
 from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import public
@@ -23,7 +22,6 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import make_table
 from mauvecl.statistics.intervals import clopper_pearson
 from mauvecl.study.labels import label, stack_tables
-from mauvecl.study.measurements import fitted_models
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.study import Study
 
@@ -33,7 +31,6 @@ if TYPE_CHECKING:
     from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
     from mauvecl.results.sums import Arrays
-    from mauvecl.statistics.nuisances import Nuisances
     from mauvecl.study.assumptions import Use
     from mauvecl.study.sections import Star
 
@@ -46,52 +43,12 @@ REJECTED = 0.01
 
 
 @dataclass(frozen=True, eq=False)
-class MeasuredFlare(InCell):
-    """One model, fitted to simulated exposures of one flare.
+class MeasuredFlare(ExpectedMeasurement):
+    """One model, fitted to simulated exposures of one flare."""
 
-    Attributes
-    ----------
-    amplitude : float
-        Of the study's flare.
-    model : str
-    snr : tuple of float
-        Of the true flare in one exposure: everything known, and unknowns marginalised over.
-    truth : ndarray, shape (n_derived,)
-        NaN where the flare has no such quantity.
-    known, ahead : Forecast
-        With everything known, and with what the study says is unknown; of the flare that the model takes for this one.
-    perfect : Measurement
-        The fit to the mean exposure: estimates without noise.
-    found : Measurement
-        Fits to simulated exposures.
-    selected : ndarray of bool, shape (n,)
-        Exposures that a matched filter for the true flare detects at the study's false-alarm probability.
-    fitted : FlareModel
-    frame : ndarray, shape (n_pixel,)
-        The first exposure, DN, less the quiescent mean.
-    quiet : Expectation
-    unknown : Nuisances, optional
-        What the fits marginalise over.
-    """
-
-    amplitude: float
-    model: str
-    snr: tuple[float, float]
-    truth: Float
-    known: Forecast
-    ahead: Forecast
-    perfect: Measurement
-    found: Measurement
-    selected: NDArray[np.bool_]
-    fitted: FlareModel
-    frame: Float
-    quiet: Expectation
-    unknown: Nuisances | None
-
-    @property
-    def name(self) -> str:
-        """The star, the flare and the model, for pictures."""
-        return f"{self.title}, flare {100 * self.amplitude:g} %, {self.model}"
+    found: Measurement  # fits to simulated exposures
+    selected: NDArray[np.bool_]  # exposures that a matched filter detects at the study's false-alarm probability
+    frame: Float  # the first exposure, DN, less the quiescent mean; shape (n_pixel,)
 
     def fitted_dn(self) -> tuple[Float, Float]:
         """Return the mean of the fitted flare in the first exposure, and the best values of what is unknown, DN."""
@@ -263,81 +220,31 @@ def _measured(
     where: InCell,
     engine: Engine | Pool,
 ) -> list[MeasuredFlare]:
-    source, asked = star.source(), study.measure
-    light = study.flare.light()
-    truth = Truth(star, source, study.flaring(source, amplitude), light, study.flare.band, quiet.exposure_s)
-    unknown = study.nuisances.marginalised(quiet)
-    models = {
-        name: FlareModel.of(
-            source,
-            study.observation.load_instrument(),
-            quiet,
-            jump=jump,
-            lines=lines,
-            band=study.flare.band,
-            electron_temperature_k=study.flare.spectrum.electron_temperature_k,
-            distance_pc=star.distance_pc,
-            radius_rsun=star.radius_rsun,
-            bands_nm=asked.bands_nm,
-            order=study.observation.order,
-        )
-        for name, jump, lines in fitted_models(study)
-    }
-    found: dict[str, list[Measurement]] = {name: [] for name in models}
-    detected: list[NDArray[np.bool_]] = []
-    first: Float = np.zeros(quiet.wavelength_nm.size)
-    weights = _matched(quiet, flare, unknown)[0]
-    lit = flare.recorded_dn - quiet.recorded_dn
-    snr = _matched(quiet, flare, None, lit)[1], _matched(quiet, flare, unknown, lit)[1]
+    expected = expected_measurements(study, star, star.source(), quiet, flare, where, amplitude)
+    models, unknown = [one.fitted for one in expected], expected[0].unknown
+    weights = matched_filter(quiet, flare, unknown)[0]
 
     def fitted(start: int, count: int) -> Arrays:
         raw = engine.realise(flare, start=start, count=count, seed=study.run.seed, **study.drawing)
         excess = raw - quiet.recorded_dn
         arrays: Arrays = {"first": excess[0], "detected": excess @ weights >= scipy.stats.norm.isf(study.run.fap)}
-        for k, model in enumerate(models.values()):
+        for k, model in enumerate(models):
             arrays |= {f"{k} {key}": value for key, value in fit(raw, quiet, model, unknown).arrays().items()}
         return arrays
 
     checkpoint = engine.checkpoint if isinstance(engine, Pool) else None
-    for start in range(0, asked.fits, BATCH):
-        count = min(BATCH, asked.fits - start)
-        depends_on = ("measure", quiet, flare, unknown, list(models.values()), study.text(), start, count)
-        arrays = kept(checkpoint, depends_on, partial(fitted, start, count))
-        first = arrays["first"] if start == 0 else first
-        detected.append(arrays["detected"])
-        for k, (name, model) in enumerate(models.items()):
-            own = {key.removeprefix(f"{k} "): value for key, value in arrays.items() if key.startswith(f"{k} ")}
-            found[name].append(Measurement.of_arrays(model, LEVELS, own))
+    parts: list[Arrays] = []
+    for start in range(0, study.measure.fits, BATCH):
+        count = min(BATCH, study.measure.fits - start)
+        depends_on = ("measure", quiet, flare, unknown, models, study.text(), start, count)
+        parts.append(kept(checkpoint, depends_on, partial(fitted, start, count)))
+    selected = np.concatenate([arrays["detected"] for arrays in parts])
     measured = []
-    for name, model in models.items():
-        perfect = fit(flare.recorded_dn, quiet, model, unknown, levels=LEVELS)
-        kelvin, linear = float(np.exp(perfect.log_k[0])), perfect.amplitudes[0]
-        ahead = [forecast(quiet, model, kelvin, linear, u) for u in (None, unknown)]
-        true = np.array([truth.value(quantity) for quantity in model.names])
-        measured.append(
-            MeasuredFlare(
-                where.label, where.at, amplitude, name, snr, true, ahead[0], ahead[1], perfect,
-                Measurement.joined(found[name]), np.concatenate(detected), model, first, quiet, unknown,
-            )
-        )  # fmt: skip
+    for k, one in enumerate(expected):
+        own = [{key.removeprefix(f"{k} "): x for key, x in part.items() if key.startswith(f"{k} ")} for part in parts]
+        found = Measurement.joined([Measurement.of_arrays(one.fitted, LEVELS, arrays) for arrays in own])
+        measured.append(MeasuredFlare(**vars(one), found=found, selected=selected, frame=parts[0]["first"]))
     return measured
-
-
-def _matched(
-    quiet: Expectation, flare: Expectation, unknown: Nuisances | None, added_dn: Float | None = None
-) -> tuple[Float, float]:
-    """Return the weights of a matched filter of variance one, and its mean with the flare.
-
-    The variance is that of the quiescent star, or of one with some light added.
-    """
-    variance, used = variance_of(quiet, added_dn)
-    delta = (flare.recorded_dn - quiet.recorded_dn) * used
-    weights = np.divide(delta, variance, out=np.zeros_like(delta), where=used)
-    if unknown:
-        rows = unknown.rows(variance, unknown.spectra * used)
-        weights = weights - (rows @ delta) @ rows
-    power = float(weights @ delta)
-    return (weights / np.sqrt(power), float(np.sqrt(power))) if power > 0 else (weights, 0.0)
 
 
 def _coverage(found: Measurement, truth: Float, level: int, which: NDArray[np.bool_]) -> Float:
@@ -371,20 +278,3 @@ def _wrong(flares: Sequence[MeasuredFlare]) -> list[str]:
             f"{error:.0f} K{against}; its goodness of fit rejects it in {rejected:.0f} % of exposures."
         )
     return lines
-
-
-def contour(one: MeasuredFlare, n: int = 81) -> tuple[Float, Float, Float]:
-    """Return temperatures, amplitudes and the expected rise of chi-squared above its minimum, (n_amplitude, n_t)."""
-    best, linear = one.perfect.log_k[0], one.perfect.amplitudes[0]
-    reduction = Reduction.of(one.fitted, one.quiet, one.fitted.counts(float(np.exp(best)), linear), one.unknown)
-    mean = linear[0] * reduction.spline(best) + linear[1:] @ reduction.fixed
-    low, high = one.perfect.low[-1, 0], one.perfect.high[-1, 0]
-    spread = np.exp(reduction.log_k[[0, -1]])
-    ends = np.clip([max(low[0] * 0.9, spread[0]), min(high[0] * 1.1, 5 * np.exp(best))], *spread)
-    kelvin = np.geomspace(float(ends[0]), float(ends[1]), n)
-    amplitude = np.geomspace(max(low[1] * 0.8, linear[0] / 30), high[1] * 1.2, n)
-    basis, _ = reduction.basis
-    hot = reduction.spline(np.log(kelvin))
-    rest = mean - amplitude[:, None, None] * hot
-    rest = rest - (rest @ basis.T) @ basis
-    return kelvin, amplitude, np.einsum("atk,atk->at", rest, rest)

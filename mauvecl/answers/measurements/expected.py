@@ -1,0 +1,146 @@
+"""Errors that the measurement of a flare will have, in closed form."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.answers.answer import InCell
+from mauvecl.answers.measurements.truth import Truth
+from mauvecl.results.measurements.fit import LEVELS, Forecast, Measurement, fit, forecast
+from mauvecl.results.measurements.model import FlareModel
+from mauvecl.results.measurements.reduction import Reduction, variance_of
+from mauvecl.study.measurements import fitted_models
+
+if TYPE_CHECKING:
+    from mauvecl.host.expectation import Expectation
+    from mauvecl.host.stars.source import Source
+    from mauvecl.statistics.nuisances import Nuisances
+    from mauvecl.study.sections import Star
+    from mauvecl.study.study import Study
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class ExpectedMeasurement(InCell):
+    """One model and one flare: the truth, and what a fit is expected to make of it."""
+
+    amplitude: float  # of the study's flare
+    model: str
+    snr: tuple[float, float]  # of the flare in one exposure: everything known, and unknowns marginalised
+    truth: Float  # shape (n_derived,); NaN where the flare has no such quantity
+    known: Forecast  # everything known
+    ahead: Forecast  # unknowns of the study marginalised
+    perfect: Measurement  # the fit to the mean exposure: estimates without noise
+    fitted: FlareModel
+    quiet: Expectation
+    unknown: Nuisances | None
+
+    @property
+    def name(self) -> str:
+        """The star, the flare and the model, for pictures."""
+        return f"{self.title}, flare {100 * self.amplitude:g} %, {self.model}"
+
+    def region(self, rise: float, n: int = 161) -> tuple[Float, Float, Float]:
+        """Return the expected confidence region of temperature and amplitude, with everything else profiled.
+
+        Parameters
+        ----------
+        rise : float
+            Increase of chi-squared that bounds the region.
+        n : int
+
+        Returns
+        -------
+        kelvin, low, high : ndarray, shape (n,)
+            Smallest and largest amplitude at each temperature.
+        """
+        best, linear = self.perfect.log_k[0], self.perfect.amplitudes[0]
+        reduction = Reduction.of(self.fitted, self.quiet, self.fitted.counts(np.exp(best), linear), self.unknown)
+        basis, _ = reduction.basis
+        mean = linear[0] * reduction.spline(best) + linear[1:] @ reduction.fixed
+        rest = mean - (mean @ basis.T) @ basis
+
+        def at(log_k: Float) -> tuple[Float, Float, Float]:
+            hot = reduction.spline(log_k)
+            hot = hot - (hot @ basis.T) @ basis
+            power = np.einsum("tk,tk->t", hot, hot)
+            amplitude = hot @ rest / power
+            return amplitude, power, rise - (rest @ rest - amplitude**2 * power)
+
+        nodes = np.linspace(reduction.log_k[0], reduction.log_k[-1], 8 * reduction.log_k.size)
+        inside = nodes[at(nodes)[2] >= 0.0]
+        ends = (inside[0], inside[-1]) if inside.size else (best, best)
+        log_k = np.linspace(*ends, n)
+        amplitude, power, left = at(log_k)
+        reach = np.sqrt(np.maximum(left, 0.0) / power)
+        return np.exp(log_k), np.maximum(amplitude - reach, 0.0), amplitude + reach
+
+
+def expected_measurements(
+    study: Study, star: Star, source: Source, quiet: Expectation, flare: Expectation, where: InCell, amplitude: float
+) -> list[ExpectedMeasurement]:
+    """Forecast the measurement of one flare, with each model that the study fits.
+
+    Parameters
+    ----------
+    study : Study
+    star : Star
+    source : Source
+        The quiescent star at its magnitude.
+    quiet, flare : Expectation
+        One exposure without and with the flare.
+    where : InCell
+    amplitude : float
+    """
+    spectrum, band = study.flare.spectrum, study.flare.band
+    truth = Truth(star, source, study.flaring(source, amplitude), study.flare.light(), band, quiet.exposure_s)
+    unknown = study.nuisances.marginalised(quiet)
+    lit = flare.recorded_dn - quiet.recorded_dn
+    snr = matched_filter(quiet, flare, None, lit)[1], matched_filter(quiet, flare, unknown, lit)[1]
+    expected = []
+    for name, jump, lines in fitted_models(study):
+        model = FlareModel.of(
+            source,
+            study.observation.load_instrument(),
+            quiet,
+            jump=jump,
+            lines=lines,
+            band=band,
+            electron_temperature_k=spectrum.electron_temperature_k,
+            distance_pc=star.distance_pc,
+            radius_rsun=star.radius_rsun,
+            bands_nm=study.measure.bands_nm,
+            order=study.observation.order,
+        )
+        perfect = fit(flare.recorded_dn, quiet, model, unknown, levels=LEVELS)
+        kelvin, linear = float(np.exp(perfect.log_k[0])), perfect.amplitudes[0]
+        known, ahead = (forecast(quiet, model, kelvin, linear, u) for u in (None, unknown))
+        true = np.array([truth.value(quantity) for quantity in model.names])
+        expected.append(
+            ExpectedMeasurement(
+                where.label, where.at, amplitude, name, snr, true, known, ahead, perfect, model, quiet, unknown
+            )
+        )
+    return expected
+
+
+def matched_filter(
+    quiet: Expectation, flare: Expectation, unknown: Nuisances | None, added_dn: Float | None = None
+) -> tuple[Float, float]:
+    """Return the weights of a matched filter of variance one, and its mean with the flare.
+
+    The variance is that of the quiescent star, or of one with some light added.
+    """
+    variance, used = variance_of(quiet, added_dn)
+    delta = (flare.recorded_dn - quiet.recorded_dn) * used
+    weights = np.divide(delta, variance, out=np.zeros_like(delta), where=used)
+    if unknown:
+        rows = unknown.rows(variance, unknown.spectra * used)
+        weights = weights - (rows @ delta) @ rows
+    power = float(weights @ delta)
+    return (weights / np.sqrt(power), float(np.sqrt(power))) if power > 0 else (weights, 0.0)
