@@ -109,8 +109,8 @@ class ClosedForms:
         frames = "one frame" if x.n_frames == 1 else f"{x.n_frames} frames"
         star = "your own star" if q.uploaded is not None else star_words(q.star)
         return (
-            f"a {q.amplitude_percent:g} % flare ({q.flare_temperature_k:g} K) on {star} of {q.band} = {q.magnitude:g}, "
-            f"in {x.exposure_s:g} s ({frames})"
+            f"a {q.amplitude_percent:g} % flare ({self.study.flare.light().describe()}) on {star} of {q.band} = "
+            f"{q.magnitude:g}, in {x.exposure_s:g} s ({frames})"
         )
 
     def at(self, light: float, rises: Float, *, sky: bool = False) -> list[DetectionForms]:

@@ -96,6 +96,14 @@ def as_command(question: Question) -> str:
         "--flare-temperature",
         f"{q.flare_temperature_k:.15g}",
     ]
+    for key, flag in (
+        ("balmer_jump", "--balmer-jump"),
+        ("second_temperature_k", "--second-temperature"),
+        ("second_area", "--second-area"),
+    ):
+        words += [flag, f"{q.spectrum[key]:.15g}"] if key in q.spectrum else []
+    for name, fraction in q.lines:
+        words += ["--line", f"{name}={fraction:.15g}"]
     words += ["--exposure", f"{q.exposure_s:.15g}", "--instrument", q.instrument]
     words += ["--temperature", f"{q.temperature_c:.15g}"]
     words += {

@@ -86,6 +86,22 @@ def points(text: str) -> tuple[tuple[float, float], ...] | None:
     return spectrum
 
 
+def optional(number: Number) -> Callable[[str], float | int | None]:
+    """Return a parser that takes nothing entered for None."""
+    return lambda text: number(text) if text.strip() else None
+
+
+def line_fluxes(text: str) -> tuple[tuple[str, float], ...]:
+    """Parse emission lines such as "Mg II = 0.03, Balmer = 0.1"."""
+    from mauvecl.host.stars.flare_spectra import EmissionLine
+
+    pairs = [pair.partition("=") for pair in text.split(",") if text.strip()]
+    fractions = tuple((EmissionLine.named(name).name, float(Number(0, 100)(value))) for name, _, value in pairs)
+    if len(dict(fractions)) < len(fractions):
+        raise InputError(f"{shortened(text)} holds a line twice, expected each once")
+    return fractions
+
+
 class Draws(NamedTuple):
     """Number of realisations, and whether the tail beyond them is sampled."""
 
@@ -218,6 +234,23 @@ FIELDS = {
         "The flare shines as a blackbody of this temperature. The hotter, the more of its light is ultraviolet.", "K",
         Slider(5000, 30_000, 500),
     ),
+    "balmer_jump": Field(
+        "Balmer jump", "", optional(Number(1, 100)),
+        "Flux just below 364.6 nm over that just above, by hydrogen recombination: 1 to 4 in most flares. Nothing: a "
+        "plain blackbody.",
+    ),
+    "second_temperature_k": Field(
+        "Second temperature", "", optional(Number(1000, 100_000)),
+        "A second blackbody in the flare, instead of a Balmer jump. Nothing: there is none.", "K",
+    ),
+    "second_area": Field(
+        "Second area", "0.05", Number(0, 1e6), "Area at the second temperature over that at the first, if there is one."
+    ),
+    "lines": Field(
+        "Emission lines", "", line_fluxes,
+        "Flux of lines as a fraction of the continuum's in 200-700 nm, such as Mg II=0.03, Ca II=0.02, Balmer=0.1, or "
+        "280=0.03 for one at 280 nm.",
+    ),
     "temperature_c": Field(
         "Detector temperature", "21", Number(-50, 60), "The dark current doubles every few degrees.", "deg C",
         Slider(-10, 40, 1),
@@ -278,7 +311,8 @@ FIELDS = {
 ASKED = ("star", "magnitude", "band", "amplitude_percent", "exposure_s")
 ADVANCED = {
     "Detection": ("fap", "statistic", "realisations", "seed"),
-    "Flare and detector": ("flare_temperature_k", "temperature_c", "instrument"),
+    "Flare's spectrum": ("flare_temperature_k", "balmer_jump", "second_temperature_k", "second_area", "lines"),
+    "Detector": ("temperature_c", "instrument"),
     "Sky": ("sky", "sky_brightness", "target", "time", "signal"),
     "Unknown": ("unknown", "own_unknown"),
     "Visibility and plan": ("see", "hours"),

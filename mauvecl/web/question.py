@@ -35,6 +35,10 @@ class Question:
     time: str
     amplitude_percent: float
     flare_temperature_k: float
+    balmer_jump: float | None
+    second_temperature_k: float | None
+    second_area: float
+    lines: tuple[tuple[str, float], ...]
     statistic: str
     fap: float
     realisations: Draws
@@ -85,9 +89,11 @@ class Question:
         own = {"own": {"points": self.own_unknown}} if self.own_unknown else {}
         seen = {"orbit": {"targets": [self.see.strip()]}, "plan": {"hours": self.hours}}
         orbit = seen if self.see.strip() else {}
+        spectrum = self.spectrum
         return orbit | {
             "star": [star],
-            "flare": {"amplitudes": [self.amplitude_percent / 100.0], "temperature_k": self.flare_temperature_k},
+            "flare": {"amplitudes": [self.amplitude_percent / 100.0], "temperature_k": self.flare_temperature_k}
+            | ({"spectrum": spectrum} if spectrum else {}),
             "observation": {
                 "exposure_s": self.exposure_s,
                 "temperature_c": self.temperature_c,
@@ -104,6 +110,16 @@ class Question:
                 "fap": self.fap,
             },
         }
+
+    @property
+    def spectrum(self) -> dict[str, Any]:
+        """The study's section of the flare's spectrum; empty for a blackbody."""
+        given: dict[str, Any] = {}
+        if self.balmer_jump is not None:
+            given["balmer_jump"] = self.balmer_jump
+        if self.second_temperature_k is not None:
+            given |= {"second_temperature_k": self.second_temperature_k, "second_area": self.second_area}
+        return given | ({"lines": dict(self.lines)} if self.lines else {})
 
 
 def write_spectrum(source: Source, folder: Path) -> Path:

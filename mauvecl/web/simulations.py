@@ -12,6 +12,7 @@ from mauvecl.answers.campaigns.visible import visible
 from mauvecl.answers.detection import maps
 from mauvecl.answers.detection.detect import DetectAnswer, detect
 from mauvecl.answers.limits.limits import limit
+from mauvecl.answers.measurements.measure import measure
 from mauvecl.answers.signal.snr import SnrAnswer, snr
 from mauvecl.answers.stares.inject import InjectAnswer, inject
 from mauvecl.host.orbit.targets import Target
@@ -87,9 +88,10 @@ SIMULATIONS: dict[str, Callable[[Study, Pool], dict[str, Any]]] = {
     "detection": _detection,
     "limit": lambda study, pool: {"limit": limit(study, pool)},
     "map": lambda study, pool: {"map": map_around(study, pool)},
+    "measure": lambda study, pool: {"measure": measure(study, pool)},
     "completeness": lambda study, pool: {"completeness": completeness(study, pool)},
     "visible": lambda study, pool: _visible(study),
     "plan": lambda study, pool: {"plan": campaign_plan(study)},
 }
 #: Simulations that use the pool's devices.
-DRAWING = {"detection", "limit", "map"}
+DRAWING = {"detection", "limit", "map", "measure"}

@@ -548,6 +548,8 @@ COMMANDS = {
     "noise-budget": ("snr", [], "noise-budget.ecsv"),
     "limit": ("limit", [], "limit.ecsv"),
     "map": ("map", [], "map.ecsv"),
+    "measure": ("measure", [], "measure.ecsv"),
+    "fits": ("measure", [], "fits.ecsv"),
     "completeness": ("inject", [], "completeness.ecsv"),
     "limits": ("inject", [], "limits.ecsv"),
     "visible": ("visible", [], "visible.ecsv"),
@@ -617,6 +619,8 @@ def test_every_table_is_the_same_bytes_on_the_command_line(served: Any, tmp_path
         "?star=Vega&magnitude=3&band=GALEX+NUV&sky=none&realisations=100000+sampled&fap=1e-06&unknown=the+usual",
         "?sky=target+and+time&target=290.68+%2B11.12&time=2026-09-01T12:00&own_unknown=200+1,+450+3&seed=7&see=eps+Eri"
         "&signal=paper",
+        "?balmer_jump=2.5&lines=Mg+II%3D0.03,+280%3D0.01",
+        "?second_temperature_k=30000&second_area=0.1",
     ],
 )
 def test_command_and_program_are_the_question(link: str, tmp_path: Path) -> None:

@@ -75,14 +75,42 @@ class ExpectedMeasurement(InCell):
         nodes = np.linspace(reduction.log_k[0], reduction.log_k[-1], 8 * reduction.log_k.size)
         inside = nodes[at(nodes)[2] >= 0.0]
         ends = (inside[0], inside[-1]) if inside.size else (best, best)
-        log_k = np.linspace(*ends, n)
+        # Dense at the ends, where the amplitudes meet like a root.
+        log_k = (ends[0] + ends[1]) / 2 + (ends[1] - ends[0]) / 2 * np.sin(np.linspace(-np.pi / 2, np.pi / 2, n))
         amplitude, power, left = at(log_k)
         reach = np.sqrt(np.maximum(left, 0.0) / power)
         return np.exp(log_k), np.maximum(amplitude - reach, 0.0), amplitude + reach
 
 
+def models_of(study: Study, star: Star, source: Source, quiet: Expectation) -> dict[str, FlareModel]:
+    """Return the models that a study fits to exposures of a star, the simplest first."""
+    return {
+        name: FlareModel.of(
+            source,
+            study.observation.load_instrument(),
+            quiet,
+            jump=jump,
+            lines=lines,
+            band=study.flare.band,
+            electron_temperature_k=study.flare.spectrum.electron_temperature_k,
+            distance_pc=star.distance_pc,
+            radius_rsun=star.radius_rsun,
+            bands_nm=study.measure.bands_nm,
+            order=study.observation.order,
+        )
+        for name, jump, lines in fitted_models(study)
+    }
+
+
 def expected_measurements(
-    study: Study, star: Star, source: Source, quiet: Expectation, flare: Expectation, where: InCell, amplitude: float
+    study: Study,
+    star: Star,
+    source: Source,
+    quiet: Expectation,
+    flare: Expectation,
+    where: InCell,
+    amplitude: float,
+    models: dict[str, FlareModel] | None = None,
 ) -> list[ExpectedMeasurement]:
     """Forecast the measurement of one flare, with each model that the study fits.
 
@@ -96,27 +124,16 @@ def expected_measurements(
         One exposure without and with the flare.
     where : InCell
     amplitude : float
+    models : dict of str to FlareModel, optional
+        Those of `models_of` by default.
     """
-    spectrum, band = study.flare.spectrum, study.flare.band
-    truth = Truth(star, source, study.flaring(source, amplitude), study.flare.light(), band, quiet.exposure_s)
+    lit_source, light = study.flaring(source, amplitude), study.flare.light()
+    truth = Truth(star, source, lit_source, light, study.flare.band, quiet.exposure_s)
     unknown = study.nuisances.marginalised(quiet)
     lit = flare.recorded_dn - quiet.recorded_dn
     snr = matched_filter(quiet, flare, None, lit)[1], matched_filter(quiet, flare, unknown, lit)[1]
     expected = []
-    for name, jump, lines in fitted_models(study):
-        model = FlareModel.of(
-            source,
-            study.observation.load_instrument(),
-            quiet,
-            jump=jump,
-            lines=lines,
-            band=band,
-            electron_temperature_k=spectrum.electron_temperature_k,
-            distance_pc=star.distance_pc,
-            radius_rsun=star.radius_rsun,
-            bands_nm=study.measure.bands_nm,
-            order=study.observation.order,
-        )
+    for name, model in (models or models_of(study, star, source, quiet)).items():
         perfect = fit(flare.recorded_dn, quiet, model, unknown, levels=LEVELS)
         kelvin, linear = float(np.exp(perfect.log_k[0])), perfect.amplitudes[0]
         known, ahead = (forecast(quiet, model, kelvin, linear, u) for u in (None, unknown))

@@ -6,9 +6,17 @@ const MOST = 8
 const KEY = "mauvecl-compare"
 const ROWS = [
   ["Star", e => e.star], ["Magnitude", e => `${e.band} = ${e.magnitude}`], ["Flare", e => `${e.amplitude_percent} %`],
-  ["Flare temperature", e => `${e.flare_temperature_k} K`], ["Exposure", e => `${e.exposure_s} s`],
+  ["Flare's spectrum", e => spectrum(e)], ["Exposure", e => `${e.exposure_s} s`],
   ["Statistic", e => e.statistic], ["False-alarm probability", e => e.fap], ["Unknown", e => e.unknown],
 ]
+
+// The flare's light in a few words; scenarios that were kept before may lack fields.
+function spectrum(entered) {
+  const second = entered.second_temperature_k
+  const parts = [`${entered.flare_temperature_k} K`, entered.balmer_jump && `jump ${entered.balmer_jump}`,
+    second && `${entered.second_area} of its area at ${second} K`, entered.lines]
+  return parts.filter(Boolean).join(", ")
+}
 
 function element(tag, text, more = {}) {
   const made = document.createElement(tag)

@@ -6,6 +6,7 @@ from mauvecl.web.tabs.compare import Compare
 from mauvecl.web.tabs.completeness import Completeness
 from mauvecl.web.tabs.detection import Detection
 from mauvecl.web.tabs.limit import Limit
+from mauvecl.web.tabs.measurements import Measurement
 from mauvecl.web.tabs.noise import Noise
 from mauvecl.web.tabs.plan import Plan
 from mauvecl.web.tabs.signal import Signal
@@ -23,6 +24,7 @@ TABS: dict[str, Tab] = {
         Signal(),
         Noise(),
         Limit(),
+        Measurement(),
         Unknown(),
         Completeness(),
         Visibility(),

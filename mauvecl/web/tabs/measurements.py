@@ -1,0 +1,164 @@
+"""Measurement of the flare's spectrum: errors in closed form, and simulated fits."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mauvecl.answers.answer import InCell
+from mauvecl.answers.measurements.expected import expected_measurements, models_of
+from mauvecl.results.measurements.fit import forecast
+from mauvecl.study.nuisances import NuisanceChoice
+from mauvecl.web.closed_forms import percent, short
+from mauvecl.web.figures import Canvas
+from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
+
+if TYPE_CHECKING:
+    from astropy.table import Table
+
+    from mauvecl.answers.measurements.expected import ExpectedMeasurement
+    from mauvecl.answers.measurements.measure import MeasuredFlare
+    from mauvecl.web.closed_forms import ClosedForms
+
+#: What an observer may not know, by name on the page, as the study's section of nuisances.
+ASSUMED = {
+    "everything known": NuisanceChoice(),
+    "usual unknowns": NuisanceChoice(usual=True),
+    "dark and star free": NuisanceChoice.model_validate({"dark": "free", "light": "free"}),
+}
+#: Increase of chi-squared that encloses 95 % in two dimensions.
+RISE_95 = 5.99
+#: Factors on the amplitude at which errors are computed.
+FACTORS = np.geomspace(0.1, 10.0, 9)
+#: Largest number of simulated fits that are shown.
+MOST_DOTS = 500
+
+
+@lru_cache(maxsize=4)
+def expected(closed: ClosedForms) -> dict[str, ExpectedMeasurement]:
+    """Return the forecast with the flare's own model for each of `ASSUMED`."""
+    study, quiet, flare = closed.study, closed.quiet, closed.flare
+    star, source, where, amplitude = study.star[0], closed.light[0], InCell("", {}), study.flare.amplitudes[0]
+    own = dict(list(models_of(study, star, source, quiet).items())[-1:])
+    found = {}
+    for name, unknown in ASSUMED.items():
+        chosen = study.model_copy(update={"nuisances": unknown})
+        (found[name],) = expected_measurements(chosen, star, source, quiet, flare, where, amplitude, own)
+    return found
+
+
+def simulated(answers: Answers) -> MeasuredFlare | None:
+    """Return the simulated fits of the flare's own model, if there are any."""
+    return answers["measure"].flares[-1] if "measure" in answers else None
+
+
+class Errors(Picture):
+    """Relative error of the temperature against the amplitude of the flare."""
+
+    name, title = "errors", "Error of the temperature for smaller and larger flares"
+    sets = "amplitude_percent=x"
+    pins = "known"
+
+    def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
+        canvas = Canvas(
+            ink, "flare amplitude (%)", "error of the temperature (%)", logs | {"x", "y"}, y_range=(0.1, 1000)
+        )
+        for name, colour in zip(("known", "usual", "free"), ("flare", "star", "sky"), strict=True):
+            called = list(ASSUMED)[("known", "usual", "free").index(name)]
+            told = canvas.line(name, called, colour, line_width=2)
+            canvas.tooltips(told, ("amplitude (%)", "x"), (f"{called} (%)", "y"))
+        canvas.pinned()
+        canvas.own_point()
+        return canvas
+
+    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
+        own = 100 * closed.study.flare.amplitudes[0]
+        sources: dict[str, Any] = {}
+        for name, one in zip(("known", "usual", "free"), expected(closed).values(), strict=True):
+            kelvin, linear = float(np.exp(one.perfect.log_k[0])), one.perfect.amplitudes[0]
+            ahead = [forecast(one.quiet, one.fitted, kelvin, factor * linear, one.unknown) for factor in FACTORS]
+            sources[name] = {"x": own * FACTORS, "y": [100 * f.errors[0] / f.values[0] for f in ahead]}
+        known, *_, free = expected(closed).values()
+        sources["own"] = {"x": [own], "y": [100 * known.ahead.errors[0] / known.ahead.values[0]]}
+        text = (
+            f"With everything known the temperature has a standard error of {_error(known)}, with dark level and star "
+            f"unknown one of {_error(free)}. A click chooses another amplitude."
+        )
+        return PictureData(text, sources)
+
+
+def _number(value: float, digits: int) -> str:
+    """Format a number, with a power of ten only if it is very small or large."""
+    text = f"{value:.{digits}g}"
+    return f"{float(text):,.0f}" if "e+" in text and abs(value) < 1e7 else text
+
+
+def _error(one: ExpectedMeasurement) -> str:
+    return f"{short(one.ahead.errors[0])} K"
+
+
+class Region(Picture):
+    """Confidence region of temperature and amplitude."""
+
+    name, title = "region", "Temperature and amplitude: 95 % confidence region"
+    logs = ("x",)
+
+    def figure(self, ink: Any, logs: frozenset[str]) -> Canvas:
+        canvas = Canvas(ink, "temperature (K)", "amplitude of the blackbody (%)", logs)
+        canvas.band("free", "dark and star free", "sky", alpha=0.3)
+        canvas.band("known", "everything known", "flare", alpha=0.5)
+        canvas.dots("fits", "simulated fits", "drawn", size=3)
+        canvas.own_point("the flare")
+        return canvas
+
+    def drawn(self, closed: ClosedForms, answers: Answers) -> PictureData:
+        all_known, *_, free = expected(closed).values()
+        sources: dict[str, Any] = {"fits": {"x": [], "y": []}}
+        for name, one in (("known", all_known), ("free", free)):
+            kelvin, low, high = one.region(RISE_95)
+            sources[name] = {"x": kelvin, "low": 100 * low, "high": 100 * high}
+        best = all_known.perfect.estimates[0]
+        sources["own"] = {"x": [best[0]], "y": [100 * best[1]]}
+        fits = simulated(answers)
+        if fits is not None:
+            some = fits.found.estimates[:MOST_DOTS]
+            sources["fits"] = {"x": some[:, 0], "y": 100 * some[:, 1]}
+        x = np.asarray(sources["free"]["x"])
+        text = (
+            f"With dark level and star unknown the 95 % region reaches from {short(x[0])} to {short(x[-1])} K: hotter "
+            "flares of smaller area look alike."
+        )
+        return PictureData(text, sources)
+
+
+class Measurement(Tab):
+    """Measurement of the flare's spectrum."""
+
+    name, title = "measure", "Measure"
+    about = (
+        "What is measured of the flare once it is detected: its temperature, size and light, with errors in closed "
+        "form; simulated fits count how often their intervals hold the truth."
+    )
+    pictures = (Errors(), Region())
+    simulations = {"measure": "Simulate fits"}  # noqa: RUF012
+    files = {"measure": "measure", "fits": "measure"}  # noqa: RUF012
+
+    def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
+        return answers["measure"].tables[name]
+
+    def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
+        each, fits = expected(closed), simulated(answers)
+        first = next(iter(each.values()))
+        heads = ["quantity", "value", *(f"error, {name}" for name in each)]
+        counted = None if fits is None else fits.rows()
+        rows = [heads if counted is None else [*heads, "scatter of fits", "95 % intervals hold the truth"]]
+        for q, (name, unit) in enumerate(zip(first.fitted.names, first.fitted.units, strict=True)):
+            unit = unit.replace("erg / (cm2 s)", "erg/cm²/s")
+            row = [f"{name} ({unit})" if unit else name, _number(first.ahead.values[q], 4)]
+            row += [_number(one.ahead.errors[q], 2) for one in each.values()]
+            if counted is not None:
+                row += [_number(counted["scatter"][q], 2), percent(float(counted["coverage_95"][q]))]
+            rows.append(row)
+        return rows
