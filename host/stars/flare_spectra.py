@@ -265,7 +265,7 @@ class EmissionLine:
         except ValueError:
             names = ", ".join((*LINE_GROUPS, *LINES_NM))
             raise InputError(f"line {name!r} is unknown, expected a wavelength in nm or one of {names}") from None
-        return cls(name, (number(f"wavelength of the line {name!r}", nm, "nm", low=100.0, high=1000.0),))
+        return cls(name.strip(), (number(f"wavelength of the line {name!r}", nm, "nm", low=100.0, high=1000.0),))
 
     @property
     def nodes_nm(self) -> Float:

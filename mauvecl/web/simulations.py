@@ -12,7 +12,7 @@ from mauvecl.answers.campaigns.visible import visible
 from mauvecl.answers.detection import maps
 from mauvecl.answers.detection.detect import DetectAnswer, detect
 from mauvecl.answers.limits.limits import limit
-from mauvecl.answers.measurements.measure import measure
+from mauvecl.answers.measurements.measure import MeasureAnswer, measure
 from mauvecl.answers.signal.snr import SnrAnswer, snr
 from mauvecl.answers.stares.inject import InjectAnswer, inject
 from mauvecl.host.orbit.targets import Target
@@ -27,6 +27,8 @@ if TYPE_CHECKING:
 MAP_STEPS, MAP_REALISATIONS = 8, 20_000
 #: Injected flares: numbers of sizes and half-widths, flares of each, and positions.
 INJECTED = {"of": "amplitude", "sizes": 12, "widths": 3, "count": 200, "positions": 4, "fitted": 0}
+#: Largest number of simulated fits.
+MOST_FITS = 10_000
 
 
 def detect_and_snr(study: Study, pool: Pool) -> tuple[DetectAnswer, SnrAnswer]:
@@ -59,6 +61,13 @@ def completeness(study: Study, pool: Pool) -> InjectAnswer:
     return inject(Study.build(data, "page"), pool)
 
 
+def fits(study: Study, pool: Pool) -> MeasureAnswer:
+    """Simulate fits of the flare's spectrum."""
+    data = study.model_dump()
+    data["measure"] |= {"fits": min(study.run.realisations, MOST_FITS)}
+    return measure(Study.build(data, "page"), pool)
+
+
 def campaign_plan(study: Study) -> PlanAnswer:
     """Compute the yield of a campaign on the target, without injections."""
     for name in study.orbit.targets:
@@ -88,10 +97,10 @@ SIMULATIONS: dict[str, Callable[[Study, Pool], dict[str, Any]]] = {
     "detection": _detection,
     "limit": lambda study, pool: {"limit": limit(study, pool)},
     "map": lambda study, pool: {"map": map_around(study, pool)},
-    "measure": lambda study, pool: {"measure": measure(study, pool)},
+    "measure": lambda study, pool: {"measure": fits(study, pool)},
     "completeness": lambda study, pool: {"completeness": completeness(study, pool)},
     "visible": lambda study, pool: _visible(study),
     "plan": lambda study, pool: {"plan": campaign_plan(study)},
 }
 #: Simulations that use the pool's devices.
-DRAWING = {"detection", "limit", "map", "measure"}
+DRAWING = {"detection", "limit", "map"}

@@ -580,7 +580,7 @@ def test_every_table_is_the_same_bytes_on_the_command_line(served: Any, tmp_path
         for tab in TABS.values():
             for name in tab.files:
                 _, table = await talk.file(link=link, tab=tab.name, name=name, ending="ecsv")
-                own = tab.name if tab.name in ("limit", "completeness", "plan") else ""
+                own = tab.name if tab.name in ("limit", "measure", "completeness", "plan") else ""
                 file, study = await talk.file(link=link, tab=own, name=name, ending="study")
                 assert file.endswith(".zip")
                 found[name] = table, study

@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 
     from mauvecl.answers.measurements.expected import ExpectedMeasurement
     from mauvecl.answers.measurements.measure import MeasuredFlare
+    from mauvecl.study.study import Study
     from mauvecl.web.closed_forms import ClosedForms
 
 #: What an observer may not know, by name on the page, as the study's section of nuisances.
@@ -147,6 +148,10 @@ class Measurement(Tab):
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         return answers["measure"].tables[name]
+
+    def study(self, name: str, closed: ClosedForms, answers: Answers) -> Study:
+        study: Study = answers["measure"].study
+        return study
 
     def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
         each, fits = expected(closed), simulated(answers)
