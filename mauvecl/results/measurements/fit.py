@@ -11,8 +11,8 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.results.measurements.model import FlareModel, derived_values
-from mauvecl.results.measurements.profile import Profile, covariance, covariance_at, intervals
-from mauvecl.results.measurements.reduction import Reduction
+from mauvecl.results.measurements.profile import Profile, covariance, covariance_of, intervals
+from mauvecl.results.measurements.reduction import Reduction, check_distinct, usable_variance
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.nuisances import Nuisances
@@ -363,10 +363,15 @@ def forecast(
         If the flare is not of the model, or is degenerate with the unknowns.
     """
     counts = model.counts(temperature_k, amplitudes)
-    reduction = Reduction.of(model, expectation, counts, nuisances)
     log_k, linear = np.array([np.log(temperature_k)]), np.asarray(amplitudes, np.float64)[None]
-    hot, slope = reduction.spline(log_k), reduction.spline(log_k, 1)
-    spread = covariance_at(model, log_k, linear, hot, slope, reduction.fixed)[0]
-    signal = linear[:, :1] * hot + linear[:, 1:] @ reduction.fixed
+    variance, used = usable_variance(expectation, counts)
+    slope = linear[0, 0] * model.hot_spline(log_k[0], 1)
+    rows = np.vstack([model.hot_spline(log_k[0]), model.fixed, slope, counts]) * used
+    plain = np.divide(rows, variance, out=np.zeros_like(rows), where=used) @ rows.T
+    lost = nuisances.rows(variance, nuisances.spectra * used) @ rows.T if nuisances else np.zeros((0, len(rows)))
+    information = plain - lost.T @ lost
+    check_distinct(np.diag(information)[:-2], np.diag(plain)[:-2], nuisances)
+    spread = covariance_of(model, log_k, linear, information[None, :-1, :-1])[0]
     values = derived_values(model, log_k, linear)[0]
-    return Forecast(model.names, model.units, values, np.sqrt(np.diag(spread)), spread, float(np.linalg.norm(signal)))
+    snr = float(np.sqrt(max(information[-1, -1], 0.0)))
+    return Forecast(model.names, model.units, values, np.sqrt(np.diag(spread)), spread, snr)

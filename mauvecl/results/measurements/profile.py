@@ -279,18 +279,20 @@ def covariance(model: FlareModel, profile: Profile, best: Best) -> Float:
     """Return the covariance of quantities from the Fisher information at the fit, (n, n_derived, n_derived)."""
     hot = profile.hot(best.log_k)
     slope = profile.reduction.spline(best.log_k, 1)
-    return covariance_at(model, best.log_k, best.linear, hot, slope, profile.reduction.fixed)
-
-
-def covariance_at(model: FlareModel, log_k: Float, linear: Float, hot: Float, slope: Float, fixed: Float) -> Float:
-    """Return the covariance of quantities, (n, n_derived, n_derived), from whitened sums and their derivative.
-
-    NaN where a flare adds no light, or its temperature and amplitudes are degenerate.
-    """
-    n, m = linear.shape
+    n, m = best.linear.shape
     jacobian = np.zeros((n, m + 1, hot.shape[1]))
-    jacobian[:, 0], jacobian[:, 1:m], jacobian[:, m] = hot, fixed, linear[:, :1] * slope
-    information = np.einsum("nik,njk->nij", jacobian, jacobian)
+    jacobian[:, 0], jacobian[:, 1:m] = hot, profile.reduction.fixed
+    jacobian[:, m] = best.linear[:, :1] * slope
+    return covariance_of(model, best.log_k, best.linear, np.einsum("nik,njk->nij", jacobian, jacobian))
+
+
+def covariance_of(model: FlareModel, log_k: Float, linear: Float, information: Float) -> Float:
+    """Return the covariance of quantities, (n, n_derived, n_derived), from the information on the parameters.
+
+    The parameters are the amplitudes and the log temperature. NaN where a flare adds no light, or its temperature and
+    amplitudes are degenerate.
+    """
+    m = linear.shape[1]
     scale = np.sqrt(np.einsum("nii->ni", information))
     good = (scale > 0.0).all(axis=1)
     scale[~good] = 1.0

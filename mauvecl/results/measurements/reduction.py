@@ -90,12 +90,7 @@ class Reduction:
         InputError
             If every pixel saturates, or the flare is degenerate with the unknowns.
         """
-        variance, used = variance_of(quiet, added_dn)
-        if left_out is not None:
-            used = used & ~left_out
-            variance = np.where(used, variance, 0.0)
-        if not used.any():
-            raise InputError(f"every pixel of {quiet.name} saturates or is left out, expected some that count")
+        variance, used = usable_variance(quiet, added_dn, left_out)
         inverse = np.divide(1.0, variance, out=np.zeros_like(variance), where=used)
         rows = nuisances.rows(variance, nuisances.spectra * used) if nuisances else np.zeros((0, variance.size))
         spanning = np.vstack([model.hot[::EVERY], model.fixed]) * used
@@ -103,9 +98,7 @@ class Reduction:
         optimal = plain - (spanning @ rows.T) @ rows
         gram = optimal @ spanning.T
         power = np.diag(gram)
-        if not (power > LEAST_KEPT * np.einsum("tp,tp->t", plain, spanning)).all():
-            unknown = join_names(nuisances.names) if nuisances else "nothing"
-            raise InputError(f"the light of a flare cannot be told from {unknown}, expected fewer unknowns")
+        check_distinct(power, np.einsum("tp,tp->t", plain, spanning), nuisances)
         length = np.sqrt(power)
         values, vectors = np.linalg.eigh(gram / np.outer(length, length))
         kept = values > LEAST * values[-1]
@@ -161,3 +154,22 @@ def variance_of(quiet: Expectation, added_dn: Float | None = None) -> tuple[Floa
     raw = light / quiet.n_frames + quiet.dark_dn + quiet.bias_dn
     used = raw + NEAR_SIGMA * np.sqrt(variance / quiet.n_frames) < quiet.ceiling_dn
     return np.where(used, variance, 0.0), used
+
+
+def usable_variance(
+    quiet: Expectation, added_dn: Float | None = None, left_out: NDArray[np.bool_] | None = None
+) -> tuple[Float, NDArray[np.bool_]]:
+    """Return `variance_of` with some pixels left out; raises InputError if none is left."""
+    variance, used = variance_of(quiet, added_dn)
+    if left_out is not None:
+        used = used & ~left_out
+    if not used.any():
+        raise InputError(f"every pixel of {quiet.name} saturates or is left out, expected some that count")
+    return np.where(used, variance, 0.0), used
+
+
+def check_distinct(kept: Float, whole: Float, nuisances: Nuisances | None) -> None:
+    """Raise InputError if marginalisation over nuisances leaves nothing of the S/N^2 of some light."""
+    if not (kept > LEAST_KEPT * whole).all():
+        unknown = join_names(nuisances.names) if nuisances else "nothing"
+        raise InputError(f"the light of a flare cannot be told from {unknown}, expected fewer unknowns")

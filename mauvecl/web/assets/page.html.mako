@@ -152,7 +152,7 @@ ${control(name)}
 <h3>${picture.title}</h3>
 <ul class="legend" aria-label="Colours of ${picture.title}"></ul>
 <div class="plot" id="plot-${picture.name}" role="img" aria-labelledby="text-${picture.name}"></div>
-<figcaption><p id="text-${picture.name}"></p>
+<figcaption><p id="text-${picture.name}">Not drawn yet.</p>
 <div class="tools">
 % for axis in picture.logs:
 <label><input type="checkbox" data-log="${axis.lower()}"${" checked" if axis.isupper() else ""}> log ${axis.lower()}</label>
