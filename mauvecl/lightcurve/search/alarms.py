@@ -25,13 +25,13 @@ from mauvecl.lightcurve.search.blends import (
     Block,
     Factor,
     Interval,
+    SearchedStare,
     StareSums,
 )
 from mauvecl.lightcurve.search.flare_fit import FittedFlares
 
 if TYPE_CHECKING:
     from mauvecl.lightcurve.search.search import Row
-    from mauvecl.lightcurve.search.survey import Survey
     from mauvecl.lightcurve.search.templates import Templates
 
 Float = NDArray[np.float64]
@@ -90,13 +90,13 @@ class Candidate:
 
 
 def alarms(
-    survey: Survey, templates: Templates, sums: NDArray[Any], threshold: float, energy: Factor | None = None
+    survey: SearchedStare, templates: Templates, sums: NDArray[Any], threshold: float, energy: Factor | None = None
 ) -> list[Alarm]:
     """Detect and fit all flares of a stare, largest statistic first.
 
     Parameters
     ----------
-    survey : Survey
+    survey : Survey or other SearchedStare
     templates : Templates
         Templates from which the survey's bank and components are made.
     sums : ndarray, shape (n_frame, n_sum)

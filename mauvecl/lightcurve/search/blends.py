@@ -7,10 +7,10 @@ of flares outside the block is subtracted. The noise of a frame includes the pho
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import scipy
@@ -19,8 +19,10 @@ from numpy.typing import NDArray
 from mauvecl.lightcurve.search.flare_fit import Fit
 
 if TYPE_CHECKING:
-    from mauvecl.lightcurve.search.survey import Survey
+    from mauvecl.lightcurve.search.bank import Bank
+    from mauvecl.lightcurve.search.search import Search
     from mauvecl.lightcurve.search.templates import Templates
+    from mauvecl.lightcurve.stares.stare import Stare
 
 Float = NDArray[np.float64]
 
@@ -71,11 +73,41 @@ class Interval:
     open_high: bool = False
 
 
+class SearchedStare(Protocol):
+    """What fits need of a stare and its search, simulated (`survey.Survey`) or observed."""
+
+    @property
+    def stare(self) -> Stare:
+        """Times of the frames."""
+
+    @property
+    def bank(self) -> Bank:
+        """Template bank of the search."""
+
+    @property
+    def search(self) -> Search:
+        """Search of the frames."""
+
+    @property
+    def curves(self) -> Float | None:
+        """Baseline curves with unknown amplitudes, shape (n_curve, n_frame)."""
+
+    @property
+    def directions(self) -> Mapping[Any, Float]:
+        """Derivatives of the mean sums by what changes, shape (n_frame, n_sum) each."""
+
+    def covariance(self) -> Float:
+        """Return the covariance of each frame's sums without a flare, shape (n_frame, n_sum, n_sum)."""
+
+    def net(self, sums: NDArray[Any]) -> NDArray[np.float32]:
+        """Return sums less their known mean, shape (n_stare, n_frame, n_sum)."""
+
+
 @dataclass(frozen=True, eq=False)
 class StareSums:
     """The sums of a stare to which flares are fitted."""
 
-    survey: Survey
+    survey: SearchedStare
     templates: Templates
     net: Float  # sums less their known means, shape (n_frame, n_sum)
 

@@ -1,0 +1,1 @@
+"""Observed frames: reading, quality, noise as measured, and the flares in them."""

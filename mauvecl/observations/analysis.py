@@ -1,0 +1,151 @@
+"""Analysis of observed frames: level, noise, false alarms, events, and what is excluded."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.lightcurve.defaults import Per, per_day
+from mauvecl.lightcurve.flares.shapes import shape_of
+from mauvecl.lightcurve.search.importance_sampling import SampledRate
+from mauvecl.observations.completeness import Completeness, inject
+from mauvecl.observations.events import Event, detect_events, measure_event
+from mauvecl.observations.frames import DAY_S, Frames
+from mauvecl.observations.level import Level, quiescent_level
+from mauvecl.observations.noise import Scatter, binned_scatter
+from mauvecl.observations.search import MeasuredRate, SeriesSurvey
+from mauvecl.schema.errors import InputError
+
+Float = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Analysis:
+    """Analysis of the frames of one star.
+
+    Attributes
+    ----------
+    frames : Frames
+    flux, error : ndarray, shape (n_frame,)
+        The light curve that was searched; of spectra, the sum over wavelength.
+    level : Level
+    survey : SeriesSurvey
+    wanted : float
+        Wanted false alarms per star-day.
+    normal : SampledRate
+        False-alarm rate in normal noise of the measured variance.
+    measured : MeasuredRate
+        False-alarm rate in noise resampled from quiescent frames.
+    threshold : float
+        The higher of the thresholds of both.
+    events : list of Event
+        Events above the threshold, in order of time.
+    completeness : Completeness
+        Share of flares that the search detects in these frames.
+    scatter : list of Scatter
+    """
+
+    frames: Frames
+    flux: Float
+    error: Float | None
+    level: Level
+    survey: SeriesSurvey
+    wanted: float
+    normal: SampledRate
+    measured: MeasuredRate
+    threshold: float
+    events: list[Event]
+    completeness: Completeness
+    scatter: list[Scatter]
+
+    @cached_property
+    def days(self) -> float:
+        """Star-days of the searched frames."""
+        return self.survey.stare.observed_s / DAY_S
+
+    def false_alarms(self, event: Event) -> tuple[float, float]:
+        """Return the false alarms per star-day at an event's statistic: in normal noise, and in noise as measured."""
+        try:
+            normal = self.normal.rate(event.value).value
+        except InputError:
+            # Beyond the largest sampled threshold the rate is smaller than there.
+            normal = self.normal.rate(float(self.normal.thresholds[-1])).value
+        return normal, self.measured.rate(event.value)
+
+    @property
+    def messages(self) -> list[str]:
+        """Statements about the data that a reader must know, the most important first."""
+        lines = list(self.frames.remarks)
+        reasons = self.level.reasons
+        if (reasons != 0).any():
+            lines.append(f"{np.count_nonzero(reasons)} of {reasons.size} frames are not searched; the table of frames "
+                         "states the reason of each.")  # fmt: skip
+        if self.level.excess > 1.2:
+            lines.append(f"The scatter of quiescent frames is {self.level.excess:.2f} times the stated errors; the "
+                         "measured scatter is used.")  # fmt: skip
+        red = next((one for one in self.scatter if one.red), None)
+        if red is not None:
+            lines.append(
+                f"Quiescent frames are correlated: means of {red.frames} frames scatter {red.measured / red.white:.2f} "
+                "times as much as independent frames."
+            )
+        if self.wanted < self.measured.smallest:
+            lines.append(
+                f"The noise as measured shows rates down to {self.measured.smallest:.2g} false alarms per star-day; "
+                "its threshold for fewer is extrapolated with the tail of normal noise."
+            )
+        return lines
+
+
+def analyse_frames(
+    frames: Frames, *, false_alarms: float = 1.0, per: Per = "day", shape: str = "davenport2014", seed: int = 1
+) -> Analysis:
+    """Find the flares in observed frames.
+
+    Parameters
+    ----------
+    frames : Frames
+    false_alarms : float
+        Wanted false alarms in a star-time of frames.
+    per : {"day", "month", "year"}
+    shape : str
+        Shape of the templates; see `SHAPES`.
+    seed : int
+        Seed of the resampled noise and of injections.
+    """
+    wanted = per_day(false_alarms, per)
+    flux, error = white_light(frames)
+    level = quiescent_level(frames, flux, error)
+    survey = SeriesSurvey.of(frames, flux, error, level, shape_of(shape))
+    normal = survey.normal_rate(seed)
+    first = normal.threshold(wanted).value
+    # Real flares are no noise: what exceeds the threshold of normal noise is left out of the resampled light curves.
+    _, taken = detect_events(survey, first)
+    measured = survey.measured_rate(level.quiet[level.used] & ~taken, wanted, seed)
+    threshold = max(first, measured.threshold(wanted))
+    detected, taken = detect_events(survey, threshold)
+    events = [measure_event(survey, taken, threshold, one) for one in detected]
+    quiet = level.quiet[level.used] & ~taken
+    residual = survey.sums[:, 0] / np.sqrt(survey.variance)
+    return Analysis(
+        frames, flux, error, level, survey, wanted, normal, measured, threshold, events,
+        inject(survey, ~taken, threshold, seed),
+        binned_scatter(survey.stare.numbers[quiet], residual[quiet]),
+    )  # fmt: skip
+
+
+def white_light(frames: Frames) -> tuple[Float, Float | None]:
+    """Return the light curve of frames: of spectra, the sum over wavelength without pixels that are not finite."""
+    if frames.flux.ndim == 1:
+        return frames.flux, frames.error
+    fine = np.isfinite(frames.flux).all(axis=0)
+    if frames.error is not None:
+        fine &= np.isfinite(frames.error).all(axis=0)
+    if not fine.any():
+        raise InputError(f"{frames.name}: no pixel is finite in every frame", "pixels with light in every frame",
+                         key="flux")  # fmt: skip
+    error = None if frames.error is None else np.sqrt((frames.error[:, fine] ** 2).sum(axis=1))
+    return frames.flux[:, fine].sum(axis=1), error

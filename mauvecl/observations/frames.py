@@ -1,0 +1,210 @@
+"""Frames of one star as they were observed: a light curve, or a sequence of spectra."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from enum import IntFlag
+from functools import cached_property
+from typing import Any, Self
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from mauvecl.schema.errors import InputError
+
+Float = NDArray[np.float64]
+
+#: Smallest number of frames from which level and noise can be estimated.
+MIN_FRAMES = 20
+#: Largest number of frames, for which a search needs some 2 GiB.
+MAX_FRAMES = 2**22
+#: Shortest time between frames as a share of the cadence; frames that are closer overlap.
+MIN_STEP = 0.5
+DAY_S = 86_400.0
+
+
+class Reason(IntFlag):
+    """Why a frame is not searched, as bits of a quality flag."""
+
+    QUALITY = 1  #: the file's own quality flag is not zero
+    NOT_FINITE = 2  #: flux or error is not a finite number, or the error is not positive
+    BELOW = 4  #: far below the quiescent level, where no flare can be
+    SPIKE = 8  #: a single frame far above both of its neighbours, such as a cosmic ray
+    SATURATED = 16  #: a pixel reaches saturation
+
+    @classmethod
+    def words(cls, value: int) -> str:
+        """Return the reasons in words."""
+        return ", ".join(str(one.name).lower().replace("_", " ") for one in cls if value & one)
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """Observed frames of one star.
+
+    Attributes
+    ----------
+    time_s : ndarray, shape (n_frame,)
+        Middle of each frame, in seconds from `reference_mjd`; ascending.
+    exposure_s : ndarray, shape (n_frame,)
+        Exposure time of each frame.
+    flux : ndarray, shape (n_frame,) or (n_frame, n_pixel)
+        Light in `unit`.
+    error : ndarray of the same shape, or None
+        Standard deviation of each value.
+    quality : ndarray, shape (n_frame,)
+        Zero for frames without a known fault.
+    wavelength_nm : ndarray, shape (n_pixel,), or None
+    temperature_c : ndarray, shape (n_frame,), or None
+        Temperature of the detector.
+    unit : str
+        Unit of the flux, in astropy's notation; empty if it is relative or unknown.
+    reference_mjd : float or None
+        Modified Julian date of time zero; None if the times have no date.
+    scale : str
+        Time scale of the dates, such as "utc" or "tdb"; empty if unknown.
+    position : str
+        Where the times are measured, as FITS TREFPOS has it, such as "TOPOCENTER" or "BARYCENTER"; empty if unknown.
+    name : str
+        Name of the star or the file.
+    remarks : tuple of str
+        What was done while reading, such as sorting.
+    """
+
+    time_s: Float
+    exposure_s: Float
+    flux: Float
+    error: Float | None = None
+    quality: NDArray[np.int64] | None = None
+    wavelength_nm: Float | None = None
+    temperature_c: Float | None = None
+    unit: str = ""
+    reference_mjd: float | None = None
+    scale: str = ""
+    position: str = ""
+    name: str = "frames"
+    remarks: tuple[str, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        time_s: ArrayLike,
+        flux: ArrayLike,
+        error: ArrayLike | None = None,
+        *,
+        exposure_s: ArrayLike | None = None,
+        quality: ArrayLike | None = None,
+        name: str = "frames",
+        **how: Any,
+    ) -> Self:
+        """Build frames from arrays in any order of time.
+
+        Parameters
+        ----------
+        time_s : array_like, shape (n_frame,)
+            Middle of each frame.
+        flux, error : array_like, shape (n_frame,) or (n_frame, n_pixel)
+        exposure_s : array_like, optional
+            One exposure time, or one for each frame; by default the median time between frames.
+        quality : array_like, shape (n_frame,), optional
+        name : str
+        **how
+            Other attributes.
+        """
+        time = np.asarray(time_s, np.float64)
+        light = np.asarray(flux, np.float64)
+        n = time.size
+        if time.ndim != 1 or light.ndim not in (1, 2) or len(light) != n:
+            raise _bad(name, "shape", (time.shape, light.shape), "times of shape (n,), flux of (n,) or (n, n_pixel)")
+        if not MIN_FRAMES <= n <= MAX_FRAMES:
+            raise _bad(name, "frames", n, f"{MIN_FRAMES} to {MAX_FRAMES} frames")
+        if not np.isfinite(time).all():
+            raise _bad(name, "time", f"{time[~np.isfinite(time)][0]} in row {int(np.argmin(np.isfinite(time)))}",
+                       "finite times")  # fmt: skip
+        sd = None if error is None else np.asarray(error, np.float64)
+        if sd is not None and sd.shape != light.shape:
+            raise _bad(name, "error", sd.shape, f"the shape of the flux, {light.shape}")
+        flags = np.zeros(n, np.int64) if quality is None else np.asarray(quality, np.int64)
+        if flags.shape != (n,):
+            raise _bad(name, "quality", flags.shape, f"({n},)")
+        exposure = None if exposure_s is None else np.array(np.broadcast_to(np.asarray(exposure_s, np.float64), (n,)))
+        order = np.argsort(time, kind="stable")
+        remarks: tuple[str, ...] = ()
+        if (np.diff(time) < 0).any():
+            remarks = (f"the times of {name} are not ascending; its frames were sorted by time",)
+        step = np.diff(time[order])
+        cadence = float(np.median(step))
+        if not cadence > 0 or (step < MIN_STEP * cadence).any():
+            row = int(np.argmin(step))
+            raise _bad(name, "time", f"steps of {step[row]:g} s", f"frames that are at least {MIN_STEP:g} cadences "
+                       f"({MIN_STEP * cadence:g} s) apart")  # fmt: skip
+        if exposure is None:
+            exposure = np.full(n, cadence)
+        if not (np.isfinite(exposure) & (exposure > 0)).all():
+            raise _bad(name, "exposure", f"{exposure[np.argmin(exposure)]:g} s", "exposure times above 0")
+        for key in ("temperature_c",):
+            if how.get(key) is not None:
+                how[key] = np.asarray(how[key], np.float64)[order]
+        made = cls(
+            time[order], exposure[order], light[order], None if sd is None else sd[order], flags[order],
+            name=name, remarks=remarks, **how,
+        )  # fmt: skip
+        wavelength = made.wavelength_nm
+        if (wavelength is None) != (light.ndim == 1) or (wavelength is not None and wavelength.size != light.shape[1]):
+            raise _bad(name, "wavelength", None if wavelength is None else wavelength.shape,
+                       "one wavelength for each pixel of spectra, none for a light curve")  # fmt: skip
+        return made
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames."""
+        return self.time_s.size
+
+    @cached_property
+    def cadence_s(self) -> float:
+        """Median time between frames."""
+        return float(np.median(np.diff(self.time_s)))
+
+    @cached_property
+    def numbers(self) -> NDArray[np.int64]:
+        """Number of each frame on a regular grid of the cadence, with gaps, shape (n_frame,).
+
+        Steps are rounded one by one, so that slowly changing times such as barycentric ones stay on the grid.
+        """
+        steps = np.maximum(1, np.rint(np.diff(self.time_s) / self.cadence_s)).astype(np.int64)
+        return np.concatenate([[0], np.cumsum(steps)])
+
+    @cached_property
+    def faults(self) -> NDArray[np.int64]:
+        """Reasons that the file itself gives not to search a frame, shape (n_frame,); see `Reason`."""
+        values = self.flux.reshape(self.n_frames, -1)
+        finite = np.isfinite(values).all(axis=1)
+        if self.error is not None:
+            errors = self.error.reshape(self.n_frames, -1)
+            finite &= (np.isfinite(errors) & (errors > 0)).all(axis=1)
+        flagged = np.zeros(self.n_frames, np.bool_) if self.quality is None else self.quality != 0
+        return np.asarray(np.where(flagged, Reason.QUALITY, 0) | np.where(finite, 0, Reason.NOT_FINITE), np.int64)
+
+    def shifted(self, by_s: Float) -> Self:
+        """Return the frames with other times."""
+        return replace(self, time_s=self.time_s + by_s)
+
+    def with_remarks(self, remarks: tuple[str, ...]) -> Self:
+        """Return the frames with additional remarks."""
+        return replace(self, remarks=(*self.remarks, *remarks))
+
+    def date(self, time_s: float) -> str:
+        """Return a time as an ISO 8601 date, or as seconds if the times have no date."""
+        if self.reference_mjd is None:
+            return f"{time_s:.1f} s"
+        from astropy.time import Time
+
+        known = {"utc", "tdb", "tai", "tt"}
+        when = Time(
+            self.reference_mjd, time_s / DAY_S, format="mjd", scale=self.scale if self.scale in known else "tdb"
+        )
+        return str(when.isot)
+
+
+def _bad(name: str, key: str, value: Any, expected: str) -> InputError:
+    return InputError.of(key, value, expected, where=name)

@@ -1,0 +1,76 @@
+"""Noise of observed frames as measured, against what the file states."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+Float = NDArray[np.float64]
+
+#: Numbers of frames per bin at which the scatter is measured.
+BINS = (1, 2, 4, 8, 16, 32, 64, 128)
+#: Smallest number of bins.
+MIN_BINS = 8
+
+
+@dataclass(frozen=True)
+class Scatter:
+    """Scatter of means of several consecutive quiescent frames.
+
+    Attributes
+    ----------
+    frames : int
+        Number of frames in a mean.
+    count : int
+        Number of means.
+    measured : float
+        Their standard deviation, in units of the noise of one frame.
+    white : float
+        The same for independent frames: one over the root of `frames`.
+    low, high : float
+        Range of `measured` in 95 % of light curves of independent, normal frames.
+    """
+
+    frames: int
+    count: int
+    measured: float
+    white: float
+    low: float
+    high: float
+
+    @property
+    def red(self) -> bool:
+        """True if the frames are correlated on this time scale."""
+        return self.measured > self.high
+
+
+def binned_scatter(numbers: NDArray[np.int64], residual: Float) -> list[Scatter]:
+    """Measure the scatter of means of consecutive frames without gaps.
+
+    Parameters
+    ----------
+    numbers : ndarray, shape (n_frame,)
+        Numbers of the frames on their regular grid.
+    residual : ndarray, shape (n_frame,)
+        Flux of quiescent frames less their level, in units of the noise of one frame.
+    """
+    found = []
+    for size in BINS:
+        starts = np.arange(0, numbers.size - size + 1)
+        whole = starts[numbers[starts + size - 1] - numbers[starts] == size - 1]
+        # Bins do not overlap.
+        kept, free = [], -1
+        for start in whole:
+            if start > free:
+                kept.append(int(start))
+                free = int(start) + size - 1
+        if len(kept) < MIN_BINS:
+            break
+        means = residual[np.array(kept)[:, None] + np.arange(size)].mean(axis=1)
+        dof = len(kept) - 1
+        low, high = (float(np.sqrt(scipy.stats.chi2.ppf(p, dof) / dof / size)) for p in (0.025, 0.975))
+        found.append(Scatter(size, len(kept), float(means.std(ddof=1)), size**-0.5, low, high))
+    return found

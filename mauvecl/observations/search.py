@@ -1,0 +1,260 @@
+"""Search of an observed light curve for flares, with the false-alarm rate of its measured noise."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mauvecl.lightcurve.search.bank import Bank, Level
+from mauvecl.lightcurve.search.counted_rate import DAY_S
+from mauvecl.lightcurve.search.importance_sampling import SampledRate, sample_rate
+from mauvecl.lightcurve.search.search import Search
+from mauvecl.lightcurve.search.templates import Templates
+from mauvecl.lightcurve.stares.stare import Stare
+
+if TYPE_CHECKING:
+    from mauvecl.lightcurve.flares.shapes import Shape
+    from mauvecl.observations.frames import Frames
+    from mauvecl.observations.level import Level as QuiescentLevel
+
+Float = NDArray[np.float64]
+
+#: Step between half-widths of a bank: the same as that of `lightcurve.defaults.HALF_WIDTHS_S`.
+WIDTH_STEP = 1.86
+#: Narrowest template in frames, and widest as a share of the light curve's length and in seconds.
+NARROWEST, WIDEST, WIDEST_S = 1.5, 0.15, 7200.0
+#: Smallest baseline window, in cadences and seconds.
+WINDOW_FRAMES, WINDOW_S = 120, 1800.0
+#: Number of alarms in resampled light curves from which a rate is estimated, and the largest number of those.
+MIN_ALARMS, MAX_RESAMPLED = 30, 20_000
+#: Largest number of values in all resampled light curves.
+MAX_VALUES = 2**26
+#: Temperature that stands for flares in a light curve without colour, K.
+NO_COLOUR_K = 10_000.0
+#: Smallest number of quiescent frames of a window whose residuals are resampled.
+MIN_WINDOW = 10
+#: Second half of the generator's key, which makes the draws independent of others.
+RESAMPLING_KEY = 0x72657361
+
+
+@dataclass(frozen=True, eq=False)
+class MeasuredRate:
+    """False-alarm rate in light curves made of the measured residuals.
+
+    Attributes
+    ----------
+    largest : ndarray, shape (n,)
+        Largest statistic of each resampled light curve, ascending.
+    days : float
+        Star-days of each.
+    """
+
+    largest: Float
+    days: float
+
+    def rate(self, threshold: float) -> float:
+        """Return the false alarms per star-day above a threshold; beyond the largest value, three over the time."""
+        above = int(np.count_nonzero(self.largest > threshold))
+        total = self.largest.size * self.days
+        if above == self.largest.size:
+            return float("inf")
+        return 3.0 / total if above == 0 else -float(np.log1p(-above / self.largest.size)) / self.days
+
+    @property
+    def smallest(self) -> float:
+        """Smallest rate that the resampled light curves can show."""
+        return MIN_ALARMS / (self.largest.size * self.days)
+
+    def threshold(self, rate: float) -> float:
+        """Return the threshold for a number of false alarms per star-day.
+
+        Rates below `smallest` use the threshold of `smallest`, raised as normal noise would be.
+        """
+        from scipy.optimize import brentq
+        from scipy.special import log_ndtr
+
+        reached = max(rate, self.smallest)
+        share = -np.expm1(-reached * self.days)
+        value = float(np.quantile(self.largest, 1 - share))
+        if rate >= self.smallest:
+            return value
+        # The tail beyond the resampled light curves is extrapolated with the shape of a normal one.
+        fall = float(np.log(rate / reached))
+        return float(brentq(lambda u: log_ndtr(-u) - log_ndtr(-value) - fall, value, value + 40.0))
+
+
+@dataclass(frozen=True, eq=False)
+class SeriesSurvey:
+    """An observed light curve as `lightcurve.search` sees a stare: sums in units of the quiescent noise.
+
+    Attributes
+    ----------
+    stare : Stare
+        Times of the searched frames.
+    bank : Bank
+    sums : ndarray, shape (n_frame, 1)
+        Flux less the quiescent level, over `scale`.
+    variance : ndarray, shape (n_frame,)
+        Variance of the quiescent sums.
+    scale : float
+        Typical standard deviation of a frame, in the unit of the flux.
+    level : float
+        Typical quiescent level, in the unit of the flux, to which amplitudes are relative.
+    photon : float
+        Rise of the variance with the flux, in the unit of the flux.
+    time_s : ndarray, shape (n_frame,)
+        Times of the frames as observed, against those of the stare's regular grid.
+    """
+
+    stare: Stare
+    bank: Bank
+    sums: Float
+    variance: Float
+    scale: float
+    level: float
+    photon: float
+    time_s: Float
+    curves: None = None
+
+    @classmethod
+    def of(cls, frames: Frames, flux: Float, error: Float | None, level: QuiescentLevel, shape: Shape) -> SeriesSurvey:
+        """Prepare the frames of a light curve that can be searched."""
+        used = level.used
+        numbers = frames.numbers[used]
+        n, cadence = int(used.sum()), frames.cadence_s
+        start = (numbers - numbers[0]) * cadence
+        ones = np.ones(n)
+        stare = Stare(start, cadence, ones, ones, ones, np.zeros(n))
+        bank = Bank(half_widths(stare), np.ones((1, 1)), shape, cadence,
+                    Level(window_s=max(WINDOW_S, WINDOW_FRAMES * cadence)))  # fmt: skip
+        scale = float(np.median(level.error[used]))
+        sums = ((flux - level.level)[used] / scale)[:, None]
+        return cls(
+            stare, bank, sums, (level.error[used] / scale) ** 2, scale, abs(float(np.median(level.level[used]))),
+            _photon_noise(flux[used], None if error is None else error[used] * np.nan_to_num(level.excess, nan=1.0)),
+            frames.time_s[used],
+        )  # fmt: skip
+
+    @cached_property
+    def search(self) -> Search:
+        """Search of the light curve."""
+        return Search(self.bank, self.stare, None, self.variance)
+
+    @property
+    def directions(self) -> dict[Any, Float]:
+        """Derivatives of the mean sums by what jitters: nothing, for the scatter is measured."""
+        return {"light": np.zeros_like(self.sums)}
+
+    def covariance(self) -> Float:
+        """Return the covariance of each frame's sums without a flare, shape (n_frame, 1, 1)."""
+        return self.variance[:, None, None].copy()
+
+    def net(self, sums: NDArray[Any]) -> NDArray[np.float32]:
+        """Return the sums, whose level is already subtracted."""
+        return np.asarray(sums, np.float32)
+
+    @property
+    def templates(self) -> Templates:
+        """Effect of a flare of unit amplitude on the sums: its flux is once the quiescent level."""
+        size = self.level / self.scale
+        noise = self.photon * self.level / self.scale**2
+        return Templates(
+            (NO_COLOUR_K,), np.ones((1, 1)), np.full((1, 1), size), np.array([size]), np.full((1, 1, 1), noise)
+        )
+
+    def frames(self, kept: NDArray[np.bool_]) -> SeriesSurvey:
+        """Return the survey of some of the frames."""
+        stare = self.stare
+        names = ("start_s", "star", "light", "sky", "temperature_c")
+        part = replace(stare, **{name: getattr(stare, name)[kept] for name in names})
+        return replace(self, stare=part, sums=self.sums[kept], variance=self.variance[kept], time_s=self.time_s[kept])
+
+    def normal_rate(self, seed: int) -> SampledRate:
+        """Return the false-alarm rate in normal noise of the measured variance."""
+        return sample_rate(self.search, seed=seed)
+
+    def measured_rate(self, quiet: NDArray[np.bool_], rate: float, seed: int) -> MeasuredRate:
+        """Return the false-alarm rate in light curves resampled from quiescent residuals.
+
+        Blocks of consecutive residuals are drawn with replacement, so that their distribution and short correlations
+        are those of the data (Kuensch 1989, doi 10.1214/aos/1176347265). Beyond the block, correlations are lost.
+
+        Parameters
+        ----------
+        quiet : ndarray of bool, shape (n_frame,)
+            Searched frames of the quiescent star.
+        rate : float
+            Wanted false alarms per star-day: enough light curves are drawn for `MIN_ALARMS`, up to a limit.
+        seed : int
+        """
+        days = self.stare.observed_s / DAY_S
+        n = self.stare.n_frames
+        residual = self._residual(quiet)
+        count = int(np.clip(MIN_ALARMS / (rate * days), 200, min(MAX_RESAMPLED, max(200, MAX_VALUES // n))))
+        rng = np.random.Generator(np.random.Philox(key=[seed % 2**64, RESAMPLING_KEY]))
+        length = block_length(residual)
+        largest = []
+        # Few at once, so that memory stays flat.
+        batch = max(1, 2**22 // n)
+        for first in range(0, count, batch):
+            size = min(batch, count - first)
+            starts = rng.integers(0, residual.size, (size, -(-n // length)))
+            rows = (starts[:, :, None] + np.arange(length)) % residual.size
+            drawn = residual[rows.reshape(size, -1)[:, :n]] * np.sqrt(self.variance)
+            largest.append(self.search.largest(drawn[:, :, None].astype(np.float32)).maximum)
+        return MeasuredRate(np.sort(np.concatenate(largest)).astype(np.float64), days)
+
+    def _residual(self, quiet: NDArray[np.bool_]) -> Float:
+        """Return the residuals of quiescent frames from a straight line in each window, in standard deviations."""
+        y = self.sums[:, 0] / np.sqrt(self.variance)
+        windows = (self.stare.start_s // self.bank.level.window_s).astype(np.int64)
+        residual = []
+        for window in np.unique(windows[quiet]):
+            here = quiet & (windows == window)
+            time = self.stare.start_s[here]
+            if here.sum() >= MIN_WINDOW:
+                residual.append(y[here] - np.polyval(np.polyfit(time - time.mean(), y[here], 1), time - time.mean()))
+        every = np.concatenate(residual) if residual else y[quiet]
+        return np.asarray(every)
+
+    def observed_time(self, stare_s: float) -> float:
+        """Return the observed time of a time of the stare's grid, s."""
+        return (
+            float(np.interp(stare_s, self.stare.middle_s, self.time_s, left=np.nan, right=np.nan))
+            if (self.stare.middle_s[0] <= stare_s <= self.stare.middle_s[-1])
+            else float(self.time_s[0] + stare_s - self.stare.middle_s[0])
+        )
+
+
+def half_widths(stare: Stare) -> tuple[float, ...]:
+    """Return the half-widths of a bank for a light curve, s."""
+    low = NARROWEST * stare.frame_s
+    high = max(low, min(WIDEST * stare.duration_s, WIDEST_S))
+    steps = max(1, round(np.log(high / low) / np.log(WIDTH_STEP)) + 1)
+    return tuple(float(w) for w in low * WIDTH_STEP ** np.arange(steps))
+
+
+def block_length(residual: Float) -> int:
+    """Return the number of consecutive residuals to draw together: beyond the first insignificant correlation."""
+    n = residual.size
+    centred = residual - residual.mean()
+    power = float(centred @ centred)
+    limit = 2.0 / np.sqrt(n)
+    for lag in range(1, n // 4):
+        if float(centred[:-lag] @ centred[lag:]) / power < limit:
+            # A block of the optimal order for a correlation of this length.
+            return max(lag, round(n ** (1 / 3))) if lag > 1 else 1
+    return max(1, n // 4)
+
+
+def _photon_noise(flux: Float, error: Float | None) -> float:
+    """Return the rise of the stated variance with flux, by least squares; zero if no errors are stated."""
+    if error is None:
+        return 0.0
+    design = np.column_stack([np.ones_like(flux), flux - np.median(flux)])
+    slope = np.linalg.lstsq(design, error**2, rcond=None)[0][1]
+    return max(float(slope), 0.0)

@@ -1,0 +1,66 @@
+"""GJ 65 as GALEX saw it in the near ultraviolet: a whole archive file, with a bad bin, a spike and two known flares."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mauvecl.observations.analysis import Analysis, analyse_frames
+from mauvecl.observations.frames import Reason
+from mauvecl.observations.reading import read_frames
+
+DATA = Path(__file__).parent.parent / "data" / "flares"
+
+
+@pytest.fixture(scope="module")
+def analysis() -> Analysis:
+    return analyse_frames(read_frames(DATA / "gj65_galex_nuv_5s.csv", DATA / "gj65.toml"))
+
+
+def test_the_file_is_read_whole(analysis: Analysis) -> None:
+    frames = analysis.frames
+    assert frames.n_frames == 341
+    assert frames.unit == "1/s"
+    assert frames.date(frames.time_s[0]).startswith("2005-11-18T19:59:48.5")
+    np.testing.assert_allclose(frames.exposure_s, 5.0)
+
+
+def test_the_bad_bin_and_the_single_bin_are_flagged_with_reasons(analysis: Analysis) -> None:
+    flagged = {int(k): int(analysis.level.reasons[k]) for k in np.flatnonzero(analysis.level.reasons)}
+    assert set(flagged) == {59, 265}
+    assert flagged[59] == Reason.SPIKE
+    assert flagged[265] & Reason.BELOW
+    assert analysis.frames.date(analysis.frames.time_s[59]).startswith("2005-11-18T20:04:43.5")
+
+
+def test_the_quiescent_level_and_its_noise_are_those_of_the_counts(analysis: Analysis) -> None:
+    level, error = float(np.median(analysis.level.level)), float(np.median(analysis.level.error))
+    assert 5.3 < level < 5.8
+    # Counts of 5.5 per second in 4.5 effective seconds.
+    assert 0.8 < error / np.sqrt(level / 4.54) < 1.1
+
+
+def test_the_small_flare_and_the_great_flare_are_found_at_their_times(analysis: Analysis) -> None:
+    frames, survey = analysis.frames, analysis.survey
+    dates = [
+        tuple(frames.date(survey.time_s[k])[11:19] for k in (e.first, e.brightest, e.last)) for e in analysis.events
+    ]
+    small = next(one for one in dates if one[0] <= "20:01:00" <= one[2])
+    assert small[0] >= "20:00:30"
+    great = analysis.events[-1]
+    assert dates[-1][1] in ("20:22:33", "20:22:38")
+    assert great.kind == "flare"
+    assert great.cut
+    assert great.missing == 1
+    # The peak of the published light curve: 838.6 counts per second over 5.5.
+    assert 148 < great.amplitude < 153
+    assert max(e.value for e in analysis.events) == great.value
+
+
+def test_the_rates_of_false_alarms_are_stated_for_each_event(analysis: Analysis) -> None:
+    for event in analysis.events:
+        normal, measured = analysis.false_alarms(event)
+        assert 0 < normal <= 1.05
+        assert 0 < measured <= 1.5
