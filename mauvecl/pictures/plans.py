@@ -135,7 +135,7 @@ ORIGINS = {
 @picture_of("SnrAnswer", "noise-budget")
 def noise_budgets(answer: SnrAnswer, path: str | Path | None = None) -> Any:
     """Plot pixel noise by origin against wavelength, one panel per star and cell, as in the paper."""
-    each = len(answer.study.cells())
+    each = answer.study.sweep.size
     observed = [(star, star.result.expectation) for star in answer.stars]
     named = [(star.title if star.at else f"{star.title}, {x.exposure_s:g} s", x) for star, x in observed]
     return noise_budget(named, each=each, path=path)

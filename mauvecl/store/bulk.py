@@ -21,6 +21,7 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.quantities import count as whole
 from mauvecl.store.export import Selection, export
 from mauvecl.store.form import CRC_BYTES, Chunk, Store, StoredScene, crc, digest
+from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -57,7 +58,7 @@ def draw(
         Raw DN.
     """
     start, count = whole("start", start), whole("count", count, low=1)
-    how = study.drawing | {"start": start, "count": count, "seed": study.run.seed}
+    how = Case(study).draw_options | {"start": start, "count": count, "seed": study.run.seed}
     if scene.frames is None:
         return engine.realise(scene.expectation, out=out, **how)
     rows = np.empty((count, *scene.row), scene.dtype) if out is None else out

@@ -26,7 +26,8 @@ from mauvecl.host.files.whole import UNFINISHED, write_whole
 from mauvecl.runs.durable import differing_keys
 from mauvecl.schema.errors import InputError
 from mauvecl.store.description import describe, study_in
-from mauvecl.study.labels import full_label, label
+from mauvecl.study.cases import cases
+from mauvecl.study.labels import full_label
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -81,18 +82,14 @@ class StoredScene:
 def scenes(study: Study) -> list[StoredScene]:
     """Return the arrays of a study's store: every star and sweep value, without and with each flare."""
     stored = []
-    number = 0
-    for at, cell in study.cells():
-        for star in cell.star:
-            number += 1
-            quiet, *flares = cell.expectations(star)
-            chosen = cell.bulk.chosen(quiet.n_frames)
-            # The amplitude is an attribute of the flare's array.
-            swept = {name: value for name, value in at.items() if name != "amplitude"}
-            name = full_label(label(star, quiet), swept)
-            stored.append(StoredScene(f"star-{number}", "quiescent", name, 0.0, quiet, chosen, swept))
-            for k, (amplitude, x) in enumerate(zip(cell.flare.amplitudes, flares, strict=True), 1):
-                stored.append(StoredScene(f"star-{number}", f"flare-{k}", name, amplitude, x, chosen, swept))
+    for number, case in enumerate(cases(study), 1):
+        chosen = case.study.bulk.chosen(case.quiet.n_frames)
+        # The amplitude is an attribute of the flare's array.
+        swept = {name: value for name, value in case.at.items() if name != "amplitude"}
+        name = full_label(case.label, swept)
+        stored.append(StoredScene(f"star-{number}", "quiescent", name, 0.0, case.quiet, chosen, swept))
+        for k, (amplitude, x) in enumerate(zip(case.amplitudes, case.flares, strict=True), 1):
+            stored.append(StoredScene(f"star-{number}", f"flare-{k}", name, amplitude, x, chosen, swept))
     return stored
 
 

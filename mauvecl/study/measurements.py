@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from mauvecl.schema.section import Section
 
 if TYPE_CHECKING:
-    from mauvecl.study.study import Study
+    from mauvecl.study.sections import Flare
 
 FittedModel = Literal["blackbody", "balmer", "lines"]
 
@@ -48,18 +48,18 @@ class MeasureQuestion(Section):
         return self
 
 
-def fitted_models(study: Study) -> list[tuple[str, bool, tuple[str, ...]]]:
+def fitted_models(asked: MeasureQuestion, flare: Flare) -> list[tuple[str, bool, tuple[str, ...]]]:
     """Return the name of each fitted model, whether it has a Balmer continuum, and its lines."""
-    asked, light = study.measure, study.flare.spectrum
+    light = flare.spectrum
     lines = asked.lines or tuple(dict.fromkeys((*light.lines, *light.line_fluxes)))
     models = list(asked.models)
     if not models:
-        models = ["blackbody"] if study.flare.is_blackbody else ["blackbody", "balmer"]
+        models = ["blackbody"] if flare.is_blackbody else ["blackbody", "balmer"]
         models += ["lines"] if lines else []
     return [(name, name != "blackbody", lines if name == "lines" else ()) for name in dict.fromkeys(models)]
 
 
-def drop_default_measure(data: dict[str, Any], study: Study) -> None:
+def drop_default_measure(data: dict[str, Any], asked: MeasureQuestion) -> None:
     """Remove the section from a study's data if it has its default values, in place."""
-    if study.measure == MeasureQuestion():
+    if asked == MeasureQuestion():
         del data["measure"]

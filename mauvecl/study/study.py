@@ -185,7 +185,7 @@ class Study(Section):
         drop_default_stare(data, self)
         drop_default_search(data, self)
         drop_default_plan(data, self)
-        drop_default_measure(data, self)
+        drop_default_measure(data, self.measure)
         drop_default_spectrum(data, self.flare.spectrum)
         for section in ("processes", "campaign"):
             if not data[section]:

@@ -14,6 +14,7 @@ from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, u
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.distributions import Gaussian, Mixture
 from mauvecl.statistics.registry import STATISTICS
+from mauvecl.study.cases import Case, Loader
 from mauvecl.study.messages import collect_messages
 from mauvecl.web.fields import star_words
 from mauvecl.web.interpolated_form import InterpolatedForm
@@ -30,28 +31,12 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True, eq=False)
 class ClosedForms:
-    """ClosedForms-form answer to a question.
-
-    Attributes
-    ----------
-    question : Question
-    study : Study
-    light : tuple of Source
-        The star at the telescope, without and with the flare.
-    quiet, flare : Expectation
-    odds : DetectionForms
-        Of the asked statistic, for Gaussian noise.
-    chance : float
-        Probability of detection; NaN where the flare saturates every pixel that counts.
-    """
+    """Closed-form answer to a question."""
 
     question: Question
-    study: Study
-    light: tuple[Source, Source]
-    quiet: Expectation
-    flare: Expectation
-    odds: DetectionForms
-    chance: float
+    case: Case
+    odds: DetectionForms  # of the statistic that is asked for, for Gaussian noise
+    chance: float  # of detection; NaN if the flare saturates every pixel that counts
 
     @classmethod
     def of(cls, question: Question, folder: Path) -> ClosedForms:
@@ -69,17 +54,38 @@ class ClosedForms:
             For values that cannot be together.
         """
         q, study = question, question.study(folder)
+        uploaded = q.uploaded
         # An uploaded spectrum is not read from its file at every change.
-        star = study.star[0].source() if q.uploaded is None else q.uploaded.at_magnitude(q.magnitude, q.band)
-        light = star, study.flaring(star, study.flare.amplitudes[0])
-        quiet, flare = study.expect(list(light))
-        one, setting = STATISTICS[q.statistic], study.setting(quiet, flare)
+        loader = Loader(None if uploaded is None else lambda star: uploaded.at_magnitude(q.magnitude, q.band))
+        case = Case(study, loader=loader)
+        quiet, flare = case.expectations
+        one, setting = STATISTICS[q.statistic], case.setting(quiet, flare)
         if not setting.used.any():
             raise InputError(f"every pixel of {quiet.name} is saturated, expected a fainter star")
         one.check(setting)
         odds = one.detection_forms(setting, flare, q.fap)
         chance = float("nan") if flare.saturated[setting.used].all() else odds.probability
-        return cls(q, study, light, quiet, flare, odds, chance)
+        return cls(q, case, odds, chance)
+
+    @property
+    def study(self) -> Study:
+        """The question as a study."""
+        return self.case.study
+
+    @property
+    def quiet(self) -> Expectation:
+        """Expectation of the star without the flare."""
+        return self.case.quiet
+
+    @property
+    def flare(self) -> Expectation:
+        """Expectation of the star with the flare."""
+        return self.case.flares[0]
+
+    @cached_property
+    def light(self) -> tuple[Source, Source]:
+        """The star at the telescope, without and with the flare."""
+        return self.case.source, self.case.flaring(self.case.amplitudes[0])
 
     @cached_property
     def null(self) -> InterpolatedForm:
@@ -129,7 +135,7 @@ class ClosedForms:
         one, rise = STATISTICS[q.statistic], self.flare.source_electrons - base.source_electrons
         behind = base.sky_electrons * (light if sky else 1.0)
         quiet = replace(base, source_electrons=light * base.source_electrons, sky_electrons=behind)
-        setting = self.study.setting(quiet)
+        setting = self.case.setting(quiet)
         if not setting.used.any():
             return []
         electrons = (light * (base.source_electrons + more * rise) for more in rises)

@@ -232,7 +232,7 @@ class Visitor(WebSocketHandler):
         closed = self._closed[1]
         if self._drawing is not None:
             self._drawing.cancel()
-        how = closed.study.drawing | {"seed": closed.study.run.seed}
+        how = closed.case.draw_options | {"seed": closed.study.run.seed}
         self._drawing = Job(lambda pool: pool.realise(closed.flare, count=1, **how)[0])
 
         def came(future: Future[Any]) -> None:

@@ -15,6 +15,7 @@ from mauvecl.answers.limits.search import LimitSearch
 from mauvecl.device.engine import Engine
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.intervals import Interval
+from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
 
 STATISTICS = ("chi2", "chi2_element", "matched", "uv_excess")
@@ -174,6 +175,6 @@ def test_what_is_assumed_moves_the_limit_as_physics_says() -> None:
     assert rows["dark counts are Poisson in"]["at_high_end"] > rows["dark counts are Poisson in"]["at_low_end"]
     lossy = asked.with_instrument({"light_loss": 0.44})
     assert lossy.observation.load_instrument().light_loss == 0.44
-    root = LimitSearch(lossy, lossy.star[0], 0.24, "matched").root()
+    root = LimitSearch(Case(lossy.at("amplitude", 0.24)), "matched").root()
     assert rows["light loss"]["at_high_end"] == pytest.approx(root, abs=1e-3)
     assert Study.build(lossy.model_dump(), "again") == lossy

@@ -15,6 +15,7 @@ from mauvecl.answers.limits.search import LimitSearch
 from mauvecl.device.engine import Engine
 from mauvecl.host.expectation import Expectation
 from mauvecl.results.requests.fap import NoThresholdError
+from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
 
 N = 20_000
@@ -145,6 +146,6 @@ def test_answers_say_so(engine: Engine) -> None:
 def test_a_limit_there_is_refused(engine: Engine) -> None:
     magnitude = at_the_rail() + 0.001
     asked = study(magnitude, limit={"of": "amplitude", "power": 0.05})
-    search = LimitSearch(asked, asked.star[0], None, "matched", engine)
+    search = LimitSearch(Case(asked), "matched", engine)
     with pytest.raises(NoThresholdError, match="no threshold of matched"):
         search.simulated(1e-5, 1)

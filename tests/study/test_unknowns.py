@@ -14,6 +14,7 @@ from mauvecl.answers.limits.search import LimitSearch, MarginalLimitSearch
 from mauvecl.device.engine import Engine
 from mauvecl.schema.errors import InputError
 from mauvecl.statistics.intervals import Interval
+from mauvecl.study.cases import Case
 from mauvecl.study.study import Study
 from mauvecl.study.unknowns import REST, average, drawn, shares
 
@@ -68,7 +69,7 @@ def test_limit_over_unknowns_has_the_power_on_average(engine: Engine) -> None:
     asked = study({"draws": 24})
     result = limiting_magnitude(asked, engine)
     (limit,) = result.limits
-    question = MarginalLimitSearch(asked, asked.star[0], 0.24, "matched")
+    question = MarginalLimitSearch(Case(asked.at("amplitude", 0.24)), "matched")
     assert question.theory(limit.closed_form) == pytest.approx(0.9, abs=1e-3)
     assert limit.verdict in ("confirms it", "")
     found = limit.unknown
@@ -140,7 +141,7 @@ def test_light_is_linear(of: str, geometry: str) -> None:
     asked = study({"draws": 0}, limit={"of": of}).with_settings(
         [f"flare.geometry={geometry}", "flare.photosphere_temperature_k=5800"]
     )
-    question = LimitSearch(asked, asked.star[0], None if of == "amplitude" else 0.24, "matched")
+    question = LimitSearch(Case(asked.at("amplitude", 0.24)), "matched")
     for value in {"magnitude": (6.0, 11.3), "amplitude": (0.02, 0.7), "exposure": (5.0, 35.0)}[of]:
         for scaled, whole in zip(question.scaled(value), question.pair(value), strict=True):
             np.testing.assert_allclose(scaled.signal_dn, whole.signal_dn, rtol=1e-9)

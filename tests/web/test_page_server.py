@@ -252,7 +252,7 @@ def test_the_card_is_the_engines_own_closed_form(statistic: str, tmp_path: Path)
     state.enter({"statistic": statistic, "magnitude": "6", "unknown": "the usual"})
     closed = ClosedForms.of(state.question(), tmp_path)
     unknown = closed.study.nuisances.marginalised(closed.quiet)
-    scene = prepare([closed.quiet, closed.flare], comparison=closed.study.run.comparison(), **closed.study.drawing)
+    scene = prepare([closed.quiet, closed.flare], comparison=closed.study.run.comparison(), **closed.case.draw_options)
     theory = Hypotheses(closed.quiet, (closed.flare,), (statistic,), scene, nuisances=unknown)
     cut = closed.odds.threshold
     assert cut == theory.closed_form(statistic).isf(1e-3)

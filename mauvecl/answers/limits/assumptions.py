@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from mauvecl.answers.limits.search import LimitSearch
+from mauvecl.answers.limits.search import LimitSearch, single_flares
 from mauvecl.noise.priors import Uniform
 from mauvecl.noise.unknowns import INSTRUMENT_VALUES
 from mauvecl.schema.calls import public
 from mauvecl.schema.tables import make_table
+from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import describe_columns
-from mauvecl.study.sections import Star, Unknowns
+from mauvecl.study.sections import Unknowns
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
@@ -58,35 +59,24 @@ class Moved:
 
     @property
     def span(self) -> float:
-        """How far it moves from end to end."""
+        """Difference between the ends."""
         return abs(self.at_ends[1] - self.at_ends[0])
 
 
 @public
 def what_matters(study: Study) -> QTable:
-    """The closed-form limits of a study with each assumption at both ends of its range, the largest move first.
-
-    Parameters
-    ----------
-    study : Study
-        Its ``limit`` says of what.
+    """Compute the closed-form limits of a study with each assumption at both ends of its range.
 
     Returns
     -------
     QTable
-        One row per star, flare, statistic and assumption.
-
-    Raises
-    ------
-    InputError
-        As `limits.limiting_magnitude`.
+        One row per star, flare, statistic and assumption; for each limit, the assumption that changes it most first.
     """
-    amplitudes = (None,) if study.limit.of == "amplitude" else study.flare.amplitudes
     rows: list[Moved] = []
-    for star in study.star:
-        for amplitude in amplitudes:
+    for case in cases(study, swept=False):
+        for one in single_flares(case):
             for statistic in study.run.statistics:
-                rows += sorted(_moves(study, star, amplitude, statistic), key=lambda m: -m.span)
+                rows += sorted(_moves(one, statistic), key=lambda m: -m.span)
     of = study.limit.of
     table = make_table(
         (
@@ -110,19 +100,19 @@ def what_matters(study: Study) -> QTable:
     return describe_columns(table)
 
 
-def _moves(study: Study, star: Star, amplitude: float | None, statistic: str) -> list[Moved]:
-    question = LimitSearch(study, star, amplitude, statistic)
-    nominal = question.root()
+def _moves(case: Case, statistic: str) -> list[Moved]:
+    """Return the change of a limit with each assumption."""
+    nominal = LimitSearch(case, statistic).root()
     moves = []
-    for assumption in assumptions(study.observation.load_instrument()):
+    for assumption in assumptions(case.instrument):
         ends = [
-            LimitSearch(study.with_instrument(change), star, amplitude, statistic).root(near=nominal)
+            LimitSearch(replace(case, study=case.study.with_instrument(change)), statistic).root(near=nominal)
             for change in assumption.changes
         ]
         moves.append(
             Moved(
-                star=star.library or str(star.file),
-                amplitude=float("nan") if amplitude is None else amplitude,
+                star=case.star.library or str(case.star.file),
+                amplitude=float("nan") if case.study.limit.of == "amplitude" else case.amplitudes[0],
                 statistic=statistic,
                 assumption=assumption,
                 nominal=nominal,

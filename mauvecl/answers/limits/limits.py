@@ -11,16 +11,16 @@ import numpy as np
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import Cost, cost_lines, marginal_lines, unknown_cost
-from mauvecl.answers.limits.search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle
+from mauvecl.answers.limits.search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle, single_flares
 from mauvecl.results.requests.fap import check_fap
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import make_table
 from mauvecl.statistics.intervals import Interval
+from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import describe_columns, label, stack_tables
 from mauvecl.study.messages import SATURATED, collect_messages, worst_first
 from mauvecl.study.quantities import UNITS
-from mauvecl.study.sections import Star
 from mauvecl.study.study import Study
 from mauvecl.study.unknowns import draws_table
 
@@ -204,42 +204,35 @@ class LimitResult(Answer):
         return super().as_json() | more
 
 
-def solve(
-    study: Study,
-    star: Star,
-    amplitude: float | None,
-    statistic: str,
-    engine: Engine | Pool,
-    at: Mapping[str, float | str] | None = None,
-) -> Limit:
-    """One limit: the closed form's root, moved by what is simulated, and simulated again there.
+def solve(case: Case, statistic: str, engine: Engine | Pool) -> Limit:
+    """Return the limit of a case's first flare, or of its amplitude, and simulate it again with another seed.
 
-    Averaged over what is unknown of the instrument where the study asks for draws of it.
+    Averages over draws of unknown instrument values if the study asks for them.
 
     Raises
     ------
     InputError
         If the power is not crossed in the range searched, or the false-alarm probability cannot be settled.
     """
+    study = case.study
     check_fap(study.run.fap, study.run.realisations, study.run.tails)
     kind = MarginalLimitSearch if study.unknowns.draws else LimitSearch
-    question = kind(study, star, amplitude, statistic, engine)
-    # The nominal instrument's root is near, and quickly found.
-    theory = question.root(near=LimitSearch(study, star, amplitude, statistic).root() if study.unknowns.draws else None)
+    question = kind(case, statistic, engine)
+    # The root of the nominal instrument is near and found quickly.
+    theory = question.root(near=LimitSearch(case, statistic).root() if study.unknowns.draws else None)
     value = settle(question, theory)
     simulated = tuple(question.points)
-    # Another seed, far from any that a user would take for a neighbour.
+    # Users are unlikely to choose a seed with this distance from another.
     fresh = (study.run.seed + 0x9E3779B97F4A7C15) % 2**64
     check = Point(value.value, question.simulated(value.value, fresh), fresh)
     quiet, flare = question.pair(value.value)
-    shown = question.study.star[0]
-    named = star.model_copy(update={"magnitude": None}) if question.of == "magnitude" else shown
-    rise = value.value if question.of == "amplitude" else question.study.flare.amplitudes[0]
+    named = case.star.model_copy(update={"magnitude": None}) if question.of == "magnitude" else case.star
+    rise = value.value if question.of == "amplitude" else case.amplitudes[0]
     there = f"exposure {value.value:.0f} s" if question.of == "exposure" else f"{question.of} {value.value:.4g}"
     where = f"{label(named, quiet)} at {there}, flare of {100 * rise:.4g} %"
     return Limit(
         star=label(named, quiet),
-        amplitude=float("nan") if amplitude is None else amplitude,
+        amplitude=float("nan") if question.of == "amplitude" else case.amplitudes[0],
         of=question.of,
         statistic=statistic,
         fap=question.fap,
@@ -249,7 +242,7 @@ def solve(
         check=check,
         points=simulated,
         curve=question.curve(value.value),
-        at=at or {},
+        at=case.at,
         unknown=question.unknown(theory) if isinstance(question, MarginalLimitSearch) else None,
         messages=tuple(m for m in collect_messages([quiet, flare]) if m.startswith(SATURATED)),
         quiet=quiet,
@@ -284,19 +277,14 @@ def limit(
     if any(axis.quantity == study.limit.of for axis in study.sweep.axes):
         raise InputError(f"the sweep runs over the {study.limit.of} that is asked for, expected other quantities")
     asked = [
-        (cell, star, amplitude, statistic, at)
-        for at, cell in study.cells()
-        for star in cell.star
-        for amplitude in ((None,) if study.limit.of == "amplitude" else cell.flare.amplitudes)
-        for statistic in study.run.statistics
+        (one, statistic) for case in cases(study) for one in single_flares(case) for statistic in study.run.statistics
     ]
 
-    def solved(one: tuple[Study, Star, float | None, str, Mapping[str, float | str]]) -> Limit | InputError:
-        cell, star, amplitude, statistic, at = one
+    def solved(item: tuple[Case, str]) -> Limit | InputError:
         try:
-            return solve(cell, star, amplitude, statistic, engine, at)
+            return solve(*item, engine)
         except InputError as error:
-            # One star's failure does not lose the others'.
+            # The limits of other stars are still computed.
             return error
 
     outcomes: list[Limit | InputError] = []

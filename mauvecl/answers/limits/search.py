@@ -1,10 +1,9 @@
-"""Where a detection probability crosses a power: the closed form's root, then steps of simulation from there."""
+"""Search for the value at which a detection probability crosses a power: root of the closed form, then simulations."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,10 +16,9 @@ from mauvecl.schema.ranges import DAY_S
 from mauvecl.statistics.intervals import Interval
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.statistics.statistic import LinearStatistic
+from mauvecl.study.cases import Case
 from mauvecl.study.messages import off_centre
 from mauvecl.study.quantities import QUANTITIES
-from mauvecl.study.sections import Star
-from mauvecl.study.study import Study
 from mauvecl.study.unknowns import DrawnStudies, average, drawn, shares
 
 if TYPE_CHECKING:
@@ -28,17 +26,17 @@ if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
     from mauvecl.runs.pool import Pool
 
-#: The search for the closed form's root begins where a flare is hardest to see, in steps of this.
+#: Steps of the search for the root of the closed form, from where a flare is hardest to see.
 STEPS = {"magnitude": -0.5, "amplitude": 2.0, "exposure": 2.0}
-#: Ends of that search: hardest, easiest.
+#: Ends of that search, hardest and easiest.
 SEARCH = {"magnitude": (20.0, -2.0), "amplitude": (1e-5, 1e3), "exposure": (None, 1e6)}
-#: Simulated evaluations at most; each moves by the closed form's slope, so that two or three suffice.
+#: Largest number of simulations; two or three usually suffice, since each moves by the closed form's slope.
 MOST_EVALUATIONS = 8
 
 
 @dataclass(frozen=True)
 class Point:
-    """One simulated evaluation."""
+    """A simulated detection probability."""
 
     value: float
     probability: Interval
@@ -47,52 +45,38 @@ class Point:
 
 @dataclass(frozen=True, eq=False)
 class Unknown:
-    """What the unknown does to a limit.
-
-    Attributes
-    ----------
-    draws : DrawnStudies
-    limits : ndarray, shape (n_draw,)
-        The closed-form limit of each draw; NaN where there is none.
-    shares : dict of float
-        Share of the limits' variance that each unknown explains, the largest first.
-    """
+    """Effect of unknown instrument values on a limit."""
 
     draws: DrawnStudies
-    limits: NDArray[np.float64]
-    shares: dict[str, float]
+    limits: NDArray[np.float64]  # closed-form limit of each draw, NaN if it has none, shape (n_draw,)
+    shares: dict[str, float]  # share of the limits' variance that each unknown explains, largest first
 
     @property
     def range(self) -> tuple[float, float]:
-        """The central 95 % of the limits."""
+        """Central 95 % of the limits."""
         low, high = np.nanquantile(self.limits, (0.025, 0.975))
         return float(low), float(high)
 
 
 class LimitSearch:
-    """One star, flare and statistic: detection probability as a function of the quantity."""
+    """Detection probability of a case's first flare by one statistic, as a function of the limit's quantity."""
 
-    def __init__(
-        self, study: Study, star: Star, amplitude: float | None, statistic: str, engine: Engine | Pool | None = None
-    ) -> None:
-        self.study, self.statistic, self.engine = study.model_copy(update={"star": (star,)}), statistic, engine
-        self.of, self.power, self.fap = study.limit.of, study.limit.power, study.run.fap
-        if amplitude is not None:
-            self.study = self.study.at("amplitude", amplitude)
+    def __init__(self, case: Case, statistic: str, engine: Engine | Pool | None = None) -> None:
+        self.case, self.statistic, self.engine = case.with_value("amplitude", case.amplitudes[0]), statistic, engine
+        self.of, self.power, self.fap = case.study.limit.of, case.study.limit.power, case.study.run.fap
         self.points: list[Point] = []
         self._base: tuple[float, Expectation, Expectation] | None = None
 
     def pair(self, value: float) -> tuple[Expectation, Expectation]:
-        """Without and with the flare."""
+        """Return the expectations without and with the flare."""
         if self.of == "exposure" and value > DAY_S:
-            # Several exposures added up.
+            # The sum of several exposures.
             return self.scaled(value)
-        study = self.study.at(self.of, value)
-        quiet, flare = study.expectations(study.star[0])
+        quiet, flare = self.case.with_value(self.of, value).expectations
         return quiet, flare
 
     def scaled(self, value: float) -> tuple[Expectation, Expectation]:
-        """`pair` for the closed form: light is linear, so that one pair gives all others without reading anything."""
+        """Return `pair` by scaling one pair, since expectations are linear in light."""
         if self._base is None:
             at = {"magnitude": 10.0, "amplitude": 0.1, "exposure": self.frame_s}[self.of]
             self._base = at, *self.pair(at)
@@ -108,9 +92,9 @@ class LimitSearch:
         return next(dimmed), next(dimmed)
 
     def theory(self, value: float) -> float:
-        """Detection probability for Gaussian noise; 0 where no pixel is left unsaturated."""
+        """Return the detection probability for Gaussian noise; 0 if every pixel saturates."""
         quiet, flare = self.scaled(value)
-        setting, one = self.study.setting(quiet, flare), STATISTICS[self.statistic]
+        setting, one = self.case.setting(quiet, flare), STATISTICS[self.statistic]
         if not setting.used.any():
             return 0.0
         one.check(setting)
@@ -119,11 +103,11 @@ class LimitSearch:
         return one.detection_forms(setting, flare, self.fap).probability
 
     def simulated(self, value: float, seed: int) -> Interval:
-        """Detection probability with its interval, by the engine."""
+        """Simulate the detection probability and return it with its interval."""
         assert self.engine is not None
         quiet, flare = self.pair(value)
         detection = self.engine.detect(
-            quiet, [flare], seed=seed, **self.study.detecting(quiet) | {"statistics": (self.statistic,)}
+            quiet, [flare], seed=seed, **self.case.detect_options(quiet) | {"statistics": (self.statistic,)}
         )
         for message in detection.messages:
             raise InputError(f"at a {self.of} of {value:g}: {message} Expected a limit where some pixel tells")
@@ -134,7 +118,7 @@ class LimitSearch:
         return probability
 
     def curve(self, value: float) -> tuple[tuple[float, float], ...]:
-        """The closed form around a value, whole frames where an exposure is asked for."""
+        """Return the closed form around a value; exposures are whole frames."""
         at = _coordinate(self.of, value)
         values = [_value(self.of, at + step) for step in np.linspace(-0.75, 0.75, 25)]
         if self.of == "exposure":
@@ -143,7 +127,7 @@ class LimitSearch:
         return tuple((v, self.theory(v)) for v in values)
 
     def root(self, near: float | None = None) -> float:
-        """Where the closed form first reaches the power, from faint to bright, small to large; or near a value."""
+        """Return the first value at which the closed form reaches the power, from the hardest or near one."""
         from scipy.optimize import brentq
 
         if near is not None and self.of != "exposure":
@@ -170,15 +154,17 @@ class LimitSearch:
             value = nearer
         raise self._beyond(easiest, "does not reach")
 
-    @cached_property
+    @property
     def frame_s(self) -> float:
         """Seconds of one frame."""
-        return self.study.observation.load_instrument().frame_s
+        return self.case.instrument.frame_s
 
     def _beyond(self, value: float, verb: str) -> InputError:
-        star = self.study.star[0]
-        name = f"{star.library or star.file}" + (f" {star.band} = {star.magnitude:g}" if self._bright(star) else "")
-        flare = "" if self.of == "amplitude" else f" with a flare of {100 * self.study.flare.amplitudes[0]:.3g} %"
+        star = self.case.star
+        name = f"{star.library or star.file}" + (
+            f" {star.band} = {star.magnitude:g}" if self.of != "magnitude" and star.magnitude is not None else ""
+        )
+        flare = "" if self.of == "amplitude" else f" with a flare of {100 * self.case.amplitudes[0]:.3g} %"
         return InputError(
             f"the detection probability of {name}{flare} by {self.statistic} {verb} {self.power:g} at {self.of} = "
             f"{value:g}, expected a limit between {_span(self.of)}{self.saturation_clause(value)}"
@@ -186,9 +172,9 @@ class LimitSearch:
         )
 
     def sign_clause(self, value: float) -> str:
-        """Return what a refusal says of a weighted sum that the flare lowers at a value."""
+        """Return the clause of an error message on a weighted sum that the flare lowers at a value."""
         quiet, flare = self.scaled(value)
-        setting, one = self.study.setting(quiet, flare), STATISTICS[self.statistic]
+        setting, one = self.case.setting(quiet, flare), STATISTICS[self.statistic]
         if not isinstance(one, LinearStatistic) or not setting.used.any() or flare.saturated[setting.used].all():
             return ""
         shape = flare if one.shaped else None
@@ -201,20 +187,17 @@ class LimitSearch:
         )
 
     def prior_clause(self, value: float) -> str:
-        """Return what a refusal says of priors that exclude the values that the expectation has."""
-        outside = off_centre([self.pair(value)[0]], self.study.drawing["processes"])
+        """Return the clause of an error message on priors that exclude the values of the expectation."""
+        outside = off_centre([self.pair(value)[0]], self.case.processes)
         return "".join(f"; {text}" for text in outside)
 
     def saturation_clause(self, value: float) -> str:
-        """Return what a refusal says of saturation at a value, of the star or else of the flare."""
+        """Return the clause of an error message on saturation at a value, of the star or else of the flare."""
         quiet, flare = self.scaled(value)
         return quiet.saturation_clause or flare.saturation_clause.replace(" saturate ", " saturate with the flare ")
 
-    def _bright(self, star: Star) -> bool:
-        return self.of != "magnitude" and star.magnitude is not None
-
     def slope(self, value: float) -> float:
-        """Of the closed form's probit, per unit of `_coordinate`, towards easier."""
+        """Return the slope of the closed form's probit, per unit of `_coordinate`."""
         at, width = _coordinate(self.of, value), 0.02
         values = (_value(self.of, at - width), _value(self.of, at + width))
         below, above = (special.ndtri(np.clip(self.theory(v), 1e-9, 1 - 1e-9)) for v in values)
@@ -222,27 +205,25 @@ class LimitSearch:
 
 
 class MarginalLimitSearch(LimitSearch):
-    """The same, averaged over what is unknown of the instrument."""
+    """Detection probability averaged over draws of unknown instrument values."""
 
-    def __init__(
-        self, study: Study, star: Star, amplitude: float | None, statistic: str, engine: Engine | Pool | None = None
-    ) -> None:
-        super().__init__(study, star, amplitude, statistic, engine)
-        self.draws = drawn(study)
-        self.each = [LimitSearch(one, star, amplitude, statistic, engine) for one in self.draws.studies]
+    def __init__(self, case: Case, statistic: str, engine: Engine | Pool | None = None) -> None:
+        super().__init__(case, statistic, engine)
+        self.draws = drawn(case.study)
+        self.each = [LimitSearch(replace(case, study=study), statistic, engine) for study in self.draws.studies]
 
     def theory(self, value: float) -> float:
-        """Mean over the draws of the unknown."""
+        """Return the mean over draws."""
         return float(np.mean([one.theory(value) for one in self.each]))
 
     def simulated(self, value: float, seed: int) -> Interval:
-        """Mean over the draws of the unknown, each with its own reference and threshold."""
+        """Return the mean over draws, each with its own reference and threshold."""
         probability = average([one.simulated(value, seed) for one in self.each])
         self.points.append(Point(value, probability, seed))
         return probability
 
     def unknown(self, near: float) -> Unknown:
-        """The closed-form limit of each draw, and which unknown moves it most."""
+        """Return the closed-form limit of each draw, and the share of its variance that each unknown explains."""
         limits = []
         for one in self.each:
             try:
@@ -251,6 +232,13 @@ class MarginalLimitSearch(LimitSearch):
                 limits.append(float("nan"))
         roots = np.array(limits)
         return Unknown(self.draws, roots, shares(self.draws, roots))
+
+
+def single_flares(case: Case) -> list[Case]:
+    """Return a case for each flare of which a limit is computed: one if the limit is that of the amplitude."""
+    if case.study.limit.of == "amplitude":
+        return [case]
+    return [case.with_value("amplitude", amplitude) for amplitude in case.amplitudes]
 
 
 def _further(of: str) -> Callable[[float, float], float]:
@@ -264,7 +252,7 @@ def _span(of: str) -> str:
 
 
 def _coordinate(of: str, value: float) -> float:
-    """Towards easier, and even: magnitudes, or 2.5 log10 of the others."""
+    """Return a coordinate that increases towards easier detection: minus the magnitude, or 2.5 log10 of the value."""
     return -value if of == "magnitude" else 2.5 * float(np.log10(value))
 
 
@@ -273,7 +261,7 @@ def _value(of: str, coordinate: float) -> float:
 
 
 def _bisect_frames(seen: Callable[[float], bool], low: float, high: float, frame_s: float) -> float:
-    """The fewest frames' exposure that is seen, between one that is not and one that is."""
+    """Return the shortest exposure of whole frames that is seen, between one that is not and one that is."""
     few, many = round(low / frame_s), round(high / frame_s)
     while many - few > 1:
         middle = (few + many) // 2
@@ -282,12 +270,9 @@ def _bisect_frames(seen: Callable[[float], bool], low: float, high: float, frame
 
 
 def settle(question: LimitSearch, start: float) -> Interval:
-    """The value at which the power is simulated, with its interval, searched from a start near it.
+    """Return the value at which the simulation reaches the power, with its interval, searched from a start near it.
 
-    Raises
-    ------
-    InputError
-        If the probability does not rise there, or the search does not settle.
+    Raises InputError if the probability does not rise there, or the search does not settle.
     """
     try:
         return (_settle_frames if question.of == "exposure" else _settle)(question, start)
@@ -299,8 +284,8 @@ def settle(question: LimitSearch, start: float) -> Interval:
 
 
 def _settle(question: LimitSearch, start: float) -> Interval:
-    """Newton's steps in the probit, with the closed form's slope; then the interval by the same slope."""
-    of, seed = question.of, question.study.run.seed
+    """Find the limit by Newton's steps in the probit, and its interval, with the slope of the closed form."""
+    of, seed = question.of, question.case.study.run.seed
     slope, goal = question.slope(start), float(special.ndtri(question.power))
     if not slope > 0:
         raise InputError(
@@ -308,7 +293,7 @@ def _settle(question: LimitSearch, start: float) -> Interval:
             f"{question.saturation_clause(start)}{question.sign_clause(start)}"
         )
     at = _coordinate(of, start)
-    n = question.study.run.realisations
+    n = question.case.study.run.realisations
     for _ in range(MOST_EVALUATIONS):
         p = question.simulated(_value(of, at), seed)
         kept = (min(max(q, 0.5 / n), 1 - 0.5 / n) for q in (p.value, p.low, p.high))
@@ -327,8 +312,8 @@ def _settle(question: LimitSearch, start: float) -> Interval:
 
 
 def _settle_frames(question: LimitSearch, start: float) -> Interval:
-    """Whole frames: the fewest that reach the power, and the fewest by either end of the interval."""
-    seed, frame_s = question.study.run.seed, question.frame_s
+    """Find the fewest frames that reach the power, by the probability and by either end of its interval."""
+    seed, frame_s = question.case.study.run.seed, question.frame_s
     known: dict[int, Interval] = {}
 
     def at(frames: int) -> Interval:
@@ -337,7 +322,7 @@ def _settle_frames(question: LimitSearch, start: float) -> Interval:
         return known[frames]
 
     def fewest(which: str) -> int:
-        """Where it is crossed near the start: steps that double until it lies between, then halving."""
+        """Return the fewest frames that reach the power, by doubling steps and then bisection."""
 
         def reaches(frames: int) -> bool:
             return frames > 0 and getattr(at(frames), which) >= question.power

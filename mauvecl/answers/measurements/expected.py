@@ -17,10 +17,8 @@ from mauvecl.study.measurements import fitted_models
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
-    from mauvecl.host.stars.source import Source
     from mauvecl.statistics.nuisances import Nuisances
-    from mauvecl.study.sections import Star
-    from mauvecl.study.study import Study
+    from mauvecl.study.cases import Case
 
 Float = NDArray[np.float64]
 
@@ -82,65 +80,45 @@ class ExpectedMeasurement(InCell):
         return np.exp(log_k), np.maximum(amplitude - reach, 0.0), amplitude + reach
 
 
-def models_of(study: Study, star: Star, source: Source, quiet: Expectation) -> dict[str, FlareModel]:
-    """Return the models that a study fits to exposures of a star, the simplest first."""
+def models_of(case: Case) -> dict[str, FlareModel]:
+    """Return the models that are fitted to exposures of a case, the simplest first."""
+    study = case.study
     return {
         name: FlareModel.of(
-            source,
-            study.observation.load_instrument(),
-            quiet,
+            case.source,
+            case.instrument,
+            case.quiet,
             jump=jump,
             lines=lines,
             band=study.flare.band,
             electron_temperature_k=study.flare.spectrum.electron_temperature_k,
-            distance_pc=star.distance_pc,
-            radius_rsun=star.radius_rsun,
+            distance_pc=case.star.distance_pc,
+            radius_rsun=case.star.radius_rsun,
             bands_nm=study.measure.bands_nm,
             order=study.observation.order,
         )
-        for name, jump, lines in fitted_models(study)
+        for name, jump, lines in fitted_models(study.measure, study.flare)
     }
 
 
 def expected_measurements(
-    study: Study,
-    star: Star,
-    source: Source,
-    quiet: Expectation,
-    flare: Expectation,
-    where: InCell,
-    amplitude: float,
-    models: dict[str, FlareModel] | None = None,
+    case: Case, amplitude: float, flare: Expectation, models: dict[str, FlareModel] | None = None
 ) -> list[ExpectedMeasurement]:
-    """Forecast the measurement of one flare, with each model that the study fits.
-
-    Parameters
-    ----------
-    study : Study
-    star : Star
-    source : Source
-        The quiescent star at its magnitude.
-    quiet, flare : Expectation
-        One exposure without and with the flare.
-    where : InCell
-    amplitude : float
-    models : dict of str to FlareModel, optional
-        Those of `models_of` by default.
-    """
-    lit_source, light = study.flaring(source, amplitude), study.flare.light()
-    truth = Truth(star, source, lit_source, light, study.flare.band, quiet.exposure_s)
-    unknown = study.nuisances.marginalised(quiet)
+    """Forecast the measurement of a flare with each model, by default those of `models_of`."""
+    quiet, light, unknown = case.quiet, case.study.flare.light(), case.unknowns()
+    band = case.study.flare.band
+    truth = Truth(case.star, case.source, case.flaring(amplitude), light, band, quiet.exposure_s)
     lit = flare.recorded_dn - quiet.recorded_dn
     snr = matched_filter(quiet, flare, None, lit)[1], matched_filter(quiet, flare, unknown, lit)[1]
     expected = []
-    for name, model in (models or models_of(study, star, source, quiet)).items():
+    for name, model in (models or models_of(case)).items():
         perfect = fit(flare.recorded_dn, quiet, model, unknown, levels=LEVELS)
         kelvin, linear = float(np.exp(perfect.log_k[0])), perfect.amplitudes[0]
         known, ahead = (forecast(quiet, model, kelvin, linear, u) for u in (None, unknown))
         true = np.array([truth.value(quantity) for quantity in model.names])
         expected.append(
             ExpectedMeasurement(
-                where.label, where.at, amplitude, name, snr, true, known, ahead, perfect, model, quiet, unknown
+                case.label, case.at, amplitude, name, snr, true, known, ahead, perfect, model, quiet, unknown
             )
         )
     return expected

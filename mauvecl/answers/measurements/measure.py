@@ -11,7 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from mauvecl.answers.answer import Answer, InCell
+from mauvecl.answers.answer import Answer
 from mauvecl.answers.measurements.expected import ExpectedMeasurement, expected_measurements, matched_filter
 from mauvecl.results.measurements.fit import LEVELS, Measurement, fit
 from mauvecl.results.measurements.reduction import variance_of
@@ -21,7 +21,8 @@ from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.tables import make_table
 from mauvecl.statistics.intervals import clopper_pearson
-from mauvecl.study.labels import label, stack_tables
+from mauvecl.study.cases import Case, cases
+from mauvecl.study.labels import stack_tables
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.study import Study
 
@@ -32,7 +33,6 @@ if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
     from mauvecl.results.sums import Arrays
     from mauvecl.study.assumptions import Use
-    from mauvecl.study.sections import Star
 
 Float = NDArray[np.float64]
 
@@ -190,42 +190,33 @@ def measure(
     """
     if study.flare.geometry != "added":
         raise InputError("flare.geometry = 'replaces' in a measurement, expected 'added': fits take light for added")
-    if any(not amplitude > 0.0 for _, cell in study.cells() for amplitude in cell.flare.amplitudes):
+    prepared = cases(study)
+    if any(not amplitude > 0.0 for case in prepared for amplitude in case.amplitudes):
         raise InputError("flare amplitude = 0 in a measurement, expected one above 0")
-    prepared = [(at, cell, star, cell.expectations(star)) for at, cell in study.cells() for star in cell.star]
+    expectations = [x for case in prepared for x in case.expectations]
     if engine is None:
         from mauvecl.device.engine import Engine as Default
 
         engine = Default()
-    asked = [
-        (cell, star, quiet, flare, amplitude, InCell(label(star, quiet), at), engine)
-        for at, cell, star, (quiet, *lit) in prepared
-        for amplitude, flare in zip(cell.flare.amplitudes, lit, strict=True)
-    ]
+    asked = [(case, *flare, engine) for case in prepared for flare in zip(case.amplitudes, case.flares, strict=True)]
     flares: list[MeasuredFlare] = []
     for done, some in enumerate(map_in_order(engine, lambda one: _measured(*one), asked), 1):
         flares += some
         if progress is not None:
             progress(done, len(asked))
-    messages = collect_messages([x for *_, group in prepared for x in group])
+    messages = collect_messages(expectations)
     return MeasureAnswer(study, flares, [*messages, *_wrong(flares)])
 
 
-def _measured(
-    study: Study,
-    star: Star,
-    quiet: Expectation,
-    flare: Expectation,
-    amplitude: float,
-    where: InCell,
-    engine: Engine | Pool,
-) -> list[MeasuredFlare]:
-    expected = expected_measurements(study, star, star.source(), quiet, flare, where, amplitude)
+def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine | Pool) -> list[MeasuredFlare]:
+    """Fit all models to simulated exposures of a flare."""
+    study, quiet = case.study, case.quiet
+    expected = expected_measurements(case, amplitude, flare)
     models, unknown = [one.fitted for one in expected], expected[0].unknown
     weights = matched_filter(quiet, flare, unknown)[0]
 
     def fitted(start: int, count: int) -> Arrays:
-        raw = engine.realise(flare, start=start, count=count, seed=study.run.seed, **study.drawing)
+        raw = engine.realise(flare, start=start, count=count, seed=study.run.seed, **case.draw_options)
         excess = raw - quiet.recorded_dn
         arrays: Arrays = {"first": excess[0], "detected": excess @ weights >= scipy.stats.norm.isf(study.run.fap)}
         for k, model in enumerate(models):

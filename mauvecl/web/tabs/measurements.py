@@ -7,7 +7,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.answers.answer import InCell
 from mauvecl.answers.measurements.expected import expected_measurements, models_of
 from mauvecl.results.measurements.fit import forecast
 from mauvecl.study.nuisances import NuisanceChoice
@@ -40,13 +39,12 @@ MOST_DOTS = 500
 @lru_cache(maxsize=4)
 def expected(closed: ClosedForms) -> dict[str, ExpectedMeasurement]:
     """Return the forecast with the flare's own model for each of `ASSUMED`."""
-    study, quiet, flare = closed.study, closed.quiet, closed.flare
-    star, source, where, amplitude = study.star[0], closed.light[0], InCell("", {}), study.flare.amplitudes[0]
-    own = dict(list(models_of(study, star, source, quiet).items())[-1:])
+    case = closed.case
+    own = dict(list(models_of(case).items())[-1:])
     found = {}
-    for name, unknown in ASSUMED.items():
-        chosen = study.model_copy(update={"nuisances": unknown})
-        (found[name],) = expected_measurements(chosen, star, source, quiet, flare, where, amplitude, own)
+    for name, nuisances in ASSUMED.items():
+        assumed = case.with_sections(nuisances=nuisances)
+        (found[name],) = expected_measurements(assumed, case.amplitudes[0], closed.flare, own)
     return found
 
 
