@@ -299,6 +299,8 @@ MEASURE = group(
     flag(list[str], "--fit-line", "Line that the model 'lines' fits [the flare's]; may be repeated.", "measure.lines",
          names_of),
     flag(int, "--fits", "Simulated exposures of each flare [1000].", "measure.fits"),
+    flag(float, "--snr-per-bin", "Measure the flares of the stare, too, against time, in bins of this S/N.",
+         "measure.snr_per_bin"),
 )  # fmt: skip
 BULK = group(
     flag(

@@ -1,4 +1,4 @@
-"""Pictures of measurements: a fit with its residuals, contours, pulls, errors against amplitude."""
+"""Pictures of measurements: a fit with its residuals, contours, pulls, errors against amplitude or time."""
 
 from __future__ import annotations
 
@@ -14,6 +14,7 @@ from mauvecl.results.measurements.reduction import variance_of
 from mauvecl.study.parts import First, note_of
 
 if TYPE_CHECKING:
+    from mauvecl.answers.measurements.along import MeasuredStare
     from mauvecl.answers.measurements.measure import MeasureAnswer, MeasuredFlare
 
 #: Increases of chi-squared that enclose 68.27 and 95 % in two dimensions.
@@ -108,4 +109,35 @@ def errors(plt: Any, flares: Sequence[MeasuredFlare]) -> Any:
         axis.set(xscale="log", yscale="log", xlabel="amplitude", ylabel="relative error", title=one.name)
         axis.legend(loc="best")
     headline(figure, note_of(flares))
+    return figure
+
+
+@picture_of("MeasureAnswer", "temperatures", each=lambda answer: [(one,) for one in answer.stares if one.perfect])
+@styled_picture
+def temperatures(plt: Any, one: MeasuredStare) -> Any:
+    """Plot temperature, size and light of the flares of a stare against time, with 95 % intervals.
+
+    Lines are the fits to the same frames without noise.
+    """
+    drawn, perfect = one.drawn, one.perfect
+    assert not isinstance(drawn, str)
+    assert perfect is not None
+    found = drawn.found
+    size = "area" if "area" in found.names else "amplitude"
+    light = "luminosity bolometric" if "area" in found.names else "flux bolometric"
+    middle, reach = (drawn.start_s + drawn.end_s) / 2, (drawn.end_s - drawn.start_s) / 2
+    figure, axes = plt.subplots(3, 1, figsize=(7.2, 6.4), sharex=True)
+    for axis, name, colour in zip(axes, ("temperature", size, light), COLOURS, strict=False):
+        q = found.column(name)
+        estimate, low, high = found.estimates[:, q], found.low[-1, :, q], found.high[-1, :, q]
+        ends = np.where(np.isfinite([low, high]), np.abs([estimate - low, high - estimate]), 0.0)
+        axis.errorbar(middle, estimate, ends, reach, fmt=".", color=colour)
+        limits = ~np.isfinite(high)
+        axis.plot(middle[limits], low[limits], "^", color=colour)
+        axis.step(middle, perfect.found.estimates[:, q], where="mid", color=NULL, linewidth=1)
+        shown = np.append(estimate, perfect.found.estimates[:, q])
+        axis.set(ylabel=f"{name} ({found.units[q]})" if found.units[q] else name, yscale="log")
+        axis.set_ylim(0.5 * shown[shown > 0].min(), 2 * shown[shown > 0].max())
+    axes[-1].set_xlabel("time from the start of the stare (s)")
+    headline(figure, f"{one.title}: one simulated stare; nominal throughput")
     return figure

@@ -28,12 +28,15 @@ class MeasureQuestion(Section):
         Number of simulated exposures per flare.
     bands_nm : tuple of tuple
         Wavelength ranges for which the flux is reported.
+    snr_per_bin : float, optional
+        S/N of the bins of frames in which the flares of the study's stare are measured against time.
     """
 
     models: tuple[FittedModel, ...] = ()
     lines: tuple[str, ...] = ()
     fits: Annotated[int, Field(ge=1, le=1_000_000)] = 1000
     bands_nm: tuple[tuple[float, float], ...] = ((200.0, 320.0), (200.0, 700.0))
+    snr_per_bin: Annotated[float, Field(gt=0)] | None = None
 
     @model_validator(mode="after")
     def _possible(self) -> Self:

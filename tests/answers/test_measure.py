@@ -12,6 +12,7 @@ from scipy import stats
 from mauvecl import Engine, InputError, Study, measure
 from mauvecl.answers.measurements.measure import MeasureAnswer
 from mauvecl.host.stars.bands import photons
+from mauvecl.runs.pool import Pool
 
 
 def study_of(*settings: str, **flare: object) -> Study:
@@ -88,6 +89,34 @@ def test_faint_and_bright_flares_have_tables_and_pictures(amplitude: float, engi
     for name, draw in answer.pictures.items():
         draw(tmp_path / f"{name}.png")
         assert (tmp_path / f"{name}.png").exists()
+
+
+def test_flares_are_measured_along_a_stare(engine: Engine, tmp_path: Path) -> None:
+    """A cooling flare. False failures: pulls of 20 or more bins beyond chi-squared's 1e-9 quantiles."""
+    events = [{"peak_s": 100.0, "amplitude": 2.0, "half_width_s": 40.0, "cooling": {"end_k": 7000.0, "fold_s": 80.0}}]
+    settings = ("measure.fits=20", "measure.snr_per_bin=20", "stare.duration_s=400", "stare.number=3", "nuisances={}")
+    study = study_of(*settings, temperature_k=14_000.0)
+    study = Study.build(study.model_dump() | {"events": events}, "test")
+    answer = measure(study, engine)
+    table = answer.tables["temperatures"]
+    assert len(table) >= 20
+    kelvin = np.array(table["temperature_without_noise"].value)
+    pulls = (np.array(table["temperature"].value) - kelvin) / np.array(table["temperature_error"].value)
+    assert stats.chi2.ppf(1e-9, len(table)) < np.sum(pulls**2) < stats.chi2.isf(1e-9, len(table))
+    assert kelvin.max() > 12_500
+    assert kelvin[-1] < 9000
+    assert (np.array(table["p_value"]) > 1e-6).all()
+    assert str(table["area"].unit) == "cm2"
+    assert str(table["luminosity_bolometric"].unit) == "erg / s"
+    answer.write(tmp_path)
+    assert (tmp_path / "temperatures.ecsv").exists()
+    assert len(answer.as_json()["temperatures"]) == len(table)
+    assert "temperatures-1" in answer.pictures
+    # A pool draws the same stare; a flare that is too faint is reported.
+    assert measure(study, Pool()).tables["temperatures"]["temperature"][5] == table["temperature"][5]
+    faint = measure(study.with_settings(["measure.snr_per_bin=1e6"]), engine)
+    assert len(faint.tables["temperatures"]) == 0
+    assert any("no bin of the stare reaches snr_per_bin" in text for text in faint.messages)
 
 
 def test_lines_and_absolute_fluxes(engine: Engine) -> None:

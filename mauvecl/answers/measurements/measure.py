@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, ClassVar
 
+import astropy.units as u
 import numpy as np
 import scipy
+from astropy.table import QTable
 from numpy.typing import NDArray
 
 from mauvecl.answers.answer import Answer
+from mauvecl.answers.measurements.along import MeasuredStare, measured_stare
 from mauvecl.answers.measurements.expected import ExpectedMeasurement, expected_measurements, matched_filter
 from mauvecl.results.measurements.fit import LEVELS, Measurement, fit
 from mauvecl.results.measurements.reduction import variance_of
@@ -19,15 +22,16 @@ from mauvecl.runs.checkpoint import kept
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.tables import make_table
+from mauvecl.schema.tables import Column, View, make_table
 from mauvecl.statistics.intervals import clopper_pearson
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import stack_tables
 from mauvecl.study.messages import collect_messages
+from mauvecl.study.stare_section import check_sweep
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
-    from astropy.table import QTable, Table
+    from astropy.table import Table
 
     from mauvecl.device.engine import Engine
     from mauvecl.host.expectation import Expectation
@@ -38,6 +42,17 @@ Float = NDArray[np.float64]
 
 #: Exposures drawn and fitted at once, which bounds the memory.
 BATCH = 4096
+#: What the terminal shows of measurements along a stare.
+BIN_COLUMNS = (
+    Column("start", heading="from (s)", format="g"),
+    Column("end", heading="to (s)", format="g"),
+    Column("snr", heading="S/N", format=".1f"),
+    Column("temperature", heading="temperature (K)", format=".0f"),
+    Column("temperature_error", heading="error", format=".0f"),
+    Column("temperature_without_noise", heading="without noise", format=".0f"),
+    Column("flux_bolometric", heading="bolometric flux (erg/s/cm2)", format=".3g"),
+    Column("p_value", heading="p-value", format=".2g"),
+)
 #: A good fit is rejected where one of its p-value is less probable.
 REJECTED = 0.01
 
@@ -128,6 +143,8 @@ class MeasureAnswer(Answer):
     flares : list of MeasuredFlare
         Every model of every flare of every star in every cell of the sweep.
     messages : list of str
+    stares : list of MeasuredStare
+        One stare of every star in every cell, if the study asks for bins of a stare.
     """
 
     USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "unknowns", "seed")
@@ -135,6 +152,7 @@ class MeasureAnswer(Answer):
     study: Study
     flares: list[MeasuredFlare]
     messages: list[str]
+    stares: list[MeasuredStare] = field(default_factory=list)
 
     @cached_property
     def table(self) -> QTable:
@@ -148,8 +166,30 @@ class MeasureAnswer(Answer):
 
     @property
     def tables(self) -> dict[str, Table]:
-        """Measured quantities, and fits."""
-        return {"measure": self.table, "fits": self.fits}
+        """Measured quantities, fits, and measurements along stares."""
+        along = {"temperatures": self.temperatures} if self.stares else {}
+        return {"measure": self.table, "fits": self.fits} | along
+
+    @cached_property
+    def temperatures(self) -> QTable:
+        """Measurements against time; one row per star, cell and bin of its stare."""
+        every = [(one, one.drawn.table()) for one in self.stares if not isinstance(one.drawn, str)]
+        for one, table in every:
+            assert one.perfect is not None
+            exact = one.perfect.found.estimates[:, 0]
+            table.add_column(exact * u.K, table.colnames.index("temperature") + 1, "temperature_without_noise")
+            table["temperature_without_noise"].info.description = "temperature fitted to the means of these frames"
+        parts = [({"star": one.label, **one.at, "model": one.model}, table) for one, table in every]
+        return stack_tables(parts, study=self.study.text()) if parts else QTable()
+
+    @property
+    def views(self) -> list[View]:
+        if not self.stares:
+            return []
+        swept = [axis.quantity for axis in self.study.sweep.axes]
+        first = [Column(name, heading=name) for name in ("star", *swept)]
+        asked = f"S/N {self.study.measure.snr_per_bin:g}"
+        return [View(f"Measured along the stare, in bins of {asked}", [*first, *BIN_COLUMNS], self.temperatures)]
 
     @property
     def inputs(self) -> list[Expectation]:
@@ -158,7 +198,8 @@ class MeasureAnswer(Answer):
     def as_json(self) -> dict[str, Any]:
         from mauvecl.answers.report import rows
 
-        return {"messages": self.messages, "rows": rows(self.table), "fits": rows(self.fits)}
+        along = {"temperatures": rows(self.temperatures)} if self.stares else {}
+        return {"messages": self.messages, "rows": rows(self.table), "fits": rows(self.fits)} | along
 
     def _together(self, table_of: Callable[[MeasuredFlare], QTable]) -> QTable:
         parts = []
@@ -190,6 +231,8 @@ def measure(
     """
     if study.flare.geometry != "added":
         raise InputError("flare.geometry = 'replaces' in a measurement, expected 'added': fits take light for added")
+    if study.measure.snr_per_bin is not None:
+        check_sweep(study)
     prepared = cases(study)
     if any(not amplitude > 0.0 for case in prepared for amplitude in case.amplitudes):
         raise InputError("flare amplitude = 0 in a measurement, expected one above 0")
@@ -204,8 +247,11 @@ def measure(
         flares += some
         if progress is not None:
             progress(done, len(asked))
+    snr = study.measure.snr_per_bin
+    stares = [measured_stare(case, engine, snr) for case in prepared if snr is not None]
     messages = collect_messages(expectations)
-    return MeasureAnswer(study, flares, [*messages, *_wrong(flares)])
+    messages += [one.drawn for one in stares if isinstance(one.drawn, str)]
+    return MeasureAnswer(study, flares, [*messages, *_wrong(flares)], stares)
 
 
 def _measured(case: Case, amplitude: float, flare: Expectation, engine: Engine | Pool) -> list[MeasuredFlare]:

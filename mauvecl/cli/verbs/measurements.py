@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from mauvecl.cli.flags import DETECTION, DRAWS, FLARE, MEASURE, NUISANCES, SIZE, SWEEP
+from mauvecl.cli.flags import DETECTION, DRAWS, FLARE, MEASURE, NUISANCES, SIZE, STARE, SWEEP
 from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 SELECTED = {"fap": DETECTION["fap"]}
 
 
-@takes_study(FLARE, MEASURE, NUISANCES, SIZE, SELECTED, {"seed": DRAWS["seed"]}, SWEEP)
+@takes_study(FLARE, MEASURE, STARE, NUISANCES, SIZE, SELECTED, {"seed": DRAWS["seed"]}, SWEEP)
 def measure(study: Study, session: Session) -> None:
     """What would be measured of a flare's spectrum, and how well.
 
@@ -25,13 +25,15 @@ def measure(study: Study, session: Session) -> None:
     Examples: mauvecl measure --star M3V -m 9 -a 0.5 --balmer-jump 2 --nuisance dark=free --nuisance light=free
 
     mauvecl measure --star M3V --magnitude 9 --amplitude 0.5 --sweep exposure=50,300 --distance 5 --radius 0.4
+
+    mauvecl measure --star M3V --magnitude 9 --amplitude 2 --snr-per-bin 20 --hours 0.5 --distance 5
     """
     answer = session.ask(study)
     session.answer(answer, lambda: _show(answer))
 
 
 def _show(answer: MeasureAnswer) -> None:
-    from mauvecl.cli.console import short, show_table
+    from mauvecl.cli.console import short, show_table, show_view
 
     cells = []
     shown = ("truth", "error_known", "error", "perfect", "bias", "scatter")
@@ -52,6 +54,8 @@ def _show(answer: MeasureAnswer) -> None:
          "fit without noise", "bias", "scatter", "95 % covers", "if detected", "one-sided"),
         cells,
     )  # fmt: skip
+    for view in answer.views:
+        show_view(view)
     show_table(
         "Goodness of fit",
         ("star", *swept, "flare", "model", "S/N, all known", "S/N", "chi-squared", "of", "p < 0.01", "detected"),

@@ -140,14 +140,27 @@ def measure_along(
         raise InputError(f"an exposure of {quiet.n_frames} frames, expected one frame of the quiescent star")
     if not 0.0 < snr_per_bin < np.inf:
         raise InputError(f"snr_per_bin = {snr_per_bin:g}, expected a number above 0")
-    # Known strengths of star, sky, dark and flare in each frame.
-    known = np.column_stack([stare.light * stare.star, stare.light * stare.sky, stare.dark_factor(quiet), stare.light])
-    bins = _bins(raw, quiet, model, nuisances, known, stare, snr_per_bin)
+    bins = _bins(raw, quiet, model, nuisances, _known(stare, quiet), stare, snr_per_bin)
     if not bins:
         raise InputError(f"no bin of the stare reaches snr_per_bin = {snr_per_bin:g}, expected a lower one")
     first, end = np.array(bins).T
+    return fit_bins(raw, quiet, model, nuisances, stare, first, end - first, levels)
+
+
+def fit_bins(
+    raw: Float,
+    quiet: Expectation,
+    model: FlareModel,
+    nuisances: Nuisances | None,
+    stare: Stare,
+    first: NDArray[np.intp],
+    count: NDArray[np.intp],
+    levels: Sequence[float] = LEVELS,
+) -> MeasuredBins:
+    """Fit bins of frames; parameters as for `measure_along`, with the first frames of bins and their numbers."""
+    known, end = _known(stare, quiet), first + count
     alike: dict[tuple[float, ...], list[int]] = {}
-    for k, (a, b) in enumerate(bins):
+    for k, (a, b) in enumerate(zip(first, end, strict=True)):
         mean = known[a:b].mean(axis=0).round(DIGITS)
         alike.setdefault((float(b - a), *map(float, mean)), []).append(k)
     parts = []
@@ -162,7 +175,12 @@ def measure_along(
         parts.append(fit(added, stacked, model.stacked(n, light), unknown, levels=levels))
     order = np.argsort(np.concatenate(list(alike.values())))
     found = Measurement.joined(parts).rows(order)
-    return MeasuredBins(first, end - first, stare.start_s[first], stare.start_s[end - 1] + stare.frame_s, found)
+    return MeasuredBins(first, count, stare.start_s[first], stare.start_s[end - 1] + stare.frame_s, found)
+
+
+def _known(stare: Stare, quiet: Expectation) -> Float:
+    """Return known strengths of star, sky, dark and flare in each frame, shape (n_frame, 4)."""
+    return np.column_stack([stare.light * stare.star, stare.light * stare.sky, stare.dark_factor(quiet), stare.light])
 
 
 def _bins(

@@ -121,6 +121,20 @@ class StareExpectation:
             sd[:, there], mean[:, there] = self.expected(rows)
         return net, sd, mean
 
+    def raw(self, draw: Draw) -> Float:
+        """Return drawn raw counts of each pixel, DN, shape (n_frame, n_pixel); saturated pixels hold their mean."""
+        frames = np.tile(self.quiet.recorded_dn, (self.stare.n_frames, 1))
+        pixels = np.flatnonzero(self.used)
+        for begin in range(0, pixels.size, MOST_STATISTICS):
+            some = pixels[begin : begin + MOST_STATISTICS]
+            frames[:, some] += draw(self.components(np.eye(self.used.size)[some]))
+        return frames
+
+    @cached_property
+    def mean_raw(self) -> Float:
+        """Mean raw counts of each pixel, DN, shape (n_frame, n_pixel)."""
+        return np.asarray(self.coefficients @ self._bare.mean_dn + self.quiet.bias_dn)
+
     def expected(self, weights: Float) -> tuple[Float, Float]:
         """Standard deviation and mean of the net light in weighted sums of pixels, DN per second, (n_frame, n_sum)."""
         frame_s, coefficients = self.stare.frame_s, self.coefficients
