@@ -18,6 +18,7 @@ from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.quantities import number
 from mauvecl.schema.ranges import EXPOSURES, check_exposure
+from mauvecl.schema.tables import Column, table_of
 
 from ..drawable import Drawable
 from .content import ContentEquality
@@ -44,6 +45,20 @@ MAX_FRAMES = 2**24
 #: Definition of the signal: the star alone ("net"), or the star and the zodiacal light, as in the MauveSim paper.
 Signal = Literal["net", "paper"]
 SIGNALS: tuple[Signal, ...] = get_args(Signal)
+
+#: Columns of the table of noise by origin.
+BUDGET_COLUMNS = (
+    Column("wavelength", unit="nm", description="vacuum wavelength, the middle of the pixel or element", heading="nm",
+           format=".1f"),
+    Column("source_photon", unit="DN", description="photon noise of the star, rms", heading="source photons",
+           format=".2f"),
+    Column("zodiacal_photon", unit="DN", description="photon noise of the zodiacal light, rms",
+           heading="zodiacal photons", format=".2f"),
+    Column("dark", unit="DN", description="noise of the dark current, rms", heading="dark", format=".2f"),
+    Column("read", unit="DN", description="read noise, rms", heading="read", format=".2f"),
+    Column("total", unit="DN", description="all of them in quadrature, without the ADC's rounding", heading="total",
+           format=".2f"),
+)  # fmt: skip
 
 
 @public
@@ -326,8 +341,6 @@ class Expectation(Drawable, ContentEquality):
             quadratic sum of the four, so `snr` is signal_dn / total. The ADC's rounding, 0.29 DN per frame, is not
             included.
         """
-        from astropy.table import QTable
-
         n, gain = self.n_frames, self.gain_dn_per_electron
         # Fraction of the light that saturation leaves.
         kept = np.divide(self.recorded_light_dn, self.light_dn, out=np.ones_like(gain), where=self.light_dn > 0)
@@ -338,12 +351,9 @@ class Expectation(Drawable, ContentEquality):
             "read": n * self.read_noise_dn**2,
             "total": self._noise_dn2,
         }
-        table = QTable({"wavelength": self.wavelength_nm * u.nm})
-        for name, variance in variances.items():
-            table[name] = np.sqrt(variance) * u.DN
-        table.meta["exposure_s"] = self.exposure_s
-        table.meta["name"] = self.name
-        return table
+        noise = {name: np.sqrt(variance) for name, variance in variances.items()}
+        about = {"exposure_s": self.exposure_s, "name": self.name}
+        return table_of(BUDGET_COLUMNS, [{"wavelength": self.wavelength_nm} | noise], **about)
 
     @property
     def ceiling_dn(self) -> float:

@@ -11,6 +11,7 @@ from scipy import special
 from mauvecl.noise import reference
 from mauvecl.noise.drawing import DrawingOptions
 from mauvecl.noise.scene import prepare
+from mauvecl.schema.tables import Column, table_of
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -50,9 +51,6 @@ def components(
     sum, from separate streams, so that the decomposition does not affect the spectrum. The conditional distribution of
     the dark counts is Poisson times Gaussian. Only in this decomposition, Poisson photons are treated as Gaussian.
     """
-    import astropy.units as u
-    from astropy.table import QTable
-
     scene = prepare([x], **drawing)
     index = np.array([realisation], np.uint64)
     n = scene.n_pixel
@@ -104,20 +102,15 @@ def components(
         for name, values in zip(parts, (source, sky, photon, dark, rest - photon, cosmic[:n]), strict=True):
             parts[name] += values
         raw += scene.base_dn[0] + dn[:n]
-    table = QTable()
-    table["wavelength"] = x.wavelength_nm * u.nm
     parts["bias"] = np.asarray(x.n_frames * x.bias_dn)
     if not scene.cosmic:
         del parts["cosmic_rays"]
-    table["raw"] = raw * u.adu
-    for name, values in parts.items():
-        table[name] = values * u.adu
-    table["digitisation"] = (raw - sum(parts.values())) * u.adu
-    table["net"] = (raw - x.n_frames * (x.bias_dn + x.dark_dn) - x.subtracted_dn) * u.adu
-    for name in table.colnames[1:]:
-        table[name].info.description = DESCRIPTIONS[name]
-    table.meta |= {"signal": x.signal, "name": x.name, "exposure_s": x.exposure_s, "frames": x.n_frames, "seed": seed}
-    return table
+    values = {"wavelength": x.wavelength_nm, "raw": raw} | parts
+    values["digitisation"] = raw - sum(parts.values())
+    values["net"] = raw - x.n_frames * (x.bias_dn + x.dark_dn) - x.subtracted_dn
+    columns = [column for column in COLUMNS if column.name in values]
+    about = {"signal": x.signal, "name": x.name, "exposure_s": x.exposure_s, "frames": x.n_frames, "seed": seed}
+    return table_of(columns, [values], **about)
 
 
 def _dark_given_total(total: Float, mean: Float, step: Float, variance: Float, chance: Float) -> Float:
@@ -138,15 +131,22 @@ def _dark_given_total(total: Float, mean: Float, step: Float, variance: Float, c
     return dark
 
 
-DESCRIPTIONS = {
-    "raw": "simulated raw spectrum, summed over the frames (DN)",
-    "source": "mean signal of the star",
-    "sky": "mean signal of the zodiacal light",
-    "photon_noise": "drawn photon noise of star and sky",
-    "dark": "drawn dark counts",
-    "bias": "bias",
-    "read_noise": "drawn read noise",
-    "cosmic_rays": "drawn charge of cosmic rays",
-    "digitisation": "what rounding and clipping changed",
-    "net": "raw less bias, mean dark and, where the signal is the star's alone, mean sky",
-}
+#: Columns of the table of components.
+COLUMNS = (
+    Column("wavelength", unit="nm", description="vacuum wavelength, the middle of the pixel or element"),
+    *(
+        Column(name, unit="adu", description=text)
+        for name, text in {
+            "raw": "simulated raw spectrum, summed over the frames (DN)",
+            "source": "mean signal of the star",
+            "sky": "mean signal of the zodiacal light",
+            "photon_noise": "drawn photon noise of star and sky",
+            "dark": "drawn dark counts",
+            "read_noise": "drawn read noise",
+            "cosmic_rays": "drawn charge of cosmic rays",
+            "bias": "bias",
+            "digitisation": "what rounding and clipping changed",
+            "net": "raw less bias, mean dark and, where the signal is the star's alone, mean sky",
+        }.items()
+    ),
+)

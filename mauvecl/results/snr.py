@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -16,7 +16,7 @@ from mauvecl.noise.reference import Floats, fma
 from mauvecl.noise.scene import Scene
 from mauvecl.results.counts.far import SparseCounts
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.tables import make_table, set_descriptions
+from mauvecl.schema.tables import Column, table_of
 
 if TYPE_CHECKING:
     from astropy.table import QTable
@@ -27,6 +27,24 @@ if TYPE_CHECKING:
 BINS_PER_SIGMA = 128.0
 #: Percentages of the reported quantiles: the median and one, two and three sigma.
 PERCENTAGES = (0.135, 2.5, 16.0, 50.0, 84.0, 97.5, 99.865)
+#: Columns of the tables of pixels and elements.
+COLUMNS = (
+    Column("wavelength", unit="nm", description="vacuum wavelength, the middle of the pixel or element", heading="nm",
+           format=".1f"),
+    Column("expected", description="closed-form S/N of the mean spectrum", heading="closed form", format=".2f"),
+    Column("mean", description="mean S/N of the realisations", heading="mean", format=".2f"),
+    Column("std", description="standard deviation of the S/N of the realisations", heading="std", format=".2f"),
+    *(
+        Column(f"q{percentage:g}", description=f"{percentage:g} % quantile of the realisations",
+               heading=f"{percentage:g} %" if percentage in (2.5, 50.0, 97.5) else "", format=".2f")
+        for percentage in PERCENTAGES
+    ),
+)  # fmt: skip
+#: Columns that the table of pixels has as well.
+CLIPPED_COLUMNS = tuple(
+    Column(f"clipped_{end}", description="share of frames cut off at this end: zero or saturation")
+    for end in ("low", "high")
+)
 
 
 def observers(x: Expectation, scene: Scene) -> NDArray[np.void]:
@@ -182,11 +200,9 @@ class SnrResult(Drawable, ContentEquality):
             noise2 = np.maximum(net, 0.0) * seen["gain"][which] + seen["variance"][which]
             return np.asarray(np.divide(net - sky[which], np.sqrt(noise2), out=np.zeros_like(net), where=noise2 > 0))
 
-        table = self._table("pixel", x.wavelength_nm, x.snr(), snr)
-        frames = self.counts.n * x.n_frames
-        table["clipped_low"], table["clipped_high"] = self.counts.clipped.T / frames
-        cut = "share of frames cut off at this end: zero or saturation"
-        return set_descriptions(table, {"clipped_low": cut, "clipped_high": cut})
+        low, high = self.counts.clipped.T / (self.counts.n * x.n_frames)
+        values = self._values("pixel", x.wavelength_nm, x.snr(), snr) | {"clipped_low": low, "clipped_high": high}
+        return self._table((*COLUMNS, *CLIPPED_COLUMNS), values)
 
     @property
     def element(self) -> QTable:
@@ -202,19 +218,24 @@ class SnrResult(Drawable, ContentEquality):
         def snr(which: NDArray[np.intp], place: NDArray[np.number]) -> NDArray[np.float64]:
             return np.asarray(self.elements["centre"][which] + step[which] * (place - 0.5))
 
-        return self._table("element", x.element_wavelength_nm, x.snr_per_element(), snr)
+        return self._table(COLUMNS, self._values("element", x.element_wavelength_nm, x.snr_per_element(), snr))
 
     def _line(self) -> str:
         return f"of {self.expectation.name!r}, {self.counts.n} realisations"
 
-    def _table(
+    def _table(self, columns: Iterable[Column], values: Mapping[str, NDArray[np.float64]]) -> QTable:
+        x = self.expectation
+        about = {"exposure_s": x.exposure_s, "name": x.name, "signal": x.signal}
+        return table_of(columns, [values], realisations=self.counts.n, **about)
+
+    def _values(
         self,
         kind: str,
         wavelength_nm: NDArray[np.float64],
         expected: NDArray[np.float64],
         snr: Callable[[NDArray[np.intp], NDArray[np.number]], NDArray[np.float64]],
-    ) -> QTable:
-        """Make the table of pixels or elements; `snr` converts fractional bin numbers to ratios."""
+    ) -> dict[str, NDArray[np.float64]]:
+        """Return the columns of pixels or elements by name; `snr` converts fractional bin numbers to ratios."""
         counts = self.counts.pixel if kind == "pixel" else self.counts.element
         numbers, every = (
             np.arange(layout.OBSERVER_BINS + 1) - layout.OBSERVER_BINS // 2,
@@ -237,19 +258,8 @@ class SnrResult(Drawable, ContentEquality):
             std[i] = np.sqrt(held @ (middle - mean[i]) ** 2 / self.counts.n)
             ends = np.column_stack([snr(i, filled), snr(i, filled + 1)]).ravel()
             quantiles[i] = np.interp(np.array(PERCENTAGES) / 100, steps_of(held) / self.counts.n, ends)
-        return make_table(
-            (
-                ("wavelength", wavelength_nm, "", "nm"),
-                ("expected", expected, "closed-form S/N of the mean spectrum"),
-                ("mean", mean, "mean S/N of the realisations"),
-                ("std", std, "standard deviation of the S/N of the realisations"),
-                *((f"q{percentage:g}", quantiles[:, i]) for i, percentage in enumerate(PERCENTAGES)),
-            ),
-            realisations=self.counts.n,
-            exposure_s=self.expectation.exposure_s,
-            name=self.expectation.name,
-            signal=self.expectation.signal,
-        )
+        values = {"wavelength": wavelength_nm, "expected": expected, "mean": mean, "std": std}
+        return values | {f"q{percentage:g}": quantiles[:, i] for i, percentage in enumerate(PERCENTAGES)}
 
 
 def _quantiles(cumulative: NDArray[np.float64], edges: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -51,15 +51,20 @@ def stack_tables(parts: Iterable[tuple[Mapping[str, float | str], QTable]], **me
     return describe_columns(whole)
 
 
-def place_columns(study: Study, *own: str) -> tuple[Column, ...]:
-    """Return the columns of the star and of what a study sweeps, for rows with a `label` and the values `at` a cell.
+def place_columns(study: Study, *own: str, star: str = "label") -> tuple[Column, ...]:
+    """Return the columns of the star and of what a study sweeps, for rows with the values `at` a cell of the sweep.
 
-    `own` names quantities for which a table has columns of its own.
+    `own` names quantities for which a table has columns of its own, and `star` the attribute with the star's label.
     """
     return (
-        Column("star", "label", description=QUANTITIES["star"].description, heading="star"),
+        star_column(star),
         *(quantity_column(axis.quantity) for axis in study.sweep.axes if axis.quantity not in own),
     )
+
+
+def star_column(get: str = "star") -> Column:
+    """Return the column of a star's label."""
+    return Column("star", get, description=QUANTITIES["star"].description, heading="star")
 
 
 def quantity_column(name: str, get: str | Callable[[Any], Any] = "", description: str = "") -> Column:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -20,11 +20,11 @@ from scipy import special
 from mauvecl.noise.unknowns import INSTRUMENT_VALUES
 from mauvecl.results.requests.fap import MIN_IN_TAIL
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.tables import Column
 from mauvecl.statistics.intervals import CONFIDENCE, Interval
+from mauvecl.study.parts import First
 
 if TYPE_CHECKING:
-    from astropy.table import QTable
-
     from mauvecl.study.study import Study
 
 Float = NDArray[np.float64]
@@ -40,6 +40,11 @@ class DrawnStudies:
     names: tuple[str, ...]
     values: Float  # shape (n_draw, n_name)
     studies: tuple[Study, ...]  # the study with each draw's instrument, without unknowns, and its share of realisations
+
+    @property
+    def by_name(self) -> dict[str, Float]:
+        """Drawn values of each unknown."""
+        return dict(zip(self.names, self.values.T, strict=True))
 
 
 def drawn(study: Study) -> DrawnStudies:
@@ -133,11 +138,20 @@ def _explained(x: Float, y: Float) -> float:
     return float(1.0 - left.var() / y.var())
 
 
-def draws_table(draws: DrawnStudies, outcomes: dict[str, Float]) -> QTable:
-    """Return a table with one row per draw: the drawn values and the outcomes."""
-    from astropy.table import QTable
+#: Unknowns whose shares of a scatter are named, at most.
+MAX_NAMED = 3
 
-    table = QTable({name: draws.values[:, k] for k, name in enumerate(draws.names)})
-    for name, values in outcomes.items():
-        table[name] = values
-    return table
+
+def describe_shares(shares: Mapping[str, float]) -> str:
+    """Return the largest shares of a scatter in words, and how many there are."""
+    first = First(shares.items(), MAX_NAMED, "unknowns")
+    note = f" ({first.note})" if first.note else ""
+    return ", ".join(f"{name} {100 * share:.0f} %" for name, share in first) + note
+
+
+def draw_columns(names: Iterable[str]) -> tuple[Column, ...]:
+    """Return the columns of the drawn values of unknowns, for rows with `draws`."""
+    return tuple(
+        Column(name, description=f"drawn {INSTRUMENT_VALUES[name].label}").of(lambda row: row.draws.by_name)
+        for name in names
+    )

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from operator import itemgetter
 from typing import TYPE_CHECKING, ClassVar
 
 import numpy as np
@@ -20,9 +21,8 @@ from mauvecl.answers.signal.snr import SnrAnswer, snr
 from mauvecl.noise.cumulants import Cumulants
 from mauvecl.results.snr import steps_of
 from mauvecl.schema.calls import public
-from mauvecl.schema.tables import set_descriptions
-from mauvecl.study.labels import describe_columns
-from mauvecl.study.quantities import UNITS
+from mauvecl.schema.tables import Column, View, number, table_of
+from mauvecl.study.labels import place_columns
 from mauvecl.study.questions import Axis, Sweep
 from mauvecl.study.study import Study
 
@@ -43,25 +43,40 @@ ONE_SIGMA = float(special.ndtr(1.0) - special.ndtr(-1.0))
 SURE, ERRORS_IN_INTERVAL = 4, 3.92
 #: A false-alarm probability further below the promised one is as wrong as this.
 SMALLEST_RATIO = 1e-3
-#: What the columns are, of an element and of a cell.
-PROMISED = {
-    "expected": "S/N by the formula",
-    "mean": "mean S/N of the realisations",
-    "error": "standard error of the mean",
-    "bias": "mean over expected S/N, less one",
-    "coverage": "share of 1-sigma intervals of its pixels that hold the truth; 0.6827 promised",
-}
-WORST = {
-    "best_snr": "largest S/N per element by the formula",
-    "snr_off_by": "largest significant (4 standard errors) difference of the mean S/N from it; 0 if none",
-    "at_nm": "where",
-    "coverage_low": "smallest share of 1-sigma intervals that hold the truth, of all elements",
-    "coverage_high": "largest",
-    "five_sigma_above": "how often a pixel lies 5 sigma above its mean, over the normal 2.9e-7; the most",
-    "five_sigma_below": "how often a pixel lies 5 sigma below its mean, over the normal 2.9e-7; the least",
-    "probability_off_by": "largest significant difference of a detection probability from the closed form",
-    "fap_ratio": "most wrong false-alarm probability over the promised one; 1 if none differs",
-}
+#: Columns of the table of resolution elements.
+ELEMENT_COLUMNS = (
+    Column("wavelength", unit="nm", description="vacuum wavelength, the middle of the pixel or element"),
+    Column("expected", description="S/N by the formula"),
+    Column("mean", description="mean S/N of the realisations"),
+    Column("std", description="standard deviation of the S/N of the realisations"),
+    Column("error", description="standard error of the mean"),
+    Column("bias", description="mean over expected S/N, less one"),
+    Column("coverage", description="share of 1-sigma intervals of its pixels that hold the truth; 0.6827 promised"),
+)
+#: Columns of the worst of each promise.
+WORST_COLUMNS = (
+    Column("best_snr", description="largest S/N per element by the formula", heading="best S/N", format=".2f"),
+    Column("snr_off_by",
+           description="largest significant (4 standard errors) difference of the mean S/N from it; 0 if none",
+           heading="S/N off by", format="+.3f"),
+    Column("at_nm", description="where", heading="at nm", format=number(".0f")),
+    Column("coverage_low", description="smallest share of 1-sigma intervals that hold the truth, of all elements",
+           heading="1-sigma intervals", format=lambda low, high: f"{100 * low:.2f}-{100 * high:.2f} %",
+           others=("coverage_high",)),
+    Column("coverage_high", description="largest"),
+    Column("five_sigma_above", description="how often a pixel lies 5 sigma above its mean, over the normal 2.9e-7; "
+           "the most", heading="5 sigma above, below", format=lambda above, below: f"{above:.2f}, {below:.2f}",
+           others=("five_sigma_below",)),
+    Column("five_sigma_below",
+           description="how often a pixel lies 5 sigma below its mean, over the normal 2.9e-7; the least"),
+    Column("fap_ratio", description="most wrong false-alarm probability over the promised one; 1 if none differs",
+           heading="false alarms", format=".3f"),
+    Column("statistic", description="detection statistic", heading="statistic"),
+    Column("why", description="main cause of a difference from the closed form", heading="why"),
+    Column("probability_off_by",
+           description="largest significant difference of a detection probability from the closed form",
+           heading="detection off by", format="+.4f"),
+)  # fmt: skip
 #: Looked at where a study sweeps over nothing.
 GRID = Sweep(
     axes=(
@@ -137,13 +152,13 @@ def beyond(x: Expectation, sigmas: float) -> NDArray[np.float64]:
 
 def _promises(result: SnrResult) -> QTable:
     """The formula's S/N and intervals beside the simulation's, one row per resolution element."""
-    table = result.element["wavelength", "expected", "mean", "std"]
-    x = result.expectation
-    table["error"] = table["std"] / np.sqrt(result.counts.n)
+    table, x = result.element, result.expectation
+    values = {name: np.asarray(table[name].value) for name in ("wavelength", "expected", "mean", "std")}
+    values["error"] = values["std"] / np.sqrt(result.counts.n)
     with np.errstate(divide="ignore", invalid="ignore"):
-        table["bias"] = table["mean"] / table["expected"] - 1.0
-    table["coverage"] = x.per_element(coverage(result)) / x.per_element(np.ones(x.wavelength_nm.size))
-    return set_descriptions(table, PROMISED)
+        values["bias"] = values["mean"] / values["expected"] - 1.0
+    values["coverage"] = x.per_element(coverage(result)) / x.per_element(np.ones(x.wavelength_nm.size))
+    return table_of(ELEMENT_COLUMNS, [values], **table.meta)
 
 
 @dataclass(eq=False)
@@ -189,20 +204,25 @@ class GaussianReport(Answer):
     @cached_property
     def cells(self) -> QTable:
         """One row per star and cell: the worst of each promise."""
-        import astropy.units as u
-        from astropy.table import QTable
-
         tables = [_by_star(t, len(self.signal.stars)) for t in (self.elements, self.thresholds, self.detection.table)]
         rows = [
-            {"star": star.label, **star.at} | _of_signal(star.result, elements) | _of_thresholds(tested, flares)
+            {"star": star} | _of_signal(star.result, elements) | _of_thresholds(tested, flares)
             for star, elements, tested, flares in zip(self.signal.stars, *tables, strict=True)
         ]
-        table = QTable(rows=rows)
-        for axis in self.study.sweep.axes:
-            if axis.quantity in UNITS:
-                table[axis.quantity] = table[axis.quantity] * u.Unit(UNITS[axis.quantity])
-        table.meta |= {"fap": self.study.run.fap, "study": self.study.text()}
-        return describe_columns(set_descriptions(table, WORST))
+        return table_of(self._columns, rows, fap=self.study.run.fap, study=self.study.text())
+
+    @property
+    def _columns(self) -> tuple[Column, ...]:
+        return (*(column.of(itemgetter("star")) for column in place_columns(self.study)), *WORST_COLUMNS)
+
+    @property
+    def views(self) -> list[View]:
+        run = self.study.run
+        title = (
+            f"The root-of-N formula beside {run.realisations:,} realisations; promised: no difference in S/N, 68.3 % "
+            f"of 1-sigma intervals, as many 5-sigma pixels and false alarms ({run.fap:g}) as normal noise has"
+        )
+        return [View(title, self._columns, self.cells)]
 
 
 def _by_star(table: QTable, stars: int) -> list[QTable]:

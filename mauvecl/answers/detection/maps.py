@@ -13,15 +13,15 @@ from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import cost_lines, marginal_lines, unknown_cost
 from mauvecl.results.requests.fap import check_fap
 from mauvecl.schema.calls import public
-from mauvecl.schema.tables import make_table
+from mauvecl.schema.tables import Column, View, table_of
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.cases import Case, cases
-from mauvecl.study.labels import describe_columns, label
+from mauvecl.study.labels import label, quantity_column
 from mauvecl.study.messages import SATURATED, collect_messages, worst_first
 from mauvecl.study.nuisances import NuisanceChoice
-from mauvecl.study.quantities import OF_SPECTRUM, UNITS
+from mauvecl.study.quantities import OF_SPECTRUM
 from mauvecl.study.study import Study
-from mauvecl.study.unknowns import average, drawn, shares
+from mauvecl.study.unknowns import average, describe_shares, drawn, shares
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
@@ -35,6 +35,16 @@ if TYPE_CHECKING:
 
 #: Quantities of the flare alone: cells that differ in them share their quiescent star, and one launch.
 OF_FLARE = ("amplitude", "flare_temperature", *OF_SPECTRUM)
+
+
+#: Columns of the table of cells, after those of the two axes.
+COLUMNS = (
+    Column("statistic", description="detection statistic"),
+    Column("probability", description="detection probability"),
+    Column("low", description="its 95 % interval, lower end, with the threshold's own"),
+    Column("high", description="its 95 % interval, upper end, with the threshold's own"),
+    Column("closed_form", description="the same for Gaussian noise"),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,22 +88,34 @@ class MapResult(Answer):
     def table(self) -> QTable:
         """One row per cell and statistic."""
         s, j, i = (index.ravel() for index in np.indices(self.probability.shape))
-        axes = ((self.study.map.x, self.x, i), (self.study.map.y, self.y, j))
-        table = make_table(
-            (
-                *((a.quantity, np.array(values)[at], "", UNITS.get(a.quantity, "")) for a, values, at in axes),
-                ("statistic", np.array(self.statistics)[s]),
-                ("probability", self.probability.ravel(), "detection probability"),
-                ("low", self.low.ravel(), "its 95 % interval, lower end, with the threshold's own"),
-                ("high", self.high.ravel(), "its 95 % interval, upper end, with the threshold's own"),
-                ("closed_form", self.closed_form.ravel(), "the same for Gaussian noise"),
-            ),
-            star=self.star,
-            fap=self.study.run.fap,
-            realisations=self.study.run.realisations,
-            study=self.study.text(),
-        )
-        return describe_columns(table)
+        x, y = self.study.map.x.quantity, self.study.map.y.quantity
+        values = {x: np.array(self.x)[i], y: np.array(self.y)[j], "statistic": np.array(self.statistics)[s]}
+        values |= {column.name: getattr(self, column.name).ravel() for column in COLUMNS[1:]}
+        columns = (quantity_column(x, x), quantity_column(y, y), *COLUMNS)
+        run = {"fap": self.study.run.fap, "realisations": self.study.run.realisations}
+        return table_of(columns, [values], star=self.star, **run, study=self.study.text())
+
+    @property
+    def views(self) -> list[View]:
+        """The map of each statistic: a row per value of y, a column per value of x."""
+        draws = f"{self.study.unknowns.draws} draws of what is unknown"
+        lines = [
+            View(f"{statistic}, averaged over {draws}: its scatter is from {describe_shares(parts)}.")
+            for statistic, parts in self.shares.items()
+        ]
+        axes = f"{self.study.map.y.quantity}, {self.study.map.x.quantity}"
+        columns = [
+            Column("y", heading=axes, format=_shown),
+            *(Column(f"x{k}", heading=_shown(x), format=lambda p: f"{100 * p:.0f}") for k, x in enumerate(self.x)),
+        ]
+        maps = []
+        for statistic, probability in zip(self.statistics, self.probability, strict=True):
+            rows = [
+                {"y": y} | {f"x{k}": p for k, p in enumerate(row)} for y, row in zip(self.y, probability, strict=True)
+            ]
+            title = f"{self.star}: detection probability in percent, {statistic}, fap {self.study.run.fap:g} per test"
+            maps.append(View(title, columns, table_of(columns, rows)))
+        return [*lines, *maps]
 
     ENDINGS = ("ecsv", "fits")
 

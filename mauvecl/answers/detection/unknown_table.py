@@ -12,9 +12,9 @@ from scipy import special
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import Cost, spoken, unknown_cost
-from mauvecl.schema.tables import set_descriptions
+from mauvecl.schema.tables import Column, View, percent, table_of
 from mauvecl.study.cases import cases
-from mauvecl.study.labels import describe_columns
+from mauvecl.study.labels import amplitude_column, star_column
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.nuisances import NuisanceChoice
 
@@ -37,13 +37,19 @@ SHOWN: dict[str, NuisanceChoice] = {
     )
 }
 
-DESCRIPTIONS = {
-    "unknown": "what is unknown",
-    "known": "S/N of the matched statistic with everything known",
-    "plain": "the same where it is unknown and the statistic does not know of it",
-    "marginalised": "the same, marginalised",
-    "smallest": "flare amplitude that is detected, marginalised, at the header's power and false alarms",
-}
+#: Columns of the table.
+COLUMNS = (
+    star_column(),
+    amplitude_column(),
+    Column("unknown", description="what is unknown", heading="unknown"),
+    Column("known", description="S/N of the matched statistic with everything known", heading="S/N, all known",
+           format=".3g"),
+    Column("plain", description="the same where it is unknown and the statistic does not know of it",
+           heading="S/N, not looked for", format=".3g"),
+    Column("marginalised", description="the same, marginalised", heading="S/N, marginalised", format=".3g"),
+    Column("smallest", description="flare amplitude that is detected, marginalised, at the header's power and false "
+           "alarms", heading="smallest flare", format=percent(".3g")),
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,16 +93,18 @@ class UnknownTable(Answer):
     @property
     def table(self) -> QTable:
         """One row per star, flare and unknown."""
-        from astropy.table import QTable
-
+        names = [column.name for column in COLUMNS]
         rows = [
-            (star, amplitude, unknown, c.known, c.plain, c.marginal, self.smallest(star, unknown))
+            dict(zip(names, (star, amplitude, unknown, c.known, c.plain, c.marginal, self.smallest(star, unknown)),
+                     strict=True))
             for (star, amplitude), costs in self.costs.items()
             for unknown, c in costs.items()
-        ]
-        table = QTable(rows=rows, names=("star", "amplitude", "unknown", "known", "plain", "marginalised", "smallest"))
-        table.meta |= {"fap": self.study.run.fap, "power": self.study.limit.power, "study": self.study.toml()}
-        return describe_columns(set_descriptions(table, DESCRIPTIONS))
+        ]  # fmt: skip
+        return table_of(COLUMNS, rows, fap=self.study.run.fap, power=self.study.limit.power, study=self.study.toml())
+
+    @property
+    def views(self) -> list[View]:
+        return [View("What unknowns cost: S/N of the matched statistic, by closed forms", COLUMNS, self.table)]
 
     @property
     def tables(self) -> dict[str, Table]:

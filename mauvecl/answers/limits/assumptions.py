@@ -9,9 +9,10 @@ from mauvecl.answers.limits.search import LimitSearch, single_flares
 from mauvecl.noise.priors import Uniform
 from mauvecl.noise.unknowns import INSTRUMENT_VALUES
 from mauvecl.schema.calls import public
-from mauvecl.schema.tables import make_table
+from mauvecl.schema.tables import Column, table_of
 from mauvecl.study.cases import Case, cases
-from mauvecl.study.labels import describe_columns
+from mauvecl.study.labels import amplitude_column, star_column
+from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.sections import Unknowns
 from mauvecl.study.study import Study
 
@@ -77,27 +78,34 @@ def what_matters(study: Study) -> QTable:
         for one in single_flares(case):
             for statistic in study.run.statistics:
                 rows += sorted(_moves(one, statistic), key=lambda m: -m.span)
-    of = study.limit.of
-    table = make_table(
-        (
-            ("star", [m.star for m in rows]),
-            ("amplitude", [m.amplitude for m in rows]),
-            ("statistic", [m.statistic for m in rows]),
-            ("assumption", [m.assumption.name for m in rows]),
-            ("low_end", [m.assumption.ends[0] for m in rows]),
-            ("high_end", [m.assumption.ends[1] for m in rows]),
-            (of, [m.nominal for m in rows]),
-            ("at_low_end", [m.at_ends[0] for m in rows]),
-            ("at_high_end", [m.at_ends[1] for m in rows]),
-            ("span", [m.span for m in rows], f"how far the closed-form limit of {of} moves from end to end"),
-        ),
-        power=study.limit.power,
-        fap=study.run.fap,
-        study=study.text(),
-    )
-    for name in (of, "at_low_end", "at_high_end", "span"):
-        table[name].info.format = ".3f"
-    return describe_columns(table)
+    columns = assumption_columns(study.limit.of)
+    table = table_of(columns, rows, power=study.limit.power, fap=study.run.fap, study=study.text())
+    for column in columns:
+        if column.format == LIMIT:
+            table[column.name].info.format = LIMIT
+    return table
+
+
+#: Format of limits.
+LIMIT = ".3f"
+
+
+def assumption_columns(of: str) -> tuple[Column, ...]:
+    """Return the columns of the table of assumptions, for limits of a quantity."""
+    return (
+        star_column(),
+        *(() if of == "amplitude" else (amplitude_column(),)),
+        Column("statistic", description="detection statistic", heading="statistic"),
+        Column("assumption", "assumption.name", "", "what is assumed of the instrument", "assumption"),
+        Column("low_end", lambda row: row.assumption.ends[0], "", "lower end of its sensible range", "from"),
+        Column("high_end", lambda row: row.assumption.ends[1], "", "upper end of its sensible range", "to"),
+        Column(of, "nominal", description=QUANTITIES[of].description, format=LIMIT),
+        Column("at_low_end", lambda row: row.at_ends[0], "", "closed-form limit with the assumption at its lower end",
+               "limit from", LIMIT),
+        Column("at_high_end", lambda row: row.at_ends[1], "", "closed-form limit with the assumption at its upper end",
+               "to", LIMIT),
+        Column("span", "", "", f"how far the closed-form limit of {of} moves from end to end", "moves by", LIMIT),
+    )  # fmt: skip
 
 
 def _moves(case: Case, statistic: str) -> list[Moved]:

@@ -5,24 +5,24 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any, ClassVar
-
-import numpy as np
 
 from mauvecl.answers.answer import Answer
 from mauvecl.answers.detection.unknown_cost import Cost, cost_lines, marginal_lines, unknown_cost
+from mauvecl.answers.limits.assumptions import assumption_columns
 from mauvecl.answers.limits.search import LimitSearch, MarginalLimitSearch, Point, Unknown, settle, single_flares
 from mauvecl.results.requests.fap import check_fap
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.tables import make_table
+from mauvecl.schema.tables import INTERVAL, Column, View, interval, records, table_of
 from mauvecl.statistics.intervals import Interval
 from mauvecl.study.cases import Case, cases
-from mauvecl.study.labels import describe_columns, label, stack_tables
+from mauvecl.study.labels import amplitude_column, label, place_columns
 from mauvecl.study.messages import SATURATED, collect_messages, worst_first
 from mauvecl.study.quantities import UNITS
 from mauvecl.study.study import Study
-from mauvecl.study.unknowns import draws_table
+from mauvecl.study.unknowns import describe_shares, draw_columns
 
 if TYPE_CHECKING:
     from astropy.table import QTable, Table
@@ -128,50 +128,82 @@ class LimitResult(Answer):
     failed: tuple[str, ...] = ()
 
     @property
+    def columns(self) -> tuple[Column, ...]:
+        """Columns of the table of limits."""
+        of = self.study.limit.of
+        unit, digits = UNITS.get(of, ""), {"magnitude": ".3f", "amplitude": ".4g", "exposure": ".0f"}[of]
+        check = "detection probability there, with a fresh seed"
+        columns = (
+            *self._place,
+            Column(of, "value.value", unit, "where the flare is detected with the wanted probability",
+                   "exposure (s)" if of == "exposure" else of, digits),
+            Column("low", "value.low", unit, "its 95 % interval, lower end, with the threshold's own", INTERVAL,
+                   interval(digits), ("high",)),
+            Column("high", "value.high", unit, "its 95 % interval, upper end, with the threshold's own"),
+            Column("closed_form", "", unit, "the same for Gaussian noise", "closed form", digits),
+            Column("check", "check.probability.value", "", check, "detected there, simulated again", ".4f"),
+            Column("check_low", "check.probability.low", "", f"{check}; 95 % interval, lower end", INTERVAL,
+                   interval(".4f"), ("check_high",)),
+            Column("check_high", "check.probability.high", "", f"{check}; 95 % interval, higher end"),
+        )  # fmt: skip
+        if not self.study.unknowns.draws:
+            return columns
+        return (
+            *columns,
+            Column("unknown_low", lambda one: one.unknown.range[0],
+                   description="central 95 % of the limits over what is unknown, lower end", heading="95 % of limits",
+                   format=lambda low, high: f"{low:{digits}} to {high:{digits}}", others=("unknown_high",)),
+            Column("unknown_high", lambda one: one.unknown.range[1],
+                   description="central 95 % of the limits over what is unknown, upper end"),
+            Column("matters_most", lambda one: next(iter(one.unknown.shares)),
+                   description="unknown that explains most of the limits' variance"),
+            Column("its_share", lambda one: next(iter(one.unknown.shares.values())),
+                   description="share of the limits' variance that this unknown explains"),
+        )  # fmt: skip
+
+    @property
+    def _place(self) -> tuple[Column, ...]:
+        """Columns of star, sweep, flare and statistic."""
+        amplitude = () if self.study.limit.of == "amplitude" else (amplitude_column(),)
+        statistic = Column("statistic", description="detection statistic", heading="statistic")
+        return (*place_columns(self.study, "amplitude", star="star"), *amplitude, statistic)
+
+    @property
     def table(self) -> QTable:
         """One row per star, flare and statistic."""
-        of, rows = self.study.limit.of, self.limits
-        unit = UNITS.get(of, "")
-        columns: list[tuple[object, ...]] = [("star", [r.star for r in rows])]
-        swept = [axis.quantity for axis in self.study.sweep.axes if axis.quantity != "amplitude"]
-        columns += [(name, np.array([r.at[name] for r in rows]), "", UNITS.get(name, "")) for name in swept]
-        if of != "amplitude":
-            columns.append(("amplitude", [r.amplitude for r in rows]))
-        check = "detection probability there, with a fresh seed"
-        columns += [
-            ("statistic", [r.statistic for r in rows]),
-            (of, [r.value.value for r in rows], "where the flare is detected with the wanted probability", unit),
-            ("low", [r.value.low for r in rows], "its 95 % interval, lower end, with the threshold's own", unit),
-            ("high", [r.value.high for r in rows], "its 95 % interval, upper end, with the threshold's own", unit),
-            ("closed_form", [r.closed_form for r in rows], "the same for Gaussian noise", unit),
-            ("check", [r.check.probability.value for r in rows], check),
-            ("check_low", [r.check.probability.low for r in rows], f"{check}; 95 % interval, lower end"),
-            ("check_high", [r.check.probability.high for r in rows], f"{check}; 95 % interval, higher end"),
-        ]
-        if self.study.unknowns.draws:
-            unknowns = [r.unknown for r in rows if r.unknown is not None]
-            low, high = np.array([one.range for one in unknowns]).T
-            most = [next(iter(one.shares.items())) for one in unknowns]
-            columns += [
-                ("unknown_low", low, "central 95 % of the limits over what is unknown, lower end"),
-                ("unknown_high", high, "central 95 % of the limits over what is unknown, upper end"),
-                ("matters_most", [name for name, _ in most]),
-                ("its_share", [share for _, share in most], "share of the limits' variance that this unknown explains"),
-            ]
         run = {"fap": self.study.run.fap, "realisations": self.study.run.realisations}
-        return describe_columns(make_table(columns, power=self.study.limit.power, **run, study=self.study.text()))
+        return table_of(self.columns, self.limits, power=self.study.limit.power, **run, study=self.study.text())
 
     @property
     def draws(self) -> QTable:
         """One row per limit and draw of the unknown: its values and the closed-form limit."""
-        parts = []
-        for one in self.limits:
-            assert one.unknown is not None
-            table = draws_table(one.unknown.draws, {self.study.limit.of: one.unknown.limits})
-            amplitude = {} if np.isnan(one.amplitude) else {"amplitude": one.amplitude}
-            swept = {k: v for k, v in one.at.items() if k != "amplitude"}
-            parts.append(({"star": one.star, **swept, **amplitude, "statistic": one.statistic}, table))
-        return stack_tables(parts, study=self.study.text())
+        of = self.study.limit.of
+        drawn = (one.unknown.draws.names for one in self.limits if one.unknown is not None)
+        limit = Column(of, "unknown.limits", description="closed-form limit")
+        values = (column.of(attrgetter("unknown")) for column in draw_columns(next(drawn)))
+        return table_of((*self._place, *values, limit), self.limits, study=self.study.text())
+
+    @property
+    def views(self) -> list[View]:
+        of, run, draws = self.study.limit.of, self.study.run, self.study.unknowns.draws
+        verdict = Column("verdict", heading="verdict")
+        columns = (*(column for column in self.columns if column.name != "unknown_low"), verdict)
+        title = (
+            f"Limit of {of} at a detection probability of {self.study.limit.power:g}, false-alarm probability "
+            f"{run.fap:g} per test, {run.realisations:,} realisations"
+        )
+        views = [View(title, columns, table_of(columns, self.limits))]
+        if draws:
+            shares = Column("shares", lambda one: describe_shares(one.unknown.shares),
+                            heading="matters most, share of the variance")  # fmt: skip
+            title = f"Averaged over {draws} draws of what is unknown of the instrument: the limits of each, and what "
+            found = (column for column in self.columns if column.name.startswith("unknown"))
+            columns = (*self._place, *found, shares)
+            views.append(View(f"{title}explains their scatter", columns, table_of(columns, self.limits)))
+        if self.assumptions is not None:
+            title = f"What is assumed, and how far it moves the closed-form limit of {of}, the largest first"
+            views.append(View(title, assumption_columns(of), self.assumptions))
+        return views
 
     @property
     def tables(self) -> dict[str, Table]:
@@ -198,9 +230,7 @@ class LimitResult(Answer):
         return [*failed, *stars, *marginal_lines(self.study.nuisances), *cost_lines(costs, self.study.nuisances)]
 
     def as_json(self) -> dict[str, Any]:
-        from mauvecl.answers.report import rows
-
-        more = {} if self.assumptions is None else {"assumptions": rows(self.assumptions)}
+        more = {} if self.assumptions is None else {"assumptions": records(self.assumptions)}
         return super().as_json() | more
 
 

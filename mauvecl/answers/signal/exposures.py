@@ -15,6 +15,7 @@ from mauvecl.schema.quantities import number
 from mauvecl.schema.ranges import DAY_S
 from mauvecl.schema.tables import Column, View, table_of
 from mauvecl.study.cases import Case, cases
+from mauvecl.study.labels import star_column
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.study import Study
@@ -55,7 +56,7 @@ def _floored(snr: float) -> str:
 
 #: Columns of the table of exposures.
 COLUMNS = (
-    Column("star", description=QUANTITIES["star"].description, heading="star"),
+    star_column(),
     Column("wavelength", "wavelength_nm", "nm", "vacuum wavelength, the middle of the pixel or element"),
     Column("per", description="pixel, or resolution element of 10.5 nm"),
     Column("wanted", description="wanted S/N"),

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from mauvecl.answers.answer import Answer
 from mauvecl.noise.components import components
 from mauvecl.schema.calls import public
 from mauvecl.schema.quantities import count
+from mauvecl.schema.tables import Column, View, table_of
 from mauvecl.study.cases import cases
-from mauvecl.study.labels import describe_columns, label
+from mauvecl.study.labels import label
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.study import Study
 
@@ -26,16 +28,42 @@ if TYPE_CHECKING:
     from mauvecl.study.assumptions import Use
 
 
+#: An observation: its title, its expectation, and the table of its components.
+Observation = tuple[str, "Expectation", "QTable"]
+
+
+def _peak(observation: Observation) -> int:
+    """Return the pixel with most signal."""
+    return int(observation[1].signal_dn.argmax())
+
+
+#: Columns of the summary of observations.
+SUMMARY_COLUMNS = (
+    Column("observation", lambda one: one[0], description="star, and flare", heading="observation"),
+    Column("frames", lambda one: one[1].n_frames, description="frames of the exposure", heading="frames"),
+    Column("peak_nm", lambda one: one[1].wavelength_nm[_peak(one)], "nm", "wavelength of the largest mean signal",
+           "peak (nm)", ".1f"),
+    Column("peak_dn", lambda one: one[1].signal_dn[_peak(one)], "DN", "largest mean signal of a pixel",
+           "peak signal (DN)", ".0f"),
+    Column("snr_pixel", lambda one: one[1].snr().max(), "", "largest closed-form S/N of a pixel", "best S/N pixel",
+           ".2f"),
+    Column("snr_element", lambda one: one[1].snr_per_element().max(), "", "largest closed-form S/N of an element",
+           "best S/N element", ".1f"),
+    Column("saturated_pixels", lambda one: one[1].saturated.sum(), "", "pixels that saturate", "saturated"),
+)  # fmt: skip
+
+
 @dataclass(eq=False)
 class SimulateAnswer(Answer):
     """What `mauvecl simulate` answers: one table of components per star and stage."""
 
     USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "unknowns", "seed")
 
+    JSON = MappingProxyType({"observations": "summary"})
     ENDINGS = ("ecsv", "fits")
 
     study: Study
-    observations: list[tuple[str, Expectation, QTable]]
+    observations: list[Observation]
     messages: list[str]
 
     @property
@@ -56,26 +84,13 @@ class SimulateAnswer(Answer):
         return [x for _, x, _ in self.observations]
 
     @property
-    def summary(self) -> list[dict[str, Any]]:
+    def summary(self) -> QTable:
         """Peak, best closed-form S/N and saturated pixels of each observation."""
-        rows = []
-        for title, x, _ in self.observations:
-            peak = int(x.signal_dn.argmax())
-            rows.append(
-                {
-                    "observation": title,
-                    "frames": x.n_frames,
-                    "peak_nm": float(x.wavelength_nm[peak]),
-                    "peak_dn": float(x.signal_dn[peak]),
-                    "snr_pixel": float(x.snr().max()),
-                    "snr_element": float(x.snr_per_element().max()),
-                    "saturated_pixels": int(x.saturated.sum()),
-                }
-            )
-        return rows
+        return table_of(SUMMARY_COLUMNS, self.observations)
 
-    def as_json(self) -> dict[str, Any]:
-        return {"messages": self.messages, "observations": self.summary}
+    @property
+    def views(self) -> list[View]:
+        return [View("One observation each (closed-form S/N)", SUMMARY_COLUMNS, self.summary)]
 
     def plot(self, path: str | Path | None = None, *, number: int = 0, ax: Any = None) -> Any:
         """One of the observations and what it is made of; needs matplotlib."""
@@ -114,7 +129,7 @@ def simulate(
             title = label(case.star, x) + (f", flare {100 * case.amplitudes[i - 1]:g} %" if i else "")
             table = components(x, realisation=realisation, seed=study.run.seed, **case.draw_options)
             table.meta["study"] = study.text()
-            observations.append((title, x, describe_columns(table)))
+            observations.append((title, x, table))
         everything += xs
         if progress is not None:
             progress(done, len(prepared))

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, ClassVar
+from types import MappingProxyType
+from typing import TYPE_CHECKING, ClassVar
 
 from mauvecl.answers.answer import Answer, InCell
-from mauvecl.answers.signal.exposures import place_of
+from mauvecl.answers.signal.exposures import Per, place_of
+from mauvecl.host.expectation import BUDGET_COLUMNS
+from mauvecl.results.snr import COLUMNS
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import public
+from mauvecl.schema.tables import View, stacked
 from mauvecl.study.cases import Case, cases
-from mauvecl.study.labels import stack_tables
+from mauvecl.study.labels import place_columns
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.study import Study
 
@@ -57,6 +61,7 @@ class SnrAnswer(Answer):
     """
 
     USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "unknowns", "seed")
+    JSON = MappingProxyType({"snr-element": "element", "noise-budget": "noise_budget"})
 
     study: Study
     stars: list[StarSnr]
@@ -86,16 +91,26 @@ class SnrAnswer(Answer):
     def inputs(self) -> list[Expectation]:
         return [star.result.expectation for star in self.stars]
 
-    def as_json(self) -> dict[str, Any]:
-        from mauvecl.answers.report import rows
+    @property
+    def views(self) -> list[View]:
+        """S/N and noise at some wavelengths; all of them are in the files."""
+        place = place_columns(self.study)
 
-        tables = {"snr-element": self.element, "noise-budget": self.noise_budget}
-        return {"messages": self.messages} | {name: rows(table) for name, table in tables.items()}
+        def at(star: StarSnr, per: Per) -> list[int]:
+            return [place_of(star.result.expectation, nm, per) for nm in star.shown_nm]
+
+        parts = [(star, star.result.element[at(star, "element")]) for star in self.stars]
+        budgets = [(star, star.result.expectation.noise_budget()[at(star, "pixel")]) for star in self.stars]
+        return [
+            View("S/N per 10.5 nm element; all of them in the files", (*place, *COLUMNS), stacked(place, parts)),
+            View("Noise of a pixel by origin, DN rms", (*place, *BUDGET_COLUMNS), stacked(place, budgets)),
+        ]
 
     def together(self, table_of: Callable[[SnrResult], QTable]) -> QTable:
-        """A table of each star and cell as one, with the star and what is swept in front."""
-        parts = (({"star": star.label, **star.at}, table_of(star.result)) for star in self.stars)
-        return stack_tables(parts, realisations=self.study.run.realisations, study=self.study.text())
+        """Return a table of each star and cell as one, with the star and what is swept in front."""
+        parts = ((star, table_of(star.result)) for star in self.stars)
+        run = self.study.run
+        return stacked(place_columns(self.study), parts, realisations=run.realisations, study=self.study.text())
 
 
 @public

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from typing import TYPE_CHECKING
 
-from mauvecl.cli.console import short
 from mauvecl.cli.flags import CAMPAIGN, COUNTED, DETECTION, DRAWS, FLARE, NUISANCES, SWEEP, TEMPLATE
 from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
-    from mauvecl.answers.detection.gaussian import GaussianReport
     from mauvecl.cli.session import Session
     from mauvecl.study.study import Study
 
@@ -43,27 +40,4 @@ def gaussian(
 
     Example: mauvecl gaussian --star G2V --sweep magnitude=6,10 --sweep exposure=5,50
     """
-    answer = session.ask(study)
-    session.answer(answer, lambda: _show_promises(answer))
-
-
-def _show_promises(answer: GaussianReport) -> None:
-    from mauvecl.cli.console import show_table
-
-    study = answer.study
-    swept = [axis.quantity for axis in answer.study.sweep.axes]
-    show_table(
-        f"The root-of-N formula beside {study.run.realisations:,} realisations; promised: no difference in S/N, "
-        f"68.3 % of 1-sigma intervals, as many 5-sigma pixels and false alarms ({study.run.fap:g}) as normal noise has",
-        ("star", *swept, "best S/N", "S/N off by", "at nm", "1-sigma intervals", "5 sigma above, below", "false alarms",
-         "statistic", "why", "detection off by"),
-        [
-            (row["star"], *(short(row[name]) for name in swept), f"{row['best_snr']:.2f}",
-             f"{row['snr_off_by']:+.3f}", "" if math.isnan(row["at_nm"]) else f"{row['at_nm']:.0f}",
-             f"{100 * row['coverage_low']:.2f}-{100 * row['coverage_high']:.2f} %",
-             f"{row['five_sigma_above']:.2f}, {row['five_sigma_below']:.2f}",
-             f"{row['fap_ratio']:.3f}",
-             row["statistic"], row["why"], f"{row['probability_off_by']:+.4f}")
-            for row in answer.cells
-        ],
-    )  # fmt: skip
+    session.answer(session.ask(study))

@@ -6,13 +6,10 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from mauvecl.cli.console import short
 from mauvecl.cli.flags import AT, COUNTED, DRAWS, FLARE, SIGNAL, SWEEP
 from mauvecl.cli.verb import takes_study
 
 if TYPE_CHECKING:
-    from mauvecl.answers.signal.simulate import SimulateAnswer
-    from mauvecl.answers.signal.snr import SnrAnswer
     from mauvecl.cli.session import Session
     from mauvecl.study.study import Study
 
@@ -33,21 +30,7 @@ def simulate(
     from mauvecl.answers.signal.simulate import simulate as compute
 
     answer = compute(study, realisation=realisation, flaring=bool(given["amplitude"]))
-    session.answer(answer, lambda: _show_observations(answer))
-
-
-def _show_observations(answer: SimulateAnswer) -> None:
-    from mauvecl.cli.console import show_table
-
-    show_table(
-        "One observation each (closed-form S/N)",
-        ("observation", "frames", "peak (nm)", "peak signal (DN)", "best S/N pixel", "best S/N element", "saturated"),
-        [
-            (s["observation"], str(s["frames"]), f"{s['peak_nm']:.1f}", f"{s['peak_dn']:.0f}", f"{s['snr_pixel']:.2f}",
-             f"{s['snr_element']:.1f}", str(s["saturated_pixels"]))
-            for s in answer.summary
-        ],
-    )  # fmt: skip
+    session.answer(answer)
 
 
 def _budgets_or_star(given: dict[str, Any]) -> Study:
@@ -75,39 +58,7 @@ def snr(
 
     mauvecl snr --star G2V --sweep magnitude=4,6,8,10 --sweep exposure=5,50,600
     """
-    answer = session.ask(study)
-    session.answer(answer, lambda: _show_snr(answer))
-
-
-def _show_snr(answer: SnrAnswer) -> None:
-    """S/N and noise at some wavelengths; all of them are in the files."""
-    from mauvecl.answers.signal.exposures import place_of
-    from mauvecl.cli.console import show_table
-
-    cells, budgets = [], []
-    for star in answer.stars:
-        x, table = star.result.expectation, star.result.element
-        budget = x.noise_budget()
-        name = (star.label, *map(short, star.at.values()))
-        for wavelength in star.shown_nm:
-            row, noise = table[place_of(x, wavelength, "element")], budget[place_of(x, wavelength, "pixel")]
-            cells.append(
-                (*name, f"{row['wavelength'].value:.1f}", f"{row['expected']:.2f}", f"{row['mean']:.2f}",
-                 f"{row['std']:.2f}", f"{row['q2.5']:.2f}", f"{row['q50']:.2f}", f"{row['q97.5']:.2f}")
-            )  # fmt: skip
-            parts = ("source_photon", "zodiacal_photon", "dark", "read", "total")
-            budgets.append((*name, f"{wavelength:g}", *(f"{noise[part].value:.2f}" for part in parts)))
-    swept = tuple(axis.quantity for axis in answer.study.sweep.axes)
-    show_table(
-        "S/N per 10.5 nm element; all of them in the files",
-        ("star", *swept, "nm", "closed form", "mean", "std", "2.5 %", "50 %", "97.5 %"),
-        cells,
-    )
-    show_table(
-        "Noise of a pixel by origin, DN rms",
-        ("star", *swept, "nm", "source photons", "zodiacal photons", "dark", "read", "total"),
-        budgets,
-    )
+    session.answer(session.ask(study))
 
 
 @takes_study(SIGNAL, COUNTED, without="exposure", draws=False)

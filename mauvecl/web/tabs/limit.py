@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy import special
 from scipy.interpolate import PchipInterpolator
 
-from mauvecl.web.closed_forms import percent
 from mauvecl.web.figures import Canvas
 from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 
@@ -256,22 +255,11 @@ class Limit(Tab):
     about = "How faint a star and how small a flare one would still see."
     pictures = (Curve(), Map())
     simulations = {"limit": "Simulate the limit", "map": "Simulate the map"}  # noqa: RUF012
+    shows = "limit"
     files = {"limit": "limit", "map": "map"}  # noqa: RUF012
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         return answers[name].table
-
-    def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
-        if "limit" not in answers:
-            return []
-        heads = ["statistic", "limiting magnitude", "95 % interval", "closed form", "simulated again there"]
-        return [heads] + [
-            [
-                one.statistic, f"{one.value.value:.3f}", f"{one.value.low:.3f} to {one.value.high:.3f}",
-                f"{one.closed_form:.3f}", percent(one.check.probability.value),
-            ]
-            for one in answers["limit"].limits
-        ]  # fmt: skip
 
     def study(self, name: str, closed: ClosedForms, answers: Answers) -> Study:
         study: Study = answers[name].study

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mauvecl.study.labels import label, stack_tables
+from mauvecl.schema.tables import stacked
+from mauvecl.study.labels import label, star_column
 from mauvecl.web.figures import Canvas
 from mauvecl.web.tabs.tab import Answers, Picture, PictureData, Tab
 
@@ -69,4 +70,4 @@ class Noise(Tab):
         """Return the closed-form table of `mauvecl snr`."""
         study = closed.study
         parts = [({"star": label(study.star[0], closed.quiet)}, closed.quiet.noise_budget())]
-        return stack_tables(parts, realisations=study.run.realisations, study=study.text())
+        return stacked([star_column()], parts, realisations=study.run.realisations, study=study.text())
