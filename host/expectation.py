@@ -137,7 +137,7 @@ class Expectation(Drawable, ContentEquality):
             from astropy.nddata import StdDevUncertainty
             from specutils import Spectrum
         except ImportError as error:
-            raise InputError("specutils is missing, expected `pip install 'mauvecl[spectra]'`") from error
+            raise InputError("specutils is missing", "`pip install 'mauvecl[spectra]'`", key="specutils") from error
         return Spectrum(
             spectral_axis=self.wavelength_nm * u.nm,
             flux=self.signal_dn * u.adu,
@@ -160,7 +160,7 @@ class Expectation(Drawable, ContentEquality):
 
     def __post_init__(self) -> None:
         if self.signal not in SIGNALS:
-            raise InputError(f"signal = {self.signal!r}, expected 'net' or 'paper'")
+            raise InputError.of("signal", self.signal, "'net' or 'paper'")
         for each in fields(self):
             value = getattr(self, each.name)
             if isinstance(value, np.ndarray):
@@ -175,7 +175,7 @@ class Expectation(Drawable, ContentEquality):
             bad = ~((values >= 0) & (values <= MAX_PER_FRAME))
             if bad.any():
                 pixel = int(np.argmax(bad))
-                raise InputError(f"{name} of pixel {pixel} = {values[pixel]:g}, expected 0 to {MAX_PER_FRAME:g}")
+                raise InputError.of(name, values[pixel], f"0 to {MAX_PER_FRAME:g}", where=f"pixel {pixel}")
         object.__setattr__(self, "provenance", dict(self.provenance))
 
     @property
@@ -327,7 +327,10 @@ class Expectation(Drawable, ContentEquality):
         """Sum the values of pixels over resolution elements, from shape (n_pixel,) to (n_element,)."""
         if np.shape(values) != self.element.shape:
             raise InputError(
-                f"values of the shape {np.shape(values)}, expected {self.element.shape}: one for each pixel"
+                f"values of the shape {np.shape(values)}",
+                f"{self.element.shape}: one for each pixel",
+                key="values",
+                value=np.shape(values),
             )
         return np.asarray(np.bincount(self.element, values, minlength=self.element_wavelength_nm.size), np.float64)
 
@@ -445,7 +448,10 @@ def expect(
     n_frames = max(1, int(np.ceil(asked_s / instrument.frame_s * (1 - 1e-12))))
     if n_frames > MAX_FRAMES:
         raise InputError(
-            f"exposure = {asked_s:g} s has {n_frames} frames of {instrument.frame_s:g} s, expected at most {MAX_FRAMES}"
+            f"exposure = {asked_s:g} s has {n_frames} frames of {instrument.frame_s:g} s",
+            f"at most {MAX_FRAMES}",
+            key="exposure",
+            value=asked_s,
         )
     low, high = instrument.output_min_nm, instrument.output_max_nm
     first, last = source.measured_nm or (float(source.wavelength_nm[0]), float(source.wavelength_nm[-1]))
@@ -453,8 +459,9 @@ def expect(
     source = _continued_to_reach(source, instrument)
     if source.unscaled:
         raise InputError(
-            f"the spectrum of {source.name} is not as bright as the star is seen: {source.unscaled}, expected a "
-            "magnitude beside it"
+            f"the spectrum of {source.name} is not as bright as the star is seen: {source.unscaled}",
+            "a magnitude beside it",
+            key="magnitude",
         )
 
     def per_frame(light: Source) -> Float:
@@ -545,7 +552,7 @@ def _source(given: Any) -> Source:
         return given
     if isinstance(given, str):
         return Source.from_library(given)
-    raise InputError(f"the source is of the type {type(given).__name__}, expected a Source, or a name of the library")
+    raise InputError.of("source", given, "a Source, or a name of the library")
 
 
 def _instrument(given: Any) -> Instrument:
@@ -553,9 +560,7 @@ def _instrument(given: Any) -> Instrument:
         return given
     if isinstance(given, str | Path):
         return Instrument.load(given)
-    raise InputError(
-        f"the instrument is of the type {type(given).__name__}, expected an Instrument, or its name or file"
-    )
+    raise InputError.of("instrument", given, "an Instrument, or its name or file")
 
 
 def _sky(given: Any) -> Sky:
@@ -619,8 +624,8 @@ def _faint_enough(electrons: Float, name: str) -> Float:
     if (electrons > MAX_PER_FRAME).any():
         why = "; at 1 au it has V = -26.76 (Willmer 2018)" if name == "Sun" else ""
         raise InputError(
-            f"{name} is too bright: it makes {float(electrons.max()):.3g} electrons in one frame of a pixel{why}, "
-            f"expected at most {MAX_PER_FRAME:g}: `magnitude` makes it a star at a distance, as in `magnitude=7.4`",
+            f"{name} is too bright: it makes {float(electrons.max()):.3g} electrons in one frame of a pixel{why}",
+            f"at most {MAX_PER_FRAME:g}: `magnitude` makes it a star at a distance, as in `magnitude=7.4`",
             key="magnitude",
         )
     return electrons

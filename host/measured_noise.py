@@ -57,8 +57,10 @@ def negative_means_message(
     if electrons[worst] < -MAX_SIGMA_BELOW_ZERO * error[worst]:
         raise InputError(
             f"the spectrum of {source.name} makes a mean of {electrons[worst]:.3g} electrons a frame at "
-            f"{nm[worst]:.1f} nm, beyond {MAX_SIGMA_BELOW_ZERO:g} times its error of {error[worst]:.2g}, expected "
-            "light: bin the spectrum (`bin_nm`) or mend it"
+            f"{nm[worst]:.1f} nm, beyond {MAX_SIGMA_BELOW_ZERO:g} times its error of {error[worst]:.2g}",
+            "light: bin the spectrum (`bin_nm`) or mend it",
+            key="bin_nm",
+            value=source.name,
         )
     return (
         f"{source.name}: the means of {int(below.sum())} of {below.size} pixels, from {nm[below][0]:.1f} to "

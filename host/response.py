@@ -81,7 +81,9 @@ def electrons_per_second(
     nodes = _nodes(wavelength_nm)
     flux = np.asarray(flux_flam, np.float64)
     if flux.shape != nodes.shape:
-        raise InputError(f"flux has {flux.size} values for {nodes.size} wavelengths, expected as many")
+        raise InputError(
+            f"flux has {flux.size} values for {nodes.size} wavelengths", "as many", key="flux", value=flux.size
+        )
     if nodes.size <= MATRIX_NODES:
         return cast(Float, response_matrix(instrument, nodes, order) @ flux)
     landing = _landing(instrument, _known(order))
@@ -201,11 +203,16 @@ def _knots(instrument: Instrument, order: Order) -> tuple[float, ...]:
 def _nodes(wavelength_nm: ArrayLike) -> Float:
     nodes = np.ascontiguousarray(wavelength_nm, np.float64)
     if nodes.ndim != 1 or nodes.size < 2 or not np.isfinite(nodes).all() or not (np.diff(nodes) > 0).all():
-        raise InputError("the wavelengths of a spectrum, expected at least two, finite and strictly increasing, in nm")
+        raise InputError(
+            "the wavelengths of a spectrum",
+            "at least two, finite and strictly increasing, in nm",
+            key="wavelength_nm",
+            value=wavelength_nm,
+        )
     return nodes
 
 
 def _known(order: str) -> Order:
     if order not in ("paper", "physical"):
-        raise InputError(f"order = {order!r}, expected 'paper' or 'physical'")
+        raise InputError.of("order", order, "'paper' or 'physical'")
     return cast(Order, order)

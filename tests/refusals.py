@@ -14,13 +14,17 @@ _ANY = object()
 
 
 @contextmanager
-def refused(key: str | None, value: Any = _ANY, *, expected: str | None = None) -> Iterator[pytest.ExceptionInfo]:
+def refused(
+    key: str | None, *facts: str, value: Any = _ANY, expected: str | None = None
+) -> Iterator[pytest.ExceptionInfo]:
     """Check that the block raises an InputError of one sentence about a key.
 
     Parameters
     ----------
     key : str or None
         The parameter, or key of a study, that the error names.
+    facts : str
+        Numbers and names that the sentence must give.
     value : object, optional
         The error's value.
     expected : str, optional
@@ -34,5 +38,7 @@ def refused(key: str | None, value: Any = _ANY, *, expected: str | None = None) 
         assert error.value == value, str(error)
     assert error.expected, f"nothing is expected in: {error}"
     if expected is not None:
-        assert expected in error.expected
+        assert expected in error.expected, str(error)
+    for fact in facts:
+        assert fact in str(error), str(error)
     assert "\n" not in str(error)

@@ -29,7 +29,7 @@ def limit_bytes(variable: str) -> int:
     """
     text = os.environ.get(variable, str(LIMITS[variable]))
     if not (text.isascii() and text.isdigit() and len(text) <= 7 and 1 <= int(text) <= 2**20):
-        raise InputError(f"{variable} = {text[:40]!r}, expected a whole number of MiB from 1 to 1048576")
+        raise InputError.of(variable, text[:40], "a whole number of MiB from 1 to 1048576")
     return int(text) << 20
 
 
@@ -49,27 +49,34 @@ def read_bytes(path: Path, what: str) -> bytes:
         # Without waiting: a pipe that nobody writes to would never open.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
     except FileNotFoundError as error:
-        raise InputError(f"{what} {shown} does not exist, expected a file") from error
+        raise InputError(f"{what} {shown} does not exist", "a file", key="file", value=str(path)) from error
     except OSError as error:
-        raise InputError(f"{what} {shown} cannot be opened ({error.strerror}), expected a readable file") from error
+        raise InputError(
+            f"{what} {shown} cannot be opened ({error.strerror})", "a readable file", key="file", value=str(path)
+        ) from error
     except ValueError as error:
         # Null bytes, and characters that no file name can hold.
-        raise InputError(f"{what} {shown} is no path ({error}), expected a file's name") from error
+        raise InputError(f"{what} {shown} is no path ({error})", "a file's name", key="file", value=path) from error
     status = os.fstat(descriptor)
     if not stat.S_ISREG(status.st_mode):
         os.close(descriptor)
         kind = "a folder" if stat.S_ISDIR(status.st_mode) else "no regular file"
-        raise InputError(f"{what} {shown} is {kind}, expected a regular file")
+        raise InputError(f"{what} {shown} is {kind}", "a regular file", key="file", value=str(path))
     with open(descriptor, "rb") as file:
         most = limit_bytes("MAUVECL_LARGEST_FILE_MIB")
         try:
             # The file may have grown since its size was read.
             content = file.read(most + 1) if status.st_size <= most else None
         except OSError as error:
-            raise InputError(f"{what} {shown} cannot be read ({error.strerror}), expected a readable file") from error
+            raise InputError(
+                f"{what} {shown} cannot be read ({error.strerror})", "a readable file", key="file", value=str(path)
+            ) from error
     if content is None or len(content) > most:
         raise InputError(
-            f"{what} {shown} has more than {most >> 20} MiB, expected less; MAUVECL_LARGEST_FILE_MIB sets the limit"
+            f"{what} {shown} has more than {most >> 20} MiB",
+            "less; MAUVECL_LARGEST_FILE_MIB sets the limit",
+            key="MAUVECL_LARGEST_FILE_MIB",
+            value=most >> 20,
         )
     return content
 
@@ -110,13 +117,15 @@ def _unpack(content: bytes, start: Callable[[], Any], form: str, what: str) -> b
                 size += len(piece)
                 if size > most:
                     raise InputError(
-                        f"{what} unpacks to more than {most >> 20} MiB, expected less; MAUVECL_LARGEST_CONTENT_MIB "
-                        "sets the limit"
+                        f"{what} unpacks to more than {most >> 20} MiB",
+                        "less; MAUVECL_LARGEST_CONTENT_MIB sets the limit",
+                        key="MAUVECL_LARGEST_CONTENT_MIB",
+                        value=most >> 20,
                     )
                 pieces.append(piece)
                 if not piece and not waiting and not stream.eof and getattr(stream, "needs_input", True):
                     raise EOFError("it ends too early")
             content = stream.unused_data.lstrip(b"\0")
     except (OSError, EOFError, zlib.error, lzma.LZMAError, MemoryError) as error:
-        raise InputError(f"{what} is damaged {form} ({error}), expected a whole file") from error
+        raise InputError(f"{what} is damaged {form} ({error})", "a whole file", key="file", value=str(error)) from error
     return b"".join(pieces)

@@ -90,7 +90,7 @@ def parse_numbers(text: str, what: str) -> Numbers:
     table = parse_ecsv(text, what)
     for name in table.colnames:
         if table[name].dtype.kind not in "iuf" or np.ma.is_masked(table[name]) or table[name].ndim != 1:
-            raise InputError(f"{what}: {name} has missing or non-numeric values, expected numbers")
+            raise InputError(f"{what}: {name} has missing or non-numeric values", "numbers", key=name)
     columns = {name: np.asarray(table[name], np.float64) for name in table.colnames}
     return Numbers(columns, {name: str(table[name].unit or "") for name in table.colnames}, dict(table.meta))
 
@@ -121,7 +121,7 @@ def check_header(lines: list[str], what: str) -> None:
     header = [line[2:] for line in lines if line.startswith("# ")]
     size = sum(map(len, header))
     if size > MOST_HEADER:
-        raise InputError(f"{what} has a header of {size} characters, expected at most {MOST_HEADER}")
+        raise InputError(f"{what} has a header of {size} characters", f"at most {MOST_HEADER}", key="file", value=size)
     if not any("*" in line for line in header):
         return
     sizes: dict[int, int] = {}
@@ -140,7 +140,7 @@ def check_header(lines: list[str], what: str) -> None:
         root = yaml.compose("\n".join(header[1:]), Loader=getattr(yaml, "CSafeLoader", yaml.SafeLoader))
         unfolded = 0 if root is None else values(root)
     if unfolded >= MOST_VALUES:
-        raise InputError(f"{what} has a header that unfolds to more than {MOST_VALUES} values, expected fewer")
+        raise InputError(f"{what} has a header that unfolds to more than {MOST_VALUES} values", "fewer", key="file")
 
 
 def check_cells(lines: list[str], what: str) -> None:
@@ -153,11 +153,15 @@ def check_cells(lines: list[str], what: str) -> None:
     widest = max(map(len, lines), default=0)
     if widest * len(lines) > most:
         raise InputError(
-            f"{what} has a line of {widest} characters among {len(lines)}, expected less than {most >> 20} MiB "
-            "together if each were as long; MAUVECL_LARGEST_CONTENT_MIB sets the limit"
+            f"{what} has a line of {widest} characters among {len(lines)}",
+            f"less than {most >> 20} MiB together if each were as long; MAUVECL_LARGEST_CONTENT_MIB sets the limit",
+            key="MAUVECL_LARGEST_CONTENT_MIB",
+            value=widest,
         )
     if widest > 2**17:
-        raise InputError(f"{what} has a line of {widest} characters, expected at most {2**17}")
+        raise InputError(f"{what} has a line of {widest} characters", f"at most {2**17}", key="file", value=widest)
     odd = next((number for number, line in enumerate(lines, 1) if line.count('"') % 2), None)
     if odd is not None:
-        raise InputError(f"{what} has a cell that goes on beyond row {odd}, expected each row on a line of its own")
+        raise InputError(
+            f"{what} has a cell that goes on beyond row {odd}", "each row on a line of its own", key="file", value=odd
+        )

@@ -49,12 +49,14 @@ def parsing(what: str, expected: str) -> Iterator[None]:
     except InputError:
         raise
     except RecursionError as error:
-        raise InputError(f"{what} is nested too deeply, expected {expected}") from error
+        raise InputError(f"{what} is nested too deeply", expected, key="file") from error
     except MemoryError as error:
-        raise InputError(f"{what} needs more memory than there is, expected {expected}") from error
+        raise InputError(f"{what} needs more memory than there is", expected, key="file") from error
     except Exception as error:
         reason = next((line.strip() for line in str(error).splitlines() if line.strip()), "") or type(error).__name__
-        raise InputError(f"{what} cannot be read ({printable(reason, 160)}), expected {expected}") from error
+        raise InputError(
+            f"{what} cannot be read ({printable(reason, 160)})", expected, key="file", value=reason
+        ) from error
 
 
 def read_text(path: Path, what: str) -> str:
@@ -67,7 +69,9 @@ def as_text(content: bytes, what: str) -> str:
     try:
         return content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{what} is not text (byte {error.start + 1} is no UTF-8), expected text in UTF-8") from error
+        raise InputError(
+            f"{what} is not text (byte {error.start + 1} is no UTF-8)", "text in UTF-8", key="file"
+        ) from error
 
 
 def is_file(path: Path) -> bool:
@@ -83,12 +87,12 @@ def toml(text: str, what: str) -> dict[str, Any]:
     parts = max(part.count(".") for part in re.split(r"[=,{}\[\]\n#]", text))
     if parts > MOST_PARTS:
         # Python's parser takes memory with the square of it.
-        raise InputError(f"{what} has a key of {parts} parts, expected at most {MOST_PARTS}")
+        raise InputError(f"{what} has a key of {parts} parts", f"at most {MOST_PARTS}", key="file", value=parts)
     with parsing(what, "TOML"):
         try:
             tree = tomllib.loads(text)
         except tomllib.TOMLDecodeError as error:
-            raise InputError(f"{what} is not valid TOML: {printable(str(error), 160)}") from error
+            raise InputError(f"{what}: {printable(str(error), 160)}", "valid TOML", key="file") from error
     possible(tree, what)
     return tree
 
@@ -111,34 +115,35 @@ def possible(data: Any, what: str) -> None:
         energy = key in ENERGIES or any(part.endswith(ERG) for part in key.split("."))
         fault = _fault(value, LARGEST_ERG if energy else LARGEST)
         if depth > DEEPEST:
-            fault = f"is nested more than {DEEPEST} deep, expected less"
+            fault = f"is nested more than {DEEPEST} deep", "less"
             key = shortened(key, 40)
         if fault:
-            raise InputError(f"{what}: {printable(key, 80) or 'the value'} {fault}")
+            named = printable(key, 80)
+            raise InputError(f"{what}: {named or 'the value'} {fault[0]}", fault[1], key=named or None, value=value)
         if isinstance(value, Mapping):
             for name, item in value.items():
                 if isinstance(name, str) and (bad := _fault(name)):
-                    raise InputError(f"{what}: a key {bad}")
+                    raise InputError(f"{what}: a key {bad[0]}", bad[1], key=printable(name, 80), value=item)
                 waiting.append((f"{key}.{name}" if key else str(name), item, depth + 1))
         elif isinstance(value, list | tuple):
             waiting += [(f"{key}.{i}", item, depth + 1) for i, item in enumerate(value)]
 
 
-def _fault(value: Any, largest: float = LARGEST) -> str | None:
-    """Return why a single value is impossible, or None."""
+def _fault(value: Any, largest: float = LARGEST) -> tuple[str, str] | None:
+    """Return why a single value is impossible and what is expected, or None."""
     if isinstance(value, bool):
         return None
     if isinstance(value, int):
         if not WHOLE[0] <= value <= WHOLE[1]:
-            return f"is a whole number of {value.bit_length()} bits, expected at most 64"
+            return f"is a whole number of {value.bit_length()} bits", "at most 64"
     elif isinstance(value, float):
         # Whoever knows the value's meaning judges NaN and infinity.
         if math.isfinite(value) and value and not SMALLEST <= abs(value) <= largest:
-            return f"= {value!r}, expected 0 or a size from {SMALLEST:g} to {largest:g}"
+            return f"= {value!r}", f"0 or a size from {SMALLEST:g} to {largest:g}"
     elif isinstance(value, str | Path):
         text = str(value)
         if len(text) > LONGEST:
-            return f"is a text of {len(text)} characters, expected at most {LONGEST}"
+            return f"is a text of {len(text)} characters", f"at most {LONGEST}"
         if not text.isprintable() and (bad := next((c for c in text if c == "\0" or "\ud800" <= c <= "\udfff"), None)):
-            return f"= {shortened(text)} holds the character {bad!r}, expected text"
+            return f"= {shortened(text)} holds the character {bad!r}", "text"
     return None

@@ -41,7 +41,7 @@ def text_table(text: str, named: str, commas: bool, expected: str = "CSV or ECSV
     from astropy.table import Table
 
     if len(text) > MOST_TEXT:
-        raise InputError(f"{named} has {len(text)} characters, expected at most {MOST_TEXT}")
+        raise InputError(f"{named} has {len(text)} characters", f"at most {MOST_TEXT}", key="file", value=len(text))
     if text.startswith("# %ECSV"):
         return parse_ecsv(text, named)
     lines = text.splitlines()

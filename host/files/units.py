@@ -8,7 +8,6 @@ from functools import lru_cache
 from typing import TYPE_CHECKING, Any, Literal
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
 
 if TYPE_CHECKING:
     import astropy.units as u
@@ -75,21 +74,21 @@ def unit_of(text: str) -> u.UnitBase | u.function.FunctionUnitBase:
         return u.STmag
     if _NANOMAGGIES.fullmatch(name):
         return u.CompositeUnit(1e-9, [u.AB], [1])
-    expected = "expected one such as Angstrom, nm or erg / (s cm2 Angstrom)"
+    expected = "one such as Angstrom, nm or erg / (s cm2 Angstrom)"
     if match := _LOGARITHM.fullmatch(name):
         return u.dex(_linear_unit(balanced(match[1]), text, expected)) if match[1] else u.dex
     if _NO_FLUX.search(name):
-        raise InputError(f"unit {shortened(text.strip())} is no flux density (magnitude or count), {expected}")
+        raise InputError.of("unit", text.strip(), f"a flux density, no magnitude or count: {expected}")
     return _linear_unit(name, text, expected)
 
 
 def _linear_unit(name: str, text: str, expected: str) -> u.UnitBase:
     import astropy.units as u
 
-    unknown = f"unit {shortened(text.strip())} is unknown, {expected}"
+    unknown = InputError.of("unit", text.strip(), f"a known unit: {expected}")
     # To astropy a comma makes a structure of two units.
     if not name or len(name) > MAX_UNIT_LENGTH or "," in name:
-        raise InputError(unknown)
+        raise unknown
     scale = 1.0
     if match := SCALE.match(name):
         scale = float(match[3] or f"1e{match[1] or match[2]}")
@@ -115,7 +114,7 @@ def _linear_unit(name: str, text: str, expected: str) -> u.UnitBase:
                 return u.CompositeUnit(scale, [u.Unit(spelling)], [1]) if scale != 1.0 else u.Unit(spelling)
         except (ValueError, TypeError, OverflowError, RecursionError):
             continue
-    raise InputError(unknown)
+    raise unknown
 
 
 def balanced(name: str) -> str:

@@ -43,6 +43,8 @@ def write_whole(path: Path, *parts: bytes | memoryview, shared: bool = False) ->
         if not isinstance(error, OSError):
             raise
         raise InputError(
-            f"{str(path)!r} cannot be written ({error.strerror}), expected a writable disk with room; what was written "
-            "before is kept"
+            f"{str(path)!r} cannot be written ({error.strerror})",
+            "a writable disk with room; what was written before is kept",
+            key="file",
+            value=str(path),
         ) from error

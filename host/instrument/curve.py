@@ -29,14 +29,22 @@ class Curve:
         value = np.asarray(self.value, dtype=np.float64)
         if wavelength.ndim != 1 or wavelength.size == 0 or wavelength.shape != value.shape:
             raise InputError(
-                f"a curve has {wavelength.size} wavelengths and {value.size} values, expected as many, one or more"
+                f"a curve has {wavelength.size} wavelengths and {value.size} values",
+                "as many, one or more",
+                key="value",
+                value=value.size,
             )
         if not (np.isfinite(wavelength).all() and (np.diff(wavelength) > 0).all()):
-            raise InputError("a curve's wavelengths are not finite and strictly increasing, expected nm in order")
+            raise InputError(
+                "a curve's wavelengths are not finite and strictly increasing",
+                "nm in order",
+                key="wavelength_nm",
+                value=wavelength,
+            )
         bad = ~(np.isfinite(value) & (value >= 0))
         if bad.any():
             knot = int(np.argmax(bad))
-            raise InputError(f"a curve's value at {wavelength[knot]:g} nm is {value[knot]:g}, expected finite and >= 0")
+            raise InputError.of("value", value[knot], "finite and >= 0", where=f"curve at {wavelength[knot]:g} nm")
 
     @classmethod
     def flat(cls, value: float, source: str = "A: assumed, no source given") -> Curve:
@@ -53,7 +61,10 @@ class Curve:
         table = read_numbers(path, "curve file")
         if "wavelength" not in table.columns or len(table.columns) != 2:
             raise InputError(
-                f"curve file {path} has the columns {', '.join(table.columns)}, expected 'wavelength' and one value"
+                f"curve file {path} has the columns {', '.join(table.columns)}",
+                "'wavelength' and one value",
+                key="columns",
+                value=table.columns,
             )
         name = next(column for column in table.columns if column != "wavelength")
         meta = table.meta
@@ -69,7 +80,7 @@ class Curve:
                 f"{meta.get('tag', 'A')}: {meta.get('source', f'assumed, no source in {Path(path).name}')}",
             )
         except InputError as error:
-            raise InputError(f"curve file {path}: {error}") from None
+            raise error.within(f"curve file {path}") from None
 
     def at(self, wavelength_nm: ArrayLike) -> NDArray[np.float64]:
         """Return the values at wavelengths in nm, shape of `wavelength_nm`; the end values hold beyond the knots."""
@@ -85,4 +96,4 @@ def _converted(values: NDArray[np.float64], name: str, unit: u.UnitBase | None, 
     for wanted in units:
         if unit is not None and unit.is_equivalent(wanted):
             return (values * unit).to_value(wanted)
-    raise InputError(f"column {name!r} has the unit {str(unit or '') or 'none'!r}, expected {units[0]}")
+    raise InputError(f"column {name!r} has the unit {str(unit or '') or 'none'!r}", str(units[0]), key=name, value=unit)

@@ -44,7 +44,7 @@ def _as_map(value: Any) -> Any:
 
 def _fraction(curve: Curve) -> Curve:
     if max(curve.value) > 1:
-        raise InputError(f"a value of {max(curve.value):g}, expected a fraction between 0 and 1")
+        raise InputError.of("value", max(curve.value), "a fraction between 0 and 1")
     return curve
 
 
@@ -200,42 +200,65 @@ class Instrument(Record):
             try:
                 _fraction(getattr(self, name))
             except InputError as error:
-                raise InputError(f"{name} has {error}") from None
+                raise InputError.of(name, error.value, str(error.expected)) from None
         low, high = self.output_min_nm, self.output_max_nm
         if not high > low:
-            raise InputError(f"output_max_nm = {high:g}, expected more than output_min_nm = {low:g}")
+            raise InputError.of("output_max_nm", high, f"more than output_min_nm = {low:g}")
         if self.wavelength_nm.size == 0:
-            raise InputError(f"no pixel lies in the output range {low:g}-{high:g} nm, expected at least one")
+            raise InputError(
+                f"no pixel lies in the output range {low:g}-{high:g} nm",
+                "at least one",
+                key="output_min_nm",
+                value=(low, high),
+            )
         for name in CURVES:
             curve: Curve = getattr(self, name)
             if not curve.covers(low, high):
                 raise InputError(
-                    f"{name} covers {curve.wavelength_nm[0]:g}-{curve.wavelength_nm[-1]:g} nm, "
-                    f"expected at least the output range {low:g}-{high:g} nm"
+                    f"{name} covers {curve.wavelength_nm[0]:g}-{curve.wavelength_nm[-1]:g} nm",
+                    f"at least the output range {low:g}-{high:g} nm",
+                    key=name,
+                    value=(curve.wavelength_nm[0], curve.wavelength_nm[-1]),
                 )
         if self.top_hat_width_nm == self.gaussian_fwhm_nm == 0:
-            raise InputError("top_hat_width_nm and gaussian_fwhm_nm are both 0, expected at least one above 0")
+            raise InputError(
+                "top_hat_width_nm and gaussian_fwhm_nm are both 0",
+                "at least one above 0",
+                key="top_hat_width_nm",
+                value=0.0,
+            )
         for name in ("top_hat_width_nm", "gaussian_fwhm_nm"):
             # A width far below a pixel has no effect, but costs time and digits.
             if 0 < getattr(self, name) < 0.1:
-                raise InputError(f"{name} = {getattr(self, name):g}, expected 0 (none) or at least 0.1")
+                raise InputError.of(name, getattr(self, name), "0 (none) or at least 0.1")
         if (most := float(self.quantum_efficiency(self.wavelength_nm).max())) > 1:
             raise InputError(
-                f"quantum_efficiency_a_per_w stands for {most:.3g} electrons per photon, expected at most 1"
+                f"quantum_efficiency_a_per_w stands for {most:.3g} electrons per photon",
+                "at most 1",
+                key="quantum_efficiency_a_per_w",
+                value=most,
             )
         if self.resolution_element_nm < self.dispersion_nm_per_pixel:
-            raise InputError(
-                f"resolution_element_nm = {self.resolution_element_nm:g}, "
-                f"expected at least a pixel ({self.dispersion_nm_per_pixel:g})"
+            raise InputError.of(
+                "resolution_element_nm",
+                self.resolution_element_nm,
+                f"at least a pixel ({self.dispersion_nm_per_pixel:g})",
             )
         if self.bias_dn >= min(self.saturation_dn, self.adc_max_dn):
-            raise InputError(f"bias_dn = {self.bias_dn:g}, expected below saturation")
+            raise InputError.of("bias_dn", self.bias_dn, "below saturation")
         if self.pixel_map is not None and self.pixel_map.size != self.pixels:
-            raise InputError(f"pixel_map has {self.pixel_map.size} pixels, expected the array's {self.pixels}")
+            raise InputError(
+                f"pixel_map has {self.pixel_map.size} pixels",
+                f"the array's {self.pixels}",
+                key="pixel_map",
+                value=self.pixel_map.size,
+            )
         if not (self.throughput(self.wavelength_nm) * self.per_pixel("response", 1.0) > 0).any():
             dark = [name for name in CURVES if not (getattr(self, name).at(self.wavelength_nm) > 0).any()]
             what = f"{' and '.join(dark) or 'the throughput'} = 0 from {low:g} to {high:g} nm"
-            raise InputError(f"{what}, expected a throughput above 0 in some pixel, where else all S/N are 0")
+            raise InputError(
+                f"{what}", "a throughput above 0 in some pixel, where else all S/N are 0", key="throughput", value=0.0
+            )
         return self
 
     @cached_property

@@ -40,9 +40,14 @@ def _built(path: Path) -> Instrument:
 def _read(path: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], dict[str, str]]:
     """Return the values and sources of a file, merged over those of the file that it extends."""
     if path.resolve() in seen:
-        raise InputError(f"{path.name} extends itself, expected a chain of files that ends")
+        raise InputError(f"{path.name} extends itself", "a chain of files that ends", key="extends", value=path.name)
     if len(seen) == MAX_EXTENDED:
-        raise InputError(f"{path.name} ends a chain of {MAX_EXTENDED} files that extend another, expected fewer")
+        raise InputError(
+            f"{path.name} ends a chain of {MAX_EXTENDED} files that extend another",
+            "fewer",
+            key="extends",
+            value=path.name,
+        )
     content = toml(read_text(path, "instrument file"), f"instrument file {shortened(str(path))}")
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}
@@ -51,7 +56,7 @@ def _read(path: Path, seen: tuple[Path, ...]) -> tuple[dict[str, Any], dict[str,
     for name, entry in content.items():
         if name == "sources":
             raise InputError(
-                f"{path.name}: unknown key 'sources', expected each value's source in the value's own table"
+                f"{path.name}: unknown key 'sources'", "each value's source in the value's own table", key="sources"
             )
         value, source = _entry(name, entry, path)
         values[name] = value
@@ -67,10 +72,12 @@ def _entry(name: str, entry: Any, path: Path) -> tuple[Any, str]:
         unknown = [key for key in entry if key not in ("value", "tag", "source")]
         if unknown or "value" not in entry:
             what = f"the unknown key {unknown[0]!r}" if unknown else "no 'value'"
-            raise InputError(f"{path.name}: the table {name} has {what}, expected value, tag and source")
+            raise InputError(
+                f"{path.name}: the table {name} has {what}", "value, tag and source", key=name, value=entry
+            )
         tag = entry.get("tag", "A")
         if tag not in TAGS:
-            raise InputError(f"{path.name}: {name} has the tag {tag!r}, expected one of {', '.join(TAGS)}")
+            raise InputError.of("tag", tag, f"one of {', '.join(TAGS)}", where=f"{path.name}, {name}")
         source = f"{tag}: {entry.get('source', f'no source in {path.name}')}"
         entry = entry["value"]
     if name in CURVES and isinstance(entry, str):

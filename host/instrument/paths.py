@@ -22,7 +22,7 @@ def shipped_names() -> tuple[str, ...]:
 def instrument_path(name: str | Path, folder: Path) -> Path:
     """Return the path of an embedded instrument or of a user's file, relative to `folder`."""
     if not isinstance(name, str | Path):
-        raise InputError(f"instrument {name!r}, expected a name or the path of a TOML file")
+        raise InputError.of("instrument", name, "a name or the path of a TOML file")
     names = shipped_names()
     if name in names:
         return _local(resources.files(__package__).joinpath("instruments", f"{name}.toml"))
@@ -30,13 +30,19 @@ def instrument_path(name: str | Path, folder: Path) -> Path:
     if is_file(path):
         return path
     if path.is_dir():
-        raise InputError(f"instrument {shortened(str(path))} is a folder, expected a name or a TOML file")
+        raise InputError(
+            f"instrument {shortened(str(path))} is a folder", "a name or a TOML file", key="instrument", value=name
+        )
     if path.suffix == ".toml":
-        raise InputError(f"instrument file {shortened(str(path))} does not exist, expected a TOML file")
+        raise InputError(
+            f"instrument file {shortened(str(path))} does not exist", "a TOML file", key="instrument", value=name
+        )
     near = difflib.get_close_matches(str(name), names, n=1, cutoff=0.0)[0]
     raise InputError(
-        f"unknown instrument {shortened(str(name))}, expected {' or '.join(names)} (nearest: {near!r}) "
-        "or the path of a TOML file"
+        f"unknown instrument {shortened(str(name))}",
+        f"{' or '.join(names)} (nearest: {near!r}) or the path of a TOML file",
+        key="instrument",
+        value=name,
     )
 
 

@@ -61,21 +61,29 @@ class PixelMap(ContentEquality):
                 continue
             values = np.array(getattr(self, name), np.float64)
             if values.ndim != 1:
-                raise InputError(f"{name} of the pixel map has the shape {values.shape}, expected one value per pixel")
+                raise InputError(
+                    f"{name} of the pixel map has the shape {values.shape}",
+                    "one value per pixel",
+                    key=name,
+                    value=values.shape,
+                )
             bad = ~(np.isfinite(values) & (values >= 0))
             if name == "gain":
                 bad |= values == 0
             if bad.any():
                 pixel = int(np.argmax(bad))
                 above = "above 0" if name == "gain" else "0 or more"
-                raise InputError(
-                    f"{name} of pixel {pixel} in the map is {values[pixel]:g}, expected finite and {above}"
-                )
+                raise InputError.of(name, values[pixel], f"finite and {above}", where=f"pixel map, pixel {pixel}")
             values.setflags(write=False)
             object.__setattr__(self, name, values)
             sizes.add(values.size)
         if len(sizes) != 1:
-            raise InputError(f"the pixel map has columns of {sorted(sizes) or 'no'} pixels, expected one length")
+            raise InputError(
+                f"the pixel map has columns of {sorted(sizes) or 'no'} pixels",
+                "one length",
+                key="pixel_map",
+                value=sizes,
+            )
 
     @property
     def size(self) -> int:
@@ -102,9 +110,11 @@ class PixelMap(ContentEquality):
         unknown = [name for name in table.columns if name not in COLUMNS and name != "pixel"]
         if unknown or list(table.columns) in ([], ["pixel"]):
             what = f"the column {unknown[0]!r}" if unknown else "no column of values"
-            raise InputError(f"pixel map {path} has {what}, expected some of {', '.join(COLUMNS)}")
+            raise InputError(f"pixel map {path} has {what}", f"some of {', '.join(COLUMNS)}", key="pixel_map")
         if "pixel" in table.columns and not np.array_equal(table["pixel"], np.arange(table["pixel"].size)):
-            raise InputError(f"pixel map {path}: the column 'pixel' is not 0, 1, 2, ..., expected every pixel in order")
+            raise InputError(
+                f"pixel map {path}: the column 'pixel' is not 0, 1, 2, ...", "every pixel in order", key="pixel"
+            )
         values = {}
         for name in table.columns:
             if name == "pixel":
@@ -112,13 +122,15 @@ class PixelMap(ContentEquality):
             unit = u.Unit(table.units[name], parse_strict="silent")
             if not unit.is_equivalent(COLUMNS[name]):
                 wanted = str(COLUMNS[name]) or "none"
-                raise InputError(f"pixel map {path}: {name} has the unit {str(unit) or 'none'!r}, expected {wanted}")
+                raise InputError(
+                    f"pixel map {path}: {name} has the unit {str(unit) or 'none'!r}", wanted, key=name, value=unit
+                )
             values[name] = table[name]
         source = f"{table.meta.get('tag', 'A')}: {table.meta.get('source', f'assumed, no source in {Path(path).name}')}"
         try:
             return cls(**values, source=source)
         except InputError as error:
-            raise InputError(f"pixel map {path}: {error}") from None
+            raise error.within(f"pixel map {path}") from None
 
     @classmethod
     def made_up(

@@ -33,10 +33,10 @@ class Thermal:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.time_constant_s) and self.time_constant_s > 0):
-            raise InputError(f"time_constant_s = {self.time_constant_s}, expected > 0")
+            raise InputError.of("time_constant_s", self.time_constant_s, "> 0")
         for name in ("sunlit_c", "shadow_c"):
             if not -100 <= getattr(self, name) <= 60:
-                raise InputError(f"{name} = {getattr(self, name)}, expected -100 to 60 deg C")
+                raise InputError.of(name, getattr(self, name), "-100 to 60 deg C")
 
     def temperature_c(
         self, sunlight: NDArray[np.float64], step_s: float, start_c: float | None = None
@@ -79,9 +79,9 @@ class Particles:
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.cosmic_per_cm2_s) and self.cosmic_per_cm2_s >= 0):
-            raise InputError(f"cosmic_per_cm2_s = {self.cosmic_per_cm2_s}, expected >= 0")
+            raise InputError.of("cosmic_per_cm2_s", self.cosmic_per_cm2_s, ">= 0")
         if not 0 <= self.share <= 1:
-            raise InputError(f"share = {self.share}, expected 0 to 1")
+            raise InputError.of("share", self.share, "0 to 1")
 
     def rate_per_cm2_s(self, track: Track) -> NDArray[np.float64]:
         """Return the rate of hits along a track, cm^-2 s^-1, shape (n,)."""

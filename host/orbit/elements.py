@@ -32,12 +32,17 @@ class Elements:
             _check(line, number)
         if self.first[2:7] != self.second[2:7]:
             raise InputError(
-                f"orbital elements are of satellites {self.first[2:7]!r} and {self.second[2:7]!r}, expected one"
+                f"orbital elements are of satellites {self.first[2:7]!r} and {self.second[2:7]!r}",
+                "one",
+                key="elements",
+                value=(self.first[2:7], self.second[2:7]),
             )
         if self.satellite.error:
             raise InputError(
-                f"orbital elements {shortened(self.second)} are refused by SGP4 (error {self.satellite.error}), "
-                "expected those of an orbit around the Earth"
+                f"orbital elements {shortened(self.second)} are refused by SGP4 (error {self.satellite.error})",
+                "those of an orbit around the Earth",
+                key="elements",
+                value=self.second,
             )
 
     @classmethod
@@ -61,7 +66,12 @@ class Elements:
         for one, two in pairwise(lines):
             if one.startswith("1 ") and two.startswith("2 "):
                 return cls(one, two, source)
-        raise InputError(f"orbit file {named} holds no two lines of elements, expected a line '1 ...' before '2 ...'")
+        raise InputError(
+            f"orbit file {named} holds no two lines of elements",
+            "a line '1 ...' before '2 ...'",
+            key="elements",
+            value=named,
+        )
 
     @cached_property
     def satellite(self) -> Any:
@@ -126,9 +136,12 @@ class Elements:
 def _check(line: str, number: int) -> None:
     """Raise InputError unless a line has the right form and checksum (digits plus 1 per minus sign, modulo 10)."""
     if len(line) < 69 or not line.isascii() or not line.startswith(f"{number} "):
-        raise InputError(f"orbital elements {shortened(line)}, expected line {number} with 69 characters")
+        raise InputError.of("elements", line, f"line {number} with 69 characters")
     checksum = sum(int(c) if c.isdigit() else c == "-" for c in line[:68]) % 10
     if line[68] != str(checksum):
         raise InputError(
-            f"orbital elements {shortened(line)} end in the checksum {line[68]!r}, expected {checksum}: one is wrong"
+            f"orbital elements {shortened(line)} end in the checksum {line[68]!r}",
+            f"{checksum}: one is wrong",
+            key="elements",
+            value=line,
         )

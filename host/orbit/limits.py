@@ -50,27 +50,28 @@ class Limits:
         for name, most in (("earth_limb_deg", 90), ("sun_deg", 180), ("moon_deg", 180), ("normal_cone_deg", 180)):
             value = getattr(self, name)
             if value is not None and not 0 <= value <= most:
-                raise InputError(f"{name} = {value}, expected 0 to {most}, or none")
+                raise InputError.of(name, value, f"0 to {most}, or none")
         if self.declination_deg is not None:
             low, high = self.declination_deg
             if not -90 <= low < high <= 90:
-                raise InputError(f"declination_deg = {low:g} to {high:g}, expected two rising values within -90 to 90")
+                raise InputError.of("declination_deg", (low, high), "two rising values within -90 to 90")
         if self.eclipse not in ("any", "only", "never"):
-            raise InputError(f"eclipse = {self.eclipse!r}, expected any, only or never")
+            raise InputError.of("eclipse", self.eclipse, "any, only or never")
         if self.proton_flux is not None and not self.proton_flux > 0:
-            raise InputError(f"proton_flux = {self.proton_flux}, expected > 0 or none")
+            raise InputError.of("proton_flux", self.proton_flux, "> 0 or none")
         if self.anomaly and (
             len(self.anomaly) < 3 or not all(math.isfinite(one) for corner in self.anomaly for one in corner)
         ):
             raise InputError(
-                f"anomaly is a polygon of {len(self.anomaly)} corners, expected at least 3, finite",
+                f"anomaly is a polygon of {len(self.anomaly)} corners",
+                "at least 3, finite",
                 key="anomaly",
                 value=self.anomaly,
             )
         if not (math.isfinite(self.shortest_s) and self.shortest_s >= 0):
-            raise InputError(f"shortest_s = {self.shortest_s}, expected >= 0")
+            raise InputError.of("shortest_s", self.shortest_s, ">= 0")
         if not 0 < self.duty_cycle <= 1:
-            raise InputError(f"duty_cycle = {self.duty_cycle}, expected above 0, at most 1")
+            raise InputError.of("duty_cycle", self.duty_cycle, "above 0, at most 1")
 
     @property
     def assumptions(self) -> list[tuple[str, str, str]]:

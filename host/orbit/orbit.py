@@ -49,7 +49,7 @@ class Orbit:
 
     def __post_init__(self) -> None:
         if self.kind not in ("auto", "tle", "mean"):
-            raise InputError(f"kind of orbit = {self.kind!r}, expected auto, tle or mean")
+            raise InputError.of("kind", self.kind, "auto, tle or mean")
 
     @classmethod
     def load(cls, file: str | Path | None = None, kind: Kind = "auto") -> Orbit:
@@ -110,7 +110,10 @@ class Orbit:
                 raise InputError(
                     f"orbital elements of epoch {self.elements.epoch} cannot be followed to "
                     f"{times.iso(float(times.seconds[np.argmax(error != 0)]))} (SGP4 error "
-                    f"{int(error[np.argmax(error != 0)])}), expected newer ones or the mean orbit"
+                    f"{int(error[np.argmax(error != 0)])})",
+                    "newer ones or the mean orbit",
+                    key="elements",
+                    value=self.elements.epoch,
                 )
         return Track(times, np.asarray(position), np.asarray(velocity))
 

@@ -31,7 +31,7 @@ class FluxMap:
     ) -> NDArray[np.float64]:
         """Interpolate the flux above an energy bilinearly, shape (n,)."""
         if above_mev not in self.flux:
-            raise InputError(f"protons above {above_mev} MeV, expected {' or '.join(map(str, self.flux))}")
+            raise InputError.of("above_mev", above_mev, " or ".join(map(str, self.flux)))
         grid = self.flux[above_mev]
         row = np.clip((np.asarray(latitude_deg, float) + 90) / self.step_deg, 0, grid.shape[0] - 1)
         column = (np.asarray(longitude_deg, float) + 180) / self.step_deg % grid.shape[1]

@@ -65,8 +65,10 @@ class Target:
             like = ", ".join(dict.fromkeys(_names()[one].name for one in near))
             like = f"a name such as {like}" if like else "a name of the embedded list"
             raise InputError(
-                f"target {shortened(text)} is not in the embedded list, expected {like}, coordinates such as "
-                "'290.0 -11.2', or `simbad=True` to ask SIMBAD"
+                f"target {shortened(text)} is not in the embedded list",
+                f"{like}, coordinates such as '290.0 -11.2', or `simbad=True` to ask SIMBAD",
+                key="target",
+                value=text,
             )
         with offline():
             place = parse_position(text).icrs
@@ -119,19 +121,26 @@ def _from_simbad(text: str, name: str | None) -> Target:
         from astroquery.simbad import Simbad
     except ImportError:
         raise InputError(
-            f"target {shortened(text)} is not in the embedded list and astroquery is missing, expected coordinates, or "
-            "`pip install 'mauvecl[names]'`"
+            f"target {shortened(text)} is not in the embedded list and astroquery is missing",
+            "coordinates, or `pip install 'mauvecl[names]'`",
+            key="target",
+            value=text,
         ) from None
     query = SIMBAD_QUERY.format(text.strip().replace("'", "''"))
     try:
         table = _within(TIMEOUT_S, lambda: Simbad.query_tap(query))
     except Exception as error:  # astroquery raises many kinds for a network failure
         raise InputError(
-            f"target {shortened(text)} is not in the embedded list and SIMBAD did not answer within {TIMEOUT_S:g} s "
-            f"({type(error).__name__}), expected a network, or coordinates"
+            f"target {shortened(text)} is not in the embedded list and SIMBAD did not answer within {TIMEOUT_S:g}"
+            f" s ({type(error).__name__})",
+            "a network, or coordinates",
+            key="target",
+            value=text,
         ) from error
     if table is None or len(table) == 0:
-        raise InputError(f"target {shortened(text)} is unknown to SIMBAD, expected another name, or coordinates")
+        raise InputError(
+            f"target {shortened(text)} is unknown to SIMBAD", "another name, or coordinates", key="target", value=text
+        )
     row = table[0]
 
     def number(column: str) -> float | None:
@@ -140,7 +149,9 @@ def _from_simbad(text: str, name: str | None) -> Target:
 
     parallax, ra, dec = number("plx_value"), number("ra"), number("dec")
     if ra is None or dec is None:
-        raise InputError(f"target {shortened(text)} has no coordinates in SIMBAD, expected another name")
+        raise InputError(
+            f"target {shortened(text)} has no coordinates in SIMBAD", "another name", key="target", value=text
+        )
     distance = None if parallax is None or parallax <= 0 else 1000 / parallax
     kind = None if np.ma.is_masked(row["sp_type"]) else str(row["sp_type"]).strip() or None
     return Target(name or text.strip(), ra, dec, "SIMBAD", distance, number("V"), kind)

@@ -35,11 +35,11 @@ class TimeGrid:
     def __post_init__(self) -> None:
         for name in ("days", "step_s"):
             if not (np.isfinite(value := getattr(self, name)) and value > 0):
-                raise InputError(f"{name} = {value}, expected a number > 0")
+                raise InputError.of(name, value, "a number > 0")
         if not 1 <= self.n <= MAX_STEPS:
             raise InputError(
-                f"{self.days:g} days in steps of {self.step_s:g} s are {self.days * DAY_S / self.step_s:.3g} steps, "
-                f"expected 1 to {MAX_STEPS}",
+                f"{self.days:g} days in steps of {self.step_s:g} s are {self.days * DAY_S / self.step_s:.3g} steps",
+                f"1 to {MAX_STEPS}",
                 key="step_s",
                 value=self.step_s,
             )

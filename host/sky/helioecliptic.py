@@ -54,7 +54,10 @@ def helioecliptic(target: SkyCoord | str, time: Time | str) -> HelioEcliptic:
             star = position.transform_to(frame)
         except Exception:  # frames that cannot be transformed (AltAz without a location) raise many kinds
             raise InputError(
-                f"target in the frame {position.frame.name!r} cannot be turned to the ecliptic, expected ICRS"
+                f"target in the frame {position.frame.name!r} cannot be turned to the ecliptic",
+                "ICRS",
+                key="target",
+                value=position.frame.name,
             ) from None
         difference = float((star.lon - sun.lon).wrap_at("180d").deg)
         longitude, latitude = abs(difference), float(star.lat.deg)
@@ -85,23 +88,23 @@ def parse_time(time: Time | str) -> Time:
     """Return a single finite time between 1990 and 2100; text is ISO 8601, UTC. Call inside `offline`."""
     from astropy.time import Time
 
-    expected = "expected a UTC time such as '2026-03-01T12:00:00'"
+    expected = "a UTC time such as '2026-03-01T12:00:00'"
     if isinstance(time, str):
         try:
             moment = Time(time.strip().removesuffix("Z"), scale="utc")
         except ValueError:
-            raise InputError(f"time = {time!r}, {expected}") from None
+            raise InputError.of("time", time, expected) from None
     elif isinstance(time, Time):
         moment = time
     else:
-        raise InputError(f"time = {_line(time)}, {expected}")
+        raise InputError.of("time", time, expected)
     if not moment.isscalar:
-        raise InputError(f"time holds {moment.size} times, expected one", key="time", value=time)
+        raise InputError(f"time holds {moment.size} times", "one", key="time", value=time)
     if np.ma.is_masked(moment.jd) or not np.isfinite(moment.jd):
-        raise InputError(f"time = {_line(time)} is not finite, {expected}")
+        raise InputError.of("time", time, expected)
     year = float(moment.decimalyear)
     if not YEARS[0] <= year < YEARS[1]:
-        raise InputError(f"time = {moment.utc.isot}, expected between {YEARS[0]} and {YEARS[1]}")
+        raise InputError.of("time", moment.utc.isot, f"between {YEARS[0]} and {YEARS[1]}")
     return moment
 
 
@@ -111,22 +114,22 @@ def parse_position(target: SkyCoord | str) -> SkyCoord:
     from astropy.coordinates import SkyCoord
     from astropy.coordinates.baseframe import BaseCoordinateFrame
 
-    expected = "expected right ascension and declination such as '290.0 -11.2' (degrees) or '19h22m00s -11d12m00s'"
+    expected = "right ascension and declination such as '290.0 -11.2' (degrees) or '19h22m00s -11d12m00s'"
     if isinstance(target, str):
         unit = u.deg if _in_degrees(target) else (u.hourangle, u.deg)
         try:
             position = SkyCoord(target.replace(",", " "), unit=unit)
         except (ValueError, TypeError, IndexError):
-            raise InputError(f"target = {target!r}, {expected}") from None
+            raise InputError.of("target", target, expected) from None
     elif isinstance(target, SkyCoord | BaseCoordinateFrame):
         position = SkyCoord(target)
     else:
-        raise InputError(f"target = {_line(target)}, {expected}")
+        raise InputError.of("target", target, expected)
     if not position.isscalar:
-        raise InputError(f"target holds {position.size} positions, expected one", key="target", value=target)
+        raise InputError(f"target holds {position.size} positions", "one", key="target", value=target)
     angles = position.spherical
     if not np.isfinite([angles.lon.deg, angles.lat.deg]).all():
-        raise InputError(f"target = {_line(target)} is not finite, {expected}")
+        raise InputError.of("target", target, expected)
     return position
 
 
@@ -137,10 +140,7 @@ def _in_degrees(target: str) -> bool:
     """
     degrees = _DEGREES.fullmatch(target)
     if degrees and not 0 <= float(degrees[1]) <= 360:
-        raise InputError(f"target = {target!r} has a right ascension of {degrees[1]}, expected 0 to 360 degrees")
+        raise InputError(
+            f"target = {target!r} has a right ascension of {degrees[1]}", "0 to 360 degrees", key="target", value=target
+        )
     return degrees is not None
-
-
-def _line(value: object) -> str:
-    """Return the representation of an object on one line."""
-    return " ".join(repr(value).split())

@@ -91,7 +91,7 @@ class Sky:
             If the nearest cell is in the solar avoidance zone.
         """
         if lookup not in ("bilinear", "nearest"):
-            raise InputError(f"lookup = {lookup!r}, expected 'bilinear' or 'nearest'")
+            raise InputError.of("lookup", lookup, "'bilinear' or 'nearest'")
         place = helioecliptic(target, time)
         brightness = zodiacal_brightness(place, lookup)
         return cls(
@@ -166,8 +166,10 @@ def zodiacal_brightness(place: HelioEcliptic, lookup: Lookup = "bilinear") -> fl
     if np.isnan(nearest):
         raise InputError(
             f"the Sun is {place.separation_deg:.1f} deg from the target (helio-ecliptic longitude "
-            f"{place.longitude_deg:.1f} deg, latitude {place.latitude_deg:.1f} deg), expected it outside the zone of "
-            "solar avoidance, some 50 deg"
+            f"{place.longitude_deg:.1f} deg, latitude {place.latitude_deg:.1f} deg)",
+            "it outside the zone of solar avoidance, some 50 deg",
+            key="target",
+            value=place.separation_deg,
         )
     if lookup == "nearest":
         return nearest

@@ -47,14 +47,14 @@ def choose(names: Sequence[str], roles: Sequence[Role], asked: Sequence[str] = (
     """
     wanted = [_named(name, names) for name in asked]
     if len(wanted) > 2:
-        raise InputError(f"columns {listed(asked)} are asked for, expected one flux, and one wavelength at most")
+        raise InputError.of("columns", asked, "one flux, and one wavelength at most")
     axes = [i for i in wanted if roles[i].kind in AXES]
     if len(wanted) == 2 and not axes:
         axes = wanted[:1]
     wavelength = (axes[0],) if axes else _wavelength(names, roles)
     rest = [i for i in wanted if i not in wavelength]
     if len(rest) > 1:
-        raise InputError(f"columns {listed(asked)} are asked for, expected one flux, and one wavelength at most")
+        raise InputError.of("columns", asked, "one flux, and one wavelength at most")
     return Choice(wavelength, rest[0] if rest else _flux(names, roles, wavelength))
 
 
@@ -63,8 +63,10 @@ def _named(name: str, names: Sequence[str]) -> int:
     places = places or [i for i, one in enumerate(names) if plain(one) == plain(name)]
     if len(places) != 1:
         raise InputError(
-            f"{'several columns are' if places else 'no column is'} named {shortened(name)}, expected one of "
-            f"{listed(names)}"
+            f"{'several columns are' if places else 'no column is'} named {shortened(name)}",
+            f"one of {listed(names)}",
+            key="columns",
+            value=name,
         )
     return places[0]
 
@@ -76,8 +78,10 @@ def _wavelength(names: Sequence[str], roles: Sequence[Role]) -> tuple[int, ...]:
     if low or high:
         return _only("lower edge of the bins", names, low), _only("upper edge of the bins", names, high)
     raise InputError(
-        f"no column is recognised as the wavelength among {listed(names)}, expected one named wavelength: name two "
-        "columns as in FILE[wavelength,flux]"
+        f"no column is recognised as the wavelength among {listed(names)}",
+        "one named wavelength: name two columns as in FILE[wavelength,flux]",
+        key="columns",
+        value=names,
     )
 
 
@@ -91,8 +95,10 @@ def _flux(names: Sequence[str], roles: Sequence[Role], wavelength: tuple[int, ..
         return unknown[0]
     held = [f"{names[i].strip()[:40]} ({roles[i].kind})" for i in rest]
     raise InputError(
-        f"no column is recognised as a star's flux, only {listed(held) or 'the wavelength'}, expected one named flux: "
-        f"name the column as in FILE[{names[(unknown or rest or [0])[0]].strip()[:40]}]"
+        f"no column is recognised as a star's flux, only {listed(held) or 'the wavelength'}",
+        f"one named flux: name the column as in FILE[{names[(unknown or rest or [0])[0]].strip()[:40]}]",
+        key="columns",
+        value=held,
     )
 
 
@@ -105,9 +111,16 @@ def _only(what: str, names: Sequence[str], places: Sequence[int]) -> int:
     if len(places) == 1:
         return places[0]
     if not places:
-        raise InputError(f"no column is the {what} among {listed(names)}, expected both edges or the wavelength itself")
+        raise InputError(
+            f"no column is the {what} among {listed(names)}",
+            "both edges or the wavelength itself",
+            key="columns",
+            value=names,
+        )
     several = [names[i].strip() for i in places]
     raise InputError(
-        f"{len(several)} columns may be the {what}: {listed(several)}, expected one: name it as in "
-        f"FILE[{several[-1][:40]}]"
+        f"{len(several)} columns may be the {what}: {listed(several)}",
+        f"one: name it as in FILE[{several[-1][:40]}]",
+        key="columns",
+        value=several,
     )

@@ -109,7 +109,9 @@ def _scale(what: str, column: str, role: Role, asked: Any, implied: str | None) 
     if is_assumed:
         if implied is None:
             usual = "nm" if what == "wavelength" else "erg / (s cm2 Angstrom)"
-            raise InputError(f"column {column} names no unit, expected one such as {usual}: --{what}-unit names it")
+            raise InputError(
+                f"column {column} names no unit", f"one such as {usual}: `{what}_unit` names it", key=f"{what}_unit"
+            )
         # Logarithms of wavelength are of Angstrom everywhere (SDSS, LAMOST, DESI).
         is_logarithm = is_bare_logarithm or role.logarithm
         unit = unit_of("Angstrom" if what == "wavelength" and is_logarithm else implied)
@@ -117,7 +119,7 @@ def _scale(what: str, column: str, role: Role, asked: Any, implied: str | None) 
     if what == "flux":
         _check_flux_unit(unit, role)
     elif not is_spectral(unit):
-        raise InputError(f"wavelengths in {unit} are none, expected a length or a frequency")
+        raise InputError.of("wavelength_unit", str(unit), "a length or a frequency")
     base = role.logarithm or ("10" if is_bare_logarithm or str(unit).startswith("dex") else "")
     if base:
         values, power = "wavelengths" if what == "wavelength" else "fluxes", "e" if base == "e" else "ten"
@@ -137,7 +139,7 @@ def _stated(what: str, column: str, stated: str | None, asked: Any) -> tuple[Any
             return (unit_of(stated) if stated is not None and is_stated(stated) else None), []
         unit = unit_of(asked) if isinstance(asked, str) else asked
     except InputError as error:
-        raise InputError(f"{what} ({column}): {error}") from error
+        raise error.within(f"{what} ({column})") from error
     if not is_stated(stated) or _is_same(stated, unit):
         return unit, []
     return unit, [f"the unit of its {what} is {unit} as asked, not {stated!s:.40} as its file says"]
@@ -158,7 +160,10 @@ def _power(values: Float, base: str, limits: tuple[float, float], column: str) -
     if outside or (finite.size and np.abs(finite).max() < 1e-3):
         raise InputError(
             f"column {column} is named as a logarithm and holds {values[np.isfinite(values)].min():g} to "
-            f"{values[np.isfinite(values)].max():g}, expected logarithms from {limits[0]:g} to {limits[1]:g}"
+            f"{values[np.isfinite(values)].max():g}",
+            f"logarithms from {limits[0]:g} to {limits[1]:g}",
+            key=column,
+            value=(values[np.isfinite(values)].min(), values[np.isfinite(values)].max()),
         )
     with np.errstate(over="ignore"):
         return np.asarray(10.0**logarithms)
@@ -168,19 +173,27 @@ def _check_flux_unit(unit: Any, role: Role) -> None:
     kind = flux_kind(unit)
     if kind == "total" and not role.total:
         raise InputError(
-            f"the unit {unit} is no flux density (nothing in it is per wavelength or frequency), expected one such as "
-            "erg / (s cm2 Angstrom), or a column whose name says lambda F_lambda, such as lamFlam"
+            f"the unit {unit} is no flux density (nothing in it is per wavelength or frequency)",
+            "one such as erg / (s cm2 Angstrom), or a column whose name says lambda F_lambda, such as lamFlam",
+            key="flux_unit",
+            value=unit,
         )
     if kind == "density" and role.total:
         raise InputError(
-            f"the column's name says lambda F_lambda and its unit {unit} a flux density, expected them to agree"
+            f"the column's name says lambda F_lambda and its unit {unit} a flux density",
+            "them to agree",
+            key="flux_unit",
+            value=unit,
         )
     if kind == "surface brightness":
         raise InputError(
-            f"the unit {unit} is per solid angle, expected the flux of the whole star, such as erg / (s cm2 Angstrom)"
+            f"the unit {unit} is per solid angle",
+            "the flux of the whole star, such as erg / (s cm2 Angstrom)",
+            key="flux_unit",
+            value=unit,
         )
     if kind == "other":
-        raise InputError(f"the unit {unit} is no flux density, expected one such as erg / (s cm2 Angstrom)")
+        raise InputError.of("flux_unit", str(unit), "one such as erg / (s cm2 Angstrom)")
 
 
 def _in_nm(values: Float, flux: Float, scale: _Scale) -> tuple[Float, Float]:
@@ -195,7 +208,7 @@ def _in_nm(values: Float, flux: Float, scale: _Scale) -> tuple[Float, Float]:
     if bad.size < nm.size and not np.isfinite(flux[bad]).any():
         # A row without either is no point.
         return np.delete(nm, bad), np.delete(flux, bad)
-    raise InputError(f"wavelength {nm[bad[0]]} at point {bad[0] + 1}, expected a finite number")
+    raise InputError.of("wavelength", nm[bad[0]], "a finite number", where=f"point {bad[0] + 1}")
 
 
 def _in_flam(flux: Float, nm: Float, scale: _Scale) -> Float:
@@ -218,8 +231,10 @@ def _joined(segments: list[tuple[Float, Float]], messages: list[str]) -> tuple[F
     for more, added in segments[1:]:
         if more[-1] <= nm[-1]:
             raise InputError(
-                f"a segment of {more[0]:g}-{more[-1]:g} nm lies within another, which ends at {nm[-1]:g} nm, expected "
-                "segments side by side: choose one by its name, as in FILE[name]"
+                f"a segment of {more[0]:g}-{more[-1]:g} nm lies within another, which ends at {nm[-1]:g} nm",
+                "segments side by side: choose one by its name, as in FILE[name]",
+                key="table",
+                value=(more[0], more[-1]),
             )
         if more[0] <= nm[-1]:
             middle = (more[0] + nm[-1]) / 2
@@ -238,14 +253,18 @@ def _check_assumed_flux(flux: Float, raw: RawSpectrum) -> None:
     low, high = float(finite.min()), float(finite.max())
     if low >= LIKELY_MAGNITUDES[0] and high <= LIKELY_MAGNITUDES[1]:
         raise InputError(
-            f"fluxes of {low:g} to {high:g} without a unit look like magnitudes, expected a flux density: `flux_unit` "
-            "names its unit"
+            f"fluxes of {low:g} to {high:g} without a unit look like magnitudes",
+            "a flux density: `flux_unit` names its unit",
+            key="flux_unit",
+            value=(low, high),
         )
     said = _THROUGHPUT.search(f"{raw.table.remarks}\n{raw.table.origin}".replace("_", " "))
     if said and low >= 0.0 and 1e-3 <= high <= 1.0:
         raise InputError(
-            f"values of {low:g} to {high:g} without a unit and the word {said[0]!r} speak of a throughput, expected a "
-            "star's flux: `flux_unit` names its unit"
+            f"values of {low:g} to {high:g} without a unit and the word {said[0]!r} speak of a throughput",
+            "a star's flux: `flux_unit` names its unit",
+            key="flux_unit",
+            value=(low, high),
         )
 
 

@@ -31,20 +31,24 @@ def check_points(name: str, wavelength: Float, flux: Float) -> None:
     """Raise InputError unless wavelengths and fluxes are equally long, and wavelengths finite and increasing."""
     if wavelength.ndim != 1 or wavelength.shape != flux.shape or wavelength.size < 2:
         raise InputError(
-            f"spectrum {name} has {wavelength.shape} wavelengths and {flux.shape} fluxes, expected two equal columns"
+            f"spectrum {name} has {wavelength.shape} wavelengths and {flux.shape} fluxes",
+            "two equal columns",
+            key="flux",
+            value=flux.shape,
         )
     bad = np.flatnonzero(~(np.isfinite(wavelength) & (wavelength > 0.0)))
     if bad.size:
-        raise InputError(
-            f"spectrum {name}: wavelength {wavelength[bad[0]]:g} at point {bad[0] + 1}, expected a finite number "
-            "above 0"
+        raise InputError.of(
+            "wavelength", wavelength[bad[0]], "a finite number above 0", where=f"spectrum {name}, point {bad[0] + 1}"
         )
     back = np.flatnonzero(np.diff(wavelength) <= 0)
     if back.size:
         i = int(back[0])
         raise InputError(
-            f"spectrum {name}: wavelength {wavelength[i + 1]:g} nm at point {i + 2} follows {wavelength[i]:g} nm, "
-            "expected increasing wavelengths"
+            f"spectrum {name}: wavelength {wavelength[i + 1]:g} nm at point {i + 2} follows {wavelength[i]:g} nm",
+            "increasing wavelengths",
+            key="wavelength",
+            value=wavelength[i + 1],
         )
     check_values(name, wavelength, flux)
 
@@ -58,8 +62,10 @@ def check_measured(name: str, wavelength: Float) -> None:
     unit = likely_unit(low, high, "nm")
     meant = f"; as numbers these look like {unit}: `wavelength_unit={unit!r}`" if unit else ""
     raise InputError(
-        f"spectrum {name} covers {low:g}-{high:g} nm, {part:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm, expected at "
-        f"least a third, which `extend` can continue{meant}"
+        f"spectrum {name} covers {low:g}-{high:g} nm, {part:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm",
+        f"at least a third, which `extend` can continue{meant}",
+        key="extend",
+        value=(low, high),
     )
 
 
@@ -69,8 +75,10 @@ def check_covers(
     """Raise InputError if a spectrum's range does not cover that of the pixels."""
     if span_nm[0] > needed_nm[0] or span_nm[1] < needed_nm[1]:
         raise InputError(
-            f"spectrum {name} spans {span_nm[0]:g}-{span_nm[1]:g} nm, expected at least {of}{needed_nm[0]:g}-"
-            f"{needed_nm[1]:g} nm: `extend` continues it by a library spectrum"
+            f"spectrum {name} spans {span_nm[0]:g}-{span_nm[1]:g} nm",
+            f"at least {of}{needed_nm[0]:g}-{needed_nm[1]:g} nm: `extend` continues it by a library spectrum",
+            key="extend",
+            value=span_nm,
         )
 
 
@@ -91,7 +99,12 @@ def without_undefined_ends(name: str, wavelength: Float, flux: Float) -> tuple[F
     stop = int(high[0]) if high.size else wavelength.size
     kept = wavelength[start:stop]
     if kept.size < 2:
-        raise InputError(f"spectrum {name} has no defined flux in {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm, expected some")
+        raise InputError(
+            f"spectrum {name} has no defined flux in {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm",
+            "some",
+            key="flux",
+            value=name,
+        )
     note = f"cut to {kept[0]:.1f}-{kept[-1]:.1f} nm: undefined flux beyond"
     return kept, flux[start:stop], (note,)
 
@@ -101,24 +114,28 @@ def check_flux(name: str, wavelength: Float, flux: Float) -> None:
     bad = np.flatnonzero(~np.isfinite(flux))
     if bad.size:
         i = int(bad[0])
-        raise InputError(
-            f"spectrum {name}: flux {flux[i]} at point {i + 1}, {wavelength[i]:g} nm, expected a finite number"
+        raise InputError.of(
+            "flux", flux[i], "a finite number", where=f"spectrum {name}, point {i + 1} at {wavelength[i]:g} nm"
         )
     inside = (wavelength >= NEEDED_NM[0]) & (wavelength <= NEEDED_NM[1])
     most, least = (float(f(flux[inside])) if inside.any() else 0.0 for f in (np.max, np.min))
     if max(abs(most), abs(least)) > BRIGHTEST or 0.0 < most < FAINTEST:
         raise InputError(
-            f"spectrum {name}: the highest flux in 200-700 nm is {most:.3g} and the lowest {least:.3g} erg/s/cm2/A, "
-            f"expected {FAINTEST:g} to {BRIGHTEST:g}"
+            f"spectrum {name}: the highest flux in 200-700 nm is {most:.3g} and the lowest {least:.3g} erg/s/cm2/A",
+            f"{FAINTEST:g} to {BRIGHTEST:g}",
+            key="flux",
+            value=(least, most),
         )
     if most <= 0.0:
         what = "every flux is zero" if not flux.any() else f"no flux in 200-700 nm is above zero, the highest {most:g}"
-        raise InputError(f"spectrum {name}: {what}, expected some light")
+        raise InputError(f"spectrum {name}: {what}", "some light", key="flux", value=most)
     if least < -most:
         at = wavelength[inside][int(np.argmin(flux[inside]))]
         raise InputError(
-            f"spectrum {name}: flux {least:g} at {at:g} nm lies farther below zero than any in 200-700 nm lies above, "
-            "expected measured noise at most: it may stand for no measurement"
+            f"spectrum {name}: flux {least:g} at {at:g} nm lies farther below zero than any in 200-700 nm lies above",
+            "measured noise at most: it may stand for no measurement",
+            key="flux",
+            value=least,
         )
 
 
@@ -209,8 +226,11 @@ def continued(
         word = "starts" if is_blue else "ends"
         if share > MAX_CONTINUED:
             raise InputError(
-                f"spectrum {name} {word} at {end:g} nm, where it is bright: {share:.1%} of the brightest pixel's light "
-                f"would be made up, expected a spectrum to {goal:g} nm: `extend` continues it by a library spectrum"
+                f"spectrum {name} {word} at {end:g} nm, where it is bright: {share:.1%} of the brightest "
+                "pixel's light would be made up",
+                f"a spectrum to {goal:g} nm: `extend` continues it by a library spectrum",
+                key="extend",
+                value=end,
             )
         messages.append(
             f"it {word} at {end:g} nm and is continued to {goal:g} nm at its end's level, {level:.3g}: at most "
@@ -288,8 +308,11 @@ def _join(
     low, high = max(wavelength[0], beyond[0]), min(wavelength[-1], beyond[-1])
     if not low < high:
         raise InputError(
-            f"spectrum {name} spans {wavelength[0]:g}-{wavelength[-1]:g} nm and its extension {extension} "
-            f"{beyond[0]:g}-{beyond[-1]:g} nm, expected them to overlap"
+            f"spectrum {name} spans {wavelength[0]:g}-{wavelength[-1]:g} nm and its extension {extension}"
+            f" {beyond[0]:g}-{beyond[-1]:g} nm",
+            "them to overlap",
+            key="extend",
+            value=extension,
         )
     noise = point_noise(flux)
     for width in JOIN_NM * 2.0 ** np.arange(6):
@@ -300,6 +323,9 @@ def _join(
         if own > MIN_JOIN_SNR * error and other > 0.0 and np.isfinite(own / other):
             return join, own, other
     raise InputError(
-        f"spectrum {name} and its extension {extension} have mean fluxes of {own:g} and {other:g} at "
-        f"{join[0]:g}-{join[1]:g} nm, expected light in both to scale by"
+        f"spectrum {name} and its extension {extension} have mean fluxes of {own:g} and {other:g} "
+        f"at {join[0]:g}-{join[1]:g} nm",
+        "light in both to scale by",
+        key="extend",
+        value=extension,
     )

@@ -75,14 +75,14 @@ def numbers(values: ArrayLike, what: str, missing: float | None = None) -> Float
     kind = np.asanyarray(values).dtype.kind
     if kind in "bc":
         held = "true and false" if kind == "b" else "complex numbers"
-        raise InputError(f"{what} holds {held}, expected real numbers")
+        raise InputError(f"{what} holds {held}", "real numbers", key=what, value=held)
     try:
         if isinstance(values, np.ma.MaskedArray):
             plain_values = np.ma.filled(values.astype(np.float64), np.nan)
         else:
             plain_values = np.array(values, np.float64)
     except (TypeError, ValueError, OverflowError) as error:
-        raise InputError(f"{what} holds no plain numbers, expected one number in each cell") from error
+        raise InputError(f"{what} holds no plain numbers", "one number in each cell", key=what) from error
     if missing is not None:
         # Single precision rounds the values, and not the mark in the header.
         plain_values[np.isclose(plain_values, float(missing), rtol=1e-6, atol=0.0)] = np.nan

@@ -56,7 +56,7 @@ def check_sizes(content: bytes) -> None:
         while content[at : at + 8] != b"END     ":
             card = content[at : at + 80]
             if len(card) < 80 or at - place > 80 * MAX_CARDS:
-                raise InputError(f"has a header {number} without an end, expected {WHOLE}")
+                raise InputError(f"has a header {number} without an end", WHOLE, key="file", value=number)
             cards.setdefault(card[:8].strip(), card[10:].split(b"/")[0].strip())
             at += 80
         start = place + -(-(at + 80 - place) // BLOCK) * BLOCK
@@ -66,20 +66,25 @@ def check_sizes(content: bytes) -> None:
                 int(cards.get(k, d)) for k, d in ((b"BITPIX", b""), (b"PCOUNT", b"0"), (b"GCOUNT", b"1"))
             )
         except (KeyError, ValueError) as error:
-            raise InputError(f"has a header {number} whose sizes are no numbers, expected {WHOLE}") from error
+            raise InputError(
+                f"has a header {number} whose sizes are no numbers", WHOLE, key="file", value=number
+            ) from error
         if axes[:1] == [0] and len(axes) > 1:
             # Random groups.
             axes = axes[1:]
         if min([extra, groups, *axes]) < 0 or abs(bits) > 64:
-            raise InputError(f"has a header {number} with impossible sizes, expected {WHOLE}")
+            raise InputError(f"has a header {number} with impossible sizes", WHOLE, key="file", value=number)
         size = abs(bits) // 8 * groups * (extra + math.prod(axes) if axes else 0)
         if start + size > len(content):
             raise InputError(
                 f"is cut short: its extension {number} is to hold {size} bytes, of which "
-                f"{max(0, len(content) - start)} are there, expected a whole file"
+                f"{max(0, len(content) - start)} are there",
+                "a whole file",
+                key="file",
+                value=len(content),
             )
         place = start + -(-size // BLOCK) * BLOCK
-    raise InputError(f"has more than {MAX_EXTENSIONS} extensions, expected fewer")
+    raise InputError(f"has more than {MAX_EXTENSIONS} extensions", "fewer", key="file", value=MAX_EXTENSIONS)
 
 
 def _check_sums(hdus: Any) -> None:
@@ -89,8 +94,10 @@ def _check_sums(hdus: Any) -> None:
             if hdu.header.get(key) not in (None, "") and verify() == 0:
                 part = "data" if key == "DATASUM" else "header or data"
                 raise InputError(
-                    f"differs from its {key} in extension {number}: its {part} are damaged or were edited, expected "
-                    "the file as it was written; after an intended change, remove the keyword"
+                    f"differs from its {key} in extension {number}: its {part} are damaged or were edited",
+                    "the file as it was written; after an intended change, remove the keyword",
+                    key=key,
+                    value=number,
                 )
 
 
@@ -120,7 +127,7 @@ class _Reader:
         if errors and not tables and not images:
             raise errors[0]
         if not tables and not images:
-            raise InputError("has no table and no image, expected a FITS table with WAVELENGTH and FLUX")
+            raise InputError("has no table and no image", "a FITS table with WAVELENGTH and FLUX", key="table")
         return [*tables, *images]
 
     def _label(self, number: int, hdu: Any) -> str:
@@ -166,7 +173,7 @@ class _Reader:
     def _of_table(self, number: int, hdu: Any) -> FileTable:
         header = hdu.header
         if text_at(header, "ZIMAGE") == "True":
-            raise InputError("holds a compressed image, expected a table with WAVELENGTH and FLUX")
+            raise InputError("holds a compressed image", "a table with WAVELENGTH and FLUX", key="table", value=number)
         # The unit of the whole file is that of the flux where its column states none (SDSS).
         whole = text_at(self.primary, "BUNIT") or text_at(header, "BUNIT") or None
         columns = []

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
 
 #: Images that hold no fluxes, by the name of their extension.
 _NO_FLUX = re.compile(r"err|sig|var|ivar|qual|mask|dq|snr|cont|sky|back|wave|lambda|lam$", re.IGNORECASE)
@@ -49,8 +48,10 @@ def rows_of(hdu: Any, telescope: str) -> tuple[Any, tuple[str, ...], tuple[str, 
     shape = [int(header.get(f"NAXIS{k + 1}", 0)) for k in range(int(header["NAXIS"]))]
     if sum(n > 1 for n in shape) > 2 or shape[0] < 2:
         raise InputError(
-            f"holds an image of {' x '.join(map(str, shape))} pixels, expected a spectrum of one dimension, rows of "
-            "spectra, or a table"
+            f"holds an image of {' x '.join(map(str, shape))} pixels",
+            "a spectrum of one dimension, rows of spectra, or a table",
+            key="table",
+            value=shape,
         )
     flux = np.asanyarray(hdu.data).reshape(-1, shape[0])
     if len(flux) == 1:
@@ -81,7 +82,9 @@ def axis_of(header: Any, primary: Any, n: int) -> tuple[Any, str | None, str, tu
         return 10.0 ** (first + slope * np.arange(n)), "Angstrom", "", ("wavelengths from COEFF0 and COEFF1",)
     start, step = number("CRVAL1"), number("CD1_1", "CDELT1")
     if start is None or step is None or step == 0:
-        raise InputError("has an image without CRVAL1 and CDELT1 or CD1_1, expected the wavelengths of its pixels")
+        raise InputError(
+            "has an image without CRVAL1 and CDELT1 or CD1_1", "the wavelengths of its pixels", key="CRVAL1"
+        )
     if number("CDELT1") is not None and number("CD1_1") is None and (scale := number("PC1_1")) is not None:
         step *= scale
     # By the FITS standard a missing CRPIX1 is 0; the archives' spectra without it begin at their first pixel.
@@ -95,14 +98,17 @@ def axis_of(header: Any, primary: Any, n: int) -> tuple[Any, str | None, str, tu
         name not in ("", "WAVE", "AWAV", "FREQ", "ENER", "LINEAR", "LAMBDA", "WAVELENGTH", "LOGLAM", "LOG", "LOG10")
         and not name.startswith(("WAVELEN", "LAM", "ANGSTROM", "ALOG"))
     ):
-        raise InputError(f"has an axis of the type {shortened(kind)}, expected linear or logarithmic wavelengths")
+        raise InputError.of("CTYPE1", kind, "linear or logarithmic wavelengths")
     flag = number("DC-FLAG")
     if unit is not None and re.match(r"\s*log|\s*dex", unit, re.IGNORECASE):
         flag, unit = 1, re.sub(r"^\s*(log|dex)\w*[\s(\[]*|[)\]\s]+$", "", unit, flags=re.IGNORECASE) or None
     if flag != 1 and "LOG" not in kind:
         if unit is None and start < 10.0 and abs(step) < 0.01:
             raise InputError(
-                f"has an axis from {start:g} in steps of {step:g} without a unit or type, expected CTYPE1 and CUNIT1"
+                f"has an axis from {start:g} in steps of {step:g} without a unit or type",
+                "CTYPE1 and CUNIT1",
+                key="CUNIT1",
+                value=(start, step),
             )
         return value, unit, name, ()
     if algorithm == "LOG" and name in ("WAVE", "AWAV", "FREQ", "ENER") and flag != 1 and start > 20.0:
@@ -111,7 +117,10 @@ def axis_of(header: Any, primary: Any, n: int) -> tuple[Any, str | None, str, tu
             return start * np.exp(step * pixel / start), unit, name, (f"logarithmic axis {kind}",)
     if not 1.0 < start < 6.0:
         raise InputError(
-            f"has a logarithmic axis from {start:g}, expected logarithms to base ten or the form {name}-LOG"
+            f"has a logarithmic axis from {start:g}",
+            f"logarithms to base ten or the form {name}-LOG",
+            key="CTYPE1",
+            value=start,
         )
     with np.errstate(over="ignore"):
         return 10.0**value, unit, name, ("wavelengths from logarithms to base ten",)

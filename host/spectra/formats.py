@@ -64,7 +64,7 @@ def read_spectrum(
         with np.errstate(all="ignore"):
             return converted(spectrum_in(tables, asked), wavelength_unit, flux_unit)
     except InputError as error:
-        raise InputError(f"{shown}: {error}") from error
+        raise error.within(shown) from error
 
 
 def _stem(name: str) -> str:
@@ -86,7 +86,10 @@ def _tables(
         return votable_tables(content, name, origin)
     if start[:1] == b"<":
         raise InputError(
-            f"is a page or XML that begins with {shortened(start[:20].decode('ascii', 'replace'))}, expected a spectrum"
+            f"is a page or XML that begins with {shortened(start[:20].decode('ascii', 'replace'))}",
+            "a spectrum",
+            key="file",
+            value=start[:20],
         )
     text = text_of(content)
     if re.match(r"#\s*%ECSV", text):

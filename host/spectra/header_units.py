@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
 
 from ..files.units import balanced, is_spectral, unit_of
 
@@ -71,16 +70,19 @@ def stated_units(
     if len(distinct) > 1:
         next_to = re.search(r"flux\w*\W{0,4}(?:in\W+)?(" + _FLUX.pattern + ")", text, re.IGNORECASE)
         if next_to is None:
-            raise InputError(f"its header names the units {', '.join(distinct)}, expected one: `flux_unit` says which")
+            raise InputError.of("flux_unit", distinct, "one: `flux_unit` says which", where="its header")
         distinct = [_spelt(next_to[1].strip())]
     if flux and not distinct and not is_named and (match := _NO_FLUX.search(text)):
         raise InputError(
-            f"its header speaks of {(match[1] or match[2])!r}, expected a flux density: `flux_unit` names its unit"
+            f"its header speaks of {match[1] or match[2]!r}",
+            "a flux density: `flux_unit` names its unit",
+            key="flux_unit",
+            value=match[1] or match[2],
         )
     rest = re.sub(_FLUX.pattern, " FLUXUNIT ", text)
     lengths = _lengths(rest) if wavelength else []
     if len(lengths) > 1:
-        raise InputError(f"its header names the units {', '.join(lengths)}, expected one: `wavelength_unit` says which")
+        raise InputError.of("wavelength_unit", lengths, "one: `wavelength_unit` says which", where="its header")
     return (lengths[0] if lengths else None), (distinct[0] if distinct else None)
 
 
@@ -94,9 +96,9 @@ def _lengths(text: str) -> list[str]:
             try:
                 unit = unit_of(match[1])
             except InputError as error:
-                raise InputError(f"its header gives wavelengths as {shortened(match[1])}: {error}") from error
+                raise error.within("its header, wavelengths") from error
             if not is_spectral(unit):
-                raise InputError(f"its header gives wavelengths in {unit}, expected a length or a frequency")
+                raise InputError.of("wavelength_unit", unit, "a length or a frequency", where="its header")
             return [match[1]]
     return _distinct(_ANYWHERE.findall(text))
 

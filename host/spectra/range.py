@@ -64,20 +64,31 @@ def check_assumed_unit(values: Float, unit: str) -> None:
     own = _part(low * factor, high * factor)
     other = likely_unit(low, high, unit)
     if own < MIN_MEASURED and other is not None:
-        raise InputError(f"{numbers} look like {other}, expected their unit: `wavelength_unit={other!r}`")
+        raise InputError(
+            f"{numbers} look like {other}",
+            f"their unit: `wavelength_unit={other!r}`",
+            key="wavelength_unit",
+            value=unit,
+        )
     elsewhere = 0.0 if other is None else _part(low * _USUAL_UNITS[other], high * _USUAL_UNITS[other])
     if other is not None and elsewhere >= max(own, 1.0 - 1e-9):
         raise InputError(
-            f"{numbers} cover {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm in {other} as well as in {unit}, expected their "
-            f"unit: `wavelength_unit={unit!r}` or `wavelength_unit={other!r}`"
+            f"{numbers} cover {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm in {other} as well as in {unit}",
+            f"their unit: `wavelength_unit={unit!r}` or `wavelength_unit={other!r}`",
+            key="wavelength_unit",
+            value=unit,
         )
     if own < MIN_MEASURED:
         raise InputError(
-            f"{numbers} would hold {own:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm in {unit}, expected at least a "
-            "third, or their unit: `wavelength_unit` names it"
+            f"{numbers} would hold {own:.0%} of {NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm in {unit}",
+            "at least a third, or their unit: `wavelength_unit` names it",
+            key="wavelength_unit",
+            value=unit,
         )
     if low * factor < PLAUSIBLE_NM[0] or high * factor > PLAUSIBLE_NM[1]:
         raise InputError(
-            f"{numbers} would go beyond {PLAUSIBLE_NM[0]:g}-{PLAUSIBLE_NM[1]:g} nm in {unit}, expected their unit: "
-            "`wavelength_unit` names it"
+            f"{numbers} would go beyond {PLAUSIBLE_NM[0]:g}-{PLAUSIBLE_NM[1]:g} nm in {unit}",
+            "their unit: `wavelength_unit` names it",
+            key="wavelength_unit",
+            value=unit,
         )

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.text import shortened
 
 from .choice import Choice, listed, plain
 from .file_table import FileTable
@@ -31,7 +30,7 @@ def holds_arrays(cells: Any) -> bool:
 
 def no_such(word: str, names: Sequence[str]) -> InputError:
     """Return the error for a word that names nothing."""
-    return InputError(f"no column or row is named {shortened(word)}, expected one of {listed(names)}")
+    return InputError.of("columns", word, f"one of {listed(names)}")
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ def selected_rows(table: FileTable, choice: Choice, cells: list[Any], asked: Seq
         shape = np.shape(cells[-1])
         cells = [np.broadcast_to(cell, shape) if np.shape(cell) == shape[1:] else cell for cell in cells]
     if len({len(cell) for cell in cells}) > 1:
-        raise InputError(f"{len(cells[0])} rows of wavelengths for {n} of fluxes, expected as many")
+        raise InputError(f"{len(cells[0])} rows of wavelengths for {n} of fluxes", "as many", key="flux", value=n)
     names = [plain(column.name) for column in table.columns]
     is_only = n == 1 and not asked and not table.row_title
     identifiers = [[""]] if is_only else _identifiers(table, {*choice.wavelength, choice.flux}, n)
@@ -88,7 +87,7 @@ def selected_rows(table: FileTable, choice: Choice, cells: list[Any], asked: Seq
         if kept.any():
             found.append([array[kept] for array in arrays])
     if not found:
-        raise InputError("its rows hold no valid point, expected some")
+        raise InputError("its rows hold no valid point", "some", key="rows")
     return Rows(found, identifier, messages)
 
 
@@ -101,13 +100,17 @@ def _arrays(cells: list[Any], step: Any) -> list[Any]:
     """Return a row's cells as arrays of equal length; a start and a step are written out."""
     *axes, flux = (np.ma.asanyarray(cell).squeeze() for cell in cells)
     if flux.ndim != 1:
-        raise InputError(f"its row: the flux has the shape {flux.shape}, expected one spectrum")
+        raise InputError(f"its row: the flux has the shape {flux.shape}", "one spectrum", key="flux", value=flux.shape)
     if axes[0].size == 1 < flux.size:
         if step is None:
-            raise InputError(f"its row: one wavelength for {flux.size} fluxes, expected as many, or a step")
+            raise InputError(
+                f"its row: one wavelength for {flux.size} fluxes", "as many, or a step", key="flux", value=flux.size
+            )
         axes = [float(axes[0]) + float(np.ravel(step)[0]) * np.arange(flux.size)]
     if any(axis.shape != flux.shape for axis in axes):
-        raise InputError(f"its row: {axes[0].size} wavelengths for {flux.size} fluxes, expected as many")
+        raise InputError(
+            f"its row: {axes[0].size} wavelengths for {flux.size} fluxes", "as many", key="flux", value=flux.size
+        )
     return [*axes, flux]
 
 
@@ -132,7 +135,7 @@ def _row_asked(identifiers: Sequence[Sequence[str]], asked: Sequence[str], names
         if match := re.fullmatch(r"row\s+(\d{1,9})", word.strip(), re.IGNORECASE):
             number = int(match[1])
             if not 1 <= number <= len(identifiers):
-                raise InputError(f"no row {number} among {len(identifiers)}, expected 1 to {len(identifiers)}")
+                raise InputError.of("row", number, f"1 to {len(identifiers)}")
             fits = [number - 1]
         else:
             fits = [row for row in fitting if word.strip() in identifiers[row]]
@@ -145,6 +148,8 @@ def _row_asked(identifiers: Sequence[Sequence[str]], asked: Sequence[str], names
     if len(set(labels)) < len(labels):
         labels = [f"row {row + 1}" for row in fitting]
     raise InputError(
-        f"{len(fitting)} spectra stand in it, one a row ({listed(labels)}), expected one: name it as in "
-        f"FILE[{(labels or ['row 1'])[0][:30]}]"
+        f"{len(fitting)} spectra stand in it, one a row ({listed(labels)})",
+        f"one: name it as in FILE[{(labels or ['row 1'])[0][:30]}]",
+        key="rows",
+        value=labels,
     )

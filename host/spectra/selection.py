@@ -39,7 +39,7 @@ class RawSpectrum:
 def spectrum_in(tables: Sequence[FileTable], asked: Sequence[str]) -> RawSpectrum:
     """Return the spectrum that a file holds, or the one of several that is asked for."""
     if not tables:
-        raise InputError("has no table, expected one with a wavelength and a flux")
+        raise InputError("has no table", "one with a wavelength and a flux", key="table")
     labels = [table.label.strip().lower() for table in tables]
     words = {word.lower() for word in asked}
     named = [i for i, label in enumerate(labels) if label and label in words]
@@ -67,7 +67,10 @@ def spectrum_in(tables: Sequence[FileTable], asked: Sequence[str]) -> RawSpectru
     if len(found) > 1:
         held = [one.table.label for one in found]
         raise InputError(
-            f"{len(held)} tables hold a spectrum: {listed(held)}, expected one: name it as in FILE[{held[0].strip()}]"
+            f"{len(held)} tables hold a spectrum: {listed(held)}",
+            f"one: name it as in FILE[{held[0].strip()}]",
+            key="table",
+            value=held,
         )
     return found[0]
 
@@ -86,7 +89,7 @@ def _spectrum_of(table: FileTable, asked: Sequence[str]) -> RawSpectrum:
     if len(choice.wavelength) == 2:
         edges = " and ".join(names[i] for i in choice.wavelength)
         if len({roles[i].unit for i in choice.wavelength}) > 1:
-            raise InputError(f"the edges of its bins, {edges}, state different units, expected one unit")
+            raise InputError.of("wavelength_unit", edges, "one unit")
         messages.append(f"its wavelengths are the middles of bins, from {edges}")
     chosen = [table.columns[i] for i in (*choice.wavelength, choice.flux)]
     cells = [column.values() for column in chosen]
@@ -108,11 +111,18 @@ def _spectrum_of(table: FileTable, asked: Sequence[str]) -> RawSpectrum:
         segments.append((sum(axes[1:], axes[0]) / len(axes), flux))
         for array, column in zip((axes[0], flux), (chosen[0], chosen[-1]), strict=True):
             if array.ndim != 1:
-                raise InputError(f"column {column.name.strip()} has the shape {array.shape}, expected one spectrum")
+                raise InputError(
+                    f"column {column.name.strip()} has the shape {array.shape}",
+                    "one spectrum",
+                    key=column.name.strip(),
+                    value=array.shape,
+                )
         if axes[0].size != flux.size:
-            raise InputError(f"{axes[0].size} wavelengths for {flux.size} fluxes, expected as many")
+            raise InputError(
+                f"{axes[0].size} wavelengths for {flux.size} fluxes", "as many", key="flux", value=flux.size
+            )
     if sum(flux.size for _, flux in segments) < 2:
-        raise InputError("holds less than two points, expected a spectrum")
+        raise InputError("holds less than two points", "a spectrum", key="flux", value=flux.size)
     axis, flux_role = roles[choice.wavelength[0]], roles[choice.flux]
     return RawSpectrum(
         segments, table, chosen[0].name, chosen[-1].name, axis, flux_role, (*table.messages, *messages),

@@ -56,13 +56,15 @@ def votable_tables(content: bytes, name: str, origin: str) -> list[FileTable]:
     from astropy.io import votable
 
     if b"<!ENTITY" in content or b"<!DOCTYPE" in content:
-        raise InputError("defines entities, expected a VOTable without them")
+        raise InputError("defines entities", "a VOTable without them", key="file")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             tables = list(votable.parse(io.BytesIO(content), verify="ignore").iter_tables())
     except Exception as error:  # the parser raises many kinds
-        raise InputError(f"cannot be read as a VOTable ({shortened(str(error))}), expected a whole one") from error
+        raise InputError(
+            f"cannot be read as a VOTable ({shortened(str(error))})", "a whole one", key="file", value=str(error)
+        ) from error
     return [
         FileTable(
             [

@@ -13,7 +13,7 @@ import numpy as np
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.text import shortened
 
-from .choice import AXES, listed
+from .choice import AXES
 from .file_table import Column, FileTable
 from .header_units import stated_units
 from .roles import Role
@@ -38,13 +38,16 @@ def text_of(content: bytes) -> str:
         text = content.decode(code)
     except UnicodeDecodeError as error:
         if b"\0" in content[:4096]:
-            raise InputError("is not text (it holds null bytes), expected two columns of numbers") from error
+            raise InputError("is not text (it holds null bytes)", "two columns of numbers", key="file") from error
         line = content[: error.start].count(b"\n") + 1
         raise InputError(
-            f"is not text in UTF-8 (byte 0x{content[error.start]:02x} in line {line}), expected UTF-8: save it so"
+            f"is not text in UTF-8 (byte 0x{content[error.start]:02x} in line {line})",
+            "UTF-8: save it so",
+            key="file",
+            value=content[error.start],
         ) from error
     if "\0" in text:
-        raise InputError("is not text (it holds null bytes), expected two columns of numbers")
+        raise InputError("is not text (it holds null bytes)", "two columns of numbers", key="file")
     return text
 
 
@@ -63,7 +66,7 @@ def text_tables(
     """
     header, lines = _divided(text.splitlines())
     if not lines:
-        raise InputError("holds no numbers, expected two columns: wavelength and flux")
+        raise InputError("holds no numbers", "two columns: wavelength and flux", key="columns")
     split, messages = _splitter([line for _, line in lines])
     rows = [(number, line, split(line)) for number, line in lines]
     n = len(rows[0][2])
@@ -90,7 +93,7 @@ def _unnamed(rows: Sequence[Row], n: int, asked: Sequence[str], messages: list[s
     """Return columns by their numbers: the first two, or those that the user names."""
     places = [int(one) - 1 for one in asked if one.isascii() and one.isdigit() and 1 <= int(one[:6]) <= n]
     if len(places) != len(asked) or len(places) > 2:
-        raise InputError(f"columns {listed(asked)} of {n} without names, expected their numbers, 1 to {n}")
+        raise InputError.of("columns", asked, f"their numbers, 1 to {n}")
     if not asked and n > 2:
         messages.append(f"the first two of its {n} columns are taken, which have no names")
     wave, value = (0, 1) if not places else (0, places[0]) if len(places) == 1 else (places[0], places[1])
@@ -173,14 +176,21 @@ def _splitter(lines: list[str]) -> tuple[Split, list[str]]:
     if all(len(cells) > 1 for cells in blanks) and not any(c.endswith(",") for cells in blanks for c in cells[:-1]):
         if points or not all(_DECIMAL_COMMA.fullmatch(c) or "," not in c for cells in blanks for c in cells):
             raise InputError(
-                f"line {shortened(sample[0], 60)} mixes commas, points and blanks, expected decimal points and one "
-                "kind of mark between columns"
+                f"line {shortened(sample[0], 60)} mixes commas, points and blanks",
+                "decimal points and one kind of mark between columns",
+                key="columns",
+                value=sample[0],
             )
         messages.append("its decimal commas are read as points")
         return partial(_cells, mark=None, decimal=True), messages
     cells = [line.split(",") for line in sample]
     if not points and all(len(row) > 1 and re.fullmatch(r"\s*\d+\s*", row[1]) for row in cells) and len(cells) > 1:
-        raise InputError(f"line {shortened(sample[0], 60)} may hold decimal commas or columns, expected decimal points")
+        raise InputError(
+            f"line {shortened(sample[0], 60)} may hold decimal commas or columns",
+            "decimal points",
+            key="columns",
+            value=sample[0],
+        )
     return (
         lambda line: line.replace(",", " , ").split(" , ") if ",," in line else re.split(r"\s*,\s*|\s+", line)
     ), messages
@@ -200,12 +210,14 @@ def _value(row: Row, place: int) -> float:
     number, line, cells = row
     if len(cells) <= place:
         what = "one column" if len(cells) == 1 else f"{len(cells)} columns"
-        raise InputError(f"line {number}: {shortened(line, 60)} has {what}, expected wavelength and flux")
+        raise InputError(
+            f"line {number}: {shortened(line, 60)} has {what}", "wavelength and flux", key="columns", value=line
+        )
     try:
         return _number(cells[place])
     except ValueError as error:
         raise InputError(
-            f"line {number}: {shortened(line, 60)} is not numeric, expected wavelength and flux"
+            f"line {number}: {shortened(line, 60)} is not numeric", "wavelength and flux", key="columns", value=line
         ) from error
 
 
@@ -231,7 +243,7 @@ def _table_of_arrays(
         # Gaia's has no column of wavelengths.
         names = next((cells for line, _ in header if len(cells := line.split(",")) == n), [])
     if not names:
-        raise InputError("holds arrays in its cells and no names of columns, expected names in its first line")
+        raise InputError("holds arrays in its cells and no names of columns", "names in its first line", key="columns")
     columns = [Column(names[k].strip(), _array_reader(rows, k), units[k] if units else None) for k in range(n)]
     known = {column.name.lower(): column for column in columns}
     if "source_id" in known and "wavelength" not in known and "flux" in known:
@@ -267,4 +279,4 @@ def _array(cell: str) -> Any:
     try:
         return np.array([_number(one) for one in cell.strip().strip("()[]").split(",")])
     except ValueError as error:
-        raise InputError(f"cell {shortened(cell, 40)} is not numeric, expected an array of numbers") from error
+        raise InputError.of("cell", cell, "an array of numbers") from error

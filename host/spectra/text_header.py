@@ -140,6 +140,9 @@ def _of_another_length(header: Header, n: int) -> list[str]:
             return [*cells, *(str(k + 1) for k in range(len(cells), n))]
         if not is_remark or not in_order:
             raise InputError(
-                f"its line of names has {len(cells)} ({listed(cells)}) for {n} columns, expected one for each"
+                f"its line of names has {len(cells)} ({listed(cells)}) for {n} columns",
+                "one for each",
+                key="columns",
+                value=cells,
             )
     return []

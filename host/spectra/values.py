@@ -27,20 +27,23 @@ def check_values(name: str, wavelength: NDArray[np.float64], flux: NDArray[np.fl
     outside = np.flatnonzero((wavelength < NEAREST_NM) | (wavelength > FARTHEST_NM))
     if outside.size:
         i = int(outside[0])
-        raise InputError(
-            f"spectrum {name}: wavelength {wavelength[i]:g} nm at point {i + 1}, expected {NEAREST_NM:g} to "
-            f"{FARTHEST_NM:g} nm"
+        raise InputError.of(
+            "wavelength",
+            wavelength[i],
+            f"{NEAREST_NM:g} to {FARTHEST_NM:g} nm",
+            where=f"spectrum {name}, point {i + 1}",
         )
     close = np.flatnonzero(np.diff(wavelength) < CLOSEST * wavelength[1:])
     if close.size:
         i = int(close[0])
         raise InputError(
-            f"spectrum {name}: wavelengths {float(wavelength[i])!r} and {float(wavelength[i + 1])!r} nm at points "
-            f"{i + 1} and {i + 2} are the same to within rounding, expected them apart by {CLOSEST:g} of their value"
+            f"spectrum {name}: wavelengths {float(wavelength[i])!r} and {float(wavelength[i + 1])!r} nm at "
+            f"points {i + 1} and {i + 2} are the same to within rounding",
+            f"them apart by {CLOSEST:g} of their value",
+            key="wavelength",
+            value=float(wavelength[i]),
         )
     # Undefined ends are cut afterwards.
     largest = float(np.abs(flux[np.isfinite(flux)]).max(initial=0.0))
     if largest and not FAINTEST <= largest <= BRIGHTEST:
-        raise InputError(
-            f"spectrum {name}: the largest flux is {largest:g} erg s-1 cm-2 A-1, expected {FAINTEST:g} to {BRIGHTEST:g}"
-        )
+        raise InputError.of("flux", largest, f"{FAINTEST:g} to {BRIGHTEST:g}", where=f"spectrum {name}, largest value")

@@ -87,7 +87,8 @@ def scale(name: str, system: System = "catalogue") -> str:
 def _check_system(system: str) -> None:
     if system not in SYSTEMS:
         raise InputError(
-            f"magnitude system {shortened(str(system))} is unknown, expected one of {', '.join(SYSTEMS)}",
+            f"magnitude system {shortened(str(system))} is unknown",
+            f"one of {', '.join(SYSTEMS)}",
             key="system",
             value=system,
         )
@@ -117,7 +118,9 @@ def magnitude(wavelength_nm: Float, flux_flam: Float, name: str = "V", system: S
     grid = np.union1d(wavelength_nm, chosen.wavelength_nm) * 10.0
     star = _photon_rate(grid, *_photon_density(wavelength_nm, flux_flam, chosen), chosen)
     if not star > 0.0:
-        raise InputError(f"the spectrum has no light in the band {chosen.name}, expected a positive flux")
+        raise InputError(
+            f"the spectrum has no light in the band {chosen.name}", "a positive flux", key="band", value=chosen.name
+        )
     if system == "ab" or (system == "catalogue" and chosen.system == "AB"):
         return _ab_magnitude(star, grid, chosen)
     vega = math.log10(photons(*_vega(), chosen.name))
@@ -148,9 +151,11 @@ def _covered(wavelength_nm: Float, name: str) -> Band:
     )
     if share < COVERAGE:
         raise InputError(
-            f"the spectrum covers {wavelength_nm[0]:.0f}-{wavelength_nm[-1]:.0f} nm, expected {COVERAGE:.0%} of "
-            f"the band {chosen.name} ({chosen.wavelength_nm[0]:.0f}-{chosen.wavelength_nm[-1]:.0f} nm), "
-            f"not {share:.0%}"
+            f"the spectrum covers {wavelength_nm[0]:.0f}-{wavelength_nm[-1]:.0f} nm",
+            f"{COVERAGE:.0%} of the band {chosen.name} ({chosen.wavelength_nm[0]:.0f}-"
+            f"{chosen.wavelength_nm[-1]:.0f} nm), not {share:.0%}",
+            key="band",
+            value=chosen.name,
         )
     return chosen
 

@@ -75,8 +75,10 @@ def with_flare(
         rise = photons(grid, lines, band) / light.star
         if rise > amplitude:
             raise InputError(
-                f"flare amplitude = {amplitude:g} is less than the rise of {rise:g} by its lines in {band}, "
-                "expected more"
+                f"flare amplitude = {amplitude:g} is less than the rise of {rise:g} by its lines in {band}",
+                "more",
+                key="flare_amplitude",
+                value=amplitude,
             )
         return grid, quiescent + lines + (amplitude - rise) * light.star / light.hot * body
     if light.ratio is None:
@@ -84,8 +86,10 @@ def with_flare(
     filling = amplitude / (light.ratio - 1.0)
     if filling > 1.0:
         raise InputError(
-            f"flare amplitude = {amplitude:g} needs {filling:.2f} of the star's disc at {spectrum.describe()}, "
-            f"expected at most {light.ratio - 1.0:.3g}"
+            f"flare amplitude = {amplitude:g} needs {filling:.2f} of the star's disc at {spectrum.describe()}",
+            f"at most {light.ratio - 1.0:.3g}",
+            key="flare_amplitude",
+            value=amplitude,
         )
     return grid, quiescent * (1.0 - filling) + filling * light.ratio * light.star / light.hot * body
 
@@ -128,8 +132,10 @@ def check_scales(spectrum: FlareSpectrum) -> None:
     """Raise InputError if some lines of a flare do not scale with its amplitude."""
     if spectrum.fixed_lines:
         raise InputError(
-            f"a flare of {spectrum.describe()} has lines that do not scale with its amplitude, expected lines as a "
-            "fraction of its continuum"
+            f"a flare of {spectrum.describe()} has lines that do not scale with its amplitude",
+            "lines as a fraction of its continuum",
+            key="lines",
+            value=spectrum.describe(),
         )
 
 
@@ -153,25 +159,39 @@ def _photons_in_band(
     grid, quiescent = _on_grid(wavelength_nm, flux_flam, spectrum)
     star = photons(grid, quiescent, band)
     if not star > 0.0:
-        raise InputError(f"the star has no light in the band {band}, expected some to measure the flare against")
+        raise InputError(
+            f"the star has no light in the band {band}", "some to measure the flare against", key="band", value=band
+        )
     hot = photons(grid, spectrum.flux(grid), band)
     if not hot > 0.0:
-        raise InputError(f"the flare, {spectrum.describe()}, has no light in the band {band}, expected some to scale")
+        raise InputError(
+            f"the flare, {spectrum.describe()}, has no light in the band {band}",
+            "some to scale",
+            key="band",
+            value=band,
+        )
     if geometry == "added":
         return _Photons(star, hot, None)
     if geometry != "replaces":
-        raise InputError(f"flare geometry = {geometry!r}, expected 'added' or 'replaces'")
+        raise InputError.of("flare geometry", geometry, "'added' or 'replaces'")
     if photosphere_temperature_k is None:
-        raise InputError("flare geometry 'replaces' needs a photosphere temperature, expected one in K")
+        raise InputError(
+            "flare geometry 'replaces' needs a photosphere temperature", "one in K", key="photosphere_temperature"
+        )
     if not spectrum.surface or spectrum.fixed_lines:
         raise InputError(
-            f"flare geometry 'replaces' with {spectrum.describe()}, expected 'added': its surface flux is unknown"
+            f"flare geometry 'replaces' with {spectrum.describe()}",
+            "'added': its surface flux is unknown",
+            key="flare_geometry",
+            value=geometry,
         )
     check_temperature("photosphere temperature", photosphere_temperature_k)
     ratio = hot / photons(wavelength_nm, blackbody(wavelength_nm, photosphere_temperature_k), band)
     if ratio <= 1.0:
         raise InputError(
-            f"flare temperature = {spectrum.describe()} is no hotter than the photosphere it replaces, "
-            f"expected more than {photosphere_temperature_k:g} K"
+            f"flare temperature = {spectrum.describe()} is no hotter than the photosphere it replaces",
+            f"more than {photosphere_temperature_k:g} K",
+            key="flare_temperature",
+            value=spectrum.describe(),
         )
     return _Photons(star, hot, ratio)

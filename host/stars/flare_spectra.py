@@ -264,7 +264,7 @@ class EmissionLine:
             nm = float(name)
         except ValueError:
             names = ", ".join((*LINE_GROUPS, *LINES_NM))
-            raise InputError(f"line {name!r} is unknown, expected a wavelength in nm or one of {names}") from None
+            raise InputError.of("lines", name, f"a wavelength in nm or one of {names}") from None
         return cls(name.strip(), (number(f"wavelength of the line {name!r}", nm, "nm", low=100.0, high=1000.0),))
 
     @property
@@ -303,7 +303,9 @@ class FlareWithLines(FlareSpectrum):
             number(f"flux of the line {name!r}", value, low=0.0)
         both = set(self.fractions) & set(self.fluxes_cgs)
         if both:
-            raise InputError(f"the line {min(both)!r} has a fraction and a flux, expected one of them")
+            raise InputError(
+                f"the line {min(both)!r} has a fraction and a flux", "one of them", key="lines", value=min(both)
+            )
 
     @property
     def temperature_k(self) -> float | None:  # type: ignore[override]
@@ -394,14 +396,19 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         ends = float(self.wavelength_nm[0]), float(self.wavelength_nm[-1])
         if ends[0] > NEEDED_NM[0] or ends[1] < NEEDED_NM[1]:
             raise InputError(
-                f"the flare spectrum {self.name} covers {ends[0]:g}-{ends[1]:g} nm, expected {NEEDED_NM[0]:g}-"
-                f"{NEEDED_NM[1]:g} nm, or the temperature of a blackbody that continues it"
+                f"the flare spectrum {self.name} covers {ends[0]:g}-{ends[1]:g} nm",
+                f"{NEEDED_NM[0]:g}-{NEEDED_NM[1]:g} nm, or the temperature of a blackbody that continues it",
+                key="continue_at_k",
+                value=ends,
             )
         if self.measured_nm == (0.0, 0.0):
             object.__setattr__(self, "measured_nm", ends)
         if not self.bolometric_flux() > 0.0:
             raise InputError(
-                f"the flare spectrum {self.name} has a total flux of {self.bolometric_flux():g}, expected > 0"
+                f"the flare spectrum {self.name} has a total flux of {self.bolometric_flux():g}",
+                "> 0",
+                key="flux",
+                value=self.bolometric_flux(),
             )
 
     @classmethod
@@ -427,7 +434,7 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
         nm, flux = np.asarray(wavelength_nm, np.float64), np.asarray(flux_flam, np.float64)
         check_points(name, nm, flux)
         if not np.isfinite(flux).all():
-            raise InputError(f"the flare spectrum {name} has undefined fluxes, expected finite ones")
+            raise InputError(f"the flare spectrum {name} has undefined fluxes", "finite ones", key="flux", value=name)
         measured = float(nm[0]), float(nm[-1])
         gaps = [f"{nm[i]:.1f}-{nm[i + 1]:.1f}" for i in np.flatnonzero(np.diff(nm) > GAP_NM)]
         if gaps:
@@ -475,7 +482,12 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
             star = read_spectrum(Path(quiescent), **units)
             inside = (nm >= star.wavelength_nm[0]) & (nm <= star.wavelength_nm[-1])
             if inside.sum() < 2:
-                raise InputError(f"the spectra {read.name} and {star.name} do not overlap, expected the same star")
+                raise InputError(
+                    f"the spectra {read.name} and {star.name} do not overlap",
+                    "the same star",
+                    key="quiescent",
+                    value=star.name,
+                )
             nm, messages = nm[inside], (*messages, *star.messages)
             flux = flux[inside] - np.interp(nm, star.wavelength_nm, star.flux_flam)
         return cls.from_arrays(
@@ -521,7 +533,10 @@ def _continued(name: str, nm: Float, flux: Float, kelvin: float) -> tuple[Float,
             continue
         if not scale > 0.0:
             raise InputError(
-                f"the flare spectrum {name} has no light near {end:g} nm, expected some to scale a blackbody to"
+                f"the flare spectrum {name} has no light near {end:g} nm",
+                "some to scale a blackbody to",
+                key="continue_at_k",
+                value=kelvin,
             )
         if first:
             added = np.exp(np.arange(np.log(low), np.log(end), steps))

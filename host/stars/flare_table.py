@@ -63,10 +63,12 @@ def _fits_table(content: bytes, named: str) -> Table:
         for hdu in hdus:
             claimed = hdu.size
             if claimed > len(content):
-                raise InputError(f"{named} says that it has {claimed} bytes of data, expected at most the file's")
+                raise InputError(
+                    f"{named} says that it has {claimed} bytes of data", "at most the file's", key="file", value=claimed
+                )
             if isinstance(hdu, fits.BinTableHDU | fits.TableHDU):
                 return Table.read(hdu)
-        raise InputError(f"{named} has no table, expected {FORMATS}")
+        raise InputError(f"{named} has no table", FORMATS, key="file")
 
 
 def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
@@ -92,16 +94,19 @@ def flares_of(table: Table | Any, name: str = "flare table") -> QTable:
     amplitudes = column(AMPLITUDES, "")
     if amplitudes is None:
         raise InputError(
-            f"{name} has the columns {shown(', '.join(lower), 300)}, expected one named {', '.join(AMPLITUDES)}"
+            f"{name} has the columns {shown(', '.join(lower), 300)}",
+            f"one named {', '.join(AMPLITUDES)}",
+            key="amplitude",
+            value=lower,
         )
     if not 0 < amplitudes.size <= MAX_FLARES:
-        raise InputError(f"{name} holds {amplitudes.size} flares, expected 1 to {MAX_FLARES}")
+        raise InputError(
+            f"{name} holds {amplitudes.size} flares", f"1 to {MAX_FLARES}", key="amplitude", value=amplitudes.size
+        )
     bad = ~((amplitudes >= SMALLEST) & (amplitudes <= LARGEST))
     if bad.any():
         row = int(np.argmax(bad))
-        raise InputError(
-            f"{name}: the amplitude of flare {row} is {amplitudes[row]:g}, expected a relative rise above 0"
-        )
+        raise InputError.of("amplitude", amplitudes[row], "a relative rise above 0", where=f"{name}, flare {row}")
     flares = QTable({"amplitude": amplitudes})
     for title, names in (("start", STARTS), ("stop", STOPS)):
         times = column(names, "d")
@@ -118,7 +123,7 @@ def _numbers(column: Any, named: str, unit: str) -> np.ndarray:
 
     kind = np.asarray(column).dtype.kind if hasattr(column, "dtype") else "O"
     if kind not in "iuf" or np.ndim(column) != 1:
-        raise InputError(f"{named} holds no plain numbers, expected one number in each row")
+        raise InputError(f"{named} holds no plain numbers", "one number in each row", key=column.name)
     values: np.ndarray = np.ma.filled(np.ma.asarray(getattr(column, "value", column), float), np.nan)
     if getattr(column, "unit", None) is None:
         return np.asarray(values, float)
@@ -126,5 +131,8 @@ def _numbers(column: Any, named: str, unit: str) -> np.ndarray:
         return np.asarray((values * u.Unit(column.unit)).to_value(unit), float)
     except (u.UnitConversionError, TypeError, ValueError) as error:
         raise InputError(
-            f"{named} has the unit {str(column.unit)!r}, expected {unit or 'none, since amplitudes are relative'}"
+            f"{named} has the unit {str(column.unit)!r}",
+            unit or "none, since amplitudes are relative",
+            key=column.name,
+            value=column.unit,
         ) from error

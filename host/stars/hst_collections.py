@@ -121,12 +121,14 @@ def fetch(
     chosen = [c for c in COLLECTIONS if c.name == word.casefold()] if colon else list(COLLECTIONS)
     known = ", ".join(c.name for c in COLLECTIONS)
     if not chosen:
-        raise InputError(f"collection {word!r} is unknown, expected one of {known}")
+        raise InputError.of("collection", word, f"one of {known}")
     if base is not None and not colon:
-        raise InputError(f"another address is given for {name!r}, expected its collection too, such as ngsl:{name}")
+        raise InputError(
+            f"another address is given for {name!r}", f"its collection too, such as ngsl:{name}", key="name", value=name
+        )
     star = star if colon else word
     if not _file_name(star):
-        raise InputError(f"star {name!r} has no name to look for, expected one such as ngsl:HD 37202")
+        raise InputError(f"star {name!r} has no name to look for", "one such as ngsl:HD 37202", key="name", value=name)
     for collection in chosen:
         address = base or collection.base
         try:
@@ -143,14 +145,19 @@ def fetch(
             return add(local, star, origin=title, replace=replace, extend=extend)
         except InputError as error:
             raise InputError(
-                f"{url} came, and is no usable spectrum ({str(error).replace(local.name, file)}), expected a whole file"
+                f"{url} came, and is no usable spectrum ({str(error).replace(local.name, file)})",
+                "a whole file",
+                key="base",
+                value=url,
             ) from error
         finally:
             local.unlink(missing_ok=True)
     where = " or ".join(c.title for c in chosen)
     raise InputError(
-        f"no star {star!r} in {where}, expected its name there, such as HD 37202; or bring the file: "
-        "mauvecl library add"
+        f"no star {star!r} in {where}",
+        "its name there, such as HD 37202; or bring the file: mauvecl library add",
+        key="name",
+        value=name,
     )
 
 
@@ -164,9 +171,7 @@ def _check_address(address: str) -> None:
         parts = urlsplit(address)
         known = parts.scheme in SCHEMES and bool(parts.hostname) and parts.port != 0
     if not (known and address.isprintable() and " " not in address):
-        raise InputError(
-            f"address {shortened(address)} is none of the network, expected one such as https://host/folder/"
-        )
+        raise InputError.of("base", address, "one such as https://host/folder/")
 
 
 def _download(url: str, show_progress: bool, max_bytes: int | None = None) -> Path:
@@ -190,15 +195,17 @@ def _download(url: str, show_progress: bool, max_bytes: int | None = None) -> Pa
                 # Object stores answer 403 for a missing file.
                 raise FileNotFoundError(url) from error
             raise InputError(
-                f"{url} answers {error.code} {error.reason}, expected the file: try again later"
+                f"{url} answers {error.code} {error.reason}", "the file: try again later", key="base", value=url
             ) from error
         if not isinstance(error, OSError | ValueError | http.client.HTTPException):
             raise
         # Invalid host names raise ValueError (IDNA codec), malformed responses HTTPException.
         reason = getattr(error, "reason", error)
         raise InputError(
-            f"{url} cannot be reached ({reason}), expected a network; without one bring the file: mauvecl library add "
-            f"{url.rsplit('/', 1)[1] or 'FILE'}"
+            f"{url} cannot be reached ({reason})",
+            f"a network; without one bring the file: mauvecl library add {url.rsplit('/', 1)[1] or 'FILE'}",
+            key="base",
+            value=url,
         ) from error
 
 
@@ -223,15 +230,22 @@ def _receive(url: str, file: IO[bytes], max_bytes: int, show_progress: bool) -> 
                     size = got
                 if time.monotonic() > latest:
                     raise InputError(
-                        f"{url} takes more than {MAX_DOWNLOAD_S:.0f} s to come, expected less: try again later"
+                        f"{url} takes more than {MAX_DOWNLOAD_S:.0f} s to come",
+                        "less: try again later",
+                        key="base",
+                        value=url,
                     )
     if size is not None and size > max_bytes:
         raise InputError(
-            f"{url} has more than {max_bytes >> 20} MiB, expected less; MAUVECL_LARGEST_FILE_MIB sets the limit of "
-            "files"
+            f"{url} has more than {max_bytes >> 20} MiB",
+            "less; MAUVECL_LARGEST_FILE_MIB sets the limit of files",
+            key="MAUVECL_LARGEST_FILE_MIB",
+            value=max_bytes >> 20,
         )
     if size is not None and got < size:
-        raise InputError(f"{url} broke off ({got} of {size} bytes came), expected the whole file: try again")
+        raise InputError(
+            f"{url} broke off ({got} of {size} bytes came)", "the whole file: try again", key="base", value=url
+        )
 
 
 def _listing(address: str, below: str) -> list[str]:

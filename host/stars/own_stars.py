@@ -87,8 +87,10 @@ def spectrum(star: OwnStar) -> tuple[np.ndarray, np.ndarray]:
     wavelength, flux = (np.asarray(table[name], float) for name in ("wavelength", "flux"))
     if _digest(wavelength, flux) != table.meta["spectrum_sha256"]:
         raise InputError(
-            f"kept star {star.name!r} is not as it was kept (its digest differs), expected it unchanged: add or "
-            "fetch it again"
+            f"kept star {star.name!r} is not as it was kept (its digest differs)",
+            "it unchanged: add or fetch it again",
+            key="name",
+            value=star.name,
         )
     return wavelength, flux
 
@@ -140,12 +142,17 @@ def add(
     check_covers(source.name, source.measured_nm or (source.wavelength_nm[0], source.wavelength_nm[-1]))
     name = (name or source.name).strip()
     if not re.fullmatch(r"[\w][\w .+\-*'()]{0,63}", name):
-        raise InputError(f"star name {name!r}, expected up to 64 letters, digits, spaces and . + - * ' ( )")
+        raise InputError.of("name", name, "up to 64 letters, digits, spaces and . + - * ' ( )")
     if catalogue.embedded(name) is not None:
-        raise InputError(f"star name {name!r} is one of the embedded library's, expected another: give one with `name`")
+        raise InputError(
+            f"star name {name!r} is one of the embedded library's",
+            "another: give one with `name`",
+            key="name",
+            value=name,
+        )
     there = find(name)
     if there is not None and not replace:
-        raise InputError(f"star {name!r} is kept already, expected another name, or `replace=True`")
+        raise InputError(f"star {name!r} is kept already", "another name, or `replace=True`", key="name", value=name)
     dereddened = any("dereddened" in note for note in source.notes)
     table = Table({"wavelength": source.wavelength_nm, "flux": source.flux_flam})
     table["wavelength"].unit, table["flux"].unit = "nm", "erg / (s cm2 Angstrom)"
@@ -164,13 +171,15 @@ def add(
         table.meta["measured_nm"] = list(source.measured_nm)
     place = there.path if there is not None else folder() / f"{re.sub(r'[^A-Za-z0-9.+-]', '_', name)}.ecsv"
     if there is None and place.exists():
-        raise InputError(f"star name {name!r} is too much like another kept star's, expected another name")
+        raise InputError(
+            f"star name {name!r} is too much like another kept star's", "another name", key="name", value=name
+        )
     text = io.StringIO()
     table.write(text, format="ascii.ecsv")
     try:
         write_whole(place, text.getvalue().encode(), shared=True)
     except InputError as error:
-        raise InputError(f"star folder: {error}; MAUVECL_DATA_DIR sets another") from error
+        raise error.within("star folder (MAUVECL_DATA_DIR sets another)") from error
     known = find(name)
     assert known is not None
     return known
@@ -184,7 +193,7 @@ def remove(name: str) -> None:
             path.unlink()
             return
     names = ", ".join(star.name for star in kept()) or "none is kept"
-    raise InputError(f"no kept star {name!r}, expected one of: {names}")
+    raise InputError.of("name", name, f"one of: {names}")
 
 
 def _named(path: Path) -> str | None:

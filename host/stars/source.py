@@ -261,7 +261,7 @@ class Source(Drawable, ContentEquality):
             )
             values = flux.to(flam, u.spectral_density(nm)) if isinstance(flux, u.Quantity) else np.asarray(flux) * flam
         except (u.UnitConversionError, TypeError, ValueError) as error:
-            raise InputError(f"spectrum {name}: {error}, expected a wavelength and a flux density") from error
+            raise InputError(f"spectrum {name}: {error}", "a wavelength and a flux density", key="flux") from error
         axis, density = np.ma.filled(nm.value, np.nan), np.ma.filled(values.value, np.nan)
         if isinstance(wavelength, u.Quantity) and wavelength.unit.physical_type != "length" and axis[:1] > axis[-1:]:
             # Rising frequencies or energies are falling wavelengths.
@@ -275,12 +275,12 @@ class Source(Drawable, ContentEquality):
         from synphot.units import FLAM
 
         if not hasattr(spectrum, "waveset"):
-            raise InputError(
-                f"the spectrum is of the type {type(spectrum).__name__}, expected a SourceSpectrum of synphot"
-            )
+            raise InputError.of("spectrum", spectrum, "a SourceSpectrum of synphot")
         own = spectrum.waveset
         if own is None:
-            raise InputError(f"{name} has no wavelengths of its own, expected a spectrum with a waveset")
+            raise InputError(
+                f"{name} has no wavelengths of its own", "a spectrum with a waveset", key="spectrum", value=name
+            )
         grid = np.arange(160.0, 1150.0, 0.5)
         nm = np.unique(own.to_value(u.nm))
         inside = grid[(grid > nm[0]) & (grid < nm[-1])]
@@ -295,10 +295,10 @@ class Source(Drawable, ContentEquality):
     def from_specutils(cls, spectrum: Any, *, name: str = "specutils spectrum") -> Self:
         """Convert a one-dimensional specutils Spectrum with units."""
         if not (hasattr(spectrum, "spectral_axis") and hasattr(spectrum, "flux")):
-            raise InputError(f"the spectrum is of the type {type(spectrum).__name__}, expected a Spectrum of specutils")
+            raise InputError.of("spectrum", spectrum, "a Spectrum of specutils")
         axis, flux = spectrum.spectral_axis, spectrum.flux
         if flux.ndim != 1:
-            raise InputError(f"{name} has shape {flux.shape}, expected one spectrum")
+            raise InputError(f"{name} has shape {flux.shape}", "one spectrum", key="spectrum", value=flux.shape)
         import astropy.units as u
 
         order = np.argsort(axis.to_value(u.nm, u.spectral()))
@@ -322,7 +322,7 @@ class Source(Drawable, ContentEquality):
         try:
             from specutils import Spectrum
         except ImportError as error:
-            raise InputError("specutils is missing, expected `pip install 'mauvecl[spectra]'`") from error
+            raise InputError("specutils is missing", "`pip install 'mauvecl[spectra]'`", key="specutils") from error
         flam = u.erg / (u.s * u.cm**2 * u.AA)
         return Spectrum(
             spectral_axis=self.wavelength_nm * u.nm,
@@ -454,22 +454,22 @@ class Source(Drawable, ContentEquality):
             from dust_extinction import parameter_averages
         except ImportError as error:
             raise InputError(
-                "extinction needs dust_extinction, expected `pip install 'mauvecl[extinction]'`"
+                "extinction needs dust_extinction", "`pip install 'mauvecl[extinction]'`", key="dust_extinction"
             ) from error
         import astropy.units as u
 
         ebv, rv = number("E(B-V)", ebv, "mag", low=0.0, high=10.0), number("R_V", rv)
         if law not in ("G23", "F19", "CCM89"):
-            raise InputError(f"extinction law = {law!r}, expected 'G23', 'F19' or 'CCM89'")
+            raise InputError.of("law", law, "'G23', 'F19' or 'CCM89'")
         try:
             model = getattr(parameter_averages, law)(Rv=rv)
         except ValueError as error:
-            raise InputError(f"R_V = {rv!r}: {error}, expected what the law {law} allows") from error
+            raise InputError(f"R_V = {rv!r}: {error}", f"what the law {law} allows", key="rv", value=rv) from error
         # Laws end in the far ultraviolet, whose light does not reach the detector.
         low, high = 1000.0 / np.asarray(model.x_range)[::-1]
         inside = (self.wavelength_nm >= low) & (self.wavelength_nm <= high)
         if low > SPAN_NM[0] or high < SPAN_NM[1]:
-            raise InputError(f"extinction law {law} covers {low:.0f}-{high:.0f} nm, expected 180-750 nm")
+            raise InputError(f"extinction law {law} covers {low:.0f}-{high:.0f} nm", "180-750 nm", key="law", value=law)
         flux = self.flux_flam[inside] * model.extinguish(self.wavelength_nm[inside] * u.nm, Ebv=ebv)
         history = (*self.history, f"reddened by E(B-V) = {ebv:g}, {law}, R_V = {rv:g}")
         return replace(self, wavelength_nm=self.wavelength_nm[inside], flux_flam=flux, history=history)

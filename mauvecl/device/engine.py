@@ -169,14 +169,19 @@ class Engine:
         shape, dtype = (count, scene.n_pixel), np.dtype(np.uint16 if narrow else np.int32)
         if scene.n_frames * expectation.adc_max_dn >= 2**31:
             raise InputError(
-                f"{scene.n_frames} frames of up to {expectation.adc_max_dn} DN overflow 32 bits, "
-                f"expected at most {2**31 // expectation.adc_max_dn} frames"
+                f"{scene.n_frames} frames of up to {expectation.adc_max_dn} DN overflow 32 bits",
+                f"at most {2**31 // expectation.adc_max_dn} frames",
+                key="frames",
+                value=scene.n_frames,
             )
         if out is None:
             out = np.empty(shape, dtype)
         elif out.shape != shape or out.dtype != dtype or not out.flags.c_contiguous or not out.flags.writeable:
             raise InputError(
-                f"out is {out.dtype} of shape {out.shape}, expected writable contiguous {dtype} of {shape}"
+                f"out is {out.dtype} of shape {out.shape}",
+                f"writable contiguous {dtype} of {shape}",
+                key="out",
+                value=out.shape,
             )
         clipped = np.empty(count, np.uint32)
         rows = out
@@ -359,7 +364,12 @@ class Engine:
         flares, statistics = request.flares, request.statistics
         scene = prepare([quiet, *flares], comparison=comparison, **drawing)
         if len(flares) >= BATCH[scene.frames]:
-            raise InputError(f"{len(flares)} flares, expected at most {BATCH[scene.frames] - 1} in one launch")
+            raise InputError(
+                f"{len(flares)} flares",
+                f"at most {BATCH[scene.frames] - 1} in one launch",
+                key="flares",
+                value=len(flares),
+            )
         hypotheses = Hypotheses(quiet, flares, statistics, scene, nuisances=as_nuisances(nuisances, quiet))
         plan = plan_channels(hypotheses, range(len(flares)), first=True)
         out = np.empty((plan.n_rows, count), np.float32)

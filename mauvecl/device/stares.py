@@ -203,8 +203,10 @@ _scene_of = lru_cache(maxsize=4)(StareScene.of)
 
 def _check(first: int, count: int, seed: int, method: str) -> None:
     if not (first >= 0 and count >= 1 and first + count <= 2**64):
-        raise InputError(f"{count} stares from number {first}, expected at least 1, numbered 0 to 2**64 - 1")
+        raise InputError(
+            f"{count} stares from number {first}", "at least 1, numbered 0 to 2**64 - 1", key="count", value=count
+        )
     if not 0 <= seed < 2**64:
-        raise InputError(f"seed = {seed}, expected 0 to 2**64 - 1")
+        raise InputError.of("seed", seed, "0 to 2**64 - 1")
     if method not in get_args(Method):
-        raise InputError(f"method = {method!r}, expected 'pixels' or 'cumulants'")
+        raise InputError.of("method", method, "'pixels' or 'cumulants'")

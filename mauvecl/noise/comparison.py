@@ -43,7 +43,7 @@ class Comparison:
         variances : {"model", "estimated"}
         """
         if variances not in ("model", "estimated"):
-            raise InputError(f"variances = {variances!r}, expected 'model' or 'estimated'")
+            raise InputError.of("variances", variances, "'model' or 'estimated'")
         return cls(_exposures(reference), variances == "estimated")
 
     @property
@@ -63,9 +63,7 @@ def _exposures(reference: str) -> int:
         return int(word == "exposure")
     if word == "stack" and number.isdecimal() and 1 <= int(number) <= MAX_EXPOSURES:
         return int(number)
-    raise InputError(
-        f"reference = {reference!r}, expected 'template', 'exposure' or 'stack:n' with n from 1 to {MAX_EXPOSURES}"
-    )
+    raise InputError.of("reference", reference, f"'template', 'exposure' or 'stack:n' with n from 1 to {MAX_EXPOSURES}")
 
 
 #: Comparison with the expectation by the model's variances.

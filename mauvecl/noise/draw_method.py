@@ -43,7 +43,9 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing, factors: F
     quiet, processes = scenarios[0], drawing.processes
     modulations = processes.modulations
     if quiet.wavelength_nm.size > MAX_PIXELS:
-        raise InputError(f"{quiet.wavelength_nm.size} pixels, expected at most {MAX_PIXELS}")
+        raise InputError(
+            f"{quiet.wavelength_nm.size} pixels", f"at most {MAX_PIXELS}", key="pixels", value=quiet.wavelength_nm.size
+        )
     for other in scenarios[1:]:
         _check_same_detector(quiet, other)
     corners = _corners(factors)
@@ -54,8 +56,10 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing, factors: F
     joint = _joint(scenarios, varied, drawing.recipe)
     if modulations and not joint:
         raise InputError(
-            f"{modulations[0][0]} varies within a run, and the noise of {quiet.name} cannot be drawn jointly, expected "
-            "Gaussian noise of 1.5 Poisson counts and more in each pixel, more where counts are few, or no such process"
+            f"{modulations[0][0]} varies within a run, and the noise of {quiet.name} cannot be drawn jointly",
+            "Gaussian noise of 1.5 Poisson counts and more in each pixel, more where counts are few, or none such",
+            key="temperature",
+            value=modulations[0][0],
         )
     return DrawMethod(
         frames=frames,
@@ -109,7 +113,10 @@ def _joint(scenarios: Sequence[Expectation], varied: Sequence[Sequence[Cumulants
                 pixel = int(np.argmin(exact))
                 raise InputError(
                     f"recipe = 'joint', and pixel {pixel} of {x.name} has {np.sqrt(c.gaussian[pixel]):.3g} DN of "
-                    "Gaussian noise next to Poisson counts, expected recipe 'apart' or 'auto'"
+                    "Gaussian noise next to Poisson counts",
+                    "recipe 'apart' or 'auto'",
+                    key="recipe",
+                    value="joint",
                 )
             return False
     return True
@@ -137,8 +144,10 @@ def _draw_frames(
                 if mode == "stacked":
                     where = float(x.wavelength_nm[pixels][0])
                     raise InputError(
-                        f"mode = 'stacked' {why} in the pixel at {where:.1f} nm of {x.name}, expected mode 'frames' or "
-                        "'auto'"
+                        f"mode = 'stacked' {why} in the pixel at {where:.1f} nm of {x.name}",
+                        "mode 'frames' or 'auto'",
+                        key="mode",
+                        value="stacked",
                     )
                 return True
     return False
@@ -156,8 +165,10 @@ def check_reach(x: Expectation, c: Cumulants, factors: Factors) -> None:
     if (reach >= REACH_DN).any():
         pixel = int(np.argmax(reach))
         raise InputError(
-            f"the priors move pixel {pixel} of {x.name} {reach[pixel]:.3g} DN away from its mean, expected less than "
-            f"{REACH_DN:g}: shorten the exposure or draw frame by frame"
+            f"the priors move pixel {pixel} of {x.name} {reach[pixel]:.3g} DN away from its mean",
+            f"less than {REACH_DN:g}: shorten the exposure or draw frame by frame",
+            key="priors",
+            value=float(reach[pixel]),
         )
 
 
@@ -178,6 +189,8 @@ def _check_same_detector(quiet: Expectation, other: Expectation) -> None:
     ):
         if not np.array_equal(getattr(quiet, name), getattr(other, name)):
             raise InputError(
-                f"{name} of {other.name} differs from that of {quiet.name}, expected scenarios of one study "
-                "to share instrument and exposure"
+                f"{name} of {other.name} differs from that of {quiet.name}",
+                "scenarios of one study to share instrument and exposure",
+                key=name,
+                value=other.name,
             )

@@ -49,7 +49,7 @@ class Drawing:
         for name, value, known in (("mode", self.mode, get_args(Mode)), ("recipe", self.recipe, get_args(Recipe))):
             if value not in known:
                 a, b, c = map(repr, known)
-                raise InputError(f"{name} = {value!r}, expected {a}, {b} or {c}")
+                raise InputError.of(name, value, f"{a}, {b} or {c}")
 
     @property
     def options(self) -> DrawingOptions:

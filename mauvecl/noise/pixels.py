@@ -62,7 +62,10 @@ def fill_poisson_counts(out: NDArray[np.void], mean: Float, gain: Float, tables:
         pixel = int(np.argmax(np.where(expanded, 0.0, mean)))
         raise InputError(
             f"pixel {pixel} has a Poisson mean of {mean[pixel]:.3g} in one draw next to a pixel of less than "
-            f"{SMALLEST_EXPANDED:g}, expected at most {LARGEST_MEAN:g} there: draw frame by frame"
+            f"{SMALLEST_EXPANDED:g}",
+            f"at most {LARGEST_MEAN:g} there: draw frame by frame",
+            key="mode",
+            value=float(mean[pixel]),
         )
     alias, starts = table_set(mean[~expanded].tolist(), tables)
     out["table"][~expanded] = starts

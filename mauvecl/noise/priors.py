@@ -42,7 +42,7 @@ class Uniform:
     def __post_init__(self) -> None:
         _make_plain(self, "low", "high")
         if not self.low <= self.high:
-            raise InputError(f"a uniform prior from {self.low:g} to {self.high:g}, expected low <= high")
+            raise InputError.of("low", self.low, "low <= high")
 
     def quantile(self, below: Float, above: Float | None = None) -> Float:
         """Return the quantiles at probabilities `below`; see `Normal.quantile`."""
@@ -67,14 +67,19 @@ class Normal:
         _make_plain(self, "mean", "sd", "low", "high")
         if not (self.sd > 0 and self.low < self.high):
             raise InputError(
-                f"a normal prior of mean {self.mean:g}, sd {self.sd:g}, cut at {self.low:g} and {self.high:g}, "
-                "expected sd > 0 and low < high"
+                f"a normal prior of mean {self.mean:g}, sd {self.sd:g}, cut at {self.low:g} and {self.high:g}",
+                "sd > 0 and low < high",
+                key="sd",
+                value=self.sd,
             )
         away = max(self.low - self.mean, self.mean - self.high) / self.sd
         if away > MAX_CUT_SD:
             raise InputError(
-                f"a normal prior of mean {self.mean:g} and sd {self.sd:g} is cut at {self.low:g} and {self.high:g}, "
-                f"{away:g} sd from its mean, expected at most {MAX_CUT_SD:g}"
+                f"a normal prior of mean {self.mean:g} and sd {self.sd:g} is cut at {self.low:g} and "
+                f"{self.high:g}, {away:g} sd from its mean",
+                f"at most {MAX_CUT_SD:g}",
+                key="low",
+                value=(self.low, self.high),
             )
 
     def quantile(self, below: Float, above: Float | None = None) -> Float:

@@ -59,16 +59,21 @@ class CosmicRays:
         low, high = self.electrons
         if not (0 <= self.rate_per_cm2_s <= 1e6 and 0 < self.area_cm2 < 1e4 and self.pixels > 0):
             raise InputError(
-                f"cosmic rays of {self.rate_per_cm2_s:g} per cm^2 s on {self.area_cm2:g} cm^2 and {self.pixels} "
-                "pixels, expected a rate of 0 to 1e6, an area and pixels above 0"
+                f"cosmic rays of {self.rate_per_cm2_s:g} per cm^2 s on {self.area_cm2:g} cm^2 and {self.pixels} pixels",
+                "a rate of 0 to 1e6, an area and pixels above 0",
+                key="rate_per_cm2_s",
+                value=self.rate_per_cm2_s,
             )
         if not 1 <= low <= high <= 100_000:
-            raise InputError(f"cosmic rays of {low:g} to {high:g} electrons, expected 1 to 100000, ascending")
+            raise InputError.of("electrons", (low, high), "1 to 100000, ascending", where="cosmic rays")
         if self.weights is not None:
             wanted = int(high) - int(low) + 1
             if len(self.weights) != wanted or min(self.weights) < 0 or not 0 < sum(self.weights) < np.inf:
                 raise InputError(
-                    f"{len(self.weights)} weights of the cosmic rays' electrons, expected {wanted} of 0 and above"
+                    f"{len(self.weights)} weights of the cosmic rays' electrons",
+                    f"{wanted} of 0 and above",
+                    key="weights",
+                    value=self.weights,
                 )
 
     def charge(self, seconds: float) -> Float:
@@ -85,8 +90,10 @@ class CosmicRays:
         size = 1 << (most + 1).bit_length()
         if size > 2**24:
             raise InputError(
-                f"cosmic rays free up to {most} electrons in a pixel and draw, expected at most {2**23}: lower the "
-                "rate, the charge or the exposure"
+                f"cosmic rays free up to {most} electrons in a pixel and draw",
+                f"at most {2**23}: lower the rate, the charge or the exposure",
+                key="rate_per_cm2_s",
+                value=most,
             )
         one = np.zeros(size)
         one[low : high + 1] = 1.0 if self.weights is None else self.weights
@@ -161,7 +168,10 @@ class Processes:
             first, last = prior.quantile(np.array([0.0, 1.0]))
             if not (varied.low <= first and last <= varied.high):
                 raise InputError(
-                    f"the prior of {name} runs from {first:g} to {last:g}, expected {varied.low:g} to {varied.high:g}"
+                    f"the prior of {name} runs from {first:g} to {last:g}",
+                    f"{varied.low:g} to {varied.high:g}",
+                    key=name,
+                    value=(first, last),
                 )
             tables[row], middle = table_of(prior, change)
             centre[factor] *= 1.0 + middle

@@ -126,8 +126,10 @@ class Checkpoint:
             return
         if not self._resume:
             raise InputError(
-                f"{str(self.folder)!r} holds an unfinished run, expected `resume=True` to continue it or "
-                "`restart=True` to forget it"
+                f"{str(self.folder)!r} holds an unfinished run",
+                "`resume=True` to continue it or `restart=True` to forget it",
+                key="resume",
+                value=str(self.folder),
             )
         try:
             manifest = json_data(read_text(self.folder / MANIFEST, "manifest"), "manifest")
@@ -145,15 +147,19 @@ class Checkpoint:
             return
         if form != FORM:
             raise InputError(
-                f"the unfinished run in {str(self.folder)!r} keeps its counts in form {form}, expected form {FORM} as "
-                "this version writes: `restart=True` to forget it"
+                f"the unfinished run in {str(self.folder)!r} keeps its counts in form {form}",
+                f"form {FORM} as this version writes: `restart=True` to forget it",
+                key="restart",
+                value=form,
             )
         ours = {"mauvecl": VERSION, "verb": self.verb, **self._plain_study()}
         differing = differing_keys(ours, theirs)
         if differing:
             raise InputError(
-                f"the unfinished run in {str(self.folder)!r} differs in {', '.join(differing)}, expected the same "
-                "study, or `restart=True` to forget it"
+                f"the unfinished run in {str(self.folder)!r} differs in {', '.join(differing)}",
+                "the same study, or `restart=True` to forget it",
+                key="restart",
+                value=differing,
             )
 
     def get(self, name: str) -> Arrays | None:
@@ -214,7 +220,12 @@ class Checkpoint:
         names = sorted(os.listdir(self.folder)) if self.folder.is_dir() else []
         shards = [name for name in names if SHARD_NAME.fullmatch(name)]
         if MANIFEST in names and not shards and not _is_ours(self.folder / MANIFEST):
-            raise InputError(f"{str(self.folder / MANIFEST)!r} is not mauvecl's, expected another output folder")
+            raise InputError(
+                f"{str(self.folder / MANIFEST)!r} is not mauvecl's",
+                "another output folder",
+                key="folder",
+                value=str(self.folder / MANIFEST),
+            )
         yield from (self.folder / name for name in names if name in shards or name == MANIFEST)
 
     def _remove(self) -> None:

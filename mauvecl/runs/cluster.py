@@ -66,7 +66,9 @@ class DaskWorkers:
         try:
             import distributed
         except ImportError as error:
-            raise InputError("Dask is missing, expected it for Dask workers: pip install 'mauvecl[cluster]'") from error
+            raise InputError(
+                "Dask is missing", "it for Dask workers: pip install 'mauvecl[cluster]'", key="dask"
+            ) from error
         self._where, self._device, self.retries = where, device, 0
         self._lock = threading.Lock()
         self._closing = False
@@ -204,7 +206,7 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
         word, _, number = where.partition(":")
         if word == "local":
             if not (number.isdecimal() and len(number) <= 4 and 1 <= int(number) <= 1024):
-                raise InputError(f"cluster = {where!r}, expected local:N with N from 1 to 1024")
+                raise InputError.of("cluster", where, "local:N with N from 1 to 1024")
             threads = max((os.cpu_count() or 1) // int(number), 1)
             # The pool counts failures and submits shards again, so that it can report them.
             how = {"distributed.scheduler.allowed-failures": 0, "distributed.admin.tick.limit": "1h"}
@@ -232,13 +234,15 @@ def _client(where: str, distributed: Any) -> Iterator[Client]:
             scheduler = json_data(read_text(Path(where), "scheduler file"), f"scheduler file {shortened(where)}")
             address = scheduler.get("address") if isinstance(scheduler, dict) else None
             if not (isinstance(address, str) and _is_address(address)):
-                raise InputError(f"scheduler file {shortened(where)} names no address, expected one that Dask wrote")
+                raise InputError(
+                    f"scheduler file {shortened(where)} names no address",
+                    "one that Dask wrote",
+                    key="cluster",
+                    value=where,
+                )
             how = {"scheduler_file": where}
         else:
-            raise InputError(
-                f"cluster = {shortened(where)}, expected local:N, an address such as tcp://host:8786, or a "
-                "scheduler file"
-            )
+            raise InputError.of("cluster", where, "local:N, an address such as tcp://host:8786, or a scheduler file")
         try:
             client = stack.enter_context(distributed.Client(**how, timeout=PATIENCE_S, set_as_default=False))
         except (OSError, ValueError, TimeoutError) as error:
@@ -270,7 +274,7 @@ def _private(distributed: Any) -> Any:
         return distributed.Security.temporary()
     except ImportError as error:
         raise InputError(
-            "cryptography is missing, expected it for workers on local:N: pip install 'mauvecl[cluster]'"
+            "cryptography is missing", "it for workers on local:N: pip install 'mauvecl[cluster]'", key="cryptography"
         ) from error
 
 

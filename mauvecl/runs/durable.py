@@ -21,17 +21,22 @@ def locked(folder: Path, what: str) -> Iterator[None]:
     try:
         handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
     except OSError as error:
-        raise InputError(f"{what} {str(folder)!r} cannot be opened ({error.strerror}), expected a folder") from error
+        raise InputError(
+            f"{what} {str(folder)!r} cannot be opened ({error.strerror})", "a folder", key="lock", value=str(folder)
+        ) from error
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
             raise InputError(
-                f"{what} {str(folder)!r} is being written by another process, expected only one"
+                f"{what} {str(folder)!r} is being written by another process", "only one", key="lock", value=str(folder)
             ) from error
         except OSError as error:
             raise InputError(
-                f"{what} {str(folder)!r} cannot be locked ({error.strerror}), expected a file system with locks"
+                f"{what} {str(folder)!r} cannot be locked ({error.strerror})",
+                "a file system with locks",
+                key="lock",
+                value=str(folder),
             ) from error
         yield
     finally:

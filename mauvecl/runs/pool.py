@@ -199,8 +199,7 @@ class Pool:
         meanwhile: Callable[[], None] | None = None,
     ) -> None:
         if workers is not None and not hasattr(workers, "submit"):
-            kind = type(workers).__name__
-            raise InputError(f"the workers are of the type {kind}, expected LocalWorkers or DaskWorkers")
+            raise InputError.of("workers", workers, "LocalWorkers or DaskWorkers")
         self.workers = LocalWorkers() if workers is None else workers
         self._meanwhile = meanwhile
         self.checkpoint, self._progress = checkpoint, progress

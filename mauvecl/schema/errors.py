@@ -34,7 +34,7 @@ class InputError(ValueError):
     Attributes
     ----------
     key : str or None
-        The parameter, or the key of a study such as ``run.fap``; None where the fault is not in one value.
+        The parameter, or the key of a study such as ``run.fap``; None for a fault that is not in one value.
     value : object
         As it was given, or as the message shows it.
     expected : str or None
@@ -52,6 +52,12 @@ class InputError(ValueError):
         if expected is None and ", expected " in message:
             expected = message.partition(", expected ")[2]
         self.key, self.value, self.expected = key, value, expected
+
+    def within(self, place: str) -> InputError:
+        """Return the same error with a place before its sentence, such as the name of a file."""
+        found = InputError(f"{place}: {self}", key=self.key, value=self.value)
+        found.expected = self.expected
+        return found
 
     @classmethod
     def of(cls, key: str, value: Any, expected: str, *, unit: str = "", where: str = "") -> InputError:

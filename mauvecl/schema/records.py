@@ -75,45 +75,52 @@ def _takes_truth(annotation: Any) -> bool:
 
 def input_error(where: str, model: type[BaseModel], error: ValidationError) -> InputError:
     """Return the first fault as an InputError whose message begins with the place where it is."""
-    first = error.errors()[0]
-    message = f"{where}: {_sentence(model, error)}"
-    key, value = ".".join(map(str, first["loc"])) or None, first.get("input")
-    inner = first.get("ctx", {}).get("error")
-    if isinstance(inner, InputError):
-        # What read the value knows more of it than where it stands.
-        known = InputError(message, key=inner.key or key, value=inner.value)
-        known.expected = inner.expected
-        return known
-    return InputError(message, key=key, value=None if first["type"] == "missing" else value)
+    return _first_fault(model, error).within(where)
 
 
-def _sentence(model: type[BaseModel], error: ValidationError) -> str:
-    """Return the first validation error as a sentence: key = value, expected ..."""
+def _first_fault(model: type[BaseModel], error: ValidationError) -> InputError:
     first = error.errors()[0]
     path = [str(part) for part in first["loc"]]
-    key = ".".join(path) or model.__name__.lower()
-    if first["type"] == "extra_forbidden":
-        fields = list(_fields(model, path[:-1]))
-        near = difflib.get_close_matches(path[-1], fields, n=1)
-        expected = f"did you mean {near[0]!r}?" if near else f"expected one of {', '.join(fields)}"
-        return f"unknown key {shortened(key)}, {expected}"
-    if first["type"] == "missing":
-        return f"{key!r} is missing, expected a value"
-    if first["type"] == "value_error":
-        told = str(first["ctx"]["error"])
-        field = _fields(model, path[:-1]).get(path[-1]) if path else None
-        # A record's own error names the key; that of a single value's validator may not.
-        own = field is None or _model_in(field.annotation) is not None or path[-1] in told
-        return told if own else f"{key}: {told}"
-    told = first["msg"].removeprefix("Input should be ")
-    value = f"{key} = {shown(first['input'])}"
-    if first["type"] in ("too_long", "too_short"):
-        return f"{value}, expected {told.partition('should have ')[2].partition(' after')[0]}"
-    if first["type"] == "truth":
-        return f"{value}, expected a number or text, not true or false"
-    if first["type"] == "path_type":
-        return f"{value}, expected a path"
-    return f"{value}: {told.lower()}" if told == first["msg"] else f"{value}, expected {told}"
+    key, value, told = ".".join(path) or model.__name__.lower(), first.get("input"), first["msg"]
+    match first["type"]:
+        case "extra_forbidden":
+            fields = list(_fields(model, path[:-1]))
+            unknown = f"unknown key {shortened(key)}"
+            if not (near := difflib.get_close_matches(path[-1], fields, n=1)):
+                return InputError(unknown, f"one of {', '.join(fields)}", key=key, value=value)
+            found = InputError(f"{unknown}, did you mean {near[0]!r}?", key=key, value=value)
+            found.expected = near[0]
+            return found
+        case "missing":
+            return InputError(f"{key!r} is missing", "a value", key=key)
+        case "value_error":
+            return _own_error(model, path, key, first)
+        case "too_long" | "too_short":
+            expected = told.partition("should have ")[2].partition(" after")[0]
+        case "truth":
+            expected = "a number or text, not true or false"
+        case "path_type":
+            expected = "a path"
+        case _:
+            expected = told.removeprefix("Input should be ")
+            if expected == told:
+                return InputError(f"{key} = {shown(value)}: {told.lower()}", key=key, value=value)
+    return InputError.of(key, value, expected)
+
+
+def _own_error(model: type[BaseModel], path: list[str], key: str, first: Any) -> InputError:
+    """Return the error that a validator raised, with the key where its sentence does not name it."""
+    inner = first["ctx"]["error"]
+    told, field = str(inner), _fields(model, path[:-1]).get(path[-1]) if path else None
+    # A record's own error names the key; that of a single value's validator may not.
+    own = field is None or _model_in(field.annotation) is not None or path[-1] in told
+    if not isinstance(inner, InputError):
+        fault, _, expected = told.partition(", expected ")
+        inner = InputError(fault, expected or None, key=key if path else None, value=first.get("input"))
+    # What read the value knows more of it than where it stands.
+    found = inner if own else inner.within(key)
+    found.key = inner.key or (key if path else None)
+    return found
 
 
 def _fields(model: type[BaseModel], path: list[str]) -> Any:

@@ -51,8 +51,10 @@ class UvExcess(LinearStatistic):
         super().check(setting)
         if not self._inside(setting).any():
             raise InputError(
-                f"no pixel of {setting.quiet.name} that counts lies at {UV_NM[0]:g}-{UV_NM[1]:g} nm, expected some for "
-                "the statistic 'uv_excess'"
+                f"no pixel of {setting.quiet.name} that counts lies at {UV_NM[0]:g}-{UV_NM[1]:g} nm",
+                "some for the statistic 'uv_excess'",
+                key="statistic",
+                value="uv_excess",
             )
 
     def plain_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
@@ -89,19 +91,23 @@ class Linear(ContentEquality, LinearStatistic):
         if weights.ndim != 1 or not np.isfinite(weights).all() or not weights.any():
             bad = int((~np.isfinite(weights)).sum())
             raise InputError(
-                f"statistic {self.name!r} has weights of the shape {weights.shape}, {bad} of them no numbers, expected "
-                "one finite value per pixel, not all zero"
+                f"statistic {self.name!r} has weights of the shape {weights.shape}, {bad} of them no numbers",
+                "one finite value per pixel, not all zero",
+                key="weights",
+                value=weights.shape,
             )
 
     def check(self, setting: Setting) -> None:
         super().check(setting)
         if self.weights.size != setting.used.size:
             raise InputError(
-                f"statistic {self.name!r} has {self.weights.size} weights, expected one for each of the "
-                f"{setting.used.size} pixels"
+                f"statistic {self.name!r} has {self.weights.size} weights",
+                f"one for each of the {setting.used.size} pixels",
+                key="weights",
+                value=self.weights.size,
             )
         if not (self.weights * setting.used).any():
-            raise InputError(f"statistic {self.name!r} weighs only saturated pixels, expected others")
+            raise InputError(f"statistic {self.name!r} weighs only saturated pixels", "others", key="weights")
 
     def plain_weights(self, setting: Setting, flare: Expectation | None = None) -> Float:
         return np.asarray(self.weights * setting.used)

@@ -13,4 +13,4 @@ DEFAULT_STATISTICS = ("chi2", "chi2_element", "matched")
 def check_statistic(name: str) -> None:
     """Raise InputError for an unknown statistic."""
     if name not in STATISTIC_NAMES:
-        raise InputError(f"statistic {name!r} is unknown, expected one of {', '.join(STATISTIC_NAMES)}")
+        raise InputError.of("statistic", name, f"one of {', '.join(STATISTIC_NAMES)}")

@@ -46,15 +46,26 @@ class Nuisances(ContentEquality):
         shapes = np.shape(self.spectra), np.shape(self.sd)
         if len(shapes[0]) != 2 or shapes[0][:1] != shapes[1] or shapes[1] != (len(self.names),):
             raise InputError(
-                f"{len(self.names)} names of unknowns, spectra of the shape {shapes[0]} and standard deviations of the "
-                f"shape {shapes[1]}, expected one spectrum and one standard deviation for each name"
+                f"{len(self.names)} names of unknowns, spectra of the shape {shapes[0]} and standard deviations of "
+                f"the shape {shapes[1]}",
+                "one spectrum and one standard deviation for each name",
+                key="names",
+                value=self.names,
             )
         for name, spectrum, sd in zip(self.names, self.spectra, self.sd, strict=True):
             if not np.isfinite(spectrum).all():
-                raise InputError(f"the spectrum of the unknown {name!r} is not finite everywhere, expected numbers")
+                raise InputError(
+                    f"the spectrum of the unknown {name!r} is not finite everywhere",
+                    "numbers",
+                    key="spectra",
+                    value=name,
+                )
             if not sd > 0:
                 raise InputError(
-                    f"the unknown {name!r} has a standard deviation of {sd:g}, expected one above 0 or 'free'"
+                    f"the unknown {name!r} has a standard deviation of {sd:g}",
+                    "one above 0 or 'free'",
+                    key="sd",
+                    value=sd,
                 )
 
     @classmethod
@@ -83,13 +94,17 @@ class Nuisances(ContentEquality):
                 spectrum = np.asarray(own[name], np.float64)
                 if spectrum.shape != quiet.wavelength_nm.shape:
                     raise InputError(
-                        f"the spectrum of the unknown {name!r} has the shape {spectrum.shape}, expected one value for "
-                        f"each of the {quiet.wavelength_nm.size} pixels"
+                        f"the spectrum of the unknown {name!r} has the shape {spectrum.shape}",
+                        f"one value for each of the {quiet.wavelength_nm.size} pixels",
+                        key="own",
+                        value=spectrum.shape,
                     )
             else:
                 spectrum = spectrum_of(name, quiet)
             if not spectrum.any():
-                raise InputError(f"the unknown {name!r} changes no pixel of {quiet.name}, expected one that does")
+                raise InputError(
+                    f"the unknown {name!r} changes no pixel of {quiet.name}", "one that does", key="own", value=name
+                )
             spectra.append(spectrum)
         shape = len(spectra), quiet.wavelength_nm.size
         return cls(tuple(sd), np.array(spectra).reshape(shape), np.array(list(sd.values()), np.float64))
@@ -139,8 +154,10 @@ class Nuisances(ContentEquality):
         eigenvalues = np.linalg.eigvalsh(information / np.outer(scale, scale))
         if eigenvalues[0] < 1e-10:
             raise InputError(
-                f"the unknowns {', '.join(self.names)} cannot be told apart in these pixels, expected fewer of them or "
-                "standard deviations instead of 'free'"
+                f"the unknowns {', '.join(self.names)} cannot be told apart in these pixels",
+                "fewer of them or standard deviations instead of 'free'",
+                key="nuisances",
+                value=self.names,
             )
         return np.asarray(np.linalg.solve(np.linalg.cholesky(information), spectra * inverse))
 
@@ -148,7 +165,12 @@ class Nuisances(ContentEquality):
 def spectrum_of(name: str, quiet: Expectation) -> Float:
     """Return the spectrum of one of `NUISANCES`, DN of the exposure for unit amplitude, shape (n_pixel,)."""
     if name not in NUISANCES:
-        raise InputError(f"the unknown {name!r} has no spectrum, expected one of {', '.join(NUISANCES)} or a file")
+        raise InputError(
+            f"the unknown {name!r} has no spectrum",
+            f"one of {', '.join(NUISANCES)} or a file",
+            key="nuisances",
+            value=name,
+        )
     return np.asarray(NUISANCES[name].spectrum(quiet))
 
 

@@ -31,13 +31,15 @@ def statistics_by_name(asked: Sequence[str | Linear]) -> dict[str, Statistic]:
             named.setdefault(one, STATISTICS[one])
             continue
         if one.name in STATISTICS:
-            raise InputError(f"statistic {one.name!r} is one of mauvecl's own, expected another name")
+            raise InputError(
+                f"statistic {one.name!r} is one of mauvecl's own", "another name", key="statistics", value=one.name
+            )
         if one.name in own:
-            raise InputError(f"statistic {one.name!r} is given twice, expected different names")
+            raise InputError.of("statistics", one.name, "different names")
         own.add(one.name)
         named[one.name] = one
     if not named:
-        raise InputError(f"no statistic named, expected some of {', '.join(STATISTICS)}")
+        raise InputError("no statistic named", f"some of {', '.join(STATISTICS)}", key="statistics")
     return named
 
 

@@ -125,8 +125,10 @@ class Statistic(ABC):
         if setting.nuisances and (setting.comparison.estimated or not self.marginal):
             why = "with estimated variances" if self.marginal else "which compares with one noisy exposure"
             raise InputError(
-                f"statistic {self.name!r} {why} cannot be marginalised over {join_names(setting.nuisances.names)}, "
-                "expected no unknowns, or another statistic by the model's variances"
+                f"statistic {self.name!r} {why} cannot be marginalised over {join_names(setting.nuisances.names)}",
+                "no unknowns, or another statistic by the model's variances",
+                key="statistic",
+                value=self.name,
             )
 
     def closed_form(self, setting: Setting, observed: Expectation, flare: Expectation | None = None) -> Form:
@@ -238,8 +240,10 @@ class LinearStatistic(Statistic):
         power = float(left @ sought)
         if power <= 1e-10 * float(weights @ sought):
             raise InputError(
-                f"statistic {self.name!r} looks for what cannot be told from {join_names(setting.nuisances.names)}, "
-                "expected fewer unknowns or smaller standard deviations"
+                f"statistic {self.name!r} looks for what cannot be told from {join_names(setting.nuisances.names)}",
+                "fewer unknowns or smaller standard deviations",
+                key="statistic",
+                value=self.name,
             )
         return np.asarray(left / np.sqrt(power) if self.normalised else left)
 

@@ -123,7 +123,12 @@ def realise_file(
     """
     file = Path(file)
     if file.exists() and not restart:
-        raise InputError(f"{str(file)!r} is there already, expected another place, or `restart=True` to write it anew")
+        raise InputError(
+            f"{str(file)!r} is there already",
+            "another place, or `restart=True` to write it anew",
+            key="restart",
+            value=str(file),
+        )
     store = Store(unfinished(file), study)
     store.make_folder()
     with locked(store.path, "store"):
@@ -148,8 +153,10 @@ def _complete(store: Store, engine: Engine | Pool, resume: bool, restart: bool, 
     todo = [chunk for chunk in store.chunks() if not store.has(chunk)]
     if begun and not resume and todo:
         raise InputError(
-            f"store {str(store.path)!r} holds {store.count() - len(todo)} of {store.count()} chunks, expected "
-            "`resume=True` to draw the others, or another place"
+            f"store {str(store.path)!r} holds {store.count() - len(todo)} of {store.count()} chunks",
+            "`resume=True` to draw the others, or another place",
+            key="resume",
+            value=str(store.path),
         )
     _fill(store, todo, engine, progress)
 
@@ -310,19 +317,21 @@ def verify(
         missing.
     """
     if engine is None and (repair or redraw):
-        raise InputError("no engine is given, expected one to repair or redraw")
+        raise InputError("no engine is given", "one to repair or redraw", key="engine")
     Store.open(path)
     with locked(Path(path), "store"):
         store = Store.open(path)
         first, last = rows or (0, store.rows)
         if not 0 <= first < last <= store.rows:
-            raise InputError(f"rows {first}:{last}, expected a range within 0:{store.rows}")
+            raise InputError.of("rows", (first, last), f"a range within 0:{store.rows}")
         files = list(store.files())
         total, there = store.count(first, last), sum(store.owns(key) for key, _ in files)
         if total - there > MAX_MISSING:
             raise InputError(
-                f"store {str(store.path)!r} holds {there} chunks where its study asks for {total}, expected at most "
-                f"{MAX_MISSING} missing: choose `rows`, or `mauvecl realise --resume` draws them"
+                f"store {str(store.path)!r} holds {there} chunks where its study asks for {total}",
+                f"at most {MAX_MISSING} missing: choose `rows`, or `mauvecl realise --resume` draws them",
+                key="rows",
+                value=(there, total),
             )
         faults = list(_faults_of_description(store, repair))
         for number, chunk in enumerate(store.chunks(first, last)):
@@ -346,9 +355,11 @@ def _fault(store: Store, chunk: Chunk, engine: Engine | Pool | None, repair: boo
     drawn = digest(*store.encode(chunk, rows))
     if store.digests.get(chunk.key, drawn) != drawn and not redraw:
         raise InputError(
-            f"{chunk.key} of {store.path.name} was written with the digest {store.digests[chunk.key]} and is now "
-            f"drawn with {drawn}, expected the same: its study or its list is wrong; "
-            "`redraw=True` with `repair=True` trusts the study"
+            f"{chunk.key} of {store.path.name} was written with the digest {store.digests[chunk.key]} and "
+            f"is now drawn with {drawn}",
+            "the same: its study or its list is wrong; `redraw=True` with `repair=True` trusts the study",
+            key="redraw",
+            value=chunk.key,
         )
     if seen == "good":
         if drawn == store.digests[chunk.key]:

@@ -59,17 +59,25 @@ class Selection:
         """
         first, stop = rows or (0, store.rows)
         if not 0 <= first < stop <= store.rows:
-            raise InputError(f"rows {first}:{stop}, expected a range within 0:{store.rows}")
+            raise InputError.of("rows", (first, stop), f"a range within 0:{store.rows}")
         chosen = [store.scene(name) for name in scenes] if scenes else store.scenes
         selection = cls(store, chosen, first, stop)
         size = sum((stop - first) * scene.row_bytes for scene in chosen)
         if size > MAX_BYTES:
             raise InputError(
-                f"{size / 2**30:.1f} GiB of spectra, expected at most {MAX_BYTES // 2**30} GiB in one file: choose rows"
+                f"{size / 2**30:.1f} GiB of spectra",
+                f"at most {MAX_BYTES // 2**30} GiB in one file: choose rows",
+                key="rows",
+                value=size,
             )
         for chunk in store.chunks(first, stop):
             if any(chunk.scene is s for s in chosen) and not store.has(chunk):
-                raise InputError(f"{chunk.key} is missing, expected a whole store: `mauvecl realise --resume` draws it")
+                raise InputError(
+                    f"{chunk.key} is missing",
+                    "a whole store: `mauvecl realise --resume` draws it",
+                    key="store",
+                    value=chunk.key,
+                )
         return selection
 
     def rows(self, scene: StoredScene) -> NDArray[Any]:
@@ -99,10 +107,10 @@ def export(selection: Selection, path: str | Path, *, replace: bool = False) -> 
     """
     path = Path(path)
     if path.suffix not in ENDINGS:
-        raise InputError(f"export {path.name!r}, expected a name ending in {', '.join(ENDINGS)}")
+        raise InputError.of("file", path.name, f"a name ending in {', '.join(ENDINGS)}")
     if path.exists() and not (replace and path.is_file()):
         expected = "another name, or `replace=True`" if path.is_file() else "a file's name"
-        raise InputError(f"export {str(path)!r} exists already, expected {expected}")
+        raise InputError(f"export {str(path)!r} exists already", expected, key="file", value=str(path))
     if path.suffix != ".fits":
         # Written to memory first, because the HDF5 library aborts the process on a full disk.
         packed = io.BytesIO()
@@ -119,7 +127,10 @@ def export(selection: Selection, path: str | Path, *, replace: bool = False) -> 
             beside.replace(path)
     except OSError as error:
         raise InputError(
-            f"export {str(path)!r} cannot be written ({error.strerror or error}), expected a writable place with room"
+            f"export {str(path)!r} cannot be written ({error.strerror or error})",
+            "a writable place with room",
+            key="file",
+            value=str(path),
         ) from error
     return path
 
@@ -203,7 +214,7 @@ def _hdf5(selection: Selection, place: io.BytesIO) -> None:
     try:
         import h5py
     except ImportError as error:
-        raise InputError("h5py is missing, expected it for HDF5: pip install 'mauvecl[bulk]'") from error
+        raise InputError("h5py is missing", "it for HDF5: pip install 'mauvecl[bulk]'", key="h5py") from error
 
     store = selection.store
     with h5py.File(place, "w") as file:

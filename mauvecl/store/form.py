@@ -124,7 +124,7 @@ class Store:
     def __post_init__(self) -> None:
         missing = [name for name in ("zarr", "xxhash", "google_crc32c") if find_spec(name) is None]
         if missing:
-            raise InputError(f"{missing[0]} is missing, expected it for stores: pip install 'mauvecl[bulk]'")
+            raise InputError(f"{missing[0]} is missing", "it for stores: pip install 'mauvecl[bulk]'", key=missing[0])
 
     @classmethod
     def open(cls, path: str | Path) -> Store:
@@ -143,16 +143,20 @@ class Store:
                 copies.setdefault(text, place.relative_to(path))
         if not copies:
             raise InputError(
-                f"{str(path)!r} is no store of spectra, expected a folder that `mauvecl realise` wrote, with an intact "
-                "copy of its study"
+                f"{str(path)!r} is no store of spectra",
+                "a folder that `mauvecl realise` wrote, with an intact copy of its study",
+                key="store",
+                value=str(path),
             )
         (text, first), *others = copies.items()
         if others:
             other, second = others[0]
             keys = ", ".join(differing_keys(toml(text, path.name), toml(other, path.name)))
             raise InputError(
-                f"store {str(path)!r} holds two studies, {str(first)!r} and {str(second)!r} differ in {keys}, "
-                "expected one study: put the right one's file back"
+                f"store {str(path)!r} holds two studies, {str(first)!r} and {str(second)!r} differ in {keys}",
+                "one study: put the right one's file back",
+                key="store",
+                value=keys,
             )
         store = cls(path, Study.build(toml(text, path.name), path.name))
         store.read_digests()
@@ -167,9 +171,7 @@ class Store:
         """Return an array by path, such as ``star-1/flare-2``."""
         known = next((scene for scene in self.scenes if scene.path == path), None)
         if known is None:
-            raise InputError(
-                f"no array {path!r} in {self.path.name}, expected one of {', '.join(s.path for s in self.scenes)}"
-            )
+            raise InputError.of("scenes", path, f"one of {', '.join(s.path for s in self.scenes)}")
         return known
 
     @property
@@ -214,7 +216,12 @@ class Store:
         ours = {scene.group for scene in self.scenes}
         other = [p.name for p in self.path.iterdir() if p.name not in ours and not p.name.startswith(UNFINISHED)]
         if other:
-            raise InputError(f"{str(self.path)!r} holds {min(other)!r} and no store, expected an empty or a new folder")
+            raise InputError(
+                f"{str(self.path)!r} holds {min(other)!r} and no store",
+                "an empty or a new folder",
+                key="store",
+                value=min(other),
+            )
         # The root comes last, so that its presence means that the description is complete.
         made = self.description()
         for name in sorted(made, key=lambda name: name == root.name):
@@ -227,12 +234,17 @@ class Store:
             room = shutil.disk_usage(self.path).total
         except OSError as error:
             raise InputError(
-                f"store {str(self.path)!r} cannot be made ({error.strerror}), expected a writable folder"
+                f"store {str(self.path)!r} cannot be made ({error.strerror})",
+                "a writable folder",
+                key="store",
+                value=str(self.path),
             ) from error
         if self.n_bytes > room:
             raise InputError(
-                f"spectra of {self.n_bytes / 2**30:.4g} GiB for {str(self.path)!r}, expected less than its disk's "
-                f"{room / 2**30:.4g} GiB"
+                f"spectra of {self.n_bytes / 2**30:.4g} GiB for {str(self.path)!r}",
+                f"less than its disk's {room / 2**30:.4g} GiB",
+                key="run.realisations",
+                value=self.n_bytes,
             )
 
     def description(self) -> dict[str, bytes]:
@@ -247,8 +259,10 @@ class Store:
         differing = differing_keys(self.study.model_dump(mode="json"), there.model_dump(mode="json"))
         if differing:
             raise InputError(
-                f"store {str(self.path)!r} was begun by another study, which differs in {', '.join(differing)}, "
-                "expected the same study or another place"
+                f"store {str(self.path)!r} was begun by another study, which differs in {', '.join(differing)}",
+                "the same study or another place",
+                key="store",
+                value=differing,
             )
 
     def read_digests(self) -> None:
@@ -279,8 +293,10 @@ class Store:
                 file.write(line.encode())
         except OSError as error:
             raise InputError(
-                f"{chunk.scene.path}/{DIGESTS} of {self.path.name} cannot be written ({error.strerror}), expected a "
-                "writable disk with room; what was written before is kept"
+                f"{chunk.scene.path}/{DIGESTS} of {self.path.name} cannot be written ({error.strerror})",
+                "a writable disk with room; what was written before is kept",
+                key="store",
+                value=str(self.path),
             ) from error
 
     def encode(self, chunk: Chunk, rows: NDArray[Any]) -> tuple[memoryview, bytes]:
@@ -334,8 +350,10 @@ class Store:
         other = [key for key, own in files if not own]
         if other:
             raise InputError(
-                f"store {str(self.path)!r} holds {other[0]!r}, which is not of it, expected nothing else where a store "
-                "is to be removed"
+                f"store {str(self.path)!r} holds {other[0]!r}, which is not of it",
+                "nothing else where a store is to be removed",
+                key="store",
+                value=other[0],
             )
         for key, _ in sorted(files, key=lambda entry: entry[0] == "zarr.json"):
             (self.path / key).unlink(missing_ok=True)

@@ -161,7 +161,7 @@ def test_sweeps_seeds_and_files(engine: Engine, tmp_path: Path) -> None:
         (["flare.geometry=replaces"], "expected 'added'"),
         (["flare.amplitudes=[0.5, 0.0]"], "flare amplitude = 0"),
         (["measure.bands_nm=[[300, 200]]"], "bands_nm"),
-        (['measure.lines=["X"]'], "'X' is unknown"),
+        (['measure.lines=["X"]'], "'X'"),
         (["measure.fits=0"], "measure.fits"),
     ],
 )

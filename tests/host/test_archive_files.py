@@ -10,12 +10,12 @@ from typing import Any
 import numpy as np
 import pytest
 from astropy.io import fits
+from refusals import refused
 
 from mauvecl.host.expectation import expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.stars.source import Source
-from mauvecl.schema.errors import InputError
 
 HERE = Path(__file__).parents[1] / "data" / "spectra"
 ANGSTROM = {"wavelength_unit": "Angstrom"}
@@ -51,34 +51,34 @@ RIGHT: list[tuple[str, dict[str, Any], Any, float | None]] = [
 ]
 #: File, options, and the sentence of reading it.
 REFUSED = [
-    ("lwp11854.mxlo", {}, r"lwp11854 covers 175-345\.144 nm, 29% of 200-700 nm, expected at least a third"),
+    ("lwp11854.mxlo", {}, ("extend", "lwp11854", "175-345.144", "29%")),
     (
         "lwp11854.mxlo",
         {"extend": "B2IV"},
-        r"lwp11854 covers 175-345\.144 nm, 29% of 200-700 nm, expected at least a third",
+        ("extend", "lwp11854", "175-345.144", "29%"),
     ),
     (
         "10lac_stis_001.txt",
         {},
-        r"1669 to 399000 without a stated unit look like Angstrom, .*: `wavelength_unit='Angstrom'`$",
+        ("wavelength_unit", "1669", "399000", "`wavelength_unit='Angstrom'`"),
     ),
     (
         "h_stis_ngsl_hd095735_v2.txtA",
         {},
-        r"1675.01 to 10191.7 .* look like Angstrom, .*: `wavelength_unit='Angstrom'`$",
+        ("wavelength_unit", "1675.01", "10191.7", "`wavelength_unit='Angstrom'`"),
     ),
-    ("wasp-96_estimate_sed.txt", {}, r"1980.05 to 6067.15 .* look like Angstrom, .*: `wavelength_unit='Angstrom'`$"),
-    ("wasp-96_estimate_sed.txt", {"extend": "G8V"}, r"look like Angstrom, .*: `wavelength_unit='Angstrom'`$"),
-    ("ckp00_5750.fits", {}, r"11 columns may be the flux: g00, g05, .*g50, expected one: name it as in FILE\[g50\]"),
-    ("ckp00_5750.fits[g55]", {}, r"no column or row is named 'g55', expected one of WAVELENGTH, g00"),
-    ("XP_SAMPLED_RAW_dr3int6.csv", {}, r"2 spectra stand in it, one a row \(6, 4\), expected one: .* FILE\[6\]"),
+    ("wasp-96_estimate_sed.txt", {}, ("wavelength_unit", "1980.05", "6067.15", "`wavelength_unit='Angstrom'`")),
+    ("wasp-96_estimate_sed.txt", {"extend": "G8V"}, ("wavelength_unit", "`wavelength_unit='Angstrom'`")),
+    ("ckp00_5750.fits", {}, ("columns", "11", "g00", "g05")),
+    ("ckp00_5750.fits[g55]", {}, ("columns", "'g55'", "WAVELENGTH", "g00")),
+    ("XP_SAMPLED_RAW_dr3int6.csv", {}, ("rows", "2", "6", "4")),
 ]
 #: Files that are read and hold less than the nominal instrument's range.
 SHORT = [
-    ("vb8_stiswfcnic_004.fits", {}, r"VB8 spans 290\.033-2497\.72 nm, expected at least .*200-700 nm: `extend`"),
-    ("ADLeo_912s.dat", {}, r"spans 100.36-444.015 nm, expected at least .*200-700 nm: `extend`"),
-    ("wasp-96_estimate_sed.txt", ANGSTROM, r"spans 198.005-606.715 nm, expected at least .*200-700 nm: `extend`"),
-    ("XP_SAMPLED_RAW_dr3int6.csv[6]", {}, r"Gaia DR3 6 spans 336-1020 nm, expected at least .*200-700 nm"),
+    ("vb8_stiswfcnic_004.fits", {}, ("extend", "VB8", "290.033-2497.72", "200-700")),
+    ("ADLeo_912s.dat", {}, ("extend", "100.36-444.015", "200-700")),
+    ("wasp-96_estimate_sed.txt", ANGSTROM, ("extend", "198.005-606.715", "200-700")),
+    ("XP_SAMPLED_RAW_dr3int6.csv[6]", {}, ("extend", "DR3", "6", "336-1020")),
 ]
 
 
@@ -107,17 +107,17 @@ def test_read_right(name: str, options: dict[str, Any], read: Any, v: float | No
 
 
 @pytest.mark.parametrize(("name", "options", "sentence"), REFUSED, ids=[entry[0] for entry in REFUSED])
-def test_unusable_archive_files_raise(name: str, options: dict[str, Any], sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence) as caught:
+def test_unusable_archive_files_raise(name: str, options: dict[str, Any], sentence: tuple[str, ...]) -> None:
+    with refused(*sentence) as caught:
         Source.read(HERE / name, **options)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(("name", "options", "sentence"), SHORT, ids=[entry[0] for entry in SHORT])
-def test_short_spectra_need_an_extension(name: str, options: dict[str, Any], sentence: str) -> None:
+def test_short_spectra_need_an_extension(name: str, options: dict[str, Any], sentence: tuple[str, ...]) -> None:
     star = Source.read(HERE / name, **options)
     assert any(text.startswith("its own points cover") for text in star.told)
-    with pytest.raises(InputError, match=sentence):
+    with refused(*sentence):
         expect(replace(star, unscaled=""), Instrument.load("mauve"), exposure=5.0)
 
 
@@ -166,12 +166,12 @@ def test_gaia_arrays_in_a_cell() -> None:
 
 def test_surface_or_relative_fluxes_need_a_magnitude() -> None:
     mauve = Instrument.load("mauve")
-    for name, options, why in (
-        ("ckp00_5750.fits[g45]", {}, "flux at the star's surface"),
-        ("h_stis_ngsl_hd095735_v2.txtA", ANGSTROM, "brighter than any star"),
+    for name, options in (
+        ("ckp00_5750.fits[g45]", {}),
+        ("h_stis_ngsl_hd095735_v2.txtA", ANGSTROM),
     ):
         star = Source.read(HERE / name, **options)
-        with pytest.raises(InputError, match=rf"{why}.*, expected a magnitude"):
+        with refused("magnitude"):
             expect(star, mauve, exposure=5.0)
         assert expect(star.at_magnitude(7.5), mauve, exposure=5.0).signal_dn.max() > 0
 

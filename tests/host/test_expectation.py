@@ -11,12 +11,12 @@ from typing import Any
 import astropy.units as u
 import numpy as np
 import pytest
+from refusals import refused
 
 from mauvecl.host.expectation import Expectation, expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.sky.zodiacal import Sky
 from mauvecl.host.stars.source import Source
-from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
 
 
@@ -101,8 +101,6 @@ def test_paper_signal_is_reported(sunlike: Source, mauve: Instrument) -> None:
     told = expect(sunlike, mauve, exposure=50, sky=sky, signal="paper").messages
     assert any("counts the zodiacal light as signal" in text for text in told)
     assert not any("zodiacal" in text for text in expect(sunlike, mauve, exposure=50, sky=sky).messages)
-    with pytest.raises(InputError, match="signal = 'all', expected 'net' or 'paper'"):
-        expect(sunlike, mauve, exposure=50, signal="all")  # type: ignore[arg-type]
 
 
 def test_per_element(quiet: Expectation) -> None:
@@ -162,17 +160,6 @@ def test_float_sum_of_frames_is_not_rounded_up(sunlike: Source, mauve: Instrumen
     x = expect(sunlike, mauve.with_(frame_s=0.1), exposure=0.1 + 0.2)
     assert x.n_frames == 3
     assert not any("rounded up" in message for message in x.messages)
-
-
-@pytest.mark.parametrize(
-    "exposure", [0, -5, np.nan, np.inf, 86_401, 2 * u.day, 3 * u.m, "50", True, None, [50, 60], [5, 6] * u.s]
-)
-def test_invalid_exposure_raises(sunlike: Source, mauve: Instrument, exposure: Any) -> None:
-    with pytest.raises(InputError) as error:
-        expect(sunlike, mauve, exposure=exposure)
-    assert error.value.key == "exposure"
-    assert error.value.expected is not None
-    assert error.value.expected.startswith("a time above 0 and up to one day")
 
 
 @pytest.mark.parametrize(
@@ -241,7 +228,7 @@ def test_survives_pickling(quiet: Expectation) -> None:
 def test_negative_mean_raises(quiet: Expectation) -> None:
     bad = quiet.source_electrons.copy()
     bad[17] = -0.2
-    with pytest.raises(InputError, match=r"source_electrons of pixel 17 = -0\.2, expected 0 to 1e\+12"):
+    with refused("source_electrons", "17", "-0.2", "0"):
         replace(quiet, source_electrons=bad)
 
 
@@ -258,7 +245,7 @@ def test_short_spectrum_raises(sunlike: Source, mauve: Instrument) -> None:
         wavelength_nm=sunlike.wavelength_nm[sunlike.wavelength_nm < 800],
         flux_flam=sunlike.flux_flam[sunlike.wavelength_nm < 800],
     )
-    with pytest.raises(InputError, match="expected at least mauve's output range 200-2000 nm"):
+    with refused("extend", "200-2000"):
         expect(short, wide, exposure=5)
 
 

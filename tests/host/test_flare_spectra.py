@@ -6,8 +6,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from refusals import refused
 
-from mauvecl import InputError
 from mauvecl.host.stars.flare import blackbody
 from mauvecl.host.stars.flare_spectra import (
     BALMER_EDGE_NM,
@@ -107,7 +107,7 @@ def test_ad_leos_great_flare() -> None:
 
 
 def test_a_short_flare_is_not_continued_unless_asked() -> None:
-    with pytest.raises(InputError, match="covers 100"):
+    with refused("continue_at_k", "100"):
         ad_leo(912, continue_at_k=None)
 
 
@@ -129,23 +129,5 @@ def test_a_quiescent_spectrum_is_subtracted(tmp_path: Path) -> None:
     kept = (nm < 330.0) | (nm > 356.0)
     gap = ObservedFlare.from_arrays(nm[kept], 1e-14 * nm[kept])
     assert any("gaps at 329.5-356.5 nm" in text for text in gap.messages)
-    with pytest.raises(InputError, match="total flux"):
+    with refused("flux"):
         ObservedFlare.from_arrays(nm, -blackbody(nm, 9e3))
-
-
-@pytest.mark.parametrize(
-    ("make", "text"),
-    [
-        (lambda: Blackbody(10.0), "flare temperature"),
-        (lambda: TwoBlackbodies(9e3, 1e7, 0.1), "second flare temperature"),
-        (lambda: TwoBlackbodies(9e3, 2e4, -1.0), "area of the second"),
-        (lambda: BalmerFlare(9e3, 0.5), "Balmer jump ratio"),
-        (lambda: FlareWithLines(Blackbody(), {"Fe XXI": 0.1}), "'Fe XXI' is unknown"),
-        (lambda: FlareWithLines(Blackbody(), {"Mg II": -0.1}), "flux of the line 'Mg II'"),
-        (lambda: FlareWithLines(Blackbody(), {"Mg II": 0.1}, {"Mg II": 1e-13}), "a fraction and a flux"),
-        (lambda: FlareWithLines(Blackbody(), {"2800": 0.1}), "wavelength of the line"),
-    ],
-)
-def test_what_cannot_be_is_named(make, text: str) -> None:
-    with pytest.raises(InputError, match=text):
-        make()

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import MaskedColumn, Table
+from refusals import refused
 
 from mauvecl.host.stars.source import Source
-from mauvecl.schema.errors import InputError
 
 FLAM = u.erg / (u.s * u.cm**2 * u.AA)
 NM = np.arange(170.0, 1100.0, 1.0)
@@ -35,16 +35,16 @@ def read_fits(path: Path, wavelength_unit: str, flux_unit: str, per_nm: float = 
 
 def test_masked_values_are_not_read(tmp_path: Path) -> None:
     masked = MaskedColumn(FLUX, mask=HIDDEN, unit=FLAM)
-    with pytest.raises(InputError, match="flux nan at point 131"):
+    with refused("flux", "131"):
         read_ecsv(tmp_path / "a.ecsv", NM * u.nm, masked)
-    with pytest.raises(InputError, match="wavelength nan at point 131"):
+    with refused("wavelength", "131"):
         read_ecsv(tmp_path / "b.ecsv", MaskedColumn(NM, mask=HIDDEN, unit="nm"), FLUX * FLAM)
 
 
 def test_ecsv_must_name_its_units(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"a\.ecsv: column wavelength names no unit"):
+    with refused("wavelength_unit"):
         read_ecsv(tmp_path / "a.ecsv", NM, FLUX * FLAM)
-    with pytest.raises(InputError, match=r"b\.ecsv: column flux names no unit"):
+    with refused("flux_unit"):
         read_ecsv(tmp_path / "b.ecsv", NM * u.nm, FLUX)
 
 
@@ -60,7 +60,7 @@ def test_wavelength_units_as_archives_spell_them(tmp_path: Path, unit: str, per_
 
 
 def test_unknown_unit_raises(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"^a\.fits: flux \(FLUX\): unit 'banana' is unknown, expected") as caught:
+    with refused("unit", "FLUX", "'banana'") as caught:
         read_fits(tmp_path / "a.fits", "ANGSTROMS", "banana")
     assert len(str(caught.value)) < 140
 
@@ -79,14 +79,5 @@ def test_text_from_other_editors(tmp_path: Path) -> None:
     (tmp_path / "windows.txt").write_bytes(b"\xef\xbb\xbf" + text.encode())
     np.testing.assert_allclose(Source.read(tmp_path / "windows.txt").flux_flam, FLUX)
     (tmp_path / "null.txt").write_bytes(b"\0" * 100)
-    with pytest.raises(InputError, match="is not text"):
+    with refused("file"):
         Source.read(tmp_path / "null.txt")
-
-
-@pytest.mark.parametrize("value", ["x", None, np.array([1.0, 2.0])])
-def test_arguments_that_are_not_numbers_raise(value: object) -> None:
-    star = Source.from_arrays(NM, FLUX)
-    for call in (star.at_magnitude, star.flaring, star.reddened, lambda v: star.flaring(0.1, v)):
-        with pytest.raises(InputError, match=r"expected (a number|magnitudes|0 to 10 mag|kelvin)"):
-            call(value)
-    assert star.at_magnitude(7.4 * u.mag).digest == star.at_magnitude(7.4).digest

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
+from refusals import refused
 
 from mauvecl.host.instrument.curve import Curve
 from mauvecl.host.instrument.instrument import CURVES, LABELS, Instrument
-from mauvecl.schema.errors import InputError
 
 # Computed independently of this code: wavelength nm, total efficiency, effective area cm^2.
 PUBLISHED = [
@@ -91,46 +90,6 @@ def test_with_returns_a_marked_copy(mauve: Instrument) -> None:
     assert {mauve: 1}[mauve.with_(temperature_c=21.0)] == 1
 
 
-@pytest.mark.parametrize(
-    ("changes", "expected"),
-    [
-        ({"temperature_c": 100}, "less than or equal to 60"),
-        ({"temperature_c": float("nan")}, "a finite number"),
-        ({"temperature_c": "13"}, "a valid number"),
-        ({"frame_s": 0}, "greater than 0"),
-        ({"light_loss": 1.0}, "less than 1"),
-        ({"pixels": 2048.5}, "a whole number"),
-        ({"dark_unit": "e-"}, "'DN' or 'electrons'"),
-        ({"output_max_nm": 150}, "more than output_min_nm"),
-        ({"gaussian_fwhm_nm": 0.01}, "0 (none) or at least 0.1"),
-        ({"bias_dn": 60_000}, "below saturation"),
-    ],
-)
-def test_invalid_values_raise(mauve: Instrument, changes: dict[str, Any], expected: str) -> None:
-    with pytest.raises(InputError) as error:
-        mauve.with_(**changes)
-    assert error.value.key == next(iter(changes))
-    assert error.value.expected is not None
-    assert error.value.expected.startswith(expected)
-    assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"temprature_c": 13}, "unknown key 'temprature_c'.*'temperature_c'"),
-        ({"grating_efficiency": 1.5}, "grating_efficiency has a value of 1.5, expected a fraction"),
-        ({"quantum_efficiency_a_per_w": 0.5}, "electrons per photon, expected at most 1"),
-        ({"output_max_nm": 750}, "covers 200-700 nm, expected at least the output range 200-750 nm"),
-        ({"top_hat_width_nm": 0, "gaussian_fwhm_nm": 0}, "both 0, expected at least one above 0"),
-    ],
-)
-def test_inconsistent_values_raise(mauve: Instrument, changes: dict[str, Any], message: str) -> None:
-    with pytest.raises(InputError, match=message) as caught:
-        mauve.with_(**changes)
-    assert "\n" not in str(caught.value)
-
-
 CURVE = """# %ECSV 1.0
 # ---
 # datatype:
@@ -170,25 +129,25 @@ def test_user_file_extends_an_embedded_instrument(tmp_path: Path, mauve: Instrum
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ('extends = "mauve"\nligth_loss = 0.2', "bad.toml: unknown key 'ligth_loss', did you mean 'light_loss'"),
-        ("light_loss = 0.2\nname = 'x'", "bad.toml: 'notice' is missing"),
-        ("light_loss 0.2", "bad.toml' is not valid TOML: .*line 1"),
-        ('extends = "mauve"\nlight_loss = { tag = "P" }', "light_loss has no 'value'"),
-        ('extends = "mauve"\nlight_loss = { value = 0.2, sauce = "x" }', "light_loss has the unknown key 'sauce'"),
-        ('extends = "mauve"\nlight_loss = { value = 0.2, tag = "Z" }', "light_loss has the tag 'Z', expected one of P"),
-        ('extends = "mauve"\nfibre_efficiency = "none.ecsv"', "none.ecsv' does not exist"),
-        ('extends = "mauve"\nfibre_efficiency = "short.ecsv"', "fibre_efficiency covers 250-710 nm, expected"),
-        ('extends = "mauve"\nfibre_efficiency = "falling.ecsv"', "not finite and strictly increasing"),
-        ('extends = "mauve"\nfibre_efficiency = "negative.ecsv"', "value at 190 nm is -0.2, expected"),
-        ('extends = "mauve"\nfibre_efficiency = "unitless.ecsv"', "'wavelength' has the unit 'none', expected nm"),
-        ('extends = "mauve"\nfibre_efficiency = "text.ecsv"', "text.ecsv' cannot be read"),
-        ('extends = "mauve"\nfibre_efficiency = true', "fibre_efficiency = True, expected"),
-        ('extends = "bad.toml"', "bad.toml extends itself"),
-        ("extends = 3", "instrument 3, expected a name or the path"),
-        ('extends = "mauve"\nsources = {}', "unknown key 'sources'"),
+        ('extends = "mauve"\nligth_loss = 0.2', ("ligth_loss", "'light_loss'")),
+        ("light_loss = 0.2\nname = 'x'", ("notice",)),
+        ("light_loss 0.2", ("file", "TOML", "1")),
+        ('extends = "mauve"\nlight_loss = { tag = "P" }', ("light_loss", "'value'")),
+        ('extends = "mauve"\nlight_loss = { value = 0.2, sauce = "x" }', ("light_loss", "'sauce'")),
+        ('extends = "mauve"\nlight_loss = { value = 0.2, tag = "Z" }', ("tag", "light_loss", "'Z'")),
+        ('extends = "mauve"\nfibre_efficiency = "none.ecsv"', ("file",)),
+        ('extends = "mauve"\nfibre_efficiency = "short.ecsv"', ("fibre_efficiency", "250-710")),
+        ('extends = "mauve"\nfibre_efficiency = "falling.ecsv"', ("wavelength_nm",)),
+        ('extends = "mauve"\nfibre_efficiency = "negative.ecsv"', ("value", "190", "-0.2")),
+        ('extends = "mauve"\nfibre_efficiency = "unitless.ecsv"', ("wavelength", "'none'", "nm")),
+        ('extends = "mauve"\nfibre_efficiency = "text.ecsv"', ("file",)),
+        ('extends = "mauve"\nfibre_efficiency = true', ("fibre_efficiency",)),
+        ('extends = "bad.toml"', ("extends",)),
+        ("extends = 3", ("instrument", "3")),
+        ('extends = "mauve"\nsources = {}', ("sources",)),
     ],
 )
-def test_invalid_files_raise(tmp_path: Path, text: str, message: str) -> None:
+def test_invalid_files_raise(tmp_path: Path, text: str, message: tuple[str, ...]) -> None:
     (tmp_path / "short.ecsv").write_text(CURVE.replace("1900", "2500"))
     (tmp_path / "falling.ecsv").write_text(CURVE.replace("1900", "7900"))
     (tmp_path / "negative.ecsv").write_text(CURVE.replace(" 0.2", " -0.2"))
@@ -196,15 +155,8 @@ def test_invalid_files_raise(tmp_path: Path, text: str, message: str) -> None:
     (tmp_path / "text.ecsv").write_text("wavelength efficiency\n200 0.3\n")
     file = tmp_path / "bad.toml"
     file.write_text(text)
-    with pytest.raises(InputError, match=message):
+    with refused(*message):
         Instrument.load(file)
-
-
-def test_unknown_instrument_raises() -> None:
-    with pytest.raises(InputError, match=r"unknown instrument 'mauv', expected .*nearest: 'mauve'"):
-        Instrument.load("mauv")
-    with pytest.raises(InputError, match=r"no-such.toml' does not exist"):
-        Instrument.load("no-such.toml")
 
 
 def test_curves_keep_their_end_values() -> None:
@@ -247,14 +199,14 @@ def test_curve_units_in_any_spelling(
 @pytest.mark.parametrize(
     ("length", "value", "sentence"),
     [
-        ("nm", "FLAM", "column 'value' has the unit 'FLAM', expected A / W"),
-        ("nm", "erg / (s cm2 Angstrom)", "column 'value' has the unit 'erg / .*', expected A / W"),
-        ("furlong", "A / W", "unit 'furlong' is unknown"),
-        ("s", "A / W", "column 'wavelength' has the unit 's', expected nm"),
+        ("nm", "FLAM", ("value", "'FLAM'", "A / W")),
+        ("nm", "erg / (s cm2 Angstrom)", ("value", "erg", "A / W")),
+        ("furlong", "A / W", ("unit", "'furlong'")),
+        ("s", "A / W", ("wavelength", "'s'", "nm")),
     ],
 )
-def test_spectrum_as_curve_raises(tmp_path: Path, length: str, value: str, sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence):
+def test_spectrum_as_curve_raises(tmp_path: Path, length: str, value: str, sentence: tuple[str, ...]) -> None:
+    with refused(*sentence):
         Curve.read(curve_file(tmp_path, length, value))
 
 
@@ -262,11 +214,11 @@ def test_spectrum_as_curve_raises(tmp_path: Path, length: str, value: str, sente
 def test_instrument_without_throughput_raises(name: str) -> None:
     """By any curve that is 0 over the band, or by two that are 0 where the other is not: every S/N would be 0."""
     mauve = Instrument.load("mauve")
-    with pytest.raises(InputError, match=rf"{name} = 0 from 200 to 700 nm, expected a throughput above 0"):
+    with refused("throughput"):
         mauve.with_(**{name: 0.0})
     below = Curve(np.array([100.0, 450.0, 450.1, 900.0]), np.array([0.03, 0.03, 0.0, 0.0]))
     above = Curve(np.array([100.0, 450.0, 450.2, 900.0]), np.array([0.0, 0.0, 0.03, 0.03]))
     other = "window_efficiency" if name != "window_efficiency" else "grating_efficiency"
-    with pytest.raises(InputError, match="the throughput = 0"):
+    with refused("throughput", "0"):
         mauve.with_(**{name: below, other: above})
     assert mauve.with_(**{name: below}).throughput(300.0) > 0

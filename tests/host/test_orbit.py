@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sgp4
+from refusals import refused
 
 from mauvecl.host.orbit.earth import direction
 from mauvecl.host.orbit.elements import Elements
@@ -148,14 +149,14 @@ def test_messages_about_the_epoch(orbit: Orbit) -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("no elements here", "holds no two lines"),
-        ("1 66756U 25276CU  26257.65431682  .00005125  00000+0  22992-3 0  9997\n2 66756", "checksum"),
-        ("1 66756U\n2 66756", "69 characters"),
+        ("no elements here", ("elements",)),
+        ("1 66756U 25276CU  26257.65431682  .00005125  00000+0  22992-3 0  9997\n2 66756", ("elements",)),
+        ("1 66756U\n2 66756", ("elements", "69")),
     ],
 )
-def test_invalid_elements_raise(tmp_path: Path, text: str, words: str) -> None:
+def test_invalid_elements_raise(tmp_path: Path, text: str, words: tuple[str, ...]) -> None:
     (tmp_path / "bad.tle").write_text(text)
-    with pytest.raises(InputError, match=words):
+    with refused(*words):
         Orbit.load(tmp_path / "bad.tle")
 
 
@@ -163,21 +164,6 @@ def test_elements_from_a_file(tmp_path: Path, orbit: Orbit) -> None:
     text = f"MAUVE\n{orbit.elements.first}\n{orbit.elements.second}\n"
     (tmp_path / "own.tle").write_text(text)
     assert Orbit.load(tmp_path / "own.tle").elements.satellite.ndot == orbit.elements.satellite.ndot
-
-
-@pytest.mark.parametrize(
-    ("kwargs", "key"),
-    [
-        ({"days": 0.0}, "days"),
-        ({"days": float("nan")}, "days"),
-        ({"step_s": 1e-3}, "step_s"),
-        ({"start": "yesterday"}, "time"),
-    ],
-)
-def test_invalid_time_grid_raises(kwargs: dict[str, float | str], key: str) -> None:
-    with pytest.raises(InputError) as error:
-        TimeGrid(**({"start": "2027-01-01", "days": 365.0} | kwargs))  # type: ignore[arg-type]
-    assert error.value.key == key
 
 
 @pytest.mark.parametrize("start", ["2027-01-01", "2027-01-01T11:59:59", "2027-01-01T12:00:01", "2027-01-01T23:59:59.5"])

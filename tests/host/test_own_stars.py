@@ -15,6 +15,7 @@ from typing import Any, ClassVar
 import numpy as np
 import pytest
 from astropy.io import fits
+from refusals import refused
 from typer.testing import CliRunner
 
 from mauvecl.cli.app import app
@@ -23,7 +24,6 @@ from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.stars import hst_collections, own_stars
 from mauvecl.host.stars.catalogue import library_table
 from mauvecl.host.stars.source import Source
-from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
 
 
@@ -70,25 +70,25 @@ def test_kept_star_is_part_of_the_library(tmp_path: Path, own_folder: Path) -> N
     asked = Study.build({"star": [{"library": "HD 1234", "magnitude": 7.0}]}, "test")
     assert asked.expectations(asked.star[0])[0].name == "HD 1234"
     own_stars.remove("hd 1234")
-    with pytest.raises(InputError, match="'HD 1234' is unknown, expected a name such as"):
+    with refused("name", "'HD 1234'"):
         Source.from_library("HD 1234")
-    with pytest.raises(InputError, match="no kept star 'HD 1234', expected one of: none is kept"):
+    with refused("name", "'HD 1234'"):
         own_stars.remove("HD 1234")
 
 
 def test_invalid_star_names_raise(tmp_path: Path) -> None:
     file = text_file(tmp_path / "mine.txt")
-    with pytest.raises(InputError, match="'g2v' is one of the embedded library's"):
+    with refused("name", "'g2v'"):
         own_stars.add(file, "g2v")
-    with pytest.raises(InputError, match="expected up to 64 letters"):
+    with refused("name", "64"):
         own_stars.add(file, "../escape")
     own_stars.add(file, "twin")
-    with pytest.raises(InputError, match="'twin' is kept already, expected another name, or `replace=True`"):
+    with refused("name", "'twin'", "`replace=True`"):
         own_stars.add(file, "twin")
     own_stars.add(text_file(tmp_path / "other.txt", 2.0), "Twin", replace=True)
     assert len(own_stars.kept()) == 1
     np.testing.assert_allclose(Source.from_library("twin").flux_flam, 2 * Source.read(file).flux_flam, rtol=1e-15)
-    with pytest.raises(InputError, match="too much like another kept star's"):
+    with refused("name"):
         own_stars.add(file, "a b") and own_stars.add(file, "a_b")
 
 
@@ -96,10 +96,10 @@ def test_changed_file_raises(tmp_path: Path) -> None:
     kept = own_stars.add(text_file(tmp_path / "mine.txt"), "mine")
     text = kept.path.read_text()
     kept.path.write_text(text.replace("e-13", "e-12", 1))
-    with pytest.raises(InputError, match=r"'mine' is not as it was kept \(its digest differs\)"):
+    with refused("name", "'mine'"):
         Source.from_library("mine")
     kept.path.write_text("garbage")
-    with pytest.raises(InputError, match="cannot be read"):
+    with refused("file"):
         Source.from_library("mine")
     own_stars.remove("mine")
     assert own_stars.kept() == []
@@ -186,7 +186,7 @@ def test_a_calspec_star_by_its_newest_file(archive: str) -> None:
 
 def test_short_spectrum_is_kept_with_its_extension(archive: str, tmp_path: Path) -> None:
     base = f"{archive}/calspec/"
-    with pytest.raises(InputError, match=r"VB8 spans 290\.033-2497\.72 nm, expected at least 200-700 nm"):
+    with refused("base", "VB8", "290.033-2497.72", "200-700"):
         hst_collections.fetch("calspec:VB 8", base=base, show_progress=False)
     kept = hst_collections.fetch("calspec:VB 8", base=base, show_progress=False, extend="M3V")
     assert any("continued by M3V" in text for text in kept.told)
@@ -200,7 +200,7 @@ def test_short_spectrum_is_kept_with_its_extension(archive: str, tmp_path: Path)
     models = WHOLE.parent / "ckp00_5750.fits"
     surface = own_stars.add(f"{models}[g45]", "model")
     assert "at the star's surface" in surface.unscaled
-    with pytest.raises(InputError, match="at the star's surface, expected a magnitude"):
+    with refused("magnitude"):
         expect(Source.from_library("model"), Instrument.load("mauve"), exposure=5.0)
 
 
@@ -229,31 +229,31 @@ def test_any_collection_is_searched(archive: str, monkeypatch: pytest.MonkeyPatc
     here = tuple(replace(c, base=f"{archive}/{c.name}/") for c in hst_collections.COLLECTIONS)
     monkeypatch.setattr(hst_collections, "COLLECTIONS", here)
     assert "Spectral Library" in hst_collections.fetch("HD 37202", show_progress=False).origin
-    with pytest.raises(InputError, match=r"no star 'HD 99999' in CALSPEC.* or Next Generation.* or the HST stellar"):
+    with refused("name", "'HD 99999'", "CALSPEC"):
         hst_collections.fetch("HD 99999", show_progress=False)
 
 
 @pytest.mark.parametrize(
     ("name", "below", "sentence"),
     [
-        ("ngsl:HD 1", "ngsl", r"h_stis_ngsl_hd000001_v2.fits came, and is no usable spectrum .* expected a whole file"),
-        ("ngsl:HD 2", "ngsl", r"h_stis_ngsl_hd000002_v2.fits came, and is no usable spectrum .* expected a whole file"),
-        ("calspec:cut", "calspec", r"cut_stis_001.fits (broke off|cannot be reached)"),
-        ("ngsl:HD 3", "ngsl", r"no star 'HD 3' in Next Generation Spectral Library.*expected its name there"),
-        ("calspec:nobody", "calspec", r"no star 'nobody' in CALSPEC"),
-        ("ngsl:HD 3", "busy", r"answers 503 .* expected the file: try again later"),
-        ("calspec:x", "hang", r"cannot be reached \(.*timed out.*expected a network; without one bring the file"),
+        ("ngsl:HD 1", "ngsl", ("base", "h_stis_ngsl_hd000001_v2.fits")),
+        ("ngsl:HD 2", "ngsl", ("base", "h_stis_ngsl_hd000002_v2.fits")),
+        ("calspec:cut", "calspec", ("base", "cut_stis_001.fits")),
+        ("ngsl:HD 3", "ngsl", ("name", "'HD 3'")),
+        ("calspec:nobody", "calspec", ("name", "'nobody'", "CALSPEC")),
+        ("ngsl:HD 3", "busy", ("base", "503")),
+        ("calspec:x", "hang", ("base",)),
     ],
 )
 def test_failed_downloads_raise(
-    archive: str, name: str, below: str, sentence: str, monkeypatch: pytest.MonkeyPatch
+    archive: str, name: str, below: str, sentence: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(hst_collections, "TIMEOUT_S", 0.5)
     base = f"{archive}/{below}" if below != "hang" else f"{archive}/x"
     if below == "hang":
         collection = hst_collections.Collection("calspec", "CALSPEC", "", base, lambda star, listing: "hang")
         monkeypatch.setattr(hst_collections, "COLLECTIONS", (collection,))
-    with pytest.raises(InputError, match=sentence):
+    with refused(*sentence):
         hst_collections.fetch(name, base=base, show_progress=False)
     assert own_stars.kept() == []
 
@@ -261,28 +261,28 @@ def test_failed_downloads_raise(
 @pytest.mark.parametrize(
     ("name", "below", "sentence"),
     [
-        ("ngsl:HD 1", "endless", r"_v2.fits has more than 1 MiB, expected less"),
-        ("calspec:x", "endless", r"/endless/ has more than 1 MiB, expected less"),
-        ("ngsl:HD 1", "slow", r"_v2.fits takes more than 0 s to come, expected less: try again later"),
+        ("ngsl:HD 1", "endless", ("MAUVECL_LARGEST_FILE_MIB", "_v2.fits", "1")),
+        ("calspec:x", "endless", ("MAUVECL_LARGEST_FILE_MIB", "1")),
+        ("ngsl:HD 1", "slow", ("base", "_v2.fits", "0")),
     ],
 )
 def test_endless_downloads_raise(
-    archive: str, name: str, below: str, sentence: str, monkeypatch: pytest.MonkeyPatch
+    archive: str, name: str, below: str, sentence: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("MAUVECL_LARGEST_FILE_MIB", "1")
     monkeypatch.setattr(hst_collections, "MAX_LISTING_BYTES", 1 << 20)
     monkeypatch.setattr(hst_collections, "MAX_DOWNLOAD_S", 0.3 if below == "slow" else 60.0)
-    with pytest.raises(InputError, match=sentence):
+    with refused(*sentence):
         hst_collections.fetch(name, base=f"{archive}/{below}", show_progress=False)
     assert own_stars.kept() == []
 
 
 def test_download_without_a_network_raises() -> None:
-    with pytest.raises(InputError, match=r"cannot be reached \(.*refused.*mauvecl library add"):
+    with refused("base"):
         hst_collections.fetch("ngsl:HD 37202", base="http://127.0.0.1:9/", show_progress=False)
-    with pytest.raises(InputError, match="collection 'mast' is unknown, expected one of calspec, ngsl, lowlib"):
+    with refused("collection", "'mast'"):
         hst_collections.fetch("mast:HD 37202")
-    with pytest.raises(InputError, match="expected its collection too, such as ngsl:HD 37202"):
+    with refused("name", "37202"):
         hst_collections.fetch("HD 37202", base="http://127.0.0.1:9/")
 
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-import pytest
+from refusals import refused
 
 from mauvecl.host.expectation import Expectation, expect
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.instrument.pixel_map import PixelMap
 from mauvecl.host.stars.source import Source
-from mauvecl.schema.errors import InputError
 
 
 def seen(payload: Instrument) -> Expectation:
@@ -52,43 +51,27 @@ def test_written_maps_are_read_back(tmp_path: Path) -> None:
     assert payload.sources["pixel_map"] == made.source
 
 
-@pytest.mark.parametrize(
-    ("columns", "sentence"),
-    [
-        ({}, "columns of no pixels"),
-        ({"dark": [1.0, -2.0]}, "dark of pixel 1 in the map is -2, expected finite and 0 or more"),
-        ({"gain": [1.0, 0.0]}, "gain of pixel 1 in the map is 0, expected finite and above 0"),
-        ({"bias_dn": [np.nan, 1.0]}, "bias_dn of pixel 0 in the map is nan"),
-        ({"dark": [1.0], "gain": [1.0, 1.0]}, r"columns of \[1, 2\] pixels"),
-        ({"dark": [[1.0]]}, "one value per pixel"),
-    ],
-)
-def test_invalid_maps_raise(columns: dict, sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence):
-        PixelMap(**{name: np.array(values) for name, values in columns.items()})
-
-
 def test_files_that_are_not_maps_raise(tmp_path: Path) -> None:
     path = tmp_path / "map.ecsv"
     for text, sentence in (
-        (None, "does not exist"),
-        ("nonsense", "cannot be read"),
-        ("# %ECSV 1.0\n# ---\n# datatype:\n# - {name: heat, datatype: float64}\nheat\n1.0\n", "the column 'heat'"),
-        ("# %ECSV 1.0\n# ---\n# datatype:\n# - {name: pixel, datatype: int64}\npixel\n0\n", "no column of values"),
+        (None, ("file",)),
+        ("nonsense", ("file",)),
+        ("# %ECSV 1.0\n# ---\n# datatype:\n# - {name: heat, datatype: float64}\nheat\n1.0\n", ("pixel_map", "'heat'")),
+        ("# %ECSV 1.0\n# ---\n# datatype:\n# - {name: pixel, datatype: int64}\npixel\n0\n", ("pixel_map",)),
         (
             "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: pixel, datatype: int64}\n# - {name: dark, datatype: float64}\n"
             "pixel dark\n1 1.0\n",
-            "not 0, 1, 2",
+            ("pixel", "0", "1", "2"),
         ),
         (
             "# %ECSV 1.0\n# ---\n# datatype:\n# - {name: dark, unit: K, datatype: float64}\ndark\n1.0\n",
-            "dark has the unit 'K', expected none",
+            ("dark", "'K'"),
         ),
     ):
         if text is not None:
             path.write_text(text)
-        with pytest.raises(InputError, match=sentence):
+        with refused(*sentence):
             PixelMap.read(path)
     PixelMap(dark=np.ones(7)).write(path)
-    with pytest.raises(InputError, match="7 pixels, expected the array's 2048"):
+    with refused("pixel_map", "7", "2048"):
         Instrument.load("mauve").with_(pixel_map=path)

@@ -14,7 +14,6 @@ from mauvecl.host import response
 from mauvecl.host.instrument.instrument import Instrument
 from mauvecl.host.instrument.line import Line
 from mauvecl.host.response import Order, electrons_per_second, response_matrix
-from mauvecl.schema.errors import InputError
 
 Float = NDArray[np.float64]
 
@@ -219,17 +218,3 @@ def test_matrix_is_cached(mauve: Instrument) -> None:
     assert response_matrix(mauve.with_(light_loss=0.3), wavelength) is not first
     with pytest.raises(ValueError, match="read-only"):
         first.data[0] = 1.0
-
-
-@pytest.mark.parametrize("nodes", [[300.0], [300.0, 300.0], [400.0, 300.0], [300.0, np.nan], [[300.0, 400.0]]])
-def test_invalid_nodes_raise(mauve: Instrument, nodes: list[float]) -> None:
-    with pytest.raises(InputError, match="strictly increasing"):
-        response_matrix(mauve, nodes)
-
-
-def test_unknown_order_and_wrong_flux_raise(mauve: Instrument) -> None:
-    with pytest.raises(InputError) as error:
-        response_matrix(mauve, [300.0, 400.0], "other")  # type: ignore[arg-type]
-    assert (error.value.key, error.value.expected) == ("order", "'paper' or 'physical'")
-    with pytest.raises(InputError, match="3 values for 2 wavelengths"):
-        electrons_per_second(mauve, [300.0, 400.0], [1.0, 1.0, 1.0])

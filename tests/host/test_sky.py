@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import socket
 from datetime import datetime
-from typing import Any
 
 import astropy.units as u
 import numpy as np
@@ -12,10 +11,10 @@ import pytest
 from astropy.coordinates import SkyCoord, solar_system_ephemeris
 from astropy.time import Time
 from astropy.utils import iers
+from refusals import refused
 
 from mauvecl.host.sky.helioecliptic import HelioEcliptic, helioecliptic
 from mauvecl.host.sky.zodiacal import Lookup, Sky, zodiacal_brightness, zodiacal_table
-from mauvecl.schema.errors import InputError
 
 # The paper's table, longitude 180 to 0 downwards, latitude 0 to 90 across.
 PAPER = """
@@ -64,7 +63,7 @@ def almanac(ra_deg: float, dec_deg: float, utc: str) -> tuple[float, float, floa
 def test_cells_of_the_table(place: tuple[int, int], lookup: Lookup) -> None:
     where = HelioEcliptic(float(place[0]), float(place[1]), 31.4)
     if CELLS[place] == "SA":
-        with pytest.raises(InputError, match=r"the Sun is 31\.4 deg from the target"):
+        with refused("target", "31.4"):
             zodiacal_brightness(where, lookup)
     else:
         assert zodiacal_brightness(where, lookup) == pytest.approx(float(CELLS[place]), abs=1e-12)
@@ -89,7 +88,7 @@ def test_between_cells() -> None:
     # The nearest cell decides on avoidance, at half a step.
     assert at(52.5, 0.0) == pytest.approx(21.3)
     for lookup in ("bilinear", "nearest"):
-        with pytest.raises(InputError, match="solar avoidance"):
+        with refused("target"):
             at(52.4, 0.0, lookup)
 
 
@@ -122,43 +121,10 @@ def test_equivalent_targets_and_times() -> None:
 
 def test_solar_avoidance_message_states_the_separation() -> None:
     _, _, separation = almanac(100.0, 10.0, "2026-06-21")
-    with pytest.raises(InputError, match="deg from the target") as caught:
+    with refused("target") as caught:
         Sky.at("100.0 10.0", "2026-06-21")
     told = float(str(caught.value).removeprefix("the Sun is ").split(" deg")[0])
     assert told == pytest.approx(separation, abs=0.1)
-
-
-@pytest.mark.parametrize(
-    ("target", "time", "key", "expected"),
-    [
-        ("18 Sco", "2026-01-01", "target", "right ascension and declination"),
-        ("290 -95", "2026-01-01", "target", "right ascension and declination"),
-        ("700 10", "2026-01-01", "target", "0 to 360 degrees"),
-        ("", "2026-01-01", "target", "right ascension and declination"),
-        ("nan nan", "2026-01-01", "target", "right ascension and declination"),
-        (12.0, "2026-01-01", "target", "right ascension and declination"),
-        (SkyCoord([1, 2] * u.deg, [3, 4] * u.deg), "2026-01-01", "target", "one"),
-        (SkyCoord(np.nan * u.deg, 4 * u.deg), "2026-01-01", "target", "right ascension and declination"),
-        ("290 -11", "yesterday", "time", "a UTC time"),
-        ("290 -11", "2026-13-01", "time", "a UTC time"),
-        ("290 -11", "1850-01-01", "time", "between 1990 and 2100"),
-        ("290 -11", Time(["2026-01-01", "2026-01-02"]), "time", "one"),
-        ("290 -11", 2026, "time", "a UTC time"),
-    ],
-)
-def test_invalid_targets_and_times_raise(target: Any, time: Any, key: str, expected: str) -> None:
-    with pytest.raises(InputError) as error:
-        Sky.at(target, time)
-    assert error.value.key == key
-    assert error.value.expected is not None
-    assert error.value.expected.startswith(expected)
-    assert "\n" not in str(error.value)
-
-
-def test_unknown_lookup_raises() -> None:
-    with pytest.raises(InputError) as error:
-        Sky.at("290 -11", "2026-07-01", "cubic")  # type: ignore[arg-type]
-    assert (error.value.key, error.value.expected) == ("lookup", "'bilinear' or 'nearest'")
 
 
 @pytest.mark.filterwarnings("error")
@@ -177,10 +143,6 @@ def test_no_network_access_and_no_global_state(monkeypatch: pytest.MonkeyPatch) 
 def test_fixed_brightness() -> None:
     assert Sky.of_brightness(22.1).surface_brightness == 22.1
     assert Sky.of_brightness(22.1 * u.mag / u.arcsec**2) == Sky.of_brightness(22.1)
-    for bad in (float("nan"), 100.0, "bright", True, 22.1 * u.mag, 3 * u.m, None):
-        with pytest.raises(InputError) as error:
-            Sky.of_brightness(bad)
-        assert error.value.key == "sky_brightness"
 
 
 def test_total_magnitude_and_spectrum() -> None:

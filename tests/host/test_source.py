@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from astropy.io import fits
 from astropy.table import Table
+from refusals import refused
 
 from mauvecl.host.expectation import expect
 from mauvecl.host.instrument.instrument import Instrument
@@ -17,7 +18,6 @@ from mauvecl.host.stars import bands, catalogue
 from mauvecl.host.stars.band_names import ALIASES
 from mauvecl.host.stars.flare import blackbody
 from mauvecl.host.stars.source import Source
-from mauvecl.schema.errors import InputError
 
 DATA = Path(__file__).parents[1] / "data"
 LIBRARY = Path(catalogue.__file__).parent / "library"
@@ -69,11 +69,9 @@ def test_ultraviolet_quality_of_known_stars() -> None:
         assert mean(low, high) / mean(540, 560) == pytest.approx(ratio, rel=0.05)
 
 
-def test_unknown_name_suggests_the_nearest() -> None:
+def test_names_ignore_case_and_blanks() -> None:
     assert Source.from_library(" g2v ").name == "G2V"
     assert Source.from_library("hd 40307").name == "K2.5V"
-    with pytest.raises(InputError, match=r"'G3V' is unknown, expected a name such as .*G[258]V"):
-        Source.from_library("G3V")
 
 
 @pytest.mark.parametrize("band", ALIASES)
@@ -143,13 +141,6 @@ def test_scaling_to_a_magnitude_in_any_system(sun: Source, system: bands.System)
     )
 
 
-def test_unknown_magnitude_system_raises(sun: Source) -> None:
-    with pytest.raises(InputError) as error:
-        sun.at_magnitude(7.4, "V", "AB")  # type: ignore[arg-type]
-    assert (error.value.key, error.value.value) == ("system", "AB")
-    assert error.value.expected == "one of catalogue, vega, ab"
-
-
 @pytest.mark.parametrize(
     ("name", "band", "catalogued", "error"),
     [
@@ -196,25 +187,6 @@ def test_a_replacing_flare_hides_photosphere(sun: Source) -> None:
     np.testing.assert_allclose(flare.flux_flam, (1 - f) * filling + f * hot, rtol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("options", "key"),
-    [
-        ({"amplitude": -0.1}, "flare_amplitude"),
-        ({"amplitude": np.nan}, "flare_amplitude"),
-        ({"amplitude": 0.1, "temperature": 10.0}, "flare_temperature"),
-        ({"amplitude": 0.1, "temperature": 1 * u.m}, "flare_temperature"),
-        ({"amplitude": 0.1, "band": "Q"}, "band"),
-        ({"amplitude": 0.1, "geometry": "replaces", "photosphere_temperature": 2e4}, "flare_temperature"),
-        ({"amplitude": 50.0, "geometry": "replaces", "photosphere_temperature": 5800}, "flare_amplitude"),
-        ({"amplitude": 0.1, "geometry": "sideways"}, "flare_geometry"),
-    ],
-)
-def test_invalid_flares_raise(sun: Source, options: dict, key: str) -> None:
-    with pytest.raises(InputError) as error:
-        sun.flaring(**options)
-    assert error.value.key == key
-
-
 def test_replacing_flare_uses_the_photosphere_of_the_star(sun: Source) -> None:
     """The library's temperature where none is given; a spectrum of one's own has none."""
     assert (sun.temperature_k, Source.from_library("K2.5V").temperature_k) == (5636.0, 4783.0)
@@ -227,14 +199,14 @@ def test_replacing_flare_uses_the_photosphere_of_the_star(sun: Source) -> None:
         own.flux_flam, sun.flaring(0.1, geometry="replaces", photosphere_temperature=4783).flux_flam
     )
     unknown = Source.from_arrays(sun.wavelength_nm, sun.flux_flam)
-    with pytest.raises(InputError, match="needs a photosphere temperature"):
+    with refused("photosphere_temperature"):
         unknown.flaring(0.1, geometry="replaces")
 
 
 def test_uncovered_band_raises() -> None:
     short = Source.from_arrays(np.arange(175.0, 751.0), np.ones(576))
     assert np.isfinite(short.magnitude("V"))
-    with pytest.raises(InputError, match="covers 175-750 nm, expected 99% of the band TESS"):
+    with refused("band", "175-750", "99%", "TESS"):
         short.flaring(0.1, band="TESS")
 
 
@@ -242,13 +214,6 @@ def test_dust_dims_the_blue_most(sun: Source) -> None:
     behind = sun.reddened(0.2)
     assert behind.magnitude("V") - sun.magnitude("V") == pytest.approx(3.1 * 0.2, abs=0.03)
     assert behind.magnitude("GALEX NUV") - sun.magnitude("GALEX NUV") > 1.0
-    for options, sentence in (
-        ({"ebv": -1}, "-1"),
-        ({"ebv": 0.1, "law": "X"}, "'X'"),
-        ({"ebv": 0.1, "rv": 99.0}, "R_V = 99"),
-    ):
-        with pytest.raises(InputError, match=sentence):
-            sun.reddened(**options)
 
 
 def test_calspec_file_is_read(sun: Source) -> None:
@@ -315,7 +280,7 @@ def test_spectra_in_memory(sun: Source) -> None:
     np.testing.assert_allclose(
         (body.flux_flam / shape)[inside], body.flux_flam[inside][0] / shape[inside][0], rtol=1e-3
     )
-    with pytest.raises(InputError, match="expected a wavelength and a flux density"):
+    with refused("flux"):
         Source.from_arrays(grid() * u.s, grid())
 
 
@@ -325,44 +290,37 @@ GOOD = grid() * 1e-15
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [
-        ("", "holds no numbers"),
-        ("200 1\n300\n400 1", "line 2: '300' has one column"),
-        ("# head\n200 1\n300 abc", "line 3: '300 abc' is not numeric"),
-        (
-            rows(grid()[365:], GOOD[365:]),
-            "would hold 33% of 200-700 nm in nm, expected at least a third, or their unit",
-        ),
-        (rows(grid() * 10, GOOD), "look like Angstrom, expected their unit: `wavelength_unit='Angstrom'`$"),
-        (rows(grid() / 1000, GOOD), "look like um, expected their unit: `wavelength_unit='um'`$"),
-        (rows(np.where(grid() == 300, 298.0, grid()), GOOD), "wavelength 298 nm at point 131 follows 299 nm"),
-        (rows(grid(), np.where(grid() == 300, np.nan, GOOD)), "flux nan at point 131"),
-        (rows(grid(), np.where(grid() == 300, -1e-11, GOOD)), "flux -1e-11 at 300 nm lies farther below zero"),
-        (rows(grid(), 0 * GOOD), "every flux is zero"),
+        ("", ("columns",)),
+        ("200 1\n300\n400 1", ("columns", "2", "'300'")),
+        ("# head\n200 1\n300 abc", ("columns", "3", "'300 abc'")),
+        (rows(grid()[365:], GOOD[365:]), ("wavelength_unit", "33%", "200-700")),
+        (rows(grid() * 10, GOOD), ("wavelength_unit", "`wavelength_unit='Angstrom'`")),
+        (rows(grid() / 1000, GOOD), ("wavelength_unit", "`wavelength_unit='um'`")),
+        (rows(np.where(grid() == 300, 298.0, grid()), GOOD), ("wavelength", "298", "131", "299")),
+        (rows(grid(), np.where(grid() == 300, np.nan, GOOD)), ("flux", "131")),
+        (rows(grid(), np.where(grid() == 300, -1e-11, GOOD)), ("flux", "-1e-11", "300")),
+        (rows(grid(), 0 * GOOD), ("flux",)),
     ],
 )
-def test_invalid_text_raises(tmp_path: Path, text: str, sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence) as caught:
+def test_invalid_text_raises(tmp_path: Path, text: str, sentence: tuple[str, ...]) -> None:
+    with refused(*sentence):
         Source.read(write(tmp_path / "star.dat", text))
-    assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(
     ("kept", "sentence"),
     [
-        (
-            slice(31, None),
-            "spans 201-1099 nm, expected at least mauve's output range 200-700 nm: `extend` continues it",
-        ),
-        (slice(25, None), r"starts at 195 nm, where it is bright: \d.\d% of the brightest"),
-        (slice(500), "spans 170-669 nm"),
-        (slice(535), r"ends at 704 nm, where it is bright: \d+.\d% of the brightest"),
+        (slice(31, None), ("extend", "201-1099", "200-700")),
+        (slice(25, None), ("extend", "195")),
+        (slice(500), ("extend", "170-669")),
+        (slice(535), ("extend", "704")),
     ],
 )
-def test_short_spectra_raise_for_the_nominal_range(kept: slice, sentence: str) -> None:
+def test_short_spectra_raise_for_the_nominal_range(kept: slice, sentence: tuple[str, ...]) -> None:
     """And used by an instrument whose pixels see what is there."""
     star = Source.from_arrays(grid()[kept], GOOD[kept])
     mauve = Instrument.load("mauve")
-    with pytest.raises(InputError, match=sentence):
+    with refused(*sentence):
         expect(star, mauve, exposure=5.0)
     narrow = mauve.with_(output_min_nm=250.0, output_max_nm=600.0)
     whole = expect(Source.from_arrays(grid(), GOOD), narrow, exposure=5.0)
@@ -370,22 +328,22 @@ def test_short_spectra_raise_for_the_nominal_range(kept: slice, sentence: str) -
 
 
 def test_unreadable_spectrum_files_raise(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="does not exist"):
+    with refused("file"):
         Source.read(tmp_path / "no.txt")
     (tmp_path / "junk.txt").write_bytes(bytes(range(256)))
-    with pytest.raises(InputError, match="is not text"):
+    with refused("file"):
         Source.read(tmp_path / "junk.txt")
     (tmp_path / "junk.fits").write_bytes(b"SIMPLE  = nothing" * 20)
-    with pytest.raises(InputError, match="header 0 without an end, expected a whole FITS file"):
+    with refused("file", "0", "FITS"):
         Source.read(tmp_path / "junk.fits")
     fits.PrimaryHDU(np.zeros(5)).writeto(tmp_path / "image.fits")
-    with pytest.raises(InputError, match="image without CRVAL1"):
+    with refused("CRVAL1"):
         Source.read(tmp_path / "image.fits")
     Table({"wavelength": grid(), "counts": GOOD}).write(tmp_path / "c.ecsv", format="ascii.ecsv")
-    with pytest.raises(InputError, match=r"no column is recognised as a star's flux, only counts \(counts\)"):
+    with refused("columns"):
         Source.read(tmp_path / "c.ecsv")
     (tmp_path / "d.ecsv").write_text("not a table")
-    with pytest.raises(InputError, match="holds no numbers, expected two columns"):
+    with refused("columns"):
         Source.read(tmp_path / "d.ecsv")
 
 
@@ -394,8 +352,6 @@ def test_sources_are_frozen_and_digested(sun: Source) -> None:
         sun.flux_flam[0] = 1.0
     assert sun.digest == Source.from_library("G2V").at_magnitude(7.4).digest
     assert sun.digest != sun.flaring(0.01).digest
-    with pytest.raises(InputError, match="magnitude = inf"):
-        sun.at_magnitude(np.inf)
 
 
 def test_other_numbers_of_the_span() -> None:
@@ -408,13 +364,13 @@ def test_other_numbers_of_the_span() -> None:
     mauve = Instrument.load("mauve")
     one, other = (expect(star.at_magnitude(5.0), mauve, exposure=5.0) for star in (whole, short))
     np.testing.assert_allclose(one.source_electrons, other.source_electrons, rtol=2e-4)
-    with pytest.raises(InputError, match=r"starts at 190 nm, where it is bright: .*`extend` continues it"):
+    with refused("extend", "190"):
         expect(Source.from_arrays(grid()[20:], hot[20:]), mauve, exposure=5.0)
     # What was continued is not taken for measured light in a band.
     dark = np.where(grid() < 300, 1e-17, GOOD)
     cut = Source.from_arrays(grid()[25:], dark[25:], name="cut")
     assert cut.measured_nm == (195.0, 1099.0)
-    with pytest.raises(InputError, match="covers 195-1099 nm, expected 99% of the band GALEX NUV"):
+    with refused("band", "195-1099", "99%", "GALEX"):
         cut.magnitude("GALEX NUV")
 
 
@@ -423,7 +379,7 @@ def test_extension_by_another_star(sun: Source) -> None:
     kept = (sun.wavelength_nm > 250) & (sun.wavelength_nm < 650)
     mauve = Instrument.load("mauve")
     short = (sun.wavelength_nm[kept], 1e-3 * sun.flux_flam[kept])
-    with pytest.raises(InputError, match=r"expected at least mauve's output range 200-700 nm: `extend`"):
+    with refused("extend", "200-700"):
         expect(Source.from_arrays(*short), mauve, exposure=5.0)
     for extension in ("G2V", Source.from_library("G2V")):
         star = Source.from_arrays(*short, name="short", extend=extension)
@@ -433,9 +389,9 @@ def test_extension_by_another_star(sun: Source) -> None:
             expect(sun, mauve, exposure=5).source_electrons,
             rtol=1e-6,
         )
-    with pytest.raises(InputError, match="expected light in both to scale by"):
+    with refused("extend"):
         Source.from_arrays(short[0], np.where(short[0] > 600, short[1], 0.0) - 1e-30, extend="G2V")
-    with pytest.raises(InputError, match="covers 3000-3002 nm, 0% of 200-700 nm, expected at least a third"):
+    with refused("extend", "3000-3002", "0%", "200-700"):
         Source.from_arrays([3000.0, 3001.0, 3002.0], [1.0, 1.0, 1.0], extend="G2V")
     whole = Source.from_arrays(sun.wavelength_nm, sun.flux_flam, extend="G2V")
     assert "reaches no farther and is not used" in whole.told[-1]
@@ -466,9 +422,7 @@ def test_measured_noise_is_kept_and_reported_once() -> None:
 def test_mean_too_far_below_zero_raises() -> None:
     """A level of -1e-13 is ten errors of a point, and hundreds of a pixel's: no noise of the spectrum explains it."""
     star = Source.from_arrays(*noisy(-1e-13), name="wrong")
-    with pytest.raises(
-        InputError, match=r"wrong makes a mean of -.* electrons a frame .*beyond 3 times its error.*bin"
-    ):
+    with refused("bin_nm", "3"):
         expect(star.at_magnitude(2.0), Instrument.load("mauve"), exposure=50.0)
 
 
@@ -495,5 +449,5 @@ def test_standard_error_equals_the_scatter_of_means() -> None:
 
 def test_nearly_equal_wavelengths_count_as_one() -> None:
     nm = np.insert(grid(), 100, np.nextafter(grid()[100], 0))
-    with pytest.raises(InputError, match="are the same to within rounding"):
+    with refused("wavelength"):
         Source.from_arrays(nm, 1e-15 * nm)

@@ -19,6 +19,7 @@ from astropy.io import fits
 from astropy.table import Column, Table
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from refusals import refused
 
 from mauvecl.host.spectra.roles import role_of
 from mauvecl.host.stars.source import Source
@@ -196,63 +197,63 @@ ONE, TWO = FLUX, 2 * FLUX
 REFUSED = {
     "model and observed": (
         text({"wavelength": NM, "model_flux": ONE, "observed_flux": TWO}),
-        r"2 columns may be the flux: model_flux, observed_flux, .*FILE\[observed_flux\]",
+        ("columns", "2", "model_flux", "observed_flux"),
     ),
-    "two fluxes": (text({"nm": NM, "flux_1": ONE, "flux_2": TWO}), "flux_1, flux_2"),
-    "flam and fnu": (text({"nm": NM, "f_lambda": ONE, "f_nu": TWO}), "f_lambda, f_nu"),
-    "rest and observed": (text({"wave_rest": NM, "wave_obs": NM + 1, "flux": ONE}), "may be the wavelength"),
-    "parts by unknown names": (text({"nm": NM, "star": ONE, "spot": TWO}), "no column is recognised as a star's flux"),
-    "errors alone": (text({"nm": NM, "error": ONE}), r"only error \(error\)"),
-    "counts": (text({"nm": NM, "counts": ONE}), r"only counts \(counts\)"),
+    "two fluxes": (text({"nm": NM, "flux_1": ONE, "flux_2": TWO}), ("columns", "flux_1", "flux_2")),
+    "flam and fnu": (text({"nm": NM, "f_lambda": ONE, "f_nu": TWO}), ("columns", "f_lambda", "f_nu")),
+    "rest and observed": (text({"wave_rest": NM, "wave_obs": NM + 1, "flux": ONE}), ("columns",)),
+    "parts by unknown names": (text({"nm": NM, "star": ONE, "spot": TWO}), ("columns",)),
+    "errors alone": (text({"nm": NM, "error": ONE}), ("columns", "error")),
+    "counts": (text({"nm": NM, "counts": ONE}), ("columns", "counts")),
     "a light curve": (
         text({"": np.arange(NM.size), "t0": NM, "t1": NM, "cps": ONE, "flux": ONE}),
-        "no column is recognised as the wavelength among 1, t0, t1, cps, flux",
+        ("columns", "1", "t0", "t1"),
     ),
-    "one edge": (text({"wave_lo": LOW, "flux": ONE}), "no column is the upper edge"),
-    "edges in two units": (text({"wave_lo_nm": LOW, "wave_hi_A": 10 * HIGH, "flux": ONE}), "state different units"),
-    "unknown names": (text({"a": NM, "b": ONE, "c": TWO}), "no column is recognised as the wavelength among a, b, c"),
-    "names for other columns": (text({"i": NM, "w": NM, "f": ONE}, " ", "wavelength flux"), "line of names has 2"),
-    "more names than columns": (text({"f": ONE, "w": NM}, " ", "# Total flux Rest wavelength"), "line of names has 4"),
-    "log of nothing": (text({"nm": NM, "log_flux": ONE}), "named as a logarithm and holds"),
-    "log wavelengths that are none": (text({"loglam": ANGSTROM, "flux": ONE}), "named as a logarithm and holds 1700"),
-    "energy per area": (text({"nm": NM, "flux": ONE}, ",", "nm,flux\nnm,W/m2"), "no flux density .*lamFlam"),
-    "erg per area": (text({"w": NM, "f": ONE}, " ", "# wavelength (nm), flux (erg/s/cm2)"), "no flux density"),
+    "one edge": (text({"wave_lo": LOW, "flux": ONE}), ("columns",)),
+    "edges in two units": (text({"wave_lo_nm": LOW, "wave_hi_A": 10 * HIGH, "flux": ONE}), ("wavelength_unit",)),
+    "unknown names": (text({"a": NM, "b": ONE, "c": TWO}), ("columns",)),
+    "names for other columns": (text({"i": NM, "w": NM, "f": ONE}, " ", "wavelength flux"), ("columns", "2")),
+    "more names than columns": (text({"f": ONE, "w": NM}, " ", "# Total flux Rest wavelength"), ("columns", "4")),
+    "log of nothing": (text({"nm": NM, "log_flux": ONE}), ("log_flux",)),
+    "log wavelengths that are none": (text({"loglam": ANGSTROM, "flux": ONE}), ("loglam", "1700")),
+    "energy per area": (text({"nm": NM, "flux": ONE}, ",", "nm,flux\nnm,W/m2"), ("flux_unit",)),
+    "erg per area": (text({"w": NM, "f": ONE}, " ", "# wavelength (nm), flux (erg/s/cm2)"), ("flux_unit",)),
     "name and unit disagree": (
         text({"nm": NM, "lamFlam": ONE}, ",", "nm,lamFlam\nnm,W/m2/nm"),
-        "expected them to agree",
+        ("flux_unit",),
     ),
-    "per steradian": (text({"w": NM, "f": ONE}, " ", "# nm  W/m2/nm/sr"), "per solid angle"),
+    "per steradian": (text({"w": NM, "f": ONE}, " ", "# nm  W/m2/nm/sr"), ("flux_unit",)),
     "per steradian in words": (
         text({"w": NM, "f": ONE}, " ", "# wave in nm\n# flux in W m-2 nm-1 sr-1"),
-        "per solid angle",
+        ("flux_unit",),
     ),
-    "per square arcsecond": (text({"nm": NM, "flux(erg/s/cm2/A/arcsec2)": ONE}), "per solid angle"),
-    "luminosity": (text({"nm": NM, "flux": ONE}, ",", "nm,flux\nnm,erg/s/A"), "is no flux density"),
-    "a factor alone": (text({"nm": NM, "flux (10^-15)": ONE}), "is no flux density"),
-    "an unknown unit": (text({"nm": NM, "flux (cgs/2)": ONE}), "unit 'cgs/2' is unknown"),
+    "per square arcsecond": (text({"nm": NM, "flux(erg/s/cm2/A/arcsec2)": ONE}), ("flux_unit",)),
+    "luminosity": (text({"nm": NM, "flux": ONE}, ",", "nm,flux\nnm,erg/s/A"), ("flux_unit",)),
+    "a factor alone": (text({"nm": NM, "flux (10^-15)": ONE}), ("flux_unit",)),
+    "an unknown unit": (text({"nm": NM, "flux (cgs/2)": ONE}), ("unit", "'cgs/2'")),
     "parsec": (
         text({"w": NM, "f": ONE}, " ", "# wavelength (parsec), flux (FLAM)"),
-        "wavelength 5.24565e.27 nm at point 1",
+        ("wavelength", "1"),
     ),
     "furlongs": (
         text({"w": NM, "f": ONE}, " ", "# wavelengths in furlongs\n# flux in FLAM"),
-        "'furlongs': unit .* unknown",
+        ("unit", "'furlongs'"),
     ),
-    "seconds": (text({"w": NM, "f": ONE}, ",", "wave (s),flux"), "wavelengths in s, expected a length"),
-    "magnitudes": (text({"nm": NM, "mag": 12.5 + 0 * FLUX}), r"only mag \(magnitude\)"),
-    "throughput": (text({"nm": NM, "throughput": FLUX / FLUX.max()}), r"only throughput \(throughput\)"),
+    "seconds": (text({"w": NM, "f": ONE}, ",", "wave (s),flux"), ("wavelength_unit",)),
+    "magnitudes": (text({"nm": NM, "mag": 12.5 + 0 * FLUX}), ("columns",)),
+    "throughput": (text({"nm": NM, "throughput": FLUX / FLUX.max()}), ("columns", "throughput")),
     "filter": (
         text({"w": NM, "f": FLUX / FLUX.max()}, " ", "# Bessell V passband"),
-        "'passband' speak of a throughput",
+        ("flux_unit", "'passband'"),
     ),
-    "transmission for a title": (text({"w": NM, "f": FLUX / FLUX.max()}, " ", "# total transmission"), "throughput"),
+    "transmission for a title": (text({"w": NM, "f": FLUX / FLUX.max()}, " ", "# total transmission"), ("flux_unit",)),
 }
 
 
 @pytest.mark.parametrize("case", REFUSED)
 def test_ambiguous_tables_raise(tmp_path: Path, case: str) -> None:
     content, sentence = REFUSED[case]
-    with pytest.raises(InputError, match=sentence) as caught:
+    with refused(*sentence) as caught:
         read(tmp_path, content)
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 400
@@ -264,7 +265,7 @@ def test_a_column_is_chosen_by_its_name(tmp_path: Path) -> None:
     assert is_right(read(tmp_path, text({"nm": NM, "model": ONE, "flux": TWO}), "[model]"))
     nameless = text({"a": TWO, "b": ONE, "c": NM}, " ", "# no names")
     assert is_right(read(tmp_path, nameless, "[3,2]"))
-    with pytest.raises(InputError, match="no column or row is named 'banana', expected one of nm, model, flux"):
+    with refused("columns", "'banana'"):
         read(tmp_path, text({"nm": NM, "model": ONE, "flux": TWO}), "[banana]")
 
 
@@ -272,7 +273,7 @@ def test_arguments_override_the_file(tmp_path: Path) -> None:
     per_nm = FLUX / 100
     assert is_right(read(tmp_path, text({"nm": NM, "flux (W/m2)": per_nm}), flux_unit="W m-2 nm-1"))
     magnitudes = text({"nm": NM, "flux": (FLUX * FLAM).to_value(u.ABmag, PER_HZ)})
-    with pytest.raises(InputError, match="look like magnitudes"):
+    with refused("flux_unit"):
         read(tmp_path, magnitudes)
     assert is_right(read(tmp_path, magnitudes, flux_unit="ABmag"))
     assert is_right(read(tmp_path, text({"nm": NM, "log_flux": np.log10(per_nm)}), flux_unit="W m-2 nm-1"))
@@ -283,7 +284,7 @@ def test_arguments_override_the_file(tmp_path: Path) -> None:
 def test_complex_and_boolean_columns_raise(tmp_path: Path, values: Any, form: str) -> None:
     made = Table({"wavelength": Column(NM, unit="nm"), "flux": Column(values, unit=FLAM)})
     made.write(tmp_path / "star.dat", format=form)
-    with pytest.raises(InputError, match=r"holds (true and false|complex numbers), expected real|no plain numbers"):
+    with refused("flux"):
         Source.read(tmp_path / "star.dat")
 
 

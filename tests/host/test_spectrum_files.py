@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from astropy.io import fits, votable
 from astropy.table import Column, MaskedColumn, Table
+from refusals import refused
 
 from mauvecl.host.spectra.formats import read_spectrum
 from mauvecl.host.stars.source import Source
@@ -236,14 +237,14 @@ def test_angstrom_that_spans_the_range_as_numbers_is_not_nm(tmp_path: Path) -> N
     """An SED from X-rays to the infrared, in Angstrom, without a word: never read as nm in silence."""
     angstrom = np.geomspace(5.0, 55_000.0, 3000)
     for low, high, sentence in (
-        (0.0, 1e9, "cover 200-700 nm in Angstrom as well as in nm"),
-        (60.0, 9000.0, "cover 200-700 nm in Angstrom as well as in nm"),
-        (60.0, 9e9, "`wavelength_unit='nm'` or `wavelength_unit='Angstrom'`"),
-        (1150.0, 9000.0, "look like Angstrom, expected their unit: `wavelength_unit='Angstrom'`$"),
+        (0.0, 1e9, ("wavelength_unit", "200-700")),
+        (60.0, 9000.0, ("wavelength_unit", "200-700")),
+        (60.0, 9e9, ("wavelength_unit", "`wavelength_unit='nm'`", "`wavelength_unit='Angstrom'`")),
+        (1150.0, 9000.0, ("wavelength_unit", "`wavelength_unit='Angstrom'`")),
     ):
         kept = angstrom[(angstrom > low) & (angstrom < high)]
         (tmp_path / "sed.txt").write_text(lines(kept, 1e-13 + 0 * kept))
-        with pytest.raises(InputError, match=sentence):
+        with refused(*sentence):
             Source.read(tmp_path / "sed.txt")
         right = Source.read(tmp_path / "sed.txt", wavelength_unit="Angstrom")
         np.testing.assert_allclose(right.wavelength_nm, kept / 10, rtol=1e-9)
@@ -269,9 +270,7 @@ def test_angstrom_without_a_unit_gets_a_single_hint(
     """The range of the AD Leo great flare and others: taken as nm, nearly all light would be another star's."""
     angstrom = np.geomspace(low, high, 1500)
     (tmp_path / "flare.dat").write_text(lines(angstrom, 1e-13 + 1e-17 * angstrom))
-    with pytest.raises(
-        InputError, match=r"look like Angstrom, expected their unit: `wavelength_unit='Angstrom'`$"
-    ) as caught:
+    with refused("wavelength_unit", "`wavelength_unit='Angstrom'`") as caught:
         Source.read(tmp_path / "flare.dat", extend=extend)
     assert "`extend`" not in str(caught.value)
 
@@ -281,7 +280,7 @@ def test_an_extension_needs_a_third_of_the_range(tmp_path: Path, low: float, hig
     nm = np.linspace(low, high, 800)
     (tmp_path / "short.txt").write_text(lines(nm, 1e-13 + 1e-15 * nm, head="# nm FLAM\n"))
     for extend in ("G2V", None):
-        with pytest.raises(InputError, match=r"covers .* nm, \d+% of 200-700 nm, expected at least a third"):
+        with refused("extend", "200-700"):
             Source.read(tmp_path / "short.txt", extend=extend)
 
 
@@ -296,30 +295,30 @@ def test_the_measured_range_is_always_reported(tmp_path: Path, low: float, high:
 def test_a_gap_is_not_measured(tmp_path: Path) -> None:
     nm = np.append(np.arange(170.0, 260.0), np.arange(650.0, 900.0))
     (tmp_path / "gap.txt").write_text(lines(nm, 1e-13 + 1e-15 * nm, head="# nm FLAM\n"))
-    with pytest.raises(InputError, match="covers 170-899 nm, 22% of 200-700 nm"):
+    with refused("extend", "170-899", "22%", "200-700"):
         Source.read(tmp_path / "gap.txt")
 
 
 BAD_TEXT = {
-    "magnitudes": (lines(NM, 12 + FLUX), "look like magnitudes, expected a flux density"),
-    "magnitudes in words": (lines(NM, FLUX, head="# wavelength and magnitude\n"), "speaks of 'magnitude'"),
-    "counts": (lines(NM, FLUX, head="# wavelength in nm and counts\n"), "speaks of 'counts'"),
-    "two units": (lines(NM, FLUX, head="# nm or Angstrom\n# FLAM\n"), "names the units nm, Angstrom, expected one"),
+    "magnitudes": (lines(NM, 12 + FLUX), ("flux_unit",)),
+    "magnitudes in words": (lines(NM, FLUX, head="# wavelength and magnitude\n"), ("flux_unit", "'magnitude'")),
+    "counts": (lines(NM, FLUX, head="# wavelength in nm and counts\n"), ("flux_unit", "'counts'")),
+    "two units": (lines(NM, FLUX, head="# nm or Angstrom\n# FLAM\n"), ("wavelength_unit",)),
     "two fluxes": (
-        lines(NM, FLUX, FLUX, head="wave flux_1 flux_2\n"), r"2 columns may be the flux: flux_1, flux_2.*FILE\[flux_2",
+        lines(NM, FLUX, FLUX, head="wave flux_1 flux_2\n"), ("columns", "2", "flux_1", "flux_2"),
     ),
-    "mixed commas": (lines(NM, FLUX).replace("1.", "1,"), "mixes commas, points and blanks"),
-    "commas or columns": ("\n".join(f"{n},5,1,2e-14" for n in range(200, 800)), "decimal commas or columns"),
-    "words": (lines(NM, FLUX) + "end of file\n", "line 416: 'end of file' is not numeric"),
-    "underscores": (lines(NM, FLUX) + "1_000 2\n", "line 416: '1_000 2' is not numeric"),
-    "not rising": (lines(np.roll(NM, 5), FLUX), "expected increasing wavelengths"),
-    "hole": (lines(NM, np.where(NM == 300, np.nan, FLUX)), "flux nan at point 66, 300 nm"),
-    "subnormal": (lines(NM, 0 * NM + 5e-324, head="# nm FLAM\n"), "expected 1e-40 to 1e\\+30"),
-    "too bright": (lines(NM, 0 * NM + 1e35, head="# nm FLAM\n"), "expected 1e-40 to 1e\\+30"),
-    "no light": (lines(NM, -FLUX), "no flux in 200-700 nm is above zero"),
-    "sign for none": (lines(NM, np.where(NM == 300, -999.0, FLUX)), "may stand for no measurement"),
-    "html": ("<!DOCTYPE html><html>404</html>", "is a page or XML"),
-    "entities": ('<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "b">]><VOTABLE/>', "defines entities"),
+    "mixed commas": (lines(NM, FLUX).replace("1.", "1,"), ("columns",)),
+    "commas or columns": ("\n".join(f"{n},5,1,2e-14" for n in range(200, 800)), ("columns",)),
+    "words": (lines(NM, FLUX) + "end of file\n", ("columns", "416", "'end of file'")),
+    "underscores": (lines(NM, FLUX) + "1_000 2\n", ("columns", "416", "'1_000 2'")),
+    "not rising": (lines(np.roll(NM, 5), FLUX), ("wavelength",)),
+    "hole": (lines(NM, np.where(NM == 300, np.nan, FLUX)), ("flux", "66", "300")),
+    "subnormal": (lines(NM, 0 * NM + 5e-324, head="# nm FLAM\n"), ("flux", "1e-40", "1e+30")),
+    "too bright": (lines(NM, 0 * NM + 1e35, head="# nm FLAM\n"), ("flux", "1e-40", "1e+30")),
+    "no light": (lines(NM, -FLUX), ("flux", "200-700")),
+    "sign for none": (lines(NM, np.where(NM == 300, -999.0, FLUX)), ("flux",)),
+    "html": ("<!DOCTYPE html><html>404</html>", ("file",)),
+    "entities": ('<?xml version="1.0"?><!DOCTYPE x [<!ENTITY a "b">]><VOTABLE/>', ("file",)),
 }  # fmt: skip
 
 
@@ -327,7 +326,7 @@ BAD_TEXT = {
 def test_unusable_text_raises(tmp_path: Path, kind: str) -> None:
     text, sentence = BAD_TEXT[kind]
     (tmp_path / "star.txt").write_text(text)
-    with pytest.raises(InputError, match=sentence) as caught:
+    with refused(*sentence) as caught:
         Source.read(tmp_path / "star.txt")
     assert "\n" not in str(caught.value)
     assert len(str(caught.value)) < 400
@@ -335,23 +334,24 @@ def test_unusable_text_raises(tmp_path: Path, kind: str) -> None:
 
 WHOLE = table()
 BAD_FITS = {
-    "cp1252": (PLAIN.replace("Angstrom", "Å").encode("cp1252"), r"is not text in UTF-8 \(byte 0xc5 in line 1\)"),
-    "cut short": (WHOLE[:-2880], "is cut short|cannot be read as FITS"),
+    "cp1252": (PLAIN.replace("Angstrom", "Å").encode("cp1252"), ("file", "UTF-8", "0xc5", "1")),
+    "cut short": (WHOLE[:-2880], ("file",)),
     "many rows": (table(columns=(np.tile(10 * NM, (3, 1)), np.tile(FLUX, (3, 1))), formats=(f"{NM.size}D",) * 2),
-                  "3 spectra stand in it"),
-    "cube": (image(np.ones((4, 5, 6)), CRVAL1=1.0, CDELT1=1.0), "image of 6 x 5 x 4 pixels"),
-    "two arrays": (table(columns=(10 * NM, np.outer(FLUX, [1, 2])), formats=("D", "2D")), "expected"),
+                  ("rows", "3")),
+    "cube": (image(np.ones((4, 5, 6)), CRVAL1=1.0, CDELT1=1.0), ("table", "6", "5", "4")),
+    "two arrays": (table(columns=(10 * NM, np.outer(FLUX, [1, 2])), formats=("D", "2D")), ("rows",)),
     "unequal": (table(columns=(short_rows(10 * NM[:-1]), short_rows(FLUX)),
-                      formats=(f"{NM.size - 1}D", f"{NM.size}D")), "414 wavelengths for 415 fluxes"),
-    "words": (table(columns=(10 * NM, ["x"] * NM.size), formats=("D", "3A")), "holds no plain numbers"),
-    "counts": (table(units=("ANGSTROMS", "Counts/s")), r"unit 'Counts/s' is no flux density \(magnitude or count"),
-    "magnitudes": (table(units=("ANGSTROMS", "mag")), r"is no flux density \(magnitude"),
-    "per steradian": (table(units=("nm", "W m-2 nm-1 sr-1")), "is per solid angle, expected the flux of the whole"),
-    "seconds": (table(units=("s", "FLAM")), "expected a length or a frequency"),
-    "no axis": (image(FLUX), "image without CRVAL1"),
-    "giant": (WHOLE.replace(b"NAXIS2  =                  415", b"NAXIS2  =" + b"4150000000".rjust(21)), "is cut short"),
-    "negative rows": (WHOLE.replace(b"NAXIS2  =                  415", b"NAXIS2  =                 -415"), "FITS"),
-    "bad card": (WHOLE.replace(b"TFORM1  = 'D       '", b"TFORM1  = 'Q!!     '"), "FITS"),
+                      formats=(f"{NM.size - 1}D", f"{NM.size}D")), ("flux", "414", "415")),
+    "words": (table(columns=(10 * NM, ["x"] * NM.size), formats=("D", "3A")), ("FLUX",)),
+    "counts": (table(units=("ANGSTROMS", "Counts/s")), ("unit", "'Counts/s'")),
+    "magnitudes": (table(units=("ANGSTROMS", "mag")), ("unit",)),
+    "per steradian": (table(units=("nm", "W m-2 nm-1 sr-1")), ("flux_unit",)),
+    "seconds": (table(units=("s", "FLAM")), ("wavelength_unit",)),
+    "no axis": (image(FLUX), ("CRVAL1",)),
+    "giant": (WHOLE.replace(b"NAXIS2  =                  415", b"NAXIS2  =" + b"4150000000".rjust(21)), ("file",)),
+    "negative rows": (WHOLE.replace(b"NAXIS2  =                  415", b"NAXIS2  =                 -415"),
+                      ("file", "FITS")),
+    "bad card": (WHOLE.replace(b"TFORM1  = 'D       '", b"TFORM1  = 'Q!!     '"), ("file", "FITS")),
 }  # fmt: skip
 
 
@@ -359,7 +359,7 @@ BAD_FITS = {
 def test_unusable_fits_raises(tmp_path: Path, kind: str) -> None:
     content, sentence = BAD_FITS[kind]
     (tmp_path / "star.fits").write_bytes(content)
-    with pytest.raises(InputError, match=sentence) as caught:
+    with refused(*sentence) as caught:
         Source.read(tmp_path / "star.fits")
     assert "\n" not in str(caught.value)
 
@@ -392,7 +392,7 @@ def test_one_of_several_tables_or_rows(tmp_path: Path) -> None:
     ]
     path = tmp_path / "two.fits"
     fits.HDUList(hdus).writeto(path)
-    with pytest.raises(InputError, match=r"2 tables hold a spectrum: ONE, TWO, expected one: .*FILE\[ONE\]"):
+    with refused("table", "2", "FILE"):
         Source.read(path)
     for word in ("ONE", "one", "1", "ONE,FLUX"):
         alike(f"{path}[{word}]")
@@ -403,7 +403,7 @@ def test_one_of_several_tables_or_rows(tmp_path: Path) -> None:
         ("5A", f"{NM.size}D", f"{NM.size}D"),
     )
     (tmp_path / "rows.fits").write_bytes(rows)
-    with pytest.raises(InputError, match=r"one a row \(LARGE, SMALL\), expected one"):
+    with refused("rows", "LARGE", "SMALL"):
         Source.read(tmp_path / "rows.fits")
     alike(f"{tmp_path / 'rows.fits'}[LARGE]")
     (tmp_path / "a[1].txt").write_text(PLAIN)
@@ -420,14 +420,14 @@ def test_masks_and_integers_that_mark_nothing(tmp_path: Path) -> None:
         assert "cut to 174.0-988.0 nm: undefined flux beyond" in star.notes
     inner = Table({"wavelength": Column(NM, unit="nm"), "flux": MaskedColumn(FLUX, mask=NM == 300, unit=FLAM)})
     inner.write(tmp_path / "d.vot", format="votable")
-    with pytest.raises(InputError, match="flux nan at point 66, 300 nm"):
+    with refused("flux", "66", "300"):
         Source.read(tmp_path / "d.vot")
 
 
 def test_coverage_is_checked_before_ends_are_dropped(tmp_path: Path) -> None:
     flux = np.where(NM < 230, np.nan, FLUX)
     (tmp_path / "a.txt").write_text(lines(NM, flux, head="# nm FLAM\n"))
-    with pytest.raises(InputError, match=r"flux nan at point \d+, 200 nm"):
+    with refused("flux", "200"):
         Source.read(tmp_path / "a.txt")
 
 
@@ -438,7 +438,7 @@ def test_yaml_alias_bomb_raises(tmp_path: Path) -> None:
     meta = "\n".join(f"# meta: {{{', '.join(levels)}}}".splitlines())
     text = f"# %ECSV 1.0\n# ---\n# datatype: [{{name: wave, datatype: float64}}]\n{meta}\nwave\n1.0\n"
     (tmp_path / "bomb.txt").write_text(text)
-    with pytest.raises(InputError, match="unfolds to more than 100000 values"):
+    with refused("file", "100000"):
         Source.read(tmp_path / "bomb.txt")
     shared = [1, 2]
     made = Table({"wave": NM * u.nm, "flux": FLUX * FLAM}, meta={"a": shared, "b": shared})

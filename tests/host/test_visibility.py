@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from astropy.table import Table
 from numpy.typing import NDArray
+from refusals import refused
 
 from mauvecl.host.orbit import constraints
 from mauvecl.host.orbit.conditions import Particles, Thermal
@@ -22,7 +23,6 @@ from mauvecl.host.orbit.time_grid import TimeGrid
 from mauvecl.host.orbit.visibility import Visibility
 from mauvecl.host.sky.helioecliptic import helioecliptic, offline
 from mauvecl.host.sky.zodiacal import zodiacal_brightness
-from mauvecl.schema.errors import InputError
 
 AXIS_KM = 6879.0
 
@@ -205,7 +205,7 @@ def test_flux_map_interpolates_between_cells() -> None:
     assert between == pytest.approx(grid[row, column : column + 2].mean())
     edge = np.array([-180.0, 179.999, 180.0])
     assert flux.at(edge, np.array([-90.0, 0.0, 90.0])) == pytest.approx(0.0)
-    with pytest.raises(InputError, match="expected 10 or 30"):
+    with refused("above_mev", "10", "30"):
         flux.at(edge, edge * 0, above_mev=5)  # type: ignore[arg-type]
 
 
@@ -222,7 +222,7 @@ def test_zodiacal_light_over_the_year() -> None:
             if np.isfinite(light[i]):
                 assert light[i] == pytest.approx(zodiacal_brightness(place), abs=0.01)
             else:
-                with pytest.raises(InputError, match="avoidance"):
+                with refused("target"):
                     zodiacal_brightness(place)
 
 
@@ -243,14 +243,6 @@ def test_hits_along_the_orbit(month: Visibility) -> None:
     assert rate.min() == 1.0
     flux = proton_map().at(*month.track.subsatellite_deg, above_mev=30)
     assert rate.max() == pytest.approx(1 + flux.max() / 2)
-
-
-@pytest.mark.parametrize(
-    ("text", "words"), [("epsilon Errr", "such as eps Eri"), ("700 10", "0 to 360"), ("zzz", "embedded list")]
-)
-def test_unknown_target_raises(text: str, words: str) -> None:
-    with pytest.raises(InputError, match=words):
-        Target.of(text)
 
 
 def test_names_in_any_spelling() -> None:
@@ -295,7 +287,7 @@ def test_simbad(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "ident.id = 'Barnard''s other star'" in asked[0]
     bare = Target.of("HD 2", simbad=True, name="mine")
     assert (bare.name, bare.distance_pc, bare.magnitude, bare.spectral_type) == ("mine", None, None, None)
-    with pytest.raises(InputError, match="unknown to SIMBAD"):
+    with refused("target", "SIMBAD"):
         Target.of("HD 3", simbad=True)
 
 
@@ -308,33 +300,15 @@ def test_network_failure_raises(monkeypatch: pytest.MonkeyPatch) -> None:
 
     with monkeypatch.context() as patch:
         _simbad(patch, fails)
-        with pytest.raises(InputError, match=r"did not answer within 10 s \(ConnectionError\)"):
+        with refused("target", "10"):
             Target.of("HD 1", simbad=True)
     with monkeypatch.context() as patch:
         done = threading.Event()
         _simbad(patch, lambda _: done.wait(60))
         patch.setattr(targets, "TIMEOUT_S", 0.1)
-        with pytest.raises(InputError, match=r"within 0.1 s \(TimeoutError\)"):
+        with refused("target", "0.1"):
             Target.of("HD 1", simbad=True)
         done.set()
     monkeypatch.setitem(sys.modules, "astroquery.simbad", None)
-    with pytest.raises(InputError, match=r"mauvecl\[names\]"):
+    with refused("target"):
         Target.of("HD 1", simbad=True)
-
-
-@pytest.mark.parametrize(
-    "kwargs",
-    [
-        {"earth_limb_deg": 91.0},
-        {"declination_deg": (10.0, -10.0)},
-        {"eclipse": "sometimes"},
-        {"proton_flux": 0.0},
-        {"anomaly": ((0.0, 0.0), (1.0, 1.0))},
-        {"duty_cycle": 0.0},
-        {"shortest_s": -1.0},
-    ],
-)
-def test_invalid_limits_raise(kwargs: dict[str, object]) -> None:
-    with pytest.raises(InputError) as error:
-        Limits(**kwargs)  # type: ignore[arg-type]
-    assert error.value.key == next(iter(kwargs))

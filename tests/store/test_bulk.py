@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 import zarr
+from refusals import refused
 from stores import CHUNK, LAST, Painter, flip, forked, full_after, killed, study, tree
 from typer.testing import CliRunner
 
@@ -172,7 +173,7 @@ def test_strangers_are_named_and_left(tmp_path: Path, engine: Engine) -> None:
 def test_another_study_is_refused_with_what_differs(tmp_path: Path, engine: Engine) -> None:
     path = tmp_path / "frames.zarr"
     bulk.realise(study(), path, engine)
-    with pytest.raises(InputError, match=r"differs in run\.seed, star\.0\.magnitude, expected the same"):
+    with refused("store", value=["run.seed", "star.0.magnitude"]):
         bulk.realise(study(run={"seed": 3}).at("magnitude", 7.0), path, engine)
     assert bulk.verify(path) == []
 
@@ -180,17 +181,17 @@ def test_another_study_is_refused_with_what_differs(tmp_path: Path, engine: Engi
 def test_places_that_cannot_be(tmp_path: Path, engine: Engine) -> None:
     (tmp_path / "notes").mkdir()
     (tmp_path / "notes" / "mine.txt").write_text("keep me")
-    with pytest.raises(InputError, match=r"holds 'mine\.txt' and no store"):
+    with refused("store", "'mine.txt'"):
         bulk.realise(study(), tmp_path / "notes", engine)
-    with pytest.raises(InputError, match="is no store of spectra"):
+    with refused("store"):
         bulk.forget(tmp_path / "notes")
     assert (tmp_path / "notes" / "mine.txt").read_text() == "keep me"
-    with pytest.raises(InputError, match="cannot be made"):
+    with refused("store"):
         bulk.realise(study(), tmp_path / "notes" / "mine.txt" / "store", engine)
-    with pytest.raises(InputError, match="is no store of spectra"):
+    with refused("store"):
         bulk.read(tmp_path / "nowhere")
     bulk.realise(study(20), tmp_path / "s.zarr", engine)
-    with pytest.raises(InputError, match="no array 'star-9/quiescent'"):
+    with refused("scenes", "'star-9/quiescent'"):
         bulk.read(tmp_path / "s.zarr", "star-9/quiescent")
     with pytest.raises(InputError, match=r"frame 7, expected 0 to 0"):
         bulk.realise(study(20, bulk={"frames": [7]}), tmp_path / "t.zarr", engine)
@@ -200,9 +201,9 @@ def test_two_writers_on_one_store(tmp_path: Path, engine: Engine) -> None:
     path = tmp_path / "frames.zarr"
     bulk.realise(study(), path, engine)
     with locked(path, "store"):
-        with pytest.raises(InputError, match="being written by another process"):
+        with refused("lock", value=str(path)):
             bulk.realise(study(), path, engine)
-        with pytest.raises(InputError, match="being written by another process"):
+        with refused("lock", value=str(path)):
             bulk.verify(path)
     assert bulk.verify(path) == []
 
@@ -279,7 +280,7 @@ def test_a_full_disk_is_one_sentence_and_a_resume(
     path = tmp_path / "frames.zarr"
     with monkeypatch.context() as patch:
         full_after(300_000, patch)
-        with pytest.raises(InputError, match=r"cannot be written \(No space left on device\), expected"):
+        with refused("file", "No space left on device"):
             bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
     there = [chunk for chunk in Store.open(path).chunks() if Store.open(path).has(chunk)]
     assert len(there) > 5, "what was written before is kept"
@@ -291,13 +292,13 @@ def test_a_disk_that_is_really_full_or_read_only(small_disk: Path, painted: dict
     path = small_disk / "frames.zarr"
     filler = small_disk / "filler"
     filler.write_bytes(bytes(1_400_000))
-    with pytest.raises(InputError, match="No space left on device"):
+    with refused("file", "No space left on device"):
         bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
     filler.unlink()
     subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
-    with pytest.raises(InputError, match="Read-only file system"):
+    with refused("file", "Read-only file system"):
         bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
-    with pytest.raises(InputError, match="Read-only file system"):
+    with refused("store", "Read-only file system"):
         bulk.realise(study(1000), small_disk / "other.zarr", Painter())  # type: ignore[arg-type]
     subprocess.run(["mount", "-o", "remount,rw", small_disk], check=True)
     bulk.realise(study(1000), path, Painter())  # type: ignore[arg-type]
@@ -368,15 +369,15 @@ def test_the_hdf5_export_of_frames(tmp_path: Path, engine: Engine) -> None:
 
 def test_exports_that_cannot_be(tmp_path: Path, engine: Engine, monkeypatch: pytest.MonkeyPatch) -> None:
     made = bulk.realise(study(50), tmp_path / "s.zarr", engine)
-    with pytest.raises(InputError, match=r"rows 10:60, expected a range within 0:50"):
+    with refused("rows", "0:50"):
         Selection.of(made, rows=(10, 60))
-    with pytest.raises(InputError, match=r"expected a name ending in \.fits, \.h5, \.hdf5"):
+    with refused("file", "h5", "hdf5"):
         export(Selection.of(made), tmp_path / "s.txt")
     (tmp_path / "s.zarr" / "star-1/quiescent/c/0/0").unlink()
-    with pytest.raises(InputError, match=r"star-1/quiescent/c/0/0 is missing"):
+    with refused("store", "star-1/quiescent/c/0/0"):
         Selection.of(made)
     monkeypatch.setattr("mauvecl.store.export.MAX_BYTES", 1000)
-    with pytest.raises(InputError, match="GiB in one file: choose rows"):
+    with refused("rows"):
         Selection.of(made)
 
 
@@ -400,7 +401,7 @@ def test_the_verbs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert run(app, ["verify", "f.zarr", "--redraw", "--rows", "0:10"]).exit_code == 0
     assert run(app, ["export", "f.zarr", "f.h5", "--rows", "0:10"]).exit_code == 0
     written = Path("f.h5").read_bytes()
-    with pytest.raises(InputError, match="exists already, expected another name, or `replace=True`"):
+    with refused("file", "`replace=True`"):
         app(["export", "f.zarr", "f.h5", "--rows", "0:5"], standalone_mode=False)
     assert Path("f.h5").read_bytes() == written
     assert run(app, ["export", "f.zarr", "f.h5", "--rows", "0:5", "--replace"]).exit_code == 0
@@ -409,7 +410,7 @@ def test_the_verbs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert direct.exit_code == 0, direct.output
     assert sorted(p.name for p in tmp_path.iterdir()) == ["f.fits", "f.h5", "f.zarr", "study.toml"]
     Path("f.zarr/star-1/quiescent/c/0/0").unlink()
-    with pytest.raises(InputError, match=r"holds 3 of 4 chunks, expected `resume=True`"):
+    with refused("resume", "3", "4", "`resume=True`"):
         app(["realise", "study.toml", "--output", "f.zarr"], standalone_mode=False)
     app(["realise", "study.toml", "--output", "f.zarr", "--resume"], standalone_mode=False)
     assert run(app, ["verify", "f.zarr"]).exit_code == 0

@@ -144,8 +144,10 @@ class Distribution:
         """Raise InputError if values are not finite."""
         if self.far.undefined:
             raise InputError(
-                f"{what} is infinite or no number in {self.far.undefined} of {self.n} realisations, expected finite "
-                "values of float32"
+                f"{what} is infinite or no number in {self.far.undefined} of {self.n} realisations",
+                "finite values of float32",
+                key="statistic",
+                value=self.far.undefined,
             )
 
     @property
@@ -231,7 +233,7 @@ class Distribution:
     def quantile_interval(self, probability: float) -> Interval:
         """Return a quantile with the 95 % interval of order statistics, rounded outwards to edges of bins."""
         if not 0.0 < probability < 1.0:
-            raise InputError(f"quantile at {probability!r}, expected a probability between 0 and 1")
+            raise InputError.of("probability", probability, "a probability between 0 and 1")
         # The number of values below the quantile is binomial, so it lies between these ranks with 95 %.
         low, high = central_counts(self.n, probability)
         lower, upper, counts = self.bins

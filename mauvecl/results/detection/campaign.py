@@ -118,14 +118,17 @@ def campaign(fap: float, frames: int, stack: int = 1, *, step: int | None = None
 
 def _check(what: str, value: float) -> None:
     if not 0.0 < value < 1.0:
-        raise InputError(f"{what} = {value!r}, expected a probability between 0 and 1")
+        raise InputError.of(what, value, "a probability between 0 and 1")
 
 
 def count_tests(frames: int, stack: int, step: int) -> int:
     """Return the number of stacks in a campaign."""
     if not (1 <= stack <= frames and 1 <= step <= stack):
         raise InputError(
-            f"a campaign of {frames} frames in stacks of {stack}, {step} apart, expected 1 <= step <= stack <= frames"
+            f"a campaign of {frames} frames in stacks of {stack}, {step} apart",
+            "1 <= step <= stack <= frames",
+            key="step",
+            value=(frames, stack, step),
         )
     return (frames - stack) // step + 1
 

@@ -77,7 +77,7 @@ def tail(detection: Detection, fap: float, statistic: str, *, template: int = 0,
         marginalised over, more than 30 quiescent exposures are averaged, or the error remains too large.
     """
     if not SMALLEST_FAP <= fap <= 0.1:
-        raise InputError(f"fap = {fap:g}, expected {SMALLEST_FAP:g} to 0.1 for importance sampling")
+        raise InputError.of("fap", fap, f"{SMALLEST_FAP:g} to 0.1 for importance sampling")
     _check(detection)
     how = _Tilt.towards(fap, detection, statistic, template)
     values, logs = np.empty(0), np.empty(0)
@@ -92,8 +92,11 @@ def tail(detection: Detection, fap: float, statistic: str, *, template: int = 0,
             return Tail(Interval(cut, low, high), fap, error, values.size)
         if goal >= MAX_REALISATIONS:
             raise InputError(
-                f"the threshold of {statistic} at fap = {fap:g} has a relative error of {error:.2g} after {goal} "
-                f"tilted draws, expected {WANTED_ERROR:g}"
+                f"the threshold of {statistic} at fap = {fap:g} has a relative error of {error:.2g} after {goal}"
+                " tilted draws",
+                f"{WANTED_ERROR:g}",
+                key="fap",
+                value=fap,
             )
         goal *= 2
 
@@ -110,8 +113,10 @@ def _check(detection: Detection) -> None:
     for reason, holds in reasons.items():
         if holds:
             raise InputError(
-                f"importance sampling with {reason}, expected stacks of joint draws and at most {MAX_AVERAGED} "
-                "averaged exposures: draw enough realisations"
+                f"importance sampling with {reason}",
+                f"stacks of joint draws and at most {MAX_AVERAGED} averaged exposures: draw enough realisations",
+                key="tails",
+                value=reason,
             )
 
 

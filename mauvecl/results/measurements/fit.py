@@ -124,7 +124,7 @@ class Measurement:
             For an unknown name.
         """
         if name not in self.names:
-            raise InputError(f"quantity {name!r} is not measured, expected one of {', '.join(self.names)}")
+            raise InputError.of("name", name, f"one of {', '.join(self.names)}")
         return self.names.index(name)
 
     def table(self, frame: int = 0) -> Table:
@@ -191,12 +191,15 @@ def fit(
     raw = np.atleast_2d(np.asarray(frames, np.float64))
     if raw.ndim != 2 or not len(raw) or raw.shape[1] != expectation.wavelength_nm.size:
         raise InputError(
-            f"frames of the shape {raw.shape}, expected {expectation.wavelength_nm.size} pixels in each of some"
+            f"frames of the shape {raw.shape}",
+            f"{expectation.wavelength_nm.size} pixels in each of some",
+            key="frames",
+            value=raw.shape,
         )
     if not np.isfinite(raw).all():
-        raise InputError("frames hold undefined values, expected finite numbers")
+        raise InputError("frames hold undefined values", "finite numbers", key="frames")
     if not levels or not all(0.0 < level < 1.0 for level in levels):
-        raise InputError(f"levels = {list(levels)}, expected probabilities between 0 and 1")
+        raise InputError.of("levels", list(levels), "probabilities between 0 and 1")
     excess = raw - expectation.recorded_dn
     nm = expectation.wavelength_nm
     left_out = np.zeros(nm.size, np.bool_)

@@ -144,11 +144,11 @@ class FlareModel:
         chosen = [EmissionLine.named(name) for name in lines]
         for name, value in (("distance_pc", distance_pc), ("radius_rsun", radius_rsun)):
             if value is not None and not 0.0 < value < np.inf:
-                raise InputError(f"{name} = {value:g}, expected a number above 0")
+                raise InputError.of(name, value, "a number above 0")
         for low, high in bands_nm:
             if not GRID_NM[0] <= low < high <= GRID_NM[-1]:
-                raise InputError(
-                    f"band of {low:g}-{high:g} nm, expected ascending wavelengths within {GRID_NM[0]:g}-{GRID_NM[-1]:g}"
+                raise InputError.of(
+                    "bands_nm", (low, high), f"ascending wavelengths within {GRID_NM[0]:g}-{GRID_NM[-1]:g}"
                 )
         kelvin = np.geomspace(*TEMPERATURES_K, NODES)
         edge = BalmerFlare().nodes_nm
@@ -158,7 +158,9 @@ class FlareModel:
         nm = star.wavelength_nm
         light = photons(nm, star.flux_flam, band)
         if not light > 0.0:
-            raise InputError(f"the star has no light in the band {band}, expected some to measure the flare against")
+            raise InputError(
+                f"the star has no light in the band {band}", "some to measure the flare against", key="band", value=band
+            )
         # Flux at the telescope over that of the flare's surface, for an amplitude of one.
         scale = np.array([light / photons(nm, blackbody(nm, float(k)), band) for k in kelvin])
         extra = ([balmer_continuum(grid, electron_temperature_k)] if jump else []) + [
@@ -234,7 +236,7 @@ class FlareModel:
             (spline for spline, one in zip(self.splines, self.derived, strict=True) if one.ratio is not None), None
         )
         if ratio is None and jump != 1.0:
-            raise InputError(f"jump = {jump:g} of a model without a Balmer continuum, expected 1")
+            raise InputError(f"jump = {jump:g} of a model without a Balmer continuum", "1", key="jump", value=jump)
         own = [] if ratio is None else [(jump - 1.0) * amplitude / float(ratio(np.log(temperature_k)))]
         given = np.array([amplitude, *own, *lines], np.float64)
         return self._checked(temperature_k, given)
@@ -242,11 +244,14 @@ class FlareModel:
     def _checked(self, temperature_k: float, amplitudes: Sequence[float] | Float) -> Float:
         low, high = np.exp(self.log_k[[0, -1]])
         if not low * (1 - 1e-9) <= temperature_k <= high * (1 + 1e-9):
-            raise InputError(f"temperature_k = {temperature_k:g}, expected {low:g} to {high:g}")
+            raise InputError.of("temperature_k", temperature_k, f"{low:g} to {high:g}")
         linear = np.asarray(amplitudes, np.float64)
         if linear.shape != (len(self.linear),) or not np.isfinite(linear).all():
             raise InputError(
-                f"amplitudes of the shape {linear.shape}, expected finite ones of {', '.join(self.linear)}"
+                f"amplitudes of the shape {linear.shape}",
+                f"finite ones of {', '.join(self.linear)}",
+                key="amplitudes",
+                value=linear.shape,
             )
         return linear
 

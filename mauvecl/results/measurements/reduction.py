@@ -164,7 +164,7 @@ def usable_variance(
     if left_out is not None:
         used = used & ~left_out
     if not used.any():
-        raise InputError(f"every pixel of {quiet.name} saturates or is left out, expected some that count")
+        raise InputError(f"every pixel of {quiet.name} saturates or is left out", "some that count", key="skipped_nm")
     return np.where(used, variance, 0.0), used
 
 
@@ -172,4 +172,6 @@ def check_distinct(kept: Float, whole: Float, nuisances: Nuisances | None) -> No
     """Raise InputError if marginalisation over nuisances leaves nothing of the S/N^2 of some light."""
     if not (kept > LEAST_KEPT * whole).all():
         unknown = join_names(nuisances.names) if nuisances else "nothing"
-        raise InputError(f"the light of a flare cannot be told from {unknown}, expected fewer unknowns")
+        raise InputError(
+            f"the light of a flare cannot be told from {unknown}", "fewer unknowns", key="nuisances", value=unknown
+        )

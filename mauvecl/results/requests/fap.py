@@ -49,12 +49,13 @@ def countable(fap: float, realisations: int) -> bool:
 def check_fap(fap: float, realisations: int, tails: Tails = "counted") -> None:
     """Raise InputError if `fap` is no probability, or too small for counted tails."""
     if not 0.0 < fap < 1.0:
-        raise InputError(f"fap = {fap!r}, expected a probability between 0 and 1")
+        raise InputError.of("fap", fap, "a probability between 0 and 1")
     if tails not in ("counted", "sampled"):
-        raise InputError(f"tails = {tails!r}, expected 'counted' or 'sampled'")
+        raise InputError.of("tails", tails, "'counted' or 'sampled'")
     if tails == "counted" and not countable(fap, realisations):
         raise InputError(
-            f"fap = {fap:g} leaves {fap * realisations:.3g} of {realisations} realisations beyond the threshold, "
-            f"expected at least {MIN_IN_TAIL}: ask for {math.ceil(MIN_IN_TAIL / fap)} realisations, or for "
-            "`tails='sampled'`"
+            f"fap = {fap:g} leaves {fap * realisations:.3g} of {realisations} realisations beyond the threshold",
+            f"at least {MIN_IN_TAIL}: ask for {math.ceil(MIN_IN_TAIL / fap)} realisations, or for `tails='sampled'`",
+            key="fap",
+            value=fap,
         )

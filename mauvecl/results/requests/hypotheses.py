@@ -60,9 +60,11 @@ class Hypotheses:
         self.setting = Setting(self.quiet, self.scene.used, self.scene.comparison, self.flares, self.nuisances, drawn)
         shaped = next((name for name, one in self._chosen.items() if one.shaped), None)
         if shaped is not None and not self.flares:
-            raise InputError(f"no flare given, expected at least one for the statistic {shaped!r}")
+            raise InputError("no flare given", f"at least one for the statistic {shaped!r}", key="flares", value=shaped)
         if not self.scene.used.any():
-            raise InputError(f"every pixel of {self.quiet.name} is saturated, expected a fainter star")
+            raise InputError(
+                f"every pixel of {self.quiet.name} is saturated", "a fainter star", key="quiet", value=self.quiet.name
+            )
         for one in self._chosen.values():
             one.check(self.setting)
         if "matched" in self._chosen:
@@ -77,7 +79,7 @@ class Hypotheses:
     def statistic(self, name: str) -> Statistic:
         """Return a statistic by name; raises InputError if it was not requested."""
         if name not in self._chosen:
-            raise InputError(f"statistic {name!r} was not simulated, expected one of {', '.join(self.statistics)}")
+            raise InputError.of("statistic", name, f"one of {', '.join(self.statistics)}")
         return self._chosen[name]
 
     def shape(self, statistic: str, template: int = 0) -> Expectation | None:
@@ -163,7 +165,7 @@ class Hypotheses:
         if self.statistic(statistic).shaped and flare is None:
             flare = template
         if flare is not None and not 0 <= flare < len(self.flares):
-            raise InputError(f"flare = {flare}, expected 0 to {len(self.flares) - 1}")
+            raise InputError.of("flare", flare, f"0 to {len(self.flares) - 1}")
 
 
 def fall_between(null: Form, flare: Form) -> float:
@@ -176,6 +178,8 @@ def check_shape(quiet: Expectation, flare: Expectation, used: NDArray[np.bool_],
     """Raise InputError if a flare changes no used pixel, since it cannot be a template."""
     if not (flare.recorded_light_dn != quiet.recorded_light_dn)[used].any():
         raise InputError(
-            f"flare {number + 1} of {quiet.name} changes no pixel that counts, expected an amplitude above 0 for the "
-            "statistic 'matched', which looks for its shape"
+            f"flare {number + 1} of {quiet.name} changes no pixel that counts",
+            "an amplitude above 0 for the statistic 'matched', which looks for its shape",
+            key="amplitude",
+            value=number + 1,
         )

@@ -47,7 +47,10 @@ def expectation_of(what: str, given: Any) -> Expectation:
     if not isinstance(given, Expectation):
         kind = type(given).__name__
         raise InputError(
-            f"{what} is of the type {kind}, expected an Expectation, as `expect(source, instrument)` makes"
+            f"{what} is of the type {kind}",
+            "an Expectation, as `expect(source, instrument)` makes",
+            key=what,
+            value=given,
         )
     return given
 

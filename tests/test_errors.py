@@ -1,0 +1,59 @@
+"""Sentences of bad input, one for each kind of error; other tests read key, value and expected."""
+
+from __future__ import annotations
+
+import pickle
+
+import astropy.units as u
+import numpy as np
+import pytest
+
+from mauvecl import Instrument, Source, Study
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.quantities import numbers
+
+
+def test_one_value_is_told_with_its_key_and_unit() -> None:
+    error = InputError.of("flare amplitude", -1.0, "at least 0", unit="s", where="a.toml")
+    assert str(error) == "a.toml: flare amplitude = -1.0 s, expected at least 0"
+    assert (error.key, error.value, error.expected) == ("flare_amplitude", -1.0, "at least 0")
+
+
+@pytest.mark.parametrize(
+    ("value", "shown"),
+    [
+        ("a\nb", r"'a\nb'"),
+        (np.float64(2.5), "2.5"),
+        (3 * u.m, "3.0 m"),
+        ([1, 2], "[1, 2]"),
+        ("x" * 500, "'" + "x" * 56 + "..." + "x" * 19 + "'"),
+    ],
+)
+def test_values_are_shown_on_one_short_line(value: object, shown: str) -> None:
+    assert str(InputError.of("key", value, "another")) == f"key = {shown}, expected another"
+
+
+def test_a_place_is_put_before_the_sentence_and_processes_pass_errors_on() -> None:
+    error = InputError("no light", "some", key="flux", value=3).within("star.txt")
+    for one in (error, pickle.loads(pickle.dumps(error))):
+        assert str(one) == "star.txt: no light, expected some"
+        assert (one.key, one.value, one.expected) == ("flux", 3, "some")
+
+
+def test_sentences_of_each_kind() -> None:
+    for call, sentence in (
+        (lambda: Source.from_library("G2V").at_magnitude(99.0), "magnitude = 99.0, expected -30 to 40"),
+        (
+            lambda: numbers("wavelengths", [1.0, -1.0], "nm", low=0.0),
+            "wavelengths = -1.0 nm, expected nm of at least 0",
+        ),
+        (lambda: Study().with_settings(["run.fap=3"]), "setting: run.fap = 3, expected less than 1"),
+        (
+            lambda: Instrument.load("mauve").with_(temprature_c=1),
+            "mauve: unknown key 'temprature_c', did you mean 'temperature_c'?",
+        ),
+        (lambda: Source.read("none.txt"), "spectrum file 'none.txt' does not exist, expected a file"),
+    ):
+        with pytest.raises(InputError) as caught:
+            call()
+        assert str(caught.value) == sentence
