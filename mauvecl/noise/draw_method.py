@@ -58,8 +58,7 @@ def choose_method(scenarios: Sequence[Expectation], drawing: Drawing, factors: F
         raise InputError(
             f"{modulations[0][0]} varies within a run, and the noise of {quiet.name} cannot be drawn jointly",
             "Gaussian noise of 1.5 Poisson counts and more in each pixel, more where counts are few, or none such",
-            key="temperature",
-            value=modulations[0][0],
+            key=modulations[0][0],
         )
     return DrawMethod(
         frames=frames,

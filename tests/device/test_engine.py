@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from answers import same_counts
 from marks import long_but
+from refusals import refused
 from scenes import instrument, star
 from scipy import stats
 
@@ -29,7 +30,6 @@ from mauvecl.results.counts.tally import Tally
 from mauvecl.results.requests.channels import ChannelPlan, plan_channels
 from mauvecl.results.requests.requests import DetectRequest
 from mauvecl.results.snr import elements, observers
-from mauvecl.schema.errors import InputError
 from mauvecl.statistics.registry import STATISTICS
 
 RAYS = CosmicRays(rate_per_cm2_s=200.0)
@@ -242,7 +242,7 @@ def test_saturating_star_is_drawn_frame_by_frame(engine: Engine) -> None:
     assert prepare([bright]).frames
     raw = engine.realise(bright, count=200, seed=1)
     assert raw.max() == 2 * bright.highest_dn == 2 * 59_578
-    with pytest.raises(InputError, match="stacked"):
+    with refused("mode"):
         prepare([bright], mode="stacked")
     (faint, *_), _ = case("stack")
     assert not prepare([faint]).frames
@@ -434,25 +434,25 @@ def test_progress_is_reported_and_may_stop(engine: Engine) -> None:
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
-        ({"count": 0, "seed": 1}, "realisations = 0"),
-        ({"count": 1, "seed": -1}, "seed = -1"),
-        ({"count": 1, "seed": 2**64}, "seed = 18446744073709551616"),
-        ({"count": 1, "seed": 1, "start": -1}, "start = -1"),
-        ({"count": 1, "seed": 1, "mode": "fast"}, "mode = 'fast'"),
+        ({"count": 0, "seed": 1}, ("realisations", "0")),
+        ({"count": 1, "seed": -1}, ("seed", "-1")),
+        ({"count": 1, "seed": 2**64}, ("seed", "18446744073709551616")),
+        ({"count": 1, "seed": 1, "start": -1}, ("start", "-1")),
+        ({"count": 1, "seed": 1, "mode": "fast"}, ("mode", "'fast'")),
     ],
 )
-def test_impossible_requests_are_refused(engine: Engine, options: dict, sentence: str) -> None:
+def test_impossible_requests_are_refused(engine: Engine, options: dict, sentence: tuple[str, ...]) -> None:
     (quiet, *_), _ = case("stack")
-    with pytest.raises(InputError, match=sentence):
+    with refused(*sentence):
         engine.realise(quiet, **options)
 
 
 def test_statistics_and_scenarios_are_checked(engine: Engine) -> None:
     (quiet, *flares), _ = case("stack")
-    with pytest.raises(InputError, match="'chi3' is unknown"):
+    with refused("statistic", "'chi3'"):
         engine.detect(quiet, flares, realisations=10, seed=1, statistics=("chi3",))
-    with pytest.raises(InputError, match="no flare"):
+    with refused("flares"):
         engine.detect(quiet, [], realisations=10, seed=1, statistics=("matched",))
     (other, *_), _ = case("one frame")
-    with pytest.raises(InputError, match="n_frames of"):
+    with refused("n_frames"):
         engine.detect(quiet, [other], realisations=10, seed=1)

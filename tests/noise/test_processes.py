@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from refusals import refused
 from scenes import instrument, star
 from scipy import stats
 
@@ -14,7 +15,6 @@ from mauvecl.noise import layout, reference
 from mauvecl.noise.components import components
 from mauvecl.noise.processes import NONE, CosmicRays, Normal, Processes, Uniform
 from mauvecl.noise.scene import prepare
-from mauvecl.schema.errors import InputError
 
 N = 20_000
 
@@ -144,29 +144,29 @@ def test_process_does_not_change_draws_of_others(engine: Engine) -> None:
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [
-        (lambda: Uniform(2.0, 1.0), "from 2 to 1, expected low <= high"),
-        (lambda: Normal(0.0, -1.0, 0.0, 1.0), "expected sd > 0"),
-        (lambda: CosmicRays(rate_per_cm2_s=-1.0), "cosmic rays of -1 per cm"),
-        (lambda: CosmicRays(electrons=(900.0, 100.0)), "900 to 100 electrons"),
-        (lambda: CosmicRays(electrons=(1, 3), weights=(1.0,)), "1 weights .* expected 3"),
-        (lambda: prepare(star(), processes=Processes(jitter=Uniform(0.0, 0.9))), "prior of jitter runs from 0 to 0.9"),
-        (lambda: prepare(star(), processes=Processes(light_loss=Uniform(-0.1, 0.5))), "prior of light_loss"),
+        (lambda: Uniform(2.0, 1.0), ("low", "2")),
+        (lambda: Normal(0.0, -1.0, 0.0, 1.0), ("sd", "0")),
+        (lambda: CosmicRays(rate_per_cm2_s=-1.0), ("rate_per_cm2_s", "-1")),
+        (lambda: CosmicRays(electrons=(900.0, 100.0)), ("electrons", "900", "100")),
+        (lambda: CosmicRays(electrons=(1, 3), weights=(1.0,)), ("weights", "1", "3")),
+        (lambda: prepare(star(), processes=Processes(jitter=Uniform(0.0, 0.9))), ("jitter", "0", "0.9")),
+        (lambda: prepare(star(), processes=Processes(light_loss=Uniform(-0.1, 0.5))), ("light_loss",)),
         (
             lambda: prepare(
                 star(payload=instrument(read_noise_dn=0.1), exposure=5.0), processes=Processes(jitter=Uniform(0, 0.05))
             ),
-            "jitter varies within a run, and the noise of G2V cannot be drawn jointly",
+            ("jitter", "G2V"),
         ),
         (
             lambda: prepare(
                 star(magnitude=3.0, exposure=80_000.0), mode="stacked", processes=Processes(qe_scale=Uniform(0.5, 1.5))
             ),
-            r"the priors move pixel \d+ of G2V",
+            ("priors", "G2V"),
         ),
     ],
 )
-def test_invalid_process_raises(make, sentence: str) -> None:
-    with pytest.raises(InputError, match=sentence):
+def test_invalid_process_raises(make, sentence: tuple[str, ...]) -> None:
+    with refused(*sentence):
         make()
 
 

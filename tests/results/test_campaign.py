@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from refusals import refused
 from scipy import stats
 
 from mauvecl.answers.detection.detect import detect
 from mauvecl.device.engine import Engine
 from mauvecl.results.detection.campaign import campaign, per_test
-from mauvecl.schema.errors import InputError
 from mauvecl.study.study import Study
 
 
@@ -54,10 +54,11 @@ def test_long_campaigns_are_joined_from_stretches() -> None:
 
 
 @pytest.mark.parametrize(
-    ("fap", "frames", "stack", "step"), [(0.0, 10, 1, 1), (0.1, 10, 20, 1), (0.1, 10, 2, 3), (0.1, 10, 2, 0)]
+    ("fap", "frames", "stack", "step", "key"),
+    [(0.0, 10, 1, 1, "fap"), (0.1, 10, 20, 1, "step"), (0.1, 10, 2, 3, "step"), (0.1, 10, 2, 0, "step")],
 )
-def test_impossible_campaigns_are_refused(fap: float, frames: int, stack: int, step: int) -> None:
-    with pytest.raises(InputError, match="expected"):
+def test_impossible_campaigns_raise(fap: float, frames: int, stack: int, step: int, key: str) -> None:
+    with refused(key):
         campaign(fap, frames, stack, step=step)
 
 
@@ -89,16 +90,16 @@ def test_overlapping_stacks_may_have_more_each() -> None:
 @pytest.mark.parametrize(
     ("campaign_asked", "sentence"),
     [
-        ({"fap": 0.01}, "campaign.fap is given without campaign.frames"),
-        ({"frames": 10, "fap": 2.0}, "campaign.fap = 2"),
-        ({"frames": 17_280, "alarms": 1e5}, "campaign.alarms = 100000 of 1728 tests"),
+        ({"fap": 0.01}, ("campaign",)),
+        ({"frames": 10, "fap": 2.0}, ("campaign.fap", "2")),
+        ({"frames": 17_280, "alarms": 1e5}, ("campaign.alarms", "100000", "1728")),
     ],
 )
-def test_wishes_that_cannot_be(campaign_asked: dict, sentence: str, engine: Engine) -> None:
+def test_wishes_that_cannot_be(campaign_asked: dict, sentence: tuple[str, ...], engine: Engine) -> None:
     def ask() -> None:
         detect(Study.build({"campaign": campaign_asked}, "test"), engine)
 
-    with pytest.raises(InputError, match=sentence):
+    with refused(*sentence):
         ask()
 
 

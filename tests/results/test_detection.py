@@ -6,6 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from refusals import refused
 from scenes import instrument, star
 from scipy import stats
 
@@ -17,7 +18,6 @@ from mauvecl.results import numpy_kernels
 from mauvecl.results.counts.tally import Distribution, Grid, Tally
 from mauvecl.results.detection.detection import Detection
 from mauvecl.results.detection.roc import Roc
-from mauvecl.schema.errors import InputError
 from mauvecl.statistics.linear import Linear, Matched
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.statistics.statistic import Setting
@@ -171,11 +171,11 @@ def test_tail_samples_are_the_extremes_and_can_be_drawn_again(engine: Engine) ->
 
 @pytest.mark.long
 def test_rare_tails_are_refused_not_extrapolated(found: Detection) -> None:
-    with pytest.raises(InputError, match="ask for 10000000 realisations"):
+    with refused("fap", "10000000"):
         found.threshold(1e-5)
     found.threshold(1e-4)
     for fap in (0.0, 1.0, -1.0, np.nan):
-        with pytest.raises(InputError, match="fap = "):
+        with refused("fap"):
             found.threshold(fap)
 
 
@@ -194,9 +194,9 @@ def test_table(found: Detection) -> None:
 def test_unsimulated_statistics_are_refused(engine: Engine) -> None:
     quiet, flare = star(amplitudes=(0.24,), payload=instrument(part=True))
     found = engine.detect(quiet, [flare], realisations=1000, seed=1, statistics=("matched",))
-    with pytest.raises(InputError, match="'chi2' was not simulated"):
+    with refused("statistic", "'chi2'"):
         found.threshold(0.5, "chi2")
-    with pytest.raises(InputError, match="flare = 1"):
+    with refused("flare", "1"):
         found.distribution("matched", 1)
 
 
@@ -212,7 +212,7 @@ def test_saturated_pixels_are_left_out(engine: Engine) -> None:
     mean = found.distribution("chi2").mean
     assert abs(mean - dof) < 5 * np.sqrt(2 * dof / 100_000)
     bright, _ = star(magnitude=-3.0, amplitudes=(0.05,), payload=payload)
-    with pytest.raises(InputError, match="every pixel of G2V is saturated"):
+    with refused("quiet", "G2V"):
         engine.detect(bright, [bright], realisations=10, seed=1)
 
 
@@ -252,22 +252,24 @@ def test_a_statistic_of_ones_own(engine: Engine) -> None:
 @pytest.mark.parametrize(
     ("weights", "name", "sentence"),
     [
-        (np.ones(5), "mine", r"has 5 weights, expected one for each of the \d+ pixels"),
-        (np.zeros(198), "mine", "not all zero"),
-        (np.full(198, np.nan), "mine", "198 of them no numbers"),
-        (np.ones((2, 99)), "mine", r"the shape \(2, 99\)"),
-        (np.ones(198), "chi2", "one of mauvecl's own"),
+        (np.ones(5), "mine", ("weights", "5")),
+        (np.zeros(198), "mine", ("weights",)),
+        (np.full(198, np.nan), "mine", ("weights", "198")),
+        (np.ones((2, 99)), "mine", ("weights", "2", "99")),
+        (np.ones(198), "chi2", ("statistics",)),
     ],
 )
-def test_impossible_weights_are_refused(engine: Engine, weights: np.ndarray, name: str, sentence: str) -> None:
+def test_impossible_weights_are_refused(
+    engine: Engine, weights: np.ndarray, name: str, sentence: tuple[str, ...]
+) -> None:
     quiet, flare = star(amplitudes=(0.1,), payload=instrument(part=True))
-    with pytest.raises(InputError, match=sentence):
+    with refused(*sentence):
         engine.detect(quiet, [flare], realisations=10, seed=1, statistics=(Linear(name, weights),))
 
 
 def test_uv_excess_needs_uv(engine: Engine) -> None:
     quiet, flare = star(amplitudes=(0.1,), payload=instrument(output_min_nm=400.0, output_max_nm=500.0))
-    with pytest.raises(InputError, match="200-360 nm"):
+    with refused("statistic", "200-360"):
         engine.detect(quiet, [flare], realisations=10, seed=1, statistics=("uv_excess",))
 
 

@@ -11,8 +11,9 @@ from typing import Any
 import numpy as np
 import pytest
 import scipy
+from refusals import refused
 
-from mauvecl import Engine, Expectation, InputError, Instrument, Nuisances, Source, expect
+from mauvecl import Engine, Expectation, Instrument, Nuisances, Source, expect
 from mauvecl.host.stars.flare_spectra import LINES_NM, BalmerFlare
 from mauvecl.results.measurements.fit import fit, fit_sums, forecast
 from mauvecl.results.measurements.model import FlareModel
@@ -285,20 +286,20 @@ def test_one_frame_is_fitted_alike_in_any_company() -> None:
 @pytest.mark.parametrize(
     ("call", "text"),
     [
-        (lambda: fit(np.zeros((2, 7)), quiet(), model()), r"shape \(2, 7\)"),
-        (lambda: fit(np.zeros((0, quiet().wavelength_nm.size)), quiet(), model()), r"shape \(0, "),
-        (lambda: fit(np.full(quiet().wavelength_nm.size, np.nan), quiet(), model()), "undefined"),
-        (lambda: fit(quiet().recorded_dn, quiet(), model(), levels=(95.0,)), "levels"),
-        (lambda: FlareModel.of(star(), MAUVE, quiet(), lines=("X",)), "'X' is unknown"),
-        (lambda: FlareModel.of(star(), MAUVE, quiet(), distance_pc=-1.0), "distance_pc = -1"),
-        (lambda: FlareModel.of(star(), MAUVE, quiet(), bands_nm=((300.0, 200.0),)), "300-200"),
-        (lambda: model().counts(100.0, [0.1]), "temperature_k = 100"),
-        (lambda: model().counts(9000.0, [0.1, 0.2]), "amplitudes of the shape"),
-        (lambda: model().amplitudes(9000.0, 0.1, jump=2.0), "without a Balmer continuum"),
+        (lambda: fit(np.zeros((2, 7)), quiet(), model()), ("frames", "2", "7")),
+        (lambda: fit(np.zeros((0, quiet().wavelength_nm.size)), quiet(), model()), ("frames", "0")),
+        (lambda: fit(np.full(quiet().wavelength_nm.size, np.nan), quiet(), model()), ("frames",)),
+        (lambda: fit(quiet().recorded_dn, quiet(), model(), levels=(95.0,)), ("levels",)),
+        (lambda: FlareModel.of(star(), MAUVE, quiet(), lines=("X",)), ("lines", "'X'")),
+        (lambda: FlareModel.of(star(), MAUVE, quiet(), distance_pc=-1.0), ("distance_pc", "-1")),
+        (lambda: FlareModel.of(star(), MAUVE, quiet(), bands_nm=((300.0, 200.0),)), ("bands_nm",)),
+        (lambda: model().counts(100.0, [0.1]), ("temperature_k", "100")),
+        (lambda: model().counts(9000.0, [0.1, 0.2]), ("amplitudes",)),
+        (lambda: model().amplitudes(9000.0, 0.1, jump=2.0), ("jump",)),
     ],
 )
-def test_what_cannot_be_is_named(call: Any, text: str) -> None:
-    with pytest.raises(InputError, match=text):
+def test_what_cannot_be_is_named(call: Any, text: tuple[str, ...]) -> None:
+    with refused(*text):
         call()
 
 

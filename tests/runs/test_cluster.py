@@ -22,6 +22,7 @@ import numpy as np
 import psutil
 import pytest
 from answers import N, same, same_snr, small
+from refusals import refused
 from scenes import flaring_stares, instrument, star
 from typer.testing import CliRunner
 
@@ -350,12 +351,12 @@ def test_no_cluster_is_a_sentence(
 
 def test_without_dask(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
-    with pytest.raises(InputError, match=r"Dask is missing.*pip install 'mauvecl\[cluster\]'"):
+    with refused("dask", "'mauvecl[cluster]'"):
         DaskWorkers("local:2")
 
 
 def test_without_certificates(monkeypatch: pytest.MonkeyPatch) -> None:
     """No cluster rather than an open one."""
     monkeypatch.setitem(sys.modules, "cryptography", None)
-    with pytest.raises(InputError, match=r"cryptography is missing.*pip install 'mauvecl\[cluster\]'"):
+    with refused("cryptography", "'mauvecl[cluster]'"):
         DaskWorkers("local:2")
