@@ -16,8 +16,8 @@ from scipy import special
 
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.quantities import number
-from mauvecl.schema.ranges import EXPOSURES, check_exposure
+from mauvecl.schema.fields import checked
+from mauvecl.schema.physical import Exposure
 from mauvecl.schema.tables import Column, table_of
 
 from ..drawable import Drawable
@@ -443,7 +443,7 @@ def expect(
     (8.21, 48.5)
     """
     source, instrument, sky = _source(source), _instrument(instrument), _sky(sky)
-    asked_s = _seconds(exposure)
+    asked_s = checked(Exposure, "exposure", exposure)
     # The margin makes 0.1 + 0.2 s three frames of 0.1 s despite rounding.
     n_frames = max(1, int(np.ceil(asked_s / instrument.frame_s * (1 - 1e-12))))
     if n_frames > MAX_FRAMES:
@@ -567,12 +567,6 @@ def _sky(given: Any) -> Sky:
     if isinstance(given, Sky):
         return given
     return Sky.of_brightness(DEFAULT_SKY if given is None else given)
-
-
-def _seconds(exposure: Any) -> float:
-    seconds = number("exposure", exposure, "s", expected=EXPOSURES)
-    check_exposure(seconds)
-    return seconds
 
 
 def _elements(instrument: Instrument) -> tuple[NDArray[np.int32], Float]:

@@ -13,6 +13,7 @@ from pydantic import BeforeValidator, ConfigDict, Field, ValidationError, model_
 
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import DetectorTemperature
 from mauvecl.schema.quantities import count, is_quantity, number, numbers, unit_of
 from mauvecl.schema.records import Record, input_error
 
@@ -88,7 +89,7 @@ class Instrument(Record):
     conversion_uv_per_electron, adc_range_v, saturation_v : float
     adc_bits : int
     temperature_c : float
-        Temperature of the detector, -40 to 60.
+        Temperature of the detector, -40 to 65.
     dark_scale_dn_per_s, dark_slope_per_c : float
         Dark current is dark_scale_dn_per_s * exp(dark_slope_per_c * temperature_c).
     dark_unit : {"DN", "electrons"}
@@ -145,7 +146,7 @@ class Instrument(Record):
     adc_bits: int = Field(ge=1, le=24)
     adc_range_v: Positive
     saturation_v: Positive
-    temperature_c: float = Field(ge=-40, le=60)
+    temperature_c: DetectorTemperature
     dark_scale_dn_per_s: NotNegative
     dark_slope_per_c: float = Field(ge=-1, le=1)
     dark_unit: Literal["DN", "electrons"]

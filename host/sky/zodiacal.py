@@ -13,6 +13,8 @@ from numpy.typing import NDArray
 
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import checked
+from mauvecl.schema.physical import SkyBrightness
 from mauvecl.schema.quantities import number
 
 from .helioecliptic import HelioEcliptic, helioecliptic
@@ -24,8 +26,6 @@ if TYPE_CHECKING:
     from ..stars.source import Source
 
 Lookup = Literal["bilinear", "nearest"]
-#: Accepted surface brightness, V mag arcsec^-2; any sky seen from orbit lies well within.
-RANGE_MAG_ARCSEC2 = (5.0, 35.0)
 
 
 @public
@@ -64,9 +64,7 @@ class Sky:
         brightness : Quantity or float
             V mag arcsec^-2, 5 to 35.
         """
-        low, high = RANGE_MAG_ARCSEC2
-        expected = f"a finite number of mag/arcsec2, {low:g} to {high:g}"
-        value = number("sky brightness", brightness, "mag / arcsec2", low=low, high=high, expected=expected)
+        value = checked(SkyBrightness, "sky brightness", brightness)
         return cls(value, f"fixed V = {value:.2f} mag/arcsec2")
 
     @classmethod

@@ -11,7 +11,8 @@ from astropy.constants import c, h, k_B
 from numpy.typing import NDArray
 
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.ranges import check_amplitude, check_temperature
+from mauvecl.schema.fields import checked
+from mauvecl.schema.physical import Amplitude, Temperature
 
 from ..array_cache import array_cache
 from .bands import ANGSTROM, photons
@@ -66,7 +67,7 @@ def with_flare(
     photosphere_temperature_k : float, optional
         Temperature of the photosphere, which ``replaces`` requires.
     """
-    check_amplitude(amplitude)
+    checked(Amplitude, "flare amplitude", amplitude)
     light = _photons_in_band(wavelength_nm, flux_flam, spectrum, band, geometry, photosphere_temperature_k)
     grid, quiescent = _on_grid(wavelength_nm, flux_flam, spectrum)
     body = spectrum.flux(grid)
@@ -185,7 +186,7 @@ def _photons_in_band(
             key="flare_geometry",
             value=geometry,
         )
-    check_temperature("photosphere temperature", photosphere_temperature_k)
+    checked(Temperature, "photosphere temperature", photosphere_temperature_k)
     ratio = hot / photons(wavelength_nm, blackbody(wavelength_nm, photosphere_temperature_k), band)
     if ratio <= 1.0:
         raise InputError(

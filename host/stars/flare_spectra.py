@@ -17,8 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import checked
+from mauvecl.schema.physical import AreaRatio, BalmerJump, Temperature
 from mauvecl.schema.quantities import number
-from mauvecl.schema.ranges import check_temperature
 
 from ..content import ContentEquality
 from ..spectra.ends import check_points
@@ -35,7 +36,6 @@ SUN_CM, PARSEC_CM = 6.957e10, 3.0856775814913674e18
 #: Balmer edge, nm, and electron temperature of the recombination below it, K (assumed: optically thin hydrogen).
 BALMER_EDGE_NM, ELECTRON_TEMPERATURE_K = 364.6, 10_000.0
 #: Largest Balmer jump ratio; observed ones are 1 to 4 (Kowalski 2024).
-LARGEST_JUMP = 100.0
 #: Wavelengths closer to each other than this are one, nm.
 SAME_NM = 1e-6
 #: Steps across the Balmer edge are this wide, nm.
@@ -128,7 +128,7 @@ class Blackbody(FlareSpectrum):
     temperature_k: float = 10_000.0
 
     def __post_init__(self) -> None:
-        check_temperature("flare temperature", self.temperature_k)
+        checked(Temperature, "flare temperature", self.temperature_k)
 
     def flux(self, wavelength_nm: Float) -> Float:
         """Return the surface flux pi B, erg s-1 cm-2 A-1."""
@@ -160,9 +160,9 @@ class TwoBlackbodies(FlareSpectrum):
     second_area: float = 0.05
 
     def __post_init__(self) -> None:
-        check_temperature("flare temperature", self.temperature_k)
-        check_temperature("second flare temperature", self.second_temperature_k)
-        number("area of the second blackbody over that of the first", self.second_area, low=0.0, high=1e6)
+        checked(Temperature, "flare temperature", self.temperature_k)
+        checked(Temperature, "second flare temperature", self.second_temperature_k)
+        checked(AreaRatio, "area of the second blackbody over that of the first", self.second_area)
 
     def flux(self, wavelength_nm: Float) -> Float:
         """Return the surface flux of the first blackbody and its share of the second, erg s-1 cm-2 A-1."""
@@ -196,9 +196,9 @@ class BalmerFlare(FlareSpectrum):
     electron_temperature_k: float = ELECTRON_TEMPERATURE_K
 
     def __post_init__(self) -> None:
-        check_temperature("flare temperature", self.temperature_k)
-        number("Balmer jump ratio", self.jump, low=1.0, high=LARGEST_JUMP)
-        check_temperature("electron temperature", self.electron_temperature_k)
+        checked(Temperature, "flare temperature", self.temperature_k)
+        checked(BalmerJump, "Balmer jump ratio", self.jump)
+        checked(Temperature, "electron temperature", self.electron_temperature_k)
 
     def flux(self, wavelength_nm: Float) -> Float:
         """Return the surface flux of blackbody and Balmer continuum, erg s-1 cm-2 A-1."""
@@ -515,7 +515,7 @@ class ObservedFlare(ContentEquality, FlareSpectrum):
 
 def _continued(name: str, nm: Float, flux: Float, kelvin: float) -> tuple[Float, Float]:
     """Continue a spectrum at both ends by a blackbody that has the mean flux of the last 20 nm there."""
-    check_temperature("temperature that continues a flare spectrum", kelvin)
+    checked(Temperature, "temperature that continues a flare spectrum", kelvin)
     low, high = CONTINUED_NM
     steps = np.log(CONTINUED_RATIO)
     for first in (True, False):

@@ -14,8 +14,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import checked
+from mauvecl.schema.physical import BinWidth, Magnitude, Reddening
 from mauvecl.schema.quantities import number
-from mauvecl.schema.ranges import check_magnitude
 
 from ...drawable import Drawable
 from ..content import ContentEquality
@@ -228,7 +229,7 @@ class Source(Drawable, ContentEquality):
         width_nm : Quantity or float
             Width of the bins, nm, 0.01 to 50.
         """
-        width = number("bin", width_nm, "nm", low=0.01, high=50.0)
+        width = checked(BinWidth, "bin", width_nm)
         first, last = self.wavelength_nm[0], self.wavelength_nm[-1]
         edges = np.append(np.arange(first, last - width / 2, width), last)
         flux = means(self.wavelength_nm, self.flux_flam, edges)
@@ -380,8 +381,7 @@ class Source(Drawable, ContentEquality):
         system : {"catalogue", "vega", "ab"}
             See `magnitude`.
         """
-        magnitude = number("magnitude", magnitude, "mag")
-        check_magnitude(magnitude)
+        magnitude = checked(Magnitude, "magnitude", magnitude)
         factor = 10.0 ** (-0.4 * (magnitude - self.magnitude(band, system)))
         scaled = self._with_flux(self.flux_flam * factor, f"scaled to {bands.band(band).name} = {magnitude:g}")
         return replace(scaled, scale=bands.scale(band, system), unscaled="")
@@ -458,7 +458,7 @@ class Source(Drawable, ContentEquality):
             ) from error
         import astropy.units as u
 
-        ebv, rv = number("E(B-V)", ebv, "mag", low=0.0, high=10.0), number("R_V", rv)
+        ebv, rv = checked(Reddening, "E(B-V)", ebv), number("R_V", rv)
         if law not in ("G23", "F19", "CCM89"):
             raise InputError.of("law", law, "'G23', 'F19' or 'CCM89'")
         try:

@@ -42,7 +42,6 @@ def question_values(study: Study, *, detects: bool) -> None:
     from mauvecl.host.instrument.paths import instrument_path
     from mauvecl.host.stars.band_names import known_band
     from mauvecl.results.requests.fap import check_fap
-    from mauvecl.schema.ranges import check_amplitude, check_exposure, check_magnitude, check_temperature
     from mauvecl.statistics.names import check_statistic
     from mauvecl.study.star_names import check_spectrum
 
@@ -51,18 +50,12 @@ def question_values(study: Study, *, detects: bool) -> None:
             check_spectrum(star.library)
         elif star.file is not None:
             _check_file(star.file)
-        if star.magnitude is not None:
-            check_magnitude(star.magnitude)
         known_band(star.band)
     instrument_path(study.observation.instrument, Path())
-    check_exposure(study.observation.exposure_s)
     if not detects:
         return
-    flare, run = study.flare, study.run
-    for amplitude in flare.amplitudes:
-        check_amplitude(amplitude)
-    check_temperature("flare temperature", flare.temperature_k)
-    known_band(flare.band)
+    run = study.run
+    known_band(study.flare.band)
     for name in run.statistics:
         check_statistic(name)
     check_fap(run.fap, run.realisations, run.tails)

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, get_args
 
 from mauvecl.noise.priors import Normal, Prior, Uniform
+from mauvecl.schema.fields import range_of
+from mauvecl.schema.physical import DetectorTemperature
 
 if TYPE_CHECKING:
     import numpy as np
@@ -207,8 +209,8 @@ PROCESSES = _by_name(
         name="detector_temperature",
         of="dark",
         stream=5,
-        low=-100.0,
-        high=100.0,
+        low=range_of(DetectorTemperature).low,
+        high=range_of(DetectorTemperature).high,
         change=_dark_follows,
         expected="temperature_c",
         # Relative to the nominal temperature; see `default_processes`.

@@ -64,10 +64,10 @@ def detection_map(plt: Any, answer: MapResult) -> Any:
                 getattr(axis, f"set_{which}ticks")(place, values)
             elif described.log:
                 getattr(axis, f"set_{which}scale")("log")
-        axis.set_xlabel(QUANTITIES[question.x.quantity].axis)
+        axis.set_xlabel(QUANTITIES[question.x.quantity].label)
         axis.set_title(label(statistic))
         plain_numbers(axis)
-    axes[0][0].set_ylabel(QUANTITIES[question.y.quantity].axis)
+    axes[0][0].set_ylabel(QUANTITIES[question.y.quantity].label)
     figure.colorbar(mesh, ax=list(axes[0]), label="detection probability")
     if lines:
         shown = [plt.Line2D([], [], color="black", linewidth=1.2, linestyle=stroke) for stroke in lines.values()]
@@ -110,7 +110,7 @@ def limits(plt: Any, answer: LimitResult) -> Any:
     axis.axhline(power, color="black", linewidth=0.8, linestyle="--")
     if of != "magnitude":
         axis.set_xscale("log")
-    axis.set(xlabel=QUANTITIES[of].axis, ylabel="detection probability", ylim=(-0.02, 1.02))
+    axis.set(xlabel=QUANTITIES[of].label, ylabel="detection probability", ylim=(-0.02, 1.02))
     plain_numbers(axis)
     exposure = "" if of == "exposure" else f", {answer.study.observation.exposure_s:g}{UNBROKEN}s"
     headline(
@@ -197,7 +197,7 @@ def snr_sweep(plt: Any, answer: SnrAnswer) -> Any:
         if first == "exposure":
             axis.set_xscale("log")
         axis.set_title(f"{wavelength:g} nm")
-        axis.set_xlabel(QUANTITIES[first].axis)
+        axis.set_xlabel(QUANTITIES[first].label)
     # The common scale is set after all panels are drawn.
     axes[0][0].set_ylim(bottom=0.1)
     for axis in axes[0]:

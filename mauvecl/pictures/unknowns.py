@@ -37,7 +37,7 @@ def unknowns(plt: Any, answer: UnknownTable) -> Any:
         for colour, (unknown, cost) in zip(cycle(COLOURS), costs.items(), strict=False):
             axis.plot(relative, power(cost.marginal * relative / amplitude, fap), color=colour, label=unknown)
             axis.plot(relative, power(cost.plain * relative / amplitude, fap), color=colour, linestyle="--")
-        axis.set(xscale="log", xlabel=QUANTITIES["amplitude"].axis, ylim=(-0.02, 1.02), title=star)
+        axis.set(xscale="log", xlabel=QUANTITIES["amplitude"].label, ylim=(-0.02, 1.02), title=star)
         if k == 0:
             axis.set_ylabel("detection probability")
     axis.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), title="solid: marginalised\ndashed: plain")

@@ -1,20 +1,31 @@
-"""Metadata of numbers in annotations: unit and range.
+"""Metadata of fields: unit, range, help, flag and quantity, from which flags, page and reference are generated.
 
 `Annotated[float, Unit("s"), Range(0, 60)]` means the same in a section of a study, which pydantic validates, and in the
-signature of a validated function.
+signature of a validated function. A field of a section states everything about its key in one place:
+
+    exposure_s: Annotated[Exposure, Help("Exposure time"), Flag("--exposure", "-t")] = 50.0
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, get_args
+from functools import cache
+from typing import TYPE_CHECKING, Annotated, Any, TypeVar, get_args, get_origin
 
-from mauvecl.schema.quantities import is_quantity, without_unit, word_of
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.quantities import is_quantity, number, without_unit, word_of
 
 if TYPE_CHECKING:
     from pydantic import GetCoreSchemaHandler
     from pydantic_core import CoreSchema
+
+
+Metadata = TypeVar("Metadata")
+
+#: Units as people write them, where they differ from astropy's notation.
+WRITTEN = {"deg_C": "deg C", "mag / arcsec2": "mag/arcsec2", "solRad": "solar radii", "solMass": "solar masses"}
 
 
 @dataclass(frozen=True)
@@ -22,6 +33,11 @@ class Unit:
     """Unit of a plain number or array, as astropy spells it; Quantities are converted to it."""
 
     name: str
+
+    @property
+    def written(self) -> str:
+        """The unit as people write it."""
+        return WRITTEN.get(self.name, self.name)
 
     def __get_pydantic_core_schema__(self, source: Any, handler: GetCoreSchemaHandler) -> CoreSchema:
         from pydantic_core import core_schema
@@ -63,12 +79,19 @@ class Range:
             raise ValueError(value)
         return value
 
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
+        ends = {
+            "exclusiveMinimum" if self.open_low else "minimum": self.low,
+            "exclusiveMaximum" if self.open_high else "maximum": self.high,
+        }
+        return handler(schema) | {name: end for name, end in ends.items() if math.isfinite(end)}
+
     def words(self, unit: str = "", *, whole: bool = False) -> str:
         """Return what is accepted, for the message of an error."""
         noun = "a whole number" if whole else word_of(unit)
         low, high = (str(end) if whole else f"{end:g}" for end in (self.low, self.high))
         has_low, has_high = math.isfinite(self.low), math.isfinite(self.high)
-        after = f" {unit}" if unit else ""
+        after = f" {WRITTEN.get(unit, unit)}" if unit else ""
         if has_low and has_high and not (self.open_low or self.open_high):
             return f"{noun} from {low} to {high}" if whole else f"{low} to {high}{after}"
         ends = [f"above {low}" if self.open_low else f"of at least {low}"] if has_low else []
@@ -83,3 +106,126 @@ def _or_error(schema: CoreSchema, words: str, **metadata: str) -> CoreSchema:
     return core_schema.custom_error_schema(
         schema, "expected", custom_error_message=f"Input should be {words}", metadata=metadata
     )
+
+
+@dataclass(frozen=True)
+class Help:
+    """Description of a field, for ``--help``, tooltips of the page and the reference.
+
+    Attributes
+    ----------
+    text : str
+        Noun phrase, without unit and default.
+    more : str
+        Explanation, in lower case, which follows the unit.
+    default : str
+        Words for the default, if the value does not tell.
+    choices : str
+        Words for the accepted values, instead of the list of them.
+    """
+
+    text: str
+    more: str = ""
+    default: str = ""
+    choices: str = ""
+
+    def __get_pydantic_json_schema__(self, schema: Any, handler: Any) -> Any:
+        return handler(schema) | {"description": f"{self.text}; {self.more}" if self.more else self.text}
+
+
+class Flag:
+    """Flag of the command line that sets a field.
+
+    Parameters
+    ----------
+    *names : str
+        As in ``"--exposure", "-t"``; the first is the flag's parameter.
+    kind : type, optional
+        Type of the flag's value; that of the field by default.
+    read : callable, optional
+        Function that converts the flag's value to the field's; also receives the flag's name, for messages.
+    help : Help, optional
+        Description, if it differs from the field's.
+    """
+
+    def __init__(
+        self,
+        *names: str,
+        kind: Any = None,
+        read: Callable[[Any, str], Any] | None = None,
+        help: Help | None = None,
+    ) -> None:
+        self.names, self.kind, self.read, self.help = names, kind, read, help
+
+    @property
+    def parameter(self) -> str:
+        """Name of the parameter that receives the flag's value."""
+        return self.names[0].partition("/")[0].lstrip("-").replace("-", "_")
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Quantity that sweeps, maps and limits can vary."""
+
+    name: str
+    description: str  # of a column of tables
+    label: str  # of an axis, with the unit
+
+
+def found(kind: Any, of: type[Metadata]) -> list[Metadata]:
+    """Return all metadata of a class in an annotation or field, outermost first."""
+    return [one for one in _metadata(kind) if isinstance(one, of)]
+
+
+def first(kind: Any, of: type[Metadata]) -> Metadata | None:
+    """Return the outermost metadata of a class in an annotation or field, or None."""
+    return next(iter(found(kind, of)), None)
+
+
+def _metadata(kind: Any) -> Iterator[Any]:
+    if hasattr(kind, "annotation") and hasattr(kind, "metadata"):
+        # A pydantic field.
+        yield from kind.metadata
+        yield from _metadata(kind.annotation)
+    elif get_origin(kind) is Annotated:
+        inner, *own = get_args(kind)
+        yield from own
+        yield from _metadata(inner)
+    else:
+        for part in get_args(kind):
+            yield from _metadata(part)
+
+
+@cache
+def range_of(kind: Any) -> Range:
+    """Return the range of an annotation such as `physical.Magnitude`."""
+    return first(kind, Range) or Range()
+
+
+@cache
+def unit_of(kind: Any) -> str:
+    """Return the unit of an annotation such as `physical.Magnitude`, empty if it has none."""
+    return (first(kind, Unit) or Unit("")).name
+
+
+def checked(kind: Any, what: str, value: Any) -> float:
+    """Return a number in the unit and range of an annotation such as `physical.Magnitude`.
+
+    Parameters
+    ----------
+    kind : type
+        Annotation with `Unit` and `Range`.
+    what : str
+        Name of the value, for messages.
+    value : Quantity or float
+    """
+    return checked_number(what, value, unit_of(kind), range_of(kind))
+
+
+def checked_number(what: str, value: Any, unit: str, reach: Range) -> float:
+    """Return a number in a unit and a range, from a Quantity or a plain number."""
+    expected = reach.words(unit)
+    plain = number(what, value, unit, expected=expected)
+    if plain not in reach:
+        raise InputError.of(what, plain, expected)
+    return plain

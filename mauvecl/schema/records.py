@@ -47,7 +47,7 @@ class Record(BaseModel, metaclass=_InputErrorMeta):
     def _no_truth_as_number(cls, given: Any, validate: ValidatorFunctionWrapHandler, info: ValidationInfo) -> Any:
         """Refuse true and false where a number or text is expected; pydantic takes them for 1 and 0."""
         annotation = cls.model_fields[str(info.field_name)].annotation
-        values = list(given.values()) if isinstance(given, dict) and not _model_in(annotation) else given
+        values = list(given.values()) if isinstance(given, dict) and not model_in(annotation) else given
         if holds_truth(values) and not _takes_truth(annotation):
             raise PydanticCustomError("truth", "Input should be no truth value")
         return validate(given)
@@ -113,7 +113,7 @@ def _own_error(model: type[BaseModel], path: list[str], key: str, first: Any) ->
     inner = first["ctx"]["error"]
     told, field = str(inner), _fields(model, path[:-1]).get(path[-1]) if path else None
     # A record's own error names the key; that of a single value's validator may not.
-    own = field is None or _model_in(field.annotation) is not None or path[-1] in told
+    own = field is None or model_in(field.annotation) is not None or path[-1] in told
     if not isinstance(inner, InputError):
         fault, _, expected = told.partition(", expected ")
         inner = InputError(fault, expected or None, key=key if path else None, value=first.get("input"))
@@ -126,12 +126,12 @@ def _own_error(model: type[BaseModel], path: list[str], key: str, first: Any) ->
 def _fields(model: type[BaseModel], path: list[str]) -> Any:
     for part in path:
         if part in model.model_fields:
-            model = _model_in(model.model_fields[part].annotation) or model
+            model = model_in(model.model_fields[part].annotation) or model
     return model.model_fields
 
 
-def _model_in(annotation: Any) -> type[BaseModel] | None:
+def model_in(annotation: Any) -> type[BaseModel] | None:
     """Return the model in a type such as `Star | None` or `tuple[Star, ...]`, or None."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         return annotation
-    return next((model for part in get_args(annotation) if (model := _model_in(part))), None)
+    return next((model for part in get_args(annotation) if (model := model_in(part))), None)

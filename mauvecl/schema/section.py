@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Iterator, Sequence
+from typing import Any, Self
 
-from pydantic import ValidationInfo, field_validator
+from pydantic import BaseModel, ValidationInfo, field_validator
+from pydantic.fields import FieldInfo
 
-from mauvecl.schema.fields import Unit
+from mauvecl.schema.fields import Unit, first
 from mauvecl.schema.quantities import is_quantity, numbers, unit_of
-from mauvecl.schema.records import Record
+from mauvecl.schema.records import Record, model_in
 
 
-def plain(key: str, given: Any) -> Any:
+def plain(key: str, given: Any, unit: str) -> Any:
     """Convert Quantities, times and coordinates to the numbers and text that a study stores."""
     if is_quantity(given):
-        return numbers(key, given, unit_of(key)).tolist()
+        return numbers(key, given, unit).tolist()
     if isinstance(given, list | tuple) and any(map(is_quantity, given)):
-        return [plain(key, one) for one in given]
+        return [plain(key, one, unit) for one in given]
     if hasattr(given, "tolist"):
         return given.tolist()
     if hasattr(given, "utc") and hasattr(given, "isot"):
@@ -29,12 +31,37 @@ def plain(key: str, given: Any) -> Any:
 class Section(Record):
     """A section of a study."""
 
+    def with_value(self, path: Sequence[str], value: Any) -> Self:
+        """Return a copy with another value at a path of sections and a key.
+
+        Each of several records, such as stars, takes the value; a key with a list of numbers takes it alone.
+        """
+        key, *inner = path
+        old = getattr(self, key)
+        new = value
+        if inner:
+            many = tuple(one.with_value(inner, value) for one in (old if isinstance(old, tuple) else (old,)))
+            new = many if isinstance(old, tuple) else many[0]
+        elif isinstance(old, tuple):
+            new = (value,)
+        return self.model_copy(update={key: new})
+
     @field_validator("*", mode="before")
     @classmethod
     def _in_its_unit(cls, given: Any, info: ValidationInfo) -> Any:
         """Convert a Quantity to the unit of the key, and times and coordinates to text."""
-        name = info.field_name or ""
-        if any(isinstance(known, Unit) for known in cls.model_fields[name].metadata):
+        key = str(info.field_name)
+        unit = first(cls.model_fields[key], Unit)
+        if unit is not None and not getattr(given, "ndim", 0):
             # The annotation converts it.
             return given
-        return plain(name, given)
+        return plain(key, given, unit_of(key) if unit is None else unit.name)
+
+
+def fields_of(section: type[BaseModel], path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], FieldInfo]]:
+    """Yield the path and the field of every key of a section and of the sections in it."""
+    for key, field in section.model_fields.items():
+        yield (*path, key), field
+        inner = model_in(field.annotation)
+        if inner is not None:
+            yield from fields_of(inner, (*path, key))

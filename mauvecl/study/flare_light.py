@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Self
 
 from pydantic import Field, model_validator
 
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Flag, Help, Quantity, Range, Unit
+from mauvecl.schema.parsing import line_fluxes
+from mauvecl.schema.physical import AreaRatio, BalmerJump, LineScale, Temperature
 from mauvecl.schema.section import Section
 
 if TYPE_CHECKING:
@@ -22,41 +26,62 @@ PATH_KEYS = ("file", "quiescent")
 
 
 class FlareLight(Section):
-    """Spectrum of a flare; by default a blackbody of `flare.temperature_k`.
+    """Spectrum of a flare; by default a blackbody of `flare.temperature_k`."""
 
-    Attributes
-    ----------
-    balmer_jump : float, optional
-        Ratio of the flux just below the Balmer edge to the flux just above it.
-    electron_temperature_k : float
-        Electron temperature of the Balmer continuum.
-    second_temperature_k, second_area : float, optional
-        Temperature of a second blackbody, and the ratio of its area to that of the first.
-    lines, line_fluxes : dict
-        Line fluxes by name or wavelength in nm: as a fraction of the continuum flux in 200-700 nm, or at the telescope
-        in erg s-1 cm-2.
-    line_scale : float
-        Factor applied to all line fluxes.
-    file, quiescent : Path, optional
-        Spectrum of the star during a flare, and its quiescent spectrum, which is subtracted.
-    wavelength_unit, flux_unit : str, optional
-        Units of these files; override the units that the files state.
-    continue_at_k : float, optional
-        Temperature of a blackbody that extends the spectrum of the file.
-    """
-
-    balmer_jump: Annotated[float, Field(ge=1, le=100)] | None = None
-    electron_temperature_k: float = 10_000.0
-    second_temperature_k: float | None = None
-    second_area: Annotated[float, Field(ge=0)] | None = None
-    lines: dict[str, Annotated[float, Field(ge=0)]] = Field(default_factory=dict)
-    line_fluxes: dict[str, Annotated[float, Field(ge=0)]] = Field(default_factory=dict)
-    line_scale: Annotated[float, Field(ge=0)] = 1.0
-    file: Path | None = None
-    quiescent: Path | None = None
-    wavelength_unit: str | None = None
-    flux_unit: str | None = None
-    continue_at_k: float | None = None
+    balmer_jump: Annotated[
+        BalmerJump | None,
+        Help("Ratio of the flare's flux just below the Balmer edge to that just above", default="1"),
+        Flag("--balmer-jump"),
+        Quantity(
+            "balmer_jump", "flux of the flare just below the Balmer edge over that just above", "Balmer jump ratio"
+        ),
+    ] = None
+    electron_temperature_k: Annotated[Temperature, Help("Electron temperature of the Balmer continuum")] = 10_000.0
+    second_temperature_k: Annotated[
+        Temperature | None,
+        Help("Temperature of a second blackbody of the flare", "needs its area"),
+        Flag("--second-temperature"),
+        Quantity("second_temperature", "temperature of the flare's second blackbody", "second temperature (K)"),
+    ] = None
+    second_area: Annotated[
+        AreaRatio | None,
+        Help("Area of the second blackbody over that of the first"),
+        Flag("--second-area"),
+        Quantity("second_area", "area of the flare's second blackbody over that of the first", "second area"),
+    ] = None
+    lines: Annotated[
+        dict[str, Annotated[float, Range(0)]],
+        Help(
+            "Emission line as a fraction of the continuum in 200-700 nm, by name or wavelength in nm",
+            "as in 'Mg II=0.05'",
+        ),
+        Flag("--line", kind=list[str], read=line_fluxes),
+    ] = Field(default_factory=dict)
+    line_fluxes: Annotated[
+        dict[str, Annotated[float, Unit("erg / (s cm2)"), Range(0)]],
+        Help("Emission line at the telescope, by name or wavelength in nm", "as in '280=1e-12'"),
+        Flag("--line-flux", kind=list[str], read=line_fluxes),
+    ] = Field(default_factory=dict)
+    line_scale: Annotated[
+        LineScale,
+        Help("Factor on all line fluxes"),
+        Quantity("line_scale", "factor of all line fluxes of the flare", "line fluxes"),
+    ] = 1.0
+    file: Annotated[Path | None, Help("Spectrum file of an observed or computed flare"), Flag("--flare-file")] = None
+    quiescent: Annotated[
+        Path | None,
+        Help("Spectrum file of its star without the flare, which is subtracted"),
+        Flag("--flare-quiescent"),
+    ] = None
+    wavelength_unit: Annotated[
+        str | None, Help("Unit of the wavelengths of the flare's files"), Flag("--flare-wavelength-unit")
+    ] = None
+    flux_unit: Annotated[str | None, Help("Unit of the fluxes of the flare's files"), Flag("--flare-flux-unit")] = None
+    continue_at_k: Annotated[
+        Temperature | None,
+        Help("Temperature of a blackbody that continues the flare's file beyond its ends"),
+        Flag("--continue-at"),
+    ] = None
 
     @model_validator(mode="after")
     def _one_model(self) -> Self:
@@ -104,8 +129,9 @@ class FlareLight(Section):
         scaled = ({name: self.line_scale * value for name, value in each.items()} for each in self._lines)
         return FlareWithLines(light, *scaled)
 
-    def with_value(self, key: str, value: Any) -> Self:
-        """Return a copy with one key changed; raises InputError if the key has no effect."""
+    def with_value(self, path: Sequence[str], value: Any) -> Self:
+        """Return a copy with another value of one key; raises InputError if the key has no effect."""
+        (key,) = path
         if key == "line_scale" and not (self.lines or self.line_fluxes):
             raise InputError(
                 f"line_scale = {value} has no effect on a flare without lines, expected lines in flare.spectrum.lines"

@@ -10,6 +10,7 @@ from pydantic import Field, ValidationError, ValidationInfo, field_validator, mo
 
 from mauvecl.host.files.text_table import read_text_table
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Range, Unit
 from mauvecl.schema.records import holds_truth, input_error
 from mauvecl.schema.text import shortened, shown
 from mauvecl.study.sections import Section
@@ -179,7 +180,8 @@ class PlanQuestion(Section):
     """Campaign: targets, exposure time per target, durations of flares, and how completeness is computed."""
 
     targets: tuple[PlanTarget, ...] = ()
-    hours: Annotated[float, Field(gt=0)] | None = None  # exposure per target; all visible time by default
+    # Exposure per target; all visible time by default.
+    hours: Annotated[float, Unit("h"), Range(0, open_low=True)] | None = None
     # Durations; see `lightcurve.search.completeness.DurationLaw`.
     half_width_s: Annotated[float, Field(gt=0)] = 100.0
     at_erg: Annotated[float, Field(gt=0)] = 1e33

@@ -1,54 +1,47 @@
-"""Quantities that sweeps, maps and limits vary."""
+"""Quantities that sweeps, maps and limits vary: the fields of a study with `Quantity` metadata."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
+
+from mauvecl.schema.fields import Quantity, Range, Unit, checked_number, first
+from mauvecl.schema.section import fields_of
+from mauvecl.study.sections import Flare, Observation, SkyLight, Star
 
 
 @dataclass(frozen=True)
-class Quantity:
-    """Description and range of a quantity."""
+class StudyQuantity(Quantity):
+    """Quantity of a study, with the unit and range of its field."""
 
-    description: str  # for table columns
-    axis: str  # axis label, with the unit
-    low: float = float("nan")  # range of numbers; NaN for names
-    high: float = float("nan")
-    unit: str = ""  # in astropy's notation; empty if dimensionless
-    suffix: str = ""  # follows a value in a title
+    path: tuple[str, ...]  # sections and key
+    unit: str  # in astropy's notation; empty if dimensionless
+    range: Range
+    is_name: bool  # names instead of numbers
+
+    def checked(self, value: Any) -> float | str:
+        """Return a value in the unit of the quantity; raises InputError if it is outside of the range."""
+        return value if self.is_name else checked_number(self.name.replace("_", " "), value, self.unit, self.range)
+
+    @property
+    def suffix(self) -> str:
+        """Unit that follows a value in a title."""
+        return f" {Unit(self.unit).written}" if self.unit else ""
 
 
-QUANTITIES: dict[str, Quantity] = {
-    "magnitude": Quantity("magnitude of the star in its band", "magnitude", -2.0, 25.0, "mag"),
-    "amplitude": Quantity(
-        "flare amplitude: relative rise of the photons in the flare's band", "flare amplitude", 1e-6, 1e4
-    ),
-    "flare_temperature": Quantity(
-        "blackbody temperature of the flare", "flare temperature (K)", 1_000.0, 100_000.0, "K", " K"
-    ),
-    "balmer_jump": Quantity(
-        "flux of the flare just below the Balmer edge over that just above", "Balmer jump ratio", 1.0, 100.0
-    ),
-    "second_temperature": Quantity(
-        "temperature of the flare's second blackbody", "second temperature (K)", 1_000.0, 100_000.0, "K", " K"
-    ),
-    "second_area": Quantity("area of the flare's second blackbody over that of the first", "second area", 0.0, 1e6),
-    "line_scale": Quantity("factor of all line fluxes of the flare", "line fluxes", 0.0, 1e6),
-    "exposure": Quantity("length of the exposure", "exposure (s)", 1e-3, 1e7, "s", " s"),
-    "detector_temperature": Quantity(
-        "temperature of the detector", "detector temperature (deg C)", -100.0, 60.0, "deg_C", " deg C"
-    ),
-    "sky": Quantity(
-        "zodiacal surface brightness in V", "sky brightness (V mag / arcsec²)", 10.0, 30.0, "mag / arcsec2",
-        " mag/arcsec2",
-    ),
-    "star": Quantity("library name or file, with its magnitude", "star"),
-}  # fmt: skip
-#: Quantities of the flare's spectrum, with their keys in [flare.spectrum].
-OF_SPECTRUM = {
-    "balmer_jump": "balmer_jump",
-    "second_temperature": "second_temperature_k",
-    "second_area": "second_area",
-    "line_scale": "line_scale",
+QUANTITIES = {
+    one.name: StudyQuantity(
+        one.name,
+        one.description,
+        one.label,
+        path,
+        unit=(first(field, Unit) or Unit("")).name,
+        range=first(field, Range) or Range(),
+        is_name=first(field, Range) is None,
+    )
+    for name, section in (("star", Star), ("flare", Flare), ("observation", Observation), ("sky", SkyLight))
+    for path, field in fields_of(section, (name,))
+    if (one := first(field, Quantity)) is not None
 }
 #: Units of the quantities that have one.
 UNITS = {name: quantity.unit for name, quantity in QUANTITIES.items() if quantity.unit}

@@ -4,13 +4,18 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
 from mauvecl.schema.errors import InputError
 from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.sections import Section
+
+if TYPE_CHECKING:
+    QuantityName = str
+else:
+    QuantityName = Literal[tuple(QUANTITIES)]
 
 #: Largest number of combinations of a sweep; each has its own expectations.
 MAX_CELLS = 100_000
@@ -75,10 +80,7 @@ class LimitQuestion(Section):
 class Axis(Section):
     """Axis of a map or sweep: explicit values, or `steps` values from `start` to `stop`."""
 
-    quantity: Literal[
-        "magnitude", "amplitude", "flare_temperature", "balmer_jump", "second_temperature", "second_area", "line_scale",
-        "exposure", "detector_temperature", "sky", "star",
-    ]  # fmt: skip
+    quantity: QuantityName
     values: tuple[float | str, ...] | None = None
     start: float | None = None
     stop: float | None = None
@@ -94,17 +96,16 @@ class Axis(Section):
             )
         if self.values is not None and len(self.values) == 0:
             raise ValueError(f"the axis {self.quantity!r} has no values, expected some")
+        quantity = QUANTITIES[self.quantity]
         for value in self.points():
-            if (self.quantity == "star") != isinstance(value, str):
-                raise ValueError(f"the axis {self.quantity!r} has the value {value!r}, expected {self._expected()}")
-            if not isinstance(value, str):
-                low, high = QUANTITIES[self.quantity].low, QUANTITIES[self.quantity].high
-                if not low <= value <= high:
-                    raise ValueError(f"the axis {self.quantity!r} reaches {value:g}, expected {low:g} to {high:g}")
+            if quantity.is_name != isinstance(value, str):
+                expected = "names of the library" if quantity.is_name else "numbers"
+                raise ValueError(f"the axis {self.quantity!r} has the value {value!r}, expected {expected}")
+            if not isinstance(value, str) and value not in quantity.range:
+                raise ValueError(
+                    f"the axis {self.quantity!r} reaches {value:g}, expected {quantity.range.words(quantity.unit)}"
+                )
         return self
-
-    def _expected(self) -> str:
-        return "names of the library" if self.quantity == "star" else "numbers"
 
     def points(self) -> tuple[float | str, ...]:
         """Return the values along the axis."""

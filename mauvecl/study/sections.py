@@ -2,14 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 
 from pydantic import Field, create_model, field_validator, model_validator
 
 from mauvecl.host.sky import DEFAULT_SKY
+from mauvecl.host.stars.band_names import ALIASES
 from mauvecl.noise.priors import Normal, Uniform
 from mauvecl.noise.unknowns import INSTRUMENT_VALUES, PROCESSES
+from mauvecl.schema.fields import Flag, Help, Quantity, Range
+from mauvecl.schema.parsing import words
+from mauvecl.schema.physical import (
+    Amplitude,
+    BinWidth,
+    DetectorTemperature,
+    Distance,
+    Exposure,
+    Magnitude,
+    Probability,
+    Radius,
+    Reddening,
+    SkyBrightness,
+    Temperature,
+)
 from mauvecl.schema.section import Section as Section
 from mauvecl.statistics.names import DEFAULT_STATISTICS, STATISTIC_NAMES
 from mauvecl.study.flare_light import FlareLight
@@ -24,6 +41,13 @@ if TYPE_CHECKING:
     from mauvecl.noise.processes import CosmicRays, Processes
 
 
+def amplitudes_in(path: Path, _: str) -> list[float]:
+    """Read the amplitudes of a table of flares, each value once."""
+    from mauvecl.host.stars.flare_table import read_flares
+
+    return sorted({float(value) for value in read_flares(path)["amplitude"]})
+
+
 #: Keys that only apply to a star from a file.
 FILE_KEYS = ("file", "wavelength_unit", "flux_unit", "extend")
 #: Keys that describe one star and are dropped when another star replaces it.
@@ -33,19 +57,51 @@ STAR_KEYS = (*FILE_KEYS, "distance_pc", "radius_rsun", "effective_temperature_k"
 class Star(Section):
     """Spectrum, extinction and magnitude of a star; distance or radius for flare energies."""
 
-    library: str | None = None
-    file: Path | None = None
-    magnitude: float | None = None
-    band: str = "V"
-    magnitude_system: Literal["catalogue", "vega", "ab"] = "catalogue"
-    ebv: float | None = None
-    wavelength_unit: str | None = None
-    flux_unit: str | None = None
-    extend: str | None = None
-    bin_nm: float | None = None
-    distance_pc: Annotated[float, Field(gt=0)] | None = None
-    radius_rsun: Annotated[float, Field(gt=0)] | None = None
-    effective_temperature_k: Annotated[float, Field(gt=0)] | None = None
+    library: Annotated[
+        str | None,
+        Help("Library name or spectrum file", "as in G2V,M3V"),
+        Flag("--star", "-s", kind=list[str]),
+        Quantity("star", "library name or file, with its magnitude", "star"),
+    ] = None
+    file: Annotated[Path | None, Help("Spectrum file, instead of a name of the library")] = None
+    magnitude: Annotated[
+        Magnitude | None,
+        Help("Magnitude", "one for all stars or one each, as in 7,8"),
+        Flag("--magnitude", "-m", kind=list[float]),
+        Quantity("magnitude", "magnitude of the star in its band", "magnitude"),
+    ] = None
+    band: Annotated[str, Help("Band of the magnitude", choices=", ".join(ALIASES)), Flag("--band")] = "V"
+    magnitude_system: Annotated[
+        Literal["catalogue", "vega", "ab"],
+        Help("Zero point of the magnitude", choices="catalogue, vega (Vega is 0 in every band) or ab"),
+        Flag("--magnitude-system"),
+    ] = "catalogue"
+    ebv: Annotated[
+        Reddening | None,
+        Help("Dust in front of the star, E(B-V)", "needs mauvecl[extinction]"),
+        Flag("--ebv"),
+    ] = None
+    wavelength_unit: Annotated[
+        str | None,
+        Help("Unit of a spectrum file's wavelengths", "as in Angstrom, or 'nm air'"),
+        Flag("--wavelength-unit"),
+    ] = None
+    flux_unit: Annotated[
+        str | None, Help("Unit of a spectrum file's fluxes", "as in 'W m-2 nm-1'"), Flag("--flux-unit")
+    ] = None
+    extend: Annotated[
+        str | None,
+        Help("Library spectrum that continues a spectrum file beyond its ends, scaled to it"),
+        Flag("--extend"),
+    ] = None
+    bin_nm: Annotated[BinWidth | None, Help("Width of bins over which the spectrum is averaged"), Flag("--bin-nm")] = (
+        None
+    )
+    distance_pc: Annotated[Distance | None, Help("Distance of the star", "for energies"), Flag("--distance")] = None
+    radius_rsun: Annotated[Radius | None, Help("Radius of the star", "for energies"), Flag("--radius")] = None
+    effective_temperature_k: Annotated[
+        Temperature | None, Help("Effective temperature of the star", "for energies"), Flag("--star-temperature")
+    ] = None
 
     @model_validator(mode="after")
     def _one_spectrum(self) -> Self:
@@ -55,6 +111,11 @@ class Star(Section):
         if self.file is None and given:
             raise ValueError(f"a star of the library has {' and '.join(given)}, expected a star from a file")
         return self
+
+    def with_value(self, path: Sequence[str], value: Any) -> Self:
+        """Return a copy with another value; another star of the library drops all that describes this one."""
+        changed = super().with_value(path, value)
+        return changed.model_copy(update=dict.fromkeys(STAR_KEYS)) if path[0] == "library" else changed
 
     def source(self) -> Source:
         """Load the spectrum and scale it to the magnitude, if one is given."""
@@ -84,11 +145,36 @@ class Star(Section):
 class Flare(Section):
     """Amplitudes, spectrum and geometry of flares."""
 
-    amplitudes: Annotated[tuple[float, ...], Field(min_length=1)] = (0.0076, 0.02, 0.081, 0.24)
-    temperature_k: float = 10_000.0
-    band: str = "Kepler"
-    geometry: Literal["added", "replaces"] = "added"
-    photosphere_temperature_k: float | None = None
+    amplitudes: Annotated[
+        tuple[Amplitude, ...],
+        Field(min_length=1),
+        Help("Flare amplitude", "0.24 is a rise of 24 % in the flare's band"),
+        Flag(
+            "--flares",
+            kind=Path,
+            read=amplitudes_in,
+            help=Help("Table of flares with their amplitudes", "CSV, ECSV or FITS, as AltaiPony's ampl_rec"),
+        ),
+        Flag("--amplitude", "-a"),
+        Quantity("amplitude", "flare amplitude: relative rise of the photons in the flare's band", "flare amplitude"),
+    ] = (0.0076, 0.02, 0.081, 0.24)
+    temperature_k: Annotated[
+        Temperature,
+        Help("Flare temperature"),
+        Flag("--flare-temperature"),
+        Quantity("flare_temperature", "blackbody temperature of the flare", "flare temperature (K)"),
+    ] = 10_000.0
+    band: Annotated[str, Help("Band of the amplitude", choices=", ".join(ALIASES)), Flag("--flare-band")] = "Kepler"
+    geometry: Annotated[
+        Literal["added", "replaces"],
+        Help("Whether a flare is added to the star or replaces part of its photosphere"),
+        Flag("--geometry"),
+    ] = "added"
+    photosphere_temperature_k: Annotated[
+        Temperature | None,
+        Help("Temperature of the photosphere that a flare replaces", default="the star's"),
+        Flag("--photosphere-temperature"),
+    ] = None
     spectrum: FlareLight = FlareLight()
 
     def light(self, temperature_k: float | None = None) -> FlareSpectrum:
@@ -100,22 +186,41 @@ class Flare(Section):
         """True if the spectrum is a single blackbody."""
         return self.spectrum == FlareLight()
 
-    def with_spectrum(self, key: str, value: Any) -> Self:
-        """Return a copy with one key of the spectrum changed."""
-        return self.model_copy(update={"spectrum": self.spectrum.with_value(key, value)})
-
 
 class Observation(Section):
     """Instrument, exposure, and how the detector is modelled."""
 
-    exposure_s: float = 50.0
-    instrument: str = "mauve"
-    temperature_c: float | None = None
-    order: Literal["paper", "physical"] = "paper"
-    signal: Literal["net", "paper"] = "net"
-    mode: Literal["auto", "frames", "stacked"] = "auto"
-    recipe: Literal["auto", "joint", "apart"] = "auto"
-    changes: dict[str, float | int | str] = Field(default_factory=dict)
+    exposure_s: Annotated[
+        Exposure,
+        Help("Exposure time", "rounded up to whole frames of 5 s"),
+        Flag("--exposure", "-t"),
+        Quantity("exposure", "length of the exposure", "exposure (s)"),
+    ] = 50.0
+    instrument: Annotated[
+        str,
+        Help("Instrument", choices="mauve (as in the paper), mauve-electrons (for planning), or your own TOML file"),
+        Flag("--instrument"),
+    ] = "mauve"
+    temperature_c: Annotated[
+        DetectorTemperature | None,
+        Help("Detector temperature", default="the instrument's"),
+        Flag("--temperature"),
+        Quantity("detector_temperature", "temperature of the detector", "detector temperature (deg C)"),
+    ] = None
+    order: Annotated[
+        Literal["paper", "physical"],
+        Help("Order of efficiency and line spread function"),
+    ] = "paper"
+    signal: Annotated[
+        Literal["net", "paper"],
+        Help("Signal of an S/N", choices="net (the star alone) or paper (with the zodiacal light)"),
+        Flag("--signal"),
+    ] = "net"
+    mode: Annotated[Literal["auto", "frames", "stacked"], Help("How the frames of an exposure are drawn")] = "auto"
+    recipe: Annotated[Literal["auto", "joint", "apart"], Help("How the noise of a frame is drawn")] = "auto"
+    changes: Annotated[dict[str, float | int | str], Help("Changed values of the instrument, by name")] = Field(
+        default_factory=dict
+    )
 
     def load_instrument(self) -> Instrument:
         """Load the instrument and apply `changes` and the detector temperature."""
@@ -129,10 +234,19 @@ class Observation(Section):
 class SkyLight(Section):
     """Sky background: a surface brightness, that of a target at a time, or none."""
 
-    surface_brightness: float | None = None
-    target: str | None = None
-    time: str | None = None
-    none: bool = False
+    surface_brightness: Annotated[
+        SkyBrightness | None,
+        Help("Surface brightness of the sky in V", "or none", default=f"{DEFAULT_SKY:g}"),
+        Flag("--sky", kind=str),
+        Quantity("sky", "zodiacal surface brightness in V", "sky brightness (V mag / arcsec²)"),
+    ] = None
+    target: Annotated[
+        str | None,
+        Help("Coordinates whose zodiacal light is the sky, with the time", "such as '290.68 +11.12'"),
+        Flag("--target"),
+    ] = None
+    time: Annotated[str | None, Help("Time of the observation, UTC, with the target"), Flag("--time")] = None
+    none: Annotated[bool, Help("Whether there is no sky")] = False
 
     @model_validator(mode="before")
     @classmethod
@@ -146,6 +260,10 @@ class SkyLight(Section):
         if (self.surface_brightness is not None) + (self.target is not None) + self.none > 1:
             raise ValueError("the sky is given twice, expected one of surface_brightness, target with time, and none")
         return self
+
+    def with_value(self, path: Sequence[str], value: Any) -> Self:
+        """Return the sky of one value, which replaces all others."""
+        return type(self)(**{path[0]: value})
 
     def sky(self) -> Sky:
         """Return the sky for the host."""
@@ -228,15 +346,41 @@ class NoiseProcesses(create_model("_Priors", __base__=Section, **_keys)):  # typ
 class Run(Section):
     """Number of realisations, seed, statistics and false-alarm probability."""
 
-    realisations: Annotated[int, Field(ge=1)] = 1_000_000
-    seed: Annotated[int, Field(ge=0, lt=2**64)] = 1
-    statistics: Annotated[tuple[str, ...], Field(min_length=1)] = DEFAULT_STATISTICS
-    fap: Annotated[float, Field(gt=0, lt=1)] = 1e-3
-    tails: Literal["counted", "sampled"] = "counted"
-    reference: str = "template"
-    variances: Literal["model", "estimated"] = "model"
-    template_temperatures_k: tuple[float, ...] = ()
-    weights: dict[str, Path] = Field(default_factory=dict)
+    realisations: Annotated[int, Range(1), Help("Noise realisations"), Flag("--realisations", "-n")] = 1_000_000
+    seed: Annotated[int, Range(0, 2**64 - 1), Help("Seed", "the same seed gives the same noise"), Flag("--seed")] = 1
+    statistics: Annotated[
+        tuple[str, ...],
+        Field(min_length=1),
+        Help("Detection statistic", choices=f"{', '.join(STATISTIC_NAMES)}, or all"),
+        Flag("--statistic", read=words),
+    ] = DEFAULT_STATISTICS
+    fap: Annotated[Probability, Help("False-alarm probability per test"), Flag("--fap")] = 1e-3
+    tails: Annotated[
+        Literal["counted", "sampled"],
+        Help(
+            "Thresholds with fewer than 100 draws beyond them",
+            choices="counted rejects them, sampled finds them by importance sampling",
+        ),
+        Flag("--tails"),
+    ] = "counted"
+    reference: Annotated[
+        str,
+        Help("Spectrum that is subtracted", choices="template (noise-free), exposure (noisy), or stack:N of them"),
+        Flag("--reference"),
+    ] = "template"
+    variances: Annotated[
+        Literal["model", "estimated"],
+        Help("Variances", choices="model, or estimated from the counts as an observer must"),
+        Flag("--variances"),
+    ] = "model"
+    template_temperatures_k: Annotated[
+        tuple[Temperature, ...],
+        Help("Temperature of a flare that is also looked for", "shows what a wrong template costs"),
+        Flag("--template"),
+    ] = ()
+    weights: Annotated[dict[str, Path], Help("Files with weights of your own statistics, by name")] = Field(
+        default_factory=dict
+    )
 
     @field_validator("statistics")
     @classmethod
@@ -255,15 +399,26 @@ class Run(Section):
         return Comparison.of(self.reference, self.variances)
 
 
+Draws = Annotated[
+    int,
+    Range(0, 4096),
+    Help("Draws of unknown instrument values over which the answer is averaged"),
+    Flag("--unknown"),
+]
+Known = Annotated[
+    tuple[str, ...],
+    Help("Instrument value that is known", "as in temperature_c,light_loss"),
+    Flag("--known", read=words),
+]
 #: Number of draws, priors by name, and names of known values.
 _unknown_keys: Any = (
-    {"draws": (Annotated[int, Field(ge=0, le=4096)], 0)}
+    {"draws": (Draws, 0)}
     | {
         name: (PriorText | None, PriorText.of(row.prior))
         for name, row in INSTRUMENT_VALUES.items()
         if isinstance(row.prior, Uniform | Normal)
     }
-    | {"known": (tuple[str, ...], ())}
+    | {"known": (Known, ())}
 )
 
 

@@ -11,14 +11,13 @@ from pydantic import Field, ValidationError, model_validator
 from mauvecl.host.files.parsed import possible, read_text, toml
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.quantities import number
 from mauvecl.schema.records import input_error
 from mauvecl.schema.text import shortened
 from mauvecl.study.flare_light import drop_default_spectrum, resolve_spectrum_paths
 from mauvecl.study.measurements import MeasureQuestion, drop_default_measure
 from mauvecl.study.nuisances import NuisanceChoice
 from mauvecl.study.orbits import OrbitQuestion, PlanQuestion, drop_default_plan, resolve_plan_paths
-from mauvecl.study.quantities import OF_SPECTRUM, QUANTITIES
+from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.questions import (
     Axis,
     BulkQuestion,
@@ -29,7 +28,7 @@ from mauvecl.study.questions import (
     Sweep,
 )
 from mauvecl.study.searches import InjectionQuestion, SearchChoice, drop_default_search
-from mauvecl.study.sections import STAR_KEYS, Flare, NoiseProcesses, Observation, Run, Section, SkyLight, Star, Unknowns
+from mauvecl.study.sections import Flare, NoiseProcesses, Observation, Run, Section, SkyLight, Star, Unknowns
 from mauvecl.study.stare_section import EventText, StareQuestion, drop_default_stare, resolve_stare_paths
 from mauvecl.study.study_text import locate_files, parse_toml_value, read_embedded_study, set_key, with_file_digests
 
@@ -236,22 +235,8 @@ class Study(Section):
             raise InputError(
                 f"quantity {shortened(str(quantity))!r} is unknown, expected one of {', '.join(QUANTITIES)}"
             )
-        if quantity != "star":
-            value = number(quantity.replace("_", " "), value, QUANTITIES[quantity].unit)
-        change: dict[str, Any]
-        if quantity in ("magnitude", "star"):
-            another = {"library": value, **dict.fromkeys(STAR_KEYS)}
-            change = {"magnitude": value} if quantity == "magnitude" else another
-            return self.model_copy(update={"star": tuple(star.model_copy(update=change) for star in self.star)})
-        if quantity in ("amplitude", "flare_temperature"):
-            change = {"amplitudes": (value,)} if quantity == "amplitude" else {"temperature_k": value}
-            return self.model_copy(update={"flare": self.flare.model_copy(update=change)})
-        if quantity in OF_SPECTRUM:
-            return self.model_copy(update={"flare": self.flare.with_spectrum(OF_SPECTRUM[quantity], value)})
-        if quantity == "sky":
-            return self.model_copy(update={"sky": SkyLight(surface_brightness=value)})
-        change = {{"exposure": "exposure_s", "detector_temperature": "temperature_c"}[quantity]: value}
-        return self.model_copy(update={"observation": self.observation.model_copy(update=change)})
+        one = QUANTITIES[quantity]
+        return self.with_value(one.path, one.checked(value))
 
     def unknown_priors(self) -> dict[str, Prior]:
         """Return the priors of unknown instrument values; values that the study sets are known."""

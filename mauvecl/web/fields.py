@@ -12,14 +12,29 @@ from typing import Any, NamedTuple
 from mauvecl.host.stars.band_names import ALIASES
 from mauvecl.host.stars.catalogue import embedded, library_table
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.fields import Range, first, range_of, unit_of
+from mauvecl.schema.physical import (
+    Amplitude,
+    DetectorTemperature,
+    Exposure,
+    Magnitude,
+    Probability,
+    SkyBrightness,
+    Temperature,
+)
 from mauvecl.schema.text import shortened
 from mauvecl.statistics.registry import STATISTICS
+from mauvecl.study.orbits import PlanQuestion
+from mauvecl.study.sections import Run
 from mauvecl.web.simulations import SIMULATIONS
 
 UPLOADED, UPLOADED_UNKNOWN = "uploaded star", "uploaded spectrum"
 #: Realisations that a visitor may ask for, and with a tail by importance sampling.
 REALISATIONS, SAMPLED = (10_000, 100_000, 1_000_000, 4_000_000), (100_000, 1_000_000)
-#: What is taken for unknown on the page.
+
+#: Amplitudes in percent.
+PERCENT = Range(100 * range_of(Amplitude).low, 100 * range_of(Amplitude).high)
+#: Choices of what is unknown.
 UNKNOWN = ("nothing", "the usual")
 SKIES = ("brightness", "target and time", "none")
 #: Characters of a field that are looked at.
@@ -30,14 +45,14 @@ MOST_CHARACTERS = 200
 class Number:
     """Number in a range, written with a decimal point."""
 
-    low: float
-    high: float
+    range: Range
     whole: bool = False
+    unit: str = ""
 
     def __call__(self, text: str) -> float | int:
         """Parse the number; an error states what is accepted."""
         kind = "a whole number" if self.whole else "a number"
-        accepted = f"expected {kind} from {self.low:.15g} to {self.high:.15g}"
+        accepted = f"expected {self.range.words(self.unit, whole=self.whole)}"
         form = r"[+-]?\d+" if self.whole else r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d{1,3})?"
         if not text.strip():
             raise InputError(f"nothing is entered, {accepted}")
@@ -45,9 +60,14 @@ class Number:
             point = ", with a point for decimals" if "," in text else ""
             raise InputError(f"{shortened(text)} is not {kind}, {accepted}{point}")
         value = int(text) if self.whole else float(text)
-        if not self.low <= value <= self.high:
+        if value not in self.range:
             raise InputError(f"{shortened(text.strip())} is out of range, {accepted}")
         return value
+
+
+def number_of(kind: Any) -> Number:
+    """Return the parser of a number in the unit and range of an annotation."""
+    return Number(range_of(kind), unit=unit_of(kind))
 
 
 @dataclass(frozen=True)
@@ -76,7 +96,7 @@ def points(text: str) -> tuple[tuple[float, float], ...] | None:
     """Parse a spectrum as pairs of nm and DN of the exposure; None for an uploaded one."""
     if text == UPLOADED_UNKNOWN:
         return None
-    number = Number(-1e30, 1e30)
+    number = Number(Range(-1e30, 1e30))
     pairs = [pair.split() for pair in text.split(",") if text.strip()]
     if any(len(pair) != 2 for pair in pairs):
         raise InputError(f"{shortened(text)} is no spectrum, expected pairs of nm and DN with commas between them")
@@ -213,24 +233,24 @@ FIELDS = {
         "file.",
     ),
     "magnitude": Field(
-        "Magnitude", "8.5", Number(-2, 25), "How bright the star is without the flare, in the band beside it.",
+        "Magnitude", "8.5", number_of(Magnitude), "How bright the star is without the flare, in the band beside it.",
         slider=Slider(0, 15, 0.1),
     ),
     "band": Field(
         "Band", "V", Choice(tuple(ALIASES)), "The band of the magnitude. In V, Vega has 0.03, as in catalogues."
     ),
     "amplitude_percent": Field(
-        "Flare amplitude", "2", Number(0.0001, 1e5),
+        "Flare amplitude", "2", Number(PERCENT),
         "By how much the flare at its peak brightens the star in the band of the Kepler satellite. In the ultraviolet "
         "the rise is many times as large.",
         "%", Slider(0.01, 1000, 10**0.1, log=True),
     ),
     "exposure_s": Field(
-        "Exposure", "50", Number(0.1, 86_400), "Time on the star; whole frames of 5 s are added up.", "s",
+        "Exposure", "50", number_of(Exposure), "Time on the star; whole frames of 5 s are added up.", "s",
         Slider(5, 3600, 5),
     ),
     "flare_temperature_k": Field(
-        "Flare temperature", "10000", Number(1000, 100_000),
+        "Flare temperature", "10000", number_of(Temperature),
         "The flare shines as a blackbody of this temperature. The hotter, the more of its light is ultraviolet.", "K",
         Slider(5000, 30_000, 500),
     ),
@@ -252,8 +272,8 @@ FIELDS = {
         "280=0.03 for one at 280 nm.",
     ),
     "temperature_c": Field(
-        "Detector temperature", "21", Number(-50, 60), "The dark current doubles every few degrees.", "deg C",
-        Slider(-10, 40, 1),
+        "Detector temperature", "21", number_of(DetectorTemperature), "The dark current doubles every few degrees.",
+        "deg C", Slider(-10, 40, 1),
     ),
     "instrument": Field(
         "Payload", "mauve", Choice(("mauve", "mauve-electrons")),
@@ -266,7 +286,8 @@ FIELDS = {
     ),
     "sky": Field("Sky", "brightness", Choice(SKIES), "Zodiacal light behind the star."),
     "sky_brightness": Field(
-        "Sky brightness", "22.1", Number(10, 30), "Of the zodiacal light, V magnitudes per square arc second.",
+        "Sky brightness", "22.1", number_of(SkyBrightness),
+        "Of the zodiacal light, V magnitudes per square arc second.",
         "mag/arcsec²", Slider(20, 24, 0.1),
     ),
     "target": Field("Target", "", str, "Coordinates in degrees such as 290.68 +11.12."),
@@ -276,7 +297,7 @@ FIELDS = {
         "; ".join(f"{name}: {one.definition}" for name, one in STATISTICS.items()) + ".",
     ),
     "fap": Field(
-        "False-alarm probability", "0.001", Number(1e-6, 0.5),
+        "False-alarm probability", "0.001", number_of(Probability),
         "How often noise alone passes for a flare, per test: it sets the threshold.", "per test",
         Slider(1e-6, 0.1, 10**0.1, log=True),
     ),
@@ -296,7 +317,7 @@ FIELDS = {
         "53.23 -9.46.",
     ),
     "hours": Field(
-        "Hours of the campaign", "100", Number(1, 8760),
+        "Hours of the campaign", "100", Number(first(PlanQuestion.model_fields["hours"], Range) or Range(), unit="h"),
         "How long the target is observed, at most: what would be found is on the tab Plan.", "h", Slider(10, 1000, 10),
     ),
     "realisations": Field(
@@ -305,7 +326,10 @@ FIELDS = {
         "How many noisy exposures a simulation draws. At least 100 must lie beyond the threshold; a sampled tail "
         "(importance sampling) needs fewer.",
     ),
-    "seed": Field("Seed", "1", Number(0, 2**31, whole=True), "The same seed gives the same noise, to the bit."),
+    "seed": Field(
+        "Seed", "1", Number(first(Run.model_fields["seed"], Range) or Range(), whole=True),
+        "The same seed gives the same noise, to the bit.",
+    ),
 }  # fmt: skip
 #: Fields that show at once, and the others by what they are about.
 ASKED = ("star", "magnitude", "band", "amplitude_percent", "exposure_s")

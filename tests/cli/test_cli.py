@@ -387,7 +387,7 @@ BAD = {
     "missing file": (["detect", "--star", "no.txt"], "'no.txt' does not exist"),
     "exposure": (["detect", "--exposure", "-5"], "exposure"),
     "amplitude": (["detect", "-a", "-0.1"], "--amplitude -0.1"),
-    "flare temperature": (["detect", "--flare-temperature", "5"], "--flare-temperature 5.0 K"),
+    "flare temperature": (["detect", "--flare-temperature", "5"], "--flare-temperature 5.0, expected 1000 to 200000 K"),
     "detector temperature": (["detect", "--temperature", "900"], "temperature"),
     "coordinates": (["detect", "--target", "here", "--time", "2026-09-01"], "here"),
     "time": (["detect", "--target", "290 11", "--time", "yesterday"], "yesterday"),

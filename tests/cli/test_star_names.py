@@ -33,7 +33,7 @@ def test_a_star_may_stand_in_place_of_the_study(verb: str, tmp_path: Path) -> No
     """Every verb takes one as far as its magnitude, which is wrong here."""
     for star in ("G2V", "sun", "G2V,M3V", spectrum(tmp_path, "star.txt"), spectrum(tmp_path, "noname")):
         code, _, told = ended(verb, star, "-m", "99", folder=tmp_path)
-        assert (code, told) == (2, "mauvecl: --magnitude 99.0, expected -30 to 40\n"), star
+        assert (code, told) == (2, "mauvecl: --magnitude 99.0, expected -30 to 40 mag\n"), star
     code, _, told = ended(verb, "G2V", "--star", "M3V", "-m", "7", folder=tmp_path)
     assert (code, told) == (2, "mauvecl: 'G2V' and --star are both stars, expected one of them\n")
 

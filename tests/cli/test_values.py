@@ -86,7 +86,7 @@ def test_one_style_for_every_number(tmp_path: Path) -> None:
                 "--photosphere-temperature",
                 "2",
             ],
-            "--photosphere-temperature 2.0 K, expected 1000 to 200000 K",
+            "--photosphere-temperature 2.0, expected 1000 to 200000 K",
         ),
     ],
     ids=lambda given: " ".join(given) if isinstance(given, list) else "",

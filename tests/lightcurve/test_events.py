@@ -68,8 +68,8 @@ def test_a_flare_that_does_not_cool_is_one_of_a_temperature():
     [
         (lambda: Event(np.nan, 60.0, 0.1), "peak_s = nan, expected seconds"),
         (lambda: Event(0.0, 0.0, 0.1), "the half width of a flare = 0 s"),
-        (lambda: Event(0.0, 60.0, -0.1), "the amplitude of a flare = -0.1"),
-        (lambda: Event(0.0, 60.0, 0.1, 10.0), "flare temperature = 10 K"),
+        (lambda: Event(0.0, 60.0, -0.1), "amplitude = -0.1, expected 0 to 1e"),
+        (lambda: Event(0.0, 60.0, 0.1, 10.0), "flare temperature = 10.0, expected 1000 to 200000 K"),
         (lambda: Event(0.0, 60.0, 0.1, shape="box"), "flare shape 'box' is unknown"),
         (lambda: Event.of_equivalent_duration(3.0, peak_s=0.0, half_width_s=0.0), "the half width of a flare = 0 s"),
         (lambda: temperatures_of([Event(0.0, 60.0, 0.1, 5e3 + k) for k in range(9)]), "flares of 9 constant temp"),

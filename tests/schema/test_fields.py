@@ -48,7 +48,7 @@ def test_values_in_range_are_plain_numbers(key: str, value: Any, plain: Any) -> 
         ("exposure", 3 * u.kg, "seconds above 0 and up to 86400"),
         ("exposure", "a minute", "seconds above 0 and up to 86400"),
         ("exposure", float("nan"), "seconds above 0 and up to 86400"),
-        ("temperature", 61, "-40 to 60 deg_C"),
+        ("temperature", 61, "-40 to 60 deg C"),
         ("width", -1 * u.um, "nm of at least 0"),
         ("loss", 1, "a number of at least 0 and below 1"),
         ("size", 6, "a whole number from 1 to 5"),

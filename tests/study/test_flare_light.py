@@ -205,7 +205,10 @@ def test_flare_file_is_located_from_an_answers_table(tmp_path: Path) -> None:
         ({"lines": {"X": 0.1}}, "'X'"),
         ({"lines": {"Mg II": -0.1}}, "Mg II"),
         ({"lines": {"Mg II": 0.1}, "line_fluxes": {"Mg II": 1e-12}}, "a fraction and a flux"),
-        ({"electron_temperature_k": 1.0, "balmer_jump": 2.0}, "electron temperature"),
+        (
+            {"electron_temperature_k": 1.0, "balmer_jump": 2.0},
+            "electron_temperature_k = 1.0, expected 1000 to 200000 K",
+        ),
     ],
 )
 def test_invalid_spectra_raise(spectrum: dict[str, Any], text: str) -> None:

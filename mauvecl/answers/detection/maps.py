@@ -19,7 +19,7 @@ from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import label, quantity_column
 from mauvecl.study.messages import SATURATED, collect_messages, worst_first
 from mauvecl.study.nuisances import NuisanceChoice
-from mauvecl.study.quantities import OF_SPECTRUM
+from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.study import Study
 from mauvecl.study.unknowns import average, describe_shares, drawn, shares
 
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from mauvecl.study.sections import Run
 
 #: Quantities of the flare alone: cells that differ in them share their quiescent star, and one launch.
-OF_FLARE = ("amplitude", "flare_temperature", *OF_SPECTRUM)
+OF_FLARE = tuple(name for name, one in QUANTITIES.items() if one.path[0] == "flare")
 
 
 #: Columns of the table of cells, after those of the two axes.

@@ -12,13 +12,12 @@ from scipy import special
 
 from mauvecl.results.requests.hypotheses import check_shape, fall_between
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.ranges import DAY_S
+from mauvecl.schema.physical import DAY_S
 from mauvecl.statistics.intervals import Interval
 from mauvecl.statistics.registry import STATISTICS
 from mauvecl.statistics.statistic import LinearStatistic
 from mauvecl.study.cases import Case
 from mauvecl.study.messages import off_centre
-from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.unknowns import DrawnStudies, average, drawn, shares
 
 if TYPE_CHECKING:
@@ -247,7 +246,7 @@ def _further(of: str) -> Callable[[float, float], float]:
 
 def _span(of: str) -> str:
     hardest, easiest = SEARCH[of]
-    ends = sorted(e for e in (hardest if hardest is not None else QUANTITIES[of].low, easiest))
+    ends = sorted((hardest if hardest is not None else 0.0, easiest))
     return f"{ends[0]:g} and {ends[1]:g}"
 
 

@@ -11,8 +11,8 @@ import numpy as np
 from mauvecl.answers.answer import Answer
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
+from mauvecl.schema.physical import DAY_S
 from mauvecl.schema.quantities import number
-from mauvecl.schema.ranges import DAY_S
 from mauvecl.schema.tables import Column, View, table_of
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import star_column
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
     from mauvecl.study.assumptions import Use
 
 Per = Literal["pixel", "element"]
+#: Longest time that is considered, s: many exposures, added up.
+LONGEST_S = 1e7
 
 
 @dataclass(frozen=True)
@@ -220,11 +222,10 @@ def _one(case: Case, snr: float, wavelength_nm: float, per: Per) -> tuple[Exposu
         return replace(frame, n_frames=frames)
 
     one = snr_at(after(1), wavelength_nm, per)
-    longest = QUANTITIES["exposure"].high
-    if not one > 0 or (snr / one) ** 2 * frame_s > longest:
+    if not one > 0 or (snr / one) ** 2 * frame_s > LONGEST_S:
         raise InputError(
             f"{case.one_frame.label} has an S/N of {one:.3g} per {per} at {wavelength_nm:g} nm in one frame, "
-            f"expected enough for {snr:g} within {longest:g} s{frame.saturation_clause}"
+            f"expected enough for {snr:g} within {LONGEST_S:g} s{frame.saturation_clause}"
         )
     # S/N grows with the root of the frames, to rounding: the neighbours settle it.
     frames = max(int(np.ceil((snr / one) ** 2)), 1)

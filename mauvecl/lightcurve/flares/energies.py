@@ -30,7 +30,8 @@ from mauvecl.host.stars.flare_spectra import PARSEC_CM, STEFAN_BOLTZMANN, SUN_CM
 from mauvecl.lightcurve.flares.shapes import Shape, shape_of
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.ranges import FLARE_TEMPERATURES_K
+from mauvecl.schema.fields import checked
+from mauvecl.schema.physical import Distance, Radius, Temperature
 
 if TYPE_CHECKING:
     from mauvecl.host.stars.source import Source
@@ -102,7 +103,7 @@ class EnergyScale:
         InputError
             For an impossible value, a spectrum without a scale, or a band that it does not cover.
         """
-        _check("distance_pc", distance_pc, 1e-7, 1e6)
+        checked(Distance, "distance_pc", distance_pc)
         if source.unscaled:
             raise InputError(f"the flux of {source.name} is of no scale: {source.unscaled}, expected a magnitude")
         source.magnitude(band)  # refuses a band that the spectrum does not cover
@@ -146,8 +147,8 @@ class EnergyScale:
         InputError
             For an impossible value or an unknown band.
         """
-        _check("radius_rsun", radius_rsun, 1e-4, 1e4)
-        _check("temperature_k", temperature_k, *FLARE_TEMPERATURES_K)
+        checked(Radius, "radius_rsun", radius_rsun)
+        checked(Temperature, "temperature_k", temperature_k)
         wavelength, _ = _response(band)
         return cls._of_light(
             wavelength,
@@ -172,9 +173,9 @@ class EnergyScale:
         quarter of the energy of light that leaves alike in all directions, and the response weights energies although
         equivalent durations count photons.
         """
-        _check("radius_rsun", radius_rsun, 1e-4, 1e4)
-        _check("temperature_k", temperature_k, *FLARE_TEMPERATURES_K)
-        _check("flare_k", flare_k, *FLARE_TEMPERATURES_K)
+        checked(Radius, "radius_rsun", radius_rsun)
+        checked(Temperature, "temperature_k", temperature_k)
+        checked(Temperature, "flare_k", flare_k)
         area = np.pi * (radius_rsun * SUN_CM) ** 2 * in_band(band, temperature_k) / in_band(band, flare_k)
         return cls(
             find_band(band).name,
@@ -241,7 +242,7 @@ def quiescent_luminosity(source: Source, distance_pc: float, band: str = "Kepler
     Many catalogues give equivalent duration times this as the energy of a flare in the band. It is the energy of light
     with the star's spectrum, not the flare's.
     """
-    _check("distance_pc", distance_pc, 1e-7, 1e6)
+    checked(Distance, "distance_pc", distance_pc)
     source.magnitude(band)
     sphere = 4 * np.pi * (distance_pc * PARSEC_CM) ** 2
     return sphere * _through(source.wavelength_nm, source.flux_flam, band)
@@ -295,7 +296,7 @@ def share_within(low_nm: float, high_nm: float, temperature_k: float) -> float:
 
 
 def _spectrum(flare_k: float) -> Blackbody:
-    _check("flare_k", flare_k, *FLARE_TEMPERATURES_K)
+    checked(Temperature, "flare_k", flare_k)
     return Blackbody(flare_k)
 
 
@@ -322,8 +323,3 @@ def _bolometric(wavelength_nm: Float, flux_flam: Float, band: str, photosphere_k
 def _integral(wavelength_nm: Float, flux_flam: Float) -> float:
     # erg s-1 cm-2 A-1 over nm.
     return 10.0 * float(np.trapezoid(flux_flam, wavelength_nm))
-
-
-def _check(name: str, value: float, low: float, high: float) -> None:
-    if not low <= value <= high:
-        raise InputError(f"{name} = {value:g}, expected {low:g} to {high:g}")

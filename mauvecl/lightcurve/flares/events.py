@@ -13,7 +13,8 @@ from mauvecl.lightcurve.flares.energies import EnergyScale, amplitude_of, amplit
 from mauvecl.lightcurve.flares.shapes import SHAPES, Shape, shape_of
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.ranges import FLARE_TEMPERATURES_K
+from mauvecl.schema.fields import checked, range_of
+from mauvecl.schema.physical import Amplitude, Temperature
 
 Float = NDArray[np.float64]
 
@@ -22,8 +23,6 @@ MOST_TEMPERATURES, LEAST_STEPS = 8, 3
 #: Parts with one temperature each of a frame, of the half-width and of the fold of a flare that cools, at least; and
 #: parts of a frame at most.
 PARTS, MOST_PARTS = 16, 512
-#: Amplitudes beyond this are no flares: of the largest known, an M dwarf's in the ultraviolet, a few thousand.
-LARGEST_AMPLITUDE = 1e6
 #: Temperatures that differ by less are one.
 SAME_K = 0.5
 #: Share of a flare's peak and of its fluence below which frames hold none of its light.
@@ -46,11 +45,11 @@ class Cooling:
     fold_s: float
 
     def __post_init__(self) -> None:
-        low, high = FLARE_TEMPERATURES_K
-        if not (low <= self.end_k <= self.peak_k <= high and np.isfinite(self.fold_s) and self.fold_s > 0):
+        reach = range_of(Temperature)
+        if not (reach.low <= self.end_k <= self.peak_k <= reach.high and np.isfinite(self.fold_s) and self.fold_s > 0):
             raise InputError(
                 f"a flare that cools from {self.peak_k:g} to {self.end_k:g} K in {self.fold_s:g} s, expected "
-                f"temperatures from {low:g} to {high:g} K, the end no hotter than the peak, and a time above 0"
+                f"temperatures from {reach.words('K')}, the end no hotter than the peak, and a time above 0"
             )
 
     def at(self, since_peak_s: Float) -> Float:
@@ -101,12 +100,9 @@ class Event:
             raise InputError(f"a flare peaks at {self.peak_s:g} s, expected a time")
         if not 0 < self.half_width_s < np.inf:
             raise InputError(f"the half width of a flare = {self.half_width_s:g} s, expected a time above 0")
-        if not 0 <= self.amplitude <= LARGEST_AMPLITUDE:
-            raise InputError(f"the amplitude of a flare = {self.amplitude:g}, expected 0 to {LARGEST_AMPLITUDE:g}")
+        checked(Amplitude, "amplitude", self.amplitude)
         if not isinstance(self.temperature, Cooling):
-            low, high = FLARE_TEMPERATURES_K
-            if not low <= self.temperature <= high:
-                raise InputError(f"flare temperature = {self.temperature:g} K, expected {low:g} to {high:g} K")
+            checked(Temperature, "flare temperature", self.temperature)
 
     @classmethod
     def of_peak(

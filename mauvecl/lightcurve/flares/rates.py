@@ -18,7 +18,8 @@ from mauvecl.host.files.text_table import read_text_table
 from mauvecl.host.stars.flare_spectra import Blackbody, FlareSpectrum
 from mauvecl.lightcurve.flares.energies import flux_in_band
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.ranges import FLARE_TEMPERATURES_K
+from mauvecl.schema.fields import checked
+from mauvecl.schema.physical import Temperature
 from mauvecl.schema.text import shortened
 
 Float = NDArray[np.float64]
@@ -270,10 +271,7 @@ def band_factor(old: str, new: str, flare_k: float = 10_000.0, flare: FlareSpect
     InputError
         For an unknown band, or a temperature that no flare has.
     """
-    low, high = FLARE_TEMPERATURES_K
-    if not low <= flare_k <= high:
-        raise InputError(f"flare_k = {flare_k}, expected {low:g} to {high:g} K")
-
+    flare_k = checked(Temperature, "flare_k", flare_k)
     light = Blackbody(flare_k) if flare is None else flare
 
     def flux(band: str) -> float:

@@ -30,7 +30,8 @@ from mauvecl.host.stars.flare_spectra import (
 )
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.ranges import FLARE_TEMPERATURES_K
+from mauvecl.schema.fields import range_of
+from mauvecl.schema.physical import Temperature
 
 if TYPE_CHECKING:
     from mauvecl.host.expectation import Expectation
@@ -40,7 +41,7 @@ if TYPE_CHECKING:
 Float = NDArray[np.float64]
 
 #: Temperatures that are fitted, K: those that a flare may have, but for cool ones without ultraviolet light.
-TEMPERATURES_K = (3_000.0, FLARE_TEMPERATURES_K[1])
+TEMPERATURES_K = (3_000.0, float(range_of(Temperature).high))
 #: Temperatures at which spectra are computed, evenly spaced in log T; splines run through them.
 NODES = 225
 #: Grid of the spectra, nm: beyond the reach of the line function, in steps far below the resolution.

@@ -1,0 +1,111 @@
+"""Readers of values that are written as text, as on the command line; each receives the value's name for messages."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from decimal import Decimal, InvalidOperation
+from typing import Any
+
+from mauvecl.schema.errors import InputError
+from mauvecl.schema.text import shortened
+
+
+def number(text: str, name: str) -> float:
+    """Read a number."""
+    try:
+        return float(text)
+    except ValueError as error:
+        raise InputError(f"{name} {shortened(text)}, expected a number") from error
+
+
+def count(text: str, name: str) -> int:
+    """Read a whole number, also in the form 1e6."""
+    try:
+        exact = Decimal(text)
+        # Writing out more digits than any count has would take forever.
+        whole = int(exact) if exact.is_finite() and exact.adjusted() < 40 else None
+    except InvalidOperation:
+        exact, whole = Decimal(0), None
+    if whole is None or whole != exact:
+        raise InputError(f"{name} {shortened(text)}, expected a whole number, such as 1000000 or 1e6")
+    return whole
+
+
+def several(texts: Sequence[str], name: str, read: Callable[[str, str], Any]) -> list[Any]:
+    """Read values from several texts, each with one value or values with commas between them."""
+    return [read(word.strip(), name) for text in texts for word in text.split(",")]
+
+
+def words(texts: Sequence[str], name: str) -> list[str]:
+    """Read names from several texts, each with one name or names with commas between them."""
+    return several(texts, name, lambda word, _: word)
+
+
+def axis(text: str, name: str) -> dict[str, Any]:
+    """Read an axis: magnitude:4:10:16, amplitude:0.01:1:16:log, or exposure=5,50,600."""
+    if "=" in text:
+        quantity, _, values = text.partition("=")
+        parts = [part.strip() for part in values.split(",")]
+        try:
+            return {"quantity": quantity, "values": parts if quantity == "star" else [float(part) for part in parts]}
+        except ValueError as error:
+            raise InputError(f"{name} {text!r}, expected numbers, such as {quantity}=5,50,600") from error
+    parts = text.split(":")
+    try:
+        quantity, start, stop, steps, *rest = parts
+        spaced = {"quantity": quantity, "start": float(start), "stop": float(stop), "steps": int(steps)}
+    except ValueError as error:
+        raise InputError(
+            f"{name} {text!r}, expected quantity:start:stop:steps, with :log behind it if wanted, or quantity=a,b,c"
+        ) from error
+    if rest not in ([], ["log"]):
+        raise InputError(f"{name} {text!r} ends in {':'.join(rest)!r}, expected log or nothing")
+    return spaced | {"log": bool(rest)}
+
+
+def axes(texts: Sequence[str], name: str) -> list[dict[str, Any]]:
+    """Read several axes."""
+    return [axis(text, name) for text in texts]
+
+
+def line_fluxes(texts: Sequence[str], name: str) -> dict[str, float]:
+    """Read fluxes of emission lines, such as 'Mg II=0.05'."""
+    lines = {}
+    for text in texts:
+        line, equals, value = (part.strip() for part in text.rpartition("="))
+        if not (line and equals):
+            raise InputError(f"{name} {shortened(text)}, expected NAME=FLUX, such as 'Mg II=0.05'")
+        lines[line] = number(value, f"{name} {shortened(text)}:")
+    return lines
+
+
+def gaps(texts: Sequence[str], name: str) -> list[tuple[float, float]]:
+    """Read ranges of time such as 1000:2000."""
+    return [_pair(text, f"{name} {text!r}, expected two times in s, such as 1000:2000") for text in texts]
+
+
+def declinations(text: str, name: str) -> tuple[float, float] | str:
+    """Read a range of declinations such as -46.4:31.8, or none."""
+    if text.strip().lower() == "none":
+        return "none"
+    return _pair(text, f"{name} {shortened(text)}, expected low:high in degrees, or none")
+
+
+def _pair(text: str, fault: str) -> tuple[float, float]:
+    try:
+        low, high = (float(part) for part in text.split(":"))
+    except ValueError as error:
+        raise InputError(fault) from error
+    return low, high
+
+
+def frames(text: str, name: str) -> str | list[int]:
+    """Read which frames are kept: stack, all, or numbers such as 0,4,9."""
+    return text if text in ("stack", "all") else several([text], name, _frame)
+
+
+def _frame(text: str, name: str) -> int:
+    try:
+        return int(text)
+    except ValueError as error:
+        raise InputError(f"{name} {shortened(text)}, expected stack, all, or numbers such as 0,4,9") from error

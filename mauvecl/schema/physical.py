@@ -1,0 +1,39 @@
+"""Physical quantities with unit and range; study keys, flags, sweeps, page fields and Python arguments share them."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from mauvecl.schema.fields import Range, Unit
+
+#: Seconds in a day.
+DAY_S = 86_400.0
+
+#: From far brighter than the Sun (-26.76, Willmer 2018) to fainter than any detected star.
+Magnitude = Annotated[float, Unit("mag"), Range(-30, 40)]
+#: Relative rise in a band. The largest known flare, ASASSN-16ae, rose by 11 magnitudes: 2.5e4 (Schmidt et al. 2016).
+Amplitude = Annotated[float, Range(0, 1e6)]
+#: From cool starspots to the hottest white dwarfs; flares of 5000 to 50 000 K are published.
+Temperature = Annotated[float, Unit("K"), Range(1_000, 200_000)]
+#: One exposure lasts at most a day; longer ones are several that are added up.
+Exposure = Annotated[float, Unit("s"), Range(0, DAY_S, open_low=True)]
+#: Operating range in the datasheet of the detector, Hamamatsu S11639-01 (KMPD1163E, absolute maximum ratings).
+DetectorTemperature = Annotated[float, Unit("deg_C"), Range(-40, 65)]
+#: Surface brightness in V; any sky seen from orbit lies well within.
+SkyBrightness = Annotated[float, Unit("mag / arcsec2"), Range(5, 35)]
+#: Ratio of the flux just below the Balmer edge to that just above.
+BalmerJump = Annotated[float, Range(1, 100)]
+#: Ratio of two areas of a flare.
+AreaRatio = Annotated[float, Range(0, 1e6)]
+#: Factor on the fluxes of lines.
+LineScale = Annotated[float, Range(0, 1e6)]
+#: Colour excess E(B-V).
+Reddening = Annotated[float, Unit("mag"), Range(0, 10)]
+#: Width of the bins of a spectrum.
+BinWidth = Annotated[float, Unit("nm"), Range(0.01, 50)]
+#: Probability that is neither 0 nor 1.
+Probability = Annotated[float, Range(0, 1, open_low=True, open_high=True)]
+#: From well within the Sun's distance (4.8e-6 pc) to nearby galaxies.
+Distance = Annotated[float, Unit("pc"), Range(1e-7, 1e6)]
+#: From far below white dwarfs (0.01) to above the largest supergiants (some 1500).
+Radius = Annotated[float, Unit("solRad"), Range(1e-4, 1e4)]
