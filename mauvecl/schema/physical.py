@@ -25,6 +25,8 @@ SkyBrightness = Annotated[float, Unit("mag / arcsec2"), Range(5, 35)]
 BalmerJump = Annotated[float, Range(1, 100)]
 #: Ratio of two areas of a flare.
 AreaRatio = Annotated[float, Range(0, 1e6)]
+#: Flux of a line over that of the continuum in 200-700 nm.
+LineFraction = Annotated[float, Range(0)]
 #: Factor on the fluxes of lines.
 LineScale = Annotated[float, Range(0, 1e6)]
 #: Colour excess E(B-V).

@@ -11,7 +11,7 @@ from pydantic import Field, model_validator
 from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Flag, Help, Quantity, Range, Unit
 from mauvecl.schema.parsing import line_fluxes
-from mauvecl.schema.physical import AreaRatio, BalmerJump, LineScale, Temperature
+from mauvecl.schema.physical import AreaRatio, BalmerJump, LineFraction, LineScale, Temperature
 from mauvecl.schema.section import Section
 
 if TYPE_CHECKING:
@@ -50,7 +50,7 @@ class FlareLight(Section):
         Quantity("second_area", "area of the flare's second blackbody over that of the first", "second area"),
     ] = None
     lines: Annotated[
-        dict[str, Annotated[float, Range(0)]],
+        dict[str, LineFraction],
         Help(
             "Emission line as a fraction of the continuum in 200-700 nm, by name or wavelength in nm",
             "as in 'Mg II=0.05'",

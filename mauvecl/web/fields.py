@@ -15,8 +15,11 @@ from mauvecl.schema.errors import InputError
 from mauvecl.schema.fields import Range, first, range_of, unit_of
 from mauvecl.schema.physical import (
     Amplitude,
+    AreaRatio,
+    BalmerJump,
     DetectorTemperature,
     Exposure,
+    LineFraction,
     Magnitude,
     Probability,
     SkyBrightness,
@@ -116,7 +119,9 @@ def line_fluxes(text: str) -> tuple[tuple[str, float], ...]:
     from mauvecl.host.stars.flare_spectra import EmissionLine
 
     pairs = [pair.partition("=") for pair in text.split(",") if text.strip()]
-    fractions = tuple((EmissionLine.named(name).name, float(Number(0, 100)(value))) for name, _, value in pairs)
+    fractions = tuple(
+        (EmissionLine.named(name).name, float(number_of(LineFraction)(value))) for name, _, value in pairs
+    )
     if len(dict(fractions)) < len(fractions):
         raise InputError(f"{shortened(text)} holds a line twice, expected each once")
     return fractions
@@ -255,16 +260,16 @@ FIELDS = {
         Slider(5000, 30_000, 500),
     ),
     "balmer_jump": Field(
-        "Balmer jump", "", optional(Number(1, 100)),
+        "Balmer jump", "", optional(number_of(BalmerJump)),
         "Flux just below 364.6 nm over that just above, by hydrogen recombination: 1 to 4 in most flares. Nothing: a "
         "plain blackbody.",
     ),
     "second_temperature_k": Field(
-        "Second temperature", "", optional(Number(1000, 100_000)),
+        "Second temperature", "", optional(number_of(Temperature)),
         "A second blackbody in the flare, instead of a Balmer jump. Nothing: there is none.", "K",
     ),
     "second_area": Field(
-        "Second area", "0.05", Number(0, 1e6), "Area at the second temperature over that at the first, if there is one."
+        "Second area", "0.05", number_of(AreaRatio), "Area at the second temperature over that at the first, if there is one."
     ),
     "lines": Field(
         "Emission lines", "", line_fluxes,
