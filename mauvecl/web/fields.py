@@ -269,7 +269,8 @@ FIELDS = {
         "A second blackbody in the flare, instead of a Balmer jump. Nothing: there is none.", "K",
     ),
     "second_area": Field(
-        "Second area", "0.05", number_of(AreaRatio), "Area at the second temperature over that at the first, if there is one."
+        "Second area", "0.05", number_of(AreaRatio),
+        "Area at the second temperature over that at the first, if there is one.",
     ),
     "lines": Field(
         "Emission lines", "", line_fluxes,
