@@ -17,7 +17,6 @@ from mauvecl.schema.tables import Column, View, table_of
 from mauvecl.study.cases import Case, cases
 from mauvecl.study.labels import star_column
 from mauvecl.study.messages import collect_messages
-from mauvecl.study.quantities import QUANTITIES
 from mauvecl.study.study import Study
 
 if TYPE_CHECKING:
