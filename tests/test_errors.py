@@ -42,7 +42,7 @@ def test_a_place_is_put_before_the_sentence_and_processes_pass_errors_on() -> No
 
 def test_sentences_of_each_kind() -> None:
     for call, sentence in (
-        (lambda: Source.from_library("G2V").at_magnitude(99.0), "magnitude = 99.0, expected -30 to 40"),
+        (lambda: Source.from_library("G2V").at_magnitude(99.0), "magnitude = 99.0, expected -30 to 40 mag"),
         (
             lambda: numbers("wavelengths", [1.0, -1.0], "nm", low=0.0),
             "wavelengths = -1.0 nm, expected nm of at least 0",

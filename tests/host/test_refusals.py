@@ -80,9 +80,9 @@ STARS: list[Row] = [
 INSTRUMENTS: list[Row] = [
     (lambda: Instrument.load("mauv"), "instrument", "'mauv'", "'mauve'"),
     (lambda: Instrument.load("no-such.toml"), "instrument", "no-such.toml"),
-    (lambda: mauve().with_(temperature_c=100), "temperature_c", "less than or equal to 60"),
-    (lambda: mauve().with_(temperature_c=NAN), "temperature_c", "a finite number"),
-    (lambda: mauve().with_(temperature_c="13"), "temperature_c", "a valid number"),
+    (lambda: mauve().with_(temperature_c=100), "temperature_c", "-40 to 65 deg C"),
+    (lambda: mauve().with_(temperature_c=NAN), "temperature_c", "-40 to 65 deg C"),
+    (lambda: mauve().with_(temperature_c="13"), "temperature_c", "-40 to 65 deg C"),
     (lambda: mauve().with_(frame_s=0), "frame_s", "greater than 0"),
     (lambda: mauve().with_(light_loss=1.0), "light_loss", "less than 1"),
     (lambda: mauve().with_(pixels=2048.5), "pixels", "a whole number"),
@@ -108,7 +108,7 @@ EXPECTATIONS: list[Row] = [
         lambda value: expect(sun(), mauve(), exposure=value),
         "exposure",
         *(0, -5, NAN, np.inf, 86_401, 2 * u.day, 3 * u.m, "50", True, None, [50, 60], [5, 6] * u.s),
-        facts=("a time above 0 and up to one day",),
+        facts=("seconds above 0 and up to 86400",),
     ),
     (lambda: expect(sun(), mauve(), exposure=50, signal="all"), "signal", "'all'", "'paper'"),  # type: ignore[arg-type]
     (lambda: response_matrix(mauve(), [300.0, 400.0], "other"), "order", "'physical'"),  # type: ignore[arg-type]
