@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Self
 
-from mauvecl.schema.tables import INTERVAL, View
+from mauvecl.schema.tables import INTERVAL, View, without_empty
 
 if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
@@ -145,7 +145,8 @@ def show_table(title: str, columns: Sequence[str], cells: Sequence[Sequence[Any]
     """A table without its empty columns, in parts where the terminal is narrower; numbers are formatted already."""
     from rich.console import Console
 
-    filled = [i for i in range(len(columns)) if not cells or any(str(row[i]) for row in cells)]
+    columns, cells = without_empty(columns, cells)
+    filled = list(range(len(columns)))
     # Names may hold brackets and colons, which are no markup here.
     how: dict[str, Any] = {"highlight": False, "markup": False, "emoji": False}
     console = Console(**how)

@@ -34,7 +34,7 @@ class Column:
     others : tuple of str
         Further columns whose values `format` takes after the column's own.
     kind : type, optional
-        Type of the values of a table without rows, or with missing values.
+        Type of the values, where it does not follow from them: in a table without rows, or with missing values.
     """
 
     name: str
@@ -72,12 +72,16 @@ class View:
     table: Table | None = None
 
     def texts(self, hidden: Collection[str] = ()) -> tuple[list[str], list[list[str]]]:
-        """Return headings and cells, without `hidden` columns and those whose cells are all empty."""
-        found = [] if self.table is None else records(self.table)
+        """Return headings and cells, without `hidden` columns."""
         shown = [one for one in self.columns if one.heading and one.name not in hidden]
-        cells = [[one.text(record) for record in found] for one in shown]
-        filled = [k for k, texts in enumerate(cells) if any(texts) or not found]
-        return [shown[k].heading for k in filled], [list(row) for row in zip(*(cells[k] for k in filled), strict=True)]
+        found = [] if self.table is None else records(self.table)
+        return [one.heading for one in shown], [[one.text(record) for one in shown] for record in found]
+
+
+def without_empty(headings: Sequence[str], cells: Sequence[Sequence[str]]) -> tuple[list[str], list[list[str]]]:
+    """Return headings and cells without columns whose cells are all empty."""
+    filled = [k for k in range(len(headings)) if not cells or any(row[k] for row in cells)]
+    return [headings[k] for k in filled], [[row[k] for k in filled] for row in cells]
 
 
 def table_of(columns: Iterable[Column], rows: Iterable[object], **meta: object) -> QTable:
@@ -90,12 +94,12 @@ def table_of(columns: Iterable[Column], rows: Iterable[object], **meta: object) 
     named = [one for one in columns if one.name]
     parts = [np.broadcast_arrays(*(np.atleast_1d(one.value(row)) for one in named)) for row in rows]
     for k, column in enumerate(named):
-        values = np.concatenate([np.array([], column.kind or float)] * (not parts) + [part[k] for part in parts])
-        if not values.size and column.kind is not None:
-            values = values.astype(column.kind)
+        values = np.concatenate([part[k] for part in parts] or [np.array([], column.kind or float)])
         if values.dtype == object:
             missing = np.array([value is None for value in values])
             values = np.ma.MaskedArray(np.where(missing, 0, values).astype(column.kind or float), missing)
+        elif column.kind is not None:
+            values = values.astype(column.kind)
         table[column.name] = values * unit_of(column.unit) if column.unit else values
         table[column.name].info.description = column.description or None
     table.meta |= meta
@@ -110,6 +114,8 @@ def stacked(first: Sequence[Column], parts: Iterable[tuple[object, Table]], **me
 
     def taken(name: str) -> Column:
         unit, text = str(one[name].unit or ""), one[name].info.description or ""
+        if any(str(table[name].unit or "") != unit for _, table in every):
+            raise ValueError(f"column {name} has several units")
         return Column(name, lambda part: getattr(part[1][name], "value", part[1][name]), unit, text)
 
     columns = [each.of(itemgetter(0)) for each in first]
@@ -132,9 +138,9 @@ def percent(spec: str) -> Callable[[float], str]:
     return lambda value: f"{100 * value:{spec}} %" if value == value else ""
 
 
-def interval(spec: str) -> Callable[[float, float], str]:
-    """Return a function that formats the ends of an interval; empty for NaN."""
-    return lambda low, high: f"[{low:{spec}}, {high:{spec}}]" if low == low else ""
+def interval(spec: str, factor: float = 1.0) -> Callable[[float, float], str]:
+    """Return a function that formats the ends of an interval, times a factor; empty for NaN."""
+    return lambda low, high: f"[{factor * low:{spec}}, {factor * high:{spec}}]" if low == low else ""
 
 
 def short(value: float | str) -> str:

@@ -64,7 +64,7 @@ def place_columns(study: Study, *own: str, star: str = "label") -> tuple[Column,
 
 def star_column(get: str = "star") -> Column:
     """Return the column of a star's label."""
-    return Column("star", get, description=QUANTITIES["star"].description, heading="star")
+    return Column("star", get, description=QUANTITIES["star"].description, heading="star", kind=str)
 
 
 def quantity_column(name: str, get: str | Callable[[Any], Any] = "", description: str = "") -> Column:

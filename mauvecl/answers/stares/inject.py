@@ -20,9 +20,9 @@ from mauvecl.lightcurve.stares.requests import Arrays
 from mauvecl.runs.pool import Pool, map_in_order
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.tables import make_table
+from mauvecl.schema.tables import INTERVAL, Column, View, interval, number, percent, stacked, table_of
 from mauvecl.statistics.intervals import Interval
-from mauvecl.study.labels import describe_columns, label, stack_tables
+from mauvecl.study.labels import label, place_columns
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.stare_expectation import orbit_lines, threshold_line
 from mauvecl.study.study import Study
@@ -47,6 +47,64 @@ SIZE_UNITS = {"amplitude": "", "duration": "s", "energy": "erg", "band_energy": 
 DIFFERS = 4.0
 #: Chance of as many alarms at the threshold below which they are too many.
 LEAST_CHANCE = 1e-5
+
+
+def limit_columns(of: str) -> tuple[Column, ...]:
+    """Return the columns of the table of limits of a kind of size."""
+    unit, columns = SIZE_UNITS[of], list[Column]()
+    size, ends = (percent(".4g"), interval(".4g", 100)) if of == "amplitude" else (".4g", interval(".4g"))
+    for power in POWERS:
+        name = f"e{100 * power:.0f}"
+        columns += [
+            Column(name, "", unit, f"{of} at which the completeness is {power:g}", name.upper(), size),
+            Column(f"{name}_low", "", unit, "its 95 % interval, lower end", INTERVAL, ends,
+                   (f"{name}_high",)),
+            Column(f"{name}_high", "", unit, "its 95 % interval, upper end"),
+        ]  # fmt: skip
+    return (
+        Column("half_width", "", "s", "half-width of the injected flares; NaN for all of them alike", "half-width (s)",
+               number(".4g", "all")),
+        *columns,
+        Column("never", "", "", "share of flares for which no template fits into what is observed", "no template fits",
+               percent(".3g")),
+    )  # fmt: skip
+
+
+def cell_columns(of: str) -> tuple[Column, ...]:
+    """Return the columns of the table of completeness over half-width and a kind of size."""
+    text = "their amplitude: relative rise of the photons in the flare's band"
+    return (
+        Column("half_width", "", "s", "half-width of the injected flares"),
+        Column("size", "", SIZE_UNITS[of], f"{of} of the injected flares"),
+        Column("amplitude", "", "", text),
+        Column("completeness", "", "", "share of injected flares that the search finds"),
+        Column("completeness_low", "", "", "its 95 % interval, lower end"),
+        Column("completeness_high", "", "", "its 95 % interval, upper end"),
+        Column("injections", "", "", "number of injected flares"),
+    )
+
+
+#: Columns of the table of searches.
+SEARCH_COLUMNS = (
+    Column("threshold", "threshold.value", "", "S/N from which on a template is an alarm", "threshold", ".3f"),
+    Column("threshold_low", "threshold.low", "", "its 95 % interval, lower end", INTERVAL, interval(".3f"),
+           ("threshold_high",)),
+    Column("threshold_high", "threshold.high", "", "its 95 % interval, upper end"),
+    Column("checked_at", "checked", "", "S/N at which drawn stares are held against normal noise",
+           "alarms a day above", ".2f"),
+    Column("alarms_sampled", "asked", "", "false alarms per star-day there, normal noise", "sampled", ".3g"),
+    Column("alarms_simulated", "simulated.value", "", "false alarms per star-day there, drawn stares", "drawn", ".3g"),
+    Column("alarms_low", "simulated.low", "", "lower end: 4 standard errors"),
+    Column("alarms_high", "simulated.high", "", "upper end: 4 standard errors"),
+    Column("alarmed", "", "", "drawn stares with a false alarm at the threshold"),
+    Column("alarmed_expected", "expected", "", "how many should have one"),
+    Column("in_a_row", "", "", "false alarms per star-day of the common rule, white noise"),
+    Column("templates", "surveyed.survey.search.n_filters", "", "templates of the bank", "templates"),
+    Column("sums", "surveyed.survey.components.n_statistics", "", "weighted sums of a frame", "sums of a frame"),
+    Column("spectral_loss", lambda one: float(one.surveyed.templates.loss.max()), "",
+           "largest share of S/N lost to so few sums"),
+    Column("star_days", lambda one: one.surveyed.survey.stare.observed_s / DAY_S, "", "star-days of a stare"),
+)  # fmt: skip
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +149,39 @@ class StarCompleteness(InCell):
     in_a_row: float
     injected: InjectedCompleteness
     fitted: FitAccuracy | None
+
+    @property
+    def limits(self) -> QTable:
+        """Sizes of which a half and nine tenths are found: all half-widths together, and each."""
+        injected = self.injected
+        every = (None, *range(len(injected.half_widths_s)))
+        values = {"half_width": np.array([np.nan, *injected.half_widths_s])}
+        for power in POWERS:
+            name = f"e{100 * power:.0f}"
+            limits = np.array([astuple(injected.limit(power, k)) for k in every]).T
+            values |= dict(zip((name, f"{name}_low", f"{name}_high"), limits, strict=True))
+        values["never"] = np.array([injected.never(k) for k in every])
+        return table_of(limit_columns(self.sizes.of), [values])
+
+    @property
+    def cells(self) -> QTable:
+        """Completeness at each half-width and size, and how well the flares are recovered."""
+        injected = self.injected
+        d, s = (index.ravel() for index in np.indices((len(injected.half_widths_s), len(injected.sizes))))
+        values = {
+            "half_width": np.array(injected.half_widths_s)[d],
+            "size": injected.sizes[s],
+            "amplitude": injected.amplitudes[d, s],
+            "completeness": injected.completeness[d, s],
+            "completeness_low": injected.completeness_low[d, s],
+            "completeness_high": injected.completeness_high[d, s],
+            "injections": np.full(d.size, injected.count),
+        }
+        columns = cell_columns(self.sizes.of)
+        if self.fitted is not None:
+            columns = (*columns, *FitAccuracy.COLUMNS)
+            values |= {one.name: one.value(self.fitted)[d, s] for one in FitAccuracy.COLUMNS}
+        return table_of(columns, [values])
 
     @property
     def messages(self) -> list[str]:
@@ -139,27 +230,38 @@ class InjectAnswer(Answer):
     @cached_property
     def table(self) -> QTable:
         """One row per star, cell of the sweep, and what is found of all half-widths and of each: sizes E50 and E90."""
-        return self._together(_limits)
+        return stacked(place_columns(self.study), ((one, one.limits) for one in self.stars), **self._about)
 
     @cached_property
     def completeness(self) -> QTable:
         """One row per star, cell of the sweep, half-width and size."""
-        return self._together(_cells)
+        return stacked(place_columns(self.study), ((one, one.cells) for one in self.stars), **self._about)
 
     @cached_property
     def search(self) -> QTable:
         """One row per star and cell of the sweep: thresholds, false alarms."""
-        return self._together(_search)
+        return table_of((*place_columns(self.study), *SEARCH_COLUMNS), self.stars, **self._about)
 
-    def _together(self, make: Callable[[StarCompleteness], QTable]) -> QTable:
-        parts = (({**star.at, "star": star.label}, make(star)) for star in self.stars)
+    @property
+    def views(self) -> list[View]:
         choice = self.study.search
-        meta = {
+        alarms = "false alarm" if choice.false_alarms == 1 else "false alarms"
+        title = f"The search: {choice.false_alarms:g} {alarms} per star-{choice.per} of frames"
+        limits = []
+        for one in self.stars:
+            unit = f" ({SIZE_UNITS[one.sizes.of]})" if SIZE_UNITS[one.sizes.of] else ""
+            found = f"{one.title}: {one.sizes.of}{unit} of which a half (E50) and nine tenths (E90) are found"
+            limits.append(View(found, limit_columns(one.sizes.of), one.limits))
+        return [View(title, (*place_columns(self.study), *SEARCH_COLUMNS), self.search), *limits]
+
+    @property
+    def _about(self) -> dict[str, object]:
+        choice = self.study.search
+        return {
             "false_alarms": f"{choice.false_alarms:g} per star-{choice.per}",
             "flare": f"{self.study.flare.light().describe()}, {choice.shape}, amplitudes in {self.study.flare.band}",
             "study": self.study.text(),
         }
-        return stack_tables(parts, **meta)
 
     @property
     def tables(self) -> dict[str, Table]:
@@ -169,61 +271,6 @@ class InjectAnswer(Answer):
     @property
     def inputs(self) -> list[Expectation]:
         return [star.surveyed.quiet for star in self.stars]
-
-
-def _limits(star: StarCompleteness) -> QTable:
-    injected, unit = star.injected, SIZE_UNITS[star.sizes.of]
-    every = (None, *range(len(injected.half_widths_s)))
-    widths, told = [np.nan, *injected.half_widths_s], "half-width of the injected flares; NaN for all of them alike"
-    columns: list[tuple[object, ...]] = [("half_width", widths, told, "s")]
-    for power in POWERS:
-        name, limits = f"e{100 * power:.0f}", np.array([astuple(injected.limit(power, k)) for k in every]).T
-        columns += [
-            (name, limits[0], f"{star.sizes.of} at which the completeness is {power:g}", unit),
-            (f"{name}_low", limits[1], "its 95 % interval, lower end", unit),
-            (f"{name}_high", limits[2], "its 95 % interval, upper end", unit),
-        ]
-    text = "share of flares for which no template fits into what is observed"
-    return describe_columns(make_table([*columns, ("never", np.array([injected.never(k) for k in every]), text)]))
-
-
-def _cells(star: StarCompleteness) -> QTable:
-    injected, of, unit = star.injected, star.sizes.of, SIZE_UNITS[star.sizes.of]
-    d, s = (index.ravel() for index in np.indices((len(injected.half_widths_s), len(injected.sizes))))
-    columns = [
-        ("half_width", np.array(injected.half_widths_s)[d], "half-width of the injected flares", "s"),
-        ("size", injected.sizes[s], f"{of} of the injected flares", unit),
-        ("amplitude", injected.amplitudes[d, s], "their amplitude: relative rise of the photons in the flare's band"),
-        ("completeness", injected.completeness[d, s], "share of injected flares that the search finds"),
-        ("completeness_low", injected.completeness_low[d, s], "its 95 % interval, lower end"),
-        ("completeness_high", injected.completeness_high[d, s], "its 95 % interval, upper end"),
-        ("injections", np.full(d.size, injected.count)),
-    ]
-    if star.fitted is not None:
-        columns += [(name, getattr(star.fitted, name)[d, s], text) for name, text in FitAccuracy.COLUMNS.items()]
-    return describe_columns(make_table(columns))
-
-
-def _search(star: StarCompleteness) -> QTable:
-    s = star.surveyed.survey
-    rows = (
-        ("threshold", star.threshold.value, "S/N from which on a template is an alarm"),
-        ("threshold_low", star.threshold.low, "its 95 % interval, lower end"),
-        ("threshold_high", star.threshold.high, "its 95 % interval, upper end"),
-        ("checked_at", star.checked, "S/N at which drawn stares are held against normal noise"),
-        ("alarms_sampled", star.asked, "false alarms per star-day there, normal noise"),
-        ("alarms_simulated", star.simulated.value, "false alarms per star-day there, drawn stares"),
-        ("alarms_low", star.simulated.low, "lower end: 4 standard errors"),
-        ("alarms_high", star.simulated.high, "upper end: 4 standard errors"),
-        ("alarmed", star.alarmed, "drawn stares with a false alarm at the threshold"),
-        ("alarmed_expected", star.expected, "how many should have one"),
-        ("in_a_row", star.in_a_row, "false alarms per star-day of the common rule, white noise"),
-        ("templates", s.search.n_filters, "templates of the bank"),
-        ("sums", s.components.n_statistics, "weighted sums of a frame"),
-        ("spectral_loss", float(star.surveyed.templates.loss.max()), "largest share of S/N lost to so few sums"),
-        ("star_days", s.stare.observed_s / DAY_S, "star-days of a stare"),
-    )
-    return describe_columns(make_table((name, [value], text) for name, value, text in rows))
 
 
 @public
@@ -259,11 +306,11 @@ def inject(
     q = study.injections
     each = q.count * q.sizes * q.widths
     answer = InjectAnswer(study, [])
-    for number, (values, one, star) in enumerate(cells):
+    for done, (values, one, star) in enumerate(cells):
 
-        def told_of(part: float, number: int = number) -> None:
+        def told_of(part: float, done: int = done) -> None:
             if progress is not None:
-                progress(round((number + part) * each), len(cells) * each)
+                progress(round((done + part) * each), len(cells) * each)
 
         told_of(0.0)
         answer.stars.append(_star(one, star, values, engine, told_of))

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
+from operator import itemgetter
+from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -18,8 +21,8 @@ from mauvecl.lightcurve.stares.observed import Draw, Light, StareExpectation, se
 from mauvecl.runs.checkpoint import kept
 from mauvecl.schema.calls import public
 from mauvecl.schema.errors import InputError
-from mauvecl.schema.tables import make_table
-from mauvecl.study.labels import describe_columns, label, stack_tables
+from mauvecl.schema.tables import Column, View, number, percent, records, table_of
+from mauvecl.study.labels import label, place_columns
 from mauvecl.study.messages import collect_messages
 from mauvecl.study.stare_expectation import energy_of, expect_stare, orbit_lines, stare_of, threshold_line, unused_lines
 from mauvecl.study.stare_section import check_sweep
@@ -86,6 +89,15 @@ class Searched:
 
 
 @dataclass(frozen=True, eq=False)
+class Found:
+    """One flare that a search found: its bolometric energy, erg, and the number of the flare put in near it."""
+
+    alarm: Alarm
+    bolometric_erg: float
+    event: int
+
+
+@dataclass(frozen=True, eq=False)
 class StarStare(InCell):
     """One star in one cell of the sweep; `searched` is a sentence where no search was possible."""
 
@@ -94,10 +106,133 @@ class StarStare(InCell):
     light: Light
     searched: Searched | str | None = None
 
+    @property
+    def found(self) -> list[Found]:
+        """What the search found."""
+        one = self.searched
+        if not isinstance(one, Searched):
+            return []
+        return [Found(*parts) for parts in zip(one.alarms, one.bolometric_erg, one.events, strict=True)]
+
+
+def _with_error(value: float, error: float) -> str:
+    """Format a value to its error's two leading digits: 9979 ± 120, not 1e+02."""
+    if value != value:
+        return ""
+    if not (math.isfinite(error) and error > 0):
+        return f"{value:.3g}"
+    digits = max(1 - math.floor(math.log10(error)), 0)
+    return f"{value:.{digits}f} ± {error:.{digits}f}"
+
+
+def _percent_with_error(value: float, error: float) -> str:
+    text = _with_error(100 * value, 100 * error)
+    return f"{text} %" if text else ""
+
+
+#: Columns of the table of stares.
+COLUMNS = (
+    Column("frames", "staring.stare.n_frames", "", "frames of the stare", "frames"),
+    Column("observed", "staring.stare.observed_s", "s", "time in them", "recorded (s)", "g"),
+    Column("intervals", lambda one: len(one.staring.stare.gtis), "",
+           "good time intervals: runs of frames without a gap", "intervals"),
+    Column("flux", lambda one: float(np.median(one.light.mean[:, 0])), "DN / s",
+           "median net light of a frame, sky included, without bias and dark", "light (DN/s)", ".4g"),
+    Column("frame_noise", lambda one: float(np.median(one.light.sd[:, 0] / one.light.mean[:, 0])), "",
+           "standard deviation of a frame's own noise, relative to its light", "noise of a frame", percent(".3g")),
+    Column("flares", lambda one: len(one.flares), "", "flares put into it"),
+)  # fmt: skip
+#: Columns that are there where stares are searched.
+SEARCHED_COLUMNS = (
+    Column("threshold", lambda one: one.searched.threshold if isinstance(one.searched, Searched) else np.nan, "",
+           "value of the search's statistic from which on it alarms"),
+    Column("found", lambda one: len(one.searched.alarms) if isinstance(one.searched, Searched) else -1, "",
+           "flares found; -1: not searched"),
+)  # fmt: skip
+SATURATED_COLUMN = Column(
+    "saturated_frames", lambda one: int(np.count_nonzero(one.staring.quality)), "",
+    "frames in which the mean of a used pixel reaches saturation", "saturated",
+)  # fmt: skip
+#: Columns of the table of flares, for `Flaring`.
+EVENT_COLUMNS = (
+    Column("peak_time", "event.peak_s", "s", "from the start of the stare; tau = 0 of the shape", "peak at (s)", ".6g",
+           kind=float),
+    Column("half_width", "event.half_width_s", "s", "t_1/2 of the shape's publication", "half-width (s)", "g",
+           kind=float),
+    Column("amplitude", "event.amplitude", "", "the shape's own, in the flare's band", kind=float),
+    Column("peak", "event.peak", "", "highest relative rise of the photons in the flare's band", "peak",
+           percent(".3g"), kind=float),
+    Column("temperature", "event.hottest_k", "K", "blackbody temperature, at the peak", kind=float),
+    Column("equivalent_duration", "event.equivalent_duration_s", "s", "in the flare's band", "ED (s)", ".4g",
+           kind=float),
+    Column("energy_band", "band_erg", "erg", "in the flare's band; nan: star of unknown size", kind=float),
+    Column("energy_bolometric", "bolometric_erg", "erg", "of all of its light", "bolometric (erg)", number(".3g"),
+           kind=float),
+    Column("snr", "snr", "", "of one who knows all but whether the flare is there", "S/N", ".3g", kind=float),
+    Column("shape", "event.form.name", kind=str),
+)  # fmt: skip
+
+
+def _fitted(name: str, key: str, unit: str, text: str, heading: str = "", form: Any = "", *more: str) -> list[Column]:
+    """Return the columns of a fitted quantity: value, standard error, and ends of its 68 % interval."""
+    error = key.replace("_s", "_error_s").replace("_k", "_error_k") if key[-2:] in ("_s", "_k") else f"{key}_error"
+    return [
+        Column(name, lambda one: float(getattr(one.alarm.recovered, key)[0]), unit, text, heading, form, more, float),
+        Column(f"{name}_error", lambda one: float(getattr(one.alarm.recovered, error)[0]), unit,
+               f"{text}; standard error by curvature", kind=float),
+        *_interval(name, key, unit),
+    ]  # fmt: skip
+
+
+def _interval(name: str, key: str, unit: str) -> list[Column]:
+    return [
+        Column(f"{name}_low", lambda one: one.alarm.intervals[key][0], unit, "lower end of its 68 % interval",
+               kind=float),
+        Column(f"{name}_high", lambda one: one.alarm.intervals[key][1], unit, "higher end of its 68 % interval",
+               kind=float),
+    ]  # fmt: skip
+
+
+#: Columns of the table of flares that a search found, for `Found`.
+FOUND_COLUMNS = (
+    *_fitted("peak_time", "peak_s", "s", "from the start of the stare", "peak at (s)", number(".6g", "not measured")),
+    *_fitted("amplitude", "amplitude", "", "in the flare's band", "amplitude", _percent_with_error, "amplitude_error"),
+    *_fitted("half_width", "half_width_s", "s", "t_1/2 of the search's shape", "half-width (s)", _with_error,
+             "half_width_error"),
+    *_fitted("temperature", "temperature_k", "K", "blackbody temperature", "temperature (K)", _with_error,
+             "temperature_error"),
+    *_fitted("equivalent_duration", "equivalent_duration_s", "s", "in the flare's band"),
+    Column("energy_bolometric", "bolometric_erg", "erg", "", "bolometric (erg)", number(".3g"), kind=float),
+    *_interval("energy_bolometric", "energy", "erg"),
+    Column("value", "alarm.rho", "", "the search's statistic when it was found: S/N of the template that fits best",
+           "value", ".2f", kind=float),
+    Column("event", "", "", "row of the star's flares that it is nearest to, from 1 on; 0: none near", "flare",
+           lambda event: str(event) if event else "none", kind=int),
+    Column("window", "alarm.block", "",
+           "number of the window that it was fitted in; flares of one number were fitted together", kind=int),
+    Column("chi2", "alarm.chi2", "", "of this fit", kind=float),
+    Column("dof", "alarm.dof", "", "degrees of freedom of this fit", kind=int),
+    Column("p_value", "alarm.p_value", "", "probability of a chi-squared at least as large where the model is right",
+           kind=float),
+    Column("note", "alarm.note", "",
+           "what is special: a flare that is not measured, an interval that ends where the fit does", kind=str),
+)  # fmt: skip
+#: Columns of a light curve for every frame; those of the light follow for each band.
+FRAME_COLUMNS = (
+    Column("time", "stare.middle_s", "s", "middle of the frame, from the start of the stare"),
+    Column("frame", "stare.numbers", "", "number of the frame, gaps included"),
+    Column("quality", "quality", "", "1 where the mean of a used pixel reaches saturation"),
+)
+LIGHT = {
+    "flux": "net light, bias and known dark taken off",
+    "flux_err": "standard deviation of its photons, dark and reading",
+    "mean": "the same without any noise",
+}
+
 
 @dataclass(eq=False)
 class StareAnswer(Answer):
-    """What `mauvecl stare` answers.
+    """The answer of `mauvecl stare`.
 
     Attributes
     ----------
@@ -108,6 +243,7 @@ class StareAnswer(Answer):
     """
 
     USES: ClassVar[tuple[Use, ...]] = ("instrument", "sky", "flare", "unknowns", "seed")
+    JSON = MappingProxyType({"stares": "table", "events": "events"})
 
     study: Study
     stares: list[StarStare]
@@ -116,53 +252,18 @@ class StareAnswer(Answer):
     @property
     def table(self) -> QTable:
         """One row per star and cell: frames, gaps, light and noise of a frame, flares."""
+        return self._table(self._columns, self.stares)
 
-        def row(one: StarStare) -> QTable:
-            stare, light, told = one.staring.stare, one.light, one.searched
-            columns: list[tuple[object, ...]] = [
-                ("frames", [stare.n_frames], "frames of the stare"),
-                ("observed", [stare.observed_s], "time in them", "s"),
-                ("intervals", [len(stare.gtis)], "good time intervals: runs of frames without a gap"),
-                ("flux", [float(np.median(light.mean[:, 0]))],
-                 "median net light of a frame, sky included, without bias and dark", "DN / s"),
-                ("frame_noise", [float(np.median(light.sd[:, 0] / light.mean[:, 0]))],
-                 "standard deviation of a frame's own noise, relative to its light"),
-                ("flares", [len(one.flares)], "flares put into it"),
-            ]  # fmt: skip
-            if self.study.stare.search:
-                threshold, alarms = (told.threshold, len(told.alarms)) if isinstance(told, Searched) else (np.nan, -1)
-                columns += [
-                    ("threshold", [threshold], "value of the search's statistic from which on it alarms"),
-                    ("found", [alarms], "flares found; -1: not searched"),
-                ]
-            saturated = int(np.count_nonzero(one.staring.quality))
-            told_of = "frames in which the mean of a used pixel reaches saturation"
-            return make_table([*columns, ("saturated_frames", [saturated], told_of)])
-
-        return self._together(row)
+    @property
+    def _columns(self) -> tuple[Column, ...]:
+        searched = SEARCHED_COLUMNS if self.study.stare.search else ()
+        return (*place_columns(self.study), *COLUMNS, *searched, SATURATED_COLUMN)
 
     @property
     def events(self) -> QTable:
         """One row per flare: when, how long, how large, how hot, and the S/N of one who looks for just this one."""
-
-        def rows(one: StarStare) -> QTable:
-            flares, events = one.flares, [flare.event for flare in one.flares]
-            numbers = (
-                ("peak_time", [e.peak_s for e in events], "from the start of the stare; tau = 0 of the shape", "s"),
-                ("half_width", [e.half_width_s for e in events], "t_1/2 of the shape's publication", "s"),
-                ("amplitude", [e.amplitude for e in events], "the shape's own, in the flare's band", ""),
-                ("peak", [e.peak for e in events], "highest relative rise of the photons in the flare's band", ""),
-                ("temperature", [e.hottest_k for e in events], "blackbody temperature, at the peak", "K"),
-                ("equivalent_duration", [e.equivalent_duration_s for e in events], "in the flare's band", "s"),
-                ("energy_band", [f.band_erg for f in flares], "in the flare's band; nan: star of unknown size", "erg"),
-                ("energy_bolometric", [f.bolometric_erg for f in flares], "of all of its light", "erg"),
-                ("snr", [f.snr for f in flares], "of one who knows all but whether the flare is there", ""),
-            )
-            shapes = np.array([e.form.name for e in events], dtype="U32")
-            plain = ((name, np.array(values, np.float64), *more) for name, values, *more in numbers)
-            return make_table([*plain, ("shape", shapes)])
-
-        return self._together(rows)
+        rows = [(one, flare) for one in self.stares for flare in one.flares]
+        return self._table(self._after_place(EVENT_COLUMNS), rows)
 
     @property
     def found(self) -> QTable:
@@ -170,85 +271,60 @@ class StareAnswer(Answer):
 
         Values are NaN where the fit does not measure the flare: `note` says why.
         """
+        rows = [(one, alarm) for one in self.stares for alarm in one.found]
+        return self._table(self._after_place(FOUND_COLUMNS), rows)
 
-        def rows(one: StarStare) -> QTable:
-            searched = one.searched if isinstance(one.searched, Searched) else Searched(np.nan, [], (), ())
-            raised = searched.alarms
-            fits = [alarm.recovered for alarm in raised]
-            fitted = (
-                ("peak_time", "peak{}_s", "from the start of the stare", "s"),
-                ("amplitude", "amplitude{}", "in the flare's band", ""),
-                ("half_width", "half_width{}_s", "t_1/2 of the search's shape", "s"),
-                ("temperature", "temperature{}_k", "blackbody temperature", "K"),
-                ("equivalent_duration", "equivalent_duration{}_s", "in the flare's band", "s"),
-            )
-            best = "the search's statistic when it was found: S/N of the template that fits best"
-            nearest = "row of the star's flares that it is nearest to, from 1 on; 0: none near"
-            columns: list[tuple[object, ...]] = []
+    def _after_place(self, columns: Iterable[Column]) -> list[Column]:
+        """Return columns of the second part of rows after those of the star and cell, which are the first part."""
+        place = place_columns(self.study)
+        return [*(one.of(itemgetter(0)) for one in place), *(one.of(itemgetter(1)) for one in columns)]
 
-            def interval(name: str, key: str, unit: str) -> list[tuple[object, ...]]:
-                ends = np.array([alarm.intervals[key] for alarm in raised], np.float64).reshape(len(raised), 2)
-                return [
-                    (f"{name}_{end}", ends[:, k], f"{end}er end of its 68 % interval", unit)
-                    for k, end in enumerate(("low", "high"))
-                ]
+    def _table(self, columns: Iterable[Column], rows: Iterable[object]) -> QTable:
+        return table_of(columns, rows, study=self.study.text(), seed=self.study.run.seed)
 
-            for name, key, text, unit in fitted:
-                for end, more in (("", ""), ("_error", "; standard error by curvature")):
-                    values = [float(getattr(fit, key.format(end))[0]) for fit in fits]
-                    columns.append((name + end, np.array(values, np.float64), text + more, unit))
-                columns += interval(name, key.format(""), unit)
-            columns += [
-                ("energy_bolometric", np.array(searched.bolometric_erg, np.float64), "", "erg"),
-                *interval("energy_bolometric", "energy", "erg"),
-                ("value", np.array([alarm.rho for alarm in raised], np.float64), best),
-                ("event", np.array(searched.events, np.int64), nearest),
-                ("window", np.array([alarm.block for alarm in raised], np.int64),
-                 "number of the window that it was fitted in; flares of one number were fitted together"),
-                ("chi2", np.array([alarm.chi2 for alarm in raised], np.float64), "of this fit"),
-                ("dof", np.array([alarm.dof for alarm in raised], np.int64), "degrees of freedom of this fit"),
-                ("p_value", np.array([alarm.p_value for alarm in raised], np.float64),
-                 "probability of a chi-squared at least as large where the model is right"),
-                ("note", np.array([alarm.note for alarm in raised], dtype="U160"),
-                 "what is special: a flare that is not measured, an interval that ends where the fit does"),
-            ]  # fmt: skip
-            return make_table(columns)
-
-        return self._together(rows)
+    @property
+    def views(self) -> list[View]:
+        place, asked = place_columns(self.study), self.study.search
+        alarms = "false alarm" if asked.false_alarms == 1 else "false alarms"
+        return [
+            View("One stare each", self._columns, self.table),
+            View(
+                "Flares in them; S/N of one who knows all but whether the flare is there",
+                (*place, *EVENT_COLUMNS),
+                self.events,
+            ),
+            *(
+                View(
+                    f"Found at {one.title} above {one.searched.threshold:.2f}, {asked.false_alarms:g} {alarms} per "
+                    f"star-{asked.per}",
+                    FOUND_COLUMNS,
+                    table_of(FOUND_COLUMNS, one.found),
+                )
+                for one in self.stares
+                if isinstance(one.searched, Searched)
+            ),
+        ]
 
     def light_curve(self, number: int = 0) -> QTable:
         """Frames of one star and cell: time, cadence number, quality, and light in every band."""
         one = self.stares[number]
-        stare, light = one.staring.stare, one.light
-        kinds = (
-            ("flux", light.flux, "net light, bias and known dark taken off"),
-            ("flux_err", light.sd, "standard deviation of its photons, dark and reading"),
-            ("mean", light.mean, "the same without any noise"),
+        suffixes = ["", *("_" + name.removesuffix(" nm").replace("-", "_") for name in one.light.bands[1:])]
+        bands = (
+            Column(kind + suffix, unit="DN / s", description=f"{band}: {text}")
+            for band, suffix in zip(one.light.bands, suffixes, strict=True)
+            for kind, text in LIGHT.items()
         )
-        suffixes = ["", *("_" + name.removesuffix(" nm").replace("-", "_") for name in light.bands[1:])]
-        return make_table(
-            [
-                ("time", stare.middle_s, "middle of the frame, from the start of the stare", "s"),
-                ("frame", stare.numbers, "number of the frame, gaps included"),
-                ("quality", one.staring.quality, "1 where the mean of a used pixel reaches saturation"),
-                *(
-                    (column + suffix, values[:, k], f"{name}: {text}", "DN / s")
-                    for k, (name, suffix) in enumerate(zip(light.bands, suffixes, strict=True))
-                    for column, values, text in kinds
-                ),
-            ],
-            **{"star": one.label, "study": self.study.text(), "seed": self.study.run.seed, **one.at},
-        )
-
-    def _together(self, table_of: Callable[[StarStare], QTable]) -> QTable:
-        parts = (({"star": one.label, **one.at}, table_of(one)) for one in self.stares)
-        return stack_tables(parts, study=self.study.text(), seed=self.study.run.seed)
+        light = {"flux": one.light.flux, "flux_err": one.light.sd, "mean": one.light.mean}
+        values = {kind + suffix: light[kind][:, k] for k, suffix in enumerate(suffixes) for kind in LIGHT}
+        about = {"star": one.label, "study": self.study.text(), "seed": self.study.run.seed, **one.at}
+        frames = (column.of(itemgetter("stare")) for column in FRAME_COLUMNS)
+        return table_of((*frames, *bands), [{"stare": one.staring, **values}], **about)
 
     @property
     def tables(self) -> dict[str, Table]:
         """The stares, their flares, and a light curve of each."""
         curves = {
-            f"light-curve-{n}": describe_columns(self.light_curve(n - 1))
+            f"light-curve-{n}": self.light_curve(n - 1)
             for n, one in enumerate(self.stares, 1)
             if one.staring.stare.n_frames <= MOST_ROWS
         }
@@ -276,12 +352,8 @@ class StareAnswer(Answer):
         )
 
     def as_json(self) -> dict[str, Any]:
-        from mauvecl.answers.report import rows
-
-        tables = {"stares": self.table, "events": self.events} | (
-            {"found": self.found} if self.study.stare.search else {}
-        )
-        return {"messages": self.messages} | {name: rows(table) for name, table in tables.items()}
+        found = {"found": records(self.found)} if self.study.stare.search else {}
+        return super().as_json() | found
 
 
 @public

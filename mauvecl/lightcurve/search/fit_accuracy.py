@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from mauvecl.schema.tables import Column
+
 if TYPE_CHECKING:
     from mauvecl.lightcurve.search.flare_fit import Fit, FittedFlares
     from mauvecl.lightcurve.search.injection_sites import Place
@@ -58,7 +60,7 @@ class Refit:
 class FitAccuracy:
     """Accuracy of fits in each cell; arrays of shape (n_half_width, n_size), NaN without detections.
 
-    `COLUMNS` describes the attributes.
+    `COLUMNS` are the attributes as columns of a table.
     """
 
     fitted: Float
@@ -72,18 +74,18 @@ class FitAccuracy:
     peak_scatter: Float
     energy_covered: Float
 
-    COLUMNS: ClassVar[dict[str, str]] = {
-        "fitted": "flares that were found and fitted",
-        "energy_ratio": "recovered over injected energy, median of those found",
-        "energy_ratio_low": "the same, 16 % quantile",
-        "energy_ratio_high": "the same, 84 % quantile",
-        "amplitude_ratio": "recovered over injected amplitude, median",
-        "half_width_ratio": "recovered over injected half-width, median",
-        "temperature_ratio": "recovered over injected temperature, median",
-        "peak_offset": "recovered less injected time of the peak, half-widths, median",
-        "peak_scatter": "half of the range of the middle 68 % of it, half-widths",
-        "energy_covered": "share of energies within their own standard error of the injected one",
-    }
+    COLUMNS: ClassVar[tuple[Column, ...]] = (
+        Column("fitted", description="flares that were found and fitted"),
+        Column("energy_ratio", description="recovered over injected energy, median of those found"),
+        Column("energy_ratio_low", description="the same, 16 % quantile"),
+        Column("energy_ratio_high", description="the same, 84 % quantile"),
+        Column("amplitude_ratio", description="recovered over injected amplitude, median"),
+        Column("half_width_ratio", description="recovered over injected half-width, median"),
+        Column("temperature_ratio", description="recovered over injected temperature, median"),
+        Column("peak_offset", description="recovered less injected time of the peak, half-widths, median"),
+        Column("peak_scatter", description="half of the range of the middle 68 % of it, half-widths"),
+        Column("energy_covered", description="share of energies within their own standard error of the injected one"),
+    )
 
     @classmethod
     def of(cls, parts: Sequence[Mapping[str, NDArray[Any]]]) -> Self:

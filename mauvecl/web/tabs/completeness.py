@@ -77,21 +77,11 @@ class Completeness(Tab):
     )
     pictures = (Shares(),)
     simulations = {"completeness": "Inject flares"}  # noqa: RUF012
+    shows, view = "completeness", 1
     files = {"completeness": "completeness", "limits": "completeness"}  # noqa: RUF012
 
     def table(self, name: str, closed: ClosedForms, answers: Answers) -> Table:
         return answers["completeness"].tables[name]
-
-    def rows(self, closed: ClosedForms, answers: Answers) -> list[list[str]]:
-        if "completeness" not in answers:
-            return []
-        table = answers["completeness"].table
-        rows = [["half-width of the flare", "half are found at", "90 % are found at"]]
-        for row in table:
-            width = float(getattr(row["half_width"], "value", row["half_width"]))
-            called = "all together" if np.isnan(width) else f"{short(width)} s"
-            rows.append([called, *(f"{100 * float(row[name]):.3g} %" for name in ("e50", "e90"))])
-        return rows
 
     def study(self, name: str, closed: ClosedForms, answers: Answers) -> Study:
         study: Study = answers["completeness"].study

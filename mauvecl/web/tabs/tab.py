@@ -7,6 +7,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, ClassVar
 
+from mauvecl.schema.tables import without_empty
+
 if TYPE_CHECKING:
     from astropy.table import Table
     from numpy.typing import ArrayLike
@@ -111,7 +113,7 @@ class Tab(ABC):
         """Return a small table as text with a header row; empty if there is nothing to report."""
         if self.shows not in answers:
             return []
-        headings, cells = answers[self.shows].views[self.view].texts(FIXED)
+        headings, cells = without_empty(*answers[self.shows].views[self.view].texts(FIXED))
         return [headings, *cells]
 
     def study(self, name: str, closed: ClosedForms, answers: Answers) -> Study:
