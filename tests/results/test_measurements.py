@@ -226,6 +226,57 @@ def test_without_a_flare_the_amplitude_is_at_its_boundary() -> None:
     assert found.one_sided[0, none, 0].sum() + np.isinf(found.low[0, none, 0]).sum() > 0
 
 
+def test_bounded_intervals_are_those_of_brute_force() -> None:
+    """Jump and lines near their bounds: non-negative least squares of SciPy on grids of temperature and jump."""
+    x, m = quiet(), model(jump=True, lines=("Mg II",))
+    raw = drawn(x, m.counts(9000.0, m.amplitudes(9000.0, 0.05, jump=1.05, lines=(2e-12,))), 4, 51)
+    found, allowed = fit(raw, x, m, levels=(0.95,)), float(scipy.stats.chi2.isf(0.05, 1))
+    kelvin, jumps = np.geomspace(3000.0, 200_000.0, 1500), np.linspace(1.0, 7.0, 61)
+    edge = m.splines[m.names.index("jump")]
+    assert edge is not None
+    for k in range(len(raw)):
+        # The variance is that of the fit before the last, so that the reduction of this one differs by little.
+        reduction = Reduction.of(m, x, m.counts(float(np.exp(found.log_k[k])), found.amplitudes[k]))
+        y = reduction.sums((raw[k] - x.recorded_dn)[None])[0][0]
+
+        def gain(columns: np.ndarray, y: np.ndarray = y) -> float:
+            return float(y @ y - scipy.optimize.nnls(columns / np.linalg.norm(columns, axis=0), y)[1] ** 2)
+
+        hot = reduction.spline(np.log(kelvin))
+        gains = np.array([gain(np.column_stack([h, reduction.fixed.T])) for h in hot])
+        inside = kelvin[gains >= gains.max() - allowed]
+        np.testing.assert_allclose([found.low[0, k, 0], found.high[0, k, 0]], inside[[0, -1]], rtol=0.01)
+        profile = np.zeros(jumps.size)
+        for i in np.flatnonzero(gains >= gains.max() - allowed)[::8]:
+            for j, jump in enumerate(jumps):
+                both = hot[i] + (jump - 1.0) / float(edge(np.log(kelvin[i]))) * reduction.fixed[0]
+                profile[j] = max(profile[j], gain(np.column_stack([both, reduction.fixed[1]])))
+        ends = jumps[profile >= gains.max() - allowed][[0, -1]]
+        column = found.column("jump")
+        low, high = found.low[0, k, column], found.high[0, k, column]
+        assert abs(low - ends[0]) < 0.12
+        assert abs(high - ends[1]) < 0.12 or ends[1] == jumps[-1]
+        assert (found.estimates[k] >= np.array(found.bounds)).all()
+    line = found.column("line Mg II")
+    assert found.one_sided[0, :, line].any()
+
+
+def test_limits_at_a_bound_cover() -> None:
+    """A flare without a jump, fitted with one: half of the fits are at the bound, and limits cover 97.5 %.
+
+    At a bound the statistic is 0 or that of Wilks, each in half of the cases (Chernoff 1954). False failures: 1e-6.
+    """
+    x, m, n = quiet(), model(jump=True), 1500
+    found = fit(drawn(x, m.counts(9000.0, m.amplitudes(9000.0, 0.3)), n, 52), x, m, levels=(0.95,))
+    column = found.column("jump")
+    at_bound = int((found.estimates[:, column] == 1.0).sum())
+    assert scipy.stats.binom.ppf(1e-6, n, 0.47) <= at_bound <= scipy.stats.binom.isf(1e-6, n, 0.53)
+    covered = int((found.low[0, :, column] <= 1.0).sum())
+    assert scipy.stats.binom.ppf(1e-6, n, 0.97) <= covered <= scipy.stats.binom.isf(1e-6, n, 0.98)
+    assert found.one_sided[0, :, column].mean() > 0.96
+    assert (found.high[0, :, column] > 1.0).all()
+
+
 def test_sums_of_the_device_are_fitted_as_pixels_are(engine: Engine) -> None:
     """The same 300 realisations as frames, and as sums that the device makes of their pixels."""
     x = quiet()

@@ -10,6 +10,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from mauvecl.results.measurements.bounded import BoundedProfile, bounded_intervals, with_bounds
 from mauvecl.results.measurements.model import FlareModel, derived_values
 from mauvecl.results.measurements.profile import Profile, covariance, covariance_of, intervals
 from mauvecl.results.measurements.reduction import Reduction, check_distinct, usable_variance
@@ -43,6 +44,8 @@ class Measurement:
     Attributes
     ----------
     names, units : tuple of str
+    bounds : tuple of float
+        Smallest possible values: 1 of a jump, 0 of light.
     estimates : ndarray, shape (n, n_derived)
         Of maximum likelihood.
     covariance : ndarray, shape (n, n_derived, n_derived)
@@ -50,7 +53,7 @@ class Measurement:
     levels : tuple of float
         Nominal coverage of the intervals.
     low, high : ndarray, shape (n_level, n, n_derived)
-        Ends of the intervals; infinite where there is none, so that the other end is a one-sided limit.
+        Ends of the intervals; infinite, or at the bound, where there is none, so that the other is a one-sided limit.
     chi2, p_value : ndarray, shape (n,)
         Goodness of fit, and the probability of a worse one if the model is right.
     dof : int
@@ -63,6 +66,7 @@ class Measurement:
 
     names: tuple[str, ...]
     units: tuple[str, ...]
+    bounds: tuple[float, ...]
     estimates: Float
     covariance: Float
     levels: tuple[float, ...]
@@ -82,8 +86,8 @@ class Measurement:
 
     @property
     def one_sided(self) -> NDArray[np.bool_]:
-        """Intervals with one end, shape (n_level, n, n_derived)."""
-        return np.asarray(np.isinf(self.low) != np.isinf(self.high))
+        """Intervals with one end, shape (n_level, n, n_derived); the other is infinite, or a bound of the quantity."""
+        return np.asarray((self.low <= self.bounds) != np.isinf(self.high))
 
     @classmethod
     def joined(cls, parts: Sequence[Self]) -> Self:
@@ -98,13 +102,13 @@ class Measurement:
     def arrays(self) -> dict[str, NDArray[Any]]:
         """Return everything that depends on the frames, for files; `of_arrays` reads it."""
         values = {one.name: np.asarray(getattr(self, one.name)) for one in fields(self)}
-        return {name: value for name, value in values.items() if name not in ("names", "units", "levels")}
+        return {name: value for name, value in values.items() if name not in ("names", "units", "bounds", "levels")}
 
     @classmethod
     def of_arrays(cls, model: FlareModel, levels: Sequence[float], arrays: Mapping[str, NDArray[Any]]) -> Self:
         """Return the measurement of a model's flares that `arrays` gave."""
         given: dict[str, Any] = {**arrays, "dof": int(arrays["dof"])}
-        return cls(model.names, model.units, levels=tuple(levels), **given)
+        return cls(model.names, model.units, model.bounds, levels=tuple(levels), **given)
 
     def rows(self, which: NDArray[Any]) -> Self:
         """Return the measurements of some frames, by number or mask."""
@@ -155,7 +159,8 @@ def fit(
     """Fit one flare to each of some exposures.
 
     The likelihood is Gaussian with the variance of the fitted flare and star. Intervals are those of the profile
-    likelihood, with Wilks' thresholds; for a quantity at the end of the model's temperatures they have one end.
+    likelihood, with Wilks' thresholds. Light is never negative and a jump at least 1: an interval that reaches that
+    bound, or the end of the model's temperatures, has one end, and is a limit.
 
     Parameters
     ----------
@@ -227,7 +232,7 @@ def fit(
     }
     dof = joined.pop("dof")
     joined["p_value"] = np.asarray(scipy.stats.chi2.sf(joined["chi2"], dof))
-    return Measurement(model.names, model.units, levels=tuple(levels), dof=int(dof.min()), **joined)
+    return Measurement(model.names, model.units, model.bounds, levels=tuple(levels), dof=int(dof.min()), **joined)
 
 
 def _pilot(excess: Float, model: FlareModel, reduction: Reduction) -> tuple[Float, Float]:
@@ -271,17 +276,31 @@ def _fitted(excess: Float, model: FlareModel, reduction: Reduction, levels: Sequ
     profile = Profile(reduction, sums)
     at_nodes = profile.gain_at_nodes()
     best = profile.best(at_nodes)
-    found: dict[str, Any] = {"log_k": best.log_k, "amplitudes": best.linear}
     if not levels:
-        return found
+        best = with_bounds(reduction, sums, best)
+        return {"log_k": best.log_k, "amplitudes": best.linear}
+    allowed = [float(scipy.stats.chi2.isf(1 - p, 1)) for p in levels]
+    ends = [intervals(model, profile, best, at_nodes, one) for one in allowed]
+    low, high = (np.stack([one[side] for one in ends]) for side in (0, 1))
+    # Only intervals that reach a bound differ from those without bounds.
+    reaches = (low <= np.array(model.bounds)) & np.isfinite(model.bounds)
+    near = np.flatnonzero(reaches.any(axis=(0, 2)) | (best.linear < 0.0).any(axis=1))
+    if near.size:
+        bounded = BoundedProfile(reduction, sums[near])
+        nodes = bounded.gain_at_nodes()
+        there = bounded.best(nodes)
+        for k, one in enumerate(allowed):
+            low[k, near], high[k, near] = bounded_intervals(model, bounded, there, nodes, one)
+        best = best.replaced(near, there)
     left = np.einsum("nk,nk->n", sums, sums) - best.gain
-    ends = [intervals(model, profile, best, at_nodes, float(scipy.stats.chi2.isf(1 - p, 1))) for p in levels]
     n_fitted = len(model.linear) + 1
-    return found | {
+    return {
+        "log_k": best.log_k,
+        "amplitudes": best.linear,
         "estimates": derived_values(model, best.log_k, best.linear),
         "covariance": covariance(model, profile, best),
-        "low": np.stack([low for low, _ in ends]),
-        "high": np.stack([high for _, high in ends]),
+        "low": low,
+        "high": high,
         "chi2": rest + left,
         "dof": np.full(len(sums), reduction.n_used - reduction.n_free - n_fitted),
         "snr": np.sqrt(best.gain),
@@ -308,7 +327,7 @@ def fit_sums(sums: Float, model: FlareModel, reduction: Reduction) -> tuple[Floa
     estimates, spreads = [], []
     for start in range(0, len(sums), BATCH):
         profile = Profile(reduction, sums[start : start + BATCH])
-        best = profile.best()
+        best = with_bounds(reduction, profile.sums, profile.best())
         estimates.append(derived_values(model, best.log_k, best.linear))
         spreads.append(covariance(model, profile, best))
     return np.concatenate(estimates), np.concatenate(spreads)

@@ -69,6 +69,11 @@ class Derived:
     factors: Float | None = None
     ratio: Float | None = None
 
+    @property
+    def bound(self) -> float:
+        """Smallest value, that of amplitudes of zero."""
+        return 1.0 if self.ratio is not None else 0.0 if self.factors is not None else -np.inf
+
 
 @public
 @dataclass(frozen=True, eq=False)
@@ -201,6 +206,11 @@ class FlareModel:
     def names(self) -> tuple[str, ...]:
         """Names of what fits report."""
         return tuple(one.name for one in self.derived)
+
+    @property
+    def bounds(self) -> tuple[float, ...]:
+        """Smallest possible values."""
+        return tuple(one.bound for one in self.derived)
 
     @property
     def units(self) -> tuple[str, ...]:

@@ -9,7 +9,7 @@ value there, delta being what the temperature alone costs of the allowed c; the 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,7 +43,7 @@ class Best:
     ----------
     log_k : ndarray, shape (n,)
     linear : ndarray, shape (n, n_linear)
-        Amplitudes; that of the blackbody is at least zero.
+        Amplitudes.
     gain : ndarray, shape (n,)
         Chi-squared of the sums without a flare less that of the fit.
     """
@@ -51,6 +51,13 @@ class Best:
     log_k: Float
     linear: Float
     gain: Float
+
+    def replaced(self, rows: NDArray[np.intp], others: Best) -> Best:
+        """Return the fits with those of some frames replaced."""
+        every = [getattr(self, one.name).copy() for one in fields(self)]
+        for values, one in zip(every, fields(self), strict=True):
+            values[rows] = getattr(others, one.name)
+        return Best(*every)
 
 
 class Profile:
@@ -129,9 +136,12 @@ class Profile:
             reached = self.gain(vertex)
             x = np.where(reached >= g.max(axis=1), vertex, three)
             step /= NARROWER
-        amplitude, _, hot = self.parts(x)
-        amplitude = np.maximum(amplitude, 0.0)
-        return Best(x, self.linear(x, amplitude, hot), self.gain(x))
+        return Best(x, self.amplitudes(x), self.gain(x))
+
+    def amplitudes(self, log_k: Float) -> Float:
+        """Return the best amplitudes at temperatures (n,), shape (n, n_linear)."""
+        amplitude, _, hot = self.parts(log_k)
+        return self.linear(log_k, np.maximum(amplitude, 0.0), hot)
 
     def ends(self, best: Best, at_nodes: Float, allowed: float) -> tuple[Float, Float]:
         """Return the log temperatures at which chi-squared has risen by `allowed`, low and high, each (n,).
@@ -188,11 +198,7 @@ def intervals(model: FlareModel, profile: Profile, best: Best, at_nodes: Float, 
     Infinite where the data give no limit within the model's temperatures, and for the temperature itself.
     """
     low, high = profile.ends(best, at_nodes, allowed)
-    first = np.where(np.isnan(low), profile.nodes[0], low)
-    last = np.where(np.isnan(high), profile.nodes[-1], high)
-    # Even in the sine's angle: the allowed rest goes to zero at the ends like a root.
-    angle = np.linspace(-np.pi / 2, np.pi / 2, SAMPLES)
-    x = (first + last)[:, None] / 2 + (last - first)[:, None] / 2 * np.sin(angle)
+    x = temperature_samples(profile, low, high)
     amplitude, variance, hot = profile.parts(x)
     linear = profile.linear(x, amplitude, hot)
     spent = best.gain[:, None] - np.einsum("nk,nk->n", profile.along, profile.along)[:, None] - amplitude**2 / variance
@@ -210,6 +216,15 @@ def intervals(model: FlareModel, profile: Profile, best: Best, at_nodes: Float, 
     return np.column_stack([c[0] for c in columns]), np.column_stack([c[1] for c in columns])
 
 
+def temperature_samples(profile: Profile, low: Float, high: Float) -> Float:
+    """Return log temperatures between the ends of intervals, or of the model where there is none, (n, n_sample)."""
+    first = np.where(np.isnan(low), profile.nodes[0], low)
+    last = np.where(np.isnan(high), profile.nodes[-1], high)
+    # Even in the sine's angle: the allowed rest goes to zero at the ends like a root.
+    angle = np.linspace(-np.pi / 2, np.pi / 2, SAMPLES)
+    return (first + last)[:, None] / 2 + (last - first)[:, None] / 2 * np.sin(angle)
+
+
 def _linear_interval(
     profile: Profile, spline: CubicSpline, x: Float, linear: Float, variance: Float, hot: Float, left: Float
 ) -> tuple[Float, Float]:
@@ -225,12 +240,12 @@ def _linear_interval(
     reach = np.sqrt(np.maximum(left, 0.0) * spread)
     outside = left < 0.0
     outside[:, [0, -1]] = False  # the ends themselves, where rounding decides
-    low = _extreme(np.where(outside, np.inf, value - reach), np.minimum)
-    high = _extreme(np.where(outside, -np.inf, value + reach), np.maximum)
+    low = extreme(np.where(outside, np.inf, value - reach), np.minimum)
+    high = extreme(np.where(outside, -np.inf, value + reach), np.maximum)
     return low, high
 
 
-def _extreme(values: Float, which: Callable[..., Float]) -> Float:
+def extreme(values: Float, which: Callable[..., Float]) -> Float:
     """Return the smallest or largest of samples (n, n_sample), by a parabola through the outermost three."""
     sign = 1.0 if which is np.maximum else -1.0
     signed = sign * values
@@ -272,7 +287,7 @@ def _ratio_interval(profile: Profile, per: Float, x: Float, hot: Float, least_ga
     open_low = (a >= 0.0) & (inside < 0.0)
     low = np.where(bounded, smaller, np.where(a >= 0.0, np.where(open_low, -np.inf, larger), np.inf))
     high = np.where(bounded, larger, np.where(a >= 0.0, np.inf, -np.inf))
-    return 1.0 + _extreme(low, np.minimum), 1.0 + _extreme(high, np.maximum)
+    return 1.0 + extreme(low, np.minimum), 1.0 + extreme(high, np.maximum)
 
 
 def covariance(model: FlareModel, profile: Profile, best: Best) -> Float:
